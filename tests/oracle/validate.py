@@ -1,0 +1,99 @@
+"""Hold the oracle against sets with known truth: `python -m oracle.validate FOLDER SET` in tests/."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from . import forward
+
+ELEMENTS = ("m21", "m22", "m23", "m31", "m32", "m33")
+PLATE = {"": None, "_C0": 0.0, "_C45": 45.0}
+AS_BUILT = {
+    "magnification": "magnification",
+    "distortion": "distortion",
+    "wedge_1": "wedge_left",
+    "wedge_2": "wedge_right",
+    "coll": "collimator_diattenuation",
+    **{k: k for k in ("quartz_1", "mgf2_1", "quartz_2", "mgf2_2", "quartz_c", "mgf2_c")},
+}
+
+
+def read_truth(folder, name):
+    """As-built parameters (constant throughputs) and the table of true matrices of a set."""
+    from astropy.io import fits
+
+    built = json.loads((Path(folder) / f"walop_south_{name}_truth.json").read_text())
+    params = forward.nominal()
+    params.update({ours: built[theirs] for ours, theirs in AS_BUILT.items()})
+    params["eta_1"], params["eta_2"] = built["efficiency"]
+    params["coll_q"], params["coll_u"] = built["collimator_bias"]
+    params["throughput"][:, 0] = built["throughput"]
+    with fits.open(Path(folder) / f"walop_south_{name}_truth.fits") as hdus:
+        table = {column: np.array(hdus[1].data[column], float) for column in hdus[1].columns.names}
+    return params, table
+
+
+def truth_matrix(table, suffix=""):
+    """m21 … m33 of a truth table."""
+    return {k: table[k.upper() + suffix] for k in ELEMENTS}
+
+
+def throughput_ratios(analysis, table):
+    """Camera throughputs (points, 4) up to one factor per half that M21 and M31 of the truth imply.
+
+    `analysis`: vectors of the as-built instrument with unit throughputs, calibration plate out.
+    """
+    ratios = np.ones(analysis.shape[:2])
+    for a, name in ((0, "M21"), (2, "M31")):
+        offset = table[name]
+        ratios[:, a] = (1 + offset) / (1 - offset) * analysis[:, a + 1, 0] / analysis[:, a, 0]
+    return ratios
+
+
+def compare(params, table, wavelengths, weights):
+    """Model minus truth of every element and plate setting, throughput ratios taken from the truth."""
+    params = {**params, "throughput": np.eye(1, 15).repeat(4, 0)}
+    ratios, out = None, {}
+    for suffix, plate in PLATE.items():
+        args = (params, table["X"], table["Y"], wavelengths, weights, plate)
+        analysis = forward.analysis_vectors(*args)
+        if ratios is None:
+            ratios = throughput_ratios(analysis, table)
+        model = forward.instrument_matrix(analysis * ratios[..., None])
+        for k, value in truth_matrix(table, suffix).items():
+            out[k + suffix] = model[k] - value
+    return out
+
+
+def main(folder, name="a"):
+    """Print the comparison with the truth, then the fit and its calibration error."""
+    from . import fit
+
+    params, table = read_truth(folder, name)
+    data = forward.load(Path(folder) / f"walop_south_{name}.fits")
+    band = forward.band(*data["filters"]["SDSS-r"], 5772.0)
+    for k, error in compare(params, table, *band).items():
+        print(f"{k:8s} rms {np.sqrt(np.mean(error**2)):.1e}  max {np.max(np.abs(error)):.1e}")
+    truth = truth_matrix(table)
+    good = np.abs(truth["m22"] * truth["m33"] - truth["m23"] * truth["m32"]) >= 0.1
+    for log in (False, True):
+        start = time.perf_counter()
+        found = fit.fit(data, log=log)
+        seconds = time.perf_counter() - start
+        matrix = forward.matrix(found["params"], table["X"], table["Y"], *band, log=log)
+        errors = fit.recovery_error(matrix, truth)
+        rms = [100 * np.sqrt(np.mean(e[good] ** 2)) for e in errors]
+        print(
+            f"{'log throughput' if log else 'throughput'} a polynomial: "
+            f"chi2 {found['chi2']:.2f} dof {found['dof']} in {seconds:.1f} s; "
+            f"error q {rms[0]:.4f} % u {rms[1]:.4f} % at {good.sum()} of {good.size} points"
+        )
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

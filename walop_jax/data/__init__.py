@@ -1,0 +1,76 @@
+"""Calibration sets, filters and the sky: FITS, units, time and ephemeris live here and nowhere else.
+
+This room turns files into plain immutable records and back. Units are checked at the door and are
+gone afterwards: inside the package a number has the unit that the record's docstring gives.
+"""
+
+from walop_jax.data.atomic import atomic_path, check_output
+from walop_jax.data.calset import CALVERS, empty_sources, read_calibration_set, with_builtins
+from walop_jax.data.checks import INSTRUMENTS
+from walop_jax.data.errors import DataError, nearest
+from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter
+from walop_jax.data.frames import FrameIntensities, Grid
+from walop_jax.data.merge import JoinedIntensities, merge_calibration_sets
+from walop_jax.data.records import (
+    CAMERAS,
+    FLAG_BITS,
+    KINDS,
+    Block,
+    CalibrationSet,
+    Exposures,
+    FilterCurve,
+    InputFile,
+    Intensities,
+    Points,
+    Site,
+    Sources,
+)
+from walop_jax.data.sky import (
+    moon_direction,
+    moon_sky,
+    rayleigh_sky,
+    sky_to_instrument,
+    standard_rotation,
+)
+from walop_jax.data.table import TableIntensities, empty_block
+from walop_jax.data.write import write_calibration_set, write_frames
+
+__all__ = [
+    "BUILTIN_FILTERS",
+    "CALVERS",
+    "CAMERAS",
+    "DEFAULT_FILTER",
+    "FLAG_BITS",
+    "INSTRUMENTS",
+    "KINDS",
+    "Block",
+    "CalibrationSet",
+    "DataError",
+    "Exposures",
+    "FilterCurve",
+    "FrameIntensities",
+    "Grid",
+    "InputFile",
+    "Intensities",
+    "JoinedIntensities",
+    "Points",
+    "Site",
+    "Sources",
+    "TableIntensities",
+    "atomic_path",
+    "builtin_filter",
+    "check_output",
+    "empty_block",
+    "empty_sources",
+    "merge_calibration_sets",
+    "moon_direction",
+    "moon_sky",
+    "nearest",
+    "rayleigh_sky",
+    "read_calibration_set",
+    "sky_to_instrument",
+    "standard_rotation",
+    "with_builtins",
+    "write_calibration_set",
+    "write_frames",
+]

@@ -1,0 +1,210 @@
+"""Reading a calibration set: one or several files in, one checked `CalibrationSet` out."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from walop_jax.data import schema
+from walop_jax.data.checks import INSTRUMENTS, make_exposures, make_filters, make_points, make_sources
+from walop_jax.data.errors import DataError, fail, nearest
+from walop_jax.data.filters import builtin_filter
+from walop_jax.data.frames import COUNT_NAMES, ERROR_NAMES, FrameIntensities, frame_stack
+from walop_jax.data.merge import merge_calibration_sets
+from walop_jax.data.opening import OpenFile, open_fits
+from walop_jax.data.records import (
+    CalibrationSet,
+    Exposures,
+    FilterCurve,
+    InputFile,
+    Intensities,
+    Points,
+    Site,
+    Sources,
+)
+from walop_jax.data.schema import Place, read_table
+from walop_jax.data.table import TableIntensities, mask_repeats, table_intensities, usable
+
+CALVERS = 1
+"""Version of the file format that is written, and the newest that is read."""
+
+_IMAGES = (*COUNT_NAMES, *ERROR_NAMES, "FLAG")
+_SAMPLE = 8  # image rows looked at when frames are opened; every block is checked again as it is read
+
+
+def read_calibration_set(*paths: str | os.PathLike[str]) -> CalibrationSet:
+    """Read and check one calibration set, merging several files into one.
+
+    Whole frames are not read, only described; their blocks are checked as they are read. What was odd but
+    harmless (unknown columns, masked rows, …) stands in `remarks`.
+
+    Raises `DataError` that names file, extension, column and row for anything that cannot be trusted.
+    """
+    if not paths:
+        raise fail("no file was given", advice="name at least one calibration set")
+    sets: list[CalibrationSet] = []
+    for path in paths:
+        one = _read_one(Path(path))
+        known = {entry.inputs[0].sha256: entry.inputs[0].path for entry in sets}
+        if one.inputs[0].sha256 in known:
+            raise fail(
+                f"has the same bytes as {known[one.inputs[0].sha256]}",
+                file=path,
+                advice="name each file once: repeated data would shrink the errors",
+            )
+        sets.append(one)
+    return sets[0] if len(sets) == 1 else merge_calibration_sets(*sets)
+
+
+def _read_one(path: Path) -> CalibrationSet:
+    with open_fits(path) as opened:
+        try:
+            return _from_hdus(opened)
+        except DataError:
+            raise
+        except (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
+            # astropy meets a damaged header only when the header is used.
+            raise fail(f"cannot be read: {error}", file=path, advice="write the file again") from error
+
+
+def _from_hdus(opened: OpenFile) -> CalibrationSet:
+    path, remarks = opened.path, list(opened.remarks)
+    primary = opened.hdus[0].header
+    instrument, site = _header(primary, path)
+    tables, images = _extensions(opened, remarks)
+
+    def table(name: str) -> dict[str, Any]:
+        if name not in tables:
+            raise fail("the extension is missing", file=path, extension=name, advice="see the file format")
+        columns, more = read_table(tables[name], schema.TABLES[name], Place(path, name))
+        remarks.extend(more)
+        return columns
+
+    filters = make_filters(table("FILTERS"), Place(path, "FILTERS")) if "FILTERS" in tables else {}
+    exposures = make_exposures(table("EXPOSURES"), filters, site, Place(path, "EXPOSURES"))
+    sources = (
+        make_sources(table("SOURCES"), Place(path, "SOURCES")) if "SOURCES" in tables else empty_sources()
+    )
+    if images:
+        if "INTENSITIES" in tables:
+            raise fail("has frames and a table of intensities", file=path, advice="use one file for each")
+        if opened.compressed:
+            raise fail("frames are read in slabs", file=path, advice="unpack the file with gunzip")
+        intensities, points = _frames(images, exposures, instrument, path)
+    else:
+        points = make_points(table("POINTS"), instrument, Place(path, "POINTS"))
+        place = Place(path, "INTENSITIES")
+        intensities, more = table_intensities(table("INTENSITIES"), exposures, points, sources, place)
+        intensities, repeated = mask_repeats(intensities, exposures)
+        remarks.extend(more + repeated + _idle(intensities, exposures, path))
+    return CalibrationSet(
+        instrument=instrument,
+        site=site,
+        origin=str(primary.get("ORIGIN", "")).strip(),
+        exposures=exposures,
+        points=points,
+        sources=sources,
+        filters=with_builtins(filters, exposures),
+        intensities=intensities,
+        inputs=(InputFile(path, opened.sha256),),
+        remarks=tuple(remarks),
+    )
+
+
+def _header(header: Any, path: Path) -> tuple[str, Site]:
+    place = Place(path, "PRIMARY")
+    version = header.get("CALVERS")
+    if version is None:
+        raise place.fail("is missing", "CALVERS", "is this a calibration set?")
+    if isinstance(version, bool) or not isinstance(version, int) or not 1 <= version <= CALVERS:
+        raise place.fail(f"is {version!r}, this program reads {CALVERS}", "CALVERS", "use a newer walop-jax")
+    instrument = str(header.get("INSTRUME", "")).strip().upper()
+    if instrument not in INSTRUMENTS:
+        raise place.fail(f"is {instrument!r}", "INSTRUME", nearest(instrument, INSTRUMENTS))
+    values: dict[str, float] = {}
+    for name in ("SITELAT", "SITELONG", "SITEELEV"):
+        value = header.get(name, float("nan"))
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise place.fail(f"is {value!r}, not a number", name, "degrees (east positive) and metres")
+        values[name] = float(value)
+    telescope = str(header.get("TELESCOP", "")).strip()
+    return instrument, Site(telescope, values["SITELAT"], values["SITELONG"], values["SITEELEV"])
+
+
+def _extensions(opened: OpenFile, remarks: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Sort the extensions of a file by name into tables and images."""
+    tables: dict[str, Any] = {}
+    images: dict[str, Any] = {}
+    for number, hdu in enumerate(opened.hdus[1:], start=1):
+        name = hdu.name.strip().upper()
+        kind = tables if name in schema.TABLES else images if name in _IMAGES else None
+        if kind is None:
+            known = (*schema.TABLES, *_IMAGES)
+            remarks.append(f"{opened.path} [{name or number}]: unknown extension ({nearest(name, known)})")
+        elif name in kind:
+            raise fail("is there twice", file=opened.path, extension=name, advice="remove one")
+        else:
+            kind[name] = hdu
+    return tables, images
+
+
+def empty_sources() -> Sources:
+    """Return a table without sources."""
+    none = np.zeros(0)
+    return Sources(np.zeros(0, dtype=np.int64), np.zeros(0, dtype="U1"), none, none, none, none, none)
+
+
+def with_builtins(filters: dict[str, FilterCurve], exposures: Exposures) -> dict[str, FilterCurve]:
+    """Add the built-in curves that the exposures name and the file does not bring; a file's own win."""
+    absent = {str(name) for name in exposures.filter} - set(filters)
+    return filters | {name: builtin_filter(name) for name in sorted(absent)}
+
+
+def _idle(intensities: TableIntensities, exposures: Exposures, path: Path) -> list[str]:
+    idle = np.setdiff1d(np.arange(len(exposures)), intensities.exposure[intensities.used])
+    names = ", ".join(str(entry) for entry in exposures.exposure[idle][:5]) + (" …" if len(idle) > 5 else "")
+    return [f"{path} [INTENSITIES]: no used row for exposure(s) {names}"] if len(idle) else []
+
+
+def _frames(
+    images: dict[str, Any], exposures: Exposures, instrument: str, path: Path
+) -> tuple[Intensities, Points]:
+    """Describe frames, and look at a few rows of pixels for what is wrong everywhere."""
+    if np.any(bad := (exposures.kind == "standard") & ~exposures.clp_in):
+        raise fail(
+            f"EXPOSURE {exposures.exposure[bad][0]} is a standard, and a pixel of a frame has no SOURCE",
+            file=path,
+            extension="EXPOSURES",
+            column="KIND",
+            advice="give standards in a table, in another file",
+        )
+    grid, stack = frame_stack(images, len(exposures), path)
+    width, total = grid.width, grid.width * grid.height
+    corners = np.array([0, width - 1, total - width, total - 1])
+    x, y = (np.concatenate(parts) for parts in zip(*(grid.xy(n, n + 1) for n in corners), strict=True))
+    make_points({"POINT": np.arange(4), "X": x, "Y": y}, instrument, Place(path, "N0"))
+    intensities = FrameIntensities(grid, (stack,))
+    place = Place(path, "N0")
+    sampled = [int(row) for row in np.unique(np.linspace(0, grid.height - 1, _SAMPLE).astype(int))]
+    spoilt = number = 0
+    lowest, highest = np.inf, -np.inf
+    for row in sampled:
+        counts, sigma, flag = intensities.read(stack, row * width, (row + 1) * width)
+        used, bad, _ = usable(counts, sigma, flag)
+        intensities.block(row * width, (row + 1) * width)  # refuses errors that are not positive
+        spoilt, number = spoilt + int(bad.sum()), number + bad.size
+        if np.any(used):
+            values = counts[used]
+            lowest, highest = min(lowest, values.min()), max(highest, values.max())
+    if spoilt > 0.2 * number:
+        raise place.fail(
+            f"{100 * spoilt / number:.0f} % of the pixels looked at are not finite or far below zero",
+            "N0…N3, E0…E3",
+            "repair the reduction, or set the FLAG image",
+        )
+    if lowest == highest and number > 1:
+        raise place.fail(f"all counts are equal ({lowest:g})", "N0…N3", "these are not measurements")
+    return intensities, grid.points

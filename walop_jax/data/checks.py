@@ -1,0 +1,207 @@
+"""What the numbers of a calibration set must satisfy before anyone believes them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from walop_jax.data.errors import nearest, rows_text
+from walop_jax.data.filters import BUILTIN_FILTERS
+from walop_jax.data.records import KINDS, Exposures, FilterCurve, Points, Site, Sources
+from walop_jax.data.schema import Place
+from walop_jax.data.sky import EPHEMERIS_MJD
+
+INSTRUMENTS = ("WALOP-SOUTH", "WALOP-NORTH", "WALOP-LAB")
+"""Values of INSTRUME that a calibration set may have."""
+
+_FIELD = {"WALOP-SOUTH": 0.35, "WALOP-NORTH": 0.35, "WALOP-LAB": 45.0}
+"""Largest |X|, |Y| in degrees; on the laboratory bench X is the tilt of the plate."""
+
+_WAVELENGTH = (0.3, 1.1)  # µm, where silicon detectors see
+
+
+def refuse(bad: np.ndarray, what: str, column: str, advice: str, place: Place) -> None:
+    """Raise `DataError` naming the rows where `bad` is set, if there are any."""
+    if np.any(bad):
+        raise place.fail(f"{what} in {rows_text(np.flatnonzero(bad))}", column, advice)
+
+
+def unique(ids: np.ndarray, column: str, place: Place) -> None:
+    """Raise `DataError` if an identifier is there twice."""
+    _, inverse, number = np.unique(ids, return_inverse=True, return_counts=True)
+    refuse(number[inverse] > 1, "the identifier is not unique", column, "number the rows", place)
+
+
+def make_points(table: dict[str, Any], instrument: str, place: Place) -> Points:
+    """Check the POINTS table (degrees) against the field of the instrument."""
+    unique(table["POINT"], "POINT", place)
+    limit = _FIELD[instrument]
+    for name in ("X", "Y"):
+        refuse(~np.isfinite(table[name]), "is not finite", name, "remove these points", place)
+        refuse(
+            np.abs(table[name]) > limit,
+            f"lies outside ±{limit:g}° of {instrument}",
+            name,
+            "field coordinates are in degrees: are these arcmin or pixels?",
+            place,
+        )
+    return Points(point=table["POINT"], x=table["X"], y=table["Y"])
+
+
+def make_filters(table: dict[str, Any], place: Place) -> dict[str, FilterCurve]:
+    """Check the FILTERS table (µm); strip the NaN padding; turn descending curves round."""
+    curves: dict[str, FilterCurve] = {}
+    wavelengths, throughputs = table["WAVELENGTH"], table["THROUGHPUT"]
+    if wavelengths.shape != throughputs.shape:
+        raise place.fail("has not as many values as WAVELENGTH", "THROUGHPUT", "pad both with NaN")
+    for row, name in enumerate(table["FILTER"]):
+        at = np.array([row])
+        if name in curves:
+            raise place.fail(f"{name!r} is there twice, again in {rows_text(at)}", "FILTER", "rename one")
+        wavelength, throughput = wavelengths[row], throughputs[row]
+        given = np.isfinite(wavelength)
+        if not np.any(given) or not np.all(np.isfinite(throughput[given])):
+            raise place.fail(
+                f"{name!r} has no value where WAVELENGTH has one, in {rows_text(at)}",
+                "THROUGHPUT",
+                "pad both columns with NaN in the same places",
+            )
+        wavelength, throughput = wavelength[given], throughput[given]
+        if wavelength.min() < _WAVELENGTH[0] or wavelength.max() > _WAVELENGTH[1]:
+            raise place.fail(
+                f"{name!r} reaches from {wavelength.min():g} to {wavelength.max():g} µm, outside 0.3 … 1.1, "
+                f"in {rows_text(at)}",
+                "WAVELENGTH",
+                "wavelengths are in µm: are these nm or Angstrom?",
+            )
+        if len(wavelength) > 1 and wavelength[0] > wavelength[-1]:
+            wavelength, throughput = wavelength[::-1].copy(), throughput[::-1].copy()
+        if np.any(np.diff(wavelength) <= 0):
+            raise place.fail(f"{name!r} is not sorted, in {rows_text(at)}", "WAVELENGTH", "sort the curve")
+        if np.any(throughput < 0) or not np.any(throughput > 0):
+            raise place.fail(
+                f"{name!r} is negative or zero throughout, in {rows_text(at)}",
+                "THROUGHPUT",
+                "correct the curve",
+            )
+        curves[str(name)] = FilterCurve(str(name), wavelength, throughput)
+    return curves
+
+
+def make_sources(table: dict[str, Any], place: Place) -> Sources:
+    """Check the SOURCES table (fractions; kelvin)."""
+    unique(table["SOURCE"], "SOURCE", place)
+    refuse(table["SOURCE"] < 0, "is negative", "SOURCE", "−1 means no source; number from 0", place)
+    for name in ("Q", "U"):
+        refuse(~np.isfinite(table[name]), "is not finite", name, "remove the source", place)
+        refuse(np.abs(table[name]) > 1, "exceeds 1", name, "fractions are wanted: are these per cent?", place)
+    for name in ("Q_ERR", "U_ERR"):
+        refuse(
+            ~(table[name] > 0) | np.isinf(table[name]),
+            "is not a positive number",
+            name,
+            "it is the width of a prior: give the error of the catalogue",
+            place,
+        )
+    _temperature(table["TEFF"], place)
+    fields = ("SOURCE", "NAME", "Q", "U", "Q_ERR", "U_ERR", "TEFF")
+    return Sources(**{name.lower(): table[name] for name in fields})
+
+
+def make_exposures(
+    table: dict[str, Any], filters: Mapping[str, FilterCurve], site: Site, place: Place
+) -> Exposures:
+    """Check the EXPOSURES table (degrees, days, kelvin, …) for what every KIND needs."""
+    unique(table["EXPOSURE"], "EXPOSURE", place)
+    table["KIND"] = kind = np.char.lower(table["KIND"])
+    for name in np.unique(kind):
+        if name not in KINDS:
+            refuse(kind == name, f"{name!r} is not a kind,", "KIND", nearest(str(name), KINDS), place)
+    known = {*filters, *BUILTIN_FILTERS}
+    for name in np.unique(table["FILTER"]):
+        if name not in known:
+            refuse(
+                table["FILTER"] == name,
+                f"{str(name)!r} is neither a row of FILTERS nor built in,",
+                "FILTER",
+                nearest(str(name), known),
+                place,
+            )
+    clp_in = table["CLP_IN"]
+    refuse((kind == "clp") & ~clp_in, "is false", "CLP_IN", "KIND clp needs the polariser in", place)
+    for plate in ("CLP", "CHWP"):
+        angle, inside = table[f"{plate}_ANGLE"], table[f"{plate}_IN"]
+        advice = f"give the encoder reading, or set {plate}_IN false"
+        refuse(inside & ~np.isfinite(angle), "is not finite", f"{plate}_ANGLE", advice, place)
+        # Out of the beam a plate has no angle, whatever the header remembers.
+        table[f"{plate}_ANGLE"] = np.where(inside, angle, np.nan)
+    _not_radians(table["CLP_ANGLE"][clp_in], place)
+    _temperature(table["TEFF"], place)
+    _ranges(table, place)
+
+    moon, standard = (kind == "moon") & ~clp_in, (kind == "standard") & ~clp_in
+    for name in ("MJD", "RA", "DEC", "ROTATOR"):
+        bad = moon & ~np.isfinite(table[name])
+        refuse(bad, "is not finite", name, "the Moon sky needs time and pointing", place)
+    refuse(
+        standard & ~np.isfinite(table["ROTATOR"]), "is not finite", "ROTATOR", "a standard needs it", place
+    )
+    low, high = EPHEMERIS_MJD
+    bad = moon & ((table["MJD"] < low) | (table["MJD"] > high))
+    refuse(bad, "is not in 1900 … 2100", "MJD", "is this a Julian Date? subtract 2400000.5", place)
+    if np.any(moon):
+        _site(site, place)
+    return Exposures(**{name: table[name.upper()] for name in Exposures.__dataclass_fields__})
+
+
+def _temperature(teff: np.ndarray, place: Place) -> None:
+    bad = ~np.isnan(teff) & ~((teff >= 500) & (teff < 1e6))
+    refuse(bad, "is not a temperature of a source", "TEFF", "NaN means a flat photon spectrum", place)
+
+
+def _ranges(table: dict[str, Any], place: Place) -> None:
+    """Refuse values that only another unit can explain; NaN passes, it has been dealt with."""
+    limits = {
+        "DEC": (90.0, "declinations are in degrees"),
+        "RA": (360.0, "right ascensions are in degrees"),
+        "ROTATOR": (3600.0, "position angles are in degrees"),
+        "CLP_ANGLE": (36000.0, "encoder readings are in degrees: are these steps?"),
+        "CHWP_ANGLE": (36000.0, "encoder readings are in degrees: are these steps?"),
+        "HA": (24.0, "hour angles are in hours: are these degrees?"),
+        "TEMP": (150.0, "temperatures are in degrees Celsius: are these kelvin?"),
+    }
+    for name, (limit, advice) in limits.items():
+        refuse(np.abs(table[name]) > limit, f"exceeds ±{limit:g}", name, advice, place)
+
+
+def _site(site: Site, place: Place) -> None:
+    values = {
+        "SITELAT": (site.latitude, -90.0, 90.0),
+        "SITELONG": (site.longitude, -180.0, 360.0),
+        "SITEELEV": (site.elevation, -500.0, 9000.0),
+    }
+    for name, (value, low, high) in values.items():
+        if not low <= value <= high:
+            raise Place(place.file, "PRIMARY").fail(
+                f"is {value:g}, not in {low:g} … {high:g}", name, "the Moon's parallax needs the site"
+            )
+
+
+def _not_radians(angles: np.ndarray, place: Place) -> None:
+    """Refuse polariser angles that are clearly radians.
+
+    Clearly: five or more, from more than a quarter of a turn in radians, none beyond a turn, and most of
+    them off the round numbers that anyone would choose in degrees.
+    """
+    distinct = np.unique(angles)
+    if len(distinct) < 5 or distinct[0] < -2 * np.pi or distinct[-1] > 2 * np.pi + 1e-6:
+        return
+    steps = distinct / 0.05
+    if distinct[-1] - distinct[0] > 0.5 * np.pi and np.mean(np.abs(steps - np.round(steps)) > 1e-3) > 0.5:
+        raise place.fail(
+            f"all {len(distinct)} different angles lie between {distinct[0]:g} and {distinct[-1]:g}",
+            "CLP_ANGLE",
+            "angles are in degrees: are these radians?",
+        )

@@ -1,0 +1,47 @@
+"""The one error of this room, and the wording that every message shares: what, where, what to do."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+_SHOWN = 5
+"""How many rows or names a message spells out before it only counts the rest."""
+
+
+class DataError(ValueError):
+    """An input cannot be trusted; the message says what is wrong, where, and what to do about it."""
+
+
+def fail(
+    what: str, *, file: object = None, extension: str = "", column: str = "", advice: str = ""
+) -> DataError:
+    """Build a `DataError` whose message reads `file [EXTENSION] COLUMN: what; advice`."""
+    place = " ".join(
+        part for part in (str(file) if file else "", f"[{extension}]" if extension else "", column) if part
+    )
+    return DataError(f"{place + ': ' if place else ''}{what}{'; ' + advice if advice else ''}")
+
+
+def rows_text(rows: Sequence[int] | np.ndarray) -> str:
+    """Name some table rows, counted from 0 as in numpy and astropy: `rows 3, 7 … (12 in all, from 0)`."""
+    shown = ", ".join(str(int(row)) for row in rows[:_SHOWN])
+    if len(rows) > _SHOWN:
+        return f"rows {shown} … ({len(rows)} in all, counted from 0)"
+    return f"row{'s' if len(rows) > 1 else ''} {shown} (counted from 0)"
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Advise on a name that does not exist: the names most like it, or some of those that there are."""
+    known = sorted(set(known))
+    if not known:
+        return "there are none to choose from"
+    close = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+    if not close:
+        lowered = {entry.lower(): entry for entry in known}
+        close = [lowered[m] for m in difflib.get_close_matches(name.lower(), lowered, n=3, cutoff=0.4)]
+    if close:
+        return "did you mean " + " or ".join(repr(entry) for entry in close) + "?"
+    return "known: " + ", ".join(known[:_SHOWN]) + (" …" if len(known) > _SHOWN else "")

@@ -1,0 +1,257 @@
+"""Intensities that stand in whole frames, which may be far larger than memory: read in slabs on demand."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.data.errors import fail
+from walop_jax.data.records import Block, Intensities, Points
+from walop_jax.data.schema import Place, convert_unit
+from walop_jax.data.table import empty_block, usable
+
+COUNT_NAMES = ("N0", "N1", "N2", "N3")
+ERROR_NAMES = ("E0", "E1", "E2", "E3")
+
+_SLAB = 1 << 19  # values of one camera that are looked at together when whole frames are gone through
+
+
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """The linear map from pixels to field coordinates (FITS standard, section 8.1).
+
+    (x, y) = `value` + `matrix` · (pixel − `reference`), in degrees, pixels counted from 1 as FITS does;
+    `width` pixels in a row, `height` rows. Points run along the rows.
+    """
+
+    width: int
+    height: int
+    reference: tuple[float, float]
+    value: tuple[float, float]
+    matrix: tuple[tuple[float, float], tuple[float, float]]
+
+    def xy(self, start: int, stop: int) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+        """Return the field coordinates (degrees) of the points `start:stop`."""
+        row, column = np.divmod(np.arange(start, stop), self.width)
+        i, j = column + (1.0 - self.reference[0]), row + (1.0 - self.reference[1])
+        (xi, xj), (yi, yj) = self.matrix
+        return self.value[0] + (xi * i + xj * j), self.value[1] + (yi * i + yj * j)
+
+    @functools.cached_property
+    def points(self) -> Points:
+        """All pixels as field points, numbered from 0."""
+        x, y = self.xy(0, self.width * self.height)
+        return Points(point=np.arange(len(x), dtype=np.int32), x=x, y=y)
+
+
+@dataclasses.dataclass(frozen=True)
+class Cube:
+    """Where the values of an image extension (exposures, rows, columns) lie, and how to read them."""
+
+    path: Path
+    extension: str
+    offset: int
+    dtype: np.dtype[Any]
+    shape: tuple[int, int, int]
+    scale: float
+    zero: float
+    blank: int | None
+    stamp: tuple[int, int]
+
+    def rows(self, start: int, stop: int) -> Float[np.ndarray, "e y x"]:
+        """Read some rows of all planes; undefined integers (BLANK) become NaN.
+
+        Raises `DataError` if the file has gone or changed since it was checked.
+        """
+        try:
+            now = self.path.stat()
+            if (now.st_size, now.st_mtime_ns) != self.stamp:
+                raise fail("the file has changed since it was opened", file=self.path, advice="start again")
+            # Mapped anew each time: no open file to keep, and pages are given back after the slab.
+            raw = np.memmap(self.path, self.dtype, mode="r", offset=self.offset, shape=self.shape)
+            part = np.asarray(raw[:, start:stop])
+        except OSError as error:
+            raise fail(f"cannot be read: {error}", file=self.path, extension=self.extension) from error
+        values = part.astype(np.float64)
+        if (self.scale, self.zero) != (1.0, 0.0):
+            values = values * self.scale + self.zero
+        if self.blank is not None:
+            values[part == self.blank] = np.nan
+        return values
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameStack:
+    """The frames of one file: four cubes of counts, four of errors, and flags if there are any."""
+
+    exposures: int
+    counts: tuple[Cube, ...]
+    sigma: tuple[Cube, ...]
+    flag: Cube | None
+
+
+class FrameIntensities(Intensities):
+    """Frames of one or several files on the same grid of pixels, exposures one after the other."""
+
+    def __init__(self, grid: Grid, stacks: tuple[FrameStack, ...]) -> None:
+        self.grid = grid
+        self.stacks = stacks
+        self.exposures = sum(stack.exposures for stack in stacks)
+        self._rows: int | None = None
+
+    @property
+    def rows(self) -> int:
+        """Number of used (exposure, pixel) pairs; the first call reads all frames, slab by slab."""
+        if self._rows is None:
+            step = max(1, _SLAB // max(1, self.exposures))
+            total = self.grid.width * self.grid.height
+            self._rows = sum(
+                int(np.count_nonzero(self.block(start, start + step).used)) for start in range(0, total, step)
+            )
+        return self._rows
+
+    def block(self, start: int, stop: int) -> Block:
+        """Return the data of the pixels `start:stop`, dense in the exposures.
+
+        Raises `DataError` for an error that is zero or negative on an unflagged pixel.
+        """
+        start, stop, _ = slice(start, stop).indices(self.grid.width * self.grid.height)
+        stop = max(start, stop)
+        block = empty_block(*self.grid.xy(start, stop), self.exposures)
+        first = 0
+        for stack in self.stacks if stop > start else ():
+            here = slice(first, first + stack.exposures)
+            counts, sigma, flag = self.read(stack, start, stop)
+            used, _, impossible = usable(counts, sigma, flag)
+            if np.any(impossible):
+                pixel, plane = (int(entry[0]) for entry in np.nonzero(impossible))
+                row, column = divmod(start + pixel, self.grid.width)
+                camera = int(np.argmax(sigma[pixel, plane] <= 0))
+                raise fail(
+                    f"is zero or negative in plane {plane}, row {row}, column {column} (counted from 0), and "
+                    f"{int(impossible.sum())} pixel(s) in all",
+                    file=stack.sigma[camera].path,
+                    extension=ERROR_NAMES[camera],
+                    advice="give the true error, or set the FLAG image",
+                )
+            block.used[:, here] = used
+            block.counts[:, here] = np.where(used[..., None], counts, 0.0)
+            block.sigma[:, here] = np.where(used[..., None], sigma, 1.0)
+            first += stack.exposures
+        return block
+
+    def read(self, stack: FrameStack, start: int, stop: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return counts and errors (points, exposures, 4) and flags (points, exposures) as they stand."""
+        top, bottom = start // self.grid.width, -(-stop // self.grid.width)
+        inside = slice(start - top * self.grid.width, stop - top * self.grid.width)
+
+        def columns(cube: Cube) -> np.ndarray:
+            values = cube.rows(top, bottom)
+            return values.reshape(len(values), -1)[:, inside].T
+
+        counts = np.stack([columns(cube) for cube in stack.counts], axis=-1)
+        sigma = np.stack([columns(cube) for cube in stack.sigma], axis=-1)
+        if stack.flag is None:
+            return counts, sigma, np.zeros(counts.shape[:2])
+        # An undefined flag is no clean bill of health.
+        return counts, sigma, np.nan_to_num(np.broadcast_to(columns(stack.flag), counts.shape[:2]), nan=2.0)
+
+
+def frame_stack(images: dict[str, Any], exposures: int, path: Path) -> tuple[Grid, FrameStack]:
+    """Describe the image extensions of a file, `images` by name, without reading their pixels.
+
+    Raises `DataError` for a missing or compressed extension, a shape that does not fit the exposures or the
+    other extensions, a coordinate system that is not linear in X and Y, and a unit that is not electrons.
+    """
+    grids: dict[Grid, str] = {}
+    cubes: dict[str, Cube] = {}
+    for name in (*COUNT_NAMES, *ERROR_NAMES, *(("FLAG",) if "FLAG" in images else ())):
+        place = Place(path, name)
+        if name not in images:
+            raise place.fail("the image extension is missing", advice="frames need N0…N3 and E0…E3")
+        cubes[name] = _cube(images[name], exposures, place)
+        if name != "FLAG":
+            grids.setdefault(_grid(images[name].header, place), name)
+            convert_unit(
+                np.ones(1), str(images[name].header.get("BUNIT") or "electron"), "electron", "BUNIT", place
+            )
+    if len(grids) > 1:
+        one, other, *_ = grids.values()
+        raise fail(f"{one} and {other} do not lie on the same grid", file=path, advice="resample them first")
+    grid = next(iter(grids))
+    flag = cubes.get("FLAG")
+    if flag is not None and flag.shape[1:] != (grid.height, grid.width):
+        raise fail("does not have the shape of N0", file=path, extension="FLAG", advice="write it anew")
+    counts, sigma = (tuple(cubes[name] for name in names) for names in (COUNT_NAMES, ERROR_NAMES))
+    return grid, FrameStack(exposures, counts, sigma, flag)
+
+
+def _cube(hdu: Any, exposures: int, place: Place) -> Cube:
+    header = hdu.header
+    if "ZIMAGE" in header or type(hdu).__name__ == "CompImageHDU":
+        raise place.fail(
+            "is compressed tile by tile", advice="unpack it with funpack: frames are read in slabs"
+        )
+    shape = tuple(int(header[f"NAXIS{n}"]) for n in range(int(header["NAXIS"]), 0, -1))
+    shape = (1, *shape) if len(shape) == 2 else shape
+    planes = (exposures, 1) if place.extension == "FLAG" else (exposures,)
+    if len(shape) != 3 or shape[0] not in planes or 0 in shape:
+        raise place.fail(
+            f"has shape {shape} where ({exposures}, ny, nx) is needed",
+            advice="one plane per row of EXPOSURES",
+        )
+    info, stat = hdu.fileinfo(), Path(str(place.file)).stat()
+    kinds = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
+    bitpix = int(header["BITPIX"])
+    blank = header.get("BLANK")
+    return Cube(
+        path=Path(str(place.file)).absolute(),
+        extension=place.extension,
+        offset=int(info["datLoc"]),
+        dtype=np.dtype(kinds[bitpix]),
+        shape=(shape[0], shape[1], shape[2]),
+        scale=float(header.get("BSCALE", 1.0)),
+        zero=float(header.get("BZERO", 0.0)),
+        blank=int(blank) if blank is not None and bitpix > 0 else None,
+        stamp=(stat.st_size, stat.st_mtime_ns),
+    )
+
+
+def _grid(header: Any, place: Place) -> Grid:
+    """Read the linear coordinates of the first two axes: CRPIX, CRVAL and CD, or CDELT with PC."""
+    for axis, name in ((1, "X"), (2, "Y")):
+        found = str(header.get(f"CTYPE{axis}", "")).strip().upper()
+        if found != name:
+            raise place.fail(
+                f"is {found!r} where {name!r} is needed", f"CTYPE{axis}", "field coordinates, linear"
+            )
+    if float(header.get("CROTA2", 0.0)) != 0.0:
+        raise place.fail("is an obsolete rotation", "CROTA2", "write PC or CD")
+
+    def matrix(i: int, j: int) -> float:
+        if any(f"CD{a}_{b}" in header for a in (1, 2) for b in (1, 2)):
+            return float(header.get(f"CD{i}_{j}", 0.0))
+        return float(header.get(f"CDELT{i}", 1.0)) * float(header.get(f"PC{i}_{j}", 1.0 if i == j else 0.0))
+
+    scale = [
+        float(convert_unit(np.ones(1), str(header.get(f"CUNIT{n}") or "deg"), "deg", f"CUNIT{n}", place)[0])
+        for n in (1, 2)
+    ]
+    grid = Grid(
+        width=int(header["NAXIS1"]),
+        height=int(header["NAXIS2"]),
+        reference=(float(header.get("CRPIX1", 0.0)), float(header.get("CRPIX2", 0.0))),
+        value=(scale[0] * float(header.get("CRVAL1", 0.0)), scale[1] * float(header.get("CRVAL2", 0.0))),
+        matrix=(
+            (scale[0] * matrix(1, 1), scale[0] * matrix(1, 2)),
+            (scale[1] * matrix(2, 1), scale[1] * matrix(2, 2)),
+        ),
+    )
+    if np.linalg.det(np.array(grid.matrix)) == 0 or not np.all(np.isfinite(grid.matrix)):
+        raise place.fail("the coordinates are singular", "CDELT, PC, CD", "write the pixel scale in degrees")
+    return grid

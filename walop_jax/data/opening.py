@@ -1,0 +1,160 @@
+"""Opening a FITS file so that what comes out of it is what was written, or an error.
+
+A file is read once from end to end: for its SHA-256, for the FITS checksums (Seaman, Pence & Rots 2012, an
+appendix of the FITS standard: the 32-bit words of an HDU, summed in ones' complement, are all ones), and
+for its length. astropy would check the sums too, but in small blocks, and would only warn.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import gzip
+import hashlib
+import io
+import os
+import warnings
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from astropy.io import fits
+
+from walop_jax.data.errors import DataError, fail
+
+_CHUNK = 1 << 23  # a multiple of four, so that words never straddle two chunks
+_LARGEST_GZIP = 1 << 31
+_BLOCK = 2880
+_BROKEN = "the copy is damaged or incomplete; transfer or write the file again"
+
+
+@dataclasses.dataclass(frozen=True)
+class OpenFile:
+    """A FITS file that has passed its checks: its HDUs, its hash, and what is worth remarking."""
+
+    path: Path
+    sha256: str
+    hdus: list[Any]
+    compressed: bool
+    remarks: tuple[str, ...]
+
+
+@contextlib.contextmanager
+def open_fits(path: str | os.PathLike[str]) -> Iterator[OpenFile]:
+    """Open a FITS file (plain, or compressed with gzip) after checking that it is whole.
+
+    Raises `DataError` if it is missing, not FITS, truncated, longer than its headers say, or if a checksum
+    that it carries does not agree with its bytes.
+    """
+    path = Path(path)
+    with contextlib.ExitStack() as stack:
+        try:
+            raw: BinaryIO = stack.enter_context(path.open("rb"))
+            compressed = raw.read(2) == b"\x1f\x8b"
+            content = _decompressed(path) if compressed else raw
+            caught = stack.enter_context(warnings.catch_warnings(record=True))
+            warnings.simplefilter("always")
+            hdus = stack.enter_context(
+                fits.open(io.BytesIO(content) if isinstance(content, bytes) else path, lazy_load_hdus=False)
+            )
+            units = list(hdus)
+        except DataError:
+            raise
+        except FileNotFoundError:
+            raise fail("there is no such file", file=path, advice="check the name") from None
+        except (
+            OSError,
+            EOFError,
+            ValueError,
+            TypeError,
+            KeyError,
+            IndexError,
+            zlib.error,
+            fits.VerifyError,
+        ) as e:
+            raise fail(f"cannot be read as FITS: {_one_line(e)}", file=path, advice=_BROKEN) from e
+        raw.seek(0)
+        source = io.BytesIO(content) if isinstance(content, bytes) else raw
+        sha256 = _verify(path, units, source)
+        if isinstance(content, bytes):
+            raw.seek(0)
+            sha256 = hashlib.file_digest(raw, "sha256").hexdigest()
+        remarks = tuple(f"{path}: {_one_line(entry.message)}" for entry in caught)
+        yield OpenFile(path, sha256, units, compressed, remarks)
+
+
+def _one_line(message: object) -> str:
+    return " ".join(str(message).split())[:300] or type(message).__name__
+
+
+def _decompressed(path: Path) -> bytes:
+    """Unpack a gzip file into memory, with a limit: a small file may unpack to any size."""
+    with gzip.open(path) as stream:
+        content = stream.read(_LARGEST_GZIP + 1)
+    if len(content) > _LARGEST_GZIP:
+        raise fail("unpacks to more than 2 GiB", file=path, advice="unpack it with gunzip")
+    return content
+
+
+def _verify(path: Path, hdus: list[Any], stream: BinaryIO) -> str:
+    """Read the file once; check length and checksums; return the SHA-256 of the bytes."""
+    stream.seek(0, os.SEEK_END)
+    size = stream.tell()
+    stream.seek(0)
+    digest = hashlib.sha256()
+    for number, hdu in enumerate(hdus):
+        info = hdu.fileinfo()
+        name = hdu.name or f"HDU {number}"
+        start, data, end = info["hdrLoc"], info["datLoc"], info["datLoc"] + info["datSpan"]
+        if end > size:
+            raise fail(
+                f"truncated: {size} bytes where {end} are announced",
+                file=path,
+                extension=name,
+                advice=_BROKEN,
+            )
+        header_sum = _sum(stream, data - start, digest)
+        data_sum = _sum(stream, end - data, digest)
+        declared = hdu.header.get("DATASUM")
+        if declared is not None and str(declared).strip() != str(data_sum):
+            raise fail("the data do not agree with DATASUM", file=path, extension=name, advice=_BROKEN)
+        if "CHECKSUM" in hdu.header and _fold(header_sum + data_sum) not in (0, 0xFFFFFFFF):
+            raise fail("the bytes do not agree with CHECKSUM", file=path, extension=name, advice=_BROKEN)
+    if stream.tell() != size:
+        raise fail(
+            f"{size - stream.tell()} bytes after the last extension cannot be read", file=path, advice=_BROKEN
+        )
+    return digest.hexdigest()
+
+
+def _sum(stream: BinaryIO, length: int, digest: Any) -> int:
+    """Add up big-endian 32-bit words in ones' complement (carries come back in at the bottom)."""
+    total = 0
+    while length > 0:
+        chunk = stream.read(min(length, _CHUNK))
+        if not chunk:
+            raise EOFError("unexpected end of file")
+        digest.update(chunk)
+        total += int(np.frombuffer(chunk.ljust(-(-len(chunk) // 4) * 4, b"\0"), ">u4").sum(dtype=np.uint64))
+        length -= len(chunk)
+    return _fold(total)
+
+
+def _fold(total: int) -> int:
+    while total >> 32:
+        total = (total & 0xFFFFFFFF) + (total >> 32)
+    return total
+
+
+def data_sum(path: Path, offset: int, length: int) -> int:
+    """Return the FITS data sum of a stretch of a file, for a writer of data larger than memory."""
+    with path.open("rb") as stream:
+        stream.seek(offset)
+        return _sum(stream, length, hashlib.sha256())
+
+
+def padded(length: int) -> int:
+    """Round a number of bytes up to whole FITS blocks."""
+    return -(-length // _BLOCK) * _BLOCK

@@ -1,0 +1,237 @@
+"""The columns of the calibration tables, and the one way that a column becomes an array.
+
+Columns go by name (FITS names know no upper and lower case). A unit that can be converted is converted;
+a missing unit is the contract's; anything else is refused. What comes out is native-endian.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+from astropy import units
+from astropy.io import fits
+
+from walop_jax.data.errors import fail, nearest, rows_text
+
+Kind = Literal["int", "float", "bool", "str"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Column:
+    """One column of a table: its kind, its unit in memory, and its value where the file lacks it.
+
+    `missing` None means that the column is required; `width` is the number of values in a row, or None for
+    as many as the file has.
+    """
+
+    kind: Kind
+    unit: str = ""
+    missing: object = None
+    width: int | None = 1
+
+
+_NAN = float("nan")
+EXPOSURES: Mapping[str, Column] = {
+    "EXPOSURE": Column("int"),
+    "KIND": Column("str"),
+    "MJD": Column("float", "d", _NAN),
+    "EXPTIME": Column("float", "s", _NAN),
+    "FILTER": Column("str", missing="SDSS-r"),
+    "CLP_IN": Column("bool"),
+    "CLP_ANGLE": Column("float", "deg", _NAN),
+    "CHWP_IN": Column("bool", missing=False),
+    "CHWP_ANGLE": Column("float", "deg", _NAN),
+    "TEMP": Column("float", "Celsius", _NAN),
+    "HA": Column("float", "h", _NAN),
+    "RA": Column("float", "deg", _NAN),
+    "DEC": Column("float", "deg", _NAN),
+    "ROTATOR": Column("float", "deg", _NAN),
+    "TEFF": Column("float", "K", _NAN),
+}
+POINTS: Mapping[str, Column] = {
+    "POINT": Column("int"),
+    "X": Column("float", "deg"),
+    "Y": Column("float", "deg"),
+}
+INTENSITIES: Mapping[str, Column] = {
+    "EXPOSURE": Column("int"),
+    "POINT": Column("int"),
+    "SOURCE": Column("int", missing=-1),
+    "N": Column("float", "electron", width=4),
+    "N_ERR": Column("float", "electron", width=4),
+    "FLAG": Column("int", missing=0),
+}
+SOURCES: Mapping[str, Column] = {
+    "SOURCE": Column("int"),
+    "NAME": Column("str"),
+    "Q": Column("float"),
+    "U": Column("float"),
+    "Q_ERR": Column("float"),
+    "U_ERR": Column("float"),
+    "TEFF": Column("float", "K", _NAN),
+}
+FILTERS: Mapping[str, Column] = {
+    "FILTER": Column("str"),
+    "WAVELENGTH": Column("float", "um", width=None),
+    "THROUGHPUT": Column("float", width=None),
+}
+TABLES: Mapping[str, Mapping[str, Column]] = {
+    "EXPOSURES": EXPOSURES,
+    "POINTS": POINTS,
+    "INTENSITIES": INTENSITIES,
+    "SOURCES": SOURCES,
+    "FILTERS": FILTERS,
+}
+"""The tables of a calibration set in the order in which they are written."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Where a table came from, so that every check can say so."""
+
+    file: object
+    extension: str
+
+    def fail(self, what: str, column: str = "", advice: str = "") -> ValueError:
+        """Build the error of something wrong in this table."""
+        return fail(what, file=self.file, extension=self.extension, column=column, advice=advice)
+
+
+def read_table(hdu: Any, schema: Mapping[str, Column], place: Place) -> tuple[dict[str, Any], list[str]]:
+    """Turn a FITS table into arrays by column name, in the schema's units, and remarks on what was odd.
+
+    Raises `DataError` for a missing, duplicated or ill-typed column, a unit that cannot be converted, and a
+    table without rows.
+    """
+    if type(hdu) is not fits.BinTableHDU:
+        raise place.fail("is not a binary table", advice="write it as a FITS binary table")
+    names = [name.upper() for name in hdu.columns.names]
+    for name in names:
+        if names.count(name) > 1:
+            raise place.fail("the column is there twice", name, "remove or rename one of them")
+    for name, column in schema.items():
+        if column.missing is None and name not in names:
+            others = sorted(set(names) - set(schema))
+            advice = f"add it{' (' + nearest(name, others) + ')' if others else ''}"
+            raise place.fail("the column is missing", name, advice)
+    rows = int(hdu.header["NAXIS2"])
+    if rows == 0:
+        raise place.fail("has no rows", advice="a calibration set needs at least one")
+
+    remarks = [
+        f"{place.file} [{place.extension}] {name}: unknown column, not used ({nearest(name, schema)})"
+        for name in names
+        if name not in schema
+    ]
+    table: dict[str, Any] = {}
+    for name, column in schema.items():
+        if name in names:
+            table[name] = _read_column(hdu, names.index(name), name, column, place)
+        else:
+            table[name] = np.full(rows, column.missing)
+            remarks.append(f"{place.file} [{place.extension}] {name}: no such column, {column.missing} taken")
+    return table, remarks
+
+
+def _read_column(hdu: Any, index: int, name: str, column: Column, place: Place) -> np.ndarray:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            values = np.asarray(hdu.data.field(index))
+    except (ValueError, TypeError, OSError, UnicodeError, KeyError, IndexError, Warning) as error:
+        raise place.fail(f"cannot be read: {error}", name, "write the column again") from error
+    if values.dtype == object or (column.width != 1 and values.ndim == 1):
+        values = _rectangular(values, name, column, place)
+    if column.width == 1 and values.ndim == 2 and values.shape[1] == 1:
+        values = values[:, 0]
+    if values.ndim != (1 if column.width == 1 else 2) or (
+        (column.width or 0) > 1 and values.shape[1] != column.width
+    ):
+        width = "any number of" if column.width is None else column.width
+        raise place.fail(
+            f"has shape {values.shape[1:] or '()'} in a row where {width} value(s) are needed",
+            name,
+            "one row holds the four cameras O1, E1, O2, E2" if column.width == 4 else "see the file format",
+        )
+    null = hdu.columns[index].null
+    if null not in (None, "") and np.issubdtype(values.dtype, np.integer) and np.any(values == int(null)):
+        raise place.fail(
+            f"undefined (TNULL) in {rows_text(np.unique(np.nonzero(values == int(null))[0]))}",
+            name,
+            "fill or remove these rows",
+        )
+    return _convert(values, hdu.columns[index].unit, name, column, place)
+
+
+def _rectangular(values: np.ndarray, name: str, column: Column, place: Place) -> np.ndarray:
+    """Bring one value per row into a column of width one, refuse arrays whose length varies."""
+    if values.dtype == object:
+        raise place.fail("is an array of variable length", name, "use one length, padded with NaN")
+    return values[:, None] if column.width is None else values
+
+
+def _convert(values: np.ndarray, unit: str | None, name: str, column: Column, place: Place) -> np.ndarray:
+    strings = values.dtype.kind in "SU"
+    if column.kind == "str":
+        if not strings:
+            raise place.fail("holds numbers where names are needed", name, "write it as a string column")
+        return np.char.strip(values.astype(str))
+    if strings:
+        raise place.fail(
+            f"holds strings where numbers are needed, {str(values.flat[0])!r} in row 0 (counted from 0)",
+            name,
+            "write it as a numeric column",
+        )
+    if column.kind == "float":
+        if values.dtype.kind not in "fiu":
+            raise place.fail(f"holds {values.dtype.name} values", name, "write it as a numeric column")
+        return _to_unit(values.astype(np.float64), unit, name, column, place)
+    # Whole numbers are compared as floats to find 3.5 and NaN; identifiers are far below 2**53.
+    if values.dtype.kind == "f" and np.any(bad := ~(np.abs(values) < 2.0**53) | (values != np.round(values))):
+        raise place.fail(f"is not a whole number in {rows_text(np.nonzero(bad)[0])}", name, "write integers")
+    if values.dtype.kind not in "fiub":
+        raise place.fail(f"holds {values.dtype.name} values", name, "write integers")
+    if column.kind == "int":
+        return values.astype(np.int64)
+    if np.any(bad := (values != 0) & (values != 1)):
+        raise place.fail(
+            f"is neither true nor false in {rows_text(np.nonzero(bad)[0])}", name, "write T or F"
+        )
+    return values.astype(bool)
+
+
+def _to_unit(values: np.ndarray, unit: str | None, name: str, column: Column, place: Place) -> np.ndarray:
+    return values if not (unit or "").strip() else convert_unit(values, str(unit), column.unit, name, place)
+
+
+def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: Place) -> np.ndarray:
+    """Convert `values` from a FITS unit string to the wanted one.
+
+    Hour angles may come as angles, temperatures in kelvin. Raises `DataError` for an unknown unit and for
+    one of another physical type.
+    """
+    try:
+        # The generic reading, because `electron` is not a unit of the FITS standard.
+        given = units.Unit(unit.strip())
+    except (ValueError, TypeError) as error:
+        raise place.fail(f"the unit {unit!r} is not known", name, f"use {wanted or 'no unit'}") from error
+    target = units.Unit(wanted)
+    if given == target:
+        return values  # no arithmetic: what was written comes back bit for bit
+    if wanted == "h" and given.is_equivalent(units.deg):
+        target = units.hourangle
+    try:
+        return np.asarray(
+            units.Quantity(values, given).to_value(target, units.temperature()), dtype=np.float64
+        )
+    except units.UnitConversionError as error:
+        advice = f"convert the column to {wanted or 'a fraction without unit'}"
+        if wanted == "electron":
+            advice += " (multiply by the gain)"
+        raise place.fail(
+            f"the unit {unit!r} cannot be converted to {wanted or 'none'!r}", name, advice
+        ) from error

@@ -1,0 +1,215 @@
+"""Writing calibration sets: tables as the format has them, and whole frames slab by slab."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+
+from walop_jax.data import schema
+from walop_jax.data.atomic import atomic_path
+from walop_jax.data.calset import CALVERS
+from walop_jax.data.errors import fail
+from walop_jax.data.frames import COUNT_NAMES, ERROR_NAMES, Grid
+from walop_jax.data.opening import data_sum, padded
+from walop_jax.data.records import CalibrationSet, FilterCurve
+from walop_jax.data.table import TableIntensities
+
+_CODES = {"int": "J", "float": "D", "bool": "L"}
+_SLAB = 1 << 18  # (exposure, pixel) pairs that are written at a time
+
+
+def write_calibration_set(
+    path: str | os.PathLike[str], calset: CalibrationSet, *, overwrite: bool = False
+) -> None:
+    """Write a calibration set as tables, with checksums; the file appears whole or not at all.
+
+    What was read comes back bit for bit, rows that are not used included; other intensities (frames, say)
+    are written as their used rows. The bytes depend on the set alone, not on the day.
+
+    Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only,
+    and if a name cannot be written in FITS (ASCII only).
+    """
+    intensities = calset.intensities
+    if not isinstance(intensities, TableIntensities):
+        intensities = TableIntensities.dense(calset.points, intensities.block(0, len(calset.points)))
+    with atomic_path(path, overwrite=overwrite) as temporary:
+        _sign_and_write([*_head(calset, path), *_body(calset, intensities, path)], temporary)
+
+
+def _sign_and_write(hdus: list[Any], path: Path) -> None:
+    for hdu in hdus:
+        # astropy would note the date in the comments: then equal sets would be unequal files.
+        hdu.add_checksum(when="FITS checksum of this extension")
+    fits.HDUList(hdus).writeto(path, overwrite=True, output_verify="exception")
+
+
+def _head(calset: CalibrationSet, path: object) -> list[Any]:
+    primary = fits.PrimaryHDU()
+    site = calset.site
+    cards = {
+        "TELESCOP": (site.telescope, "telescope"),
+        "INSTRUME": (calset.instrument, "instrument"),
+        "CALVERS": (CALVERS, "version of the calibration set format"),
+        "SITELAT": (site.latitude, "[deg] latitude"),
+        "SITELONG": (site.longitude, "[deg] longitude, east positive"),
+        "SITEELEV": (site.elevation, "[m] elevation"),
+        "ORIGIN": (calset.origin, "who made these data"),
+    }
+    for name, (value, comment) in cards.items():
+        if isinstance(value, str):
+            _ascii(value, f"PRIMARY] {name}", path)
+        elif not np.isfinite(value):
+            continue  # FITS headers know no NaN; a missing card is read as one
+        primary.header[name] = (value, comment if not isinstance(value, str) else "")
+    columns = {name: getattr(calset.exposures, name.lower()) for name in schema.EXPOSURES}
+    return [primary, _table("EXPOSURES", columns, path)]
+
+
+def _body(calset: CalibrationSet, intensities: TableIntensities, path: object) -> list[Any]:
+    points, sources = calset.points, calset.sources
+    hdus = [_table("POINTS", {"POINT": points.point, "X": points.x, "Y": points.y}, path)]
+    rows = {
+        "EXPOSURE": calset.exposures.exposure[intensities.exposure],
+        "POINT": points.point[intensities.point],
+        # The appended −1 is what a row without a source (−1, the last entry) becomes.
+        "SOURCE": np.append(sources.source, -1)[intensities.source],
+        "N": intensities.counts,
+        "N_ERR": intensities.sigma,
+        "FLAG": intensities.flag,
+    }
+    return [*hdus, _table("INTENSITIES", rows, path), *_optional(calset, path)]
+
+
+def _optional(calset: CalibrationSet, path: object) -> list[Any]:
+    hdus = []
+    if len(calset.sources):
+        columns = {name: getattr(calset.sources, name.lower()) for name in schema.SOURCES}
+        hdus.append(_table("SOURCES", columns, path))
+    if calset.filters:
+        hdus.append(_table("FILTERS", _filter_columns(calset.filters), path))
+    return hdus
+
+
+def _filter_columns(filters: Mapping[str, FilterCurve]) -> dict[str, np.ndarray]:
+    longest = max(len(curve.wavelength) for curve in filters.values())
+    columns = {name: np.full((len(filters), longest), np.nan) for name in ("WAVELENGTH", "THROUGHPUT")}
+    for row, curve in enumerate(filters.values()):
+        columns["WAVELENGTH"][row, : len(curve.wavelength)] = curve.wavelength
+        columns["THROUGHPUT"][row, : len(curve.throughput)] = curve.throughput
+    return {"FILTER": np.array(list(filters)), **columns}
+
+
+def _table(name: str, columns: Mapping[str, np.ndarray], path: object) -> fits.BinTableHDU:
+    made = []
+    for column, rule in schema.TABLES[name].items():
+        values = columns[column]
+        if rule.kind == "str":
+            for value in np.unique(values):
+                _ascii(str(value), f"{name}] {column}", path)
+            code = f"{max(1, values.dtype.itemsize // 4)}A"
+        else:
+            width = 1 if values.ndim == 1 else values.shape[1]
+            code = f"{width if width > 1 else ''}{_CODES[rule.kind]}"
+            if rule.kind == "int" and np.any(np.abs(values) > 2**31 - 1):
+                code = "K"
+        made.append(fits.Column(name=column, format=code, unit=rule.unit or None, array=values))
+    return fits.BinTableHDU.from_columns(made, name=name)
+
+
+def _ascii(value: str, where: str, path: object) -> None:
+    if not value.isascii() or not (value.isprintable() or not value):
+        extension, _, column = where.partition("] ")
+        raise fail(
+            f"{value!r} is not plain ASCII",
+            file=path,
+            extension=extension,
+            column=column,
+            advice="FITS knows no other letters: rename it",
+        )
+
+
+def write_frames(
+    path: str | os.PathLike[str],
+    calset: CalibrationSet,
+    grid: Grid,
+    *,
+    dtype: str = "f4",
+    overwrite: bool = False,
+) -> None:
+    """Write a calibration set as whole frames, never holding more than a slab of them in memory.
+
+    The points of `calset` must be the pixels of `grid`, row by row; its `intensities.block` is asked for some
+    image rows at a time. Pixels without a measurement get bit 2 (bad pixel) of the FLAG image. `dtype` is
+    `f4` or `f8`. The images carry the checksum of their data.
+
+    Raises `DataError` as `write_calibration_set` does, and if points and grid differ in number.
+    """
+    if len(calset.points) != grid.width * grid.height:
+        raise fail(
+            f"{len(calset.points)} points for {grid.width} × {grid.height} pixels",
+            file=path,
+            advice="one per pixel",
+        )
+    shape = (len(calset.exposures), grid.height, grid.width)
+    kinds = dict.fromkeys((*COUNT_NAMES, *ERROR_NAMES), np.dtype(f">{dtype}")) | {"FLAG": np.dtype(">i2")}
+    with atomic_path(path, overwrite=overwrite) as temporary:
+        _sign_and_write([*_head(calset, path), *_optional(calset, path)], temporary)
+        cubes: dict[str, tuple[np.memmap[Any, Any], int]] = {}
+        for name, kind in kinds.items():
+            cubes[name] = _append_image(temporary, name, kind, shape, grid)
+        step = max(1, _SLAB // (shape[0] * grid.width))
+        for top in range(0, grid.height, step):
+            bottom = min(top + step, grid.height)
+            block = calset.intensities.block(top * grid.width, bottom * grid.width)
+            planes = (shape[0], bottom - top, grid.width)
+            for k in range(4):
+                cubes[COUNT_NAMES[k]][0][:, top:bottom] = block.counts[..., k].T.reshape(planes)
+                cubes[ERROR_NAMES[k]][0][:, top:bottom] = block.sigma[..., k].T.reshape(planes)
+            cubes["FLAG"][0][:, top:bottom] = np.where(block.used.T, 0, 2).reshape(planes)
+        for cube, start in cubes.values():
+            cube.flush()
+            _sign_image(temporary, start, cube)
+
+
+def _append_image(
+    path: Path, name: str, kind: np.dtype[Any], shape: tuple[int, int, int], grid: Grid
+) -> tuple[np.memmap[Any, Any], int]:
+    """Add the header and the room of an image to a file; return the mapped room and the header's place."""
+    header = fits.Header()
+    header["XTENSION"] = "IMAGE"
+    header["BITPIX"] = 16 if kind.kind == "i" else -8 * kind.itemsize
+    header["NAXIS"] = 3
+    for axis, length in enumerate(reversed(shape), start=1):
+        header[f"NAXIS{axis}"] = length
+    header["PCOUNT"], header["GCOUNT"], header["EXTNAME"] = 0, 1, name
+    for n, axis in enumerate("XY"):
+        header[f"CTYPE{n + 1}"], header[f"CUNIT{n + 1}"] = axis, "deg"
+        header[f"CRPIX{n + 1}"], header[f"CRVAL{n + 1}"] = grid.reference[n], grid.value[n]
+        for m in range(2):
+            header[f"CD{n + 1}_{m + 1}"] = grid.matrix[n][m]
+    if name != "FLAG":
+        header["BUNIT"] = "electron"
+    header["DATASUM"] = "0".rjust(10)
+    text = header.tostring().encode("ascii")
+    start = path.stat().st_size
+    with path.open("r+b") as stream:
+        stream.seek(start)
+        stream.write(text)
+        stream.truncate(start + len(text) + padded(int(np.prod(shape)) * kind.itemsize))
+    return np.memmap(path, kind, mode="r+", offset=start + len(text), shape=shape), start
+
+
+def _sign_image(path: Path, start: int, cube: np.memmap[Any, Any]) -> None:
+    """Put the sum of an image's data into the card that was kept free for it."""
+    total = data_sum(path, int(cube.offset), padded(cube.nbytes))
+    with path.open("r+b") as stream:
+        stream.seek(start)
+        header = fits.Header.fromstring(stream.read(int(cube.offset) - start).decode("ascii"))
+        header["DATASUM"] = str(total).rjust(10)
+        stream.seek(start)
+        stream.write(header.tostring().encode("ascii"))

@@ -1,0 +1,30 @@
+"""Polynomials over the field: products of Legendre polynomials up to a total degree.
+
+Equation    f(x, y) = Σ_{i+j ≤ n} c_ij P_i(x/h) P_j(y/h), h = `FIELD_SCALE` = 0.3°.
+Source      Abramowitz & Stegun 22.7.10: (k+1) P_{k+1} = (2k+1) t P_k − k P_{k−1}.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from walop_jax.model.conventions import FIELD_SCALE
+
+
+def terms(degree: int) -> tuple[tuple[int, int], ...]:
+    """Exponents (i, j) in order of total degree."""
+    return tuple((n - j, j) for n in range(degree + 1) for j in range(n + 1))
+
+
+def _one_dimension(t: Float[Array, "..."], degree: int) -> list[Float[Array, "..."]]:
+    values = [jnp.ones_like(t), t]
+    for k in range(1, degree):
+        values.append(((2 * k + 1) * t * values[k] - k * values[k - 1]) / (k + 1))
+    return values
+
+
+def basis(x: Float[Array, "..."], y: Float[Array, "..."], degree: int) -> Float[Array, "... t"]:
+    """Values of all terms at field positions in degrees."""
+    px, py = _one_dimension(x / FIELD_SCALE, degree), _one_dimension(y / FIELD_SCALE, degree)
+    return jnp.stack([px[i] * py[j] for i, j in terms(degree)], axis=-1)

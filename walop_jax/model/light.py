@@ -1,0 +1,236 @@
+"""The light path, from Stokes vector to counts: read this file to know what the package computes.
+
+    sky or polariser → collimator → calibration plate → wedge → half-wave plate → Wollaston prism → camera
+
+Everything up to the cameras is linear, so the path is run backwards from each analyser: `half_rows` gives the
+Mueller rows S0 and S1 behind a half-wave plate for every wavelength node, `band_rows` integrates them over the
+bands (that is all the optics there is: once per field point), `camera_vectors` adds analyser, collimator and
+throughput, and `counts` is a dot product per exposure. `trace.py` runs the same functions forward, stage by
+stage.
+
+Units       counts per unit of unpolarised light at unit throughput; angles rad; wavelengths µm; field deg.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from walop_jax.model import legendre, materials, mueller, optics
+from walop_jax.model import plates as plate_models
+from walop_jax.model.conventions import HALF_OF_CAMERA, SIGN_OF_CAMERA
+from walop_jax.model.effects.base import ExposureArrays
+from walop_jax.model.instrument import HalfWavePlate, Instrument
+from walop_jax.model.plan import Plan
+from walop_jax.model.plates import Plate
+
+Scalar = Float[Array, ""]
+_MUELLER = {"waves": plate_models.stack_mueller, "fixed_axis": plate_models.fixed_axis_mueller}
+
+
+# ----------------------------------------------------------------------------------- the optics, per node
+
+
+def _plates(
+    instrument: Instrument, where: str, plate: HalfWavePlate, fast_axis: float, wavelength: Float[Array, " n"], plan: Plan
+) -> tuple[Plate, ...]:
+    axis = jnp.deg2rad(fast_axis) * jnp.ones_like(wavelength)
+    stack: tuple[Plate, ...] = (
+        Plate(plate.quartz, materials.QUARTZ_O.index(wavelength), materials.QUARTZ_E.index(wavelength), axis),
+        Plate(plate.mgf2, materials.MGF2_O.index(wavelength), materials.MGF2_E.index(wavelength), axis + 0.5 * jnp.pi),
+    )
+    for effect in instrument.effects:
+        stack = effect.plates(where, stack, plan.conditions)
+    return stack
+
+
+def _wave_plate(
+    instrument: Instrument,
+    where: str,
+    plate: HalfWavePlate,
+    fast_axis: float,
+    sx: Float[Array, " n"],
+    sy: Float[Array, " n"],
+    wavelength: Float[Array, " n"],
+    plan: Plan,
+) -> Float[Array, "n 4 4"]:
+    stack = _plates(instrument, where, plate, fast_axis, wavelength, plan)
+    matrix = _MUELLER[instrument.plates](sx, sy, stack, wavelength)
+    axis = stack[0].axis
+    for effect in instrument.effects:
+        matrix = effect.ahead_of_plates(where, matrix, sx, sy, wavelength, axis)
+    return matrix
+
+
+def node_wavelengths(instrument: Instrument, plan: Plan) -> Float[Array, " n"]:
+    """Wavelengths (µm) of the nodes."""
+    wavelength = plan.wavelength
+    for effect in instrument.effects:
+        wavelength = effect.wavelengths(wavelength)
+    return wavelength
+
+
+def _direction(
+    instrument: Instrument, x: Scalar, y: Scalar, plan: Plan
+) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
+    for effect in instrument.effects:
+        x, y = effect.field(x, y, plan.conditions)
+    pupil = instrument.pupil
+    direction = optics.pupil_direction(x, y, pupil.magnification, pupil.distortion)
+    kx, ky, kz = (jnp.broadcast_to(k, plan.wavelength.shape) for k in direction)
+    return kx, ky, kz
+
+
+def half_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "n 2 2 4"]:
+    """Mueller rows of unpolarised and analysed light behind wedge and plate: (node, half, row, Stokes)."""
+    wavelength = node_wavelengths(instrument, plan)
+    direction = _direction(instrument, x, y, plan)
+    glass = materials.BK7.index(wavelength)
+    turn: Scalar | float = 0.0
+    for effect in instrument.effects:
+        turn = effect.analyser_angle(turn)
+    rows = []
+    for where, half in zip(("half1", "half2"), instrument.halves, strict=True):
+        sx, sy = optics.behind_wedge(direction, half.wedge, glass)
+        matrix = _wave_plate(instrument, where, half.plate, half.fast_axis, sx, sy, wavelength, plan)
+        analysed = matrix[:, 1]
+        if not isinstance(turn, float):
+            analysed = jnp.cos(2 * turn) * matrix[:, 1] + jnp.sin(2 * turn) * matrix[:, 2]
+        rows.append(jnp.stack([matrix[:, 0], analysed], axis=1))
+    return jnp.stack(rows, axis=1)
+
+
+def calibration_plate(
+    instrument: Instrument, plan: Plan, x: Scalar, y: Scalar, angle: float | None
+) -> Float[Array, "n 4 4"] | None:
+    """Mueller matrix of the calibration plate at `angle` (deg) for every node; None when it is out."""
+    for effect in instrument.effects:
+        angle = effect.calibration_plate(angle)
+    if angle is None:
+        return None
+    wavelength = node_wavelengths(instrument, plan)
+    kx, ky, _ = _direction(instrument, x, y, plan)
+    return _wave_plate(instrument, "chwp", instrument.chwp, angle, kx, ky, wavelength, plan)
+
+
+# ------------------------------------------------------------------------------------ bands and cameras
+
+
+def band_weights(instrument: Instrument, plan: Plan) -> Float[Array, "b n"]:
+    """Weights of the nodes in every band: filter × photon spectrum, each band summing to 1.
+
+    Photon spectrum λ⁻⁴ / (exp(14387.77/λT) − 1) (Planck; λ in µm, T in K), flat where T = 0 stands for "none".
+    """
+    wavelength = node_wavelengths(instrument, plan)
+    hot = plan.teff > 0
+    exponent = 14387.77 / (wavelength * jnp.where(hot, plan.teff, 5000.0)[:, None])
+    spectrum = jnp.where(hot[:, None], wavelength**-4 / jnp.expm1(exponent), 1.0)
+    weight = plan.node_weight * spectrum
+    return weight / weight.sum(axis=1, keepdims=True)
+
+
+def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b 2 2 4"]:
+    """Band-integrated rows S0 and S1 of both halves, calibration plate included: the optics of a field point."""
+    rows = half_rows(instrument, plan, x, y)
+    weights = band_weights(instrument, plan)
+    bands = []
+    for angle, first, last in plan.settings:
+        plate = calibration_plate(instrument, plan, x, y, angle)
+        seen = rows if plate is None else jnp.einsum("nhrs,nst->nhrt", rows, plate)
+        bands.append(jnp.einsum("bn,nhrs->bhrs", weights[first:last], seen))
+    return jnp.concatenate(bands, axis=0)
+
+
+def upstream(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
+    """Mueller matrix from the polariser to the calibration plate: the collimator (contract, item 3)."""
+    lens = instrument.collimator
+    q = lens.diattenuation * (x**2 - y**2) + lens.q
+    u = lens.diattenuation * 2.0 * x * y + lens.u
+    matrix = mueller.diattenuator(q, u)
+    for effect in instrument.effects:
+        matrix = effect.upstream(matrix, x, y)
+    return matrix
+
+
+def throughput_at(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, "4"]:
+    """Throughput of the four cameras at a field point."""
+    series = instrument.throughput
+    return series.coefficients @ legendre.basis(x, y, series.degree)
+
+
+def camera_vectors(
+    instrument: Instrument, rows: Float[Array, "b 2 2 4"], throughput: Float[Array, "4"], x: Scalar, y: Scalar
+) -> Float[Array, "b 4 4"]:
+    """Analysis vectors (band, camera, Stokes): counts = vector · Stokes for light of unit flux."""
+    for effect in instrument.effects:
+        throughput = effect.throughput(throughput, x, y)
+    efficiency = jnp.stack([half.efficiency for half in instrument.halves])
+    half = jnp.asarray(HALF_OF_CAMERA)
+    sign = jnp.asarray(SIGN_OF_CAMERA) * efficiency[half]
+    analysed = 0.5 * (rows[:, half, 0] + sign[:, None] * rows[:, half, 1])
+    return throughput[:, None] * (analysed @ upstream(instrument, x, y))
+
+
+# ----------------------------------------------------------------------------------------- light and counts
+
+
+def stokes(
+    instrument: Instrument, exposures: ExposureArrays, sky: Float[Array, "e 2"], source: Int[Array, " e"]
+) -> Float[Array, "e 4"]:
+    """Stokes vectors that enter the collimator, one per exposure, at a field point.
+
+    `sky` is (q, u) of the Moon sky for δ = 1 in the ICS, `source` the row of the standard star or −1. Catalogue
+    values are turned into the ICS, (q + iu) exp(−2i ROTATOR); light through the polariser forgets its past.
+    """
+    moon = instrument.sky.depolarisation * sky
+    beam = jnp.where(exposures.moon[:, None], moon, 0.0)
+    if instrument.standard.names:
+        known = source >= 0
+        row = jnp.where(known, source, 0)
+        q, u = instrument.standard.q[row], instrument.standard.u[row]
+        cos, sin = jnp.cos(2 * exposures.rotator), jnp.sin(2 * exposures.rotator)
+        star = jnp.stack([q * cos + u * sin, u * cos - q * sin], axis=-1)
+        beam = jnp.where((known & ~exposures.moon)[:, None], star, beam)
+    one = jnp.ones_like(exposures.clp_angle)
+    light = jnp.stack([one, beam[:, 0], beam[:, 1], jnp.zeros_like(one)], axis=-1)
+    angle = exposures.clp_angle
+    for effect in instrument.effects:
+        light = effect.sky(light, exposures)
+        angle = effect.polariser_angle(angle, exposures)
+    behind = mueller.polarised(angle, instrument.polariser.extinction)
+    for effect in instrument.effects:
+        behind = effect.polarised(behind, exposures)
+    return jnp.where(exposures.clp_in[:, None], behind, light)
+
+
+def counts(
+    instrument: Instrument,
+    plan: Plan,
+    rows: Float[Array, "b 2 2 4"],
+    throughput: Float[Array, "4"],
+    x: Scalar,
+    y: Scalar,
+    sky: Float[Array, "e 2"],
+    source: Int[Array, " e"],
+    band: Int[Array, " e"],
+) -> Float[Array, "e 4"]:
+    """Counts of the four cameras in every exposure at a field point, for light of unit flux."""
+    vectors = camera_vectors(instrument, rows, throughput, x, y)
+    light = stokes(instrument, plan.exposures, sky, source)
+    result = jnp.einsum("eks,es->ek", vectors[band], light)
+    for effect in instrument.effects:
+        result = effect.counts(result, plan.exposures)
+    return result
+
+
+# --------------------------------------------------------------------------------------- what users ask for
+
+
+def instrument_matrix(vectors: Float[Array, "... 4 4"]) -> Float[Array, "... 2 3"]:
+    """Rows (m21, m22, m23) and (m31, m32, m33) of the instrument matrix from analysis vectors.
+
+    Difference of the two cameras' response to 1, q, u, each over the sum of their response to unpolarised light.
+    """
+    first = (vectors[..., 0, :3] - vectors[..., 1, :3]) / (vectors[..., 0, :1] + vectors[..., 1, :1])
+    second = (vectors[..., 2, :3] - vectors[..., 3, :3]) / (vectors[..., 2, :1] + vectors[..., 3, :1])
+    return jnp.stack([first, second], axis=-2)

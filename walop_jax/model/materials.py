@@ -1,0 +1,49 @@
+"""Refractive indices of the glasses and crystals in the light path.
+
+Equations   Sellmeier formula 1, n² = 1 + Σ B λ²/(λ² − C²) (Dodge), and formula 2, n² = A + Σ B λ²/(λ² − C)
+            (Schott, Ghosh). Mixing the two up is the classic mistake; `FORMULA` says which is which.
+Symbols     λ vacuum wavelength [µm]; n refractive index; A, B dimensionless; C [µm] in formula 1, [µm²] in 2.
+Sources     N-BK7: Schott data sheet 2017, 0.3–2.5 µm, 20 °C. Quartz: Ghosh 1999, Opt. Commun. 163, 95,
+            0.198–2.05 µm. MgF2: Dodge 1984, Appl. Opt. 23, 1980, 0.2–7 µm, 19 °C. All three as transcribed in
+            the refractiveindex.info database. Birefringence against temperature: Etzel, Rose & Wang 2000,
+            Appl. Opt. 39, 5796.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class Sellmeier(NamedTuple):
+    """Coefficients of one dispersion curve: n² = constant + Σ strength λ²/(λ² − pole), pole in µm²."""
+
+    constant: float
+    strength: tuple[float, ...]
+    pole: tuple[float, ...]
+
+    def index(self, wavelength: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Refractive index at `wavelength` (µm)."""
+        square = wavelength**2
+        terms = sum(b * square / (square - c) for b, c in zip(self.strength, self.pole, strict=True))
+        return jnp.sqrt(self.constant + terms)
+
+
+def _formula_1(strength: tuple[float, ...], root_of_pole: tuple[float, ...]) -> Sellmeier:
+    return Sellmeier(1.0, strength, tuple(c**2 for c in root_of_pole))
+
+
+BK7 = Sellmeier(
+    1.0, (1.03961212, 0.231792344, 1.01046945), (0.00600069867, 0.0200179144, 103.560653)
+)
+QUARTZ_O = Sellmeier(1.28604141, (1.07044083, 1.10202242), (0.0100585997, 100.0))
+QUARTZ_E = Sellmeier(1.28851804, (1.09509924, 1.15662475), (0.0102101864, 100.0))
+MGF2_O = _formula_1((0.48755108, 0.39875031, 2.3120353), (0.04338408, 0.09461442, 23.793604))
+MGF2_E = _formula_1((0.41344023, 0.50497499, 2.4904862), (0.03684262, 0.09076162, 23.771995))
+
+# Relative change of birefringence per kelvin, −(1/Δn) dΔn/dT.
+QUARTZ_THERMAL = 1.23e-4
+MGF2_THERMAL = 5.37e-5
+REFERENCE_TEMPERATURE = 10.0  # Celsius

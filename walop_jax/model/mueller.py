@@ -1,0 +1,128 @@
+"""Mueller and Jones algebra: plain functions, one equation each.
+
+Stokes vectors are (S0, S1, S2, S3) in the convention of `conventions.py`. A Jones matrix is the four arrays
+((a, b), (c, d)) of equal shape, kept apart because 2 × 2 products of long arrays are fastest, and clearest,
+when written out.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Inexact
+
+Scalar = Float[Array, "..."]
+
+
+class Matrix2(NamedTuple):
+    """The 2 × 2 matrix ((a, b), (c, d)) at every element of the arrays a, b, c, d (real or complex)."""
+
+    a: Inexact[Array, "..."]
+    b: Inexact[Array, "..."]
+    c: Inexact[Array, "..."]
+    d: Inexact[Array, "..."]
+
+    def __matmul__(self, other: Matrix2) -> Matrix2:
+        return Matrix2(
+            self.a * other.a + self.b * other.c,
+            self.a * other.b + self.b * other.d,
+            self.c * other.a + self.d * other.c,
+            self.c * other.b + self.d * other.d,
+        )
+
+    def plus(self, other: Matrix2) -> Matrix2:
+        """Sum of two matrices."""
+        return Matrix2(self.a + other.a, self.b + other.b, self.c + other.c, self.d + other.d)
+
+    def inverse(self) -> Matrix2:
+        """Inverse matrix."""
+        determinant = self.a * self.d - self.b * self.c
+        return Matrix2(self.d / determinant, -self.b / determinant, -self.c / determinant, self.a / determinant)
+
+    def scaled_rows(self, first: Inexact[Array, "..."], second: Inexact[Array, "..."]) -> Matrix2:
+        """The matrix diag(first, second) times this one."""
+        return Matrix2(first * self.a, first * self.b, second * self.c, second * self.d)
+
+    def times(self, factor: Inexact[Array, "..."] | float) -> Matrix2:
+        """Every element times a scalar."""
+        return Matrix2(factor * self.a, factor * self.b, factor * self.c, factor * self.d)
+
+
+def from_jones(jones: Matrix2) -> Float[Array, "... 4 4"]:
+    """Mueller matrix of a Jones matrix.
+
+    M_ij = ½ Tr(σ_i J σ_j J†) with the Pauli matrices ordered as S0…S3 (Gil & Ossikovski 2016, eq. 3.11),
+    written out; a non-depolarising matrix, Tr(MᵀM) = 4 M00².
+    """
+    a, b, c, d = jones
+
+    def power(z: Inexact[Array, "..."]) -> Scalar:
+        return z.real**2 + z.imag**2
+
+    aa, bb, cc, dd = power(a), power(b), power(c), power(d)
+    ab, cd = a * jnp.conj(b), c * jnp.conj(d)
+    ac, bd = a * jnp.conj(c), b * jnp.conj(d)
+    ad, bc = a * jnp.conj(d), b * jnp.conj(c)
+    rows = (
+        (0.5 * (aa + bb + cc + dd), 0.5 * (aa - bb + cc - dd), (ab + cd).real, -(ab + cd).imag),
+        (0.5 * (aa + bb - cc - dd), 0.5 * (aa - bb - cc + dd), (ab - cd).real, -(ab - cd).imag),
+        ((ac + bd).real, (ac - bd).real, (ad + bc).real, -(ad - bc).imag),
+        ((ac + bd).imag, (ac - bd).imag, (ad + bc).imag, (ad - bc).real),
+    )
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def diattenuator(q: Scalar, u: Scalar) -> Float[Array, "... 4 4"]:
+    """Non-depolarising linear diattenuator of unit mean transmission with diattenuation vector (q, u).
+
+    M = [[1, Dᵀ], [D, √(1−D²) 1 + (1 − √(1−D²)) D̂D̂ᵀ]] (Lu & Chipman 1996, eq. 18); identity for D = 0. The
+    factor (1 − √(1−D²))/D² is written 1/(1 + √(1−D²)), which has no singularity there.
+    """
+    q, u = jnp.broadcast_arrays(q, u)
+    root = jnp.sqrt(1.0 - q**2 - u**2)
+    k = 1.0 / (1.0 + root)
+    one, zero = jnp.ones_like(q), jnp.zeros_like(q)
+    rows = (
+        (one, q, u, zero),
+        (q, root + k * q**2, k * q * u, zero),
+        (u, k * q * u, root + k * u**2, zero),
+        (zero, zero, zero, root),
+    )
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def retarder(delta: Scalar, axis: Scalar) -> Float[Array, "... 4 4"]:
+    """Linear retarder of retardance `delta` with its fast axis at `axis` (both rad).
+
+    Paper II, appendix B, general retarder matrix; identity for delta = 0.
+    """
+    delta, axis = jnp.broadcast_arrays(delta, axis)
+    c2, s2 = jnp.cos(2 * axis), jnp.sin(2 * axis)
+    cd, sd = jnp.cos(delta), jnp.sin(delta)
+    one, zero = jnp.ones_like(delta), jnp.zeros_like(delta)
+    rows = (
+        (one, zero, zero, zero),
+        (zero, c2**2 + s2**2 * cd, c2 * s2 * (1 - cd), -s2 * sd),
+        (zero, c2 * s2 * (1 - cd), c2**2 * cd + s2**2, c2 * sd),
+        (zero, s2 * sd, -c2 * sd, cd),
+    )
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rotation(angle: Scalar) -> Float[Array, "... 4 4"]:
+    """Stokes parameters referred to axes turned by `angle` (rad): the matrix M_rot(angle) of Paper II."""
+    c2, s2 = jnp.cos(2 * angle), jnp.sin(2 * angle)
+    one, zero = jnp.ones_like(c2), jnp.zeros_like(c2)
+    rows = ((one, zero, zero, zero), (zero, c2, s2, zero), (zero, -s2, c2, zero), (zero, zero, zero, one))
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def polarised(angle: Scalar, extinction: Scalar | float) -> Float[Array, "... 4"]:
+    """Stokes vector behind a polariser with its axis at `angle` (rad), per unit of transmitted light.
+
+    (1, c cos 2θ, c sin 2θ, 0) with c = (1 − ε)/(1 + ε), ε the extinction ratio.
+    """
+    c = (1.0 - extinction) / (1.0 + extinction)
+    two = 2.0 * angle
+    return jnp.stack([jnp.ones_like(two), c * jnp.cos(two), c * jnp.sin(two), jnp.zeros_like(two)], axis=-1)

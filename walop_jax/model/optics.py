@@ -1,0 +1,43 @@
+"""Geometry of the rays: from the field through the collimator and the wedges to the plates.
+
+Pupil       (X, Y) leaves the collimator along (tan M X′, tan M Y′, 1), X′ = X (1 + κ r²): M magnification,
+            κ distortion [deg⁻²], r² = X² + Y² [deg²].
+Wedge       exact refraction at a front face with normal n = (sin w, 0, cos w) and a rear face normal to z:
+            in the glass k_g = k + (√(N² − 1 + (k·n)²) − k·n) n; behind the rear face the transverse part of k_g
+            stays. N index of BK7, w wedge angle [rad]. No rotation of the frame, no loss (contract).
+Source      vector form of Snell's law, Born & Wolf 1.5.1; mapping: Paper II, appendix B, contract item 5.
+Limits      w = 0 leaves the direction as it is; X = Y = 0 goes along z.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Real = Float[Array, "..."]
+
+
+def pupil_direction(x: Real, y: Real, magnification: Real, distortion: Real) -> tuple[Real, Real, Real]:
+    """Unit direction behind the collimator of the field point x, y (degrees)."""
+    stretch = magnification * (1.0 + distortion * (x**2 + y**2)) * (jnp.pi / 180.0)
+    tx, ty = jnp.tan(stretch * x), jnp.tan(stretch * y)
+    norm = 1.0 / jnp.sqrt(1.0 + tx**2 + ty**2)
+    return tx * norm, ty * norm, norm
+
+
+def behind_wedge(direction: tuple[Real, Real, Real], angle: Real, index: Real) -> tuple[Real, Real]:
+    """Transverse direction (sx, sy) behind a wedge of `angle` (rad) and refractive `index`."""
+    kx, ky, kz = direction
+    nx, nz = jnp.sin(angle), jnp.cos(angle)
+    incidence = kx * nx + kz * nz
+    bend = jnp.sqrt(index**2 - 1.0 + incidence**2) - incidence
+    return kx + bend * nx, ky + jnp.zeros_like(bend)
+
+
+def carried_axes(direction: tuple[Real, Real, Real]) -> tuple[Float[Array, "... 3"], Float[Array, "... 3"]]:
+    """The ICS axes carried from (0, 0, 1) to `direction` by the smallest rotation."""
+    kx, ky, kz = direction
+    g = 1.0 / (1.0 + kz)
+    first = jnp.stack([1.0 - g * kx**2, -g * kx * ky, -kx], axis=-1)
+    second = jnp.stack([-g * kx * ky, 1.0 - g * ky**2, -ky], axis=-1)
+    return first, second

@@ -1,0 +1,89 @@
+"""Wavelength nodes of a band: a Gauss rule for the filter's own tabulated curve.
+
+The band integral ∫ THROUGHPUT f dλ over the tabulated curve is a sum with positive weights (trapezium rule on
+the table, refined to 0.5 nm by linear interpolation where it is coarser). The Gauss rule of that discrete
+measure integrates polynomials of degree 2n − 1 exactly, so n nodes follow an oscillation of the plates as well
+as any n nodes can. n is the smallest that integrates the fringes of the plates (35 waves thick, so periods near
+17 nm, half of that at second order, in all phases) to `tolerance`.
+
+Source      Golub & Welsch 1969, Math. Comp. 23, 221; discrete measures by the Lanczos process: Gautschi 2004,
+            Orthogonal Polynomials, 2.2.3.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+FINEST = 0.0005  # µm
+WAVES = 36.0  # of one plate at 0.62 µm: (n_e − n_o) d / λ
+MAXIMUM_NODES = 200
+
+Vector = Float[np.ndarray, " n"]
+
+
+def tabulated_measure(wavelength: Vector, throughput: Vector) -> tuple[Vector, Vector]:
+    """Nodes and weights of the trapezium rule over a tabulated curve, refined to 0.5 nm; weights sum to 1."""
+    if len(wavelength) == 1:
+        return wavelength, np.ones(1)
+    pieces = [
+        np.linspace(a, b, max(1, int(np.ceil((b - a) / FINEST - 1e-6))), endpoint=False)
+        for a, b in zip(wavelength[:-1], wavelength[1:], strict=True)
+    ]
+    fine = np.concatenate([*pieces, wavelength[-1:]])
+    gap = np.diff(fine)
+    weight = np.interp(fine, wavelength, throughput)
+    weight *= 0.5 * (np.append(gap, 0.0) + np.append(0.0, gap))
+    inside = weight > 0
+    return fine[inside], weight[inside] / weight[inside].sum()
+
+
+def gauss_rule(node: Vector, weight: Vector, count: int) -> tuple[Vector, Vector]:
+    """Gauss rule with `count` nodes for a discrete measure whose weights sum to 1."""
+    if count >= len(node):
+        return node, weight
+    centre, half = 0.5 * (node[0] + node[-1]), 0.5 * (node[-1] - node[0])
+    t = (node - centre) / half
+    vectors = np.zeros((count, len(node)))
+    alpha, beta = np.zeros(count), np.zeros(count)
+    vector = np.sqrt(weight)
+    for k in range(count):
+        vectors[k] = vector
+        step = t * vector
+        alpha[k] = vector @ step
+        # Twice is enough: full orthogonalisation keeps Lanczos from losing the rule.
+        for _ in range(2):
+            step = step - vectors[: k + 1].T @ (vectors[: k + 1] @ step)
+        beta[k] = np.linalg.norm(step)
+        vector = step / beta[k]
+    jacobi = np.diag(alpha) + np.diag(beta[:-1], 1) + np.diag(beta[:-1], -1)
+    value, columns = np.linalg.eigh(jacobi)
+    return centre + half * value, columns[0] ** 2
+
+
+def _fringe_error(node: Vector, weight: Vector, fine: Vector, fine_weight: Vector, waves: float) -> float:
+    # Phase of a plate of fixed birefringence, 2π waves · 0.62/λ, at a range of thicknesses.
+    thickness = 2j * np.pi * 0.62 * waves * np.linspace(0.3, 1.0, 8)[:, None]
+    rule = np.exp(thickness / node) @ weight
+    exact = np.exp(thickness / fine) @ fine_weight
+    return float(np.abs(rule - exact).max())
+
+
+def band_rule(wavelength: Vector, throughput: Vector, tolerance: float = 1e-7) -> tuple[Vector, Vector]:
+    """Fewest wavelength nodes (µm) and weights (sum 1) that integrate plate fringes to `tolerance`.
+
+    Fringes at twice the plates' frequency carry a hundred times less light and are held to a hundred times the
+    tolerance.
+    """
+    fine, fine_weight = tabulated_measure(wavelength, throughput)
+    for count in range(1, MAXIMUM_NODES):
+        if count >= len(fine):
+            break
+        node, weight = gauss_rule(fine, fine_weight, count)
+        if (
+            _fringe_error(node, weight, fine, fine_weight, WAVES) < tolerance
+            and _fringe_error(node, weight, fine, fine_weight, 2 * WAVES) < 100 * tolerance
+        ):
+            return node, weight
+    return fine, fine_weight
+
