@@ -56,9 +56,11 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[OpenFile]:
             content = _decompressed(path) if compressed else raw
             caught = stack.enter_context(warnings.catch_warnings(record=True))
             warnings.simplefilter("always")
-            hdus = stack.enter_context(
-                fits.open(io.BytesIO(content) if isinstance(content, bytes) else path, lazy_load_hdus=False)
+            # Opened here because astropy does not close a file that it fails to read.
+            stream = (
+                io.BytesIO(content) if isinstance(content, bytes) else stack.enter_context(path.open("rb"))
             )
+            hdus = stack.enter_context(fits.open(stream, lazy_load_hdus=False))
             units = list(hdus)
         except DataError:
             raise

@@ -89,7 +89,7 @@ class Throughput(Component):
     """Throughput of each camera as a Legendre series over the field (total degree `degree`)."""
 
     coefficients: Float[Array, "4 t"] = param(
-        unit="", about="Legendre coefficient P_i(x/0.3°) P_j(y/0.3°)", source=CONTRACT, scale=0.02
+        unit="", about="Legendre coefficient P_i(x/0.3°) P_j(y/0.3°)", source=CONTRACT, scale=0.02, loose=0.5
     )
     degree: int = eqx.field(static=True)
 

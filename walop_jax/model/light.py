@@ -2,17 +2,18 @@
 
     sky or polariser → collimator → calibration plate → wedge → half-wave plate → Wollaston prism → camera
 
-Everything up to the cameras is linear, so the path is run backwards from each analyser: `half_rows` gives the
-Mueller rows S0 and S1 behind a half-wave plate for every wavelength node, `band_rows` integrates them over the
-bands (that is all the optics there is: once per field point), `camera_vectors` adds analyser, collimator and
-throughput, and `counts` is a dot product per exposure. `trace.py` runs the same functions forward, stage by
-stage.
+Everything up to the cameras is linear, so the path is run backwards from the analysers: `plate_matrices` solves
+the half-wave plates at every wavelength node, `band_rows` keeps the Mueller rows that the Wollaston prisms see
+and integrates them over the bands (all the optics there is, once per field point), `camera_vectors` adds
+analyser, collimator and throughput, and `counts` is a dot product per exposure. `trace.py` runs the same
+functions forward, stage by stage.
 
 Units       counts per unit of unpolarised light at unit throughput; angles rad; wavelengths µm; field deg.
 """
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -25,41 +26,11 @@ from walop_jax.model.plan import Plan
 from walop_jax.model.plates import Plate
 
 Scalar = Float[Array, ""]
+Nodes = Float[Array, " n"]
 _MUELLER = {"waves": plate_models.stack_mueller, "fixed_axis": plate_models.fixed_axis_mueller}
 
 
 # ----------------------------------------------------------------------------------- the optics, per node
-
-
-def _plates(
-    instrument: Instrument, where: str, plate: HalfWavePlate, fast_axis: float, wavelength: Float[Array, " n"], plan: Plan
-) -> tuple[Plate, ...]:
-    axis = jnp.deg2rad(fast_axis) * jnp.ones_like(wavelength)
-    stack: tuple[Plate, ...] = (
-        Plate(plate.quartz, materials.QUARTZ_O.index(wavelength), materials.QUARTZ_E.index(wavelength), axis),
-        Plate(plate.mgf2, materials.MGF2_O.index(wavelength), materials.MGF2_E.index(wavelength), axis + 0.5 * jnp.pi),
-    )
-    for effect in instrument.effects:
-        stack = effect.plates(where, stack, plan.conditions)
-    return stack
-
-
-def _wave_plate(
-    instrument: Instrument,
-    where: str,
-    plate: HalfWavePlate,
-    fast_axis: float,
-    sx: Float[Array, " n"],
-    sy: Float[Array, " n"],
-    wavelength: Float[Array, " n"],
-    plan: Plan,
-) -> Float[Array, "n 4 4"]:
-    stack = _plates(instrument, where, plate, fast_axis, wavelength, plan)
-    matrix = _MUELLER[instrument.plates](sx, sy, stack, wavelength)
-    axis = stack[0].axis
-    for effect in instrument.effects:
-        matrix = effect.ahead_of_plates(where, matrix, sx, sy, wavelength, axis)
-    return matrix
 
 
 def node_wavelengths(instrument: Instrument, plan: Plan) -> Float[Array, " n"]:
@@ -70,47 +41,67 @@ def node_wavelengths(instrument: Instrument, plan: Plan) -> Float[Array, " n"]:
     return wavelength
 
 
-def _direction(
-    instrument: Instrument, x: Scalar, y: Scalar, plan: Plan
-) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
+def _pupil_direction(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> tuple[Nodes, Nodes, Nodes]:
     for effect in instrument.effects:
         x, y = effect.field(x, y, plan.conditions)
     pupil = instrument.pupil
-    direction = optics.pupil_direction(x, y, pupil.magnification, pupil.distortion)
-    kx, ky, kz = (jnp.broadcast_to(k, plan.wavelength.shape) for k in direction)
-    return kx, ky, kz
+    kx, ky, kz = optics.pupil_direction(x, y, pupil.magnification, pupil.distortion)
+    nodes = plan.wavelength.shape
+    return jnp.broadcast_to(kx, nodes), jnp.broadcast_to(ky, nodes), jnp.broadcast_to(kz, nodes)
 
 
-def half_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "n 2 2 4"]:
-    """Mueller rows of unpolarised and analysed light behind wedge and plate: (node, half, row, Stokes)."""
-    wavelength = node_wavelengths(instrument, plan)
-    direction = _direction(instrument, x, y, plan)
-    glass = materials.BK7.index(wavelength)
-    turn: Scalar | float = 0.0
+def _stack(
+    instrument: Instrument, plan: Plan, where: str, plate: HalfWavePlate, fast_axis: float, wavelength: Nodes
+) -> tuple[Plate, ...]:
+    axis = jnp.full_like(wavelength, jnp.deg2rad(fast_axis))
+    stack: tuple[Plate, ...] = (
+        Plate(plate.quartz, materials.QUARTZ_O.index(wavelength), materials.QUARTZ_E.index(wavelength), axis),
+        Plate(plate.mgf2, materials.MGF2_O.index(wavelength), materials.MGF2_E.index(wavelength), axis + 0.5 * jnp.pi),
+    )
     for effect in instrument.effects:
-        turn = effect.analyser_angle(turn)
-    rows = []
-    for where, half in zip(("half1", "half2"), instrument.halves, strict=True):
-        sx, sy = optics.behind_wedge(direction, half.wedge, glass)
-        matrix = _wave_plate(instrument, where, half.plate, half.fast_axis, sx, sy, wavelength, plan)
-        analysed = matrix[:, 1]
-        if not isinstance(turn, float):
-            analysed = jnp.cos(2 * turn) * matrix[:, 1] + jnp.sin(2 * turn) * matrix[:, 2]
-        rows.append(jnp.stack([matrix[:, 0], analysed], axis=1))
-    return jnp.stack(rows, axis=1)
+        stack = effect.plates(where, stack, plan.conditions)
+    return stack
 
 
-def calibration_plate(
-    instrument: Instrument, plan: Plan, x: Scalar, y: Scalar, angle: float | None
-) -> Float[Array, "n 4 4"] | None:
-    """Mueller matrix of the calibration plate at `angle` (deg) for every node; None when it is out."""
+def calibration_angle(instrument: Instrument, angle: float | None) -> float | None:
+    """Angle (deg) at which the calibration plate really stands, None when it is out."""
     for effect in instrument.effects:
         angle = effect.calibration_plate(angle)
-    if angle is None:
-        return None
+    return angle
+
+
+def plate_matrices(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> dict[float | str, Float[Array, "n 4 4"]]:
+    """Mueller matrices of all half-wave plates at every node of a field point.
+
+    Keys: "half1" and "half2" behind their wedges, and each angle (deg) of the calibration plate. All of them are
+    solved in one go, as rows of the same arrays: one piece of physics, compiled once.
+    """
     wavelength = node_wavelengths(instrument, plan)
-    kx, ky, _ = _direction(instrument, x, y, plan)
-    return _wave_plate(instrument, "chwp", instrument.chwp, angle, kx, ky, wavelength, plan)
+    direction = _pupil_direction(instrument, plan, x, y)
+    glass = materials.BK7.index(wavelength)
+    cases: dict[float | str, tuple[str, tuple[Nodes, Nodes], tuple[Plate, ...]]] = {}
+    for where, half in zip(("half1", "half2"), instrument.halves, strict=True):
+        behind = optics.behind_wedge(direction, half.wedge, glass)
+        cases[where] = where, behind, _stack(instrument, plan, where, half.plate, half.fast_axis, wavelength)
+    for setting, _, _ in plan.settings:
+        angle = calibration_angle(instrument, setting)
+        if angle is not None:
+            stack = _stack(instrument, plan, "chwp", instrument.chwp, angle, wavelength)
+            cases[angle] = "chwp", direction[:2], stack
+
+    def together(*values: Float[Array, "*n"]) -> Float[Array, "cases n"]:
+        return jnp.stack([jnp.broadcast_to(value, wavelength.shape) for value in values])
+
+    sx, sy = (together(*(case[1][i] for case in cases.values())) for i in (0, 1))
+    plates = jax.tree.map(together, *(case[2] for case in cases.values()))
+    matrices = _MUELLER[instrument.plates](sx, sy, plates, wavelength)
+    result: dict[float | str, Float[Array, "n 4 4"]] = {}
+    for i, (key, (where, (kx, ky), stack)) in enumerate(cases.items()):
+        matrix = matrices[i]
+        for effect in instrument.effects:
+            matrix = effect.ahead_of_plates(where, matrix, kx, ky, wavelength, stack[0].axis)
+        result[key] = matrix
+    return result
 
 
 # ------------------------------------------------------------------------------------ bands and cameras
@@ -130,13 +121,25 @@ def band_weights(instrument: Instrument, plan: Plan) -> Float[Array, "b n"]:
 
 
 def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b 2 2 4"]:
-    """Band-integrated rows S0 and S1 of both halves, calibration plate included: the optics of a field point."""
-    rows = half_rows(instrument, plan, x, y)
+    """Band-integrated Mueller rows (band, half, row, Stokes): all the optics there is at a field point.
+
+    Row 0 is S0, row 1 what the Wollaston prism analyses (S1, turned by an effect if need be), behind calibration
+    plate, wedge and half-wave plate.
+    """
+    matrices = plate_matrices(instrument, plan, x, y)
+    turn: Scalar | float = 0.0
+    for effect in instrument.effects:
+        turn = effect.analyser_angle(turn)
+    halves = jnp.stack([matrices["half1"], matrices["half2"]], axis=1)
+    analysed = halves[:, :, 1]
+    if not isinstance(turn, float):
+        analysed = jnp.cos(2 * turn) * halves[:, :, 1] + jnp.sin(2 * turn) * halves[:, :, 2]
+    rows = jnp.stack([halves[:, :, 0], analysed], axis=2)
     weights = band_weights(instrument, plan)
     bands = []
-    for angle, first, last in plan.settings:
-        plate = calibration_plate(instrument, plan, x, y, angle)
-        seen = rows if plate is None else jnp.einsum("nhrs,nst->nhrt", rows, plate)
+    for setting, first, last in plan.settings:
+        angle = calibration_angle(instrument, setting)
+        seen = rows if angle is None else jnp.einsum("nhrs,nst->nhrt", rows, matrices[angle])
         bands.append(jnp.einsum("bn,nhrs->bhrs", weights[first:last], seen))
     return jnp.concatenate(bands, axis=0)
 

@@ -22,7 +22,9 @@ class Declaration:
     """What a module says of one of its parameters.
 
     `width` is the standard deviation of the as-built value (None: no prior), `scale` the step a solver should
-    think in (the width where there is one), `optical` whether it enters before the band integral.
+    think in (the width where there is one), `optical` whether it enters before the band integral. `loose` is the
+    width of a very weak pull toward the start value that keeps combinations which the data hardly see from
+    running away; it is no prior knowledge and is not counted as such.
     """
 
     unit: str
@@ -30,6 +32,7 @@ class Declaration:
     source: str
     width: float | None = None
     scale: float | None = None
+    loose: float | None = None
     optical: bool = False
 
 
@@ -40,11 +43,12 @@ def param(
     source: str,
     width: float | None = None,
     scale: float | None = None,
+    loose: float | None = None,
     optical: bool = False,
     default: float | None = None,
 ) -> Any:
     """Declare a parameter of an Equinox module; values become float64 arrays."""
-    declaration = Declaration(unit, about, source, width, scale, optical)
+    declaration = Declaration(unit, about, source, width, scale, loose, optical)
     extra: dict[str, Any] = {} if default is None else {"default": default}
     return eqx.field(metadata={KEY: declaration}, converter=jnp.asarray, **extra)
 

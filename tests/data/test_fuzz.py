@@ -1,0 +1,56 @@
+"""Flip bytes of a valid file: a typed error or the same answer, never another answer."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+
+import numpy as np
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from walop_jax.data import DataError, read_calibration_set
+
+
+def same(one, other):
+    for part in ("exposures", "points", "sources"):
+        a, b = (dataclasses.asdict(getattr(entry, part)) for entry in (one, other))
+        for name in a:
+            assert a[name].dtype.kind == b[name].dtype.kind
+            np.testing.assert_array_equal(a[name], b[name])
+    assert (one.instrument, one.site, one.origin) == (other.instrument, other.site, other.origin)
+    assert one.filters.keys() == other.filters.keys()
+    for name, curve in one.filters.items():
+        np.testing.assert_array_equal(curve.throughput, other.filters[name].throughput)
+    a, b = (dataclasses.asdict(entry.intensities.block(0, len(entry.points))) for entry in (one, other))
+    for name in a:
+        np.testing.assert_array_equal(a[name], b[name])
+
+
+@settings(
+    max_examples=120,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(data=st.data())
+def test_flipped_bytes(handmade, data):
+    path = handmade.write()
+    good = read_calibration_set(path)
+    content = bytearray(path.read_bytes())
+    # Half of the flips go to the headers' letters, where a file keeps its meaning.
+    places = st.one_of(
+        st.integers(0, len(content) - 1),
+        st.sampled_from([n for n, byte in enumerate(content) if 32 < byte < 127]),
+    )
+    for _ in range(data.draw(st.integers(1, 3), label="flips")):
+        content[data.draw(places, label="place")] ^= 1 << data.draw(st.integers(0, 7), label="bit")
+    path.write_bytes(content)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            damaged = read_calibration_set(path)
+        except DataError as error:
+            assert str(path) in str(error)
+        else:
+            same(good, damaged)

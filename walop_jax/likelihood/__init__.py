@@ -1,0 +1,1 @@
+"""How probable data are: one noise object that scores and draws, the flux eliminated, priors, synthetic scenes."""

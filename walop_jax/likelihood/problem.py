@@ -1,0 +1,242 @@
+"""A calibration set and a model brought together: what a fit, a sampler or a diagnosis works on."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from functools import cached_property
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from walop_jax.data.records import Block, CalibrationSet, Exposures
+from walop_jax.data.sky import moon_sky
+from walop_jax.likelihood import engine
+from walop_jax.model.compiled import require_double_precision
+from walop_jax.model.instrument import nominal_instrument
+from walop_jax.model.plan import Plan, build_plan
+from walop_jax.model.specification import Model, make_model
+
+Vector = Float[np.ndarray, " n"]
+Matrix = Float[np.ndarray, "n n"]
+
+POINTS_PER_CHUNK = 256
+LARGEST_CHUNK = 2_000_000  # intensities × local quantities that a chunk may hold
+
+
+@dataclasses.dataclass(frozen=True)
+class Posterior:
+    """χ² of data and priors at a point of parameter space, and its expansion there in the free parameters.
+
+    `gradient` is half the gradient of the total and `matrix` half its Gauss–Newton Hessian. `loose` is the share
+    of the weak pulls that are no prior knowledge; it is in the gradient and the matrix, not in `chi2`.
+    """
+
+    data: float
+    priors: float
+    loose: float
+    gradient: Vector
+    matrix: Matrix
+
+    @property
+    def chi2(self) -> float:
+        """Sum over data and priors."""
+        return self.data + self.priors
+
+    @property
+    def objective(self) -> float:
+        """What a fit minimises."""
+        return self.data + self.priors + self.loose
+
+
+class Problem:
+    """The joint likelihood of one calibration set under one model.
+
+    Field points are handled in chunks of equal size, so that a set larger than memory goes through the same code.
+    """
+
+    def __init__(self, calset: CalibrationSet, model: Model, points_per_chunk: int | None = None) -> None:
+        require_double_precision()
+        self.calset = calset
+        self.model = model
+        depends_on = {q for effect in model.template.effects for q in effect.optics_depend_on}
+        self.plan: Plan = build_plan(calset.exposures, calset.filters, calset.sources, depends_on)
+        n_points = len(calset.points)
+        local = len(model.parameters) - len(model.template.throughput.coefficients.ravel()) + 4
+        fits = max(1, LARGEST_CHUNK // (4 * len(calset.exposures) * local) * 4)
+        chunk = points_per_chunk or min(POINTS_PER_CHUNK, fits)
+        self.points_per_chunk = min(chunk, n_points)
+
+    @cached_property
+    def _in_memory(self) -> list[engine.PointData]:
+        return list(self._load())
+
+    def _load(self) -> Iterator[engine.PointData]:
+        n, size = len(self.calset.points), self.points_per_chunk
+        for start in range(0, n, size):
+            block = self.calset.intensities.block(start, min(start + size, n))
+            yield point_data(self.calset, self.plan, _padded(block, size))
+
+    @property
+    def chunks(self) -> list[engine.PointData]:
+        """The data, chunk by chunk; the last chunk is padded with points of weight 0."""
+        return self._in_memory
+
+    # -------------------------------------------------------------------------------------- the posterior
+
+    @cached_property
+    def _priors(self) -> tuple[Int[np.ndarray, " k"], Vector, Vector]:
+        known = [(i, *p.prior) for i, p in enumerate(self.model.parameters) if p.prior is not None and p.tie is None]
+        index, mean, width = zip(*known, strict=True) if known else ((), (), ())
+        return np.array(index, int), np.array(mean, float), np.array(width, float)
+
+    @cached_property
+    def _loose(self) -> Vector:
+        """Inverse squared widths of the weak pulls, per parameter."""
+        return np.array([0.0 if p.loose is None or p.prior is not None else p.loose**-2 for p in self.model.parameters])
+
+    def expand(self, values: Vector) -> Posterior:
+        """χ² and its quadratic expansion at a full vector of parameter values."""
+        instrument = self.model.instrument(values)
+        data, gradient, matrix = 0.0, np.zeros(len(values)), np.zeros((len(values), len(values)))
+        for chunk in self.chunks:
+            part = engine.normal_equations(instrument, self.plan, chunk)
+            data += float(part.chi2)
+            gradient += np.asarray(part.gradient)
+            matrix += np.asarray(part.matrix)
+        index, mean, width = self._priors
+        pull = (values[index] - mean) / width
+        gradient[index] += pull / width
+        matrix[index, index] += width**-2
+        away = values - self.model.start
+        gradient += self._loose * away
+        matrix[np.diag_indices_from(matrix)] += self._loose
+        select = self.model.selection()
+        return Posterior(
+            data=data,
+            priors=float(pull @ pull),
+            loose=float(self._loose @ away**2),
+            gradient=select.T @ gradient,
+            matrix=select.T @ matrix @ select,
+        )
+
+    def residuals(self, values: Vector) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e 4"]]:
+        """Best flux and normalised residuals (data − model)/σ of every (point, exposure); 0 where unused."""
+        instrument = self.model.instrument(values)
+        parts = [engine.residuals(instrument, self.plan, chunk) for chunk in self.chunks]
+        flux = np.concatenate([np.asarray(part[0]) for part in parts])
+        residual = np.concatenate([np.asarray(part[1]) for part in parts])
+        return flux[: len(self.calset.points)], residual[: len(self.calset.points)]
+
+    # ------------------------------------------------------------------------------------------- counting
+
+    @cached_property
+    def used(self) -> Float[np.ndarray, "p e"]:
+        """True where the four intensities of a (point, exposure) are used."""
+        used = np.concatenate([np.asarray(chunk.weight[..., 0] > 0) for chunk in self.chunks])
+        return used[: len(self.calset.points)]
+
+    @property
+    def n_data(self) -> int:
+        """Number of intensities used."""
+        return 4 * int(self.used.sum())
+
+    @property
+    def dof(self) -> int:
+        """Three per used row (four when the flux is known), one per prior, minus the free parameters."""
+        rows = self.used.sum(axis=0)
+        per_row = np.where(np.asarray(self.plan.exposures.flux_known), 4, 3)
+        free = set(self.model.free.tolist())
+        priors = sum(1 for i in self._priors[0] if int(i) in free)
+        return int(rows @ per_row) + priors - len(free)
+
+
+def _padded(block: Block, size: int) -> Block:
+    missing = size - len(block.x)
+    if missing == 0:
+        return block
+
+    def pad(array: np.ndarray, value: float) -> np.ndarray:
+        return np.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1), constant_values=value)
+
+    return Block(
+        x=pad(block.x, 0.0), y=pad(block.y, 0.0), counts=pad(block.counts, 0.0), sigma=pad(block.sigma, 1.0),
+        used=pad(block.used, False), source=pad(block.source, -1),
+    )  # fmt: skip
+
+
+def sky_polarisation(calset: CalibrationSet, x: Vector, y: Vector) -> Float[np.ndarray, "p e 2"]:
+    """(q, u) in the ICS of the Moon sky for δ = 1 at field points; 0 in exposures of other kinds."""
+    e: Exposures = calset.exposures
+    sky = np.zeros((len(x), len(e), 2))
+    moon = np.flatnonzero((e.kind == "moon") & ~e.clp_in)
+    if moon.size:
+        q, u = moon_sky(e.mjd[moon], e.ra[moon], e.dec[moon], e.rotator[moon], calset.site, x, y)
+        sky[:, moon, 0], sky[:, moon, 1] = q, u
+    return sky
+
+
+def point_data(calset: CalibrationSet, plan: Plan, block: Block) -> engine.PointData:
+    """A block of measurements as the engine wants it."""
+    band = np.take_along_axis(plan.band_of[None], block.source[:, :, None] + 1, axis=2)[:, :, 0]
+    weight = np.where(block.used[:, :, None], 1.0 / np.where(block.sigma > 0, block.sigma, 1.0), 0.0)
+    return engine.PointData(
+        x=jnp.asarray(block.x),
+        y=jnp.asarray(block.y),
+        counts=jnp.asarray(np.where(block.used[:, :, None], block.counts, 0.0)),
+        weight=jnp.asarray(weight),
+        sky=jnp.asarray(sky_polarisation(calset, block.x, block.y)),
+        source=jnp.asarray(block.source),
+        band=jnp.asarray(band),
+    )
+
+
+def standard_names(calset: CalibrationSet) -> tuple[str, ...]:
+    """Unique names of the standards, usable in parameter names."""
+    names: list[str] = []
+    for number, name in zip(calset.sources.source, calset.sources.name, strict=True):
+        clean = "".join(c if c.isalnum() else "_" for c in str(name).strip()) or f"source{number}"
+        names.append(clean if clean not in names else f"{clean}_{number}")
+    return tuple(names)
+
+
+def has_known_flux(calset: CalibrationSet) -> bool:
+    """Whether any exposure is of KIND `flux`, so that the overall scale of the throughput is measured."""
+    return bool((calset.exposures.kind == "flux").any())
+
+
+def base_model(calset: CalibrationSet, *, plates: str = "waves", throughput_degree: int = 4) -> Model:
+    """The base model (contract, section 3) for the instrument and standards of a calibration set.
+
+    The scale of the throughput is a gauge unless a flux is known, and the constant of camera N0 is held then.
+    """
+    names = standard_names(calset)
+    sources = calset.sources
+    level = _throughput_level(calset) if has_known_flux(calset) else 0.5
+    instrument = nominal_instrument(
+        calset.instrument,
+        standards=list(zip(names, sources.q, sources.u, strict=True)),
+        plates=plates,
+        throughput_degree=throughput_degree,
+        throughput=level,
+    )
+    priors = {}
+    for i, name in enumerate(names):
+        priors[f"standard.{name}.q"] = (float(sources.q[i]), float(sources.q_err[i]))
+        priors[f"standard.{name}.u"] = (float(sources.u[i]), float(sources.u_err[i]))
+    model = make_model(calset.instrument, instrument, priors=priors)
+    for name in model.names:
+        if name.startswith("throughput."):
+            p = model[name]
+            model = model.change(name, scale=p.scale * level / 0.5, loose=level)
+    if not has_known_flux(calset):
+        model = model.change("throughput.n0.p00", free=False)
+    return model
+
+
+def _throughput_level(calset: CalibrationSet) -> float:
+    # A camera gets half of the unpolarised light: N = T/2. One slab of points is enough for a start value.
+    block = calset.intensities.block(0, min(256, len(calset.points)))
+    rows = block.used & (calset.exposures.kind == "flux")
+    return float(2.0 * block.counts[rows].mean())

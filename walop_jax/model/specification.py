@@ -1,0 +1,182 @@
+"""The model as a list of parameters beside the instrument they belong to: what is free, tied, known beforehand.
+
+Three things of one shape: values, freedom and priors. Names come from the tree (`parameters.leaves`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
+
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import leaves
+
+Vector = Float[np.ndarray, " n"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """One number of the model.
+
+    `prior` is (mean, standard deviation) or None; `tie` the name of the parameter whose value this one takes.
+    `scale` is the unit a solver thinks in, `loose` the width of the weak pull to `start` of `Declaration`.
+    """
+
+    name: str
+    unit: str
+    about: str
+    source: str
+    start: float
+    prior: tuple[float, float] | None
+    free: bool
+    scale: float
+    loose: float | None = None
+    tie: str | None = None
+
+
+def unknown_name(what: str, name: str, known: Iterable[str]) -> ValueError:
+    """The error for a name that does not exist, with the nearest ones that do."""
+    known = list(known)
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+    hint = f"nearest: {', '.join(near)}" if near else f"known: {', '.join(sorted(known)[:12])}"
+    return ValueError(f"unknown {what} {name!r}; {hint}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """An instrument with what may vary in it. Immutable: every change returns a new model."""
+
+    name: str
+    template: Instrument
+    parameters: tuple[Parameter, ...]
+
+    def __post_init__(self) -> None:
+        names = self.names
+        for p in self.parameters:
+            if not np.isfinite(p.start):
+                raise ValueError(f"parameter {p.name}: start value {p.start} is not finite")
+            if p.prior is not None and not (np.isfinite(p.prior[0]) and p.prior[1] > 0):
+                raise ValueError(f"parameter {p.name}: prior {p.prior} needs a finite mean and a width above 0")
+            if not p.scale > 0:
+                raise ValueError(f"parameter {p.name}: scale {p.scale} must be above 0")
+            if p.tie is not None and (p.tie not in names or self.parameters[names.index(p.tie)].tie is not None):
+                raise ValueError(f"parameter {p.name}: tied to {p.tie!r}, which does not exist or is itself tied")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all parameters, in tree order."""
+        return tuple(p.name for p in self.parameters)
+
+    def __getitem__(self, name: str) -> Parameter:
+        return self.parameters[self.index(name)]
+
+    def index(self, name: str) -> int:
+        """Position of a parameter; ValueError with the nearest names when there is none."""
+        try:
+            return self.names.index(name)
+        except ValueError:
+            raise unknown_name("parameter", name, self.names) from None
+
+    def change(self, name: str, **changes: Any) -> Model:
+        """The model with fields of one parameter replaced."""
+        i = self.index(name)
+        changed = dataclasses.replace(self.parameters[i], **changes)
+        return dataclasses.replace(self, parameters=(*self.parameters[:i], changed, *self.parameters[i + 1 :]))
+
+    def started_at(self, values: Vector) -> Model:
+        """The model with all start values replaced (full vector, tree order)."""
+        changed = tuple(
+            dataclasses.replace(p, start=float(v)) for p, v in zip(self.parameters, values, strict=True)
+        )
+        return dataclasses.replace(self, parameters=changed)
+
+    # ------------------------------------------------------------------------------ vectors and the tree
+
+    @property
+    def start(self) -> Vector:
+        """Start values of all parameters; a tied one starts where its master does."""
+        values = {p.name: p.start for p in self.parameters}
+        return np.array([values[p.tie] if p.tie else p.start for p in self.parameters])
+
+    @property
+    def free(self) -> Int[np.ndarray, " f"]:
+        """Positions of the free parameters."""
+        return np.array([i for i, p in enumerate(self.parameters) if p.free and p.tie is None], int)
+
+    def selection(self) -> Float[np.ndarray, "n f"]:
+        """Derivative of all parameters with respect to the free ones: ones, ties included."""
+        free = self.free
+        column = {self.parameters[i].name: k for k, i in enumerate(free)}
+        matrix = np.zeros((len(self.parameters), len(free)))
+        for i, p in enumerate(self.parameters):
+            name = p.tie or p.name
+            if name in column:
+                matrix[i, column[name]] = 1.0
+        return matrix
+
+    def full(self, free_values: Vector) -> Vector:
+        """All parameters from the values of the free ones."""
+        start = self.start
+        return start + self.selection() @ (np.asarray(free_values) - start[self.free])
+
+    def instrument(self, values: Vector | None = None) -> Instrument:
+        """The instrument at a full vector of values (default: start values)."""
+        return unravel(self.template)(jnp.asarray(self.start if values is None else values))
+
+
+def unravel(template: Instrument) -> Callable[[Float[Array, " n"]], Instrument]:
+    """The function from a full vector of values to an instrument of the template's shape."""
+    return ravel_pytree(template)[1]
+
+
+def full_values(instrument: Instrument) -> Vector:
+    """All numbers of an instrument in tree order."""
+    return np.asarray(ravel_pytree(instrument)[0])
+
+
+def optical_indices(instrument: Instrument) -> tuple[int, ...]:
+    """Positions of the parameters that enter before the band integral."""
+    return tuple(i for i, leaf in enumerate(leaves(instrument)) if leaf.declaration.optical)
+
+
+def series_indices(instrument: Instrument) -> tuple[int, ...]:
+    """Positions of the throughput coefficients (4 × terms, contiguous)."""
+    return tuple(i for i, leaf in enumerate(leaves(instrument)) if leaf.owner == "Throughput")
+
+
+def make_model(
+    name: str,
+    instrument: Instrument,
+    *,
+    priors: Mapping[str, tuple[float, float]] | None = None,
+    frozen: Sequence[str] = (),
+) -> Model:
+    """The model of an instrument at its nominal values with the priors that its components declare.
+
+    `priors` adds priors by name (catalogue errors of standards), `frozen` names parameters that do not vary.
+    """
+    priors = dict(priors or {})
+    parameters = []
+    for leaf, value in zip(leaves(instrument), full_values(instrument), strict=True):
+        d = leaf.declaration
+        prior = priors.pop(leaf.name, None) or ((float(value), d.width) if d.width is not None else None)
+        scale = prior[1] if prior is not None else (d.scale or max(abs(float(value)), 1e-3))
+        parameters.append(
+            Parameter(
+                name=leaf.name, unit=d.unit, about=d.about, source=d.source, start=float(value), prior=prior,
+                free=leaf.name not in frozen, scale=scale, loose=d.loose,
+            )
+        )  # fmt: skip
+    names = [p.name for p in parameters]
+    for missing in [*priors, *(f for f in frozen if f not in names)]:
+        raise unknown_name("parameter", missing, names)
+    return Model(name=name, template=jax.tree.map(jnp.asarray, eqx.filter(instrument, eqx.is_array)), parameters=tuple(parameters))
