@@ -1,0 +1,199 @@
+"""The joint fit of a calibration set: start values, Levenberg–Marquardt, gates, covariance."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.data.records import CalibrationSet
+from walop_jax.fit.levenberg import Minimum, minimise
+from walop_jax.likelihood.problem import Posterior, Problem, base_model
+from walop_jax.model import materials
+from walop_jax.model.specification import Model
+
+Vector = Float[np.ndarray, " n"]
+Matrix = Float[np.ndarray, "n n"]
+
+SUSPECT_SIGMA = 5.0  # excess of χ² over its expectation, in its own standard deviations
+PRIOR_EDGE = 4.0  # standard deviations
+Progress = Callable[[str, int, float], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class FitResult:
+    """A fit and how far it can be trusted.
+
+    `values` and `covariance` are of all parameters in tree order, frozen ones with zero variance. `trusted` needs a
+    converged fit that explains the data; `warnings` says in words what does not hold.
+    """
+
+    model: Model
+    values: Vector
+    covariance: Matrix
+    posterior: Posterior
+    minimum: Minimum
+    n_data: int
+    dof: int
+    starts: int
+    seconds: float
+    warnings: tuple[str, ...]
+
+    @property
+    def chi2(self) -> float:
+        """χ² of data and priors."""
+        return self.posterior.chi2
+
+    @property
+    def sigma(self) -> Vector:
+        """Standard errors of all parameters."""
+        return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
+
+    @property
+    def excess(self) -> float:
+        """(χ² − dof) / √(2 dof): how many standard deviations χ² lies above its expectation."""
+        return (self.chi2 - self.dof) / np.sqrt(2.0 * max(self.dof, 1))
+
+    @property
+    def converged(self) -> bool:
+        """Whether the minimum was reached and is well conditioned."""
+        return self.minimum.converged
+
+    @property
+    def explains_data(self) -> bool:
+        """Whether χ² is what noise alone would give."""
+        return self.dof > 0 and self.excess < SUSPECT_SIGMA
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the result may be used without a second thought."""
+        return self.converged and self.explains_data
+
+    def value(self, name: str) -> tuple[float, float]:
+        """Value and standard error of a parameter."""
+        i = self.model.index(name)
+        return float(self.values[i]), float(self.sigma[i])
+
+
+def check_identifiable(problem: Problem) -> None:
+    """Raise ValueError when the exposures cannot determine an instrument at all."""
+    e = problem.calset.exposures
+    through = e.clp_in & problem.used.any(axis=0)
+    angles = np.unique(np.round(np.mod(e.clp_angle[through], 180.0), 3))
+    if len(angles) < 3:
+        raise ValueError(
+            f"{len(angles)} distinct polariser angle(s) modulo 180° with usable data: a fit of the instrument needs "
+            "at least 3, better 8 or more spread over 360°"
+        )
+    if len(problem.calset.points) < 2:
+        raise ValueError("a single field point: the joint fit over the field needs several points")
+
+
+def covariance(problem: Problem, posterior: Posterior) -> Matrix:
+    """Covariance of all parameters: the inverse of JᵀJ, priors included, ties expanded."""
+    scale = _scale(problem.model)
+    scaled = posterior.matrix * np.outer(scale, scale)
+    value, vector = np.linalg.eigh(scaled)
+    keep = value > value.max(initial=0.0) * 1e-15
+    inverse = (vector[:, keep] / value[keep]) @ vector[:, keep].T
+    select = problem.model.selection() * scale
+    return select @ inverse @ select.T
+
+
+def _scale(model: Model) -> Vector:
+    return np.array([model.parameters[i].scale for i in model.free])
+
+
+def _order_starts(problem: Problem) -> Iterator[tuple[str, Vector]]:
+    """Start values one order of retardance away: first-order plates wrap every 2π."""
+    wavelength = np.asarray(problem.plan.wavelength).mean()
+    birefringence = float(materials.MGF2_E.index(wavelength) - materials.MGF2_O.index(wavelength))
+    one_wave = wavelength / birefringence
+    for name in ("half2.plate.mgf2", "half1.plate.mgf2"):
+        for sign in (-1, 1):
+            start = problem.model.start.copy()
+            start[problem.model.index(name)] += sign * one_wave
+            yield f"{name} {sign:+d} wave", start
+
+
+def fit(
+    problem: Problem,
+    *,
+    start: Vector | None = None,
+    scan_orders: bool = True,
+    progress: Progress | None = None,
+) -> FitResult:
+    """Fit the model of `problem` to its data.
+
+    From the start values of the model (or `start`, a full vector) and, when that does not explain the data by far,
+    from plates one order of retardance away. Raises ValueError when the exposures cannot determine the instrument.
+    """
+    began = time.perf_counter()
+    check_identifiable(problem)
+    model, scale = problem.model, _scale(problem.model)
+
+    def run(label: str, first: Vector) -> Minimum:
+        report = None if progress is None else lambda step, chi2: progress(label, step, chi2)
+        base = first.copy()
+
+        def expand(x: Vector) -> Posterior:
+            return problem.expand(base + model.selection() @ (x - base[model.free]))
+
+        return minimise(expand, base[model.free], scale, progress=report)
+
+    first = model.start if start is None else np.asarray(start, float)
+    starts, best, origin = 1, run("fit", first), first
+    if scan_orders and _chi2_per_dof(best, problem) > 4.0:
+        for label, other in _order_starts(problem):
+            trial = run(label, other)
+            starts += 1
+            if trial.expansion.objective < best.expansion.objective:
+                best, origin = trial, other
+    values = origin + model.selection() @ (best.x - origin[model.free])
+    posterior = best.expansion
+    if not isinstance(posterior, Posterior):
+        raise TypeError("a fit needs a Posterior expansion")
+    result = FitResult(
+        model=model,
+        values=values,
+        covariance=covariance(problem, posterior),
+        posterior=posterior,
+        minimum=best,
+        n_data=problem.n_data,
+        dof=problem.dof,
+        starts=starts,
+        seconds=time.perf_counter() - began,
+        warnings=(),
+    )
+    return dataclasses.replace(result, warnings=tuple(_warnings(result)))
+
+
+def _chi2_per_dof(minimum: Minimum, problem: Problem) -> float:
+    return minimum.expansion.objective / max(problem.dof, 1)
+
+
+def _warnings(result: FitResult) -> Iterator[str]:
+    if not result.converged:
+        yield result.minimum.message
+    if result.dof <= 0:
+        yield f"{result.n_data} intensities for {len(result.model.free)} free parameters: nothing is left to test"
+    elif not result.explains_data:
+        yield (
+            f"χ²/dof = {result.chi2 / result.dof:.4g} lies {result.excess:.3g} standard deviations above 1: the model "
+            "does not explain the data; do not trust the errors (walop-jax diagnose looks for what is missing)"
+        )
+    elif result.excess < -SUSPECT_SIGMA:
+        yield f"χ²/dof = {result.chi2 / result.dof:.4g}: the stated errors N_ERR are too large (gain or units?)"
+    for i in result.model.free:
+        p = result.model.parameters[i]
+        if p.prior is not None and abs(result.values[i] - p.prior[0]) > PRIOR_EDGE * p.prior[1]:
+            pull = (result.values[i] - p.prior[0]) / p.prior[1]
+            yield f"{p.name} = {result.values[i]:.6g} {p.unit} lies {pull:+.1f} prior widths from {p.prior[0]:g}"
+
+
+def refit(calset: CalibrationSet, model: Model | None = None, *, progress: Progress | None = None) -> FitResult:
+    """Fit a calibration set with `model` (default: the base model)."""
+    return fit(Problem(calset, model or base_model(calset)), progress=progress)
