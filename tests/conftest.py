@@ -1,5 +1,38 @@
-"""Double precision for every test: the package itself never switches it on."""
+"""The house rules of every test: float64, shapes checked, long studies and timings only on demand."""
+
+from __future__ import annotations
+
+from pathlib import Path
 
 import jax
+import jaxtyping
+import pytest
 
-jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_enable_x64", True)  # the package itself never switches it on
+# Every annotated shape and type of the package is checked under pytest, and only there. Must precede its import.
+jaxtyping.install_import_hook("walop_jax", "shapes.checked")
+
+SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+OPTIONS = {"long": "studies that take minutes", "benchmark": "timings"}
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    for name, what in OPTIONS.items():
+        parser.addoption(f"--{name}", action="store_true", default=False, help=f"run {what} as well")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    for name, what in OPTIONS.items():
+        if config.getoption(f"--{name}"):
+            continue
+        for item in items:
+            if item.get_closest_marker(name):
+                item.add_marker(pytest.mark.skip(reason=f"{what}: run with --{name}"))
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of the calibration sets with known truth, which were made outside the project."""
+    if not (SHARED_DATA / "walop_south_a.fits").exists():
+        pytest.skip("calibration sets with known truth are not beside the project (../shared/data)")
+    return SHARED_DATA

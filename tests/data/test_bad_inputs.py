@@ -179,10 +179,10 @@ def test_bad_set_is_refused_by_name(handmade, name):
 
 
 def test_duplicated_column(handmade):
-    hdus = handmade.hdus()
-    hdus[2].columns[2].name = "X"
-    path = handmade.folder / "set.fits"
-    fits.HDUList(hdus).writeto(path)
+    path = handmade.write(checksum=False)
+    content = path.read_bytes()
+    assert content.count(b"'Y       '") == 1
+    path.write_bytes(content.replace(b"'Y       '", b"'x       '"))
     with pytest.raises(DataError, match=r"\[POINTS\] X: the column is there twice"):
         read_calibration_set(path)
 
@@ -238,14 +238,14 @@ def test_truncated_file(handmade, share, checksum):
     path = handmade.write(checksum=checksum)
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(DataError, match="set.fits"):
+    with pytest.raises(DataError, match=r"set\.fits"):
         read_calibration_set(path)
 
 
 def test_bytes_behind_the_last_extension(handmade):
     path = handmade.write()
     path.write_bytes(path.read_bytes() + b"XTENSION of nothing")
-    with pytest.raises(DataError, match="set.fits"):
+    with pytest.raises(DataError, match=r"set\.fits"):
         read_calibration_set(path)
 
 

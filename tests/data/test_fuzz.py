@@ -50,7 +50,6 @@ def test_flipped_bytes(handmade, data):
         warnings.simplefilter("error")
         try:
             damaged = read_calibration_set(path)
-        except DataError as error:
-            assert str(path) in str(error)
-        else:
-            same(good, damaged)
+        except DataError:
+            return
+    same(good, damaged)

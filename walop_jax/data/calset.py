@@ -14,7 +14,7 @@ from walop_jax.data.errors import DataError, fail, nearest
 from walop_jax.data.filters import builtin_filter
 from walop_jax.data.frames import COUNT_NAMES, ERROR_NAMES, FrameIntensities, frame_stack
 from walop_jax.data.merge import merge_calibration_sets
-from walop_jax.data.opening import OpenFile, open_fits
+from walop_jax.data.opening import UNREADABLE, OpenFile, open_fits
 from walop_jax.data.records import (
     CalibrationSet,
     Exposures,
@@ -65,8 +65,7 @@ def _read_one(path: Path) -> CalibrationSet:
             return _from_hdus(opened)
         except DataError:
             raise
-        except (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
-            # astropy meets a damaged header only when the header is used.
+        except UNREADABLE as error:
             raise fail(f"cannot be read: {error}", file=path, advice="write the file again") from error
 
 

@@ -56,7 +56,7 @@ def make_filters(table: dict[str, Any], place: Place) -> dict[str, FilterCurve]:
     wavelengths, throughputs = table["WAVELENGTH"], table["THROUGHPUT"]
     if wavelengths.shape != throughputs.shape:
         raise place.fail("has not as many values as WAVELENGTH", "THROUGHPUT", "pad both with NaN")
-    for row, name in enumerate(table["FILTER"]):
+    for row, name in enumerate(table["FILTER"].tolist()):
         at = np.array([row])
         if name in curves:
             raise place.fail(f"{name!r} is there twice, again in {rows_text(at)}", "FILTER", "rename one")
@@ -86,7 +86,7 @@ def make_filters(table: dict[str, Any], place: Place) -> dict[str, FilterCurve]:
                 "THROUGHPUT",
                 "correct the curve",
             )
-        curves[str(name)] = FilterCurve(str(name), wavelength, throughput)
+        curves[name] = FilterCurve(name, wavelength, throughput)
     return curves
 
 
@@ -116,17 +116,17 @@ def make_exposures(
     """Check the EXPOSURES table (degrees, days, kelvin, …) for what every KIND needs."""
     unique(table["EXPOSURE"], "EXPOSURE", place)
     table["KIND"] = kind = np.char.lower(table["KIND"])
-    for name in np.unique(kind):
+    for name in np.unique(kind).tolist():
         if name not in KINDS:
-            refuse(kind == name, f"{name!r} is not a kind,", "KIND", nearest(str(name), KINDS), place)
+            refuse(kind == name, f"{name!r} is not a kind,", "KIND", nearest(name, KINDS), place)
     known = {*filters, *BUILTIN_FILTERS}
-    for name in np.unique(table["FILTER"]):
+    for name in np.unique(table["FILTER"]).tolist():
         if name not in known:
             refuse(
                 table["FILTER"] == name,
-                f"{str(name)!r} is neither a row of FILTERS nor built in,",
+                f"{name!r} is neither a row of FILTERS nor built in,",
                 "FILTER",
-                nearest(str(name), known),
+                nearest(name, known),
                 place,
             )
     clp_in = table["CLP_IN"]

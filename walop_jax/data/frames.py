@@ -193,7 +193,7 @@ def frame_stack(images: dict[str, Any], exposures: int, path: Path) -> tuple[Gri
 
 def _cube(hdu: Any, exposures: int, place: Place) -> Cube:
     header = hdu.header
-    if "ZIMAGE" in header or type(hdu).__name__ == "CompImageHDU":
+    if "ZIMAGE" in header:
         raise place.fail(
             "is compressed tile by tile", advice="unpack it with funpack: frames are read in slabs"
         )

@@ -177,7 +177,7 @@ def _join_sources(sets: tuple[CalibrationSet, ...]) -> tuple[Sources, list[np.nd
                 values = ("q", "u", "q_err", "u_err", "teff")
                 if not all(np.array_equal(rows[old][name], row[name], equal_nan=True) for name in values):
                     raise _conflict(
-                        f"{row['name']!r} has other values than in an earlier file",
+                        f"{str(row['name'])!r} has other values than in an earlier file",
                         entry,
                         "SOURCES",
                         "correct one of them, or give it another NAME",

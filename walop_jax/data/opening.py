@@ -17,7 +17,7 @@ import warnings
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from astropy.io import fits
@@ -28,6 +28,19 @@ _CHUNK = 1 << 23  # a multiple of four, so that words never straddle two chunks
 _LARGEST_GZIP = 1 << 31
 _BLOCK = 2880
 _BROKEN = "the copy is damaged or incomplete; transfer or write the file again"
+
+UNREADABLE = (
+    OSError,
+    EOFError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    AttributeError,
+    zlib.error,
+    fits.VerifyError,
+)
+"""What astropy raises on a damaged file, some of it only when a header or a column is used."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +64,7 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[OpenFile]:
     path = Path(path)
     with contextlib.ExitStack() as stack:
         try:
-            raw: BinaryIO = stack.enter_context(path.open("rb"))
+            raw = stack.enter_context(path.open("rb"))
             compressed = raw.read(2) == b"\x1f\x8b"
             content = _decompressed(path) if compressed else raw
             caught = stack.enter_context(warnings.catch_warnings(record=True))
@@ -60,26 +73,18 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[OpenFile]:
             stream = (
                 io.BytesIO(content) if isinstance(content, bytes) else stack.enter_context(path.open("rb"))
             )
-            hdus = stack.enter_context(fits.open(stream, lazy_load_hdus=False))
+            hdus = stack.enter_context(
+                fits.open(stream, lazy_load_hdus=False, disable_image_compression=True)
+            )
             units = list(hdus)
+            raw.seek(0)
+            sha256 = _verify(path, units, io.BytesIO(content) if isinstance(content, bytes) else raw)
         except DataError:
             raise
         except FileNotFoundError:
             raise fail("there is no such file", file=path, advice="check the name") from None
-        except (
-            OSError,
-            EOFError,
-            ValueError,
-            TypeError,
-            KeyError,
-            IndexError,
-            zlib.error,
-            fits.VerifyError,
-        ) as e:
-            raise fail(f"cannot be read as FITS: {_one_line(e)}", file=path, advice=_BROKEN) from e
-        raw.seek(0)
-        source = io.BytesIO(content) if isinstance(content, bytes) else raw
-        sha256 = _verify(path, units, source)
+        except UNREADABLE as error:
+            raise fail(f"cannot be read as FITS: {_one_line(error)}", file=path, advice=_BROKEN) from error
         if isinstance(content, bytes):
             raw.seek(0)
             sha256 = hashlib.file_digest(raw, "sha256").hexdigest()
@@ -100,14 +105,16 @@ def _decompressed(path: Path) -> bytes:
     return content
 
 
-def _verify(path: Path, hdus: list[Any], stream: BinaryIO) -> str:
+def _verify(path: Path, hdus: list[Any], stream: io.BufferedIOBase) -> str:
     """Read the file once; check length and checksums; return the SHA-256 of the bytes."""
     stream.seek(0, os.SEEK_END)
     size = stream.tell()
     stream.seek(0)
     digest = hashlib.sha256()
     for number, hdu in enumerate(hdus):
-        info = hdu.fileinfo()
+        info = hdu.fileinfo() if hasattr(hdu, "fileinfo") else None
+        if info is None:  # astropy's stand-in for an extension whose header it cannot understand
+            raise fail(f"the header of extension {number} is damaged", file=path, advice=_BROKEN)
         name = hdu.name or f"HDU {number}"
         start, data, end = info["hdrLoc"], info["datLoc"], info["datLoc"] + info["datSpan"]
         if end > size:
@@ -131,7 +138,7 @@ def _verify(path: Path, hdus: list[Any], stream: BinaryIO) -> str:
     return digest.hexdigest()
 
 
-def _sum(stream: BinaryIO, length: int, digest: Any) -> int:
+def _sum(stream: io.BufferedIOBase, length: int, digest: Any) -> int:
     """Add up big-endian 32-bit words in ones' complement (carries come back in at the bottom)."""
     total = 0
     while length > 0:
@@ -155,6 +162,28 @@ def data_sum(path: Path, offset: int, length: int) -> int:
     with path.open("rb") as stream:
         stream.seek(offset)
         return _sum(stream, length, hashlib.sha256())
+
+
+def checksum_text(header: bytes, data: int) -> str:
+    """Return the CHECKSUM that completes a header in which it is `'0' * 16`, given the sum of the data.
+
+    FITS standard 4.0, appendix J.1: each byte of the complement is split over four letters, kept clear of
+    punctuation, and the string is turned by one because it starts at the twelfth byte of its card.
+    """
+    value = 0xFFFFFFFF ^ _fold(_sum(io.BytesIO(header), len(header), hashlib.sha256()) + data)
+    letters = [0] * 16
+    for place, byte in enumerate(value.to_bytes(4, "big")):
+        four = [byte // 4 + 48 + (byte % 4 if n == 0 else 0) for n in range(4)]
+        while any(_punctuation(letter) for letter in four):
+            for n in (0, 2):
+                if _punctuation(four[n]) or _punctuation(four[n + 1]):
+                    four[n], four[n + 1] = four[n] + 1, four[n + 1] - 1
+        letters[place::4] = four
+    return bytes(letters[-1:] + letters[:-1]).decode("ascii")
+
+
+def _punctuation(letter: int) -> bool:
+    return 0x3A <= letter <= 0x40 or 0x5B <= letter <= 0x60
 
 
 def padded(length: int) -> int:

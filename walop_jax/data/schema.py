@@ -106,7 +106,7 @@ def read_table(hdu: Any, schema: Mapping[str, Column], place: Place) -> tuple[di
     Raises `DataError` for a missing, duplicated or ill-typed column, a unit that cannot be converted, and a
     table without rows.
     """
-    if type(hdu).__name__ != "BinTableHDU":  # exactly: a tile-compressed image is a kind of one
+    if type(hdu).__name__ != "BinTableHDU":
         raise place.fail("is not a binary table", advice="write it as a FITS binary table")
     names = [name.upper() for name in hdu.columns.names]
     for name in names:

@@ -162,11 +162,11 @@ def standard_rotation(
 
 
 def sky_to_instrument(
-    q: Float[np.ndarray, "*n"], u: Float[np.ndarray, "*n"], rotator: Float[np.ndarray, "*n"]
-) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
+    q: Float[np.ndarray, ...], u: Float[np.ndarray, ...], rotator: Float[np.ndarray, ...]
+) -> tuple[Float[np.ndarray, ...], Float[np.ndarray, ...]]:
     """Turn equatorial Stokes parameters (position angle north through east) into the instrument frame.
 
-    `rotator` in degrees. The inverse is the same with −`rotator`.
+    `rotator` in degrees, broadcast against q and u. The inverse is the same with −`rotator`.
     """
     cos_2r, sin_2r = standard_rotation(rotator)
     return q * cos_2r + u * sin_2r, u * cos_2r - q * sin_2r

@@ -15,7 +15,7 @@ from walop_jax.data.atomic import atomic_path
 from walop_jax.data.calset import CALVERS
 from walop_jax.data.errors import fail
 from walop_jax.data.frames import COUNT_NAMES, ERROR_NAMES, Grid
-from walop_jax.data.opening import data_sum, padded
+from walop_jax.data.opening import checksum_text, data_sum, padded
 from walop_jax.data.records import CalibrationSet, FilterCurve
 from walop_jax.data.table import TableIntensities
 
@@ -145,7 +145,7 @@ def write_frames(
 
     The points of `calset` must be the pixels of `grid`, row by row; its `intensities.block` is asked for some
     image rows at a time. Pixels without a measurement get bit 2 (bad pixel) of the FLAG image. `dtype` is
-    `f4` or `f8`. The images carry the checksum of their data.
+    `f4` or `f8`. The images carry checksums too.
 
     Raises `DataError` as `write_calibration_set` does, and if points and grid differ in number.
     """
@@ -194,7 +194,7 @@ def _append_image(
             header[f"CD{n + 1}_{m + 1}"] = grid.matrix[n][m]
     if name != "FLAG":
         header["BUNIT"] = "electron"
-    header["DATASUM"] = "0".rjust(10)
+    header["CHECKSUM"], header["DATASUM"] = "0" * 16, "0".rjust(10)
     text = header.tostring().encode("ascii")
     start = path.stat().st_size
     with path.open("r+b") as stream:
@@ -205,11 +205,12 @@ def _append_image(
 
 
 def _sign_image(path: Path, start: int, cube: np.memmap[Any, Any]) -> None:
-    """Put the sum of an image's data into the card that was kept free for it."""
+    """Put the sums of an image into the cards that were kept free for them."""
     total = data_sum(path, int(cube.offset), padded(cube.nbytes))
     with path.open("r+b") as stream:
         stream.seek(start)
         header = fits.Header.fromstring(stream.read(int(cube.offset) - start).decode("ascii"))
         header["DATASUM"] = str(total).rjust(10)
+        header["CHECKSUM"] = checksum_text(header.tostring().encode("ascii"), total)
         stream.seek(start)
         stream.write(header.tostring().encode("ascii"))

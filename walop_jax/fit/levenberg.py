@@ -76,7 +76,10 @@ def _information(
 
 
 def _propose(
-    step_size: Float[Array, ""], objective: Float[Array, ""], gradient: Float[Array, " n"], matrix: Float[Array, "n n"]
+    step_size: Float[Array, ""],
+    objective: Float[Array, ""],
+    gradient: Float[Array, " n"],
+    matrix: Float[Array, "n n"],
 ) -> Float[Array, " n"]:
     info = _information(objective, gradient, matrix)
     state = _DESCENT.query(gradient, info, _DESCENT.init(gradient, info))
@@ -120,7 +123,14 @@ def minimise(
     history = [expansion.objective]
     if not np.isfinite(expansion.objective):
         return Minimum(
-            here, expansion, False, "the model is not finite at the start values", 0, np.inf, np.inf, (np.nan,)
+            here,
+            expansion,
+            False,
+            "the model is not finite at the start values",
+            0,
+            np.inf,
+            np.inf,
+            (np.nan,),
         )
     state = _SEARCH.init(jnp.zeros_like(jnp.asarray(here)), _arrays(expansion, scale))
     there, trial, first = here, expansion, True

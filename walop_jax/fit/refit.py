@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.levenberg import Minimum, minimise
+from walop_jax.fit.levenberg import MAXIMUM_STEPS, Minimum, minimise
 from walop_jax.likelihood.problem import Posterior, Problem, base_model
 from walop_jax.model import materials
 from walop_jax.model.specification import Model
@@ -20,7 +20,16 @@ Matrix = Float[np.ndarray, "n n"]
 
 SUSPECT_SIGMA = 5.0  # excess of χ² over its expectation, in its own standard deviations
 PRIOR_EDGE = 4.0  # standard deviations
+FAR_OFF = 25.0  # χ²/dof above which other orders are tried and the errors scaled
+MAXIMUM_RESCALINGS = 4
+FIRST_STEPS = 20
 Progress = Callable[[str, int, float], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Found:
+    minimum: Minimum
+    values: Vector  # of all parameters
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +72,11 @@ class FitResult:
         return self.minimum.converged
 
     @property
+    def noise_scale(self) -> float:
+        """Factor on the errors of the data under which the minimum was sought; 1 unless the model is far off."""
+        return self.posterior.noise_scale
+
+    @property
     def explains_data(self) -> bool:
         """Whether χ² is what noise alone would give."""
         return self.dof > 0 and self.excess < SUSPECT_SIGMA
@@ -92,6 +106,16 @@ def check_identifiable(problem: Problem) -> None:
         raise ValueError("a single field point: the joint fit over the field needs several points")
 
 
+def check_constrained(problem: Problem, posterior: Posterior) -> None:
+    """Raise ValueError for a free parameter that neither data nor a prior know anything of."""
+    idle = [problem.model.parameters[i].name for i in problem.model.free[np.diag(posterior.matrix) == 0.0]]
+    if idle:
+        raise ValueError(
+            f"nothing in the data depends on {', '.join(idle)}, free and without a prior: freeze "
+            f"{'it' if len(idle) == 1 else 'them'} or set a prior in the model file"
+        )
+
+
 def covariance(problem: Problem, posterior: Posterior) -> Matrix:
     """Covariance of all parameters: the inverse of JᵀJ, priors included, ties expanded."""
     scale = _scale(problem.model)
@@ -119,49 +143,58 @@ def _order_starts(problem: Problem) -> Iterator[tuple[str, Vector]]:
             yield f"{name} {sign:+d} wave", start
 
 
-def fit(
+def _search(
     problem: Problem,
-    *,
-    start: Vector | None = None,
-    scan_orders: bool = True,
-    progress: Progress | None = None,
-) -> FitResult:
-    """Fit the model of `problem` to its data.
+    label: str,
+    first: Vector,
+    noise_scale: float,
+    progress: Progress | None,
+    steps: int = MAXIMUM_STEPS,
+) -> _Found:
+    model = problem.model
+    select, origin = model.selection(), first[model.free]
+    report = None if progress is None else lambda step, chi2: progress(label, step, chi2)
 
-    From the start values of the model (or `start`, a full vector) and, when that does not explain the data by far,
-    from plates one order of retardance away. Raises ValueError when the exposures cannot determine the instrument.
+    def expand(x: Vector) -> Posterior:
+        return problem.expand(first + select @ (x - origin), noise_scale)
+
+    minimum = minimise(expand, origin, _scale(model), maximum_steps=steps, progress=report)
+    return _Found(minimum, first + select @ (minimum.x - origin))
+
+
+def fit(problem: Problem, *, start: Vector | None = None, progress: Progress | None = None) -> FitResult:
+    """Fit the model of `problem` to its data, from the start values of the model or `start` (a full vector).
+
+    A model whose χ²/dof stays above `FAR_OFF` would be bent out of all physical shape: priors mean nothing beside
+    such residuals. The errors of the data are then scaled until χ²/dof is 1, the minimum is sought again, from plates
+    one order of retardance away as well, and the result says so (`noise_scale`, `warnings`).
+    Raises ValueError when the exposures cannot determine the instrument.
     """
     began = time.perf_counter()
     check_identifiable(problem)
-    model, scale = problem.model, _scale(problem.model)
-
-    def run(label: str, first: Vector) -> Minimum:
-        report = None if progress is None else lambda step, chi2: progress(label, step, chi2)
-        base = first.copy()
-
-        def expand(x: Vector) -> Posterior:
-            return problem.expand(base + model.selection() @ (x - base[model.free]))
-
-        return minimise(expand, base[model.free], scale, progress=report)
-
-    first = model.start if start is None else np.asarray(start, float)
-    starts, best, origin = 1, run("fit", first), first
-    if scan_orders and _chi2_per_dof(best, problem) > 4.0:
+    first = problem.model.start if start is None else np.asarray(start, float)
+    found, starts = _search(problem, "fit", first, 1.0, progress, FIRST_STEPS), 1
+    if not found.minimum.converged and _raw(found, problem) < FAR_OFF:
+        found = _search(problem, "fit, continued", found.values, 1.0, progress)
+    check_constrained(problem, _expansion(found))
+    for _ in range(MAXIMUM_RESCALINGS):
+        scale = float(np.sqrt(_raw(found, problem)))
+        if scale**2 < FAR_OFF or abs(scale / _expansion(found).noise_scale - 1.0) < 0.1:
+            break
+        found = _search(problem, f"errors × {scale:.3g}", first, scale, progress)
+    if _raw(found, problem) > FAR_OFF:
         for label, other in _order_starts(problem):
-            trial = run(label, other)
+            trial = _search(problem, label, other, _expansion(found).noise_scale, progress)
             starts += 1
-            if trial.expansion.objective < best.expansion.objective:
-                best, origin = trial, other
-    values = origin + model.selection() @ (best.x - origin[model.free])
-    posterior = best.expansion
-    if not isinstance(posterior, Posterior):
-        raise TypeError("a fit needs a Posterior expansion")
+            if trial.minimum.expansion.objective < found.minimum.expansion.objective:
+                found = trial
+    posterior = _expansion(found)
     result = FitResult(
-        model=model,
-        values=values,
+        model=problem.model,
+        values=found.values,
         covariance=covariance(problem, posterior),
         posterior=posterior,
-        minimum=best,
+        minimum=found.minimum,
         n_data=problem.n_data,
         dof=problem.dof,
         starts=starts,
@@ -171,8 +204,15 @@ def fit(
     return dataclasses.replace(result, warnings=tuple(_warnings(result)))
 
 
-def _chi2_per_dof(minimum: Minimum, problem: Problem) -> float:
-    return minimum.expansion.objective / max(problem.dof, 1)
+def _raw(found: _Found, problem: Problem) -> float:
+    """χ² of the data with their errors as given, per degree of freedom."""
+    return _expansion(found).data / max(problem.dof, 1)
+
+
+def _expansion(found: _Found) -> Posterior:
+    if not isinstance(found.minimum.expansion, Posterior):
+        raise TypeError("a fit needs a Posterior expansion")
+    return found.minimum.expansion
 
 
 def _warnings(result: FitResult) -> Iterator[str]:
@@ -183,10 +223,12 @@ def _warnings(result: FitResult) -> Iterator[str]:
     elif not result.explains_data:
         yield (
             f"χ²/dof = {result.chi2 / result.dof:.4g} lies {result.excess:.3g} standard deviations above 1: the model "
-            "does not explain the data; do not trust the errors (walop-jax diagnose looks for what is missing)"
+            "does not explain the data; do not trust the calibration (walop-jax diagnose looks for what is missing)"
         )
     elif result.excess < -SUSPECT_SIGMA:
         yield f"χ²/dof = {result.chi2 / result.dof:.4g}: the stated errors N_ERR are too large (gain or units?)"
+    if result.noise_scale > 1.0:
+        yield f"the errors of the data were multiplied by {result.noise_scale:.3g} to fit at all: the model is far off"
     for i in result.model.free:
         p = result.model.parameters[i]
         if p.prior is not None and abs(result.values[i] - p.prior[0]) > PRIOR_EDGE * p.prior[1]:
@@ -194,6 +236,8 @@ def _warnings(result: FitResult) -> Iterator[str]:
             yield f"{p.name} = {result.values[i]:.6g} {p.unit} lies {pull:+.1f} prior widths from {p.prior[0]:g}"
 
 
-def refit(calset: CalibrationSet, model: Model | None = None, *, progress: Progress | None = None) -> FitResult:
+def refit(
+    calset: CalibrationSet, model: Model | None = None, *, progress: Progress | None = None
+) -> FitResult:
     """Fit a calibration set with `model` (default: the base model)."""
     return fit(Problem(calset, model or base_model(calset)), progress=progress)

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.model import legendre, light
 from walop_jax.model.compiled import compiled
@@ -54,7 +54,7 @@ class Normal(NamedTuple):
 
 
 def eliminate_flux(
-    weighted_counts: Float[Array, "e 4"], weighted_model: Float[Array, "e 4"], flux_known: Float[Array, " e"]
+    weighted_counts: Float[Array, "e 4"], weighted_model: Float[Array, "e 4"], flux_known: Bool[Array, " e"]
 ) -> tuple[Float[Array, " e"], Float[Array, "e 4"]]:
     """Best flux of every exposure and the normalised residuals data − model."""
     power = jnp.sum(weighted_model**2, axis=-1)
@@ -64,7 +64,11 @@ def eliminate_flux(
 
 
 def _point_counts(
-    instrument: Instrument, plan: Plan, rows: Float[Array, "b 2 2 4"], throughput: Float[Array, "4"], point: PointData
+    instrument: Instrument,
+    plan: Plan,
+    rows: Float[Array, "b 2 2 4"],
+    throughput: Float[Array, 4],
+    point: PointData,
 ) -> Float[Array, "e 4"]:
     return light.counts(
         instrument, plan, rows, throughput, point.x, point.y, point.sky, point.source, point.band
@@ -77,7 +81,9 @@ def _point_prediction(instrument: Instrument, plan: Plan, point: PointData) -> F
     return _point_counts(instrument, plan, rows, throughput, point)
 
 
-def _point_residuals(instrument: Instrument, plan: Plan, point: PointData) -> tuple[Float[Array, " e"], Float[Array, "e 4"]]:
+def _point_residuals(
+    instrument: Instrument, plan: Plan, point: PointData
+) -> tuple[Float[Array, " e"], Float[Array, "e 4"]]:
     model = _point_prediction(instrument, plan, point) * point.weight
     return eliminate_flux(point.counts * point.weight, model, plan.exposures.flux_known)
 
@@ -94,7 +100,9 @@ def _point_normal(
     def optics(optical_values: Vector) -> Float[Array, "b 2 2 4"]:
         return light.band_rows(to_instrument(values.at[optical].set(optical_values)), plan, point.x, point.y)
 
-    def data(rows: Float[Array, "b 2 2 4"], all_values: Vector, local: Float[Array, "4"]) -> Float[Array, "e 4"]:
+    def data(
+        rows: Float[Array, "b 2 2 4"], all_values: Vector, local: Float[Array, 4]
+    ) -> Float[Array, "e 4"]:
         return _point_counts(to_instrument(all_values), plan, rows, local, point) * point.weight
 
     rows, push_optics = jax.linearize(optics, values[optical])
@@ -136,7 +144,9 @@ def _normal_equations(instrument: Instrument, plan: Plan, data: PointData) -> No
     return Normal(chi2.sum(), g, matrix)
 
 
-def _residuals(instrument: Instrument, plan: Plan, data: PointData) -> tuple[Float[Array, "p e"], Float[Array, "p e 4"]]:
+def _residuals(
+    instrument: Instrument, plan: Plan, data: PointData
+) -> tuple[Float[Array, "p e"], Float[Array, "p e 4"]]:
     return jax.vmap(_point_residuals, in_axes=(None, None, 0))(instrument, plan, data)
 
 

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from walop_jax.data.records import Block, CalibrationSet, Exposures
 from walop_jax.data.sky import moon_sky
@@ -29,13 +29,15 @@ LARGEST_CHUNK = 2_000_000  # intensities × local quantities that a chunk may ho
 class Posterior:
     """χ² of data and priors at a point of parameter space, and its expansion there in the free parameters.
 
-    `gradient` is half the gradient of the total and `matrix` half its Gauss–Newton Hessian. `loose` is the share
-    of the weak pulls that are no prior knowledge; it is in the gradient and the matrix, not in `chi2`.
+    `gradient` is half the gradient of the total and `matrix` half its Gauss–Newton Hessian, both with the errors of
+    the data times `noise_scale`; `data` and `chi2` are with the errors as given. `loose` is the share of the weak
+    pulls that are no prior knowledge; it is in the gradient and the matrix, not in `chi2`.
     """
 
     data: float
     priors: float
     loose: float
+    noise_scale: float
     gradient: Vector
     matrix: Matrix
 
@@ -47,7 +49,7 @@ class Posterior:
     @property
     def objective(self) -> float:
         """What a fit minimises."""
-        return self.data + self.priors + self.loose
+        return self.data / self.noise_scale**2 + self.priors + self.loose
 
 
 class Problem:
@@ -87,17 +89,27 @@ class Problem:
 
     @cached_property
     def _priors(self) -> tuple[Int[np.ndarray, " k"], Vector, Vector]:
-        known = [(i, *p.prior) for i, p in enumerate(self.model.parameters) if p.prior is not None and p.tie is None]
+        known = [
+            (i, *p.prior)
+            for i, p in enumerate(self.model.parameters)
+            if p.prior is not None and p.tie is None
+        ]
         index, mean, width = zip(*known, strict=True) if known else ((), (), ())
         return np.array(index, int), np.array(mean, float), np.array(width, float)
 
     @cached_property
     def _loose(self) -> Vector:
         """Inverse squared widths of the weak pulls, per parameter."""
-        return np.array([0.0 if p.loose is None or p.prior is not None else p.loose**-2 for p in self.model.parameters])
+        return np.array(
+            [0.0 if p.loose is None or p.prior is not None else p.loose**-2 for p in self.model.parameters]
+        )
 
-    def expand(self, values: Vector) -> Posterior:
-        """χ² and its quadratic expansion at a full vector of parameter values."""
+    def expand(self, values: Vector, noise_scale: float = 1.0) -> Posterior:
+        """χ² and its quadratic expansion at a full vector of parameter values.
+
+        `noise_scale` multiplies the errors of the data (not the priors'): above 1 it stands for what the model
+        cannot explain.
+        """
         instrument = self.model.instrument(values)
         data, gradient, matrix = 0.0, np.zeros(len(values)), np.zeros((len(values), len(values)))
         for chunk in self.chunks:
@@ -105,6 +117,7 @@ class Problem:
             data += float(part.chi2)
             gradient += np.asarray(part.gradient)
             matrix += np.asarray(part.matrix)
+        gradient, matrix = gradient / noise_scale**2, matrix / noise_scale**2
         index, mean, width = self._priors
         pull = (values[index] - mean) / width
         gradient[index] += pull / width
@@ -117,6 +130,7 @@ class Problem:
             data=data,
             priors=float(pull @ pull),
             loose=float(self._loose @ away**2),
+            noise_scale=noise_scale,
             gradient=select.T @ gradient,
             matrix=select.T @ matrix @ select,
         )
@@ -132,7 +146,7 @@ class Problem:
     # ------------------------------------------------------------------------------------------- counting
 
     @cached_property
-    def used(self) -> Float[np.ndarray, "p e"]:
+    def used(self) -> Bool[np.ndarray, "p e"]:
         """True where the four intensities of a (point, exposure) are used."""
         used = np.concatenate([np.asarray(chunk.weight[..., 0] > 0) for chunk in self.chunks])
         return used[: len(self.calset.points)]
@@ -232,6 +246,8 @@ def base_model(calset: CalibrationSet, *, plates: str = "waves", throughput_degr
             model = model.change(name, scale=p.scale * level / 0.5, loose=level)
     if not has_known_flux(calset):
         model = model.change("throughput.n0.p00", free=False)
+    if not ((calset.exposures.kind == "moon") & ~calset.exposures.clp_in).any():
+        model = model.change("sky.depolarisation", free=False)
     return model
 
 

@@ -73,7 +73,9 @@ class Pupil(Component):
     magnification: Scalar = param(
         unit="", about="field-to-pupil magnification", source=CONTRACT, width=0.05, optical=True
     )
-    distortion: Scalar = param(unit="deg-2", about="cubic distortion", source=CONTRACT, width=0.01, optical=True)
+    distortion: Scalar = param(
+        unit="deg-2", about="cubic distortion", source=CONTRACT, width=0.01, optical=True
+    )
 
 
 class Half(Component):
@@ -81,7 +83,9 @@ class Half(Component):
 
     wedge: Scalar = param(unit="rad", about="wedge angle", source=CONTRACT, width=0.001, optical=True)
     plate: HalfWavePlate
-    efficiency: Scalar = param(unit="", about="η of the analysers ½(1, ±η, 0, 0)", source=CONTRACT, width=0.0003)
+    efficiency: Scalar = param(
+        unit="", about="η of the analysers ½(1, ±η, 0, 0)", source=CONTRACT, width=0.0003
+    )
     fast_axis: float = eqx.field(static=True, default=0.0)
 
 

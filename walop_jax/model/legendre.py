@@ -17,14 +17,14 @@ def terms(degree: int) -> tuple[tuple[int, int], ...]:
     return tuple((n - j, j) for n in range(degree + 1) for j in range(n + 1))
 
 
-def _one_dimension(t: Float[Array, "..."], degree: int) -> list[Float[Array, "..."]]:
+def _one_dimension(t: Float[Array, ...], degree: int) -> list[Float[Array, ...]]:
     values = [jnp.ones_like(t), t]
     for k in range(1, degree):
         values.append(((2 * k + 1) * t * values[k] - k * values[k - 1]) / (k + 1))
     return values
 
 
-def basis(x: Float[Array, "..."], y: Float[Array, "..."], degree: int) -> Float[Array, "... t"]:
+def basis(x: Float[Array, ...], y: Float[Array, ...], degree: int) -> Float[Array, "... t"]:
     """Values of all terms at field positions in degrees."""
     px, py = _one_dimension(x / FIELD_SCALE, degree), _one_dimension(y / FIELD_SCALE, degree)
     return jnp.stack([px[i] * py[j] for i, j in terms(degree)], axis=-1)

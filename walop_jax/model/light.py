@@ -56,7 +56,12 @@ def _stack(
     axis = jnp.full_like(wavelength, jnp.deg2rad(fast_axis))
     stack: tuple[Plate, ...] = (
         Plate(plate.quartz, materials.QUARTZ_O.index(wavelength), materials.QUARTZ_E.index(wavelength), axis),
-        Plate(plate.mgf2, materials.MGF2_O.index(wavelength), materials.MGF2_E.index(wavelength), axis + 0.5 * jnp.pi),
+        Plate(
+            plate.mgf2,
+            materials.MGF2_O.index(wavelength),
+            materials.MGF2_E.index(wavelength),
+            axis + 0.5 * jnp.pi,
+        ),
     )
     for effect in instrument.effects:
         stack = effect.plates(where, stack, plan.conditions)
@@ -70,7 +75,9 @@ def calibration_angle(instrument: Instrument, angle: float | None) -> float | No
     return angle
 
 
-def plate_matrices(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> dict[float | str, Float[Array, "n 4 4"]]:
+def plate_matrices(
+    instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
+) -> dict[float | str, Float[Array, "n 4 4"]]:
     """Mueller matrices of all half-wave plates at every node of a field point.
 
     Keys: "half1" and "half2" behind their wedges, and each angle (deg) of the calibration plate. All of them are
@@ -155,14 +162,14 @@ def upstream(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, "4 4"
     return matrix
 
 
-def throughput_at(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, "4"]:
+def throughput_at(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, 4]:
     """Throughput of the four cameras at a field point."""
     series = instrument.throughput
     return series.coefficients @ legendre.basis(x, y, series.degree)
 
 
 def camera_vectors(
-    instrument: Instrument, rows: Float[Array, "b 2 2 4"], throughput: Float[Array, "4"], x: Scalar, y: Scalar
+    instrument: Instrument, rows: Float[Array, "b 2 2 4"], throughput: Float[Array, 4], x: Scalar, y: Scalar
 ) -> Float[Array, "b 4 4"]:
     """Analysis vectors (band, camera, Stokes): counts = vector · Stokes for light of unit flux."""
     for effect in instrument.effects:
@@ -210,7 +217,7 @@ def counts(
     instrument: Instrument,
     plan: Plan,
     rows: Float[Array, "b 2 2 4"],
-    throughput: Float[Array, "4"],
+    throughput: Float[Array, 4],
     x: Scalar,
     y: Scalar,
     sky: Float[Array, "e 2"],

@@ -24,7 +24,7 @@ class Sellmeier(NamedTuple):
     strength: tuple[float, ...]
     pole: tuple[float, ...]
 
-    def index(self, wavelength: Float[Array, "..."]) -> Float[Array, "..."]:
+    def index(self, wavelength: Float[Array, ...]) -> Float[Array, ...]:
         """Refractive index at `wavelength` (µm)."""
         square = wavelength**2
         terms = sum(b * square / (square - c) for b, c in zip(self.strength, self.pole, strict=True))
@@ -35,9 +35,7 @@ def _formula_1(strength: tuple[float, ...], root_of_pole: tuple[float, ...]) -> 
     return Sellmeier(1.0, strength, tuple(c**2 for c in root_of_pole))
 
 
-BK7 = Sellmeier(
-    1.0, (1.03961212, 0.231792344, 1.01046945), (0.00600069867, 0.0200179144, 103.560653)
-)
+BK7 = Sellmeier(1.0, (1.03961212, 0.231792344, 1.01046945), (0.00600069867, 0.0200179144, 103.560653))
 QUARTZ_O = Sellmeier(1.28604141, (1.07044083, 1.10202242), (0.0100585997, 100.0))
 QUARTZ_E = Sellmeier(1.28851804, (1.09509924, 1.15662475), (0.0102101864, 100.0))
 MGF2_O = _formula_1((0.48755108, 0.39875031, 2.3120353), (0.04338408, 0.09461442, 23.793604))

@@ -18,10 +18,10 @@ Scalar = Float[Array, "..."]
 class Matrix2(NamedTuple):
     """The 2 × 2 matrix ((a, b), (c, d)) at every element of the arrays a, b, c, d (real or complex)."""
 
-    a: Inexact[Array, "..."]
-    b: Inexact[Array, "..."]
-    c: Inexact[Array, "..."]
-    d: Inexact[Array, "..."]
+    a: Inexact[Array, ...]
+    b: Inexact[Array, ...]
+    c: Inexact[Array, ...]
+    d: Inexact[Array, ...]
 
     def __matmul__(self, other: Matrix2) -> Matrix2:
         return Matrix2(
@@ -38,13 +38,15 @@ class Matrix2(NamedTuple):
     def inverse(self) -> Matrix2:
         """Inverse matrix."""
         determinant = self.a * self.d - self.b * self.c
-        return Matrix2(self.d / determinant, -self.b / determinant, -self.c / determinant, self.a / determinant)
+        return Matrix2(
+            self.d / determinant, -self.b / determinant, -self.c / determinant, self.a / determinant
+        )
 
-    def scaled_rows(self, first: Inexact[Array, "..."], second: Inexact[Array, "..."]) -> Matrix2:
+    def scaled_rows(self, first: Inexact[Array, ...], second: Inexact[Array, ...]) -> Matrix2:
         """The matrix diag(first, second) times this one."""
         return Matrix2(first * self.a, first * self.b, second * self.c, second * self.d)
 
-    def times(self, factor: Inexact[Array, "..."] | float) -> Matrix2:
+    def times(self, factor: Inexact[Array, ...] | float) -> Matrix2:
         """Every element times a scalar."""
         return Matrix2(factor * self.a, factor * self.b, factor * self.c, factor * self.d)
 
@@ -57,7 +59,7 @@ def from_jones(jones: Matrix2) -> Float[Array, "... 4 4"]:
     """
     a, b, c, d = jones
 
-    def power(z: Inexact[Array, "..."]) -> Scalar:
+    def power(z: Inexact[Array, ...]) -> Scalar:
         return z.real**2 + z.imag**2
 
     aa, bb, cc, dd = power(a), power(b), power(c), power(d)

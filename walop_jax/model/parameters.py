@@ -7,7 +7,8 @@ the unit of the declaration (the unit of the contract, e.g. µm or deg), convers
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+import difflib
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -53,6 +54,14 @@ def param(
     return eqx.field(metadata={KEY: declaration}, converter=jnp.asarray, **extra)
 
 
+def unknown_name(what: str, name: str, known: Iterable[str]) -> ValueError:
+    """The error for a name that does not exist, with the nearest ones that do."""
+    known = list(known)
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+    hint = f"nearest: {', '.join(near)}" if near else f"known: {', '.join(sorted(known)[:12])}"
+    return ValueError(f"unknown {what} {name!r}; {hint}")
+
+
 @dataclasses.dataclass(frozen=True)
 class Leaf:
     """One number of the tree: its name, its declaration and the name of the module class that holds it."""
@@ -79,7 +88,9 @@ def _walk(component: Component, prefix: str) -> Iterator[Leaf]:
         if declaration is not None:
             labels = component.labels(field.name)
             if len(labels) != np.size(value):
-                raise ValueError(f"{type(component).__name__}.{field.name}: {len(labels)} labels, {np.size(value)} values")
+                raise ValueError(
+                    f"{type(component).__name__}.{field.name}: {len(labels)} labels, {np.size(value)} values"
+                )
             for label in labels:
                 yield Leaf(f"{prefix}{label}", declaration, type(component).__name__)
         elif isinstance(value, tuple):

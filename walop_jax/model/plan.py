@@ -120,7 +120,9 @@ def build_plan(
         weight[i, first : first + len(rules[name][1])] = rules[name][1]
 
     def per_node(values: list[float]) -> Float[Array, " n"]:
-        return jnp.asarray(np.concatenate([np.full(len(rules[g[0]][0]), v) for g, v in zip(groups, values, strict=True)]))
+        return jnp.asarray(
+            np.concatenate([np.full(len(rules[g[0]][0]), v) for g, v in zip(groups, values, strict=True)])
+        )
 
     settings = []
     values = [key[0] for key in bands]

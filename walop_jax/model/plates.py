@@ -105,9 +105,7 @@ def stack_jones(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real)
     return _face(medium, outside) @ jones
 
 
-def stack_mueller(
-    sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real
-) -> Float[Array, "... 4 4"]:
+def stack_mueller(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real) -> Float[Array, "... 4 4"]:
     """Mueller matrix of plates in contact, in air (see `stack_jones`)."""
     return from_jones(stack_jones(sx, sy, plates, wavelength))
 

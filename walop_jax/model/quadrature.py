@@ -20,9 +20,10 @@ WAVES = 36.0  # of one plate at 0.62 µm: (n_e − n_o) d / λ
 MAXIMUM_NODES = 200
 
 Vector = Float[np.ndarray, " n"]
+Rule = tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]
 
 
-def tabulated_measure(wavelength: Vector, throughput: Vector) -> tuple[Vector, Vector]:
+def tabulated_measure(wavelength: Vector, throughput: Vector) -> Rule:
     """Nodes and weights of the trapezium rule over a tabulated curve, refined to 0.5 nm; weights sum to 1."""
     if len(wavelength) == 1:
         return wavelength, np.ones(1)
@@ -38,7 +39,7 @@ def tabulated_measure(wavelength: Vector, throughput: Vector) -> tuple[Vector, V
     return fine[inside], weight[inside] / weight[inside].sum()
 
 
-def gauss_rule(node: Vector, weight: Vector, count: int) -> tuple[Vector, Vector]:
+def gauss_rule(node: Vector, weight: Vector, count: int) -> Rule:
     """Gauss rule with `count` nodes for a discrete measure whose weights sum to 1."""
     if count >= len(node):
         return node, weight
@@ -61,7 +62,13 @@ def gauss_rule(node: Vector, weight: Vector, count: int) -> tuple[Vector, Vector
     return centre + half * value, columns[0] ** 2
 
 
-def _fringe_error(node: Vector, weight: Vector, fine: Vector, fine_weight: Vector, waves: float) -> float:
+def _fringe_error(
+    node: Vector,
+    weight: Vector,
+    fine: Float[np.ndarray, " f"],
+    fine_weight: Float[np.ndarray, " f"],
+    waves: float,
+) -> float:
     # Phase of a plate of fixed birefringence, 2π waves · 0.62/λ, at a range of thicknesses.
     thickness = 2j * np.pi * 0.62 * waves * np.linspace(0.3, 1.0, 8)[:, None]
     rule = np.exp(thickness / node) @ weight
@@ -69,7 +76,7 @@ def _fringe_error(node: Vector, weight: Vector, fine: Vector, fine_weight: Vecto
     return float(np.abs(rule - exact).max())
 
 
-def band_rule(wavelength: Vector, throughput: Vector, tolerance: float = 1e-7) -> tuple[Vector, Vector]:
+def band_rule(wavelength: Vector, throughput: Vector, tolerance: float = 1e-7) -> Rule:
     """Fewest wavelength nodes (µm) and weights (sum 1) that integrate plate fringes to `tolerance`.
 
     Fringes at twice the plates' frequency carry a hundred times less light and are held to a hundred times the
@@ -86,4 +93,3 @@ def band_rule(wavelength: Vector, throughput: Vector, tolerance: float = 1e-7) -
         ):
             return node, weight
     return fine, fine_weight
-

@@ -6,8 +6,7 @@ Three things of one shape: values, freedom and priors. Names come from the tree 
 from __future__ import annotations
 
 import dataclasses
-import difflib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -18,7 +17,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import leaves
+from walop_jax.model.parameters import leaves, unknown_name
 
 Vector = Float[np.ndarray, " n"]
 
@@ -43,14 +42,6 @@ class Parameter:
     tie: str | None = None
 
 
-def unknown_name(what: str, name: str, known: Iterable[str]) -> ValueError:
-    """The error for a name that does not exist, with the nearest ones that do."""
-    known = list(known)
-    near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
-    hint = f"nearest: {', '.join(near)}" if near else f"known: {', '.join(sorted(known)[:12])}"
-    return ValueError(f"unknown {what} {name!r}; {hint}")
-
-
 @dataclasses.dataclass(frozen=True)
 class Model:
     """An instrument with what may vary in it. Immutable: every change returns a new model."""
@@ -65,11 +56,17 @@ class Model:
             if not np.isfinite(p.start):
                 raise ValueError(f"parameter {p.name}: start value {p.start} is not finite")
             if p.prior is not None and not (np.isfinite(p.prior[0]) and p.prior[1] > 0):
-                raise ValueError(f"parameter {p.name}: prior {p.prior} needs a finite mean and a width above 0")
+                raise ValueError(
+                    f"parameter {p.name}: prior {p.prior} needs a finite mean and a width above 0"
+                )
             if not p.scale > 0:
                 raise ValueError(f"parameter {p.name}: scale {p.scale} must be above 0")
-            if p.tie is not None and (p.tie not in names or self.parameters[names.index(p.tie)].tie is not None):
-                raise ValueError(f"parameter {p.name}: tied to {p.tie!r}, which does not exist or is itself tied")
+            if p.tie is not None and (
+                p.tie not in names or self.parameters[names.index(p.tie)].tie is not None
+            ):
+                raise ValueError(
+                    f"parameter {p.name}: tied to {p.tie!r}, which does not exist or is itself tied"
+                )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -90,7 +87,9 @@ class Model:
         """The model with fields of one parameter replaced."""
         i = self.index(name)
         changed = dataclasses.replace(self.parameters[i], **changes)
-        return dataclasses.replace(self, parameters=(*self.parameters[:i], changed, *self.parameters[i + 1 :]))
+        return dataclasses.replace(
+            self, parameters=(*self.parameters[:i], changed, *self.parameters[i + 1 :])
+        )
 
     def started_at(self, values: Vector) -> Model:
         """The model with all start values replaced (full vector, tree order)."""
@@ -179,4 +178,8 @@ def make_model(
     names = [p.name for p in parameters]
     for missing in [*priors, *(f for f in frozen if f not in names)]:
         raise unknown_name("parameter", missing, names)
-    return Model(name=name, template=jax.tree.map(jnp.asarray, eqx.filter(instrument, eqx.is_array)), parameters=tuple(parameters))
+    return Model(
+        name=name,
+        template=jax.tree.map(jnp.asarray, eqx.filter(instrument, eqx.is_array)),
+        parameters=tuple(parameters),
+    )

@@ -1,0 +1,120 @@
+"""Small pieces that tests of the model and the likelihood are built from; none of them computes light."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from oracle import forward
+from walop_jax.data.records import Exposures, FilterCurve
+from walop_jax.model import light
+from walop_jax.model.compiled import compiled
+from walop_jax.model.instrument import Instrument, nominal_instrument
+from walop_jax.model.parameters import leaves
+from walop_jax.model.plan import Plan, build_plan
+from walop_jax.model.specification import full_values, unravel
+
+NAN = float("nan")
+_BLANK: dict[str, Any] = {
+    "kind": "clp", "mjd": 61043.85, "exptime": 30.0, "filter": "band", "clp_in": False, "clp_angle": NAN,
+    "chwp_in": False, "chwp_angle": NAN, "temp": 10.0, "ha": 0.0, "ra": NAN, "dec": NAN, "rotator": NAN, "teff": NAN,
+}  # fmt: skip
+
+# Names of the oracle for the parameters of the package.
+ORACLE_NAMES = {
+    "sky.depolarisation": "delta",
+    "collimator.diattenuation": "coll",
+    "collimator.q": "coll_q",
+    "collimator.u": "coll_u",
+    "chwp.quartz": "quartz_c",
+    "chwp.mgf2": "mgf2_c",
+    "pupil.magnification": "magnification",
+    "pupil.distortion": "distortion",
+    **{
+        f"half{half}.{ours}": f"{theirs}_{half}"
+        for half in (1, 2)
+        for ours, theirs in (
+            ("wedge", "wedge"), ("plate.quartz", "quartz"), ("plate.mgf2", "mgf2"), ("efficiency", "eta")
+        )
+    },
+}  # fmt: skip
+
+
+def exposures(*rows: dict[str, Any]) -> Exposures:
+    """Exposures from what differs from a blank one; an angle puts its element into the beam."""
+    full = []
+    for row in rows:
+        inside = {f"{what}_in": f"{what}_angle" in row for what in ("clp", "chwp")}
+        full.append(_BLANK | inside | row)
+    return Exposures(
+        exposure=np.arange(len(rows)), **{key: np.array([row[key] for row in full]) for key in _BLANK}
+    )
+
+
+def curve(wavelength: Sequence[float], throughput: Sequence[float]) -> FilterCurve:
+    return FilterCurve("band", np.asarray(wavelength, float), np.asarray(throughput, float))
+
+
+def monochromatic(wavelength: float) -> FilterCurve:
+    return curve([wavelength], [1.0])
+
+
+def broad_band() -> FilterCurve:
+    """A super-Gaussian r band tabulated every 0.5 nm, 461 rows."""
+    wavelength = np.linspace(0.505, 0.735, 461)
+    return curve(wavelength, np.exp(-(((wavelength - 0.62) / 0.062) ** 8)))
+
+
+def setting_plan(filter_curve: FilterCurve, settings: Sequence[float | None] = (None,), teff: float = NAN) -> Plan:
+    """A plan with one band per setting (deg, or None: out) of the calibration plate, in the order given."""
+    rows = [{"teff": teff} | ({} if s is None else {"chwp_angle": s}) for s in settings]
+    plan = build_plan(exposures(*rows), {"band": filter_curve})
+    assert [s for s, _, _ in plan.settings] == list(settings)
+    return plan
+
+
+def as_built(instrument: Instrument, rng: np.random.Generator, sigmas: float = 1.0) -> Instrument:
+    """An instrument whose numbers scatter around the nominal ones by their prior widths (or solver scales)."""
+    values = full_values(instrument)
+    width = [leaf.declaration.width or leaf.declaration.scale for leaf in leaves(instrument)]
+    return unravel(instrument)(jnp.asarray(values + sigmas * np.array(width) * rng.standard_normal(values.size)))
+
+
+def south(rng: np.random.Generator | None = None, **options: Any) -> Instrument:
+    instrument = nominal_instrument("WALOP-SOUTH", **options)
+    return instrument if rng is None else as_built(instrument, rng)
+
+
+def field(rng: np.random.Generator, count: int, edge: float = 0.29) -> tuple[np.ndarray, np.ndarray]:
+    return rng.uniform(-edge, edge, count), rng.uniform(-edge, edge, count)
+
+
+def oracle_params(instrument: Instrument) -> dict[str, Any]:
+    """The same instrument in the words of the oracle."""
+    values = dict(zip((leaf.name for leaf in leaves(instrument)), full_values(instrument), strict=True))
+    params = {theirs: float(values[ours]) for ours, theirs in ORACLE_NAMES.items()}
+    params["throughput"] = np.array(
+        [[values[f"throughput.n{k}.p{i}{j}"] for i, j in forward.TERMS] for k in range(4)]
+    )
+    return params | {"q": np.asarray(instrument.standard.q), "u": np.asarray(instrument.standard.u)}
+
+
+def _vectors(instrument: Instrument, plan: Plan, x: jax.Array, y: jax.Array) -> jax.Array:
+    def one(px: jax.Array, py: jax.Array) -> jax.Array:
+        rows = light.band_rows(instrument, plan, px, py)
+        return light.camera_vectors(instrument, rows, light.throughput_at(instrument, px, py), px, py)
+
+    return jax.vmap(one)(x, y)
+
+
+_compiled_vectors = compiled(_vectors)
+
+
+def vectors(instrument: Instrument, plan: Plan, x: Any, y: Any) -> np.ndarray:
+    """Analysis vectors (point, band, camera, Stokes) of the package."""
+    x, y = (np.atleast_1d(np.asarray(v, float)) for v in (x, y))
+    return np.asarray(_compiled_vectors(instrument, plan, jnp.asarray(x), jnp.asarray(y)))

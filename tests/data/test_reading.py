@@ -1,0 +1,250 @@
+"""What a good file becomes: native arrays in the record's units, odd things remarked on."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from walop_jax.data import DataError, TableIntensities, read_calibration_set
+
+NAN = float("nan")
+
+
+def test_good_set(handmade):
+    path = handmade.write()
+    calset = read_calibration_set(path)
+    assert (calset.instrument, calset.origin) == ("WALOP-SOUTH", "by hand")
+    assert calset.site.longitude == 20.8107
+    assert calset.exposures.kind.tolist() == ["clp"] * 5 + ["flux", "moon", "standard"]
+    assert calset.exposures.exposure.tolist() == list(range(10, 18))
+    assert set(calset.filters) == {"NARROW", "SDSS-r"}
+    assert calset.filters["NARROW"].wavelength.tolist() == [0.57, 0.58, 0.59]
+    assert calset.remarks == ()
+    assert calset.inputs[0].sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert calset.intensities.rows == 24
+    block = calset.intensities.block(1, 3)
+    assert block.counts.shape == (2, 8, 4)
+    # exposure 16 (row 6) at point 7 (row 2 of the points, row 1 of the block), by the formula of the fixture
+    assert block.counts[1, 6].tolist() == [106200.0, 106210.0, 106220.0, 106230.0]
+    assert block.source[:, 6:].tolist() == [[-1, 0], [-1, 0]]  # SOURCE 3 is row 0
+
+
+def test_everything_is_native(handmade):
+    calset = read_calibration_set(handmade.write())
+    for record in (calset.exposures, calset.points, calset.sources, calset.intensities.block(0, 3)):
+        for name in record.__dataclass_fields__:
+            array = getattr(record, name)
+            assert array.dtype.isnative
+            assert array.dtype.kind in "iUb" or array.dtype == np.float64
+
+
+def test_units_are_converted(handmade):
+    plain = read_calibration_set(handmade.write("plain.fits"))
+    for table, column, unit, factor in [
+        ("POINTS", "X", "arcmin", 60.0),
+        ("EXPOSURES", "CLP_ANGLE", "rad", np.pi / 180),
+        ("EXPOSURES", "EXPTIME", "min", 1 / 60),
+        ("EXPOSURES", "HA", "deg", 15.0),
+        ("FILTERS", "WAVELENGTH", "nm", 1000.0),
+        ("SOURCES", "Q", "%", 100.0),
+    ]:
+        entry = handmade[table][column]
+        entry[1], entry[2] = unit, entry[2] * factor
+    handmade["EXPOSURES"]["TEMP"][1:] = ["K", np.full(8, 283.15)]
+    other = read_calibration_set(handmade.write())
+    np.testing.assert_allclose(other.points.x, plain.points.x, rtol=1e-15)
+    for name in ("clp_angle", "exptime", "ha", "temp"):
+        one, two = getattr(plain.exposures, name), getattr(other.exposures, name)
+        np.testing.assert_allclose(two, one, rtol=1e-5 if name == "temp" else 1e-7)  # float32 columns
+    np.testing.assert_allclose(other.filters["NARROW"].wavelength, [0.57, 0.58, 0.59], rtol=1e-14)
+    np.testing.assert_allclose(other.sources.q, plain.sources.q, rtol=1e-14)
+
+
+def test_a_missing_unit_is_the_usual_one(handmade):
+    plain = read_calibration_set(handmade.write("plain.fits"))
+    for table in handmade.tables.values():
+        for entry in table.values():
+            entry[1] = None
+    other = read_calibration_set(handmade.write())
+    np.testing.assert_array_equal(other.points.x, plain.points.x)
+    assert other.remarks == ()
+
+
+def test_columns_go_by_name_not_by_place_or_case(handmade):
+    plain = read_calibration_set(handmade.write("plain.fits"))
+    handmade.tables["INTENSITIES"] = {
+        name.lower(): entry for name, entry in reversed(handmade["INTENSITIES"].items())
+    }
+    other = read_calibration_set(handmade.write())
+    one, two = plain.intensities.block(0, 3), other.intensities.block(0, 3)
+    np.testing.assert_array_equal(one.counts, two.counts)
+    np.testing.assert_array_equal(one.source, two.source)
+
+
+def test_optional_columns_may_be_absent(handmade):
+    for name in ("TEFF", "TEMP", "HA", "EXPTIME", "CHWP_IN", "CHWP_ANGLE", "FILTER"):
+        del handmade["EXPOSURES"][name]
+    del handmade["INTENSITIES"]["FLAG"]
+    calset = read_calibration_set(handmade.write())
+    assert np.all(np.isnan(calset.exposures.teff))
+    assert not np.any(calset.exposures.chwp_in)
+    assert set(calset.exposures.filter.tolist()) == {"SDSS-r"}
+    assert len(calset.remarks) == 8
+    assert any("[EXPOSURES] TEFF: no such column" in remark for remark in calset.remarks)
+
+
+def test_unknown_columns_and_extensions_are_remarked_on(handmade):
+    handmade["POINTS"]["XX"] = ["D", "deg", np.zeros(3)]
+    path = handmade.folder / "set.fits"
+    fits.HDUList([*handmade.hdus(), fits.ImageHDU(np.zeros((2, 2)), name="PREVIEW")]).writeto(path)
+    calset = read_calibration_set(path)
+    assert len(calset.remarks) == 2
+    assert "[PREVIEW]: unknown extension" in calset.remarks[0]
+    assert "[POINTS] XX: unknown column, not used (did you mean 'X'?)" in calset.remarks[1]
+
+
+def test_flagged_and_spoilt_rows_are_not_used(handmade):
+    handmade.values("INTENSITIES", "FLAG")[4] = 3
+    handmade.values("INTENSITIES", "N_ERR")[4] = 0.0  # nobody gives errors of flagged rows
+    handmade.values("INTENSITIES", "N")[5, 2] = NAN
+    handmade.values("INTENSITIES", "N_ERR")[6, 0] = np.inf
+    handmade.values("INTENSITIES", "N")[8, 0] = -1e4  # far below what noise explains
+    calset = read_calibration_set(handmade.write())
+    block = calset.intensities.block(0, 3)
+    assert calset.intensities.rows == 20
+    assert np.argwhere(~block.used.T).tolist() == [[1, 1], [1, 2], [2, 0], [2, 2]]
+    assert np.all(block.counts[~block.used] == 0.0)
+    assert np.all(block.sigma[~block.used] == 1.0)
+    assert len(calset.remarks) == 2
+    assert "rows 5, 6, 8 (counted from 0), not used" in calset.remarks[0]
+    assert "FLAG: set in 1 of 24 rows" in calset.remarks[1]
+
+
+def test_slightly_negative_counts_are_kept(handmade):
+    handmade.values("INTENSITIES", "N")[8] = [-30.0, 20.0, 5.0, 0.0]
+    handmade.values("INTENSITIES", "N_ERR")[8] = 30.0
+    calset = read_calibration_set(handmade.write())
+    assert calset.intensities.rows == 24
+
+
+def test_an_exposure_without_data_is_remarked_on(handmade):
+    handmade.values("INTENSITIES", "FLAG")[3:6] = 1
+    calset = read_calibration_set(handmade.write())
+    assert any("no used row for exposure(s) 11" in remark for remark in calset.remarks)
+
+
+def test_plates_out_of_the_beam_have_no_angle(handmade):
+    handmade.values("EXPOSURES", "CLP_ANGLE")[6] = 12.0
+    calset = read_calibration_set(handmade.write())
+    assert np.isnan(calset.exposures.clp_angle[6])
+
+
+@pytest.mark.parametrize(
+    "angles",
+    [np.arange(5.0), 0.5 * np.arange(5), 1.25 * np.arange(5), np.array([0.1, 36.2, 72.3, 108.4, 144.5])],
+)
+def test_small_polariser_angles_in_degrees_are_believed(handmade, angles):
+    handmade.values("EXPOSURES", "CLP_ANGLE")[:5] = angles
+    assert read_calibration_set(handmade.write()).exposures.clp_angle[:5].tolist() == angles.tolist()
+
+
+def test_the_bench_has_other_limits(handmade):
+    handmade.values("POINTS", "X")[:] = [0.0, 12.0, 20.0]
+    handmade.header["INSTRUME"] = "WALOP-LAB"
+    assert read_calibration_set(handmade.write()).points.x.tolist() == [0.0, 12.0, 20.0]
+    handmade.values("POINTS", "X")[2] = 60.0
+    with pytest.raises(DataError, match=r"\[POINTS\] X: lies outside ±45° of WALOP-LAB in row 2"):
+        read_calibration_set(handmade.write())
+
+
+def test_only_the_moon_needs_a_site(handmade):
+    for name in ("SITELAT", "SITELONG", "SITEELEV"):
+        del handmade.header[name]
+    handmade.values("EXPOSURES", "KIND")[6] = "flux"
+    assert np.isnan(read_calibration_set(handmade.write()).site.latitude)
+
+
+def test_a_file_overrides_a_builtin_filter(handmade):
+    handmade.values("FILTERS", "FILTER")[0] = "SDSS-r"
+    handmade.values("EXPOSURES", "FILTER")[:] = "SDSS-r"
+    calset = read_calibration_set(handmade.write())
+    assert calset.filters["SDSS-r"].wavelength.tolist() == [0.57, 0.58, 0.59]
+
+
+def test_a_copied_exposure_is_used_once(handmade):
+    made = handmade["EXPOSURES"]
+    for name, entry in made.items():
+        if name != "EXPOSURE":
+            entry[2][1] = entry[2][0]
+    counts, errors = (handmade.values("INTENSITIES", name) for name in ("N", "N_ERR"))
+    similar = read_calibration_set(handmade.write())
+    assert similar.intensities.rows == 24
+    assert "exposures 10 and 11 have the same time and settings" in similar.remarks[0]
+    counts[3:6], errors[3:6] = counts[:3], errors[:3]
+    calset = read_calibration_set(handmade.write())
+    assert calset.intensities.rows == 21
+    assert any("exposures 10 and 11 are the same to the last bit" in remark for remark in calset.remarks)
+
+
+# ---- several files ----
+
+
+def test_merging(handmade):
+    one = handmade.write("one.fits")
+    other = handmade.copy()
+    other.values("POINTS", "X")[1] = 0.05  # the other two points are the same places
+    other.values("POINTS", "POINT")[:] = [6, 5, 7]
+    table = other.values("INTENSITIES", "POINT")
+    table[:] = np.array([6, 5, 7] * 8)
+    other.values("SOURCES", "SOURCE")[:] = [4, 3]  # the same stars under other numbers
+    other.values("INTENSITIES", "SOURCE")[21:] = 4
+    other.values("EXPOSURES", "MJD")[:] += 1.0
+    two = other.write("two.fits")
+    calset = read_calibration_set(one, two)
+    assert len(calset.exposures) == 16
+    assert len(np.unique(calset.exposures.exposure)) == 16
+    assert len(calset.points) == 4
+    assert len(np.unique(calset.points.point)) == 4
+    assert calset.sources.name.tolist() == ["BD+25", "HD 1"]
+    assert calset.intensities.rows == 48
+    assert [entry.path for entry in calset.inputs] == [one, two]
+    assert any("raised by 8" in remark for remark in calset.remarks)
+
+    block = calset.intensities.block(0, 4)
+    a = read_calibration_set(one).intensities.block(0, 3)
+    b = read_calibration_set(two).intensities.block(0, 3)
+    np.testing.assert_array_equal(block.counts[:3, :8], a.counts)
+    np.testing.assert_array_equal(block.counts[[0, 3, 2], 8:], b.counts)
+    assert not np.any(block.used[3, :8])
+    assert not np.any(block.used[1, 8:])
+    assert np.all(block.source[[0, 3, 2], 15] == 0)
+
+
+def test_merging_refuses_what_does_not_fit(handmade):
+    one = handmade.write("one.fits")
+    for change, fragment in [
+        (lambda made: made.header.update(INSTRUME="WALOP-NORTH"), "is WALOP-NORTH"),
+        (lambda made: made.header.update(SITELAT=35.0), "is another site"),
+        (lambda made: made.values("SOURCES", "Q").__setitem__(0, 0.5), "'BD\\+25' has other values"),
+        (
+            lambda made: made.values("FILTERS", "THROUGHPUT").__setitem__((0, 0), 0.5),
+            "'NARROW' is another curve",
+        ),
+    ]:
+        other = handmade.copy()
+        change(other)
+        with pytest.raises(DataError, match=fragment):
+            read_calibration_set(one, other.write("two.fits"))
+
+
+def test_blocks_are_slices(handmade):
+    intensities = read_calibration_set(handmade.write()).intensities
+    assert isinstance(intensities, TableIntensities)
+    whole = intensities.block(0, 3)
+    for start, stop in [(0, 1), (1, 1), (1, 3), (2, 99), (3, 5)]:
+        part = intensities.block(start, stop)
+        for name in whole.__dataclass_fields__:
+            np.testing.assert_array_equal(getattr(part, name), getattr(whole, name)[start:stop])

@@ -1,0 +1,119 @@
+"""Where model and data disagree: χ² per intensity by camera, exposure kind, filter and wavelength, and what the
+disagreement would be in the elements of the instrument matrix.
+
+A residual of the light through the polariser is, at each field point and setting, expanded as
+Δq_m = Δm21 + Δm22 q + Δm23 u (and Δu_m likewise) by least squares over the polariser angles; the rms over the
+field is in the unit of the matrix, so it can be compared with the 0.1 % goal.
+"""  # fmt: skip
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.likelihood.problem import Problem
+from walop_jax.model.conventions import CAMERA_NAMES, MATRIX_ELEMENTS
+
+
+@dataclasses.dataclass(frozen=True)
+class Misfit:
+    """Mean squared normalised residual per intensity in each group, and rms disagreement of matrix elements.
+
+    With the flux eliminated, noise alone gives 3/4 per intensity (1 where the flux is known).
+    """
+
+    camera: Mapping[str, float]
+    kind: Mapping[str, float]
+    filter: Mapping[str, float]
+    calibration_plate: Mapping[str, float]
+    matrix_element: Mapping[str, float]
+    worst_exposure: tuple[int, float]
+    worst_point: tuple[int, float, float, float]
+
+    def sentences(self) -> tuple[str, ...]:
+        """The disagreement in words, the largest of each kind first."""
+
+        def ranked(groups: Mapping[str, float], form: str) -> str:
+            order = sorted(groups.items(), key=lambda item: -item[1])
+            return ", ".join(f"{name} {format(value, form)}" for name, value in order)
+
+        point, x, y, value = self.worst_point
+        return (
+            f"mean squared residual by camera: {ranked(self.camera, '.3g')}",
+            f"by kind: {ranked(self.kind, '.3g')}; by filter: {ranked(self.filter, '.3g')}; "
+            f"by calibration plate: {ranked(self.calibration_plate, '.3g')}",
+            "disagreement in the matrix, rms over field: "
+            + ranked({k: 100 * v for k, v in self.matrix_element.items()}, ".3g")
+            + " (%)",
+            f"worst exposure {self.worst_exposure[0]} ({self.worst_exposure[1]:.3g}), "
+            f"worst point {point} at ({x:+.3f}, {y:+.3f}) deg ({value:.3g})",
+        )
+
+
+def describe(problem: Problem, values: Float[np.ndarray, " n"]) -> Misfit:
+    """Group the residuals of a fit (full vector of parameter values)."""
+    e, used = problem.calset.exposures, problem.used
+    flux, residual = problem.residuals(values)
+    square = residual**2
+    per_exposure, rows = square.sum(axis=(0, 2)), used.sum(axis=0)
+
+    def grouped(labels: np.ndarray) -> dict[str, float]:
+        return {
+            str(label): float(per_exposure[labels == label].sum() / max(4 * rows[labels == label].sum(), 1))
+            for label in np.unique(labels)
+        }
+
+    plate = np.array([f"{a:g} deg" if i else "out" for i, a in zip(e.chwp_in, e.chwp_angle, strict=True)])
+    per_point = square.sum(axis=(1, 2)) / np.maximum(4 * used.sum(axis=1), 1)
+    worst = int(per_point.argmax())
+    points = problem.calset.points
+    exposure = per_exposure / np.maximum(4 * rows, 1)
+    return Misfit(
+        camera=dict(zip(CAMERA_NAMES, (square.sum(axis=(0, 1)) / used.sum()).tolist(), strict=True)),
+        kind=grouped(e.kind),
+        filter=grouped(e.filter),
+        calibration_plate=grouped(plate),
+        matrix_element=_matrix_elements(problem, flux, residual),
+        worst_exposure=(int(e.exposure[exposure.argmax()]), float(exposure.max())),
+        worst_point=(
+            int(points.point[worst]),
+            float(points.x[worst]),
+            float(points.y[worst]),
+            float(per_point[worst]),
+        ),
+    )
+
+
+def _matrix_elements(
+    problem: Problem, flux: Float[np.ndarray, "p e"], residual: Float[np.ndarray, "p e 4"]
+) -> dict[str, float]:
+    e = problem.calset.exposures
+    weight = np.concatenate([np.asarray(c.weight) for c in problem.chunks])[: len(flux)]
+    counts = np.concatenate([np.asarray(c.counts) for c in problem.chunks])[: len(flux)]
+    delta = residual / np.where(weight > 0, weight, np.inf)  # electrons, data − model
+    squares: dict[str, list[float]] = {name: [] for name in MATRIX_ELEMENTS}
+    setting = np.array(
+        [f"{f}/{a if i else 'out'}" for f, i, a in zip(e.filter, e.chwp_in, e.chwp_angle, strict=True)]
+    )
+    for label in np.unique(setting[e.clp_in]):
+        use = np.flatnonzero(e.clp_in & (setting == label) & problem.used.any(axis=0))
+        if len(use) < 3:
+            continue
+        angle = 2.0 * np.deg2rad(e.clp_angle[use])
+        design = np.column_stack([np.ones(len(use)), np.cos(angle), np.sin(angle)])
+        # Over a full turn of angles the sum of a pair averages to the unpolarised sum of the definition of m.
+        for pair, names in ((0, MATRIX_ELEMENTS[:3]), (2, MATRIX_ELEMENTS[3:])):
+            total = counts[:, use, pair] + counts[:, use, pair + 1]
+            ok = problem.used[:, use].all(axis=1) & (total > 0).all(axis=1)
+            if not ok.any():
+                continue
+            difference = (delta[ok][:, use, pair] - delta[ok][:, use, pair + 1]) / total[ok].mean(
+                axis=1, keepdims=True
+            )
+            coefficients, *_ = np.linalg.lstsq(design, difference.T, rcond=None)
+            for name, row in zip(names, coefficients, strict=True):
+                squares[name].extend((row**2).tolist())
+    return {name: float(np.sqrt(np.mean(v))) if v else float("nan") for name, v in squares.items()}
