@@ -114,12 +114,3 @@ class Handmade:
 @pytest.fixture
 def handmade(tmp_path: Path) -> Handmade:
     return Handmade(tmp_path)
-
-
-@pytest.fixture(scope="session")
-def shared_data() -> Path:
-    """Sets made outside the project, beside the repository; tests that use them skip without them."""
-    folder = Path(__file__).parents[3] / "shared" / "data"
-    if not folder.is_dir():
-        pytest.skip(f"no outside data sets at {folder}")
-    return folder

@@ -135,7 +135,7 @@ def test_a_full_disk_leaves_the_old_file(handmade, monkeypatch):
         temporary.write_bytes(b"SIMPLE  =")
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(walop_jax.data.write, "_sign_and_write", full)
+    monkeypatch.setattr(walop_jax.data.write, "sign_and_write", full)
     with pytest.raises(DataError, match=r"set\.fits: writing failed: .*No space left.*untouched"):
         write_calibration_set(path, calset, overwrite=True)
     assert path.read_bytes() == before

@@ -14,7 +14,7 @@ from walop_jax.data.errors import DataError, fail, nearest
 from walop_jax.data.filters import builtin_filter
 from walop_jax.data.frames import COUNT_NAMES, ERROR_NAMES, FrameIntensities, frame_stack
 from walop_jax.data.merge import merge_calibration_sets
-from walop_jax.data.opening import UNREADABLE, OpenFile, open_fits
+from walop_jax.data.opening import UNREADABLE, OpenFile, one_line, open_fits
 from walop_jax.data.records import (
     CalibrationSet,
     Exposures,
@@ -66,7 +66,9 @@ def _read_one(path: Path) -> CalibrationSet:
         except DataError:
             raise
         except UNREADABLE as error:
-            raise fail(f"cannot be read: {error}", file=path, advice="write the file again") from error
+            raise fail(
+                f"cannot be read: {one_line(error)}", file=path, advice="write the file again"
+            ) from error
 
 
 def _from_hdus(opened: OpenFile) -> CalibrationSet:
@@ -182,7 +184,7 @@ def _frames(
         )
     grid, stack = frame_stack(images, len(exposures), path)
     width, total = grid.width, grid.width * grid.height
-    corners = np.array([0, width - 1, total - width, total - 1])
+    corners = (0, width - 1, total - width, total - 1)
     x, y = (np.concatenate(parts) for parts in zip(*(grid.xy(n, n + 1) for n in corners), strict=True))
     make_points({"POINT": np.arange(4), "X": x, "Y": y}, instrument, Place(path, "N0"))
     intensities = FrameIntensities(grid, (stack,))

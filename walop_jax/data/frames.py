@@ -157,9 +157,10 @@ class FrameIntensities(Intensities):
         counts = np.stack([columns(cube) for cube in stack.counts], axis=-1)
         sigma = np.stack([columns(cube) for cube in stack.sigma], axis=-1)
         if stack.flag is None:
-            return counts, sigma, np.zeros(counts.shape[:2])
+            return counts, sigma, np.zeros(counts.shape[:2], dtype=np.int64)
         # An undefined flag is no clean bill of health.
-        return counts, sigma, np.nan_to_num(np.broadcast_to(columns(stack.flag), counts.shape[:2]), nan=2.0)
+        flag = np.nan_to_num(columns(stack.flag), nan=2.0).astype(np.int64)
+        return counts, sigma, np.broadcast_to(flag, counts.shape[:2])
 
 
 def frame_stack(images: dict[str, Any], exposures: int, path: Path) -> tuple[Grid, FrameStack]:
@@ -176,7 +177,7 @@ def frame_stack(images: dict[str, Any], exposures: int, path: Path) -> tuple[Gri
             raise place.fail("the image extension is missing", advice="frames need N0…N3 and E0…E3")
         cubes[name] = _cube(images[name], exposures, place)
         if name != "FLAG":
-            grids.setdefault(_grid(images[name].header, place), name)
+            grids.setdefault(read_grid(images[name].header, place), name)
             convert_unit(
                 np.ones(1), str(images[name].header.get("BUNIT") or "electron"), "electron", "BUNIT", place
             )
@@ -222,7 +223,7 @@ def _cube(hdu: Any, exposures: int, place: Place) -> Cube:
     )
 
 
-def _grid(header: Any, place: Place) -> Grid:
+def read_grid(header: Any, place: Place) -> Grid:
     """Read the linear coordinates of the first two axes: CRPIX, CRVAL and CD, or CDELT with PC."""
     for axis, name in ((1, "X"), (2, "Y")):
         found = str(header.get(f"CTYPE{axis}", "")).strip().upper()

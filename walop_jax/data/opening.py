@@ -2,7 +2,8 @@
 
 A file is read once from end to end: for its SHA-256, for the FITS checksums (Seaman, Pence & Rots 2012, an
 appendix of the FITS standard: the 32-bit words of an HDU, summed in ones' complement, are all ones), and
-for its length. astropy would check the sums too, but in small blocks, and would only warn.
+for its length. astropy would check the sums too, but in small blocks, and would only warn. The sums find
+every damaged byte, but not two changes that cancel each other; the SHA-256 is what tells two files apart.
 """
 
 from __future__ import annotations
@@ -84,15 +85,16 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[OpenFile]:
         except FileNotFoundError:
             raise fail("there is no such file", file=path, advice="check the name") from None
         except UNREADABLE as error:
-            raise fail(f"cannot be read as FITS: {_one_line(error)}", file=path, advice=_BROKEN) from error
+            raise fail(f"cannot be read as FITS: {one_line(error)}", file=path, advice=_BROKEN) from error
         if isinstance(content, bytes):
             raw.seek(0)
             sha256 = hashlib.file_digest(raw, "sha256").hexdigest()
-        remarks = tuple(f"{path}: {_one_line(entry.message)}" for entry in caught)
+        remarks = tuple(f"{path}: {one_line(entry.message)}" for entry in caught)
         yield OpenFile(path, sha256, units, compressed, remarks)
 
 
-def _one_line(message: object) -> str:
+def one_line(message: object) -> str:
+    """Put a message of another library on one line, shortened."""
     return " ".join(str(message).split())[:300] or type(message).__name__
 
 
@@ -130,7 +132,8 @@ def _verify(path: Path, hdus: list[Any], stream: io.BufferedIOBase) -> str:
         if declared is not None and str(declared).strip() != str(data_sum):
             raise fail("the data do not agree with DATASUM", file=path, extension=name, advice=_BROKEN)
         if "CHECKSUM" in hdu.header and _fold(header_sum + data_sum) not in (0, 0xFFFFFFFF):
-            raise fail("the bytes do not agree with CHECKSUM", file=path, extension=name, advice=_BROKEN)
+            advice = f"{_BROKEN}, or renew the checksum if the header was edited on purpose"
+            raise fail("the bytes do not agree with CHECKSUM", file=path, extension=name, advice=advice)
     if stream.tell() != size:
         raise fail(
             f"{size - stream.tell()} bytes after the last extension cannot be read", file=path, advice=_BROKEN

@@ -38,10 +38,11 @@ def write_calibration_set(
     if not isinstance(intensities, TableIntensities):
         intensities = TableIntensities.dense(calset.points, intensities.block(0, len(calset.points)))
     with atomic_path(path, overwrite=overwrite) as temporary:
-        _sign_and_write([*_head(calset, path), *_body(calset, intensities, path)], temporary)
+        sign_and_write([*_head(calset, path), *_body(calset, intensities, path)], temporary)
 
 
-def _sign_and_write(hdus: list[Any], path: Path) -> None:
+def sign_and_write(hdus: list[Any], path: Path) -> None:
+    """Add checksums to HDUs and write them to a file that may be there already (a temporary one)."""
     for hdu in hdus:
         # astropy would note the date in the comments: then equal sets would be unequal files.
         hdu.add_checksum(when="FITS checksum of this extension")
@@ -67,12 +68,12 @@ def _head(calset: CalibrationSet, path: object) -> list[Any]:
             continue  # FITS headers know no NaN; a missing card is read as one
         primary.header[name] = (value, comment if not isinstance(value, str) else "")
     columns = {name: getattr(calset.exposures, name.lower()) for name in schema.EXPOSURES}
-    return [primary, _table("EXPOSURES", columns, path)]
+    return [primary, table_hdu("EXPOSURES", columns, path)]
 
 
 def _body(calset: CalibrationSet, intensities: TableIntensities, path: object) -> list[Any]:
     points, sources = calset.points, calset.sources
-    hdus = [_table("POINTS", {"POINT": points.point, "X": points.x, "Y": points.y}, path)]
+    hdus = [table_hdu("POINTS", {"POINT": points.point, "X": points.x, "Y": points.y}, path)]
     rows = {
         "EXPOSURE": calset.exposures.exposure[intensities.exposure],
         "POINT": points.point[intensities.point],
@@ -82,20 +83,21 @@ def _body(calset: CalibrationSet, intensities: TableIntensities, path: object) -
         "N_ERR": intensities.sigma,
         "FLAG": intensities.flag,
     }
-    return [*hdus, _table("INTENSITIES", rows, path), *_optional(calset, path)]
+    return [*hdus, table_hdu("INTENSITIES", rows, path), *_optional(calset, path)]
 
 
 def _optional(calset: CalibrationSet, path: object) -> list[Any]:
     hdus = []
     if len(calset.sources):
         columns = {name: getattr(calset.sources, name.lower()) for name in schema.SOURCES}
-        hdus.append(_table("SOURCES", columns, path))
+        hdus.append(table_hdu("SOURCES", columns, path))
     if calset.filters:
-        hdus.append(_table("FILTERS", _filter_columns(calset.filters), path))
+        hdus.append(table_hdu("FILTERS", filter_columns(calset.filters), path))
     return hdus
 
 
-def _filter_columns(filters: Mapping[str, FilterCurve]) -> dict[str, np.ndarray]:
+def filter_columns(filters: Mapping[str, FilterCurve]) -> dict[str, np.ndarray]:
+    """The columns of a FILTERS table, padded with NaN."""
     longest = max(len(curve.wavelength) for curve in filters.values())
     columns = {name: np.full((len(filters), longest), np.nan) for name in ("WAVELENGTH", "THROUGHPUT")}
     for row, curve in enumerate(filters.values()):
@@ -104,9 +106,18 @@ def _filter_columns(filters: Mapping[str, FilterCurve]) -> dict[str, np.ndarray]
     return {"FILTER": np.array(list(filters)), **columns}
 
 
-def _table(name: str, columns: Mapping[str, np.ndarray], path: object) -> fits.BinTableHDU:
+def table_hdu(
+    name: str,
+    columns: Mapping[str, np.ndarray],
+    path: object,
+    rules: Mapping[str, schema.Column] | None = None,
+) -> fits.BinTableHDU:
+    """A binary table by its rules (default: those of the calibration set's table of that name).
+
+    Raises `DataError`, naming `path`, for text that is not plain ASCII.
+    """
     made = []
-    for column, rule in schema.TABLES[name].items():
+    for column, rule in (schema.TABLES[name] if rules is None else rules).items():
         values = columns[column]
         if rule.kind == "str":
             for value in np.unique(values):
@@ -158,7 +169,7 @@ def write_frames(
     shape = (len(calset.exposures), grid.height, grid.width)
     kinds = dict.fromkeys((*COUNT_NAMES, *ERROR_NAMES), np.dtype(f">{dtype}")) | {"FLAG": np.dtype(">i2")}
     with atomic_path(path, overwrite=overwrite) as temporary:
-        _sign_and_write([*_head(calset, path), *_optional(calset, path)], temporary)
+        sign_and_write([*_head(calset, path), *_optional(calset, path)], temporary)
         cubes: dict[str, tuple[np.memmap[Any, Any], int]] = {}
         for name, kind in kinds.items():
             cubes[name] = _append_image(temporary, name, kind, shape, grid)
@@ -176,6 +187,16 @@ def write_frames(
             _sign_image(temporary, start, cube)
 
 
+def grid_cards(grid: Grid) -> dict[str, str | float]:
+    """The header cards of the linear field coordinates of an image."""
+    cards: dict[str, str | float] = {}
+    for n, axis in enumerate("XY"):
+        cards |= {f"CTYPE{n + 1}": axis, f"CUNIT{n + 1}": "deg"}
+        cards |= {f"CRPIX{n + 1}": grid.reference[n], f"CRVAL{n + 1}": grid.value[n]}
+        cards |= {f"CD{n + 1}_{m + 1}": grid.matrix[n][m] for m in range(2)}
+    return cards
+
+
 def _append_image(
     path: Path, name: str, kind: np.dtype[Any], shape: tuple[int, int, int], grid: Grid
 ) -> tuple[np.memmap[Any, Any], int]:
@@ -187,11 +208,7 @@ def _append_image(
     for axis, length in enumerate(reversed(shape), start=1):
         header[f"NAXIS{axis}"] = length
     header["PCOUNT"], header["GCOUNT"], header["EXTNAME"] = 0, 1, name
-    for n, axis in enumerate("XY"):
-        header[f"CTYPE{n + 1}"], header[f"CUNIT{n + 1}"] = axis, "deg"
-        header[f"CRPIX{n + 1}"], header[f"CRVAL{n + 1}"] = grid.reference[n], grid.value[n]
-        for m in range(2):
-            header[f"CD{n + 1}_{m + 1}"] = grid.matrix[n][m]
+    header.update(grid_cards(grid))
     if name != "FLAG":
         header["BUNIT"] = "electron"
     header["CHECKSUM"], header["DATASUM"] = "0" * 16, "0".rjust(10)

@@ -19,7 +19,7 @@ from walop_jax.data.records import Exposures, FilterCurve
 from walop_jax.model import legendre, light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.plan import Plan, build_plan
+from walop_jax.model.plan import Plan, plan_for
 from walop_jax.model.specification import optical_indices, series_indices
 
 CHUNK = 256
@@ -68,8 +68,7 @@ def settings_plan(settings: Settings, filters: Mapping[str, FilterCurve], instru
         clp_in=off, clp_angle=nan, chwp_in=chwp_in, chwp_angle=settings.chwp_angle, temp=settings.temp,
         ha=settings.ha, ra=nan, dec=nan, rotator=nan, teff=settings.teff,
     )  # fmt: skip
-    depends_on = {q for effect in instrument.effects for q in effect.optics_depend_on}
-    return build_plan(exposures, filters, None, depends_on)
+    return plan_for(instrument.effects, exposures, filters)
 
 
 def _point_vectors(
@@ -96,7 +95,9 @@ def _point_matrix(
     def matrix(
         rows: Float[Array, "b 2 2 4"], all_values: Float[Array, " n"], local: Float[Array, 4]
     ) -> Float[Array, "b 2 3"]:
-        return light.instrument_matrix(light.camera_vectors(to_instrument(all_values), rows, local, x, y))
+        there = to_instrument(all_values)
+        vectors = light.camera_vectors(there, rows, local, x, y)
+        return light.instrument_matrix(vectors @ light.telescope(there))
 
     rows, push_optics = jax.linearize(optics, values[optical])
     m, push = jax.linearize(matrix, rows, values, throughput)

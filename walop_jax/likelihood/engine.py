@@ -11,11 +11,13 @@ Three layers, each with its own small Jacobian:
 Flux           For each (exposure, point) with y = N/σ and a = model/σ over the four cameras, the flux that fits best is
                F = y·a / a·a, and r = y − F a. Its derivative is taken as −F (1 − â âᵀ) da (Kaufman's form of
                variable projection, Golub & Pereyra 2003, Inverse Problems 19, R1): the gradient is exact, and JᵀJ is
-               the Fisher information with the flux marginalised. KIND `flux`: F = 1.
+               the Fisher information with the flux marginalised. KIND `flux`: F = 1. Where an effect of the
+               detectors D acts, the model is D(F a), F follows by Newton steps and ∂D/∂F takes the place of a.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -26,11 +28,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.model import legendre, light
 from walop_jax.model.compiled import compiled
+from walop_jax.model.effects.base import Effect, overridden
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 from walop_jax.model.specification import optical_indices, series_indices
 
 Vector = Float[Array, " n"]
+NEWTON_STEPS = 3  # each squares the share of the detectors' distortion that is missing from the flux
 
 
 class PointData(NamedTuple):
@@ -43,6 +47,7 @@ class PointData(NamedTuple):
     sky: Float[Array, "p e 2"]
     source: Int[Array, "p e"]
     band: Int[Array, "p e"]
+    opposite_sky: Float[Array, "p e 2"] | None = None  # the sky at (−X, −Y), only where an effect asks for it
 
 
 class Normal(NamedTuple):
@@ -63,66 +68,136 @@ def eliminate_flux(
     return flux, weighted_counts - flux[:, None] * weighted_model
 
 
-def _point_counts(
+def field_sites(instrument: Instrument, point: PointData) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Field positions whose optics and throughput a point needs: its own and, for ghosts, the opposite one."""
+    if overridden(instrument.effects, "mirrored"):
+        return jnp.stack([point.x, -point.x]), jnp.stack([point.y, -point.y])
+    return point.x[None], point.y[None]
+
+
+def _rows_at(instrument: Instrument, plan: Plan, point: PointData) -> Float[Array, "m b 2 2 4"]:
+    return jax.vmap(light.band_rows, (None, None, 0, 0))(instrument, plan, *field_sites(instrument, point))
+
+
+def _throughput_at(instrument: Instrument, point: PointData) -> Float[Array, "m 4"]:
+    return jax.vmap(light.throughput_at, (None, 0, 0))(instrument, *field_sites(instrument, point))
+
+
+def _unit_counts(
     instrument: Instrument,
     plan: Plan,
-    rows: Float[Array, "b 2 2 4"],
-    throughput: Float[Array, 4],
+    rows: Float[Array, "m b 2 2 4"],
+    throughput: Float[Array, "m 4"],
     point: PointData,
 ) -> Float[Array, "e 4"]:
-    return light.counts(
-        instrument, plan, rows, throughput, point.x, point.y, point.sky, point.source, point.band
+    """Counts for light of unit flux, ahead of the detectors."""
+    x, y = field_sites(instrument, point)
+    counts = light.counts(
+        instrument, plan, rows[0], throughput[0], x[0], y[0], point.sky, point.source, point.band
     )
+    if point.opposite_sky is None or len(x) == 1:
+        return counts
+    opposite = light.counts(
+        instrument, plan, rows[1], throughput[1], x[1], y[1], point.opposite_sky, point.source, point.band
+    )
+    return light.with_ghosts(instrument, counts, opposite, point.source)
 
 
 def _point_prediction(instrument: Instrument, plan: Plan, point: PointData) -> Float[Array, "e 4"]:
-    rows = light.band_rows(instrument, plan, point.x, point.y)
-    throughput = light.throughput_at(instrument, point.x, point.y)
-    return _point_counts(instrument, plan, rows, throughput, point)
+    rows, throughput = _rows_at(instrument, plan, point), _throughput_at(instrument, point)
+    return _unit_counts(instrument, plan, rows, throughput, point)
+
+
+def _best_flux(
+    instrument: Instrument, plan: Plan, unit: Float[Array, "e 4"], point: PointData
+) -> Float[Array, " e"]:
+    """Flux that fits best: in closed form, refined by Newton steps where detectors are not linear in it."""
+    known = plan.exposures.flux_known
+    flux, _ = eliminate_flux(point.counts * point.weight, unit * point.weight, known)
+    if overridden(instrument.effects, "detector"):
+        for _ in range(NEWTON_STEPS):
+            counts, slope = jax.jvp(
+                lambda f: _real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),)
+            )
+            missing = (point.counts - counts) * point.weight
+            step, _ = eliminate_flux(missing, slope * point.weight, known)
+            flux = jnp.where(known, flux, flux + step)
+    return flux
+
+
+def _real_counts(
+    instrument: Instrument, plan: Plan, unit: Float[Array, "e 4"], flux: Float[Array, " e"]
+) -> Float[Array, "e 4"]:
+    return light.detected(instrument, plan.exposures, flux[:, None] * unit)
 
 
 def _point_residuals(
     instrument: Instrument, plan: Plan, point: PointData
 ) -> tuple[Float[Array, " e"], Float[Array, "e 4"]]:
-    model = _point_prediction(instrument, plan, point) * point.weight
-    return eliminate_flux(point.counts * point.weight, model, plan.exposures.flux_known)
+    unit = _point_prediction(instrument, plan, point)
+    flux = _best_flux(instrument, plan, unit, point)
+    return flux, (point.counts - _real_counts(instrument, plan, unit, flux)) * point.weight
+
+
+def _point_jacobian(
+    instrument: Instrument, plan: Plan, point: PointData
+) -> tuple[Float[Array, " d"], Float[Array, "l d"]]:
+    """Residuals of one point and their derivatives with respect to its local quantities.
+
+    Local quantities are all parameters but the series, then the throughputs of its sites; d runs over exposures
+    and cameras.
+    """
+    values, to_instrument = ravel_pytree(instrument)
+    optical = np.asarray(optical_indices(instrument), int)
+    plain = np.setdiff1d(np.arange(values.size), series_indices(instrument))
+    throughput = _throughput_at(instrument, point)
+
+    def optics(optical_values: Vector) -> Float[Array, "m b 2 2 4"]:
+        return _rows_at(to_instrument(values.at[optical].set(optical_values)), plan, point)
+
+    def data(
+        rows: Float[Array, "m b 2 2 4"], all_values: Vector, local: Float[Array, "m 4"]
+    ) -> Float[Array, "e 4"]:
+        return _unit_counts(to_instrument(all_values), plan, rows, local, point)
+
+    rows, push_optics = jax.linearize(optics, values[optical])
+    unit, push = jax.linearize(data, rows, values, throughput)
+    d_rows = jax.vmap(push_optics)(jnp.eye(optical.size))
+    each = jnp.eye(values.size)[plain]
+
+    # Tangents: plain parameters first (the optical ones carry their rows), then the throughputs of the sites.
+    rows_of = jnp.zeros((values.size, *rows.shape)).at[optical].set(d_rows)[plain]
+    no_rows, no_values, no_local = jnp.zeros_like(rows), jnp.zeros_like(values), jnp.zeros_like(throughput)
+    d_plain = jax.vmap(lambda dr, dv: push(dr, dv, no_local))(rows_of, each)
+    each_local = jnp.eye(throughput.size).reshape(-1, *throughput.shape)
+    d_local = jax.vmap(lambda dt: push(no_rows, no_values, dt))(each_local)
+
+    # From unit flux to counts: `along` is the derivative with respect to the flux itself.
+    flux = _best_flux(instrument, plan, unit, point)
+    known = plan.exposures.flux_known
+    counts, along = flux[:, None] * unit, unit
+    d_counts = flux[:, None] * jnp.concatenate([d_plain, d_local])
+    if overridden(instrument.effects, "detector"):
+        counts, push_detector = jax.linearize(
+            lambda v, n: light.detected(to_instrument(v), plan.exposures, n), values, counts
+        )
+        all_values = jnp.concatenate([each, jnp.zeros((throughput.size, values.size))])
+        d_counts = jax.vmap(push_detector)(all_values, d_counts)
+        along = push_detector(no_values, unit)
+    along = along * point.weight
+    d_counts = d_counts * point.weight
+    power = jnp.sum(along**2, axis=-1)
+    share = jnp.sum(d_counts * along, axis=-1) / jnp.where(power > 0, power, 1.0)
+    projected = d_counts - jnp.where(known, 0.0, share)[..., None] * along
+    jacobian = -projected.reshape(d_counts.shape[0], -1)
+    return ((point.counts - counts) * point.weight).reshape(-1), jacobian
 
 
 def _point_normal(
     instrument: Instrument, plan: Plan, point: PointData
 ) -> tuple[Float[Array, ""], Float[Array, " l"], Float[Array, "l l"]]:
-    """χ², Jᵀr and JᵀJ of one point in its local quantities: all parameters but the series, then 4 throughputs."""
-    values, to_instrument = ravel_pytree(instrument)
-    optical = np.asarray(optical_indices(instrument), int)
-    plain = np.setdiff1d(np.arange(values.size), series_indices(instrument))
-    throughput = light.throughput_at(instrument, point.x, point.y)
-
-    def optics(optical_values: Vector) -> Float[Array, "b 2 2 4"]:
-        return light.band_rows(to_instrument(values.at[optical].set(optical_values)), plan, point.x, point.y)
-
-    def data(
-        rows: Float[Array, "b 2 2 4"], all_values: Vector, local: Float[Array, 4]
-    ) -> Float[Array, "e 4"]:
-        return _point_counts(to_instrument(all_values), plan, rows, local, point) * point.weight
-
-    rows, push_optics = jax.linearize(optics, values[optical])
-    model, push = jax.linearize(data, rows, values, throughput)
-    d_rows = jax.vmap(push_optics)(jnp.eye(optical.size))
-    unit = np.eye(values.size)
-
-    # Tangents: plain parameters first (the optical ones carry their rows), then the four throughputs.
-    rows_of = jnp.zeros((values.size, *rows.shape)).at[optical].set(d_rows)[plain]
-    d_plain = jax.vmap(lambda dr, dv: push(dr, dv, jnp.zeros(4)))(rows_of, jnp.asarray(unit[plain]))
-    zero_rows, zero_values = jnp.zeros_like(rows), jnp.zeros_like(values)
-    d_local = jax.vmap(lambda dt: push(zero_rows, zero_values, dt))(jnp.eye(4))
-    d_model = jnp.concatenate([d_plain, d_local])
-
-    flux, residual = eliminate_flux(point.counts * point.weight, model, plan.exposures.flux_known)
-    power = jnp.sum(model**2, axis=-1)
-    along = jnp.sum(d_model * model, axis=-1) / jnp.where(power > 0, power, 1.0)
-    projected = d_model - jnp.where(plan.exposures.flux_known, 0.0, along)[..., None] * model
-    jacobian = (-flux[:, None] * projected).reshape(d_model.shape[0], -1)
-    r = residual.reshape(-1)
+    """χ², Jᵀr and JᵀJ of one point in its local quantities."""
+    r, jacobian = _point_jacobian(instrument, plan, point)
     return r @ r, jacobian @ r, jacobian @ jacobian.T
 
 
@@ -132,11 +207,16 @@ def _normal_equations(instrument: Instrument, plan: Plan, data: PointData) -> No
     plain = np.setdiff1d(np.arange(values.size), series)
     chi2, gradient, gram = jax.vmap(_point_normal, in_axes=(None, None, 0))(instrument, plan, data)
     k = plain.size
-    basis = legendre.basis(data.x, data.y, instrument.throughput.degree)
+    basis = legendre.basis(*jax.vmap(field_sites, (None, 0))(instrument, data), instrument.throughput.degree)
     g = jnp.zeros(values.size).at[plain].set(gradient[:, :k].sum(axis=0))
-    g = g.at[series].set(jnp.einsum("ps,pt->st", gradient[:, k:], basis).reshape(-1))
-    cross = jnp.einsum("pis,pt->ist", gram[:, :k, k:], basis).reshape(k, -1)
-    square = jnp.einsum("psr,pt,pu->stru", gram[:, k:, k:], basis, basis).reshape(series.size, series.size)
+    # Local throughputs are (site, camera); a coefficient of a camera acts at all sites of a point.
+    sites = (basis.shape[1], 4)
+    by_site = gradient[:, k:].reshape(-1, *sites)
+    g = g.at[series].set(jnp.einsum("pmk,pmt->kt", by_site, basis).reshape(-1))
+    by_site = gram[:, :k, k:].reshape(-1, k, *sites)
+    cross = jnp.einsum("pimk,pmt->ikt", by_site, basis).reshape(k, -1)
+    by_site = gram[:, k:, k:].reshape(-1, *sites, *sites)
+    square = jnp.einsum("pmknl,pmt,pnu->ktlu", by_site, basis, basis).reshape(series.size, series.size)
     matrix = jnp.zeros((values.size, values.size))
     matrix = matrix.at[np.ix_(plain, plain)].set(gram[:, :k, :k].sum(axis=0))
     matrix = matrix.at[np.ix_(plain, series)].set(cross).at[np.ix_(series, plain)].set(cross.T)
@@ -151,9 +231,74 @@ def _residuals(
 
 
 def _prediction(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p e 4"]:
+    """Counts for light of unit flux; `detected` takes electrons, flux × these, through the detectors."""
     return jax.vmap(_point_prediction, in_axes=(None, None, 0))(instrument, plan, data)
 
 
+def _dense_jacobian(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p d n"]:
+    """Derivatives of all residuals with respect to all parameters: for tables, not for whole frames."""
+    values, _ = ravel_pytree(instrument)
+    series = np.asarray(series_indices(instrument), int)
+    plain = np.setdiff1d(np.arange(values.size), series)
+    _, local = jax.vmap(_point_jacobian, in_axes=(None, None, 0))(instrument, plan, data)
+    basis = legendre.basis(*jax.vmap(field_sites, (None, 0))(instrument, data), instrument.throughput.degree)
+    by_site = local[:, plain.size :].reshape(len(local), basis.shape[1], 4, -1)
+    expanded = jnp.einsum("pmkd,pmt->pdkt", by_site, basis).reshape(len(local), -1, series.size)
+    full = jnp.zeros((*expanded.shape[:2], values.size)).at[:, :, series].set(expanded)
+    return full.at[:, :, plain].set(jnp.swapaxes(local[:, : plain.size], 1, 2))
+
+
+def _point_effect_columns(
+    instrument: Instrument, plan: Plan, probes: tuple[Effect, ...], point: PointData
+) -> Float[Array, "a d"]:
+    names = [(i, name) for i, probe in enumerate(probes) for name in probe.amplitudes()]
+    neutral = [getattr(probes[i], name) for i, name in names]
+
+    def with_amplitudes(amplitudes: list[Float[Array, "..."]]) -> Instrument:
+        changed = list(probes)
+        for (i, name), value in zip(names, amplitudes, strict=True):
+            changed[i] = dataclasses.replace(changed[i], **{name: value})
+        return dataclasses.replace(instrument, effects=(*instrument.effects, *changed))
+
+    at_neutral = with_amplitudes(neutral)
+    unit = _point_prediction(at_neutral, plan, point)
+    flux = _best_flux(at_neutral, plan, unit, point)
+
+    def counts(amplitudes: list[Float[Array, "..."]]) -> Float[Array, "e 4"]:
+        active = with_amplitudes(amplitudes)
+        return _real_counts(active, plan, _point_prediction(active, plan, point), flux)
+
+    _, push = jax.linearize(counts, neutral)
+    flat, to_tree = ravel_pytree(neutral)
+    change = jax.vmap(lambda one: push(to_tree(one)))(jnp.eye(flat.size)) * point.weight
+    _, along = jax.jvp(lambda f: _real_counts(at_neutral, plan, unit, f), (flux,), (jnp.ones_like(flux),))
+    along = along * point.weight
+    power = jnp.sum(along**2, axis=-1)
+    share = jnp.sum(change * along, axis=-1) / jnp.where(power > 0, power, 1.0)
+    projected = change - jnp.where(plan.exposures.flux_known, 0.0, share)[..., None] * along
+    return -projected.reshape(flat.size, -1)
+
+
+def _effect_columns(
+    instrument: Instrument, plan: Plan, probes: tuple[Effect, ...], data: PointData
+) -> Float[Array, "p d a"]:
+    """Derivatives of the residuals with respect to the amplitudes of effects that are not active, at neutral.
+
+    Only what an effect changes is differentiated: one at the detectors costs a dot product, not the optics.
+    """
+    columns = jax.vmap(_point_effect_columns, in_axes=(None, None, None, 0))(instrument, plan, probes, data)
+    return jnp.swapaxes(columns, 1, 2)
+
+
 normal_equations = compiled(_normal_equations)
+dense_jacobian = compiled(_dense_jacobian)
+effect_columns = compiled(_effect_columns)
 residuals = compiled(_residuals)
 prediction = compiled(_prediction)
+
+
+def _detected(instrument: Instrument, plan: Plan, counts: Float[Array, "p e 4"]) -> Float[Array, "p e 4"]:
+    return jax.vmap(light.detected, (None, None, 0))(instrument, plan.exposures, counts)
+
+
+detected = compiled(_detected)

@@ -8,14 +8,15 @@ from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.data.records import Block, CalibrationSet, Exposures
 from walop_jax.data.sky import moon_sky
 from walop_jax.likelihood import engine
 from walop_jax.model.compiled import require_double_precision
+from walop_jax.model.effects.base import Effect, overridden
 from walop_jax.model.instrument import nominal_instrument
-from walop_jax.model.plan import Plan, build_plan
+from walop_jax.model.plan import Plan, plan_for, with_median
 from walop_jax.model.specification import Model, make_model
 
 Vector = Float[np.ndarray, " n"]
@@ -62,8 +63,11 @@ class Problem:
         require_double_precision()
         self.calset = calset
         self.model = model
-        depends_on = {q for effect in model.template.effects for q in effect.optics_depend_on}
-        self.plan: Plan = build_plan(calset.exposures, calset.filters, calset.sources, depends_on)
+        effects = model.template.effects
+        self.plan: Plan = plan_for(effects, calset.exposures, calset.filters, calset.sources)
+        if any(effect.uses_median for effect in effects):
+            self.plan = with_median(self.plan, median_counts(calset))
+        self._mirrored = overridden(effects, "mirrored")
         n_points = len(calset.points)
         local = len(model.parameters) - len(model.template.throughput.coefficients.ravel()) + 4
         fits = max(1, LARGEST_CHUNK // (4 * len(calset.exposures) * local) * 4)
@@ -78,7 +82,7 @@ class Problem:
         n, size = len(self.calset.points), self.points_per_chunk
         for start in range(0, n, size):
             block = self.calset.intensities.block(start, min(start + size, n))
-            yield point_data(self.calset, self.plan, _padded(block, size))
+            yield point_data(self.calset, self.plan, _padded(block, size), mirrored=self._mirrored)
 
     @property
     def chunks(self) -> list[engine.PointData]:
@@ -143,6 +147,28 @@ class Problem:
         residual = np.concatenate([np.asarray(part[1]) for part in parts])
         return flux[: len(self.calset.points)], residual[: len(self.calset.points)]
 
+    def jacobian(self, values: Vector) -> Float[np.ndarray, "d f"]:
+        """Derivatives of the used residuals with respect to the free parameters, dense: for tables, not frames.
+
+        Rows run over points, then exposures, then cameras, as in `residuals(values)[1][self.used]`.
+        """
+        instrument = self.model.instrument(values)
+        select = self.model.selection()
+        parts = [self._rows(engine.dense_jacobian(instrument, self.plan, c), c) @ select for c in self.chunks]
+        return np.concatenate(parts)
+
+    def effect_columns(self, values: Vector, probes: tuple[Effect, ...]) -> Float[np.ndarray, "d a"]:
+        """Derivatives of the used residuals with respect to the amplitudes of neutral effects added to the model."""
+        instrument = self.model.instrument(values)
+        parts = [self._rows(engine.effect_columns(instrument, self.plan, probes, c), c) for c in self.chunks]
+        return np.concatenate(parts)
+
+    @staticmethod
+    def _rows(columns: Array, chunk: engine.PointData) -> Float[np.ndarray, "d n"]:
+        used = np.asarray(chunk.weight[..., 0] > 0)
+        cube = np.asarray(columns).reshape(*used.shape, 4, -1)
+        return cube[used].reshape(-1, cube.shape[-1])
+
     # ------------------------------------------------------------------------------------------- counting
 
     @cached_property
@@ -191,8 +217,28 @@ def sky_polarisation(calset: CalibrationSet, x: Vector, y: Vector) -> Float[np.n
     return sky
 
 
-def point_data(calset: CalibrationSet, plan: Plan, block: Block) -> engine.PointData:
-    """A block of measurements as the engine wants it."""
+def median_counts(calset: CalibrationSet, slab: int = 4096, most: int = 65536) -> Float[np.ndarray, "e 4"]:
+    """Median over the field of the measured counts of each camera in each exposure; 0 where nothing is used.
+
+    Of a set with more than `most` points, slabs spread evenly over it are enough.
+    """
+    n = len(calset.points)
+    starts = range(0, n, slab) if n <= most else np.linspace(0, n - slab, most // slab).astype(int)
+    counts = []
+    for start in starts:
+        block = calset.intensities.block(int(start), min(int(start) + slab, n))
+        counts.append(np.where(block.used[:, :, None], block.counts, np.nan))
+    every = np.concatenate(counts)
+    seen = np.isfinite(every[..., 0]).any(axis=0)
+    median = np.zeros(every.shape[1:])
+    median[seen] = np.nanmedian(every[:, seen], axis=0)
+    return median
+
+
+def point_data(
+    calset: CalibrationSet, plan: Plan, block: Block, *, mirrored: bool = False
+) -> engine.PointData:
+    """A block of measurements as the engine wants it; `mirrored` adds what ghosts need of the opposite points."""
     band = np.take_along_axis(plan.band_of[None], block.source[:, :, None] + 1, axis=2)[:, :, 0]
     weight = np.where(block.used[:, :, None], 1.0 / np.where(block.sigma > 0, block.sigma, 1.0), 0.0)
     return engine.PointData(
@@ -203,6 +249,7 @@ def point_data(calset: CalibrationSet, plan: Plan, block: Block) -> engine.Point
         sky=jnp.asarray(sky_polarisation(calset, block.x, block.y)),
         source=jnp.asarray(block.source),
         band=jnp.asarray(band),
+        opposite_sky=jnp.asarray(sky_polarisation(calset, -block.x, -block.y)) if mirrored else None,
     )
 
 

@@ -19,3 +19,4 @@ SIGN_OF_CAMERA = (+1.0, -1.0, +1.0, -1.0)
 FAST_AXES = (0.0, 22.5)  # degrees, of HWP1 and HWP2
 MATRIX_ELEMENTS = ("m21", "m22", "m23", "m31", "m32", "m33")
 FIELD_SCALE = 0.3  # degrees: the unit of the field polynomials
+EXTINCTION = 2e-5  # of the calibration polariser, unwanted over wanted transmission

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.model import legendre
-from walop_jax.model.conventions import CAMERAS, FAST_AXES
+from walop_jax.model.conventions import CAMERAS, EXTINCTION, FAST_AXES
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.parameters import Component, param
 
@@ -47,7 +47,7 @@ class Standards(Component):
 class Polariser(Component):
     """Calibration polariser: a fixed extinction ratio, its axis is the encoder reading."""
 
-    extinction: float = eqx.field(static=True, default=2e-5)
+    extinction: float = eqx.field(static=True, default=EXTINCTION)
 
 
 class Collimator(Component):

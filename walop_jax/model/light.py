@@ -6,7 +6,7 @@ Everything up to the cameras is linear, so the path is run backwards from the an
 the half-wave plates at every wavelength node, `band_rows` keeps the Mueller rows that the Wollaston prisms see
 and integrates them over the bands (all the optics there is, once per field point), `camera_vectors` adds
 analyser, collimator and throughput, and `counts` is a dot product per exposure. `trace.py` runs the same
-functions forward, stage by stage.
+functions forward, stage by stage. Effects of the detectors (`detected`) act on electrons, when the flux is known.
 
 Units       counts per unit of unpolarised light at unit throughput; angles rad; wavelengths µm; field deg.
 """
@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 from walop_jax.model import legendre, materials, mueller, optics
 from walop_jax.model import plates as plate_models
 from walop_jax.model.conventions import HALF_OF_CAMERA, SIGN_OF_CAMERA
-from walop_jax.model.effects.base import ExposureArrays
+from walop_jax.model.effects.base import ExposureArrays, overridden
 from walop_jax.model.instrument import HalfWavePlate, Instrument
 from walop_jax.model.plan import Plan
 from walop_jax.model.plates import Plate
@@ -37,7 +37,7 @@ def node_wavelengths(instrument: Instrument, plan: Plan) -> Float[Array, " n"]:
     """Wavelengths (µm) of the nodes."""
     wavelength = plan.wavelength
     for effect in instrument.effects:
-        wavelength = effect.wavelengths(wavelength)
+        wavelength = effect.wavelengths(wavelength, plan.conditions)
     return wavelength
 
 
@@ -68,6 +68,10 @@ def _stack(
     return stack
 
 
+def _with_cuts(stack: tuple[Plate, ...]) -> tuple[Plate, ...]:
+    return tuple(p._replace(cut=jnp.zeros_like(p.axis)) if p.cut is None else p for p in stack)
+
+
 def calibration_angle(instrument: Instrument, angle: float | None) -> float | None:
     """Angle (deg) at which the calibration plate really stands, None when it is out."""
     for effect in instrument.effects:
@@ -95,6 +99,9 @@ def plate_matrices(
         if angle is not None:
             stack = _stack(instrument, plan, "chwp", instrument.chwp, angle, wavelength)
             cases[angle] = "chwp", direction[:2], stack
+
+    if any(plate.cut is not None for _, _, stack in cases.values() for plate in stack):
+        cases = {key: (where, ray, _with_cuts(stack)) for key, (where, ray, stack) in cases.items()}
 
     def together(*values: Float[Array, "*n"]) -> Float[Array, "cases n"]:
         return jnp.stack([jnp.broadcast_to(value, wavelength.shape) for value in values])
@@ -178,10 +185,38 @@ def camera_vectors(
     half = jnp.asarray(HALF_OF_CAMERA)
     sign = jnp.asarray(SIGN_OF_CAMERA) * efficiency[half]
     analysed = 0.5 * (rows[:, half, 0] + sign[:, None] * rows[:, half, 1])
-    return throughput[:, None] * (analysed @ upstream(instrument, x, y))
+    vectors = throughput[:, None] * (analysed @ upstream(instrument, x, y))
+    for effect in instrument.effects:
+        vectors = effect.cameras(vectors)
+    return vectors
 
 
 # ----------------------------------------------------------------------------------------- light and counts
+
+
+def telescope(instrument: Instrument) -> Float[Array, "4 4"]:
+    """Mueller matrix that light from the sky, and no other, meets ahead of the collimator: 1 unless an effect acts."""
+    matrix = jnp.eye(4)
+    for effect in instrument.effects:
+        matrix = effect.telescope(matrix)
+    return matrix
+
+
+def _catalogue(
+    instrument: Instrument, rotator: Float[Array, " e"], source: Int[Array, " e"]
+) -> Float[Array, "e 2"]:
+    """(q, u) of the standard star of each exposure in the ICS, (q + iu) exp(−2i ROTATOR)."""
+    all_q, all_u = instrument.standard.q, instrument.standard.u
+    for effect in instrument.effects:
+        all_q, all_u = effect.catalogue(all_q, all_u, instrument.standard.names)
+    row = jnp.where(source >= 0, source, 0)
+    return _turned(jnp.stack([all_q[row], all_u[row]], axis=-1), rotator)
+
+
+def _turned(qu: Float[Array, "e 2"], angle: Float[Array, " e"] | Scalar) -> Float[Array, "e 2"]:
+    """(q, u) referred to axes turned by `angle` (rad): (q + iu) exp(−2i angle)."""
+    cos, sin = jnp.cos(2 * angle), jnp.sin(2 * angle)
+    return jnp.stack([qu[:, 0] * cos + qu[:, 1] * sin, qu[:, 1] * cos - qu[:, 0] * sin], axis=-1)
 
 
 def stokes(
@@ -189,25 +224,31 @@ def stokes(
 ) -> Float[Array, "e 4"]:
     """Stokes vectors that enter the collimator, one per exposure, at a field point.
 
-    `sky` is (q, u) of the Moon sky for δ = 1 in the ICS, `source` the row of the standard star or −1. Catalogue
-    values are turned into the ICS, (q + iu) exp(−2i ROTATOR); light through the polariser forgets its past.
+    `sky` is (q, u) of the Moon sky for δ = 1 in the ICS, `source` the row of the standard star or −1. Light
+    through the polariser forgets its past; light of known flux does not come through the telescope.
     """
+    rotator = exposures.rotator
+    offset: Scalar | float = 0.0
+    for effect in instrument.effects:
+        offset = effect.rotator(offset)
+    if not isinstance(offset, float):
+        rotator, sky = rotator + offset, _turned(sky, offset)
     moon = instrument.sky.depolarisation * sky
+    for effect in instrument.effects:
+        moon = effect.moon(moon, sky)
     beam = jnp.where(exposures.moon[:, None], moon, 0.0)
     if instrument.standard.names:
-        known = source >= 0
-        row = jnp.where(known, source, 0)
-        q, u = instrument.standard.q[row], instrument.standard.u[row]
-        cos, sin = jnp.cos(2 * exposures.rotator), jnp.sin(2 * exposures.rotator)
-        star = jnp.stack([q * cos + u * sin, u * cos - q * sin], axis=-1)
-        beam = jnp.where((known & ~exposures.moon)[:, None], star, beam)
+        star = _catalogue(instrument, rotator, source)
+        beam = jnp.where(((source >= 0) & ~exposures.moon)[:, None], star, beam)
     one = jnp.ones_like(exposures.clp_angle)
     light = jnp.stack([one, beam[:, 0], beam[:, 1], jnp.zeros_like(one)], axis=-1)
-    angle = exposures.clp_angle
+    if overridden(instrument.effects, "telescope"):
+        light = jnp.where(exposures.flux_known[:, None], light, light @ telescope(instrument).T)
+    angle, extinction = exposures.clp_angle, instrument.polariser.extinction
     for effect in instrument.effects:
-        light = effect.sky(light, exposures)
         angle = effect.polariser_angle(angle, exposures)
-    behind = mueller.polarised(angle, instrument.polariser.extinction)
+        extinction = effect.extinction(extinction)
+    behind = mueller.polarised(angle, extinction)
     for effect in instrument.effects:
         behind = effect.polarised(behind, exposures)
     return jnp.where(exposures.clp_in[:, None], behind, light)
@@ -224,13 +265,31 @@ def counts(
     source: Int[Array, " e"],
     band: Int[Array, " e"],
 ) -> Float[Array, "e 4"]:
-    """Counts of the four cameras in every exposure at a field point, for light of unit flux."""
+    """Counts of the four cameras in every exposure at a field point, for light of unit flux and no ghosts."""
     vectors = camera_vectors(instrument, rows, throughput, x, y)
     light = stokes(instrument, plan.exposures, sky, source)
-    result = jnp.einsum("eks,es->ek", vectors[band], light)
+    return jnp.einsum("eks,es->ek", vectors[band], light)
+
+
+def with_ghosts(
+    instrument: Instrument,
+    counts: Float[Array, "e 4"],
+    opposite: Float[Array, "e 4"],
+    source: Int[Array, " e"],
+) -> Float[Array, "e 4"]:
+    """Counts for light of unit flux with what the cameras see of the opposite field point, `opposite`."""
     for effect in instrument.effects:
-        result = effect.counts(result, plan.exposures)
-    return result
+        counts = effect.mirrored(counts, opposite, source < 0)
+    return counts
+
+
+def detected(
+    instrument: Instrument, exposures: ExposureArrays, counts: Float[Array, "e 4"]
+) -> Float[Array, "e 4"]:
+    """What the detectors report for counts in electrons: the one stage that is not linear in the light."""
+    for effect in instrument.effects:
+        counts = effect.detector(counts, exposures)
+    return counts
 
 
 # --------------------------------------------------------------------------------------- what users ask for
@@ -240,6 +299,7 @@ def instrument_matrix(vectors: Float[Array, "... 4 4"]) -> Float[Array, "... 2 3
     """Rows (m21, m22, m23) and (m31, m32, m33) of the instrument matrix from analysis vectors.
 
     Difference of the two cameras' response to 1, q, u, each over the sum of their response to unpolarised light.
+    For light from the sky pass `vectors @ telescope(instrument)`, so that an active effect there is included.
     """
     first = (vectors[..., 0, :3] - vectors[..., 1, :3]) / (vectors[..., 0, :1] + vectors[..., 1, :1])
     second = (vectors[..., 2, :3] - vectors[..., 3, :3]) / (vectors[..., 2, :1] + vectors[..., 3, :1])

@@ -7,7 +7,7 @@ per exposure. Angles of the polariser never meet wavelengths.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.data.records import Exposures, FilterCurve, Sources
-from walop_jax.model.effects.base import Conditions, ExposureArrays
+from walop_jax.model.effects.base import Conditions, Effect, ExposureArrays
 from walop_jax.model.materials import REFERENCE_TEMPERATURE
 from walop_jax.model.quadrature import band_rule
 
@@ -53,7 +53,8 @@ def _teff(exposures: Exposures, sources: Sources | None, e: int, s: int) -> floa
 
 
 def _condition(exposures: Exposures, e: int, depends_on: Collection[str]) -> tuple[float, float]:
-    temperature = float(exposures.temp[e]) if "temperature" in depends_on else REFERENCE_TEMPERATURE
+    known = "temperature" in depends_on and np.isfinite(exposures.temp[e])
+    temperature = float(exposures.temp[e]) if known else REFERENCE_TEMPERATURE
     hour_angle = float(np.nan_to_num(exposures.ha[e])) if "hour_angle" in depends_on else 0.0
     return temperature, hour_angle
 
@@ -73,15 +74,33 @@ def exposure_arrays(exposures: Exposures) -> ExposureArrays:
     )
 
 
+def equivalent_width(curve: FilterCurve) -> float:
+    """∫ THROUGHPUT dλ / max THROUGHPUT (µm); 0 for a monochromatic band."""
+    return float(np.trapezoid(curve.throughput, curve.wavelength) / curve.throughput.max())
+
+
+def plan_for(
+    effects: Sequence[Effect],
+    exposures: Exposures,
+    filters: Mapping[str, FilterCurve],
+    sources: Sources | None = None,
+) -> Plan:
+    """The plan of `exposures` as detailed as the active effects need it."""
+    depends_on = {quantity for effect in effects for quantity in effect.optics_depend_on}
+    return build_plan(exposures, filters, sources, depends_on, max((e.fringes for e in effects), default=0.0))
+
+
 def build_plan(
     exposures: Exposures,
     filters: Mapping[str, FilterCurve],
     sources: Sources | None = None,
     depends_on: Collection[str] = (),
+    fringes: float = 0.0,
 ) -> Plan:
     """Lay out the nodes and bands of `exposures`.
 
-    `depends_on` names the exposure quantities on which the optics depend ("temperature", "hour_angle").
+    `depends_on` names the exposure quantities on which the optics depend ("temperature", "hour_angle"), `fringes`
+    the path difference (waves at 0.62 µm) that the nodes must follow beyond that of the plates.
     Raises KeyError for a filter that `filters` does not hold.
     """
     n_sources = 0 if sources is None else len(sources)
@@ -109,7 +128,11 @@ def build_plan(
                 band_of[e, s + 1] = index[keys[e, s]]
 
     groups = sorted({(name, condition) for _, name, condition, _ in bands})
-    rules = {name: band_rule(filters[name].wavelength, filters[name].throughput) for name, _ in groups}
+    rules = {
+        name: band_rule(filters[name].wavelength, filters[name].throughput, fringes=fringes)
+        for name, _ in groups
+    }
+    width = {name: equivalent_width(filters[name]) for name in rules}
     offset, start = {}, 0
     for group in groups:
         offset[group] = start
@@ -131,10 +154,19 @@ def build_plan(
         settings.append((angle, values.index(value), len(values) - values[::-1].index(value)))
     return Plan(
         wavelength=jnp.asarray(np.concatenate([rules[g[0]][0] for g in groups])),
-        conditions=Conditions(per_node([c[0] for _, c in groups]), per_node([c[1] for _, c in groups])),
+        conditions=Conditions(
+            temperature=per_node([c[0] for _, c in groups]),
+            hour_angle=per_node([c[1] for _, c in groups]),
+            band_width=per_node([width[name] for name, _ in groups]),
+        ),
         node_weight=jnp.asarray(weight),
         teff=jnp.asarray([key[3] for key in bands]),
         exposures=exposure_arrays(exposures),
         band_of=band_of,
         settings=tuple(settings),
     )
+
+
+def with_median(plan: Plan, median: Float[np.ndarray, "e 4"]) -> Plan:
+    """The plan with the median counts of every exposure and camera, which some effects need."""
+    return eqx.tree_at(lambda p: p.exposures, plan, plan.exposures._replace(median=jnp.asarray(median)))

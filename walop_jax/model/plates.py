@@ -14,6 +14,10 @@ Face            with 𝐄, 𝐇 the 2 × 2 matrices of the tangential fields of 
 Stack           J = t_out Π P_j t_j, P = diag(1, exp 2πi d (k_ze − k_zo)/λ); the ordinary phase is common.
 
 Symbols     s = sin of the angle in air; d thickness [µm]; λ vacuum wavelength [µm]; n_o, n_e at λ.
+Cut axis    with c = (cos α cos χ, sin α cos χ, sin χ) the extraordinary waves obey k·εk = n_o² n_e², a quadratic in k_z
+            whose two roots are no mirror images; with 𝐄₋, 𝐇₋ the backward waves of the first medium and
+            Y = 𝐇₋ 𝐄₋⁻¹ the face is t = (𝐇₂ − Y 𝐄₂)⁻¹ (𝐇₁ − Y 𝐄₁). Solved that way only if a plate has a `cut`.
+
 Sources     Born & Wolf, Principles of Optics, ch. 15 (waves in uniaxial crystals) and 1.5 (continuity);
             Yeh 1982, Surf. Sci. 96, 41 (the matrix form). Fixed axis: Paper II, appendix B.
 Limits      At normal incidence a plate of air indices is the identity; 𝐄 of air is the carried frame of
@@ -22,7 +26,8 @@ Limits      At normal incidence a plate of air indices is the identity; 𝐄 of 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -33,12 +38,16 @@ Real = Float[Array, "..."]
 
 
 class Plate(NamedTuple):
-    """A uniaxial plate: thickness (µm), indices at the wavelengths, and the azimuth of its axis (rad)."""
+    """A uniaxial plate: thickness (µm), indices at the wavelengths, azimuth of its optic axis (rad).
+
+    `cut` is the angle (rad) of the optic axis out of the surface, None where it lies in the surface.
+    """
 
     thickness: Real
     ordinary: Real
     extraordinary: Real
     axis: Real
+    cut: Real | None = None
 
 
 class _Waves(NamedTuple):
@@ -83,26 +92,88 @@ def _face(before: _Waves, after: _Waves) -> Matrix2:
     return electric.plus(magnetic).inverse().times(2.0)
 
 
+# ------------------------------------------------------------------ optic axes out of the surface
+
+
+class _BothWays(NamedTuple):
+    forward: _Waves
+    backward: _Waves  # tangential fields of the two backward waves; their phase is not used
+
+
+def _air_both_ways(sx: Real, sy: Real) -> _BothWays:
+    forward = _air(sx, sy)
+    return _BothWays(forward, forward._replace(magnetic=forward.magnetic.times(-1.0)))
+
+
+def _extraordinary_kz(sx: Real, sy: Real, plate: Plate) -> tuple[Real, Real]:
+    """Both roots k_z of k·εk = n_o² n_e², forward first."""
+    cut = 0.0 if plate.cut is None else plate.cut
+    no2, ne2 = plate.ordinary**2, plate.extraordinary**2
+    along, cz = (sx * jnp.cos(plate.axis) + sy * jnp.sin(plate.axis)) * jnp.cos(cut), jnp.sin(cut)
+    a = no2 + (ne2 - no2) * cz**2
+    b = (ne2 - no2) * along * cz
+    c = no2 * (sx**2 + sy**2) + (ne2 - no2) * along**2 - no2 * ne2
+    root = jnp.sqrt(b**2 - a * c)
+    return (root - b) / a, (-root - b) / a
+
+
+def _crystal_both_ways(sx: Real, sy: Real, plate: Plate) -> _BothWays:
+    cut = 0.0 if plate.cut is None else plate.cut
+    no2 = plate.ordinary**2
+    cx, cy, cz = jnp.cos(plate.axis) * jnp.cos(cut), jnp.sin(plate.axis) * jnp.cos(cut), jnp.sin(cut)
+    kz_o = jnp.sqrt(no2 - sx**2 - sy**2)
+
+    def waves(kz_o: Real, kz_e: Real) -> _Waves:
+        along = sx * cx + sy * cy + kz_e * cz
+        e_o = (sy * cz - kz_o * cy, kz_o * cx - sx * cz, sx * cy - sy * cx)
+        e_e = (no2 * cx - along * sx, no2 * cy - along * sy, no2 * cz - along * kz_e)
+        h_o, h_e = _tangential(sx, sy, kz_o, e_o), _tangential(sx, sy, kz_e, e_e)
+        electric = Matrix2(e_o[0], e_e[0], e_o[1], e_e[1])
+        return _Waves(electric, Matrix2(h_o[0], h_e[0], h_o[1], h_e[1]), kz_e - kz_o)
+
+    forward, backward = _extraordinary_kz(sx, sy, plate)
+    return _BothWays(waves(kz_o, forward), waves(-kz_o, backward))
+
+
+def _face_both_ways(before: _BothWays, after: _BothWays) -> Matrix2:
+    y = (before.backward.magnetic @ before.backward.electric.inverse()).times(-1.0)
+    transmitted = after.forward.magnetic.plus(y @ after.forward.electric)
+    incident = before.forward.magnetic.plus(y @ before.forward.electric)
+    return transmitted.inverse() @ incident
+
+
+def _stack(
+    media: list[_Waves] | list[_BothWays],
+    phases: list[Real],
+    face: Callable[[Any, Any], Matrix2],
+) -> Matrix2:
+    jones = face(media[0], media[1])
+    for before, after, phase in zip(media[1:-1], media[2:], phases, strict=True):
+        turn = jnp.exp(2j * jnp.pi * phase)
+        jones = face(before, after) @ jones.scaled_rows(jnp.ones_like(turn), turn)
+    return jones
+
+
 def stack_jones(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real) -> Matrix2:
     """Jones matrix of plates in contact, in air, for rays of direction (sx, sy, √(1 − s²)).
 
     Referred to the carried axes on both sides, Fresnel losses of every face included. All arguments
     broadcast; `wavelength` in µm.
     """
-    sx, sy = jnp.broadcast_arrays(sx, sy)
-    medium = _air(sx, sy)
-    outside = medium
-    jones = None
-    for plate in plates:
-        inside = _crystal(sx, sy, plate)
-        face = _face(medium, inside)
-        jones = face if jones is None else face @ jones
-        turn = jnp.exp(2j * jnp.pi * plate.thickness * inside.phase / wavelength)
-        jones = jones.scaled_rows(jnp.ones_like(turn), turn)
-        medium = inside
-    if jones is None:
+    if not plates:
         raise ValueError("a stack needs at least one plate")
-    return _face(medium, outside) @ jones
+    sx, sy = jnp.broadcast_arrays(sx, sy)
+    if any(plate.cut is not None for plate in plates):
+        air = _air_both_ways(sx, sy)
+        crystals = [_crystal_both_ways(sx, sy, plate) for plate in plates]
+        inside = [crystal.forward for crystal in crystals]
+        media, face = [air, *crystals, air], _face_both_ways
+    else:
+        air = _air(sx, sy)
+        inside = [_crystal(sx, sy, plate) for plate in plates]
+        media, face = [air, *inside, air], _face
+    phases = [p.thickness * w.phase / wavelength for p, w in zip(plates, inside, strict=True)]
+    return _stack(media, phases, face)
 
 
 def stack_mueller(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real) -> Float[Array, "... 4 4"]:
@@ -122,10 +193,8 @@ def fixed_axis_mueller(
     total = jnp.zeros_like(sx)
     last = plates[-1].axis
     for plate in plates:
-        cx, cy = jnp.cos(plate.axis), jnp.sin(plate.axis)
-        along, across = sx * cx + sy * cy, -sx * cy + sy * cx
         kz_o = jnp.sqrt(plate.ordinary**2 - sx**2 - sy**2)
-        kz_e = jnp.sqrt(plate.extraordinary**2 * (1.0 - along**2 / plate.ordinary**2) - across**2)
+        kz_e, _ = _extraordinary_kz(sx, sy, plate)
         sign = jnp.cos(2.0 * (plate.axis - last))
         total = total + sign * 2.0 * jnp.pi * plate.thickness * (kz_e - kz_o) / wavelength
     return retarder(total, last + 0.5 * jnp.pi)

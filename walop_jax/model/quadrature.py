@@ -76,12 +76,13 @@ def _fringe_error(
     return float(np.abs(rule - exact).max())
 
 
-def band_rule(wavelength: Vector, throughput: Vector, tolerance: float = 1e-7) -> Rule:
+def band_rule(wavelength: Vector, throughput: Vector, tolerance: float = 1e-7, fringes: float = 0.0) -> Rule:
     """Fewest wavelength nodes (µm) and weights (sum 1) that integrate plate fringes to `tolerance`.
 
     Fringes at twice the plates' frequency carry a hundred times less light and are held to a hundred times the
-    tolerance.
+    tolerance; so are those of a path difference of `fringes` waves at 0.62 µm, if there is an etalon.
     """
+    weak = max(2 * WAVES, fringes)
     fine, fine_weight = tabulated_measure(wavelength, throughput)
     for count in range(1, MAXIMUM_NODES):
         if count >= len(fine):
@@ -89,7 +90,7 @@ def band_rule(wavelength: Vector, throughput: Vector, tolerance: float = 1e-7) -
         node, weight = gauss_rule(fine, fine_weight, count)
         if (
             _fringe_error(node, weight, fine, fine_weight, WAVES) < tolerance
-            and _fringe_error(node, weight, fine, fine_weight, 2 * WAVES) < 100 * tolerance
+            and _fringe_error(node, weight, fine, fine_weight, weak) < 100 * tolerance
         ):
             return node, weight
     return fine, fine_weight

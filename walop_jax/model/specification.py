@@ -16,8 +16,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
+from walop_jax.data.records import Exposures
+from walop_jax.model.effects import EFFECTS, effect_by_name
+from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import leaves, unknown_name
+from walop_jax.model.parameters import Component, leaves, unknown_name
 
 Vector = Float[np.ndarray, " n"]
 
@@ -137,9 +140,9 @@ def unravel(template: Instrument) -> Callable[[Float[Array, " n"]], Instrument]:
     return ravel_pytree(template)[1]
 
 
-def full_values(instrument: Instrument) -> Vector:
-    """All numbers of an instrument in tree order."""
-    return np.asarray(ravel_pytree(instrument)[0])
+def full_values(component: Component) -> Vector:
+    """All numbers of an instrument, or of a part of it, in tree order."""
+    return np.asarray(ravel_pytree(component)[0])
 
 
 def optical_indices(instrument: Instrument) -> tuple[int, ...]:
@@ -150,6 +153,11 @@ def optical_indices(instrument: Instrument) -> tuple[int, ...]:
 def series_indices(instrument: Instrument) -> tuple[int, ...]:
     """Positions of the throughput coefficients (4 × terms, contiguous)."""
     return tuple(i for i, leaf in enumerate(leaves(instrument)) if leaf.owner == "Throughput")
+
+
+def make_template(instrument: Instrument) -> Instrument:
+    """The instrument with nothing but arrays in its tree."""
+    return jax.tree.map(jnp.asarray, eqx.filter(instrument, eqx.is_array))
 
 
 def make_model(
@@ -178,8 +186,49 @@ def make_model(
     names = [p.name for p in parameters]
     for missing in [*priors, *(f for f in frozen if f not in names)]:
         raise unknown_name("parameter", missing, names)
-    return Model(
-        name=name,
-        template=jax.tree.map(jnp.asarray, eqx.filter(instrument, eqx.is_array)),
-        parameters=tuple(parameters),
+    return Model(name=name, template=make_template(instrument), parameters=tuple(parameters))
+
+
+def effect_context(instrument: Instrument, exposures: Exposures) -> Context:
+    """What effects need to know of a data set: its Moon exposures, its standards, how many exposures."""
+    moon = np.flatnonzero((exposures.kind == "moon") & ~exposures.clp_in)
+    return Context(
+        exposures=len(exposures),
+        moon=tuple(moon.tolist()),
+        moon_ids=tuple(np.asarray(exposures.exposure)[moon].tolist()),
+        sources=instrument.standard.names,
     )
+
+
+def with_effects(model: Model, effects: Sequence[str | Effect], context: Context) -> Model:
+    """The model with effects added, in the order light meets them; what it had stays as it was.
+
+    A name adds the effect at its neutral value, at the shape of its first probe; an instance starts where it
+    stands. Priors are centred on neutral, with the widths of the declarations. Raises ValueError for a name
+    that does not exist and for an effect that is there already.
+    """
+    order = [kind.name for kind in EFFECTS]
+    active = list(model.template.effects)
+    starts = {}
+    for effect in effects:
+        if isinstance(effect, str):
+            kind = effect_by_name(effect)
+            effect = next((group[0] for group in kind.probes(context)), kind.neutral(context))
+        if effect.name in (other.name for other in active):
+            raise ValueError(f"effect {effect.name!r} is in the model already")
+        active.append(effect)
+        neutral = type(effect).neutral(context)
+        names = [f"{effect.name}.{leaf.name}" for leaf in leaves(effect)]
+        values = zip(full_values(effect), full_values(neutral), strict=True)
+        starts |= dict(zip(names, values, strict=True))
+    active.sort(key=lambda effect: order.index(effect.name))
+    instrument = dataclasses.replace(model.template, effects=tuple(active))
+    known = {p.name: p for p in model.parameters}
+    parameters = []
+    for p in make_model(model.name, instrument).parameters:
+        if p.name in starts:
+            start, neutral = map(float, starts[p.name])
+            prior = None if p.prior is None else (neutral, p.prior[1])
+            known[p.name] = dataclasses.replace(p, start=start, prior=prior)
+        parameters.append(known[p.name])
+    return dataclasses.replace(model, template=make_template(instrument), parameters=tuple(parameters))

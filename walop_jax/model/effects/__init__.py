@@ -1,7 +1,76 @@
-"""Physical effects beyond the base model: one file each, and the one list `EFFECTS`."""
+"""Physical effects beyond the base model: one file each, and the one list `EFFECTS`, in the order light meets them."""
 
-from walop_jax.model.effects.base import Effect
+from walop_jax.model.effects.base import Context, Effect
+from walop_jax.model.effects.blemish import Blemish
+from walop_jax.model.effects.camera_gain_drift import CameraGainDrift
+from walop_jax.model.effects.camera_leakage import CameraLeakage
+from walop_jax.model.effects.chwp_in_beam import ChwpInBeam
+from walop_jax.model.effects.chwp_thickness import ChwpThickness
+from walop_jax.model.effects.clp_ellipticity import ClpEllipticity
+from walop_jax.model.effects.clp_extinction import ClpExtinction
+from walop_jax.model.effects.clp_wobble import ClpWobble
+from walop_jax.model.effects.clp_zero import ClpZero
+from walop_jax.model.effects.etalon import Etalon
+from walop_jax.model.effects.filter_shift import FilterShift
+from walop_jax.model.effects.flexure import Flexure
+from walop_jax.model.effects.ghost import Ghost
+from walop_jax.model.effects.hwp_temperature import HwpTemperature
+from walop_jax.model.effects.lens_birefringence import LensBirefringence
+from walop_jax.model.effects.moon_multiple_scattering import MoonMultipleScattering
+from walop_jax.model.effects.moon_patch import MoonPatch
+from walop_jax.model.effects.nonlinearity import Nonlinearity
+from walop_jax.model.effects.pedestal import Pedestal
+from walop_jax.model.effects.plate_axis import ChwpAxis, Hwp1Axis, Hwp2Axis
+from walop_jax.model.effects.plate_crossing import Hwp1Crossing, Hwp2Crossing
+from walop_jax.model.effects.plate_cut import Hwp1AxisCut, Hwp2AxisCut
+from walop_jax.model.effects.rotator_zero import RotatorZero
+from walop_jax.model.effects.standard_outlier import StandardOutlier
+from walop_jax.model.effects.telescope_polarisation import TelescopePolarisation
+from walop_jax.model.effects.upstream_retarder import UpstreamRetarder
+from walop_jax.model.effects.wollaston_axis import WollastonAxis
+from walop_jax.model.parameters import unknown_name
 
-EFFECTS: tuple[type[Effect], ...] = ()
+EFFECTS: tuple[type[Effect], ...] = (
+    MoonMultipleScattering,
+    MoonPatch,
+    RotatorZero,
+    StandardOutlier,
+    TelescopePolarisation,
+    ClpZero,
+    ClpWobble,
+    ClpExtinction,
+    ClpEllipticity,
+    LensBirefringence,
+    UpstreamRetarder,
+    ChwpInBeam,
+    ChwpAxis,
+    ChwpThickness,
+    Flexure,
+    FilterShift,
+    Etalon,
+    HwpTemperature,
+    Hwp1Axis,
+    Hwp2Axis,
+    Hwp1Crossing,
+    Hwp2Crossing,
+    Hwp1AxisCut,
+    Hwp2AxisCut,
+    WollastonAxis,
+    Blemish,
+    CameraLeakage,
+    Ghost,
+    Pedestal,
+    Nonlinearity,
+    CameraGainDrift,
+)
 
-__all__ = ["EFFECTS", "Effect"]
+
+def effect_by_name(name: str) -> type[Effect]:
+    """The effect of a canonical name; ValueError with the nearest names when there is none."""
+    for effect in EFFECTS:
+        if effect.name == name:
+            return effect
+    raise unknown_name("effect", name, [effect.name for effect in EFFECTS])
+
+
+__all__ = ["EFFECTS", "Context", "Effect", "effect_by_name"]

@@ -141,7 +141,7 @@ class Effect(Component):
 
     def choices(self) -> dict[str, Any]:
         """Discrete choices that belong to the description of the effect, e.g. the number of a camera."""
-        return {}
+        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.metadata.get("static")}
 
     def standard_form(self) -> Self:
         """The same effect with positive amplitude and with angles in their principal range."""

@@ -1,0 +1,128 @@
+"""Patterns without a name: what a disagreement could look like in any instrument of this kind.
+
+Each stratum perturbs the counts of the cameras, N_k → N_k + F · pattern, and is one candidate of the score test:
+
+vector          one element (q or u) of the analysis vector of one camera × field polynomials up to degree 4:
+                anything linear in the light (a Mueller effect) that is smooth in the field
+harmonic        1θ, 3θ, 4θ of the polariser angle in one camera × field polynomials up to degree 1: what no Mueller
+                matrix behind the polariser can make
+time, flux, temperature   gain of a camera linear in that quantity
+kind, filter, plate       response of a camera that differs between kinds of exposure, filters, plate settings
+exposure        gain of each camera in each single exposure
+fine structure  gain of a camera × field polynomials of degree 5 to 8
+
+The columns carry the unit "share of the unpolarised counts of the camera".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from walop_jax.diagnose.score import Candidate
+from walop_jax.likelihood.problem import Problem
+from walop_jax.model import legendre
+from walop_jax.model.conventions import CAMERA_NAMES
+
+WIDTH = 0.003  # plausible size of an unknown pattern, in units of the unpolarised counts
+SMOOTH, FINE = 4, 8
+
+Cube = Float[np.ndarray, "p e 4"]
+
+
+class Measured:
+    """The measurements of a problem at its best fit, laid out for building columns of residual derivatives."""
+
+    def __init__(self, problem: Problem, values: Float[np.ndarray, " n"]) -> None:
+        self.problem = problem
+        n = len(problem.calset.points)
+        self.weight: Cube = np.concatenate([np.asarray(c.weight) for c in problem.chunks])[:n]
+        self.counts: Cube = np.concatenate([np.asarray(c.counts) for c in problem.chunks])[:n]
+        self.used: Bool[np.ndarray, "p e"] = problem.used
+        self.flux, self.residual = problem.residuals(values)
+        # Weighted model at unit flux, from data = flux · model + residual.
+        flux = np.where(self.flux == 0, 1.0, self.flux)[..., None]
+        self.model: Cube = (self.counts * self.weight - self.residual) / flux
+        self.known = np.asarray(problem.plan.exposures.flux_known)
+        unpolarised = np.where(self.used[..., None], self.counts, 0.0).sum(axis=1)
+        self.level: Float[np.ndarray, "p 4"] = unpolarised / np.maximum(
+            np.where(self.used, self.flux, 0.0).sum(axis=1), 1e-300
+        )[:, None]
+
+    def column(self, pattern: Cube) -> Float[np.ndarray, " d"]:
+        """Derivative of the residuals with respect to the amplitude of N_k → N_k + F · level_k · pattern."""
+        change = self.flux[..., None] * pattern * self.level[:, None, :] * self.weight
+        power = np.sum(self.model**2, axis=-1)
+        along = np.sum(change * self.model, axis=-1) / np.where(power > 0, power, 1.0)
+        along = np.where(self.known, 0.0, along)
+        return -(change - along[..., None] * self.model)[self.used].reshape(-1)
+
+    def candidate(self, name: str, patterns: list[Cube]) -> Candidate:
+        """A stratum of patterns."""
+        columns = np.column_stack([self.column(p) for p in patterns])
+        return Candidate(name, columns, np.full(columns.shape[1], WIDTH))
+
+
+def _camera(k: int) -> Float[np.ndarray, "1 1 4"]:
+    return np.eye(4)[k][None, None]
+
+
+def strata(measured: Measured) -> Iterator[Candidate]:
+    """All strata that the exposures of the set allow."""
+    problem = measured.problem
+    e, points = problem.calset.exposures, problem.calset.points
+    shape = (len(points), len(e), 4)
+    smooth = np.asarray(legendre.basis(points.x, points.y, SMOOTH))
+    fine = np.asarray(legendre.basis(points.x, points.y, FINE))[:, smooth.shape[1] :]
+    stokes = problem.light(measured)
+    for k, camera in enumerate(CAMERA_NAMES):
+        for i, element in ((1, "q"), (2, "u")):
+            patterns = [
+                (term[:, None] * stokes[..., i])[..., None] * _camera(k) for term in smooth.T
+            ]
+            yield measured.candidate(f"vector {element} of {camera}", patterns)
+        through = e.clp_in & measured.used.any(axis=0)
+        angle = np.deg2rad(np.where(through, e.clp_angle, 0.0))
+        for harmonic in (1, 3, 4):
+            if len(np.unique(np.round(np.mod(e.clp_angle[through], 360.0), 3))) < 2 * harmonic + 1:
+                continue
+            waves = [np.where(through, wave(harmonic * angle), 0.0) for wave in (np.cos, np.sin)]
+            patterns = [
+                (term[:, None] * wave[None, :])[..., None] * _camera(k) for term in smooth.T[:3] for wave in waves
+            ]
+            yield measured.candidate(f"{harmonic}θ of {camera}", patterns)
+        yield measured.candidate(
+            f"fine structure of {camera}",
+            [np.broadcast_to(term[:, None, None] * _camera(k), shape) for term in fine.T],
+        )
+    for name, quantity in (
+        ("time", (e.mjd - np.nanmean(e.mjd))[None, :]),
+        ("temperature", (e.temp - np.nanmean(e.temp))[None, :]),
+        ("flux", measured.flux - measured.flux[measured.used].mean()),
+    ):
+        spread = np.nanstd(quantity)
+        if np.isfinite(spread) and spread > 1e-9 * max(1.0, float(np.nanmax(np.abs(quantity)))):
+            scaled = np.nan_to_num(quantity / spread)
+            patterns = [np.broadcast_to(scaled[..., None] * _camera(k), shape) for k in range(4)]
+            yield measured.candidate(name, patterns)
+    plate = np.array([f"{a:g}" if i else "out" for i, a in zip(e.chwp_in, e.chwp_angle, strict=True)])
+    for name, label in (("kind", e.kind), ("filter", e.filter), ("plate", plate)):
+        groups = np.unique(label)
+        patterns = [
+            np.where((label == group)[None, :, None], stokes[..., i : i + 1], 0.0) * _camera(k)
+            for group in groups[1:]
+            for i in range(3)
+            for k in range(4)
+        ]
+        if patterns:
+            yield measured.candidate(name, patterns)
+    yield measured.candidate(
+        "single exposures",
+        [
+            np.broadcast_to((np.arange(len(e)) == one)[None, :, None] * _camera(k), shape)
+            for one in range(len(e))
+            for k in range(3)
+        ],
+    )

@@ -1,0 +1,81 @@
+"""Fringes of the air gaps ahead of the half-wave plates.
+
+Equation    diattenuator with D = contrast · cos(4π gap cos ϑ / λ) along the fast axis of each plate, ahead of it
+Symbols     gap thickness of the air [µm]; ϑ angle of the ray in air at the plate; λ wavelength [µm]
+Source      calibration contract, section 6; fringes of polarised light are "the chief bane" of precise polarimetry
+            (Clarke 2005, A&A 434, 377), 1e-3 remains with coatings (Semel 2003, A&A 401, 1).
+Neutral     contrast = 0, whatever the gap
+Revealed by zero offsets that oscillate with wavelength (period λ²/2 gap) and in rings over the field; a broad band
+            averages gaps beyond some tens of µm away.
+
+Near a gap the fringe is a cosine and a sine: the probes come in pairs λ₀/8 apart, a quarter of a fringe, on a grid
+that no fringe of the r band escapes. The wavelength nodes follow gaps up to `LARGEST_GAP`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Self
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from walop_jax.model import mueller as mm
+from walop_jax.model.effects.base import CONTRACT, Effect, Real, Scalar
+from walop_jax.model.parameters import param
+
+REFERENCE_WAVELENGTH = 0.62  # µm
+LARGEST_GAP = 60.0  # µm
+GAPS = tuple(np.arange(1.0, LARGEST_GAP, 0.75).tolist())
+QUARTER = REFERENCE_WAVELENGTH / 8.0
+
+
+class Etalon(Effect):
+    """Diattenuation of an air gap along the fast axis of each plate."""
+
+    contrast: Scalar = param(
+        unit="", about="diattenuation at a maximum", source=CONTRACT, width=0.003, optical=True, default=0.0
+    )
+    gap: Scalar = param(
+        unit="um",
+        about="thickness of the air gap",
+        source=CONTRACT,
+        scale=0.05,
+        loose=5.0,
+        optical=True,
+        default=10.0,
+    )
+
+    name: ClassVar[str] = "etalon"
+    shape: ClassVar[tuple[str, ...]] = ("gap",)
+    starts: ClassVar[tuple[tuple[Mapping[str, Any], ...], ...]] = tuple(
+        ({"gap": gap}, {"gap": gap + QUARTER}) for gap in GAPS
+    )
+    fringes: ClassVar[float] = 2.0 * LARGEST_GAP / REFERENCE_WAVELENGTH
+    revealed_by: ClassVar[str] = "unpolarised light or polariser exposures in narrow bands"
+    separated_by: ClassVar[str] = (
+        "narrow bands of different wavelength, or a change of temperature: throughput and lens polarisation do not oscillate"
+    )
+
+    def ahead_of_plates(
+        self,
+        where: str,
+        mueller: Float[Array, "n 4 4"],
+        sx: Real,
+        sy: Real,
+        wavelength: Real,
+        fast_axis: Real,
+    ) -> Float[Array, "n 4 4"]:
+        """The fringe, then the plate."""
+        cosine = jnp.sqrt(1.0 - sx**2 - sy**2)
+        d = self.contrast * jnp.cos(4.0 * jnp.pi * self.gap * cosine / wavelength)
+        return mueller @ mm.diattenuator(d * jnp.cos(2.0 * fast_axis), d * jnp.sin(2.0 * fast_axis))
+
+    @classmethod
+    def combine(cls, group: Sequence[Self], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
+        """Contrast and gap from cosine and sine at the pair's gap."""
+        cosine, sine = amplitudes
+        shift = np.arctan2(sine, cosine) * REFERENCE_WAVELENGTH / (4.0 * np.pi)
+        return dataclasses.replace(group[0], contrast=np.hypot(cosine, sine), gap=float(group[0].gap) + shift)

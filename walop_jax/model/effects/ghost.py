@@ -1,0 +1,42 @@
+"""A ghost image of the field, turned by 180°.
+
+Equation    N(X, Y) → N(X, Y) + share · N(−X, −Y) in the same camera, for extended sources (SOURCE = −1)
+Symbols     share: of the light at the opposite field point
+Source      calibration contract, section 6; reflections between detector and window are point-symmetric about the axis.
+Neutral     share = 0
+Revealed by polariser and Moon exposures whose response resembles that of the opposite field point, while stars at the
+            same place do not show it.
+
+An extended source is taken to be as bright at the opposite point; its polarisation is that of the source there.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from walop_jax.model.effects.base import CONTRACT, Effect, Scalar
+from walop_jax.model.parameters import param
+
+
+class Ghost(Effect):
+    """A share of the counts at the opposite field point."""
+
+    share: Scalar = param(
+        unit="", about="share of the opposite point", source=CONTRACT, width=0.005, default=0.0
+    )
+
+    name: ClassVar[str] = "ghost"
+    one_sided: ClassVar[tuple[str, ...]] = ("share",)
+    revealed_by: ClassVar[str] = "extended sources and stars at the same field points"
+    separated_by: ClassVar[str] = (
+        "a star dithered over the field: its ghost moves the other way, flats and throughput do not"
+    )
+
+    def mirrored(
+        self, counts: Float[Array, "e 4"], opposite: Float[Array, "e 4"], extended: Bool[Array, " e"]
+    ) -> Float[Array, "e 4"]:
+        """Add the opposite point."""
+        return counts + jnp.where(extended[:, None], self.share * opposite, 0.0)

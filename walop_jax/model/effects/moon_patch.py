@@ -1,0 +1,55 @@
+"""Free mean polarisation of every Moon patch.
+
+Equation    (q, u) of exposure e → (q, u) + (q_e, u_e), the same over the field, in the ICS
+Symbols     q_e, u_e for each exposure of KIND `moon`
+Source      calibration contract, section 6; neutral points and aerosol: a third of the patches of RoboPol were not what
+            single scattering says (Maharana et al. 2023, A&A 679, A68).
+Neutral     all 0
+Revealed by Moon patches that disagree with each other under the instrument that polariser and standards give.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from walop_jax.model.effects.base import CONTRACT, Context, Effect
+from walop_jax.model.parameters import param
+
+
+class MoonPatch(Effect):
+    """What a patch has beyond single scattering, per Moon exposure."""
+
+    q: Float[Array, " m"] = param(unit="", about="added to q of the patch", source=CONTRACT, width=0.005)
+    u: Float[Array, " m"] = param(unit="", about="added to u of the patch", source=CONTRACT, width=0.005)
+    positions: tuple[int, ...] = eqx.field(static=True)
+    ids: tuple[int, ...] = eqx.field(static=True)
+
+    name: ClassVar[str] = "moon_patch"
+    revealed_by: ClassVar[str] = "Moon patches with polariser exposures"
+    separated_by: ClassVar[str] = (
+        "the same patch again an hour later, or at another ROTATOR angle: the sky turns, the telescope not"
+    )
+
+    @classmethod
+    def neutral(cls, context: Context) -> Self:
+        """Nothing beyond single scattering in any patch."""
+        zero = np.zeros(len(context.moon))
+        return cls(q=zero, u=zero, positions=context.moon, ids=context.moon_ids)
+
+    def labels(self, field: str) -> Sequence[str]:
+        """One value per Moon exposure, by its EXPOSURE number."""
+        return tuple(f"{field}.{number}" for number in self.ids)
+
+    def choices(self) -> dict[str, Any]:
+        """None: the exposures belong to the data."""
+        return {}
+
+    def moon(self, beam: Float[Array, "e 2"], sky: Float[Array, "e 2"]) -> Float[Array, "e 2"]:
+        """Add the values of each patch."""
+        return beam.at[np.asarray(self.positions, int)].add(jnp.stack([self.q, self.u], axis=-1))

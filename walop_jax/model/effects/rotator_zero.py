@@ -1,0 +1,37 @@
+"""Zero point of the position angle of the instrument.
+
+Equation    true ROTATOR = header + angle, hence (q + iu) of the sky in the ICS → (q + iu) exp(−2i angle)
+Symbols     angle [deg], north through east
+Source      calibration contract, section 6, with its section 1: EVPA in the ICS = position angle − ROTATOR.
+Neutral     angle = 0
+Revealed by Moon and standards turned together against the polariser.
+
+Field points also stand elsewhere on the sky, by angle · r, which changes the Moon sky by less than 3e-5 for one degree
+and is left out.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from walop_jax.model.effects.base import CONTRACT, Effect, Scalar
+from walop_jax.model.parameters import param
+
+
+class RotatorZero(Effect):
+    """Position angle of +X = ROTATOR + angle."""
+
+    angle: Scalar = param(unit="deg", about="added to ROTATOR", source=CONTRACT, width=0.3, default=0.0)
+
+    name: ClassVar[str] = "rotator_zero"
+    revealed_by: ClassVar[str] = "polarised standards, or Moon patches, together with polariser exposures"
+    separated_by: ClassVar[str] = (
+        "nothing but an independent zero of the polariser, such as a polariser aligned in the laboratory: both turn sky "
+        "against polariser"
+    )
+
+    def rotator(self, offset: Scalar | float) -> Scalar | float:
+        """Add the zero point."""
+        return offset + jnp.deg2rad(self.angle)

@@ -1,0 +1,51 @@
+"""One catalogue value that is wrong, or a star that varies.
+
+Equation    (Q, U) of the star → (Q + q, U + u), equatorial frame
+Symbols     q, u difference from the catalogue; source: name of the star
+Source      calibration contract, section 6; some classical standards vary (Blinov et al. 2023, A&A 677, A144).
+Neutral     q = u = 0
+Revealed by one star that is off by the same Stokes parameters wherever in the field it stands.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, Self
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from walop_jax.model.effects.base import CONTRACT, Context, Effect, Scalar
+from walop_jax.model.parameters import param, unknown_name
+
+
+class StandardOutlier(Effect):
+    """Stokes parameters of one standard differ from the catalogue."""
+
+    q: Scalar = param(unit="", about="added to the catalogue q", source=CONTRACT, width=0.005, default=0.0)
+    u: Scalar = param(unit="", about="added to the catalogue u", source=CONTRACT, width=0.005, default=0.0)
+    source: str = eqx.field(static=True, default="")
+
+    name: ClassVar[str] = "standard_outlier"
+    revealed_by: ClassVar[str] = "several standards, one of which disagrees with the others"
+    separated_by: ClassVar[str] = (
+        "the star at several ROTATOR angles: a wrong catalogue turns with the sky, the telescope not"
+    )
+
+    @classmethod
+    def neutral(cls, context: Context) -> Self:
+        """The first star, as catalogued."""
+        return cls(source=context.sources[0] if context.sources else "")
+
+    @classmethod
+    def probes(cls, context: Context) -> tuple[tuple[Self, ...], ...]:
+        """Any one of the stars."""
+        return tuple((cls(source=name),) for name in context.sources)
+
+    def catalogue(
+        self, q: Float[Array, " s"], u: Float[Array, " s"], names: tuple[str, ...]
+    ) -> tuple[Float[Array, " s"], Float[Array, " s"]]:
+        """Move the values of the star."""
+        if self.source not in names:
+            raise unknown_name("standard star", self.source, names)
+        row = names.index(self.source)
+        return q.at[row].add(self.q), u.at[row].add(self.u)

@@ -1,0 +1,57 @@
+"""A uniform retarder between the collimator and the plates.
+
+Equation    M = Ret(delta, axis) · collimator
+Symbols     delta retardance [rad]; axis of the fast direction, from +X toward +Y [deg]
+Source      calibration contract, section 6; stress in a window or in the last lens (Selbing 2005, arXiv:1010.4142,
+            needed five parameters for one lens).
+Neutral     delta = 0, whatever the axis
+Revealed by V picked up ahead of the plates: cross-talk in both halves that does not follow their field pattern.
+
+Around neutral the effect is linear in delta · (cos 2 axis, sin 2 axis): two probes at 0° and 45° span it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Self
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from walop_jax.model import mueller as mm
+from walop_jax.model.effects.base import CONTRACT, Effect, Scalar
+from walop_jax.model.parameters import param
+
+
+class UpstreamRetarder(Effect):
+    """Uniform linear retarder behind the collimator."""
+
+    delta: Scalar = param(unit="rad", about="retardance", source=CONTRACT, width=0.02, default=0.0)
+    axis: Scalar = param(unit="deg", about="fast axis", source=CONTRACT, scale=10.0, loose=500.0, default=0.0)
+
+    name: ClassVar[str] = "upstream_retarder"
+    shape: ClassVar[tuple[str, ...]] = ("axis",)
+    starts: ClassVar[tuple[tuple[Mapping[str, Any], ...], ...]] = (({"axis": 0.0}, {"axis": 45.0}),)
+    revealed_by: ClassVar[str] = "polariser exposures over the field"
+    separated_by: ClassVar[str] = (
+        "the calibration plate at 45° turns what it makes but not errors of HWP2; narrow bands and temperature tell it "
+        "from retardance of the plates"
+    )
+
+    def upstream(self, mueller: Float[Array, "4 4"], x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
+        """Retard what leaves the collimator."""
+        return mm.retarder(self.delta, jnp.deg2rad(self.axis)) @ mueller
+
+    @classmethod
+    def combine(cls, group: Sequence[Self], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
+        """Retardance and axis from the two linear directions."""
+        straight, diagonal = amplitudes
+        axis = 0.5 * np.rad2deg(np.arctan2(diagonal, straight))
+        return dataclasses.replace(group[0], delta=np.hypot(straight, diagonal), axis=axis)
+
+    def standard_form(self) -> Self:
+        """Positive retardance, axis in [0°, 180°)."""
+        axis = (float(self.axis) + (90.0 if float(self.delta) < 0 else 0.0)) % 180.0
+        return dataclasses.replace(self, delta=jnp.abs(self.delta), axis=axis)
