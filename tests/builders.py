@@ -8,8 +8,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-
 from oracle import forward
+
 from walop_jax.data.records import Exposures, FilterCurve
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
@@ -21,7 +21,8 @@ from walop_jax.model.specification import full_values, unravel
 NAN = float("nan")
 _BLANK: dict[str, Any] = {
     "kind": "clp", "mjd": 61043.85, "exptime": 30.0, "filter": "band", "clp_in": False, "clp_angle": NAN,
-    "chwp_in": False, "chwp_angle": NAN, "temp": 10.0, "ha": 0.0, "ra": NAN, "dec": NAN, "rotator": NAN, "teff": NAN,
+    "chwp_in": False, "chwp_angle": NAN, "temp": 10.0, "ha": 0.0, "ra": NAN, "dec": NAN, "rotator": NAN,
+    "teff": NAN,
 }  # fmt: skip
 
 # Names of the oracle for the parameters of the package.
@@ -69,7 +70,9 @@ def broad_band() -> FilterCurve:
     return curve(wavelength, np.exp(-(((wavelength - 0.62) / 0.062) ** 8)))
 
 
-def setting_plan(filter_curve: FilterCurve, settings: Sequence[float | None] = (None,), teff: float = NAN) -> Plan:
+def setting_plan(
+    filter_curve: FilterCurve, settings: Sequence[float | None] = (None,), teff: float = NAN
+) -> Plan:
     """A plan with one band per setting (deg, or None: out) of the calibration plate, in the order given."""
     rows = [{"teff": teff} | ({} if s is None else {"chwp_angle": s}) for s in settings]
     plan = build_plan(exposures(*rows), {"band": filter_curve})
@@ -78,10 +81,12 @@ def setting_plan(filter_curve: FilterCurve, settings: Sequence[float | None] = (
 
 
 def as_built(instrument: Instrument, rng: np.random.Generator, sigmas: float = 1.0) -> Instrument:
-    """An instrument whose numbers scatter around the nominal ones by their prior widths (or solver scales)."""
+    """An instrument whose numbers scatter around the given ones by prior widths (or solver scales)."""
     values = full_values(instrument)
     width = [leaf.declaration.width or leaf.declaration.scale for leaf in leaves(instrument)]
-    return unravel(instrument)(jnp.asarray(values + sigmas * np.array(width) * rng.standard_normal(values.size)))
+    return unravel(instrument)(
+        jnp.asarray(values + sigmas * np.array(width) * rng.standard_normal(values.size))
+    )
 
 
 def south(rng: np.random.Generator | None = None, **options: Any) -> Instrument:
@@ -118,3 +123,36 @@ def vectors(instrument: Instrument, plan: Plan, x: Any, y: Any) -> np.ndarray:
     """Analysis vectors (point, band, camera, Stokes) of the package."""
     x, y = (np.atleast_1d(np.asarray(v, float)) for v in (x, y))
     return np.asarray(_compiled_vectors(instrument, plan, jnp.asarray(x), jnp.asarray(y)))
+
+
+def _counts(
+    instrument: Instrument,
+    plan: Plan,
+    x: jax.Array,
+    y: jax.Array,
+    sky: jax.Array,
+    source: jax.Array,
+    band: jax.Array,
+) -> jax.Array:
+    rows = light.band_rows(instrument, plan, x, y)
+    return light.counts(
+        instrument, plan, rows, light.throughput_at(instrument, x, y), x, y, sky, source, band
+    )
+
+
+_compiled_counts = compiled(_counts)
+
+
+def counts(
+    instrument: Instrument, plan: Plan, x: float, y: float, sky: Any = None, source: Any = None
+) -> np.ndarray:
+    """Counts (exposure, camera) at a field point, for light of unit flux."""
+    e = plan.exposures.clp_in.size
+    source = np.full(e, -1) if source is None else np.asarray(source)
+    band = np.asarray(plan.band_of)[np.arange(e), np.minimum(source + 1, plan.band_of.shape[1] - 1)]
+    return np.asarray(
+        _compiled_counts(
+            instrument, plan, jnp.asarray(float(x)), jnp.asarray(float(y)),
+            jnp.zeros((e, 2)) if sky is None else jnp.asarray(sky), jnp.asarray(source), jnp.asarray(band),
+        )
+    )  # fmt: skip

@@ -9,7 +9,7 @@ import jaxtyping
 import pytest
 
 jax.config.update("jax_enable_x64", True)  # the package itself never switches it on
-# Every annotated shape and type of the package is checked under pytest, and only there. Must precede its import.
+# Every annotated shape and type of the package is checked, under pytest only. Must precede its import.
 jaxtyping.install_import_hook("walop_jax", "shapes.checked")
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

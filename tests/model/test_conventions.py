@@ -1,22 +1,21 @@
-"""The conventions, pinned by canonical states: which camera brightens, and the paper's matrices typed by hand."""
+"""The conventions, pinned by canonical states: which camera brightens, and the paper's matrices typed."""
 
+import builders
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-import builders
 from oracle import forward
+
 from walop_jax.model import conventions, light, mueller
 from walop_jax.model.instrument import HalfWavePlate, Polariser, nominal_instrument
 from walop_jax.model.plan import build_plan
 
 LAM = 0.62
-ORIGIN = jnp.asarray(0.0)
 
 
 def thin_plate(retardance):
-    """Crossed plates of that retardance (rad, fast axis along the MgF2's) at 0.62 µm, indices of the oracle."""
+    """Crossed plates of that retardance (rad, fast axis the MgF2's) at 0.62 µm, indices of the oracle."""
     (q_o, q_e), (m_o, m_e) = forward.quartz(LAM), forward.mgf2(LAM)
     mgf2 = 300.0
     quartz = (mgf2 * (m_e - m_o) - retardance / (2 * np.pi) * LAM) / (q_e - q_o)
@@ -127,14 +126,7 @@ def test_retarders_are_the_papers(delta):
 def counts(rows, sky=None, source=None, standards=()):
     instrument = eqx.tree_at(lambda i: i.standard, ideal(), nominal_instrument(standards=standards).standard)
     plan = build_plan(builders.exposures(*rows), {"band": builders.monochromatic(LAM)})
-    band_rows = light.band_rows(instrument, plan, ORIGIN, ORIGIN)
-    throughput = light.throughput_at(instrument, ORIGIN, ORIGIN)
-    sky = jnp.zeros((len(rows), 2)) if sky is None else jnp.asarray(sky)
-    source = jnp.full(len(rows), -1) if source is None else jnp.asarray(source)
-    band = jnp.asarray(plan.band_of[:, 0])
-    return np.asarray(
-        light.counts(instrument, plan, band_rows, throughput, ORIGIN, ORIGIN, sky, source, band)
-    )
+    return builders.counts(instrument, plan, 0.0, 0.0, sky, source)
 
 
 def test_polariser_angle_grows_from_x_to_y():

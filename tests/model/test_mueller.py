@@ -11,7 +11,9 @@ ANGLES = np.deg2rad([0.0, 17.0, 22.5, 45.0, 90.0, 133.0])
 
 
 def jones(matrix):
-    return Matrix2(*(jnp.asarray(np.asarray(matrix, complex)[i, j]) for i, j in ((0, 0), (0, 1), (1, 0), (1, 1))))
+    return Matrix2(
+        *(jnp.asarray(np.asarray(matrix, complex)[i, j]) for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
+    )
 
 
 def random_jones(rng, count=20):
@@ -23,13 +25,25 @@ def random_jones(rng, count=20):
 
 TYPED = {
     # fields exp(i(kz − ωt)): the slow axis gains phase
-    "quarter wave, fast axis X": ([[1, 0], [0, 1j]], [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1], [0, 0, -1, 0]]),
-    "quarter wave, fast axis Y": ([[1j, 0], [0, 1]], [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, -1], [0, 0, 1, 0]]),
+    "quarter wave, fast axis X": (
+        [[1, 0], [0, 1j]],
+        [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1], [0, 0, -1, 0]],
+    ),
+    "quarter wave, fast axis Y": (
+        [[1j, 0], [0, 1]],
+        [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, -1], [0, 0, 1, 0]],
+    ),
     "half wave, axis X": ([[1, 0], [0, -1]], np.diag([1, 1, -1, -1])),
     "half wave, axis 45°": ([[0, 1], [1, 0]], np.diag([1, -1, 1, -1])),
     "rotator by 90°": ([[0, -1], [1, 0]], np.diag([1, -1, -1, 1])),
-    "polariser X": ([[1, 0], [0, 0]], 0.5 * np.array([[1, 1, 0, 0], [1, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]])),
-    "polariser Y": ([[0, 0], [0, 1]], 0.5 * np.array([[1, -1, 0, 0], [-1, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]])),
+    "polariser X": (
+        [[1, 0], [0, 0]],
+        0.5 * np.array([[1, 1, 0, 0], [1, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]),
+    ),
+    "polariser Y": (
+        [[0, 0], [0, 1]],
+        0.5 * np.array([[1, -1, 0, 0], [-1, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]),
+    ),
     "polariser 45°": (
         [[0.5, 0.5], [0.5, 0.5]],
         0.5 * np.array([[1, 0, 1, 0], [0, 0, 0, 0], [1, 0, 1, 0], [0, 0, 0, 0]]),
@@ -39,7 +53,7 @@ TYPED = {
         [[0.5, 0.5j], [-0.5j, 0.5]],
         0.5 * np.array([[1, 0, 0, 1], [0, 0, 0, 0], [0, 0, 0, 0], [1, 0, 0, 1]]),
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", TYPED)
@@ -90,7 +104,9 @@ def pure_elements():
     yield "rotation", mueller.rotation(jnp.asarray(ANGLES))
 
 
-@pytest.mark.parametrize(("name", "matrix"), list(pure_elements()), ids=lambda v: v if isinstance(v, str) else "")
+@pytest.mark.parametrize(
+    ("name", "matrix"), list(pure_elements()), ids=lambda v: v if isinstance(v, str) else ""
+)
 def test_pure_elements_do_not_depolarise(name, matrix):
     """Tr(MᵀM) = 4 M00² (Gil & Bernabeu 1985)."""
     del name

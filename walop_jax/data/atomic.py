@@ -57,7 +57,7 @@ def atomic_path(path: str | os.PathLike[str], *, overwrite: bool = False) -> Ite
     temporary = Path(name)
     try:
         yield temporary
-        _publish(temporary, target, overwrite=overwrite)
+        publish(temporary, target, overwrite=overwrite)
     except OSError as error:
         raise fail(
             f"writing failed: {error}",
@@ -68,7 +68,7 @@ def atomic_path(path: str | os.PathLike[str], *, overwrite: bool = False) -> Ite
         temporary.unlink(missing_ok=True)
 
 
-def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
+def publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
     """Flush `temporary` to disk and move it to `target`, with the permissions of an ordinary new file."""
     umask = os.umask(0)
     os.umask(umask)

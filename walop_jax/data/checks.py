@@ -16,7 +16,7 @@ from walop_jax.data.sky import EPHEMERIS_MJD
 INSTRUMENTS = ("WALOP-SOUTH", "WALOP-NORTH", "WALOP-LAB")
 """Values of INSTRUME that a calibration set may have."""
 
-_FIELD = {"WALOP-SOUTH": 0.35, "WALOP-NORTH": 0.35, "WALOP-LAB": 45.0}
+FIELD_LIMITS = {"WALOP-SOUTH": 0.35, "WALOP-NORTH": 0.35, "WALOP-LAB": 45.0}
 """Largest |X|, |Y| in degrees; on the laboratory bench X is the tilt of the plate."""
 
 _WAVELENGTH = (0.3, 1.1)  # µm, where silicon detectors see
@@ -37,7 +37,7 @@ def unique(ids: np.ndarray, column: str, place: Place) -> None:
 def make_points(table: dict[str, Any], instrument: str, place: Place) -> Points:
     """Check the POINTS table (degrees) against the field of the instrument."""
     unique(table["POINT"], "POINT", place)
-    limit = _FIELD[instrument]
+    limit = FIELD_LIMITS[instrument]
     for name in ("X", "Y"):
         refuse(~np.isfinite(table[name]), "is not finite", name, "remove these points", place)
         refuse(

@@ -41,6 +41,7 @@ class Measured:
         self.weight: Cube = np.concatenate([np.asarray(c.weight) for c in problem.chunks])[:n]
         self.counts: Cube = np.concatenate([np.asarray(c.counts) for c in problem.chunks])[:n]
         self.used: Bool[np.ndarray, "p e"] = problem.used
+        self.values = values
         self.flux, self.residual = problem.residuals(values)
         # Weighted model at unit flux, from data = flux · model + residual.
         flux = np.where(self.flux == 0, 1.0, self.flux)[..., None]
@@ -76,7 +77,7 @@ def strata(measured: Measured) -> Iterator[Candidate]:
     shape = (len(points), len(e), 4)
     smooth = np.asarray(legendre.basis(points.x, points.y, SMOOTH))
     fine = np.asarray(legendre.basis(points.x, points.y, FINE))[:, smooth.shape[1] :]
-    stokes = problem.light(measured)
+    stokes = problem.light(measured.values)
     for k, camera in enumerate(CAMERA_NAMES):
         for i, element in ((1, "q"), (2, "u")):
             patterns = [

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import lineax as lx
@@ -34,6 +34,7 @@ _SEARCH = optx.ClassicalTrustRegion()
 _DESCENT = optx.DampedNewtonDescent(linear_solver=lx.Cholesky())
 
 
+@runtime_checkable
 class Expansion(Protocol):
     """What is minimised, and half its gradient and Hessian, at one place."""
 
@@ -169,7 +170,7 @@ def minimise(
             progress(steps, min(trial.objective, expansion.objective))
     else:
         message = f"not converged after {maximum_steps} steps, scaled gradient {decrement:.1e}"
-    converged = decrement < tolerance and np.isfinite(expansion.objective)
+    converged = bool(decrement < tolerance and np.isfinite(expansion.objective))
     if converged and condition > LARGEST_CONDITION:
         converged, message = False, f"parameters cannot be told apart: condition number {condition:.1e}"
     return Minimum(here, expansion, converged, message, steps, decrement, condition, tuple(history))

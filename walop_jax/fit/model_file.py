@@ -6,14 +6,17 @@
     throughput_degree = 4
     effects = ["clp_wobble"]    # effects beyond the base model, by name
 
+    [effects.blemish]           # discrete choices of an effect that has some
+    camera = 2
+
     [parameters."half2.plate.mgf2"]
     start = 1930.0
     prior = [1930.0, 1.0]       # mean and standard deviation, or "none"
     free = true
     tie = "half1.plate.mgf2"    # optional: takes the value of another parameter
 
-A file may hold any part of this; what it does not mention stays as in the base model. Names that do not exist are
-errors that list the nearest ones.
+A file may hold any part of this; what it does not mention stays as in the base model. Names that do not exist
+are errors that list the nearest ones.
 """
 
 from __future__ import annotations
@@ -28,6 +31,7 @@ import tomlkit
 
 from walop_jax.model.specification import Model, Parameter, unknown_name
 
+TABLES = ("model", "effects", "parameters")
 MODEL_KEYS = ("instrument", "plates", "throughput_degree", "effects")
 PARAMETER_KEYS = ("start", "prior", "free", "tie", "unit", "scale", "about")
 
@@ -40,6 +44,7 @@ class Header:
     plates: str | None = None
     throughput_degree: int | None = None
     effects: tuple[str, ...] = ()
+    choices: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
 
 
 def render(model: Model) -> str:
@@ -54,6 +59,9 @@ def render(model: Model) -> str:
     table["throughput_degree"] = model.template.throughput.degree
     table["effects"] = [effect.name for effect in model.template.effects]
     document["model"] = table
+    choices = {effect.name: effect.choices() for effect in model.template.effects}
+    if any(choices.values()):
+        document["effects"] = {name: values for name, values in choices.items() if values}
     parameters = tomlkit.table(is_super_table=True)
     for p in model.parameters:
         entry = tomlkit.table()
@@ -81,9 +89,11 @@ def parse(text: str, build: Callable[[Header], Model]) -> Model:
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"the model file is not valid TOML: {error}") from None
     for key in content:
-        if key not in ("model", "parameters"):
-            raise unknown_name("table", key, ("model", "parameters"))
-    header = _header(content.get("model", {}))
+        if key not in TABLES:
+            raise unknown_name("table", key, TABLES)
+        if not isinstance(content[key], Mapping):
+            raise ValueError(f"{key} = {content[key]!r} must be a table, [{key}]")
+    header = _header(content.get("model", {}), content.get("effects", {}))
     model = build(header)
     if header.instrument is not None and header.instrument != model.name:
         raise ValueError(f"[model] instrument is {header.instrument}, but the data come from {model.name}")
@@ -97,7 +107,7 @@ def parse(text: str, build: Callable[[Header], Model]) -> Model:
     return dataclasses.replace(model, parameters=changed)
 
 
-def _header(table: Mapping[str, Any]) -> Header:
+def _header(table: Mapping[str, Any], choices: Mapping[str, Any]) -> Header:
     for key in table:
         if key not in MODEL_KEYS:
             raise unknown_name("key of [model]", key, MODEL_KEYS)
@@ -107,7 +117,12 @@ def _header(table: Mapping[str, Any]) -> Header:
     degree = table.get("throughput_degree")
     if degree is not None and not (isinstance(degree, int) and 0 <= degree <= 12):
         raise ValueError(f"[model] throughput_degree = {degree!r} must be a whole number from 0 to 12")
-    return Header(table.get("instrument"), table.get("plates"), degree, tuple(effects))
+    for name, values in choices.items():
+        if name not in effects:
+            raise unknown_name("effect (it has choices but is not in the list of [model])", name, effects)
+        if not isinstance(values, Mapping):
+            raise ValueError(f"[effects] {name} = {values!r} must be a table, [effects.{name}]")
+    return Header(table.get("instrument"), table.get("plates"), degree, tuple(effects), choices)
 
 
 def _number(name: str, key: str, value: Any) -> float:

@@ -7,8 +7,10 @@ Covariance   C_m = J C_θ Jᵀ with the exact J; the throughput series enters th
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,13 +24,17 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan, plan_for
 from walop_jax.model.specification import optical_indices, series_indices
 
-CHUNK = 256
+CHUNK = 256  # field points that are computed together
+SMALL_CHUNK = 16
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Optical settings, one per row: filter name, colour temperature (K, NaN flat), calibration plate (deg, NaN out),
-    instrument temperature (Celsius) and hour angle (h)."""  # fmt: skip
+    """Optical settings, one per row.
+
+    Filter name, colour temperature (K, NaN flat), calibration plate (deg, NaN out), instrument temperature
+    (Celsius) and hour angle (h).
+    """
 
     filter: np.ndarray
     teff: Float[np.ndarray, " n"]
@@ -45,17 +51,17 @@ class Settings:
     def __len__(self) -> int:
         return len(self.teff)
 
-    def distinct(self) -> tuple[Settings, Int[np.ndarray, " n"]]:
-        """The settings that differ, and which of them each row has."""
-        key = np.rec.fromarrays(
-            [
-                self.filter.astype(str),
-                *(np.nan_to_num(a, nan=-1e30) for a in (self.teff, self.chwp_angle, self.temp, self.ha)),
-            ]
-        )
+    def layouts(self) -> list[tuple[Settings, Int[np.ndarray, " r"]]]:
+        """One setting for each combination of filter and calibration plate, and the rows that have it.
+
+        Only these two decide how a computation is laid out; the rest are numbers that go into it.
+        """
+        key = np.rec.fromarrays([self.filter.astype(str), np.nan_to_num(self.chwp_angle, nan=-1e30)])
         _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
-        columns = (getattr(self, f.name)[first] for f in dataclasses.fields(self))
-        return Settings(*columns), inverse.reshape(-1)
+        return [(self[k : k + 1], np.flatnonzero(inverse.reshape(-1) == n)) for n, k in enumerate(first)]
+
+    def __getitem__(self, rows: slice | Int[np.ndarray, " r"]) -> Settings:
+        return Settings(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
 
 
 def settings_plan(settings: Settings, filters: Mapping[str, FilterCurve], instrument: Instrument) -> Plan:
@@ -113,16 +119,36 @@ def _point_matrix(
     return m, jnp.moveaxis(derivative, 0, -1)
 
 
+class _Row(NamedTuple):
+    """A field point and the numbers of its setting; `teff` is 0 for a flat spectrum."""
+
+    x: Float[Array, "*p"]
+    y: Float[Array, "*p"]
+    teff: Float[Array, "*p"]
+    temperature: Float[Array, "*p"]
+    hour_angle: Float[Array, "*p"]
+
+
+def _row_plan(plan: Plan, row: _Row) -> Plan:
+    """The plan of a layout (one band) with the numbers of a row."""
+    nodes = plan.wavelength.shape
+    conditions = plan.conditions._replace(
+        temperature=jnp.broadcast_to(row.temperature, nodes),
+        hour_angle=jnp.broadcast_to(row.hour_angle, nodes),
+    )
+    changed = (jnp.broadcast_to(row.teff, plan.teff.shape), conditions)
+    return eqx.tree_at(lambda p: (p.teff, p.conditions), plan, changed)
+
+
 def _matrices_with_covariance(
-    instrument: Instrument,
-    plan: Plan,
-    x: Float[Array, " p"],
-    y: Float[Array, " p"],
-    covariance: Float[Array, "n n"],
-) -> tuple[Float[Array, "p b 6"], Float[Array, "p b 6 6"]]:
-    m, derivative = jax.vmap(_point_matrix, in_axes=(None, None, 0, 0))(instrument, plan, x, y)
-    flat = derivative.reshape(*m.shape[:2], 6, -1)
-    return m.reshape(*m.shape[:2], 6), jnp.einsum("pbin,nk,pbjk->pbij", flat, covariance, flat)
+    instrument: Instrument, plan: Plan, rows: _Row, covariance: Float[Array, "n n"]
+) -> tuple[Float[Array, "p 6"], Float[Array, "p 6 6"]]:
+    def one(row: _Row) -> tuple[Float[Array, "b 2 3"], Float[Array, "b 2 3 n"]]:
+        return _point_matrix(instrument, _row_plan(plan, row), row.x, row.y)
+
+    m, derivative = jax.vmap(one)(rows)
+    flat = derivative[:, 0].reshape(len(m), 6, -1)
+    return m[:, 0].reshape(len(m), 6), jnp.einsum("pin,nk,pjk->pij", flat, covariance, flat)
 
 
 _matrices = compiled(_matrices_with_covariance)
@@ -133,7 +159,7 @@ def analysis_vectors(
     instrument: Instrument, plan: Plan, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]
 ) -> Float[np.ndarray, "p b 4 4"]:
     """Analysis vectors (point, band, camera, Stokes) at field positions in degrees."""
-    return _in_chunks(lambda a, b: (np.asarray(_vectors(instrument, plan, a, b)),), x, y)[0]
+    return _in_chunks(lambda a, b: (_vectors(instrument, plan, a, b),), x, y)[0]
 
 
 def matrices(
@@ -144,32 +170,30 @@ def matrices(
     y: Float[np.ndarray, " p"],
     covariance: Float[np.ndarray, "n n"],
 ) -> tuple[Float[np.ndarray, "p 6"], Float[np.ndarray, "p 6 6"]]:
-    """Instrument matrix (m21, m22, m23, m31, m32, m33) and its covariance at field positions (deg), row by row.
+    """Instrument matrix (m21, m22, m23, m31, m32, m33) and its covariance at field positions (deg).
 
     `settings` has one row per position. Raises KeyError for a filter that `filters` does not hold.
     """
-    distinct, of_row = settings.distinct()
     values, errors = np.empty((len(x), 6)), np.empty((len(x), 6, 6))
     cov = jnp.asarray(covariance)
-    for k in range(len(distinct)):
-        rows = np.flatnonzero(of_row == k)
-        one = Settings(*(getattr(distinct, f.name)[k : k + 1] for f in dataclasses.fields(distinct)))
-        plan = settings_plan(one, filters, instrument)
-        m, c = _in_chunks(
-            lambda a, b, plan=plan: tuple(np.asarray(v) for v in _matrices(instrument, plan, a, b, cov)),
-            x[rows],
-            y[rows],
+    columns = (x, y, np.nan_to_num(settings.teff), settings.temp, settings.ha)
+    for layout, rows in settings.layouts():
+        plan = settings_plan(layout, filters, instrument)
+        values[rows], errors[rows] = _in_chunks(
+            lambda *row, plan=plan: _matrices(instrument, plan, _Row(*row), cov), *(c[rows] for c in columns)
         )
-        values[rows], errors[rows] = m[:, 0], c[:, 0]
     return values, errors
 
 
-def _in_chunks(function, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> tuple[np.ndarray, ...]:
-    size = min(CHUNK, max(len(x), 1))
+def _in_chunks(function: Callable[..., Any], *columns: Float[np.ndarray, " p"]) -> tuple[np.ndarray, ...]:
+    """Apply a compiled function to slices of the columns, padded to one of two sizes: two compilations."""
+    count = len(columns[0])
+    size = SMALL_CHUNK if count <= SMALL_CHUNK else CHUNK
     parts = []
-    for start in range(0, len(x), size):
-        a, b = x[start : start + size], y[start : start + size]
-        missing = size - len(a)
-        result = function(jnp.asarray(np.pad(a, (0, missing))), jnp.asarray(np.pad(b, (0, missing))))
-        parts.append([part[: len(a)] for part in result])
-    return tuple(np.concatenate(columns) for columns in zip(*parts, strict=True))
+    for start in range(0, count, size):
+        slices = [column[start : start + size] for column in columns]
+        missing = size - len(slices[0])
+        # Padding with the last row keeps the arithmetic as tame as that of the data.
+        result = function(*(jnp.asarray(np.pad(part, (0, missing), mode="edge")) for part in slices))
+        parts.append([np.asarray(part)[: size - missing] for part in result])
+    return tuple(np.concatenate(parts) for parts in zip(*parts, strict=True))

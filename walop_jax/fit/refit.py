@@ -79,7 +79,7 @@ class FitResult:
     @property
     def explains_data(self) -> bool:
         """Whether χ² is what noise alone would give."""
-        return self.dof > 0 and self.excess < SUSPECT_SIGMA
+        return self.dof > 0 and bool(self.excess < SUSPECT_SIGMA)
 
     @property
     def trusted(self) -> bool:
@@ -162,27 +162,35 @@ def _search(
     return _Found(minimum, first + select @ (minimum.x - origin))
 
 
-def fit(problem: Problem, *, start: Vector | None = None, progress: Progress | None = None) -> FitResult:
+def fit(
+    problem: Problem,
+    *,
+    start: Vector | None = None,
+    noise_scale: float | None = None,
+    progress: Progress | None = None,
+) -> FitResult:
     """Fit the model of `problem` to its data, from the start values of the model or `start` (a full vector).
 
     A model whose χ²/dof stays above `FAR_OFF` would be bent out of all physical shape: priors mean nothing beside
     such residuals. The errors of the data are then scaled until χ²/dof is 1, the minimum is sought again, from plates
-    one order of retardance away as well, and the result says so (`noise_scale`, `warnings`).
+    one order of retardance away as well, and the result says so (`noise_scale`, `warnings`). A `noise_scale` that
+    is given is kept, with no other start: so that fits can be compared.
     Raises ValueError when the exposures cannot determine the instrument.
     """
     began = time.perf_counter()
     check_identifiable(problem)
     first = problem.model.start if start is None else np.asarray(start, float)
-    found, starts = _search(problem, "fit", first, 1.0, progress, FIRST_STEPS), 1
-    if not found.minimum.converged and _raw(found, problem) < FAR_OFF:
-        found = _search(problem, "fit, continued", found.values, 1.0, progress)
+    fixed = noise_scale is not None
+    found, starts = _search(problem, "fit", first, noise_scale or 1.0, progress, FIRST_STEPS), 1
+    if not found.minimum.converged and (fixed or _raw(found, problem) < FAR_OFF):
+        found = _search(problem, "fit, continued", found.values, noise_scale or 1.0, progress)
     check_constrained(problem, _expansion(found))
-    for _ in range(MAXIMUM_RESCALINGS):
+    for _ in range(0 if fixed else MAXIMUM_RESCALINGS):
         scale = float(np.sqrt(_raw(found, problem)))
         if scale**2 < FAR_OFF or abs(scale / _expansion(found).noise_scale - 1.0) < 0.1:
             break
         found = _search(problem, f"errors × {scale:.3g}", first, scale, progress)
-    if _raw(found, problem) > FAR_OFF:
+    if not fixed and _raw(found, problem) > FAR_OFF:
         for label, other in _order_starts(problem):
             trial = _search(problem, label, other, _expansion(found).noise_scale, progress)
             starts += 1

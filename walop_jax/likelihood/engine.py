@@ -8,11 +8,12 @@ Three layers, each with its own small Jacobian:
 3. field       throughput is a series over the field, so at one point only its four values matter; the small
                Gram matrix of the point is expanded through the series afterwards.
 
-Flux           For each (exposure, point) with y = N/σ and a = model/σ over the four cameras, the flux that fits best is
-               F = y·a / a·a, and r = y − F a. Its derivative is taken as −F (1 − â âᵀ) da (Kaufman's form of
-               variable projection, Golub & Pereyra 2003, Inverse Problems 19, R1): the gradient is exact, and JᵀJ is
-               the Fisher information with the flux marginalised. KIND `flux`: F = 1. Where an effect of the
-               detectors D acts, the model is D(F a), F follows by Newton steps and ∂D/∂F takes the place of a.
+Flux           For each (exposure, point) with y = N/σ and a = model/σ over the four cameras, the flux that
+               fits best is F = y·a / a·a, and r = y − F a. Its derivative is taken as −F (1 − â âᵀ) da
+               (Kaufman's form of variable projection, Golub & Pereyra 2003, Inverse Problems 19, R1): the
+               gradient is exact, and JᵀJ is the Fisher information with the flux marginalised. KIND `flux`:
+               F = 1. Where an effect of the detectors D acts, the model is D(F a), F follows by Newton
+               steps and ∂D/∂F takes the place of a.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def eliminate_flux(
 
 
 def field_sites(instrument: Instrument, point: PointData) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Field positions whose optics and throughput a point needs: its own and, for ghosts, the opposite one."""
+    """Field positions whose optics a point needs: its own and, for ghosts, the opposite one."""
     if overridden(instrument.effects, "mirrored"):
         return jnp.stack([point.x, -point.x]), jnp.stack([point.y, -point.y])
     return point.x[None], point.y[None]
@@ -144,8 +145,8 @@ def _point_jacobian(
 ) -> tuple[Float[Array, " d"], Float[Array, "l d"]]:
     """Residuals of one point and their derivatives with respect to its local quantities.
 
-    Local quantities are all parameters but the series, then the throughputs of its sites; d runs over exposures
-    and cameras.
+    Local quantities are all parameters but the series, then the throughputs of its sites; d runs over
+    exposures and cameras.
     """
     values, to_instrument = ravel_pytree(instrument)
     optical = np.asarray(optical_indices(instrument), int)
@@ -290,7 +291,27 @@ def _effect_columns(
     return jnp.swapaxes(columns, 1, 2)
 
 
+def _incoming(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p e 4"]:
+    """Stokes vectors that enter the collimator."""
+    return jax.vmap(light.stokes, (None, None, 0, 0))(instrument, plan.exposures, data.sky, data.source)
+
+
+incoming = compiled(_incoming)
+
+PROBES_AT_ONCE = 6  # shapes of one effect that are worked on together: bounds the memory
+
+
+def _effect_columns_over_shapes(
+    instrument: Instrument, plan: Plan, probes: Effect, data: PointData
+) -> Float[Array, "g p d a"]:
+    """As `effect_columns`, for one effect at many shapes: its parameters carry a leading axis g."""
+    return jax.lax.map(
+        lambda probe: _effect_columns(instrument, plan, (probe,), data), probes, batch_size=PROBES_AT_ONCE
+    )
+
+
 normal_equations = compiled(_normal_equations)
+effect_columns_over_shapes = compiled(_effect_columns_over_shapes)
 dense_jacobian = compiled(_dense_jacobian)
 effect_columns = compiled(_effect_columns)
 residuals = compiled(_residuals)

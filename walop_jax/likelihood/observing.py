@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -81,11 +82,10 @@ class ObservingPlan:
             filter_curve(name)
 
     @classmethod
-    def bench(cls, tilts: int = 11) -> ObservingPlan:
-        """The laboratory bench: plate tilts from 0 to 20°, no sky."""
-        return cls(
-            "WALOP-LAB", grid=tilts, field=20.0, moon_patches=0, standards=0, unpolarised=0, throughput_degree=0
-        )
+    def bench(cls, tilts: int = 11, **options: Any) -> ObservingPlan:
+        """The laboratory bench: plate tilts from 0 to 20°, no sky. `options` are other fields of the plan."""
+        sky = {"moon_patches": 0, "standards": 0, "unpolarised": 0}
+        return cls("WALOP-LAB", **(sky | {"grid": tilts, "field": 20.0, "throughput_degree": 0} | options))
 
     @property
     def site(self) -> Site:

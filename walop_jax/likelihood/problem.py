@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from walop_jax.data.records import Block, CalibrationSet, Exposures
+from walop_jax.data.records import Block, CalibrationSet, Exposures, Sources
 from walop_jax.data.sky import moon_sky
 from walop_jax.likelihood import engine
 from walop_jax.model.compiled import require_double_precision
@@ -30,9 +31,10 @@ LARGEST_CHUNK = 2_000_000  # intensities × local quantities that a chunk may ho
 class Posterior:
     """χ² of data and priors at a point of parameter space, and its expansion there in the free parameters.
 
-    `gradient` is half the gradient of the total and `matrix` half its Gauss–Newton Hessian, both with the errors of
-    the data times `noise_scale`; `data` and `chi2` are with the errors as given. `loose` is the share of the weak
-    pulls that are no prior knowledge; it is in the gradient and the matrix, not in `chi2`.
+    `gradient` is half the gradient of the total and `matrix` half its Gauss–Newton Hessian, both with the
+    errors of the data times `noise_scale`; `data` and `chi2` are with the errors as given. `loose` is the
+    share of the weak pulls that are no prior knowledge; it is in the gradient and the matrix, not in
+    `chi2`.
     """
 
     data: float
@@ -56,14 +58,22 @@ class Posterior:
 class Problem:
     """The joint likelihood of one calibration set under one model.
 
-    Field points are handled in chunks of equal size, so that a set larger than memory goes through the same code.
+    Field points are handled in chunks of equal size, so that a set larger than memory goes through the
+    same code.
     """
 
-    def __init__(self, calset: CalibrationSet, model: Model, points_per_chunk: int | None = None) -> None:
+    def __init__(
+        self,
+        calset: CalibrationSet,
+        model: Model,
+        points_per_chunk: int | None = None,
+        probes: tuple[Effect, ...] = (),
+    ) -> None:
+        """`probes` are effects that are not in the model but whose columns will be asked for."""
         require_double_precision()
         self.calset = calset
         self.model = model
-        effects = model.template.effects
+        effects = (*model.template.effects, *probes)
         self.plan: Plan = plan_for(effects, calset.exposures, calset.filters, calset.sources)
         if any(effect.uses_median for effect in effects):
             self.plan = with_median(self.plan, median_counts(calset))
@@ -111,8 +121,8 @@ class Problem:
     def expand(self, values: Vector, noise_scale: float = 1.0) -> Posterior:
         """χ² and its quadratic expansion at a full vector of parameter values.
 
-        `noise_scale` multiplies the errors of the data (not the priors'): above 1 it stands for what the model
-        cannot explain.
+        `noise_scale` multiplies the errors of the data (not the priors'): above 1 it stands for what the
+        model cannot explain.
         """
         instrument = self.model.instrument(values)
         data, gradient, matrix = 0.0, np.zeros(len(values)), np.zeros((len(values), len(values)))
@@ -163,11 +173,27 @@ class Problem:
         parts = [self._rows(engine.effect_columns(instrument, self.plan, probes, c), c) for c in self.chunks]
         return np.concatenate(parts)
 
+    def effect_columns_over_shapes(self, values: Vector, probes: Sequence[Effect]) -> Float[np.ndarray, "g d a"]:
+        """As `effect_columns` for one effect at many shapes, all with the same discrete choices."""
+        instrument = self.model.instrument(values)
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *probes)
+        parts = []
+        for chunk in self.chunks:
+            cube = np.asarray(engine.effect_columns_over_shapes(instrument, self.plan, stacked, chunk))
+            parts.append(np.stack([self._rows(one, chunk) for one in cube]))
+        return np.concatenate(parts, axis=1)
+
     @staticmethod
     def _rows(columns: Array, chunk: engine.PointData) -> Float[np.ndarray, "d n"]:
         used = np.asarray(chunk.weight[..., 0] > 0)
         cube = np.asarray(columns).reshape(*used.shape, 4, -1)
         return cube[used].reshape(-1, cube.shape[-1])
+
+    def light(self, values: Vector) -> Float[np.ndarray, "p e 4"]:
+        """Stokes vectors that enter the instrument, per unit flux."""
+        instrument = self.model.instrument(values)
+        parts = [np.asarray(engine.incoming(instrument, self.plan, chunk)) for chunk in self.chunks]
+        return np.concatenate(parts)[: len(self.calset.points)]
 
     # ------------------------------------------------------------------------------------------- counting
 
@@ -253,10 +279,10 @@ def point_data(
     )
 
 
-def standard_names(calset: CalibrationSet) -> tuple[str, ...]:
+def standard_names(sources: Sources) -> tuple[str, ...]:
     """Unique names of the standards, usable in parameter names."""
     names: list[str] = []
-    for number, name in zip(calset.sources.source, calset.sources.name, strict=True):
+    for number, name in zip(sources.source, sources.name, strict=True):
         clean = "".join(c if c.isalnum() else "_" for c in str(name).strip()) or f"source{number}"
         names.append(clean if clean not in names else f"{clean}_{number}")
     return tuple(names)
@@ -272,7 +298,7 @@ def base_model(calset: CalibrationSet, *, plates: str = "waves", throughput_degr
 
     The scale of the throughput is a gauge unless a flux is known, and the constant of camera N0 is held then.
     """
-    names = standard_names(calset)
+    names = standard_names(calset.sources)
     sources = calset.sources
     level = _throughput_level(calset) if has_known_flux(calset) else 0.5
     instrument = nominal_instrument(

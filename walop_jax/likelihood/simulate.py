@@ -128,7 +128,7 @@ def simulate(
     active = sorted((*instrument.effects, *effects), key=lambda effect: order.index(effect.name))
     truth = make_template(dataclasses.replace(instrument, standard=standards, effects=tuple(active)))
     blank = _blank(plan, sources, seed)
-    expected = _expected(plan, blank, truth, _fluxes(plan, sky))
+    expected = _expected(blank, truth, _fluxes(plan, sky))
     read = PhotonNoise(plan.read_noise)
     counts, sigma = (expected, read.sigma(expected)) if noiseless else read.draw(noise, expected)
     return Simulated(_with_counts(plan, blank, counts, sigma), truth)

@@ -2,11 +2,12 @@
 
     sky or polariser → collimator → calibration plate → wedge → half-wave plate → Wollaston prism → camera
 
-Everything up to the cameras is linear, so the path is run backwards from the analysers: `plate_matrices` solves
-the half-wave plates at every wavelength node, `band_rows` keeps the Mueller rows that the Wollaston prisms see
-and integrates them over the bands (all the optics there is, once per field point), `camera_vectors` adds
-analyser, collimator and throughput, and `counts` is a dot product per exposure. `trace.py` runs the same
-functions forward, stage by stage. Effects of the detectors (`detected`) act on electrons, when the flux is known.
+Everything up to the cameras is linear, so the path is run backwards from the analysers: `plate_matrices`
+solves the half-wave plates at every wavelength node, `band_rows` keeps the Mueller rows that the Wollaston
+prisms see and integrates them over the bands (all the optics there is, once per field point),
+`camera_vectors` adds analyser, collimator and throughput, and `counts` is a dot product per exposure.
+`trace.py` runs the same functions forward, stage by stage. Effects of the detectors (`detected`) act on
+electrons, when the flux is known.
 
 Units       counts per unit of unpolarised light at unit throughput; angles rad; wavelengths µm; field deg.
 """
@@ -84,8 +85,8 @@ def plate_matrices(
 ) -> dict[float | str, Float[Array, "n 4 4"]]:
     """Mueller matrices of all half-wave plates at every node of a field point.
 
-    Keys: "half1" and "half2" behind their wedges, and each angle (deg) of the calibration plate. All of them are
-    solved in one go, as rows of the same arrays: one piece of physics, compiled once.
+    Keys: "half1" and "half2" behind their wedges, and each angle (deg) of the calibration plate. All of
+    them are solved in one go, as rows of the same arrays: one piece of physics, compiled once.
     """
     wavelength = node_wavelengths(instrument, plan)
     direction = _pupil_direction(instrument, plan, x, y)
@@ -124,7 +125,8 @@ def plate_matrices(
 def band_weights(instrument: Instrument, plan: Plan) -> Float[Array, "b n"]:
     """Weights of the nodes in every band: filter × photon spectrum, each band summing to 1.
 
-    Photon spectrum λ⁻⁴ / (exp(14387.77/λT) − 1) (Planck; λ in µm, T in K), flat where T = 0 stands for "none".
+    Photon spectrum λ⁻⁴ / (exp(14387.77/λT) − 1) (Planck; λ in µm, T in K), flat where T = 0 stands for
+    "none".
     """
     wavelength = node_wavelengths(instrument, plan)
     hot = plan.teff > 0
@@ -137,8 +139,8 @@ def band_weights(instrument: Instrument, plan: Plan) -> Float[Array, "b n"]:
 def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b 2 2 4"]:
     """Band-integrated Mueller rows (band, half, row, Stokes): all the optics there is at a field point.
 
-    Row 0 is S0, row 1 what the Wollaston prism analyses (S1, turned by an effect if need be), behind calibration
-    plate, wedge and half-wave plate.
+    Row 0 is S0, row 1 what the Wollaston prism analyses (S1, turned by an effect if need be), behind
+    calibration plate, wedge and half-wave plate.
     """
     matrices = plate_matrices(instrument, plan, x, y)
     turn: Scalar | float = 0.0
@@ -195,7 +197,7 @@ def camera_vectors(
 
 
 def telescope(instrument: Instrument) -> Float[Array, "4 4"]:
-    """Mueller matrix that light from the sky, and no other, meets ahead of the collimator: 1 unless an effect acts."""
+    """Mueller matrix that light from the sky, and no other, meets first: 1 unless an effect acts."""
     matrix = jnp.eye(4)
     for effect in instrument.effects:
         matrix = effect.telescope(matrix)
@@ -213,7 +215,7 @@ def _catalogue(
     return _turned(jnp.stack([all_q[row], all_u[row]], axis=-1), rotator)
 
 
-def _turned(qu: Float[Array, "e 2"], angle: Float[Array, " e"] | Scalar) -> Float[Array, "e 2"]:
+def _turned(qu: Float[Array, "e 2"], angle: Float[Array, " e"]) -> Float[Array, "e 2"]:
     """(q, u) referred to axes turned by `angle` (rad): (q + iu) exp(−2i angle)."""
     cos, sin = jnp.cos(2 * angle), jnp.sin(2 * angle)
     return jnp.stack([qu[:, 0] * cos + qu[:, 1] * sin, qu[:, 1] * cos - qu[:, 0] * sin], axis=-1)
@@ -232,7 +234,7 @@ def stokes(
     for effect in instrument.effects:
         offset = effect.rotator(offset)
     if not isinstance(offset, float):
-        rotator, sky = rotator + offset, _turned(sky, offset)
+        rotator, sky = rotator + offset, _turned(sky, jnp.broadcast_to(offset, rotator.shape))
     moon = instrument.sky.depolarisation * sky
     for effect in instrument.effects:
         moon = effect.moon(moon, sky)
@@ -298,8 +300,9 @@ def detected(
 def instrument_matrix(vectors: Float[Array, "... 4 4"]) -> Float[Array, "... 2 3"]:
     """Rows (m21, m22, m23) and (m31, m32, m33) of the instrument matrix from analysis vectors.
 
-    Difference of the two cameras' response to 1, q, u, each over the sum of their response to unpolarised light.
-    For light from the sky pass `vectors @ telescope(instrument)`, so that an active effect there is included.
+    Difference of the two cameras' response to 1, q, u, each over the sum of their response to unpolarised
+    light. For light from the sky pass `vectors @ telescope(instrument)`, so that an active effect there is
+    included.
     """
     first = (vectors[..., 0, :3] - vectors[..., 1, :3]) / (vectors[..., 0, :1] + vectors[..., 1, :1])
     second = (vectors[..., 2, :3] - vectors[..., 3, :3]) / (vectors[..., 2, :1] + vectors[..., 3, :1])

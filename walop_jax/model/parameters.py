@@ -1,7 +1,8 @@
-"""Parameters that know their unit, meaning, source and prior, and names derived from the tree that holds them.
+"""Parameters that know their unit, meaning, source and prior; names derived from the tree that holds them.
 
-A module declares a parameter with `param`; nobody types a second list of names. The value in the tree carries
-the unit of the declaration (the unit of the contract, e.g. µm or deg), conversions stand in the equations.
+A module declares a parameter with `param`; nobody types a second list of names. The value in the tree
+carries the unit of the declaration (the unit of the contract, e.g. µm or deg), conversions stand in the
+equations.
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ KEY = "walop_jax.parameter"
 class Declaration:
     """What a module says of one of its parameters.
 
-    `width` is the standard deviation of the as-built value (None: no prior), `scale` the step a solver should
-    think in (the width where there is one), `optical` whether it enters before the band integral. `loose` is the
-    width of a very weak pull toward the start value that keeps combinations which the data hardly see from
-    running away; it is no prior knowledge and is not counted as such.
+    `width` is the standard deviation of the as-built value (None: no prior), `scale` the step a solver
+    should think in (the width where there is one), `optical` whether it enters before the band integral.
+    `loose` is the width of a very weak pull toward the start value that keeps combinations which the data
+    hardly see from running away; it is no prior knowledge and is not counted as such.
     """
 
     unit: str

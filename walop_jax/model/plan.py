@@ -1,8 +1,8 @@
 """What is to be computed for a set of exposures: wavelength nodes, bands, settings of the calibration plate.
 
 Light is linear, so an exposure is a dot product with the analysis vectors of its *band* (filter, colour
-temperature, calibration plate, conditions); the optics are worked out once per point and wavelength node, never
-per exposure. Angles of the polariser never meet wavelengths.
+temperature, calibration plate, conditions); the optics are worked out once per point and wavelength node,
+never per exposure. Angles of the polariser never meet wavelengths.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from walop_jax.model.quadrature import band_rule
 class Plan(eqx.Module):
     """Static layout of a computation.
 
-    Nodes: `wavelength` (µm) and the `conditions` at which the plates are solved. Bands: rows of `node_weight`,
-    sorted by setting of the calibration plate; `settings` holds (angle in degrees or None, first band, one past
-    the last). `band_of[e, s + 1]` is the band of exposure e for light of source s (s = −1: no source).
+    Nodes: `wavelength` (µm) and the `conditions` at which the plates are solved. Bands: rows of
+    `node_weight`, sorted by setting of the calibration plate; `settings` holds (angle in degrees or None,
+    first band, one past the last). `band_of[e, s + 1]` is the band of exposure e for light of source s (s =
+    −1: no source).
     """
 
     wavelength: Float[Array, " n"]
@@ -99,8 +100,8 @@ def build_plan(
 ) -> Plan:
     """Lay out the nodes and bands of `exposures`.
 
-    `depends_on` names the exposure quantities on which the optics depend ("temperature", "hour_angle"), `fringes`
-    the path difference (waves at 0.62 µm) that the nodes must follow beyond that of the plates.
+    `depends_on` names the exposure quantities on which the optics depend ("temperature", "hour_angle"),
+    `fringes` the path difference (waves at 0.62 µm) that the nodes must follow beyond that of the plates.
     Raises KeyError for a filter that `filters` does not hold.
     """
     n_sources = 0 if sources is None else len(sources)

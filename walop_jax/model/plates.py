@@ -8,15 +8,16 @@ Ordinary        k_z² = n_o² − s²,                                E ∝ k ×
 Extraordinary   k_z² = n_e² (1 − (s·c)²/n_o²) − (s·c⊥)²,          E ∝ n_o² c − (k·c) k
 Both            H = k × E (in units of 1/Z0)
 Face            with 𝐄, 𝐇 the 2 × 2 matrices of the tangential fields of the two forward waves of a medium,
-                the amplitudes go over as t = 2 (𝐄₁⁻¹𝐄₂ + 𝐇₁⁻¹𝐇₂)⁻¹. The backward waves have the same tangential
-                E and the opposite tangential H because the axis lies in the surface; they enter the continuity
-                and are then dropped (no multiple reflections).
+                the amplitudes go over as t = 2 (𝐄₁⁻¹𝐄₂ + 𝐇₁⁻¹𝐇₂)⁻¹. The backward waves have the same
+                tangential E and the opposite tangential H because the axis lies in the surface; they enter
+                the continuity and are then dropped (no multiple reflections).
 Stack           J = t_out Π P_j t_j, P = diag(1, exp 2πi d (k_ze − k_zo)/λ); the ordinary phase is common.
 
 Symbols     s = sin of the angle in air; d thickness [µm]; λ vacuum wavelength [µm]; n_o, n_e at λ.
-Cut axis    with c = (cos α cos χ, sin α cos χ, sin χ) the extraordinary waves obey k·εk = n_o² n_e², a quadratic in k_z
-            whose two roots are no mirror images; with 𝐄₋, 𝐇₋ the backward waves of the first medium and
-            Y = 𝐇₋ 𝐄₋⁻¹ the face is t = (𝐇₂ − Y 𝐄₂)⁻¹ (𝐇₁ − Y 𝐄₁). Solved that way only if a plate has a `cut`.
+Cut axis    with c = (cos α cos χ, sin α cos χ, sin χ) the extraordinary waves obey k·εk = n_o² n_e², a
+            quadratic in k_z whose two roots are no mirror images; with 𝐄₋, 𝐇₋ the backward waves of the
+            first medium and Y = 𝐇₋ 𝐄₋⁻¹ the face is t = (𝐇₂ − Y 𝐄₂)⁻¹ (𝐇₁ − Y 𝐄₁). Solved that way only if
+            a plate has a `cut`.
 
 Sources     Born & Wolf, Principles of Optics, ch. 15 (waves in uniaxial crystals) and 1.5 (continuity);
             Yeh 1982, Surf. Sci. 96, 41 (the matrix form). Fixed axis: Paper II, appendix B.
@@ -83,7 +84,9 @@ def _crystal(sx: Real, sy: Real, plate: Plate) -> _Waves:
     h_o = _tangential(sx, sy, kz_o, e_o)
     h_e = _tangential(sx, sy, kz_e, e_e)
     electric = Matrix2(e_o[0], e_e[0], e_o[1], e_e[1])
-    return _Waves(electric, Matrix2(h_o[0], h_e[0], h_o[1], h_e[1]), kz_e - kz_o)
+    # k_ze − k_zo without the cancellation, from k_ze² − k_zo² = (n_e² − n_o²)(1 − (s·c)²/n_o²).
+    phase = (ne2 - no2) * (1.0 - along**2 / no2) / (kz_e + kz_o)
+    return _Waves(electric, Matrix2(h_o[0], h_e[0], h_o[1], h_e[1]), phase)
 
 
 def _face(before: _Waves, after: _Waves) -> Matrix2:
@@ -129,7 +132,8 @@ def _crystal_both_ways(sx: Real, sy: Real, plate: Plate) -> _BothWays:
         e_e = (no2 * cx - along * sx, no2 * cy - along * sy, no2 * cz - along * kz_e)
         h_o, h_e = _tangential(sx, sy, kz_o, e_o), _tangential(sx, sy, kz_e, e_e)
         electric = Matrix2(e_o[0], e_e[0], e_o[1], e_e[1])
-        return _Waves(electric, Matrix2(h_o[0], h_e[0], h_o[1], h_e[1]), kz_e - kz_o)
+        phase = (plate.extraordinary**2 - no2) * (1.0 - along**2 / no2) / (kz_e + kz_o)
+        return _Waves(electric, Matrix2(h_o[0], h_e[0], h_o[1], h_e[1]), phase)
 
     forward, backward = _extraordinary_kz(sx, sy, plate)
     return _BothWays(waves(kz_o, forward), waves(-kz_o, backward))
@@ -184,11 +188,11 @@ def stack_mueller(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Rea
 def fixed_axis_mueller(
     sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real
 ) -> Float[Array, "... 4 4"]:
-    """The paper's approximation: one retarder whose axis stays that of the last plate, without Fresnel losses.
+    """The paper's approximation: one retarder whose axis is that of the last plate, without Fresnel losses.
 
     δ = Σ ± 2π d (k_ze − k_zo)/λ, counted positive for plates whose axis is that of the last one. Misses up
-    to 1–2 % of the cross-talk of thick crossed plates at 10° (kept for comparison). Both crystals are positive
-    (n_e > n_o), so the optic axis is the slow one and the fast axis of a plate lies at axis + 90°.
+    to 1–2 % of the cross-talk of thick crossed plates at 10° (kept for comparison). Both crystals are
+    positive (n_e > n_o), so the optic axis is the slow one and the fast axis of a plate lies at axis + 90°.
     """
     total = jnp.zeros_like(sx)
     last = plates[-1].axis

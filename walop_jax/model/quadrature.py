@@ -1,13 +1,13 @@
 """Wavelength nodes of a band: a Gauss rule for the filter's own tabulated curve.
 
-The band integral ∫ THROUGHPUT f dλ over the tabulated curve is a sum with positive weights (trapezium rule on
-the table, refined to 0.5 nm by linear interpolation where it is coarser). The Gauss rule of that discrete
-measure integrates polynomials of degree 2n − 1 exactly, so n nodes follow an oscillation of the plates as well
-as any n nodes can. n is the smallest that integrates the fringes of the plates (35 waves thick, so periods near
-17 nm, half of that at second order, in all phases) to `tolerance`.
+The band integral ∫ THROUGHPUT f dλ over the tabulated curve is a sum with positive weights (trapezium rule
+on the table, refined to 0.5 nm by linear interpolation where it is coarser). The Gauss rule of that
+discrete measure integrates polynomials of degree 2n − 1 exactly, so n nodes follow an oscillation of the
+plates as well as any n nodes can. n is the smallest that integrates the fringes of the plates (35 waves
+thick, so periods near 17 nm, half of that at second order, in all phases) to `tolerance`.
 
-Source      Golub & Welsch 1969, Math. Comp. 23, 221; discrete measures by the Lanczos process: Gautschi 2004,
-            Orthogonal Polynomials, 2.2.3.
+Source      Golub & Welsch 1969, Math. Comp. 23, 221; discrete measures by the Lanczos process: Gautschi
+            2004, Orthogonal Polynomials, 2.2.3.
 """
 
 from __future__ import annotations
@@ -79,12 +79,14 @@ def _fringe_error(
 def band_rule(wavelength: Vector, throughput: Vector, tolerance: float = 1e-7, fringes: float = 0.0) -> Rule:
     """Fewest wavelength nodes (µm) and weights (sum 1) that integrate plate fringes to `tolerance`.
 
-    Fringes at twice the plates' frequency carry a hundred times less light and are held to a hundred times the
-    tolerance; so are those of a path difference of `fringes` waves at 0.62 µm, if there is an etalon.
+    Fringes at twice the plates' frequency carry a hundred times less light and are held to a hundred times
+    the tolerance; so are those of a path difference of `fringes` waves at 0.62 µm, if there is an etalon.
     """
     weak = max(2 * WAVES, fringes)
     fine, fine_weight = tabulated_measure(wavelength, throughput)
-    for count in range(1, MAXIMUM_NODES):
+    # No rule follows a fringe with fewer than two nodes a cycle: there is no need to try those.
+    cycles = 0.62 * fringes * (1.0 / fine[0] - 1.0 / fine[-1])
+    for count in range(max(1, int(2.0 * cycles)), MAXIMUM_NODES):
         if count >= len(fine):
             break
         node, weight = gauss_rule(fine, fine_weight, count)

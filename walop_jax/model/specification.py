@@ -1,4 +1,4 @@
-"""The model as a list of parameters beside the instrument they belong to: what is free, tied, known beforehand.
+"""The model as a list of parameters beside their instrument: what is free, tied, known beforehand.
 
 Three things of one shape: values, freedom and priors. Names come from the tree (`parameters.leaves`).
 """
@@ -125,7 +125,7 @@ class Model:
                 matrix[i, column[name]] = 1.0
         return matrix
 
-    def full(self, free_values: Vector) -> Vector:
+    def full(self, free_values: Float[np.ndarray, " f"]) -> Vector:
         """All parameters from the values of the free ones."""
         start = self.start
         return start + self.selection() @ (np.asarray(free_values) - start[self.free])

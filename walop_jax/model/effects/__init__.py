@@ -1,4 +1,4 @@
-"""Physical effects beyond the base model: one file each, and the one list `EFFECTS`, in the order light meets them."""
+"""Physical effects beyond the base model: one file each, and `EFFECTS`, in the order light meets them."""
 
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.effects.blemish import Blemish

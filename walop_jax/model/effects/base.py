@@ -1,8 +1,8 @@
 """What an effect is: a component with a name that acts at one stage of the light path, or at a few.
 
 The light path (`light.py`) passes every stage through the active effects in order; the hooks below are the
-stages, and each leaves the light as it is unless an effect overrides it. An effect that is not active is not in
-the tree: it costs nothing.
+stages, and each leaves the light as it is unless an effect overrides it. An effect that is not active is
+not in the tree: it costs nothing.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class Conditions(NamedTuple):
 class Context(NamedTuple):
     """What effects that grow with the data need to know of them.
 
-    `moon` holds the positions of the Moon exposures and `moon_ids` their EXPOSURE numbers; `sources` the names
-    of the standards, `exposures` the number of exposures.
+    `moon` holds the positions of the Moon exposures and `moon_ids` their EXPOSURE numbers; `sources` the
+    names of the standards, `exposures` the number of exposures.
     """
 
     exposures: int = 0
@@ -64,14 +64,14 @@ class Context(NamedTuple):
 class Effect(Component):
     """A physical effect beyond the base model.
 
-    Its parameters are the `param` fields; static fields are its discrete choices (which camera, which star).
-    `shape` names the parameters that act non-linearly (phase, gap, position); all others are amplitudes, and
-    nothing happens when they are neutral, whatever the shape. `starts` are groups of shapes from which to look
-    for the effect: groups are alternatives, the members of a group are directions that are fitted together
-    and that `combine` turns into one effect. `one_sided` names amplitudes that physics keeps above neutral.
-    `optics_depend_on` names the exposure quantities ("temperature", "hour_angle") that make the optics differ
-    from exposure to exposure; `fringes` is the path difference, in waves at 0.62 µm, that the wavelength nodes
-    must follow; `uses_median` asks for the median counts of every exposure.
+    Its parameters are the `param` fields; static fields are its discrete choices (which camera, which
+    star). `shape` names the parameters that act non-linearly (phase, gap, position); all others are
+    amplitudes, and nothing happens when they are neutral, whatever the shape. `starts` are groups of shapes
+    from which to look for the effect: groups are alternatives, the members of a group are directions that
+    are fitted together and that `combine` turns into one effect. `one_sided` names amplitudes that physics
+    keeps above neutral. `optics_depend_on` names the exposure quantities ("temperature", "hour_angle") that
+    make the optics differ from exposure to exposure; `fringes` is the path difference, in waves at 0.62 µm,
+    that the wavelength nodes must follow; `uses_median` asks for the median counts of every exposure.
     """
 
     name: ClassVar[str] = ""
@@ -104,16 +104,16 @@ class Effect(Component):
             if name not in names:
                 raise unknown_name(f"parameter of {cls.name}", name, names)
             if name in field_declarations(cls):
-                values[name] = np.broadcast_to(np.asarray(value, float), np.shape(getattr(effect, name)))
+                values[name] = jnp.broadcast_to(jnp.asarray(value, float), np.shape(getattr(effect, name)))
         return dataclasses.replace(effect, **values)
 
     @classmethod
     def probes(cls, context: Context) -> tuple[tuple[Self, ...], ...]:
-        """Neutral effects at the shapes of `starts`: what a linear search differentiates in the amplitudes."""
+        """Neutral effects at the shapes of `starts`: what a linear search differentiates."""
         return tuple(tuple(cls.of(context, **start) for start in group) for group in cls.starts)
 
     @classmethod
-    def combine(cls, group: Sequence[Self], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
+    def combine(cls, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
         """The effect with the amplitudes that a linear fit of the probes of a group has found.
 
         `amplitudes` are counted from neutral, member by member in the order of the fields. A group of one

@@ -2,7 +2,8 @@
 
 Equation    N0 → N0 + share N1, N1 → N1 + share N0, and N2, N3 likewise (behind the throughput)
 Symbols     share: of the orthogonal camera's light
-Source      calibration contract, section 6; a wire-grid beam splitter mixes both polarisations into its reflected beam.
+Source      calibration contract, section 6; a wire-grid beam splitter mixes both polarisations into its
+            reflected beam.
 Neutral     share = 0
 Revealed by efficiencies too low by 2 share in both halves.
 """
@@ -30,8 +31,8 @@ class CameraLeakage(Effect):
     one_sided: ClassVar[tuple[str, ...]] = ("share",)
     revealed_by: ClassVar[str] = "polariser exposures: an efficiency below what the analysers can have"
     separated_by: ClassVar[str] = (
-        "nothing in intensities alone tells it from less efficient analysers beyond their prior; standards of 3–5 % tell "
-        "it from the extinction of the polariser, flux levels from stray light"
+        "nothing in intensities alone tells it from less efficient analysers beyond their prior; standards "
+        "of 3–5 % tell it from the extinction of the polariser, flux levels from stray light"
     )
 
     def cameras(self, vectors: Float[Array, "b 4 4"]) -> Float[Array, "b 4 4"]:

@@ -2,10 +2,11 @@
 
 Equation    d → d + mgf2, d + quartz
 Symbols     d thickness of the crystal; mgf2, quartz [µm]
-Source      calibration contract, section 6; one µm is 6.8° of retardance in MgF2 and 5.3° in quartz at 0.62 µm.
+Source      calibration contract, section 6; one µm is 6.8° of retardance in MgF2 and 5.3° in quartz at 0.62
+            µm.
 Neutral     mgf2 = quartz = 0
-Revealed by exposures with the calibration plate: cross-talk that exceeds what its prior of 1 µm allows. The base
-            model has both thicknesses free, so this is the same quantity without that prior.
+Revealed by exposures with the calibration plate: cross-talk that exceeds what its prior of 1 µm allows. The
+            base model has both thicknesses free, so this is the same quantity without that prior.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ Equation    light behind the polariser (1, c cos 2θ, c sin 2θ, v)
 Symbols     v: S3 per unit of transmitted light, the same at every angle of the polariser
 Source      calibration contract, section 6; retardance of film and substrate, 1–3 % is plausible.
 Neutral     v = 0
-Revealed by an offset of u_m in polariser exposures that follows the V column of the second half (about sin δ of
-            HWP2: a field map) and is absent for stars.
+Revealed by an offset of u_m in polariser exposures that follows the V column of the second half (about sin
+            δ of HWP2: a field map) and is absent for stars.
 """
 
 from __future__ import annotations

@@ -2,12 +2,14 @@
 
 Equation    θ = CLP_ANGLE + amplitude · sin(CLP_ANGLE − phase)
 Symbols     θ transmission axis in the ICS; amplitude [deg]; phase [rad]
-Source      calibration contract, section 6. An eccentric code disc reads wrong by e/r sin: 0.1° is 0.35 % of the
-            intensity at worst.
+Source      calibration contract, section 6. An eccentric code disc reads wrong by e/r sin: 0.1° is 0.35 %
+            of the intensity at worst.
 Neutral     amplitude = 0, whatever the phase
-Revealed by side bands at one and three times the polariser angle in the normalised intensities of all cameras.
+Revealed by side bands at one and three times the polariser angle in the normalised intensities of all
+            cameras.
 
-Around neutral the effect is linear in amplitude · (cos phase, sin phase): two probes at phase 0 and π/2 span it.
+Around neutral the effect is linear in amplitude · (cos phase, sin phase): two probes at phase 0 and π/2
+span it.
 """
 
 from __future__ import annotations
@@ -37,8 +39,8 @@ class ClpWobble(Effect):
     starts: ClassVar[tuple[tuple[Mapping[str, Any], ...], ...]] = (({"phase": 0.0}, {"phase": 0.5 * np.pi}),)
     revealed_by: ClassVar[str] = "polariser exposures at many angles, best over a full turn"
     separated_by: ClassVar[str] = (
-        "polariser angles over 360° instead of 180°: an encoder error changes sign after half a turn, nothing "
-        "that polarised light itself does can"
+        "polariser angles over 360° instead of 180°: an encoder error changes sign after half a turn, "
+        "nothing that polarised light itself does can"
     )
 
     def polariser_angle(self, angle: Real, exposures: ExposureArrays) -> Real:
@@ -46,7 +48,7 @@ class ClpWobble(Effect):
         return angle + jnp.deg2rad(self.amplitude) * jnp.sin(exposures.clp_angle - self.phase)
 
     @classmethod
-    def combine(cls, group: Sequence[Self], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
+    def combine(cls, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
         """Amplitude and phase from the two linear directions."""
         sine, cosine = amplitudes
         return dataclasses.replace(group[0], amplitude=np.hypot(sine, cosine), phase=np.arctan2(cosine, sine))

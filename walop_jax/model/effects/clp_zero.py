@@ -2,10 +2,11 @@
 
 Equation    θ = CLP_ANGLE + angle
 Symbols     θ transmission axis in the ICS; angle [deg]
-Source      calibration contract, section 6; axes of such polarisers are clocked to 0.1° (Harrington et al. 2021,
-            JATIS 7, 018004).
+Source      calibration contract, section 6; axes of such polarisers are clocked to 0.1° (Harrington et al.
+            2021, JATIS 7, 018004).
 Neutral     angle = 0
-Revealed by standard stars: polariser and sky then disagree on the direction of +q by the same angle everywhere.
+Revealed by standard stars: polariser and sky then disagree on the direction of +q by the same angle
+            everywhere.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ class ClpZero(Effect):
         "polariser exposures together with polarised standards (or a trusted sky angle)"
     )
     separated_by: ClassVar[str] = (
-        "a polarised standard separates it from rotated plates or analysers (they turn stars as well); standards and "
-        "Moon at several ROTATOR angles separate it from the rotator zero"
+        "a polarised standard separates it from rotated plates or analysers (they turn stars as well); "
+        "standards and Moon at several ROTATOR angles separate it from the rotator zero"
     )
 
     def polariser_angle(self, angle: Real, exposures: ExposureArrays) -> Real:

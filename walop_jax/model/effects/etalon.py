@@ -1,15 +1,16 @@
 """Fringes of the air gaps ahead of the half-wave plates.
 
-Equation    diattenuator with D = contrast · cos(4π gap cos ϑ / λ) along the fast axis of each plate, ahead of it
+Equation    diattenuator with D = contrast · cos(4π gap cos ϑ / λ) along the fast axis of each plate, ahead
+            of it
 Symbols     gap thickness of the air [µm]; ϑ angle of the ray in air at the plate; λ wavelength [µm]
-Source      calibration contract, section 6; fringes of polarised light are "the chief bane" of precise polarimetry
-            (Clarke 2005, A&A 434, 377), 1e-3 remains with coatings (Semel 2003, A&A 401, 1).
+Source      calibration contract, section 6; fringes of polarised light are "the chief bane" of precise
+            polarimetry (Clarke 2005, A&A 434, 377), 1e-3 remains with coatings (Semel 2003, A&A 401, 1).
 Neutral     contrast = 0, whatever the gap
-Revealed by zero offsets that oscillate with wavelength (period λ²/2 gap) and in rings over the field; a broad band
-            averages gaps beyond some tens of µm away.
+Revealed by zero offsets that oscillate with wavelength (period λ²/2 gap) and in rings over the field; a
+            broad band averages gaps beyond some tens of µm away.
 
-Near a gap the fringe is a cosine and a sine: the probes come in pairs λ₀/8 apart, a quarter of a fringe, on a grid
-that no fringe of the r band escapes. The wavelength nodes follow gaps up to `LARGEST_GAP`.
+Near a gap the fringe is a cosine and a sine: the probes come in pairs λ₀/8 apart, a quarter of a fringe, on
+a grid that no fringe of the r band escapes. The wavelength nodes follow gaps up to `LARGEST_GAP`.
 """
 
 from __future__ import annotations
@@ -56,7 +57,8 @@ class Etalon(Effect):
     fringes: ClassVar[float] = 2.0 * LARGEST_GAP / REFERENCE_WAVELENGTH
     revealed_by: ClassVar[str] = "unpolarised light or polariser exposures in narrow bands"
     separated_by: ClassVar[str] = (
-        "narrow bands of different wavelength, or a change of temperature: throughput and lens polarisation do not oscillate"
+        "narrow bands of different wavelength, or a change of temperature: throughput and lens polarisation "
+        "do not oscillate"
     )
 
     def ahead_of_plates(
@@ -74,7 +76,7 @@ class Etalon(Effect):
         return mueller @ mm.diattenuator(d * jnp.cos(2.0 * fast_axis), d * jnp.sin(2.0 * fast_axis))
 
     @classmethod
-    def combine(cls, group: Sequence[Self], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
+    def combine(cls, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
         """Contrast and gap from cosine and sine at the pair's gap."""
         cosine, sine = amplitudes
         shift = np.arctan2(sine, cosine) * REFERENCE_WAVELENGTH / (4.0 * np.pi)

@@ -2,11 +2,11 @@
 
 Equation    THROUGHPUT(λ) → THROUGHPUT(λ − wavelength) for filters of an equivalent width above 0.05 µm
 Symbols     wavelength: displacement [µm]; equivalent width ∫ THROUGHPUT dλ / max THROUGHPUT
-Source      calibration contract, section 6; interference filters shift with tilt and temperature, and catalogue curves
-            differ from the filter in the wheel by several nm.
+Source      calibration contract, section 6; interference filters shift with tilt and temperature, and
+            catalogue curves differ from the filter in the wheel by several nm.
 Neutral     wavelength = 0
-Revealed by cross-talk of the u half that narrow bands do not confirm. Narrow bands stay where they are; the source
-            spectrum is taken at the displaced wavelengths.
+Revealed by cross-talk of the u half that narrow bands do not confirm. Narrow bands stay where they are; the
+            source spectrum is taken at the displaced wavelengths.
 """
 
 from __future__ import annotations

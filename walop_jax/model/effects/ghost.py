@@ -2,12 +2,14 @@
 
 Equation    N(X, Y) → N(X, Y) + share · N(−X, −Y) in the same camera, for extended sources (SOURCE = −1)
 Symbols     share: of the light at the opposite field point
-Source      calibration contract, section 6; reflections between detector and window are point-symmetric about the axis.
+Source      calibration contract, section 6; reflections between detector and window are point-symmetric
+            about the axis.
 Neutral     share = 0
-Revealed by polariser and Moon exposures whose response resembles that of the opposite field point, while stars at the
-            same place do not show it.
+Revealed by polariser and Moon exposures whose response resembles that of the opposite field point, while
+            stars at the same place do not show it.
 
-An extended source is taken to be as bright at the opposite point; its polarisation is that of the source there.
+An extended source is taken to be as bright at the opposite point; its polarisation is that of the source
+there.
 """
 
 from __future__ import annotations

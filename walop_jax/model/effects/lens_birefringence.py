@@ -2,8 +2,9 @@
 
 Equation    M = Ret(2π delta (r/0.3°)², φ) · collimator
 Symbols     delta retardance in waves at 0.3°, fast axis radial; r, φ polar coordinates of the field point
-Source      calibration contract, section 6; stress of mounted lenses grows like the radius squared (Selbing 2005,
-            arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146, for the pattern in a focal reducer).
+Source      calibration contract, section 6; stress of mounted lenses grows like the radius squared (Selbing
+            2005, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146, for the pattern in a focal
+            reducer).
 Neutral     delta = 0
 Revealed by V picked up in proportion to r², with the pattern of cos 2φ and sin 2φ.
 
@@ -32,8 +33,8 @@ class LensBirefringence(Effect):
     name: ClassVar[str] = "lens_birefringence"
     revealed_by: ClassVar[str] = "polariser exposures over the field"
     separated_by: ClassVar[str] = (
-        "the calibration plate at 45° turns what it makes; its radial pattern about the axis (errors of the plates "
-        "have theirs about the wedge normal); narrow bands"
+        "the calibration plate at 45° turns what it makes; its radial pattern about the axis (errors of the "
+        "plates have theirs about the wedge normal); narrow bands"
     )
 
     def upstream(self, mueller: Float[Array, "4 4"], x: Scalar, y: Scalar) -> Float[Array, "4 4"]:

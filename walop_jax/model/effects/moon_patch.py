@@ -2,10 +2,11 @@
 
 Equation    (q, u) of exposure e → (q, u) + (q_e, u_e), the same over the field, in the ICS
 Symbols     q_e, u_e for each exposure of KIND `moon`
-Source      calibration contract, section 6; neutral points and aerosol: a third of the patches of RoboPol were not what
-            single scattering says (Maharana et al. 2023, A&A 679, A68).
+Source      calibration contract, section 6; neutral points and aerosol: a third of the patches of RoboPol
+            were not what single scattering says (Maharana et al. 2023, A&A 679, A68).
 Neutral     all 0
-Revealed by Moon patches that disagree with each other under the instrument that polariser and standards give.
+Revealed by Moon patches that disagree with each other under the instrument that polariser and standards
+            give.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ from walop_jax.model.parameters import param
 class MoonPatch(Effect):
     """What a patch has beyond single scattering, per Moon exposure."""
 
-    q: Float[Array, " m"] = param(unit="", about="added to q of the patch", source=CONTRACT, width=0.005)
-    u: Float[Array, " m"] = param(unit="", about="added to u of the patch", source=CONTRACT, width=0.005)
     positions: tuple[int, ...] = eqx.field(static=True)
     ids: tuple[int, ...] = eqx.field(static=True)
+    q: Float[Array, " m"] = param(unit="", about="added to q of the patch", source=CONTRACT, width=0.005)
+    u: Float[Array, " m"] = param(unit="", about="added to u of the patch", source=CONTRACT, width=0.005)
 
     name: ClassVar[str] = "moon_patch"
     revealed_by: ClassVar[str] = "Moon patches with polariser exposures"
@@ -39,7 +40,7 @@ class MoonPatch(Effect):
     @classmethod
     def neutral(cls, context: Context) -> Self:
         """Nothing beyond single scattering in any patch."""
-        zero = np.zeros(len(context.moon))
+        zero = jnp.zeros(len(context.moon))
         return cls(q=zero, u=zero, positions=context.moon, ids=context.moon_ids)
 
     def labels(self, field: str) -> Sequence[str]:

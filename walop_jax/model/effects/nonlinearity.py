@@ -2,11 +2,12 @@
 
 Equation    N → N (1 + coefficient · N / 10⁶)
 Symbols     N counts [electron]; coefficient per camera
-Source      calibration contract, section 6; "small non-linearities in the CCD" were the major obstacle in calibrating the
-            Swedish solar telescope (Selbing 2005, arXiv:1010.4142); 1 % at full well is typical.
+Source      calibration contract, section 6; "small non-linearities in the CCD" were the major obstacle in
+            calibrating the Swedish solar telescope (Selbing 2005, arXiv:1010.4142); 1 % at full well is
+            typical.
 Neutral     coefficient = 0
-Revealed by a cos 4θ in the normalised intensities of polariser exposures, of opposite sign in the two halves, that grows
-            with the flux; stars and sky disagree.
+Revealed by a cos 4θ in the normalised intensities of polariser exposures, of opposite sign in the two
+            halves, that grows with the flux; stars and sky disagree.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ class Nonlinearity(Effect):
     name: ClassVar[str] = "nonlinearity"
     revealed_by: ClassVar[str] = "polariser exposures: a fourth harmonic that grows with the flux"
     separated_by: ClassVar[str] = (
-        "a few polariser angles at two flux levels: throughput imbalance and an encoder error twice per turn make the same "
-        "harmonic at every flux"
+        "a few polariser angles at two flux levels: throughput imbalance and an encoder error twice per "
+        "turn make the same harmonic at every flux"
     )
 
     @classmethod

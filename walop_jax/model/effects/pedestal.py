@@ -4,7 +4,8 @@ Equation    N_k → N_k + level_k · median over the field of the measured count
 Symbols     level per camera, a share
 Source      calibration contract, section 6; 0.1–1 % of diffuse light is common in focal reducers.
 Neutral     level = 0
-Revealed by efficiencies that are lower where the field is darker (vignetted corners, stars fainter than the median).
+Revealed by efficiencies that are lower where the field is darker (vignetted corners, stars fainter than the
+            median).
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ class Pedestal(Effect):
         "polariser exposures: modulation of one camera that is diluted by light of all angles"
     )
     separated_by: ClassVar[str] = (
-        "two flux levels in one field, or stars brighter and fainter than the median: leakage and analysers go with the "
-        "light of the same point"
+        "two flux levels in one field, or stars brighter and fainter than the median: leakage and analysers "
+        "go with the light of the same point"
     )
 
     @classmethod

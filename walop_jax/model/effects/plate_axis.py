@@ -2,11 +2,11 @@
 
 Equation    α → α + angle for the optic axes of both crystals of the plate
 Symbols     α fast axis in the ICS (0° HWP1, 22.5° HWP2, CHWP_ANGLE); angle [deg]
-Source      calibration contract, section 6; 1.8° was found in an instrument in use (NaCo, SPIE 9147, 87), 0.1° is the
-            repeatability of good mounts.
+Source      calibration contract, section 6; 1.8° was found in an instrument in use (NaCo, SPIE 9147, 87),
+            0.1° is the repeatability of good mounts.
 Neutral     angle = 0
-Revealed by an analyser turned by 2 angle, in one half (or behind the calibration plate) only, constant over the
-            field to first order.
+Revealed by an analyser turned by 2 angle, in one half (or behind the calibration plate) only, constant over
+            the field to first order.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class Hwp1Axis(PlateAxis):
     where: ClassVar[str] = "half1"
     revealed_by: ClassVar[str] = "polariser exposures: the q half is turned against the u half"
     separated_by: ClassVar[str] = (
-        "a polarised standard (together with the u half) separates it from the zero of the polariser; a turned Wollaston "
-        "prism is told apart by the field pattern and by the calibration plate only"
+        "a polarised standard (together with the u half) separates it from the zero of the polariser; a "
+        "turned Wollaston prism is told apart by the field pattern and by the calibration plate only"
     )
 
 

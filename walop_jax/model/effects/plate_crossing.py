@@ -2,11 +2,11 @@
 
 Equation    optic axis of MgF2 = α + 90° + angle, that of quartz stays at α
 Symbols     α fast axis of the plate; angle [deg]
-Source      calibration contract, section 6; 0.1–0.2° of clocking between crystals (Harrington et al. 2023, JATIS 9,
-            038003), which makes 0.35–1.4 % of cross-talk.
+Source      calibration contract, section 6; 0.1–0.2° of clocking between crystals (Harrington et al. 2023,
+            JATIS 9, 038003), which makes 0.35–1.4 % of cross-talk.
 Neutral     angle = 0
-Revealed by cross-talk that oscillates fast with wavelength (35 waves), and by linear cross-talk of both signs over
-            the field in the half concerned: the pair is an elliptical retarder.
+Revealed by cross-talk that oscillates fast with wavelength (35 waves), and by linear cross-talk of both
+            signs over the field in the half concerned: the pair is an elliptical retarder.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ class PlateCrossing(Effect):
     where: ClassVar[str]
     revealed_by: ClassVar[str] = "polariser exposures in narrow bands, or over the field"
     separated_by: ClassVar[str] = (
-        "several narrow bands (it oscillates with wavelength, a turned plate does not) and the calibration plate"
+        "several narrow bands (it oscillates with wavelength, a turned plate does not) and the calibration "
+        "plate"
     )
 
     def plates(self, where: str, plates: tuple[Plate, ...], conditions: Conditions) -> tuple[Plate, ...]:

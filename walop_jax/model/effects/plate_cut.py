@@ -2,9 +2,9 @@
 
 Equation    c = (cos α cos angle, sin α cos angle, sin angle) for one crystal of the plate
 Symbols     c optic axis, along the light for 90°; α its azimuth; angle [deg]
-Source      calibration contract, section 6; to first order the retardance changes by 2π d Δn/(λ n) · 2 angle · s·c, odd
-            in the field angle: about 0.55° per degree of incidence for 0.1° in a plate of 36 waves. Cutting errors
-            of large crystals: Harrington et al. 2023, JATIS 9, 038003.
+Source      calibration contract, section 6; to first order the retardance changes by 2π d Δn/(λ n) · 2
+            angle · s·c, odd in the field angle: about 0.55° per degree of incidence for 0.1° in a plate of
+            36 waves. Cutting errors of large crystals: Harrington et al. 2023, JATIS 9, 038003.
 Neutral     angle = 0 (the waves are then those of `plates.stack_jones`; the general solver gives the same)
 Revealed by a part of the cross-talk that is odd in the field angle and grows with the number of waves.
 
@@ -41,8 +41,8 @@ class PlateCut(Effect):
     where: ClassVar[str]
     revealed_by: ClassVar[str] = "polariser exposures over the field, best in narrow bands"
     separated_by: ClassVar[str] = (
-        "narrow bands separate it from the wedge angle (it grows with the waves, the wedge with geometry); the calibration "
-        "plate, which has no wedge, and the change of the pattern with field angle do too"
+        "narrow bands separate it from the wedge angle (it grows with the waves, the wedge with geometry); "
+        "the calibration plate, which has no wedge, and the change of the pattern with field angle do too"
     )
 
     def __check_init__(self) -> None:
@@ -61,7 +61,7 @@ class PlateCut(Effect):
         changed: list[Any] = list(plates)
         i = CRYSTALS.index(self.crystal)
         tilt = jnp.broadcast_to(jnp.deg2rad(self.angle), jnp.shape(plates[i].axis))
-        changed[i] = plates[i]._replace(cut=tilt if plates[i].cut is None else plates[i].cut + tilt)
+        changed[i] = plates[i]._replace(cut=tilt)
         return tuple(changed)
 
 

@@ -6,8 +6,8 @@ Source      calibration contract, section 6, with its section 1: EVPA in the ICS
 Neutral     angle = 0
 Revealed by Moon and standards turned together against the polariser.
 
-Field points also stand elsewhere on the sky, by angle · r, which changes the Moon sky by less than 3e-5 for one degree
-and is left out.
+Field points also stand elsewhere on the sky, by angle · r, which changes the Moon sky by less than 3e-5 for
+one degree and is left out.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class RotatorZero(Effect):
     name: ClassVar[str] = "rotator_zero"
     revealed_by: ClassVar[str] = "polarised standards, or Moon patches, together with polariser exposures"
     separated_by: ClassVar[str] = (
-        "nothing but an independent zero of the polariser, such as a polariser aligned in the laboratory: both turn sky "
-        "against polariser"
+        "nothing but an independent zero of the polariser, such as a polariser aligned in the laboratory: "
+        "both turn sky against polariser"
     )
 
     def rotator(self, offset: Scalar | float) -> Scalar | float:

@@ -2,7 +2,8 @@
 
 Equation    (Q, U) of the star → (Q + q, U + u), equatorial frame
 Symbols     q, u difference from the catalogue; source: name of the star
-Source      calibration contract, section 6; some classical standards vary (Blinov et al. 2023, A&A 677, A144).
+Source      calibration contract, section 6; some classical standards vary (Blinov et al. 2023, A&A 677,
+            A144).
 Neutral     q = u = 0
 Revealed by one star that is off by the same Stokes parameters wherever in the field it stands.
 """

@@ -1,9 +1,10 @@
 """Polarisation by the telescope.
 
-Equation    M = [[1, 0], [(q, u, 0)ᵀ, 1]]: (0, q, u, 0) per unit of light is added to every beam from the sky
+Equation    M = [[1, 0], [(q, u, 0)ᵀ, 1]]: (0, q, u, 0) per unit of light is added to every beam from the
+            sky
 Symbols     q, u in the ICS
-Source      calibration contract, section 6; 0.3 % was found on a Cassegrain telescope with aged mirrors (Patat &
-            Taubenberger 2011, A&A 529, A57), Paper II assumes less than 0.01 %.
+Source      calibration contract, section 6; 0.3 % was found on a Cassegrain telescope with aged mirrors
+            (Patat & Taubenberger 2011, A&A 529, A57), Paper II assumes less than 0.01 %.
 Neutral     q = u = 0
 Revealed by zero offsets of Moon and stars that polariser exposures do not have (light through the polariser
             forgets its past). Light of known flux (KIND `flux`) does not come from the sky.
@@ -32,8 +33,9 @@ class TelescopePolarisation(Effect):
         "unpolarised or known standards, with polariser exposures of the same field points"
     )
     separated_by: ClassVar[str] = (
-        "standards at several ROTATOR angles: the telescope's part stays in the instrument frame, an error of the "
-        "catalogue turns with the sky; Moon patches must see the same offset, an error of one patch does not"
+        "standards at several ROTATOR angles: the telescope's part stays in the instrument frame, an error "
+        "of the catalogue turns with the sky; Moon patches must see the same offset, an error of one patch "
+        "does not"
     )
 
     def telescope(self, mueller: Float[Array, "4 4"]) -> Float[Array, "4 4"]:

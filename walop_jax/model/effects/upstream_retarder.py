@@ -2,10 +2,11 @@
 
 Equation    M = Ret(delta, axis) · collimator
 Symbols     delta retardance [rad]; axis of the fast direction, from +X toward +Y [deg]
-Source      calibration contract, section 6; stress in a window or in the last lens (Selbing 2005, arXiv:1010.4142,
-            needed five parameters for one lens).
+Source      calibration contract, section 6; stress in a window or in the last lens (Selbing 2005,
+            arXiv:1010.4142, needed five parameters for one lens).
 Neutral     delta = 0, whatever the axis
-Revealed by V picked up ahead of the plates: cross-talk in both halves that does not follow their field pattern.
+Revealed by V picked up ahead of the plates: cross-talk in both halves that does not follow their field
+            pattern.
 
 Around neutral the effect is linear in delta · (cos 2 axis, sin 2 axis): two probes at 0° and 45° span it.
 """
@@ -36,8 +37,8 @@ class UpstreamRetarder(Effect):
     starts: ClassVar[tuple[tuple[Mapping[str, Any], ...], ...]] = (({"axis": 0.0}, {"axis": 45.0}),)
     revealed_by: ClassVar[str] = "polariser exposures over the field"
     separated_by: ClassVar[str] = (
-        "the calibration plate at 45° turns what it makes but not errors of HWP2; narrow bands and temperature tell it "
-        "from retardance of the plates"
+        "the calibration plate at 45° turns what it makes but not errors of HWP2; narrow bands and "
+        "temperature tell it from retardance of the plates"
     )
 
     def upstream(self, mueller: Float[Array, "4 4"], x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
@@ -45,7 +46,7 @@ class UpstreamRetarder(Effect):
         return mm.retarder(self.delta, jnp.deg2rad(self.axis)) @ mueller
 
     @classmethod
-    def combine(cls, group: Sequence[Self], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
+    def combine(cls, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
         """Retardance and axis from the two linear directions."""
         straight, diagonal = amplitudes
         axis = 0.5 * np.rad2deg(np.arctan2(diagonal, straight))

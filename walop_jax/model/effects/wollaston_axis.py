@@ -27,8 +27,9 @@ class WollastonAxis(Effect):
     name: ClassVar[str] = "wollaston_axis"
     revealed_by: ClassVar[str] = "polariser exposures with polarised standards"
     separated_by: ClassVar[str] = (
-        "nothing at one field point: only 2 α − angle enters; the field pattern of the plates, whose axes set its symmetry, "
-        "and scans of the calibration plate tell it from their axes, polarised standards from the polariser's zero"
+        "nothing at one field point: only 2 α − angle enters; the field pattern of the plates, whose axes "
+        "set its symmetry, and scans of the calibration plate tell it from their axes, polarised standards "
+        "from the polariser's zero"
     )
 
     def analyser_angle(self, angle: Scalar | float) -> Scalar | float:

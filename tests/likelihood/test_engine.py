@@ -1,0 +1,354 @@
+"""Residuals and normal equations against plain derivatives, numpy, identities and the oracle."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import builders
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from oracle import forward, validate
+
+from walop_jax.data import read_calibration_set
+from walop_jax.data.records import Block, CalibrationSet, Intensities, Points, Site, Sources
+from walop_jax.likelihood import engine
+from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.model.compiled import compiled
+from walop_jax.model.specification import full_values
+
+POINTS = 7
+# flux exposures come last so that they can be left off
+ROWS = [
+    *({"clp_angle": angle} for angle in (0.0, 50.0, 100.0)),
+    *({"clp_angle": angle, "chwp_angle": 45.0} for angle in (20.0, 80.0, 140.0)),
+    *({"kind": "moon", "ra": ra, "dec": 30.0, "rotator": 20.0} for ra in (100.0, 112.0)),
+    *({"kind": "standard", "rotator": angle, "teff": 5500.0} for angle in (0.0, 40.0)),
+    {"kind": "flux"},
+]
+
+
+class Dense(Intensities):
+    """All intensities in memory."""
+
+    def __init__(self, block):
+        self.all = block
+
+    def block(self, start, stop):
+        return Block(*(getattr(self.all, f.name)[start:stop] for f in dataclasses.fields(Block)))
+
+    @property
+    def rows(self):
+        return int(self.all.used.sum())
+
+
+def calibration_set(block, rows=ROWS):
+    sources = Sources(
+        np.array([3, 9]), np.array(["POL", "UNPOL"]), np.array([0.03, 0.0]), np.array([-0.04, 0.0]),
+        np.array([1e-3, 2e-3]), np.array([1e-3, 3e-3]), np.array([4500.0, np.nan]),
+    )  # fmt: skip
+    return CalibrationSet(
+        instrument="WALOP-SOUTH",
+        site=Site("SAAO 1-m", -32.38, 20.81, 1798.0),
+        origin="made here",
+        exposures=builders.exposures(*rows),
+        points=Points(np.arange(len(block.x)), block.x, block.y),
+        sources=sources,
+        filters={"band": builders.curve([0.62, 0.6204, 0.6208], [1.0, 0.8, 0.3])},
+        intensities=Dense(block),
+    )
+
+
+def make_block(seed=3, noise=True, flux_known=True):
+    """Counts of a random as-built instrument at random points, at random fluxes, with some rows unused."""
+    rng = np.random.default_rng(seed)
+    x, y = builders.field(rng, POINTS)
+    e = len(ROWS)
+    source = np.full((POINTS, e), -1)
+    source[:, 8:10] = rng.integers(0, 2, (POINTS, 2))
+    sigma = rng.uniform(300.0, 900.0, (POINTS, e, 4))
+    used = rng.uniform(size=(POINTS, e)) > 0.15
+    block = Block(x, y, np.ones((POINTS, e, 4)), sigma, used, source)
+    calset = calibration_set(block)
+    model = base_model(calset, throughput_degree=2)
+    instrument = builders.as_built(model.instrument(model.start), rng)
+    problem = Problem(calset, model)
+    flux = rng.uniform(0.5e6, 1.5e6, (POINTS, e, 1))
+    if flux_known:
+        flux[:, -1] = 1.0
+    counts = flux * np.asarray(engine.prediction(instrument, problem.plan, problem.chunks[0]))
+    sigma = sigma * np.where(flux == 1.0, 1e-6, 1.0)
+    if noise:
+        counts = counts + sigma * rng.standard_normal(counts.shape)
+    counts = np.where(used[..., None], counts, 0.0)
+    return Block(x, y, counts, sigma, used, source), instrument
+
+
+BLOCK, TRUTH = make_block()
+
+
+def problem_of(block, rows=ROWS, points_per_chunk=None):
+    calset = calibration_set(block, rows)
+    return Problem(calset, base_model(calset, throughput_degree=2), points_per_chunk)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return problem_of(BLOCK)
+
+
+@pytest.fixture(scope="module")
+def values(problem):
+    """A point of parameter space some standard deviations off the truth: residuals far from noise."""
+    rng = np.random.default_rng(8)
+    return full_values(builders.as_built(TRUTH, rng, 0.5))
+
+
+TEMPLATE = problem_of(BLOCK).model.template
+
+
+def _plain(values, plan, data):
+    model = engine._prediction(ravel_pytree(TEMPLATE)[1](values), plan, data) * data.weight
+    eliminate = jax.vmap(engine.eliminate_flux, in_axes=(0, 0, None))
+    residual = eliminate(data.counts * data.weight, model, plan.exposures.flux_known)[1]
+    return (residual, model), (residual, model)
+
+
+_derivatives = compiled(jax.jacfwd(_plain, has_aux=True))
+
+
+def jacobians(problem, values, data):
+    """Residuals, weighted model, and their plain forward derivatives with respect to all parameters."""
+    (dr, da), (r, a) = _derivatives(jnp.asarray(values), problem.plan, data)
+    return tuple(np.asarray(v) for v in (r, a, dr, da))
+
+
+def kaufman(y, a, da, known):
+    """J of one row of four: −F (da − â âᵀ da), or −da where the flux is known. numpy, row by row."""
+    out = np.zeros_like(da)
+    for index in np.ndindex(a.shape[:2]):
+        row, d = a[index], da[index]
+        if not row.any():
+            continue
+        if known[index[1]]:
+            out[index] = -d
+            continue
+        flux = (y[index] @ row) / (row @ row)
+        out[index] = -flux * (d - np.outer(row, row @ d) / (row @ row))
+    return out
+
+
+# ------------------------------------------------------------------------------------- the normal equations
+
+
+@pytest.fixture(scope="module")
+def plain(problem, values):
+    return jacobians(problem, values, problem.chunks[0])
+
+
+def test_gradient_is_that_of_plain_derivatives(problem, values, plain):
+    """Jᵀr of the structured equations = Jᵀr of the residuals differentiated as they stand, flux and all."""
+    r, _, dr, _ = plain
+    np.testing.assert_allclose(problem.residuals(values)[1], r, rtol=1e-9, atol=1e-9)
+    normal = engine.normal_equations(problem.model.instrument(values), problem.plan, problem.chunks[0])
+    assert float(normal.chi2) == pytest.approx(np.sum(r**2), rel=1e-12)
+    expected = np.einsum("pek,pekn->n", r, dr)
+    scale = np.sqrt(np.einsum("pek,pekn->n", r**2, dr**2))
+    np.testing.assert_allclose(normal.gradient, expected, rtol=0, atol=1e-9 * scale.max())
+    np.testing.assert_array_less(np.abs(np.asarray(normal.gradient) - expected), 1e-8 * scale + 1e-12)
+
+
+def test_matrix_is_kaufmans(problem, values, plain):
+    _, a, _, da = plain
+    data = problem.chunks[0]
+    y = np.asarray(data.counts * data.weight)
+    jacobian = kaufman(y, a, da, np.asarray(problem.plan.exposures.flux_known)).reshape(-1, len(values))
+    expected = jacobian.T @ jacobian
+    normal = engine.normal_equations(problem.model.instrument(values), problem.plan, data)
+    size = np.sqrt(np.diag(expected))
+    assert (size > 0).all()
+    np.testing.assert_allclose(
+        normal.matrix / np.outer(size, size), expected / np.outer(size, size), atol=1e-10
+    )
+
+
+def test_matrix_is_the_fisher_information_with_fluxes_marginalised():
+    """Without noise and at the truth: Schur complement of the joint information of parameters and fluxes."""
+    block, truth = make_block(noise=False)
+    problem, values = problem_of(block), full_values(truth)
+    data = problem.chunks[0]
+    r, a, dr, da = jacobians(problem, values, data)
+    np.testing.assert_allclose(r, 0.0, atol=1e-6)
+    known = np.asarray(problem.plan.exposures.flux_known)
+    information = np.zeros((len(values), len(values)))
+    for p, e in np.ndindex(a.shape[:2]):
+        row, d = a[p, e], da[p, e]
+        if not row.any():
+            continue
+        flux = 1.0 if known[e] else float(np.asarray(data.counts * data.weight)[p, e] @ row / (row @ row))
+        joint = np.concatenate([flux * d, row[:, None]], 1)
+        joint = joint.T @ joint
+        information += joint[:-1, :-1]
+        if not known[e]:
+            information -= np.outer(joint[:-1, -1], joint[-1, :-1]) / joint[-1, -1]
+    normal = engine.normal_equations(problem.model.instrument(values), problem.plan, data)
+    size = np.sqrt(np.diag(information))
+    np.testing.assert_allclose(
+        normal.matrix / np.outer(size, size), information / np.outer(size, size), atol=1e-9
+    )
+    # there the plain residuals have the same derivative
+    plain = np.einsum("pekn,pekm->nm", dr, dr)
+    np.testing.assert_allclose(plain / np.outer(size, size), information / np.outer(size, size), atol=1e-8)
+
+
+def test_posterior_adds_the_priors(problem, values):
+    """χ² of the priors and half its derivative, by hand, on top of the data's."""
+    found = problem.expand(values)
+    normal = engine.normal_equations(problem.model.instrument(values), problem.plan, problem.chunks[0])
+    gradient, matrix, chi2 = np.array(normal.gradient), np.array(normal.matrix), 0.0
+    loose = 0.0
+    for i, p in enumerate(problem.model.parameters):
+        if p.prior is not None:
+            chi2 += ((values[i] - p.prior[0]) / p.prior[1]) ** 2
+            gradient[i] += (values[i] - p.prior[0]) / p.prior[1] ** 2
+            matrix[i, i] += p.prior[1] ** -2
+        elif p.loose is not None:
+            loose += ((values[i] - p.start) / p.loose) ** 2
+            gradient[i] += (values[i] - p.start) / p.loose**2
+            matrix[i, i] += p.loose**-2
+    free = problem.model.free
+    assert found.priors == pytest.approx(chi2, rel=1e-12)
+    assert found.loose == pytest.approx(loose, rel=1e-12)
+    assert found.data == pytest.approx(float(normal.chi2), rel=1e-12)
+    assert found.objective == pytest.approx(float(normal.chi2) + chi2 + loose, rel=1e-12)
+    np.testing.assert_allclose(found.gradient, gradient[free], rtol=1e-12)
+    np.testing.assert_allclose(found.matrix, matrix[np.ix_(free, free)], rtol=1e-12)
+
+
+# ------------------------------------------------------------------------------------------------ identities
+
+
+def same(one, other, rtol=1e-10):
+    assert one.data == pytest.approx(other.data, rel=rtol)
+    size = np.sqrt(np.diag(other.matrix))
+    np.testing.assert_allclose(
+        one.gradient / size, other.gradient / size, rtol=0, atol=rtol * np.sqrt(other.data)
+    )
+    np.testing.assert_allclose(
+        one.matrix / np.outer(size, size), other.matrix / np.outer(size, size), atol=rtol
+    )
+
+
+def changed(block, **changes):
+    return dataclasses.replace(block, **changes)
+
+
+def test_chunks_change_nothing(problem, values):
+    """Seven points in chunks of three: the last one is padded."""
+    chunked = problem_of(BLOCK, points_per_chunk=3)
+    assert len(chunked.chunks) == 3
+    same(chunked.expand(values), problem.expand(values))
+    assert (chunked.dof, chunked.n_data) == (problem.dof, problem.n_data)
+
+
+def test_order_of_the_points_changes_nothing(problem, values):
+    order = np.random.default_rng(1).permutation(POINTS)
+    shuffled = Block(*(getattr(BLOCK, f.name)[order] for f in dataclasses.fields(Block)))
+    same(problem_of(shuffled).expand(values), problem.expand(values))
+
+
+def test_row_that_is_not_used_is_as_good_as_removed(values):
+    """An exposure masked everywhere (counts and errors of any size) = a set that lacks it."""
+    gone = 4
+    used, counts, sigma = BLOCK.used.copy(), BLOCK.counts.copy(), BLOCK.sigma.copy()
+    used[:, gone], counts[:, gone], sigma[:, gone] = False, 1e9, 1e-3
+    masked = problem_of(changed(BLOCK, used=used, counts=counts, sigma=sigma))
+    keep = np.delete(np.arange(len(ROWS)), gone)
+    names = ("counts", "sigma", "used", "source")
+    removed = problem_of(
+        changed(BLOCK, **{name: getattr(BLOCK, name)[:, keep] for name in names}), [ROWS[i] for i in keep]
+    )
+    same(masked.expand(values), removed.expand(values))
+    assert (masked.dof, masked.n_data) == (removed.dof, removed.n_data)
+    flux, residual = masked.residuals(values)
+    np.testing.assert_array_equal(residual[:, gone], 0.0)
+    assert np.isfinite(flux).all()
+
+
+def test_unit_of_the_counts_does_not_matter(values):
+    """N and N_ERR times anything, row by row: the flux is eliminated (KIND `flux` has none to eliminate)."""
+    factor = np.random.default_rng(2).uniform(0.01, 100.0, (POINTS, len(ROWS), 1))
+    factor[:, -1] = 1.0
+    scaled = changed(BLOCK, counts=BLOCK.counts * factor, sigma=BLOCK.sigma * factor)
+    plain = problem_of(BLOCK)
+    same(problem_of(scaled).expand(values), plain.expand(values), 1e-9)
+    flux = plain.residuals(values)[0]
+    np.testing.assert_allclose(problem_of(scaled).residuals(values)[0], flux * factor[..., 0], rtol=1e-9)
+
+
+def test_known_flux_is_not_eliminated(values):
+    used = np.zeros_like(BLOCK.used)
+    used[:, -1] = True
+    alone = changed(BLOCK, used=used)
+    twice = problem_of(changed(alone, counts=2 * BLOCK.counts)).expand(values).data
+    assert twice > 2 * problem_of(alone).expand(values).data
+
+
+def test_degrees_of_freedom(problem):
+    """Three per row, four with known flux, one per prior, minus the free parameters; counted by hand."""
+    rows = BLOCK.used.sum()
+    flux_rows = BLOCK.used[:, -1].sum()
+    # priors: collimator 3, calibration plate 2, pupil 2, each half 4, two standards 4; throughput 4 × 6; δ
+    priors, free = 3 + 2 + 2 + 8 + 4, 3 + 2 + 2 + 8 + 4 + 24 + 1
+    assert problem.n_data == 4 * rows
+    assert problem.dof == 3 * rows + flux_rows + priors - free
+
+
+def test_eliminated_flux_is_the_least_squares_one():
+    rng = np.random.default_rng(6)
+    y, a = rng.uniform(1, 2, (5, 4)), rng.uniform(1, 2, (5, 4))
+    known = np.array([False, False, True, False, False])
+    a[3] = 0.0
+    flux, residual = engine.eliminate_flux(jnp.asarray(y), jnp.asarray(a), jnp.asarray(known))
+    for i in (0, 1, 4):
+        expected, rest, *_ = np.linalg.lstsq(a[i][:, None], y[i], rcond=None)
+        assert float(flux[i]) == pytest.approx(expected[0], rel=1e-12)
+        assert float(jnp.sum(residual[i] ** 2)) == pytest.approx(rest[0], rel=1e-10)
+    np.testing.assert_array_equal(residual[2], y[2] - a[2])
+    np.testing.assert_array_equal(residual[3], y[3])
+
+
+# ------------------------------------------------------------------------------------------------ the oracle
+
+
+@pytest.mark.parametrize("start", ["true", "nominal"])
+def test_set_a_has_the_oracles_residuals(shared_data, start):
+    """χ² of a set made elsewhere, residual by residual, at the as-built values and at the nominal ones."""
+    path = shared_data / "walop_south_a.fits"
+    calset = read_calibration_set(path)
+    problem = Problem(calset, base_model(calset))
+    data = forward.load(path)
+    params = forward.nominal() if start == "nominal" else validate.read_truth(shared_data, "a")[0]
+    params["q"], params["u"] = data["sources"]["Q"] + 1e-4, data["sources"]["U"] - 2e-4
+    values = dict(zip(problem.model.names, problem.model.start, strict=True))
+    values |= {ours: params[theirs] for ours, theirs in builders.ORACLE_NAMES.items()}
+    for k in range(4):
+        values |= {
+            f"throughput.n{k}.p{i}{j}": c
+            for (i, j), c in zip(forward.TERMS, params["throughput"][k], strict=True)
+        }
+    for i in range(8):
+        values |= {f"standard.STD0{i}.q": params["q"][i], f"standard.STD0{i}.u": params["u"][i]}
+    assert len(values) == len(problem.model.names)
+    vector = np.array([values[name] for name in problem.model.names])
+
+    expected = forward.residuals(params, data)
+    rows = 4 * data["point"].size
+    found = problem.residuals(vector)[1][data["point"], data["exposure"]]
+    np.testing.assert_allclose(found.ravel(), expected[:rows], rtol=1e-6, atol=1e-4)
+    posterior = problem.expand(vector)
+    assert posterior.data == pytest.approx(np.sum(expected[:rows] ** 2), rel=1e-6)
+    assert posterior.priors == pytest.approx(np.sum(expected[rows:] ** 2), rel=1e-10)
+    assert problem.n_data == rows

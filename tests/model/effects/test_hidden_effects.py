@@ -1,0 +1,53 @@
+"""Sets of an independent simulator with effects that are known: fitted, they come out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from walop_jax.data import read_calibration_set
+from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.model.effects import Context, Effect, effect_by_name
+from walop_jax.model.specification import effect_context, with_effects
+
+
+def fit(path, *names: str, start=()):
+    """Gauss–Newton by hand: values and errors by name, χ²/dof."""
+    calset = read_calibration_set(path)
+    model = base_model(calset)
+    context = effect_context(model.template, calset.exposures)
+    effects: list[Effect] = [effect_by_name(name).of(context) for name in names]
+    model = with_effects(model, effects, context)
+    for name, value in start:
+        model = model.change(name, start=value)
+    problem, values, free = Problem(calset, model), model.start, model.free
+    scale = np.array([model.parameters[i].scale for i in free])
+    for _ in range(8):
+        here = problem.expand(values)
+        step = scale * np.linalg.solve(here.matrix * scale * scale[:, None], here.gradient * scale)
+        values = model.full(values[free] - step)
+    here = problem.expand(values)
+    sigma = np.zeros(len(values))
+    sigma[free] = np.sqrt(np.diag(np.linalg.inv(here.matrix)))
+    found = {name: (values[i], sigma[i]) for i, name in enumerate(model.names)}
+    return found, here.chi2 / problem.dof
+
+
+def test_clp_wobble(shared_data):
+    start = (("clp_wobble.amplitude", 0.05), ("clp_wobble.phase", 0.8))
+    found, reduced = fit(shared_data / "walop_south_c.fits", "clp_wobble", start=start)
+    assert reduced == pytest.approx(1.0, abs=0.04)  # three standard deviations of 10 475 degrees of freedom
+    (amplitude, amplitude_error), (phase, phase_error) = (
+        found[f"clp_wobble.{n}"] for n in ("amplitude", "phase")
+    )
+    effect = effect_by_name("clp_wobble").of(Context(), amplitude=amplitude, phase=phase).standard_form()
+    assert abs(float(effect.amplitude) - 0.06) < 3 * amplitude_error
+    assert abs(float(effect.phase) - 1.1) < 3 * phase_error
+
+
+def test_camera_leakage_and_hwp2_axis(shared_data):
+    found, reduced = fit(shared_data / "walop_south_d.fits", "camera_leakage", "hwp2_axis")
+    assert reduced == pytest.approx(1.0, abs=0.04)
+    for name, truth in (("camera_leakage.share", 0.003), ("hwp2_axis.angle", -0.15)):
+        value, sigma = found[name]
+        assert abs(value - truth) < 3 * sigma, (name, value, sigma)

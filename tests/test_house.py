@@ -1,0 +1,161 @@
+"""The house: who may import whom, who owns which library, how large a file may grow; by syntax trees."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "walop_jax"
+ROOMS = ("data", "model", "likelihood", "fit", "posterior", "diagnose", "report", "cli")
+OWNERS = {
+    "astropy": {"data"},
+    "speclite": {"data"},
+    "optimistix": {"fit"},
+    "scipy": {"diagnose"},
+    "emcee": {"posterior"},
+    "matplotlib": {"report"},
+    "typer": {"cli"},
+    "rich": {"cli"},
+    "tomlkit": {"cli", "model", "fit"},
+}
+# Imported by nobody: tools of the tests, and what there is no need of.
+STRANGERS = {"pandas", "elli", "beartype", "hypothesis", "pytest", "oracle", "tests"}
+LONGEST = 500
+MACHINE = re.compile(r"""/(?:home|root|work|tmp|Users|opt|mnt|data)/|[A-Z]:\\\\|\.\./shared|file://""")
+
+
+def files() -> list[Path]:
+    return sorted(PACKAGE.rglob("*.py"))
+
+
+def room_of(module: str) -> str | None:
+    """The room of a dotted module name; None for the package's door itself."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else None
+
+
+def imports(tree: ast.AST, module: str, is_package: bool) -> Iterator[tuple[int, str]]:
+    """Line and absolute dotted name of everything that a module imports, wherever in it."""
+    here = module.split(".") if is_package else module.split(".")[:-1]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield node.lineno, alias.name
+        elif isinstance(node, ast.ImportFrom):
+            base = here[: len(here) - node.level + 1] if node.level else []
+            base = [*base, *(node.module.split(".") if node.module else [])]
+            for alias in node.names:
+                yield node.lineno, ".".join([*base, alias.name])
+
+
+def complaints(source: str, module: str, is_package: bool = False) -> list[str]:
+    """What a module does that the house forbids."""
+    room = room_of(module)
+    found = []
+    for line, name in imports(ast.parse(source), module, is_package):
+        top = name.split(".")[0]
+        where = f"{module}:{line}"
+        if top == PACKAGE.name:
+            target = room_of(name)
+            if room is None or target is None or target.startswith("__"):
+                continue
+            if target not in ROOMS:
+                found.append(f"{where}: {target} is no room")
+            elif ROOMS.index(target) > ROOMS.index(room):
+                found.append(f"{where}: {room} must not know {target}")
+        elif room is not None and room not in OWNERS.get(top, {room}):
+            found.append(f"{where}: only {sorted(OWNERS[top])} may import {top}")
+        if top in STRANGERS:
+            found.append(f"{where}: {top} has no business in the package")
+    if room != "cli":
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print":
+                found.append(f"{module}:{node.lineno}: prints; that is the business of cli")
+    return found
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+@pytest.mark.parametrize("path", files(), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_module_keeps_to_its_room(path):
+    source = path.read_text()
+    assert complaints(source, module_name(path), path.name == "__init__.py") == []
+    assert len(source.splitlines()) <= LONGEST
+    assert [line for line in source.splitlines() if MACHINE.search(line)] == []
+
+
+def test_every_library_is_declared():
+    """What the package imports beyond Python itself stands in the dependencies of pyproject.toml."""
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
+    declared = {re.split(r"[<>=!~\[; ]", entry)[0].lower() for entry in project["dependencies"]}
+    used = {
+        name.split(".")[0]: module_name(path)
+        for path in files()
+        for _, name in imports(ast.parse(path.read_text()), module_name(path), path.name == "__init__.py")
+    }
+    missing = set(used) - declared - set(sys.stdlib_module_names) - {PACKAGE.name}
+    assert {name: used[name] for name in missing} == {}
+
+
+def test_every_folder_is_a_room():
+    """A new room must be given its place in the order."""
+    folders = {path.parent.relative_to(PACKAGE).parts[0] for path in files() if path.parent != PACKAGE}
+    assert folders <= set(ROOMS)
+    assert {"data", "model", "likelihood"} <= folders
+
+
+FAULTS = {
+    "from walop_jax.fit import refit": "model must not know fit",
+    "import walop_jax.report.page": "model must not know report",
+    "def f():\n    from walop_jax import likelihood": "model must not know likelihood",
+    "from ..cli import main": "model must not know cli",
+    "from astropy.io import fits": "may import astropy",
+    "import matplotlib.pyplot as plt": "may import matplotlib",
+    "from scipy import optimize": "may import scipy",
+    "import pandas": "pandas has no business",
+    "from walop_jax.attic import junk": "attic is no room",
+    "print('here')": "prints",
+}
+
+
+@pytest.mark.parametrize("source", FAULTS)
+def test_seeded_faults_are_caught(source):
+    found = complaints(source, "walop_jax.model.light")
+    assert len(found) == 1
+    assert FAULTS[source] in found[0]
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "from walop_jax.data.records import Exposures",
+        "from . import optics",
+        "from .effects import base",
+        "import jax.numpy as jnp",
+        "from walop_jax import __version__",
+        "text = 'print(1)'",
+    ],
+)
+def test_what_is_allowed_is_not_complained_of(source):
+    assert complaints(source, "walop_jax.model.light") == []
+
+
+def test_relative_imports_of_a_package_are_followed():
+    assert complaints("from ...fit import x", "walop_jax.model.effects", is_package=True) == [
+        "walop_jax.model.effects:1: model must not know fit"
+    ]
+
+
+def test_machine_paths_are_recognised():
+    assert MACHINE.search("open('/home/someone/data.fits')")
+    assert MACHINE.search("Path('../shared/data')")
+    assert not MACHINE.search("a/b, data/model, https://example.org")

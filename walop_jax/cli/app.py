@@ -1,0 +1,72 @@
+"""The program `walop-jax` and the list of its commands: one file each, named like the command."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from typing import Annotated
+
+import typer
+
+from walop_jax.cli.common import guarded
+
+COMMANDS = (
+    "inspect",
+    "simulate",
+    "refit",
+    "sample",
+    "diagnose",
+    "matrix",
+    "apply",
+    "report",
+    "model",
+    "import-zemax",
+    "trace",
+    "cite",
+)
+"""In the order of the help; `import-zemax` is the function `import_zemax` of `import_zemax.py`, and so on."""
+
+app = typer.Typer(
+    name="walop-jax",
+    help="Calibrate the WALOP imaging polarimeters with one differentiable model of the instrument.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            typer.echo(version("walop-jax"))
+        except PackageNotFoundError:
+            typer.echo("unknown")
+        raise typer.Exit
+
+
+@app.callback()
+def _program(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+def _register() -> None:
+    for name in COMMANDS:
+        identifier = name.replace("-", "_")
+        path = f"walop_jax.cli.{identifier}"
+        if importlib.util.find_spec(path) is not None:
+            function = getattr(importlib.import_module(path), identifier)
+            app.command(name)(guarded(function))
+
+
+_register()
+
+
+def main() -> None:
+    """Run the program: the entry point."""
+    app()

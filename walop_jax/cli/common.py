@@ -1,0 +1,168 @@
+"""What the commands share: options, the one line that an error is, output to terminals, switching on JAX."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json as json_format
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+CACHE_VARIABLE = "WALOP_JAX_CACHE"
+DEBUG_VARIABLE = "WALOP_JAX_DEBUG"
+
+CalsetFiles = Annotated[
+    list[Path], typer.Argument(metavar="CALSET...", help="Calibration sets (FITS), fitted as one.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable result to stdout, nothing else.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors.")]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace outputs that exist.")]
+SeedOption = Annotated[
+    int | None, typer.Option("--seed", help="Seed of random numbers; recorded where none are drawn.")
+]
+ModelOption = Annotated[
+    Path | None,
+    typer.Option("--model", metavar="MODEL.toml", help="Model file: what is free, tied, known, added."),
+]
+
+
+class CommandError(Exception):
+    """A command failed for a reason that its one line of message states."""
+
+
+def guarded(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with every error turned into one line on stderr and exit code 1.
+
+    With the environment variable WALOP_JAX_DEBUG set, errors keep their traceback.
+    """
+
+    @functools.wraps(command)
+    def run(*args: Any, **kwargs: Any) -> None:
+        try:
+            command(*args, **kwargs)
+            sys.stdout.flush()
+        except BrokenPipeError:
+            # The reader of stdout has gone (`| head`): not an error, and Python must not complain at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(1) from None
+        except KeyboardInterrupt:
+            complain("interrupted; nothing was left half-written")
+            raise typer.Exit(130) from None
+        except MemoryError:
+            complain("out of memory: use fewer field points, or a machine with more")
+            raise typer.Exit(1) from None
+        except Exception as error:
+            if os.environ.get(DEBUG_VARIABLE) or type(error).__module__.split(".")[0] in ("typer", "click"):
+                raise
+            expected = isinstance(error, CommandError | ValueError | OSError)
+            hint = "" if expected else f" (unexpected {type(error).__name__}; {DEBUG_VARIABLE}=1 shows where)"
+            complain(f"{error}{hint}")
+            raise typer.Exit(1) from None
+
+    return run
+
+
+def complain(message: str) -> None:
+    """Print an error as one line on stderr."""
+    typer.echo(f"walop-jax: error: {' '.join(message.split())}", err=True)
+
+
+def warn(message: str) -> None:
+    """Print a warning as one line on stderr."""
+    typer.echo(f"walop-jax: warning: {' '.join(message.split())}", err=True)
+
+
+def print_json(value: Any) -> None:
+    """Print a value as JSON on stdout."""
+    typer.echo(json_text(value), nl=False)
+
+
+def json_text(value: Any) -> str:
+    """The JSON text of a value, indented, with a final newline; null for what is not finite."""
+    return json_format.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def plain(value: Any) -> Any:
+    """The value with mappings as dicts, sequences as lists and numbers that are not finite as None."""
+    if isinstance(value, dict):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(entry) for entry in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
+
+
+def read_text(path: Path) -> str:
+    """The text of a file; ValueError, with the name, if it is missing or not text in UTF-8."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: is not text in UTF-8") from None
+
+
+@contextlib.contextmanager
+def named(path: Path | None) -> Iterator[None]:
+    """Say in errors which file they are about."""
+    try:
+        yield
+    except ValueError as error:
+        if path is None or str(path) in str(error):
+            raise
+        raise ValueError(f"{path}: {error}") from error
+
+
+@contextlib.contextmanager
+def progress(quiet: bool) -> Iterator[Callable[[str], None]]:
+    """Give a function that shows what is being done: on a terminal only, on stderr, gone at the end."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    if quiet or not console.is_terminal:
+        yield lambda message: None
+        return
+    with console.status("") as status:
+        yield status.update
+
+
+def cache_folder() -> Path | None:
+    """Where compiled code is kept between runs; None when that is switched off or impossible.
+
+    WALOP_JAX_CACHE names the folder ("off": none), otherwise it is walop-jax/xla in the user's cache folder.
+    """
+    chosen = os.environ.get(CACHE_VARIABLE, "")
+    if chosen.lower() in ("off", "0", "none"):
+        return None
+    try:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(chosen) if chosen else Path(base) / "walop-jax" / "xla"
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # no home
+        return None
+    return folder if os.access(folder, os.W_OK | os.X_OK) else None
+
+
+def switch_on_jax() -> None:
+    """Import JAX with float64 and with the cache of compiled code, which makes later runs start fast."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    folder = cache_folder()
+    if folder is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+        jax.config.update("jax_raise_persistent_cache_errors", False)
+
+
+def product_path(run: Path) -> Path:
+    """The calibration product that RUN, a folder or the file itself, stands for."""
+    return run / "calibration.fits" if run.is_dir() else run

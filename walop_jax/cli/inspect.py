@@ -1,0 +1,91 @@
+"""`walop-jax inspect`: what is in calibration sets, and what is wrong with them."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from walop_jax.cli.common import CommandError, JsonOption, QuietOption, SeedOption, print_json
+
+if TYPE_CHECKING:
+    from walop_jax.data.inspection import Inspection
+
+Files = Annotated[list[Path], typer.Argument(metavar="CALSET...", help="Calibration sets (FITS).")]
+
+
+def inspect(
+    calsets: Files, json: JsonOption = False, quiet: QuietOption = False, seed: SeedOption = None
+) -> None:
+    """Say what is in calibration sets and what is wrong with them.
+
+    Each file by itself; then whether they can be fitted as one. Exit code 1 if any cannot be read or fitted.
+    """
+    del seed  # nothing is random here
+    from walop_jax.data import DataError, read_calibration_set
+    from walop_jax.data.inspection import inspect as look_at
+
+    reports, faults = [], []
+    for path in calsets:
+        try:
+            report = look_at(read_calibration_set(path))
+        except DataError as error:
+            faults.append(str(error))
+            reports.append({"files": [str(path)], "error": str(error)})
+            continue
+        faults += [f"{path}: {entry}" for entry in report.findings if entry.severity == "fault"]
+        reports.append(dataclasses.asdict(report))
+        if not (json or quiet):
+            _show(report)
+    joint = None
+    if len(calsets) > 1 and not faults:
+        joint = look_at(read_calibration_set(*calsets))
+        if not (json or quiet):
+            _show(joint)
+    if json:
+        print_json({"sets": reports, "joint": None if joint is None else dataclasses.asdict(joint)})
+    if faults:
+        raise CommandError("; ".join(faults))
+
+
+def _show(report: Inspection) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    console.print(f"[bold]{', '.join(report.files)}[/bold]", soft_wrap=True)
+    low_x, high_x, low_y, high_y = report.field
+    lines = {
+        "instrument": f"{report.instrument}, {report.telescope} ({report.origin or 'origin not stated'})",
+        "field points": f"{report.points}, X {low_x:+.3f} … {high_x:+.3f}°, Y {low_y:+.3f} … {high_y:+.3f}°",
+        "polariser angles": f"{len(report.angles)} modulo 180°, widest gap {report.widest_gap:.3g}°",
+        "used": f"{report.rows} of {report.possible} (exposure, point) pairs"
+        + (f" at {report.looked_at} points looked at" if report.looked_at < report.points else ""),
+        "flagged": ", ".join(f"{count} {name}" for name, count in report.flags.items()) or "none",
+        "median counts": f"{report.median_counts:.4g} electrons",
+        "errors": f"{report.noise_ratio**0.5:.4g} × the photon noise √N (median)",
+        "standards": ", ".join(report.sources) or "none",
+        "filters": ", ".join(report.filters),
+    }
+    for name, text in lines.items():
+        console.print(f"  {name:<17} {text}", markup=False, soft_wrap=True)
+    table = Table("kind", "filter", "calibration plate", "source", "exposures", "angles", "used")
+    for group in report.groups:
+        table.add_row(
+            group.kind,
+            group.filter,
+            group.calibration_plate,
+            group.teff,
+            str(group.exposures),
+            str(group.angles) if group.angles else "",
+            f"{100 * group.used:.0f} %",
+        )
+    console.print(table)
+    if not report.findings:
+        console.print("  nothing is wrong", style="green")
+    colours = {"fault": "red", "doubt": "yellow", "note": "cyan"}
+    for finding in report.findings:
+        console.print(f"  [{colours[finding.severity]}]{finding.severity}[/] ", end="")
+        console.print(str(finding), markup=False, soft_wrap=True)

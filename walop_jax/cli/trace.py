@@ -1,0 +1,120 @@
+"""`walop-jax trace`: the light of one source, stage by stage, as a table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from walop_jax.cli.common import JsonOption, named, print_json, product_path, switch_on_jax
+
+if TYPE_CHECKING:
+    from walop_jax.data.records import FilterCurve
+    from walop_jax.model.instrument import Instrument
+    from walop_jax.model.trace import Stage
+
+ProductArgument = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="[RUN/calibration.fits]", help="An instrument as fitted; without it, as designed.", show_default=False
+    ),
+]
+InstrumentOption = Annotated[
+    str, typer.Option("--instrument", help="WALOP-SOUTH, WALOP-NORTH or WALOP-LAB, as designed.")
+]
+AngleOption = Annotated[
+    float | None, typer.Option("--angle", help="Polariser in, with its axis here (deg).", show_default=False)
+]
+PlateOption = Annotated[
+    float | None,
+    typer.Option("--chwp", help="Calibration plate in, with its axis here (deg).", show_default=False),
+]
+TeffOption = Annotated[
+    float | None, typer.Option("--teff", help="Colour temperature (K); without it, a flat spectrum.", show_default=False)
+]
+
+
+def trace(
+    product: ProductArgument = None,
+    instrument: InstrumentOption = "WALOP-SOUTH",
+    x: Annotated[float, typer.Option("--x", help="Field position X (deg).")] = 0.0,
+    y: Annotated[float, typer.Option("--y", help="Field position Y (deg).")] = 0.0,
+    q: Annotated[float, typer.Option("--q", help="Stokes q of the source, a fraction.")] = 0.0,
+    u: Annotated[float, typer.Option("--u", help="Stokes u of the source, a fraction.")] = 0.0,
+    angle: AngleOption = None,
+    chwp: PlateOption = None,
+    teff: TeffOption = None,
+    filter: Annotated[str, typer.Option("--filter", help="Filter of the calibration, or SDSS-r.")] = "SDSS-r",  # noqa: A002
+    json: JsonOption = False,
+) -> None:
+    """Follow the light of one source through the instrument.
+
+    Every line is the light at one place: Stokes vectors averaged over the band, then the four cameras. The
+    last line is what a fit works with.
+    """
+    nan = float("nan")
+    switch_on_jax()
+    from walop_jax.model.trace import Ray
+    from walop_jax.model.trace import trace as follow
+
+    try:
+        ray = Ray(
+            x=x,
+            y=y,
+            q=q,
+            u=u,
+            clp_angle=nan if angle is None else angle,
+            chwp_angle=nan if chwp is None else chwp,
+            teff=nan if teff is None else teff,
+        )
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
+    built, curve = _instrument(product, instrument, filter)
+    stages = follow(built, curve, ray)
+    if json:
+        print_json(
+            [
+                {"stage": s.name, "about": s.about, "rows": s.rows, "columns": s.columns, "value": s.value.tolist()}
+                for s in stages
+            ]
+        )
+        return
+    for line in table(stages):
+        typer.echo(line)
+
+
+def _instrument(product: Path | None, name: str, filter_name: str) -> tuple[Instrument, FilterCurve]:
+    """The instrument of a calibration product, or one as designed, and the curve of the filter."""
+    from walop_jax.data.filters import builtin_filter
+
+    if product is None:
+        from walop_jax.model.instrument import nominal_instrument
+
+        try:
+            return nominal_instrument(name.upper()), builtin_filter(filter_name)
+        except ValueError as error:
+            raise typer.BadParameter(str(error)) from None
+    from walop_jax.data.product import read_product
+    from walop_jax.fit.calibration import Calibration
+
+    path = product_path(product)
+    with named(path):
+        calibration = Calibration.from_product(read_product(path))
+    return calibration.model.instrument(calibration.values), calibration.filter_curve(filter_name)
+
+
+def table(stages: tuple[Stage, ...]) -> list[str]:
+    """The stages as lines of text; column names appear where they change."""
+    width = max(len(f"{stage.name} {row}") for stage in stages for row in stage.rows)
+    lines: list[str] = []
+    columns: tuple[str, ...] = ()
+    for stage in stages:
+        if stage.columns != columns:
+            columns = stage.columns
+            lines.append(" " * width + "".join(f"{column:>13}" for column in columns))
+        for i, (row, values) in enumerate(zip(stage.rows, stage.value, strict=True)):
+            name = f"{stage.name} {row}".strip()
+            about = f"   {stage.about}" if i == 0 else ""
+            lines.append(f"{name:<{width}}" + "".join(f"{value:13.6f}" for value in values) + about)
+    return lines

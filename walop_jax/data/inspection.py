@@ -1,0 +1,221 @@
+"""What is in a calibration set and what is wrong with it: numbers and findings; nothing is printed here."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterator
+from typing import Literal
+
+import numpy as np
+
+from walop_jax.data.records import FLAG_BITS, CalibrationSet
+from walop_jax.data.table import TableIntensities
+
+Severity = Literal["fault", "doubt", "note"]
+
+_LOOKED_AT = 1024  # field points whose intensities are looked at; of frames, in evenly spaced runs
+_RUN = 64
+_FEW_ANGLES = 8
+_NARROW = 30.0  # degrees
+_FEW_POINTS = 15
+_NOISE = (0.8, 25.0)  # believable σ²/N
+_MUCH = 0.05
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """Something about a set that its owner should know: a fault forbids a fit, a doubt may spoil it."""
+
+    severity: Severity
+    what: str
+    advice: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.what}{'; ' + self.advice if self.advice else ''}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Group:
+    """Exposures that share kind, filter, calibration plate (text) and colour temperature (text)."""
+
+    kind: str
+    filter: str
+    calibration_plate: str
+    teff: str
+    exposures: int
+    angles: int
+    used: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Inspection:
+    """A calibration set at a glance.
+
+    `angles` are the distinct polariser angles modulo 180° of exposures with data, `widest_gap` the largest
+    distance between neighbours among them (degrees). `noise_ratio` is the median of σ²/N: 1 for pure photon
+    noise, more with read noise; NaN where KIND is `flux` throughout. `rows` counts used (exposure, point)
+    pairs of those looked at (`looked_at` points).
+    """
+
+    instrument: str
+    telescope: str
+    origin: str
+    files: tuple[str, ...]
+    groups: tuple[Group, ...]
+    points: int
+    field: tuple[float, float, float, float]
+    angles: tuple[float, ...]
+    widest_gap: float
+    looked_at: int
+    rows: int
+    possible: int
+    flags: dict[str, int]
+    median_counts: float
+    noise_ratio: float
+    sources: tuple[str, ...]
+    filters: tuple[str, ...]
+    findings: tuple[Finding, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Sample:
+    points: int
+    used: np.ndarray  # (point, exposure)
+    counts: np.ndarray  # used rows that are not KIND flux
+    ratio: np.ndarray
+
+
+def inspect(calset: CalibrationSet) -> Inspection:
+    """Look at a calibration set that has been read; of whole frames only at evenly spaced pixels."""
+    e, points = calset.exposures, calset.points
+    sample = _sample(calset)
+    share = sample.used.mean(axis=0)
+    live = share > 0
+    angles = np.unique(np.round(np.mod(e.clp_angle[e.clp_in & live], 180.0), 3))
+    gaps = np.diff(np.append(angles, angles[:1] + 180.0))
+    ratio = float(np.median(sample.ratio)) if sample.ratio.size else float("nan")
+    made = Inspection(
+        instrument=calset.instrument,
+        telescope=calset.site.telescope,
+        origin=calset.origin,
+        files=tuple(str(entry.path) for entry in calset.inputs),
+        groups=_groups(calset, share),
+        points=len(points),
+        field=(float(points.x.min()), float(points.x.max()), float(points.y.min()), float(points.y.max())),
+        angles=tuple(angles.tolist()),
+        widest_gap=float(gaps.max(initial=0.0)) if len(angles) > 1 else 180.0,
+        looked_at=sample.points,
+        rows=int(sample.used.sum()),
+        possible=int(sample.used.size),
+        flags=_flags(calset),
+        median_counts=float(np.median(sample.counts)) if sample.counts.size else float("nan"),
+        noise_ratio=ratio,
+        sources=tuple(str(name) for name in calset.sources.name),
+        filters=tuple(calset.filters),
+        findings=(),
+    )
+    notes = [Finding("note", remark) for remark in calset.remarks]
+    return dataclasses.replace(made, findings=(*_findings(calset, made), *notes))
+
+
+def _sample(calset: CalibrationSet) -> _Sample:
+    total = len(calset.points)
+    if total <= _LOOKED_AT:
+        blocks = [calset.intensities.block(0, total)]
+    else:
+        starts = np.unique(np.linspace(0, total - _RUN, _LOOKED_AT // _RUN).astype(int))
+        blocks = [calset.intensities.block(int(start), int(start) + _RUN) for start in starts]
+    used = np.concatenate([block.used for block in blocks])
+    counted = calset.exposures.kind != "flux"
+    counts, ratio = [], []
+    for block in blocks:
+        rows = block.used & counted
+        n, sigma = block.counts[rows], block.sigma[rows]
+        counts.append(n.ravel())
+        bright = n > 0
+        ratio.append(sigma[bright] ** 2 / n[bright])
+    return _Sample(len(used), used, np.concatenate(counts), np.concatenate(ratio))
+
+
+def _groups(calset: CalibrationSet, share: np.ndarray) -> tuple[Group, ...]:
+    e = calset.exposures
+    keys = [
+        (
+            str(e.kind[n]),
+            str(e.filter[n]),
+            f"{e.chwp_angle[n]:g} deg" if e.chwp_in[n] else "out",
+            f"{e.teff[n]:g} K" if np.isfinite(e.teff[n]) else "flat",
+        )
+        for n in range(len(e))
+    ]
+    groups = []
+    for key in dict.fromkeys(keys):
+        rows = np.array([n for n, other in enumerate(keys) if other == key])
+        angles = np.unique(np.round(e.clp_angle[rows][e.clp_in[rows]], 3))
+        groups.append(Group(*key, len(rows), len(angles), float(share[rows].mean())))
+    return tuple(groups)
+
+
+def _flags(calset: CalibrationSet) -> dict[str, int]:
+    """Flagged rows by meaning, for tables only: those of frames would have to be read entirely."""
+    if not isinstance(calset.intensities, TableIntensities):
+        return {}
+    flag = calset.intensities.flag
+    counts = Counter({name: int(np.count_nonzero(flag & bit)) for bit, name in FLAG_BITS.items()})
+    counts["other"] = int(np.count_nonzero(flag & ~sum(FLAG_BITS)))
+    return {name: number for name, number in counts.items() if number}
+
+
+def _findings(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
+    yield from _about_angles(calset, made)
+    if made.points < 2:
+        yield Finding("fault", "a single field point", "the joint fit over the field needs several")
+    elif made.points < _FEW_POINTS:
+        yield Finding(
+            "doubt",
+            f"only {made.points} field points",
+            "the throughput of each camera over the field has 15 terms",
+        )
+    if np.isfinite(made.noise_ratio) and not _NOISE[0] <= made.noise_ratio <= _NOISE[1]:
+        yield Finding(
+            "doubt",
+            f"the errors are {np.sqrt(made.noise_ratio):.3g} times the photon noise sqrt(N)",
+            "are N and N_ERR in electrons, or in counts (multiply by the gain)?",
+        )
+    e = calset.exposures
+    if not np.any(((e.kind == "moon") | (e.kind == "standard")) & ~e.clp_in):
+        yield Finding(
+            "note",
+            "no light of known polarisation but through the polariser (neither Moon sky nor standards)",
+            "the zero of the polariser and a polarising telescope cannot be seen without",
+        )
+    if (saturated := made.flags.get("saturated", 0)) > _MUCH * made.possible:
+        yield Finding("doubt", f"{saturated} rows are saturated", "expose for a shorter time")
+    if unknown := made.flags.get("other", 0):
+        yield Finding("note", f"{unknown} rows have FLAG bits without a meaning", "they are not used")
+
+
+def _about_angles(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
+    e, number, span = calset.exposures, len(made.angles), 180.0 - made.widest_gap
+    if number < 3:
+        yield Finding(
+            "fault",
+            f"{number} distinct polariser angle(s) modulo 180° with usable data",
+            "a fit needs at least 3, better 15 spread over 360°",
+        )
+        return
+    if span < _NARROW:
+        yield Finding("doubt", f"all polariser angles lie within {span:.3g}°", "spread them over 180°")
+    elif number < _FEW_ANGLES:
+        yield Finding(
+            "doubt",
+            f"only {number} polariser angles",
+            "with fewer than 8, errors of the polariser look like errors of the instrument",
+        )
+    if np.ptp(np.mod(e.clp_angle[e.clp_in], 360.0)) < 180.0:
+        yield Finding(
+            "note",
+            "the polariser was turned through half a turn only",
+            "a full turn tells a wobble of its rotation from the instrument",
+        )

@@ -1,0 +1,160 @@
+"""One fit laid out for linear algebra: residuals, Jacobian, priors as rows, and where every row comes from."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from walop_jax.diagnose.freeform import Measured
+from walop_jax.diagnose.score import Candidate, Projector
+from walop_jax.fit.refit import FitResult
+from walop_jax.likelihood.problem import Problem
+
+Vector = Float[np.ndarray, " d"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Design:
+    """Residuals r (data − model, whitened) and J = ∂r/∂θ of the free parameters at a fit; priors are the last rows.
+
+    The rows of the data run over points, then exposures, then cameras, used ones only.
+    """
+
+    problem: Problem
+    fit: FitResult
+    measured: Measured
+    residual: Vector
+    jacobian: Float[np.ndarray, "d f"]
+
+    @classmethod
+    def of(cls, problem: Problem, fit: FitResult) -> Design:
+        """Lay out a fit."""
+        measured = Measured(problem, fit.values)
+        scale = fit.noise_scale
+        data = measured.residual[measured.used].reshape(-1) / scale
+        slope = problem.jacobian(fit.values) / scale
+        prior, prior_slope = cls._prior_rows(problem, fit.values)
+        return cls(problem, fit, measured, np.concatenate([data, prior]), np.vstack([slope, prior_slope]))
+
+    @staticmethod
+    def _prior_rows(problem: Problem, values: Vector) -> tuple[Vector, Float[np.ndarray, "k f"]]:
+        model = problem.model
+        select = model.selection()
+        residual, slope = [], []
+        for i, p in enumerate(model.parameters):
+            if p.tie is not None or not select[i].any():
+                continue
+            if p.prior is not None:
+                residual.append((p.prior[0] - values[i]) / p.prior[1])
+                slope.append(-select[i] / p.prior[1])
+            elif p.loose is not None:
+                residual.append((p.start - values[i]) / p.loose)
+                slope.append(-select[i] / p.loose)
+        return np.array(residual), np.array(slope).reshape(len(residual), select.shape[1])
+
+    @property
+    def rows(self) -> int:
+        """Number of rows that are data."""
+        return 4 * int(self.measured.used.sum())
+
+    @cached_property
+    def exposure(self) -> Int[np.ndarray, " d"]:
+        """Exposure (position) of every data row."""
+        return np.repeat(np.nonzero(self.measured.used)[1], 4)
+
+    @cached_property
+    def point(self) -> Int[np.ndarray, " d"]:
+        """Field point (position) of every data row."""
+        return np.repeat(np.nonzero(self.measured.used)[0], 4)
+
+    @cached_property
+    def projector(self) -> Projector:
+        """Removes from columns what the free parameters could absorb."""
+        return Projector(self.residual, self.jacobian)
+
+    def padded(self, candidates: Sequence[Candidate]) -> list[Candidate]:
+        """Candidates with zero rows for the priors."""
+        extra = len(self.residual) - self.rows
+        scale = self.fit.noise_scale
+        return [
+            dataclasses.replace(c, columns=np.pad(c.columns / scale, ((0, extra), (0, 0)))) for c in candidates
+        ]
+
+    def cube(self, rows: Vector) -> Float[np.ndarray, "p e 4"]:
+        """Data rows put back into (point, exposure, camera); 0 where unused."""
+        used = self.measured.used
+        cube = np.zeros((*used.shape, 4))
+        cube[used] = rows[: self.rows].reshape(-1, 4)
+        return cube
+
+    def subset_step(self, keep: Bool[np.ndarray, " d"]) -> Float[np.ndarray, " f"]:
+        """Change of the free parameters when only the data rows in `keep` (and the priors) are fitted.
+
+        One Gauss–Newton step from the joint minimum: the change is a fraction of the standard errors, where the
+        model is linear to better than that fraction squared.
+        """
+        rows = np.concatenate([keep, np.ones(len(self.residual) - self.rows, bool)])
+        j, r = self.jacobian[rows], self.residual[rows]
+        norm = np.sqrt(np.sum(self.jacobian**2, axis=0))
+        norm = np.where(norm > 0, norm, 1.0)
+        scaled = j / norm
+        return -np.linalg.solve(scaled.T @ scaled + 1e-12 * np.eye(len(norm)), scaled.T @ r) / norm
+
+
+HOLDOUT_FOLDS = 5
+
+
+@dataclasses.dataclass(frozen=True)
+class HeldOut:
+    """Squared normalised residuals on data that took no part in the fit, fold by fold."""
+
+    scheme: str
+    squares: Float[np.ndarray, " folds"]
+    counts: Int[np.ndarray, " folds"]
+
+    @property
+    def mean(self) -> float:
+        """Mean squared normalised residual (noise alone gives 3/4 when the flux is free)."""
+        return float(self.squares.sum() / self.counts.sum())
+
+
+def exposure_folds(design: Design) -> Int[np.ndarray, " d"]:
+    """Fold of every data row: exposures of each kind and setting dealt out in turn."""
+    e = design.problem.calset.exposures
+    fold = np.zeros(len(e), int)
+    groups: dict[tuple[str, ...], int] = {}
+    for i in range(len(e)):
+        key = (str(e.kind[i]), str(e.filter[i]), str(e.chwp_in[i]), str(e.chwp_angle[i]))
+        fold[i] = groups.get(key, 0) % HOLDOUT_FOLDS
+        groups[key] = groups.get(key, 0) + 1
+    return fold[design.exposure]
+
+
+def field_folds(design: Design) -> Int[np.ndarray, " d"]:
+    """Fold of every data row: the field cut into 5 × 5 blocks, dealt out so that neighbours differ."""
+    points = design.problem.calset.points
+
+    def cell(v: np.ndarray) -> np.ndarray:
+        span = np.ptp(v) or 1.0
+        return np.minimum((5 * (v - v.min()) / span).astype(int), 4)
+
+    return ((cell(points.x) + 2 * cell(points.y)) % HOLDOUT_FOLDS)[design.point]
+
+
+def held_out(design: Design, scheme: str) -> HeldOut:
+    """Cross-validate a fit: each fold is predicted by a fit to the others."""
+    fold = {"exposures": exposure_folds, "field blocks": field_folds}[scheme](design)
+    squares, counts = np.zeros(HOLDOUT_FOLDS), np.zeros(HOLDOUT_FOLDS, int)
+    for k in range(HOLDOUT_FOLDS):
+        out = fold == k
+        if not out.any():
+            continue
+        step = design.subset_step(~out)
+        rows = np.flatnonzero(out)
+        predicted = design.residual[rows] + design.jacobian[rows] @ step
+        squares[k], counts[k] = predicted @ predicted, len(rows)
+    return HeldOut(scheme, squares, counts)

@@ -1,0 +1,54 @@
+"""The summary of a fit as plain data, `summary.json`."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from walop_jax.data.records import CalibrationSet
+from walop_jax.fit.calibration import quality, software_versions
+from walop_jax.fit.misfit import Misfit
+from walop_jax.fit.refit import FitResult
+
+PRODUCT = "calibration.fits"
+SUMMARY = "summary.json"
+FAILED = "summary.failed.json"
+
+
+def summary(
+    result: FitResult, calset: CalibrationSet, *, seconds: float, misfit: Misfit | None = None
+) -> dict[str, Any]:
+    """What a fit found: the contract's keys first, then how far it can be trusted.
+
+    Frozen parameters have sigma 0.
+    """
+    parameters = {
+        p.name: {"value": float(value), "sigma": float(sigma), "unit": p.unit}
+        for p, value, sigma in zip(result.model.parameters, result.values, result.sigma, strict=True)
+    }
+    return {
+        "chi2": result.chi2,
+        "dof": result.dof,
+        "n_data": result.n_data,
+        "parameters": parameters,
+        "converged": result.converged,
+        "message": result.minimum.message,
+        "seconds": seconds,
+        "versions": software_versions(),
+        "inputs": [{"path": str(entry.path), "sha256": entry.sha256} for entry in calset.inputs],
+        "trusted": result.trusted,
+        "quality": quality(result),
+        "warnings": list(result.warnings),
+        "instrument": result.model.name,
+        "effects": [effect.name for effect in result.model.template.effects],
+        "free_parameters": len(result.model.free),
+        "noise_scale": result.noise_scale,
+        "steps": result.minimum.steps,
+        "starts": result.starts,
+        "seconds_fit": result.seconds,
+        "scaled_gradient": result.minimum.scaled_gradient,
+        "condition_number": result.minimum.condition,
+        "chi2_history": list(result.minimum.history),
+        "misfit": None if misfit is None else dataclasses.asdict(misfit),
+        "remarks": list(calset.remarks),
+    }
