@@ -21,8 +21,8 @@ def test_jacobian_of_the_optics_compiles_and_runs_quickly():
     """144 points, SDSS-r, all optical parameters, in seconds of processor time.
 
     The trap cost 35 s to compile and 9.6 s a call when the plates were solved one by one; solved together, as
-    they are now, the emitters cost 10 s against 5 s, and the same per call (jax 0.10.2). The bounds leave room
-    for a slower machine and would notice the trap, from whichever change it comes back.
+    they are now, the emitters cost 10 s against 5 s, as much per call (jax 0.10.2). Bounds leave room
+    for a slower machine and would notice the trap if a change brings it back.
     """
     instrument = builders.south()
     plan = builders.setting_plan(builtin_filter("SDSS-r"))

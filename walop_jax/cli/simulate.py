@@ -156,7 +156,12 @@ def parsed_effect(text: str, context: Context) -> Effect:
     if names and not any(parameter in values for parameter in kind.amplitudes()):
         wanted = " or ".join(kind.amplitudes())
         raise ValueError(f"effect {name!r} changes nothing without a value of {wanted}")
-    return kind.of(context, **values)
+    try:
+        return kind.of(context, **values)
+    except (TypeError, ValueError) as error:
+        if str(error).startswith("unknown"):
+            raise
+        raise ValueError(f"effect {name!r}: {rest!r} does not fit its parameters ({error})") from None
 
 
 def _value(text: str, name: str) -> Any:

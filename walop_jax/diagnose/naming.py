@@ -100,7 +100,7 @@ def try_effect(
     start = dict(zip(base.model.names, base.values, strict=True))
     values = np.array([start.get(p.name, p.start) for p in model.parameters])
     problem = Problem(calset, model)
-    result = fit(problem, start=values, noise_scale=base.noise_scale)
+    result = fit(problem, start=values, noise_scale=base.noise_scale, worth=base.posterior.objective)
     bayes = log_evidence_ratio(base, result) - (float(np.log(prior_shapes)) if prior_shapes > 1 else 0.0)
     return Trial(type(instance), problem, result, bayes)
 

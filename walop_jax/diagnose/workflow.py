@@ -152,6 +152,8 @@ def diagnose(
         steps.append(_step(look, trial))
         tell(f"added {trial.effect.name}")
         problem, current = trial.problem, trial.fit
+        if current.noise_scale > 1.0:  # the errors were scaled to fit at all: perhaps no longer needed
+            current = fit(problem, start=current.values)
         look = _Look(problem, current, wanted, rng)
     steps = [_finished(step, calset, current, look.design, context, wanted) for step in steps]
     unexplained = _unexplained(look) if look.alarm or not current.explains_data else None

@@ -167,6 +167,7 @@ def fit(
     *,
     start: Vector | None = None,
     noise_scale: float | None = None,
+    worth: float | None = None,
     progress: Progress | None = None,
 ) -> FitResult:
     """Fit the model of `problem` to its data, from the start values of the model or `start` (a full vector).
@@ -174,7 +175,8 @@ def fit(
     A model whose χ²/dof stays above `FAR_OFF` would be bent out of all physical shape: priors mean nothing beside
     such residuals. The errors of the data are then scaled until χ²/dof is 1, the minimum is sought again, from plates
     one order of retardance away as well, and the result says so (`noise_scale`, `warnings`). A `noise_scale` that
-    is given is kept, with no other start: so that fits can be compared.
+    is given is kept, with no other start: so that fits can be compared; `worth` is the objective of the other fit,
+    and a search that has not come below it when it should have converged is given up.
     Raises ValueError when the exposures cannot determine the instrument.
     """
     began = time.perf_counter()
@@ -182,7 +184,8 @@ def fit(
     first = problem.model.start if start is None else np.asarray(start, float)
     fixed = noise_scale is not None
     found, starts = _search(problem, "fit", first, noise_scale or 1.0, progress, FIRST_STEPS), 1
-    if not found.minimum.converged and (fixed or _raw(found, problem) < FAR_OFF):
+    promising = _expansion(found).objective < worth if worth is not None else _raw(found, problem) < FAR_OFF
+    if not found.minimum.converged and promising:
         found = _search(problem, "fit, continued", found.values, noise_scale or 1.0, progress)
     check_constrained(problem, _expansion(found))
     for _ in range(0 if fixed else MAXIMUM_RESCALINGS):

@@ -76,8 +76,8 @@ class ObservingPlan:
             raise ValueError("numbers of Moon patches and standards cannot be negative")
         if not self.electrons > 0:
             raise ValueError(f"{self.electrons} electrons: a camera needs some light")
-        if not (self.filters and self.plate):
-            raise ValueError("at least one filter and one setting of the calibration plate are needed")
+        if not (self.filters and self.plate and self.polariser_angles):
+            raise ValueError("at least a filter, a setting of the calibration plate, a polariser angle are needed")
         for name in self.filters:
             filter_curve(name)
 

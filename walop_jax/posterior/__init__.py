@@ -1,0 +1,11 @@
+"""Posteriors around a fit: emcee on a checked surrogate of the exact posterior, NUTS as the cross-check.
+
+This room samples and says how far to believe it. It draws no figures, and knows no FITS.
+"""
+
+from walop_jax.posterior.convergence import Convergence
+from walop_jax.posterior.sampling import Options, PosteriorSample, sample
+from walop_jax.posterior.accuracy import Accuracy
+from walop_jax.posterior.surrogate import Surrogate, build_surrogate
+
+__all__ = ["Accuracy", "Convergence", "Options", "PosteriorSample", "Surrogate", "build_surrogate", "sample"]

@@ -9,9 +9,11 @@ near-linear ones in whitened coordinates s,
 Γ is fitted by least squares to exact residuals at design points. Only the Gram matrix of the exact residuals is
 kept, so χ² = yᵀ Q y costs the same for 10⁴ and 10⁹ data. s is marginalised:
 
-    −2 ln p(z) = h (Q_hh − Q_hs Q_ss⁻¹ Q_sh) h + z · ∇ ln det H_ss,     s | z ~ N(−Q_ss⁻¹ Q_sh h, Q_ss⁻¹)
+    −2 ln p(z) = h (Q_hh − Q_hs Q_ss⁻¹ Q_sh) h + z · ∇_z ln det H_ss
+    s | z ~ N(−Q_ss⁻¹ Q_sh h − ½ ∇_s ln det H_ss, Q_ss⁻¹)
 
-The determinant is that of the exact model's Gauss–Newton matrix H (fluxes marginalised), to first order in z.
+H is the true half Hessian of the objective. Its determinant tilts the marginal, and the skewness behind it displaces
+the means of s from the mode; ∇ ln det H_ss = Σ_j (g(S_j) + g(−S_j) − 2 g(0)) from exact half gradients g.
 
 With noise inflation the errors of the data are times f, and Q_ss = D/f² + P is diagonal in the common
 eigenvectors of D and P; − n ln f is added, ln f having the prior N(0, 1).
@@ -50,7 +52,7 @@ class Surrogate:
 
     x = centre + along @ z + across @ s. `data` and `prior` are Q in the features y for the errors as given;
     `linear` turns s into the common eigenvectors of both, with eigenvalues `share` for the data, 1 − `share` for
-    the priors, `slope` is ∇ ln det H_ss. `pairs` and `triples` are the monomials of h.
+    the priors, `slope` and `skew` are ∇_z and ∇_s of ln det H_ss. `pairs` and `triples` are the monomials of h.
     """
 
     names: tuple[str, ...]
@@ -65,6 +67,7 @@ class Surrogate:
     linear: Float[np.ndarray, "s s"]
     share: Float[np.ndarray, " s"]
     slope: Float[np.ndarray, " k"]
+    skew: Float[np.ndarray, " s"]
     measured: int
     inflate: bool = False
 
@@ -111,7 +114,7 @@ class Surrogate:
         precision = self.share * weight + (1.0 - self.share)
         y = self.features(z[:, :k])
         pull = weight * (y @ self.data[:h, h:] @ self.linear) + y @ self.prior[:h, h:] @ self.linear
-        return -pull / precision, 1.0 / precision
+        return -(pull + 0.5 * self.skew @ self.linear) / precision, 1.0 / precision
 
     def draw(self, z: Draws, rng: np.random.Generator) -> Float[np.ndarray, "n f"]:
         """Free parameters for sampled coordinates: the marginalised ones are drawn from their conditional."""
@@ -137,7 +140,8 @@ class Surrogate:
         s = np.linalg.lstsq(self.across, offset.T, rcond=None)[0].T if len(self.share) else offset[:, :0]
         y = np.concatenate([self.features(z[:, :k]), s], axis=1)
         weight = np.exp(-2.0 * z[:, k]) if self.inflate else 1.0
-        return weight * np.sum((y @ self.data) * y, axis=1) + np.sum((y @ self.prior) * y, axis=1)
+        tilt = z[:, :k] @ self.slope + s @ self.skew
+        return weight * np.sum((y @ self.data) * y, axis=1) + np.sum((y @ self.prior) * y, axis=1) + tilt
 
 
 def _features(z: Array, pairs: Array, triples: Array) -> Array:
@@ -244,10 +248,11 @@ def build_surrogate(
     prior = _prior_form(target, along, across, n_features)
     h = n_features - s
     linear, share = _common_axes(data[h:, h:], prior[h:, h:])
+    slope, skew = _determinant_slopes(target, along, across)
     return Surrogate(
         names=target.names, sampled=sampled, centre=target.centre, along=along, across=across, pairs=pairs,
         triples=triples, data=0.5 * (data + data.T), prior=prior, linear=linear, share=share,
-        slope=_determinant_slope(target, along, across), measured=target.measured, inflate=inflate,
+        slope=slope, skew=skew, measured=target.measured, inflate=inflate,
     )  # fmt: skip
 
 
@@ -275,15 +280,14 @@ def _prior_form(target: Target, along: Matrix, across: Matrix, n_features: int) 
     return rows.T @ rows
 
 
-def _determinant_slope(target: Target, along: Matrix, across: Matrix) -> Float[np.ndarray, " k"]:
-    """Derivative of ln det H_ss along the sampled coordinates."""
-
-    def ln_det(x: Float[np.ndarray, " f"]) -> float:
-        return float(np.linalg.slogdet(across.T @ target.matrix(x) @ across)[1])
-
-    if across.shape[1] == 0:
-        return np.zeros(along.shape[1])
-    return np.array([0.5 * (ln_det(target.centre + step) - ln_det(target.centre - step)) for step in along.T])
+def _determinant_slopes(
+    target: Target, along: Matrix, across: Matrix
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " s"]]:
+    """Derivatives of ln det H_ss along both kinds of coordinates; columns of `across` make H_ss the unit matrix."""
+    total, first = np.zeros(len(target.centre)), target.half_gradient(target.centre)
+    for step in across.T:
+        total += target.half_gradient(target.centre + step) + target.half_gradient(target.centre - step) - 2.0 * first
+    return total @ along, total @ across
 
 
 def _common_axes(data: Matrix, prior: Matrix) -> tuple[Matrix, Float[np.ndarray, " s"]]:

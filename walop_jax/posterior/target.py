@@ -71,9 +71,9 @@ class Target:
         """Normalised residuals of priors and loose pulls: linear in x."""
         return (self.values(x)[self._where] - self._mean) / self._width
 
-    def matrix(self, x: Vector) -> Float[np.ndarray, "f f"]:
-        """Half the Gauss–Newton Hessian of the objective."""
-        return self.problem.expand(self.values(x), self.noise_scale).matrix
+    def half_gradient(self, x: Vector) -> Vector:
+        """Half the gradient of the objective."""
+        return self.problem.expand(self.values(x), self.noise_scale).gradient
 
     def data(self, x: Vector) -> float:
         """χ² of the data, errors times `noise_scale`."""

@@ -1,0 +1,118 @@
+"""`walop-jax diagnose`: find what the model lacks, name it, add it, show the gap shrink."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from walop_jax.cli.common import (
+    CalsetFiles,
+    JsonOption,
+    ModelOption,
+    OverwriteOption,
+    QuietOption,
+    SeedOption,
+    json_text,
+    named,
+    print_json,
+    progress,
+    read_text,
+    switch_on_jax,
+    warn,
+)
+
+if TYPE_CHECKING:
+    from walop_jax.diagnose.workflow import Diagnosis
+
+RunFolder = Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the results.")]
+
+
+def diagnose(
+    calsets: CalsetFiles,
+    output: RunFolder,
+    model: ModelOption = None,
+    overwrite: OverwriteOption = False,
+    seed: SeedOption = None,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Say what is missing from the model, add it, and fit again: RUN/diagnosis.json and RUN/calibration.fits.
+
+    The verdict is consistent, effect_found or unexplained. Effects that the data cannot tell apart are listed
+    together; effects that the data cannot show at all are listed as such. RUN/calibration.fits and
+    RUN/summary.json hold the extended model.
+    """
+    began = time.perf_counter()
+    from walop_jax.data.folder import atomic_folder, check_folder
+    from walop_jax.data.product import write_product
+    from walop_jax.fit.summary import PRODUCT, SUMMARY, summary
+
+    text = "" if model is None else read_text(model)
+    check_folder(output, (PRODUCT, SUMMARY, "diagnosis.json"), overwrite=overwrite)
+    switch_on_jax()
+    from walop_jax.data import read_calibration_set
+    from walop_jax.diagnose.document import DIAGNOSIS, document
+    from walop_jax.diagnose.workflow import diagnose as find
+    from walop_jax.fit.building import model_for
+    from walop_jax.fit.calibration import Calibration
+    from walop_jax.fit.misfit import describe
+
+    with progress(quiet or json) as tell:
+        tell("reading")
+        calset = read_calibration_set(*calsets)
+        with named(model):
+            chosen = model_for(calset, text)
+        found = find(calset, chosen, seed=seed or 0, progress=tell)
+        tell("mapping the field")
+        product = Calibration.from_fit(found.after, found.problem).to_product()
+        misfit = None if found.after.explains_data else describe(found.problem, found.after.values)
+        content = document(found)
+        seconds = time.perf_counter() - began
+        with atomic_folder(output, (PRODUCT, SUMMARY, DIAGNOSIS), overwrite=overwrite) as folder:
+            write_product(folder / PRODUCT, product)
+            fitted = summary(found.after, calset, seconds=seconds, misfit=misfit) | {"seed": seed}
+            (folder / SUMMARY).write_text(json_text(fitted), encoding="utf-8")
+            (folder / DIAGNOSIS).write_text(json_text(content), encoding="utf-8")
+    if json:
+        print_json(content)
+    for sentence in found.after.warnings:
+        warn(sentence)
+    if not (json or quiet):
+        _show(found, output)
+
+
+def _show(found: Diagnosis, output: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    before, after = found.before, found.after
+    if found.steps:
+        table = Table("effect", "parameters", "χ² before", "after", "held out before", "after", "cannot be told from")
+        for step in found.steps:
+            values = "\n".join(
+                f"{name} = {value:.4g} ± {sigma:.2g} {unit}" for name, (value, sigma, unit) in step.parameters.items()
+            )
+            table.add_row(
+                step.effect, values, f"{step.chi2_before:.1f}", f"{step.chi2_after:.1f}",
+                f"{step.heldout_before.mean:.4f}", f"{step.heldout_after.mean:.4f}", ", ".join(step.equivalent) or "–",
+            )  # fmt: skip
+        console.print(table)
+        for step in found.steps:
+            places = "; ".join(f"{key.replace('_', ' ')}: {value}" for key, value in step.where.items())
+            console.print(f"{step.effect} sits in  {places}", soft_wrap=True)
+            if step.separated_by:
+                console.print(f"{step.effect} would be separated by  {step.separated_by}", soft_wrap=True)
+    console.print(
+        f"χ²/dof {before.chi2 / max(before.dof, 1):.4f} → {after.chi2 / max(after.dof, 1):.4f}; "
+        f"significance of the disagreement before: p = {found.p_value:.2g}",
+        soft_wrap=True,
+    )
+    if found.unexplained is not None:
+        console.print(f"unexplained: {found.unexplained.description}", markup=False, soft_wrap=True)
+    if found.untestable:
+        console.print(f"cannot be tested with these data: {', '.join(found.untestable)}", soft_wrap=True)
+    console.print(f"verdict: {found.verdict}   ({found.seconds:.0f} s)   {output}", markup=False, soft_wrap=True)

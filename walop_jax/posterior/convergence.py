@@ -1,0 +1,118 @@
+"""Whether an ensemble has run long enough, and if not, how far it has to go.
+
+Autocorrelation   τ per quantity, averaged over walkers of all ensembles (Goodman & Weare 2010, CAMCoS 5, 65; Sokal's
+                  window with c = 5). Walkers of one ensemble are not independent chains, so R̂ is taken between
+                  ensembles only.
+R̂                √(1 + Var(means of half ensembles) / mean variance), of the values and of their distance from the
+                  median (Gelman & Rubin 1992; folded as in Vehtari et al. 2021, Bayesian Anal. 16, 667).
+Rules             N > 50 τ; τ the same within 25 % after N/4, N/2 and N steps; R̂ < 1.01.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from emcee.autocorr import integrated_time
+from jaxtyping import Float
+
+Chains = Float[np.ndarray, "e n w k"]  # ensembles, stored steps, walkers, quantities
+
+LENGTHS = 50.0  # in units of τ
+STABLE = 0.25  # allowed relative change of τ over each of two doublings
+LARGEST_RHAT = 1.01
+LEAST_STORED = 40  # steps, below which nothing is said
+
+
+@dataclasses.dataclass(frozen=True)
+class Convergence:
+    """The evidence. `tau` is in steps, per quantity; `history` holds the worst τ after N/4, N/2 and N steps.
+
+    `steps` are those kept after burn-in, `needed` how many more the rules ask for (0 when converged).
+    """
+
+    names: tuple[str, ...]
+    steps: int
+    tau: Float[np.ndarray, " k"]
+    history: tuple[float, float, float]
+    ess: Float[np.ndarray, " k"]
+    rhat: Float[np.ndarray, " k"]
+    needed: int
+    reasons: tuple[str, ...]
+
+    @property
+    def converged(self) -> bool:
+        """Whether all rules hold."""
+        return not self.reasons
+
+    @property
+    def worst(self) -> str:
+        """Name of the quantity with the longest autocorrelation time."""
+        return self.names[int(np.argmax(self.tau))]
+
+    def message(self, seconds_per_step: float = math.nan) -> str:
+        """One sentence for people."""
+        if self.converged:
+            return (
+                f"converged: {self.steps} steps, {self.steps / self.tau.max():.0f} τ, τ = {self.tau.max():.1f}, at least "
+                f"{self.ess.min():.0f} effective samples, R-hat {self.rhat.max():.4f}"
+            )
+        time = "" if not np.isfinite(seconds_per_step) else f" (about {self.needed * seconds_per_step:.0f} s)"
+        return f"NOT converged: {'; '.join(self.reasons)}. Go on for {self.needed} steps or more{time} with --resume"
+
+
+def autocorrelation(chains: Chains) -> Float[np.ndarray, " k"]:
+    """τ in stored steps, per quantity; NaN for a quantity that never moved."""
+    e, n, w, k = chains.shape
+    tau = np.full(k, np.nan)
+    for i in range(k):
+        x = np.moveaxis(chains[..., i], 0, 1).reshape(n, e * w)
+        if np.all(x.std(axis=0) > 0):
+            tau[i] = float(integrated_time(x[:, :, None], quiet=True, tol=0)[0])
+    return tau
+
+
+def between(chains: Chains) -> Float[np.ndarray, " k"]:
+    """R̂ between the halves of all ensembles, worst of plain and folded; NaN for a quantity that never moved."""
+    e, n, w, k = chains.shape
+    half = n // 2
+    parts = chains[:, n - 2 * half :].reshape(2 * e, half * w, k)
+    folded = np.abs(parts - np.median(parts, axis=(0, 1)))
+    result = np.zeros(k)
+    for values in (parts, folded):
+        inside = values.var(axis=1, ddof=1).mean(axis=0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = values.mean(axis=1).var(axis=0, ddof=1) / inside
+        result = np.maximum(result, np.sqrt(1.0 + ratio))
+    return result
+
+
+def assess(chains: Chains, names: tuple[str, ...], thin: int = 1) -> Convergence:
+    """Apply the rules to chains stored every `thin` steps, burn-in taken off."""
+    e, n, w, k = chains.shape
+    steps = n * thin
+    if n < LEAST_STORED:
+        nothing = np.full(k, np.nan)
+        needed = LEAST_STORED * thin - steps
+        reason = f"{steps} steps are too few to judge"
+        return Convergence(names, steps, nothing, (np.nan,) * 3, np.zeros(k), nothing, needed, (reason,))
+    quarter, half, tau = (autocorrelation(chains[:, :m]) * thin for m in (n // 4, n // 2, n))
+    rhat = between(chains)
+    history = (float(np.max(quarter)), float(np.max(half)), float(np.max(tau)))
+    reasons, needed = [], 0
+    if not np.all(np.isfinite(tau)):
+        stuck = [name for name, value in zip(names, tau, strict=True) if not np.isfinite(value)]
+        return Convergence(names, steps, tau, history, np.zeros(k), rhat, steps, (f"{stuck[0]} never moved",))
+    if steps <= LENGTHS * history[2]:
+        reasons.append(f"{steps} steps are {steps / history[2]:.0f} τ of {history[2]:.0f}, fewer than {LENGTHS:.0f}")
+        needed = max(needed, math.ceil(1.1 * LENGTHS * history[2]) - steps)
+    changes = [abs(b / a - 1.0) if a > 0 else np.inf for a, b in zip(history, history[1:], strict=False)]
+    if not max(changes) < STABLE:
+        reasons.append("τ still changes: " + " → ".join(f"{value:.0f}" for value in history))
+        needed = max(needed, steps)
+    if not np.max(rhat) < LARGEST_RHAT:
+        worst = int(np.argmax(rhat))
+        reasons.append(f"R-hat between ensembles is {rhat[worst]:.3f} for {names[worst]}")
+        needed = max(needed, steps)
+    return Convergence(names, steps, tau, history, e * w * steps / tau, rhat, needed, tuple(reasons))

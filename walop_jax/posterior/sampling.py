@@ -1,0 +1,322 @@
+"""`sample`: from a fit to a posterior, block by block, with checkpoints and a verdict."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import os
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from walop_jax.fit.refit import FitResult
+from walop_jax.likelihood.problem import Problem
+from walop_jax.posterior.accuracy import Accuracy, check
+from walop_jax.posterior.checkpoint import Checkpoints, digest
+from walop_jax.posterior.convergence import Chains, Convergence, assess
+from walop_jax.posterior.ensemble import MOVES, Block, Walkers, advance, start, start_inflated
+from walop_jax.posterior.surrogate import Surrogate, build_surrogate
+from walop_jax.posterior.target import LARGEST_SAMPLED, Target, choose_sampled
+
+Vector = Float[np.ndarray, " n"]
+
+BURN_IN = 0.2  # share of the steps that is not used
+INFLATION = "noise.ln_f"
+SOFTWARE = ("walop-jax", "jax", "jaxlib", "numpy", "emcee")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """How to sample. `interval` is the length of a block, hence of what a kill can lose, in steps.
+
+    `walkers` 0 stands for twice the number of sampled coefficients, at least 64. `parameters` names what is
+    sampled (None: the physics coefficients). `checks` is the number of draws compared with the exact posterior.
+    """
+
+    seed: int = 0
+    walkers: int = 0
+    interval: int = 1000
+    maximum_steps: int = 100_000
+    thin: int = 5
+    moves: str = MOVES[0]
+    order: int = 3
+    inflate: bool = False
+    draws: int = 4000
+    checks: int = 256
+    ensembles: int = 2
+    parameters: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.moves not in MOVES:
+            raise ValueError(f"unknown moves {self.moves!r}: choose one of {', '.join(MOVES)}")
+        if self.ensembles < 2:
+            raise ValueError("at least two independent ensembles are needed to judge convergence")
+        if min(self.interval, self.thin, self.draws, self.checks, self.maximum_steps) < 1:
+            raise ValueError("interval, thin, draws, checks and maximum_steps must be 1 or more")
+        if self.interval % self.thin:
+            raise ValueError(f"interval {self.interval} must be a multiple of thin {self.thin}")
+        if self.parameters is not None and len(self.parameters) > LARGEST_SAMPLED:
+            raise ValueError(f"{len(self.parameters)} parameters to sample: at most {LARGEST_SAMPLED}")
+
+
+class Progress(NamedTuple):
+    """What a progress bar shows: what is being done, how much of it is done (0 … 1), τ in steps, ESS."""
+
+    stage: str
+    share: float
+    tau: float = float("nan")
+    ess: float = float("nan")
+
+
+Report = Callable[[Progress], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class PosteriorSample:
+    """The posterior of all coefficients.
+
+    `draws` holds (ensemble, draw, parameter) of all parameters in tree order, tied and frozen ones included;
+    `mean` and `covariance` use every kept step. `trusted` needs convergence and a surrogate that is exact enough.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    draws: Float[np.ndarray, "e d n"]
+    log_posterior: Float[np.ndarray, "e d"]
+    ln_f: Float[np.ndarray, "e d"] | None
+    mean: Vector
+    covariance: Float[np.ndarray, "n n"]
+    chains: Chains
+    sampled: tuple[str, ...]
+    thin: int
+    convergence: Convergence
+    accuracy: Accuracy
+    acceptance: float
+    seconds: float
+    fingerprint: dict[str, str]
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the posterior may be believed."""
+        return self.convergence.converged and self.accuracy.exact_enough
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What does not hold, in words."""
+        found = [] if self.convergence.converged else [self.convergence.message(self.seconds_per_step)]
+        if not self.accuracy.exact_enough:
+            a = self.accuracy
+            found.append(
+                f"the surrogate differs from the exact posterior: {a.shift[0]} by {a.shift[1]:+.2f} ± {a.shift[2]:.2f} σ, "
+                f"width of {a.width[0]} by a factor {a.width[1]:.2f} ± {a.width[2]:.2f}, weights {a.efficiency:.2f} "
+                "effective; sample fewer or better determined coefficients, or use NUTS"
+            )
+        return tuple(found)
+
+    @property
+    def seconds_per_step(self) -> float:
+        """Time per step of all ensembles."""
+        return self.seconds / max(self.convergence.steps / (1.0 - BURN_IN), 1.0)
+
+    def value(self, name: str) -> tuple[float, float]:
+        """Mean and standard deviation of a coefficient."""
+        i = self.names.index(name)
+        return float(self.mean[i]), float(np.sqrt(self.covariance[i, i]))
+
+
+def fingerprint(problem: Problem, target: Target, options: Options) -> dict[str, str]:
+    """Hashes of everything that decides the chain."""
+    model = problem.model
+    data = [np.asarray(part) for chunk in problem.chunks for part in chunk if part is not None]
+    plan = [np.asarray(part) for part in (problem.plan.wavelength, problem.plan.node_weight, problem.plan.teff)]
+    exposures = [np.asarray(part) for part in problem.plan.exposures if part is not None]
+    parameters = [(p.name, p.start, p.free, p.tie, p.scale) for p in model.parameters]
+    priors = [(p.name, p.prior, p.loose) for p in model.parameters]
+    chain = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
+    for name in ("maximum_steps", "draws", "checks"):  # how long, and what is made of it: free to change
+        del chain[name]
+    versions = {name: _version(name) for name in SOFTWARE}
+    return {
+        "data": digest(*data, *plan, *exposures, problem.plan.settings),
+        "model": digest(model.name, parameters, [type(e).__name__ for e in model.template.effects], model.template.plates),
+        "priors": digest(priors),
+        "fit": digest(np.round(target.centre, 12), target.noise_scale),
+        "settings": digest(sorted(chain.items(), key=lambda item: item[0])),
+        "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
+    }  # fmt: skip
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"
+
+
+def sample(
+    problem: Problem,
+    result: FitResult,
+    options: Options | None = None,
+    *,
+    folder: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    report: Report | None = None,
+) -> PosteriorSample:
+    """Sample the posterior around a fit until it has converged or `maximum_steps` are done.
+
+    With `folder`, checkpoints are kept there; `resume` goes on from them, bit for bit as if there had been no
+    interruption. Raises `DataError` for a folder that holds a run already while `resume` is False, or one of
+    other data, model, priors, settings or versions; ValueError where there is nothing to sample.
+    """
+    options = options or Options()
+    report = report or (lambda progress: None)
+    target = Target(problem, result)
+    checkpoints = None
+    if folder is not None:
+        checkpoints = Checkpoints(folder, fingerprint(problem, target, options))
+        if checkpoints.exists() and not resume:
+            from walop_jax.data.errors import fail
+
+            raise fail("holds a chain already", file=folder, advice="go on with --resume, or --overwrite it")
+    surrogate, build_seconds = _surrogate(target, options, checkpoints, report)
+    run = _Run(surrogate, options, checkpoints)
+    run.restore()
+    while True:
+        verdict = run.assess()
+        if verdict is not None and (verdict.converged or run.steps >= options.maximum_steps):
+            break
+        goal = options.maximum_steps if verdict is None else run.steps + verdict.needed
+        numbers = (np.nan, np.nan) if verdict is None else (verdict.history[2], float(np.min(verdict.ess)))
+        report(Progress("sampling", min(run.steps / max(goal, 1), 1.0), *numbers))
+        run.go_on()
+    report(Progress("comparing with the exact posterior", 1.0, verdict.history[2], float(np.min(verdict.ess))))
+    return _finish(target, run, verdict, options, build_seconds)
+
+
+def _surrogate(
+    target: Target, options: Options, checkpoints: Checkpoints | None, report: Report
+) -> tuple[Surrogate, float]:
+    if checkpoints is not None and checkpoints.exists():
+        surrogate, extra = checkpoints.load_surrogate()
+        return surrogate, float(extra["seconds"])
+    began = time.perf_counter()
+    surrogate = build_surrogate(
+        target,
+        sampled=choose_sampled(target, options.parameters),
+        order=options.order,
+        inflate=options.inflate,
+        seed=options.seed,
+        progress=lambda done, total: report(Progress("tabulating the model", done / total)),
+    )
+    seconds = time.perf_counter() - began
+    if checkpoints is not None:
+        checkpoints.save_surrogate(surrogate, {"seconds": seconds})
+    return surrogate, seconds
+
+
+class _Run:
+    """The ensembles of a run and what they have stored so far."""
+
+    def __init__(self, surrogate: Surrogate, options: Options, checkpoints: Checkpoints | None) -> None:
+        self.surrogate, self.options, self.checkpoints = surrogate, options, checkpoints
+        self.log_posterior = surrogate.log_posterior()
+        d = surrogate.dimension
+        count = options.walkers or max(64, 2 * d)
+        if count < 2 * d or count % 2:
+            raise ValueError(f"{count} walkers for {d} sampled coefficients: an even number of at least {2 * d}")
+        self.walkers: list[Walkers] = []
+        for number in range(options.ensembles):
+            walkers = start(self.log_posterior, count, d, options.seed, number)
+            if surrogate.inflate:
+                walkers = start_inflated(walkers, self.log_posterior, surrogate.measured)
+            self.walkers.append(walkers)
+        self.blocks: list[list[Block]] = []
+        self.seconds = 0.0
+
+    @property
+    def steps(self) -> int:
+        return len(self.blocks) * self.options.interval
+
+    def restore(self) -> None:
+        for number in range(1, 1 + (0 if self.checkpoints is None else self.checkpoints.count())):
+            assert self.checkpoints is not None
+            self.walkers, blocks, seconds = self.checkpoints.load_block(number)
+            self.blocks.append(blocks)
+            self.seconds += seconds
+
+    def go_on(self) -> None:
+        began, thin = time.perf_counter(), self.options.thin
+        blocks = []
+        for i, walkers in enumerate(self.walkers):
+            stored = self.options.interval // thin
+            self.walkers[i], block = advance(self.log_posterior, walkers, stored, thin, self.options.moves)
+            blocks.append(block)
+        seconds = time.perf_counter() - began
+        self.seconds += seconds
+        self.blocks.append(blocks)
+        if self.checkpoints is not None:
+            self.checkpoints.save_block(len(self.blocks), self.walkers, blocks, seconds)
+
+    def kept(self) -> tuple[Chains, Float[np.ndarray, "e n w"]]:
+        """Stored positions and ln p after burn-in."""
+        z = np.concatenate([np.stack([b.coordinates for b in blocks]) for blocks in self.blocks], axis=1)
+        lnp = np.concatenate([np.stack([b.log_posterior for b in blocks]) for blocks in self.blocks], axis=1)
+        first = int(BURN_IN * z.shape[1])
+        return z[:, first:], lnp[:, first:]
+
+    def quoted(self, z: Chains) -> Chains:
+        """The sampled coefficients themselves, as people quote them (and ln f)."""
+        s = self.surrogate
+        k = s.along.shape[1]
+        physical = s.centre[s.sampled] + z[..., :k] @ s.along[s.sampled].T
+        return np.concatenate([physical, z[..., k:]], axis=-1)
+
+    def names(self) -> tuple[str, ...]:
+        s = self.surrogate
+        return (*(s.names[i] for i in s.sampled), *((INFLATION,) if s.inflate else ()))
+
+    def assess(self) -> Convergence | None:
+        """The verdict on what there is; None before the first block."""
+        if not self.blocks:
+            return None
+        return assess(self.quoted(self.kept()[0]), self.names(), self.options.thin)
+
+
+def _evenly(count: int, wanted: int) -> Int[np.ndarray, " m"]:
+    return np.unique(np.linspace(0, count - 1, min(wanted, count)).astype(int))
+
+
+def _finish(
+    target: Target, run: _Run, verdict: Convergence, options: Options, build_seconds: float
+) -> PosteriorSample:
+    z, lnp = run.kept()
+    e, n, w, d = z.shape
+    surrogate, rng = run.surrogate, np.random.default_rng([options.seed, 99])
+    steps = _evenly(n, -(-options.draws // (e * w)))
+    flat = z[:, steps].reshape(e, -1, d)
+    x = surrogate.draw(flat.reshape(-1, d), rng)
+    values = np.array([target.values(one) for one in x]).reshape(e, flat.shape[1], -1)
+    checked = z.reshape(-1, d)[_evenly(e * n * w, options.checks)]
+    accuracy = check(target, surrogate, checked, rng)
+    mean, covariance = surrogate.moments(z.reshape(-1, d)[:: max(1, e * n * w // 200_000)])
+    select = target.model.selection()
+    return PosteriorSample(
+        names=target.model.names,
+        units=tuple(p.unit for p in target.model.parameters),
+        draws=values,
+        log_posterior=lnp[:, steps].reshape(e, -1),
+        ln_f=flat[:, :, -1] if surrogate.inflate else None,
+        mean=target.values(mean),
+        covariance=select @ covariance @ select.T,
+        chains=run.quoted(z),
+        sampled=run.names(),
+        thin=options.thin,
+        convergence=verdict,
+        accuracy=accuracy,
+        acceptance=float(np.mean([[b.accepted for b in blocks] for blocks in run.blocks])),
+        seconds=build_seconds + run.seconds,
+        fingerprint={} if run.checkpoints is None else dict(run.checkpoints.fingerprint),
+    )
