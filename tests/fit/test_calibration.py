@@ -23,7 +23,12 @@ from walop_jax.likelihood.simulate import simulate
 from walop_jax.model.references import references
 
 TINY = ObservingPlan(
-    grid=5, standard_grid=2, polariser_angles=polariser_turn(8), moon_patches=3, standards=3, plate=(None, 45.0)
+    grid=5,
+    standard_grid=2,
+    polariser_angles=polariser_turn(8),
+    moon_patches=3,
+    standards=3,
+    plate=(None, 45.0),
 )
 X, Y = np.array([-0.21, 0.03, 0.2]), np.array([0.1, -0.05, 0.22])
 
@@ -51,26 +56,12 @@ def product_file(calibration, tmp_path_factory) -> Path:
     return path
 
 
-def starting(text: str) -> tuple[Problem, Calibration]:
+def starting(problem: Problem, result: FitResult, text: str) -> Calibration:
     """A calibration at the start values of a model, never fitted: for what does not depend on the data."""
-    calset = simulate(TINY, seed=3).calset
-    model = model_for(calset, text)
-    verdict = Calibration.from_product  # keeps the type checker from thinking that this is optional
-    del verdict
-    problem = Problem(calset, model)
-    values = model.start
-    names = np.array(model.names)
-    spread = 1e-3 * np.arange(1.0, len(names) + 1.0) / len(names)
-    result = dataclasses.replace(_RESULT[0], model=model, values=values, covariance=np.diag(spread**2))
-    return problem, Calibration.from_fit(result, problem)
-
-
-_RESULT: list[FitResult] = []
-
-
-@pytest.fixture(autouse=True)
-def _remember(result) -> None:
-    _RESULT[:] = [result]
+    model = model_for(problem.calset, text)
+    spread = 1e-3 * np.linspace(0.1, 1.0, len(model.names))
+    unfitted = dataclasses.replace(result, model=model, values=model.start, covariance=np.diag(spread**2))
+    return Calibration.from_fit(unfitted, problem)
 
 
 def test_the_fit_is_trusted(result, calibration):
@@ -147,9 +138,9 @@ def test_flags_say_what_is_special(calibration):
     assert calibration.flags(x, y, settings, values)[0] == 16
 
 
-def test_temperature_counts_where_the_model_depends_on_it():
-    _, plain = starting("")
-    _, warm = starting('[model]\neffects = ["hwp_temperature"]\n')
+def test_temperature_counts_where_the_model_depends_on_it(problem, result):
+    plain = starting(problem, result, "")
+    warm = starting(problem, result, '[model]\neffects = ["hwp_temperature"]\n')
     settings = dataclasses.replace(Settings.default(2), temp=np.array([10.0, 30.0]))
     x, values = np.zeros(2), np.tile([0.0, 1, 0, 0, 0, 1], (2, 1))
     assert plain.flags(x, x, settings, values).tolist() == [0, 0]
@@ -184,9 +175,9 @@ tie = "half1.plate.mgf2"
 """
 
 
-def test_effects_and_their_choices_survive_the_product(problem, tmp_path):
+def test_effects_and_their_choices_survive_the_product(problem, result, tmp_path):
     star = problem.model.template.standard.names[1]
-    problem, calibration = starting(EFFECTS.format(star=star))
+    calibration = starting(problem, result, EFFECTS.format(star=star))
     write_product(tmp_path / "c.fits", calibration.to_product())
     back = Calibration.from_product(read_product(tmp_path / "c.fits"))
     assert back.model.names == calibration.model.names
@@ -241,8 +232,8 @@ def test_quality_bits_follow_the_fit(result):
     bad = dataclasses.replace(result, minimum=minimum, posterior=posterior, values=values)
     assert quality(bad) == 1 | 2 | 4 | 8 | 8192
     assert at_prior_edge(bad) == ("pupil.magnification",)
-    slightly = dataclasses.replace(result, posterior=dataclasses.replace(result.posterior, data=1.2 * result.dof))
-    assert quality(slightly) in (8192, 0)
+    slightly = dataclasses.replace(result.posterior, data=result.dof * 1.0 + 20.0 * np.sqrt(result.dof))
+    assert quality(dataclasses.replace(result, posterior=slightly)) & ~8 == 8192
 
 
 def test_a_product_of_other_physics_is_refused(calibration):
@@ -274,7 +265,7 @@ def calibration_error(true: np.ndarray, fitted: np.ndarray, p: float = 0.05, ang
 @pytest.mark.parametrize(
     ("name", "limit"),
     [
-        # Measured: see the table that the test prints with -s.
+        # Measured in November 2026: q 0.00388, u 0.00668 % (a) and q 0.00174, u 0.00692 % (b).
         ("a", (0.005, 0.015)),
         ("b", (0.0025, 0.007)),
     ],
@@ -299,8 +290,8 @@ def test_error_between_grid_points(shared_data, name, limit):
     pulls = (fitted - true) / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     print(
         f"set {name}: χ²/dof {result.chi2 / result.dof:.4f}, {result.minimum.steps} steps; error in q, u "
-        f"{error[0]:.5f}, {error[1]:.5f} % at {100 * easy.mean():.0f} % of the points; rms pulls of the matrix "
-        f"{np.sqrt(np.mean(pulls**2, axis=0)).round(2)}"
+        f"{error[0]:.5f}, {error[1]:.5f} % at {100 * easy.mean():.0f} % of the points; rms pulls of the "
+        f"matrix {np.sqrt(np.mean(pulls**2, axis=0)).round(2)}"
     )
     assert error[0] <= limit[0]
     assert error[1] <= limit[1]

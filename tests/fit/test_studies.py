@@ -33,7 +33,7 @@ SMALL = ObservingPlan(
 
 
 class Study(NamedTuple):
-    """Pulls (set, parameter); squared errors of matrix elements and their predicted variances (set, point, 6)."""
+    """Pulls (set, parameter), squared errors of matrix elements and their predicted variances (set, point, 6)."""
 
     names: tuple[str, ...]
     pulls: np.ndarray
@@ -87,9 +87,7 @@ def study(plan: ObservingPlan, seeds: Sequence[int]) -> Study:
         free = result.model.free
         names = tuple(result.model.names[i] for i in free)
         pulls.append((result.values - full_values(truth))[free] / result.sigma[free])
-        fitted, variance = matrix_at(
-            result.model.instrument(result.values), calset, plan, result.covariance
-        )
+        fitted, variance = matrix_at(result.model.instrument(result.values), calset, plan, result.covariance)
         true, _ = matrix_at(truth, calset, plan, result.covariance)
         squared.append((fitted - true) ** 2)
         predicted.append(variance)
@@ -172,7 +170,9 @@ def test_twice_the_data_halve_the_covariance():
         for name in model.names:
             model = model.change(name, prior=None, loose=None)
         information.append(Problem(data, model).expand(full_values(truth)).matrix)
-    np.testing.assert_allclose(information[1], 2.0 * information[0], rtol=1e-9, atol=1e-9 * information[0].max())
+    np.testing.assert_allclose(
+        information[1], 2.0 * information[0], rtol=1e-9, atol=1e-9 * information[0].max()
+    )
 
 
 def test_a_study_can_fail():

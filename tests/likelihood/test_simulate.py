@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 import re
 import shlex
+import sys
 from pathlib import Path
+from subprocess import run
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from walop_jax.cli import app
 from walop_jax.data import (
     TableIntensities,
     merge_calibration_sets,
@@ -44,6 +44,10 @@ def at_truth(simulated: Simulated) -> tuple[Problem, np.ndarray]:
     added = [type(e).of(SMALL.context(), **e.choices()) for e in simulated.truth.effects]
     model = with_effects(model, added, SMALL.context()) if added else model
     return Problem(simulated.calset, model), full_values(simulated.truth)
+
+
+def chi2(problem: Problem, values: np.ndarray) -> float:
+    return float((problem.residuals(values)[1] ** 2).sum())
 
 
 # ---------------------------------------------------------------------------------------------- the plan
@@ -82,7 +86,10 @@ def test_patches_lie_around_the_moon_wherever_it_is(instrument: str, mjd: float 
     ra, dec = (np.deg2rad(a) for a in moon_direction(e.mjd[moon], plan.site))
     field_ra, field_dec = np.deg2rad(e.ra[moon]), np.deg2rad(e.dec[moon])
     # Haversine form, exact for small angles too.
-    chord = np.sin((field_dec - dec) / 2) ** 2 + np.cos(dec) * np.cos(field_dec) * np.sin((field_ra - ra) / 2) ** 2
+    chord = (
+        np.sin((field_dec - dec) / 2) ** 2
+        + np.cos(dec) * np.cos(field_dec) * np.sin((field_ra - ra) / 2) ** 2
+    )
     separation = np.rad2deg(2 * np.arcsin(np.sqrt(chord)))
     assert separation.min() > 8.0
     assert separation.max() < 20.0
@@ -104,12 +111,18 @@ def test_default_nights_are_full_moon_and_the_moon_is_up(instrument: str):
     with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("iers_degraded_accuracy", "ignore"):
         time = Time(e.mjd[moon], format="mjd")
         place = EarthLocation.from_geodetic(site.longitude, site.latitude, site.elevation)
-        separation = get_body("moon", time, place).separation(get_body("sun", time, place), origin_mismatch="ignore")
+        separation = get_body("moon", time, place).separation(
+            get_body("sun", time, place), origin_mismatch="ignore"
+        )
         frame = AltAz(obstime=time, location=place)
         fields = SkyCoord(e.ra[moon] * units.deg, e.dec[moon] * units.deg).transform_to(frame)
-        sun = get_body("sun", time, place).transform_to(frame)
+        sun = sun_there.transform_to(frame)
         # Hour angles of the plan against astropy's, to a minute.
-        hour_angle = (time.sidereal_time("mean", site.longitude * units.deg) - fields.icrs.ra).wrap_at("180d").hourangle
+        hour_angle = (
+            (time.sidereal_time("mean", site.longitude * units.deg) - fields.icrs.ra)
+            .wrap_at("180d")
+            .hourangle
+        )
     assert separation.deg.min() > 165.0
     assert fields.alt.deg.min() > 25.0
     assert sun.alt.deg.max() < -18.0
@@ -178,8 +191,8 @@ def test_tied_parameters_are_built_alike():
 
 def test_stars_scatter_around_their_catalogue():
     pulls = []
-    for seed in range(30):
-        calset, truth = simulate(SMALL, seed, noiseless=True)
+    for seed in range(20):
+        calset, truth = simulate(dataclasses.replace(SMALL, grid=1), seed, noiseless=True)
         pulls.append((np.asarray(truth.standard.q) - calset.sources.q) / calset.sources.q_err)
     assert np.mean(pulls) == pytest.approx(0.0, abs=0.4)
     assert np.std(pulls) == pytest.approx(1.0, abs=0.25)
@@ -200,16 +213,15 @@ def test_a_seed_decides_everything():
 def test_the_truth_explains_the_data():
     simulated = simulate(SMALL, 9)
     problem, true = at_truth(simulated)
-    found = problem.expand(true)
     rows = simulated.calset.intensities.rows
-    assert found.data == pytest.approx(3 * rows, abs=4 * np.sqrt(6 * rows))
+    assert chi2(problem, true) == pytest.approx(3 * rows, abs=4 * np.sqrt(6 * rows))
     assert list(truth_values(simulated.truth)) == list(problem.model.names)
 
 
 def test_without_noise_nothing_is_left():
     simulated = simulate(SMALL, 9, noiseless=True)
     problem, true = at_truth(simulated)
-    assert problem.expand(true).data < 1e-15
+    assert chi2(problem, true) < 1e-15
 
 
 @pytest.mark.parametrize(
@@ -219,10 +231,7 @@ def test_without_noise_nothing_is_left():
         ("ghost", {"share": 0.01}),
         ("pedestal", {"level": 0.01}),
         ("nonlinearity", {"coefficient": 0.02}),
-        ("camera_gain_drift", {"camera": 2, "rate": 0.01}),
-        ("moon_patch", {"q": 0.002}),
         ("standard_outlier", {"source": "STD01", "q": 0.003}),
-        ("hwp_temperature", {"coefficient": 3.0}),
     ],
 )
 def test_effects_are_in_the_data(name: str, values: dict):
@@ -232,9 +241,9 @@ def test_effects_are_in_the_data(name: str, values: dict):
     changed, plain = (block_of(s) for s in (with_it, without))
     assert np.abs(changed.counts[changed.used] / plain.counts[plain.used] - 1.0).max() > 1e-4
     problem, true = at_truth(with_it)
-    assert problem.expand(true).data < 1e-6
+    assert chi2(problem, true) < 1e-6
     bare = Problem(with_it.calset, base_model(with_it.calset))
-    assert bare.expand(full_values(without.truth)).data > 10.0
+    assert chi2(bare, full_values(without.truth)) > 10.0
 
 
 def test_an_instrument_may_be_given():
@@ -254,7 +263,10 @@ def test_counts_are_at_the_level_that_was_asked_for():
 
 @pytest.mark.parametrize(
     "plan",
-    [dataclasses.replace(SMALL, instrument="WALOP-NORTH"), ObservingPlan.bench(polariser_angles=polariser_turn(6))],
+    [
+        dataclasses.replace(SMALL, instrument="WALOP-NORTH"),
+        ObservingPlan.bench(polariser_angles=polariser_turn(6)),
+    ],
     ids=["north", "bench"],
 )
 def test_other_instruments(plan: ObservingPlan, tmp_path: Path):
@@ -264,11 +276,13 @@ def test_other_instruments(plan: ObservingPlan, tmp_path: Path):
     assert again.instrument == plan.instrument
     problem = Problem(again, base_model(again, throughput_degree=plan.throughput_degree))
     rows = calset.intensities.rows
-    assert problem.expand(full_values(truth)).data == pytest.approx(3 * rows, abs=4 * np.sqrt(6 * rows))
+    assert chi2(problem, full_values(truth)) == pytest.approx(3 * rows, abs=4 * np.sqrt(6 * rows))
 
 
 def test_two_nights_can_be_merged():
-    nights = [simulate(dataclasses.replace(SMALL, mjd=61220.85 + night, standards=0), 14).calset for night in (0, 1)]
+    nights = [
+        simulate(dataclasses.replace(SMALL, mjd=61220.85 + night, standards=0), 14).calset for night in (0, 1)
+    ]
     assert len(merge_calibration_sets(*nights).exposures) == 2 * len(nights[0].exposures)
 
 
@@ -284,10 +298,10 @@ def documented_command() -> list[str]:
 
 def test_the_documented_command_makes_the_set_in_fits_data(tmp_path: Path):
     arguments = [
-        str(tmp_path / Path(word).name) if word.startswith("fits_data/") else word for word in documented_command()
+        str(tmp_path / Path(word).name) if word.startswith("fits_data/") else word
+        for word in documented_command()
     ]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0, result.output
+    run([sys.executable, "-c", "from walop_jax.cli import main; main()", *arguments], check=True)
     stored = read_calibration_set(FITS_DATA / "walop_south_small.fits")
     made = read_calibration_set(tmp_path / "walop_south_small.fits")
     for name in ("exposures", "points", "sources"):

@@ -66,8 +66,8 @@ def test_the_last_stage_is_what_a_fit_computes(ray: Ray):
 
 # One effect for every stage at which the path can be changed.
 STAGES = (
-    "telescope_polarisation", "clp_ellipticity", "upstream_retarder", "chwp_in_beam", "filter_shift", "etalon",
-    "hwp2_axis_cut", "wollaston_axis", "blemish", "camera_leakage",
+    "telescope_polarisation", "clp_ellipticity", "upstream_retarder", "chwp_in_beam", "filter_shift",
+    "etalon", "hwp2_axis_cut", "wollaston_axis", "blemish", "camera_leakage",
 )  # fmt: skip
 
 
@@ -94,7 +94,7 @@ def test_unpolarised_light_is_shared_equally_by_the_nominal_instrument():
 
 
 def test_half_wave_plate_at_45_degrees_turns_x_into_y():
-    # On axis the retardance is 2π (2407 µm Δn(quartz) − 1930 µm Δn(MgF2)) / λ, and cos of it is what is left of Q.
+    # On axis the retardance is 2π (2407 µm Δn(quartz) − 1930 µm Δn(MgF2)) / λ; its cosine is what is left of Q.
     # Δn at 0.62 µm: 0.00906 and 0.01179 (handbook values; the plates are 35 and 37 waves thick).
     stages = trace(nominal_instrument(), builders.monochromatic(0.62), Ray(clp_angle=0.0, chwp_angle=45.0))
     np.testing.assert_allclose(named(stages, "source")[0], [1, 1, 0, 0], atol=5e-5)

@@ -35,7 +35,7 @@ app = typer.Typer(
 )
 
 
-def _show_version(wanted: bool) -> None:
+def _show_version(wanted: bool) -> bool:
     if wanted:
         from importlib.metadata import PackageNotFoundError, version
 
@@ -44,6 +44,7 @@ def _show_version(wanted: bool) -> None:
         except PackageNotFoundError:
             typer.echo("unknown")
         raise typer.Exit
+    return wanted
 
 
 @app.callback()

@@ -91,10 +91,13 @@ def _show(found: Diagnosis, output: Path) -> None:
     console = Console(highlight=False)
     before, after = found.before, found.after
     if found.steps:
-        table = Table("effect", "parameters", "χ² before", "after", "held out before", "after", "cannot be told from")
+        table = Table(
+            "effect", "parameters", "χ² before", "after", "held out before", "after", "cannot be told from"
+        )
         for step in found.steps:
             values = "\n".join(
-                f"{name} = {value:.4g} ± {sigma:.2g} {unit}" for name, (value, sigma, unit) in step.parameters.items()
+                f"{name} = {value:.4g} ± {sigma:.2g} {unit}"
+                for name, (value, sigma, unit) in step.parameters.items()
             )
             table.add_row(
                 step.effect, values, f"{step.chi2_before:.1f}", f"{step.chi2_after:.1f}",
@@ -115,4 +118,6 @@ def _show(found: Diagnosis, output: Path) -> None:
         console.print(f"unexplained: {found.unexplained.description}", markup=False, soft_wrap=True)
     if found.untestable:
         console.print(f"cannot be tested with these data: {', '.join(found.untestable)}", soft_wrap=True)
-    console.print(f"verdict: {found.verdict}   ({found.seconds:.0f} s)   {output}", markup=False, soft_wrap=True)
+    console.print(
+        f"verdict: {found.verdict}   ({found.seconds:.0f} s)   {output}", markup=False, soft_wrap=True
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -85,7 +86,7 @@ def simulate(
     turn = polariser_turn(angles, full_turn=full_turn)
     try:
         if instrument.upper() == "WALOP-LAB":
-            plan = ObservingPlan.bench(grid, polariser_angles=turn, electrons=electrons)
+            plan = dataclasses.replace(ObservingPlan.bench(grid), polariser_angles=turn, electrons=electrons)
         else:
             plan = ObservingPlan(
                 instrument.upper(),
@@ -177,8 +178,6 @@ def _value(text: str, name: str) -> Any:
 
 
 def _truth(plan: ObservingPlan, seed: int, true: Any) -> Mapping[str, Any]:
-    import dataclasses
-
     from walop_jax.likelihood.simulate import truth_values
     from walop_jax.model.parameters import leaves
 

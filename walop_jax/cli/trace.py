@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 ProductArgument = Annotated[
     Path | None,
     typer.Argument(
-        metavar="[RUN/calibration.fits]", help="An instrument as fitted; without it, as designed.", show_default=False
+        metavar="[RUN/calibration.fits]",
+        help="An instrument as fitted; without it, as designed.",
+        show_default=False,
     ),
 ]
 InstrumentOption = Annotated[
@@ -31,7 +33,8 @@ PlateOption = Annotated[
     typer.Option("--chwp", help="Calibration plate in, with its axis here (deg).", show_default=False),
 ]
 TeffOption = Annotated[
-    float | None, typer.Option("--teff", help="Colour temperature (K); without it, a flat spectrum.", show_default=False)
+    float | None,
+    typer.Option("--teff", help="Colour temperature (K); without it, a flat spectrum.", show_default=False),
 ]
 
 
@@ -45,7 +48,7 @@ def trace(
     angle: AngleOption = None,
     chwp: PlateOption = None,
     teff: TeffOption = None,
-    filter: Annotated[str, typer.Option("--filter", help="Filter of the calibration, or SDSS-r.")] = "SDSS-r",  # noqa: A002
+    filter: Annotated[str, typer.Option("--filter", help="Filter of the calibration, or SDSS-r.")] = "SDSS-r",
     json: JsonOption = False,
 ) -> None:
     """Follow the light of one source through the instrument.
@@ -75,7 +78,13 @@ def trace(
     if json:
         print_json(
             [
-                {"stage": s.name, "about": s.about, "rows": s.rows, "columns": s.columns, "value": s.value.tolist()}
+                {
+                    "stage": s.name,
+                    "about": s.about,
+                    "rows": s.rows,
+                    "columns": s.columns,
+                    "value": s.value.tolist(),
+                }
                 for s in stages
             ]
         )

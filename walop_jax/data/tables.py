@@ -149,7 +149,7 @@ def _numbers(
 ) -> Float[np.ndarray, " n"]:
     if values.dtype.kind in "OSU":
         numbers = np.full(len(values), np.nan)
-        for row, text in enumerate(values.astype(str)):
+        for row, text in enumerate(values.astype(str).tolist()):
             if masked[row] or not text.strip():
                 continue
             try:

@@ -87,7 +87,7 @@ class Calibration:
         return cls(
             model=result.model,
             values=result.values,
-            covariance=result.covariance,
+            covariance=0.5 * (result.covariance + result.covariance.T),
             verdict=verdict,
             filters=calset.filters,
             exposures=calset.exposures,

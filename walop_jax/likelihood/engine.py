@@ -255,7 +255,7 @@ def _point_effect_columns(
     names = [(i, name) for i, probe in enumerate(probes) for name in probe.amplitudes()]
     neutral = [getattr(probes[i], name) for i, name in names]
 
-    def with_amplitudes(amplitudes: list[Float[Array, "..."]]) -> Instrument:
+    def with_amplitudes(amplitudes: list[Float[Array, ...]]) -> Instrument:
         changed = list(probes)
         for (i, name), value in zip(names, amplitudes, strict=True):
             changed[i] = dataclasses.replace(changed[i], **{name: value})
@@ -265,7 +265,7 @@ def _point_effect_columns(
     unit = _point_prediction(at_neutral, plan, point)
     flux = _best_flux(at_neutral, plan, unit, point)
 
-    def counts(amplitudes: list[Float[Array, "..."]]) -> Float[Array, "e 4"]:
+    def counts(amplitudes: list[Float[Array, ...]]) -> Float[Array, "e 4"]:
         active = with_amplitudes(amplitudes)
         return _real_counts(active, plan, _point_prediction(active, plan, point), flux)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -21,7 +20,7 @@ SITES: Mapping[str, Site] = {
     "WALOP-LAB": Site("bench", 18.5590, 73.8250, 560.0),
 }
 FULL_MOON: Mapping[str, float] = {"WALOP-SOUTH": 61220.85, "WALOP-NORTH": 61042.90, "WALOP-LAB": 61042.90}
-"""MJD (UTC) in a night of full Moon in which it stands high: 2026 June 29 in the south, January 2 in the north."""
+"""MJD (UTC) in a night of full Moon in which it stands high: 2026 June 29 (south), 2026 January 2 (north)."""
 
 NARROW_BANDS: Mapping[str, float] = {"NB-580": 0.580, "NB-660": 0.660}  # centre, µm
 _SPACING = 0.004  # d between exposures
@@ -39,12 +38,13 @@ def polariser_turn(count: int = 15, *, full_turn: bool = False) -> tuple[float, 
 class ObservingPlan:
     """A calibration run: where, when, through what.
 
-    Field points are a `grid` × `grid` raster over ±`field` degrees, on which polariser and Moon sky are measured, and
-    `standard_grid` × `standard_grid` places of the standards; on the laboratory bench X is the tilt of the plate and
-    the points are `grid` tilts from 0 to `field`. The polariser goes through `polariser_angles` (deg) for each of
-    `filters` and each setting of the calibration plate in `plate` (deg, None: out); Moon patches and standards
-    take the settings in turn, in the first filter. The Moon is observed from `mjd` (UTC) on, at `separations` (deg),
-    the polariser before and the standards after. `electrons` is the mean level of a camera in unpolarised light.
+    Field points are a `grid` × `grid` raster over ±`field` degrees, on which polariser and Moon sky are
+    measured, and `standard_grid` × `standard_grid` places of the standards; on the laboratory bench X is the
+    tilt of the plate and the points are `grid` tilts from 0 to `field`. The polariser goes through
+    `polariser_angles` (deg) for each of `filters` and each setting of the calibration plate in `plate` (deg,
+    None: out); Moon patches and standards take the settings in turn, in the first filter. The Moon is
+    observed from `mjd` (UTC) on, at `separations` (deg), the polariser before and the standards after.
+    `electrons` is the level of a camera in unpolarised light of full transparency, ahead of reflections.
     """
 
     instrument: str = "WALOP-SOUTH"
@@ -77,15 +77,18 @@ class ObservingPlan:
         if not self.electrons > 0:
             raise ValueError(f"{self.electrons} electrons: a camera needs some light")
         if not (self.filters and self.plate and self.polariser_angles):
-            raise ValueError("at least a filter, a setting of the calibration plate, a polariser angle are needed")
+            raise ValueError(
+                "at least a filter, a setting of the calibration plate, a polariser angle are needed"
+            )
         for name in self.filters:
             filter_curve(name)
 
     @classmethod
-    def bench(cls, tilts: int = 11, **options: Any) -> ObservingPlan:
-        """The laboratory bench: plate tilts from 0 to 20°, no sky. `options` are other fields of the plan."""
-        sky = {"moon_patches": 0, "standards": 0, "unpolarised": 0}
-        return cls("WALOP-LAB", **(sky | {"grid": tilts, "field": 20.0, "throughput_degree": 0} | options))
+    def bench(cls, tilts: int = 11) -> ObservingPlan:
+        """The laboratory bench: plate tilts from 0 to 20°, no sky."""
+        return cls(
+            "WALOP-LAB", tilts, field=20.0, moon_patches=0, standards=0, unpolarised=0, throughput_degree=0
+        )
 
     @property
     def site(self) -> Site:
@@ -177,7 +180,9 @@ class ObservingPlan:
             sources=self.star_names,
         )
 
-    def _patches(self, mjd: Float[np.ndarray, " m"]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    def _patches(
+        self, mjd: Float[np.ndarray, " m"]
+    ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Field centres around the Moon: separations and position angles spread evenly."""
         if not len(mjd):
             return mjd, mjd
@@ -202,6 +207,6 @@ def filter_curve(name: str) -> FilterCurve:
 
 
 def _local_sidereal(mjd: Float[np.ndarray, " e"], longitude: float) -> Float[np.ndarray, " e"]:
-    """Local sidereal time (deg) to a few arcsec: Earth rotation angle and general precession in right ascension."""
+    """Local mean sidereal time (deg) to a few arcsec (Meeus 1998, Astronomical Algorithms, 12.4)."""
     days = mjd - 51544.5
     return np.mod(280.46061837 + 360.98564736629 * days + longitude, 360.0)

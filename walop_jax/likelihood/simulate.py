@@ -56,8 +56,8 @@ def truth_values(truth: Instrument) -> dict[str, float]:
 def draw_instrument(model: Model, rng: np.random.Generator) -> Instrument:
     """An instrument as it might have been built.
 
-    Every parameter with a prior is drawn from it (efficiencies stop at 1), tied ones follow; throughputs are drawn as
-    smooth maps: levels 0.5 ± 0.03, structure over the field of 2 % rms. The scale that all cameras
+    Every parameter with a prior is drawn from it (efficiencies stop at 1), tied ones follow; throughputs are
+    drawn as smooth maps: levels 0.5 ± 0.03, structure over the field of 2 % rms. The scale that all cameras
     share is a gauge, so the constant of camera N0 is 0.5. What else has no prior stays at its start value.
     """
     values = model.start
@@ -113,11 +113,12 @@ def simulate(
     effects: Sequence[Effect] = (),
     noiseless: bool = False,
 ) -> Simulated:
-    """Simulate a calibration run: the same plan, seed and effects give the same set, bit for bit on one machine.
+    """Simulate a calibration run: the same plan, seed and effects give the same set, bit for bit.
 
-    `instrument` is the true one (default: drawn from the priors of the base model); its standards are replaced by
-    those of the simulated catalogue, `effects` are added to it. `noiseless` leaves the expected counts as
-    they are and states the errors that they would have. Effects that depend on the run are made with `plan.context()`.
+    `instrument` is the true one (default: drawn from the priors of the base model); its standards are replaced
+    by those of the simulated catalogue, `effects` are added to it. `noiseless` leaves the expected counts as
+    they are and states the errors that they would have. Effects that depend on the run are made with
+    `plan.context()`.
     """
     build, stars, sky, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
     sources, standards = _catalogue(plan, stars)

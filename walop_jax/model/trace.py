@@ -2,10 +2,10 @@
 
     source → collimator → calibration plate → half-wave plates → Wollaston prisms → cameras → counts
 
-`light.py` runs this path backwards from the cameras, once for all sources. Here the Stokes vector goes forward,
-averaged over the band where the plates make it depend on wavelength; both ends meet in the counts.
+`light.py` runs this path backwards from the cameras, once for all sources. Here the Stokes vector goes
+forward, averaged over the band where the plates make it depend on wavelength; both ends meet in the counts.
 
-Units       Stokes vectors in units of the flux that arrives; counts per unit of flux, as those of `light.counts`:
+Units       Stokes vectors in units of the flux that arrives; counts per unit of flux, as in `light.counts`:
             ghosts of other field points and effects of the detectors, which act on electrons, come after.
 """
 
@@ -29,7 +29,7 @@ STOKES = ("I", "Q", "U", "V")
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """The light at one place: rows of `value` are `rows` (one beam, or the two halves), columns are `columns`."""
+    """The light at one place: `rows` of `value` are one beam or the two halves, `columns` Stokes or cameras."""
 
     name: str
     about: str
@@ -43,7 +43,7 @@ class Ray:
     """A source and the way through which it is looked at; angles and field coordinates in degrees.
 
     `q`, `u` are those of the source in the instrument frame (taken as catalogue values at ROTATOR 0);
-    `clp_angle` and `chwp_angle` are NaN where polariser and calibration plate are out; `teff` in K, NaN: flat.
+    `clp_angle`, `chwp_angle` are NaN where polariser and calibration plate are out; `teff` in K, NaN: flat.
     """
 
     x: float = 0.0
@@ -68,9 +68,10 @@ class Ray:
 
         return Exposures(
             exposure=np.zeros(1, int), kind=np.array(["standard"]), mjd=one(0.0), exptime=one(0.0),
-            filter=np.array([filter_name]), clp_in=np.isfinite(one(self.clp_angle)), clp_angle=one(self.clp_angle),
-            chwp_in=np.isfinite(one(self.chwp_angle)), chwp_angle=one(self.chwp_angle), temp=one(self.temperature),
-            ha=one(self.hour_angle), ra=one(np.nan), dec=one(np.nan), rotator=one(0.0), teff=one(self.teff),
+            filter=np.array([filter_name]), clp_in=np.isfinite(one(self.clp_angle)),
+            clp_angle=one(self.clp_angle), chwp_in=np.isfinite(one(self.chwp_angle)),
+            chwp_angle=one(self.chwp_angle), temp=one(self.temperature), ha=one(self.hour_angle),
+            ra=one(np.nan), dec=one(np.nan), rotator=one(0.0), teff=one(self.teff),
         )  # fmt: skip
 
 
@@ -86,7 +87,7 @@ def trace(instrument: Instrument, curve: FilterCurve, ray: Ray) -> tuple[Stage, 
     beam = light.upstream(instrument, x, y) @ beam
     stages.append(_one("collimator", "lenses of the collimator, ahead of the calibration plate", beam))
 
-    # From here on light depends on wavelength: one Stokes vector per node, its average over the band is shown.
+    # From here on light depends on wavelength: one Stokes vector per node, and its average over the band.
     weight = light.band_weights(instrument, plan)[0]
     matrices = light.plate_matrices(instrument, plan, x, y)
     nodes = jnp.broadcast_to(beam, (len(weight), 4))
@@ -116,7 +117,9 @@ def trace(instrument: Instrument, curve: FilterCurve, ray: Ray) -> tuple[Stage, 
         throughput = effect.throughput(throughput, x, y)
     beams = throughput * beams
     stages.append(_cameras("cameras", "behind lenses, filter and detector of each camera", beams))
-    stages.append(_cameras("counts", "electrons per electron of flux", _between_cameras(instrument, plan, beams)))
+    stages.append(
+        _cameras("counts", "electrons per electron of flux", _between_cameras(instrument, plan, beams))
+    )
     return tuple(stages)
 
 

@@ -39,8 +39,7 @@ def check(target: Target, surrogate: Surrogate, z: Draws, rng: np.random.Generat
     With ρ = ln(exact/surrogate) and a standardised coefficient t, to first order the exact mean is off by Cov(ρ, t)
     and the exact variance by the factor 1 + Cov(ρ, t²).
     """
-    x, k = surrogate.draw(z, rng), surrogate.along.shape[1]
-    weight = np.exp(-2.0 * z[:, k]) if surrogate.inflate else np.ones(len(z))
+    x, weight = surrogate.draw(z, rng), surrogate.weight(z)
     exact = [w * target.data(one) + float(np.sum(target.prior_rows(one) ** 2)) for w, one in zip(weight, x, strict=True)]
     ln_ratio = -0.5 * (np.array(exact) - surrogate.joint(z, x))
     ln_ratio = ln_ratio - ln_ratio.mean()

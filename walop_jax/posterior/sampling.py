@@ -17,7 +17,7 @@ from walop_jax.likelihood.problem import Problem
 from walop_jax.posterior.accuracy import Accuracy, check
 from walop_jax.posterior.checkpoint import Checkpoints, digest
 from walop_jax.posterior.convergence import Chains, Convergence, assess
-from walop_jax.posterior.ensemble import MOVES, Block, Walkers, advance, start, start_inflated
+from walop_jax.posterior.ensemble import MOVES, Block, Walkers, advance, start
 from walop_jax.posterior.surrogate import Surrogate, build_surrogate
 from walop_jax.posterior.target import LARGEST_SAMPLED, Target, choose_sampled
 
@@ -38,9 +38,9 @@ class Options:
 
     seed: int = 0
     walkers: int = 0
-    interval: int = 1000
+    interval: int = 500
     maximum_steps: int = 100_000
-    thin: int = 5
+    thin: int = 2
     moves: str = MOVES[0]
     order: int = 3
     inflate: bool = False
@@ -229,10 +229,7 @@ class _Run:
             raise ValueError(f"{count} walkers for {d} sampled coefficients: an even number of at least {2 * d}")
         self.walkers: list[Walkers] = []
         for number in range(options.ensembles):
-            walkers = start(self.log_posterior, count, d, options.seed, number)
-            if surrogate.inflate:
-                walkers = start_inflated(walkers, self.log_posterior, surrogate.measured)
-            self.walkers.append(walkers)
+            self.walkers.append(start(self.log_posterior, count, d, options.seed, number))
         self.blocks: list[list[Block]] = []
         self.seconds = 0.0
 
@@ -272,7 +269,7 @@ class _Run:
         s = self.surrogate
         k = s.along.shape[1]
         physical = s.centre[s.sampled] + z[..., :k] @ s.along[s.sampled].T
-        return np.concatenate([physical, z[..., k:]], axis=-1)
+        return np.concatenate([physical, z[..., k:] * s.ln_f_unit], axis=-1)
 
     def names(self) -> tuple[str, ...]:
         s = self.surrogate
@@ -308,7 +305,7 @@ def _finish(
         units=tuple(p.unit for p in target.model.parameters),
         draws=values,
         log_posterior=lnp[:, steps].reshape(e, -1),
-        ln_f=flat[:, :, -1] if surrogate.inflate else None,
+        ln_f=flat[:, :, -1] * surrogate.ln_f_unit if surrogate.inflate else None,
         mean=target.values(mean),
         covariance=select @ covariance @ select.T,
         chains=run.quoted(z),

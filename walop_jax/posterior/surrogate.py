@@ -16,7 +16,7 @@ H is the true half Hessian of the objective. Its determinant tilts the marginal,
 the means of s from the mode; ∇ ln det H_ss = Σ_j (g(S_j) + g(−S_j) − 2 g(0)) from exact half gradients g.
 
 With noise inflation the errors of the data are times f, and Q_ss = D/f² + P is diagonal in the common
-eigenvectors of D and P; − n ln f is added, ln f having the prior N(0, 1).
+eigenvectors of D and P; − n ln f is added, ln f having the prior N(0, 1). Its coordinate is ln f √(2n).
 
 `accuracy.check` compares with the exact posterior, all coefficients, at draws of the surrogate's own posterior.
 Source   Laplace marginals: Tierney & Kadane 1986, JASA 81, 82. Compression as in reduced-order quadrature:
@@ -76,6 +76,15 @@ class Surrogate:
         """Number of sampled coordinates."""
         return self.along.shape[1] + int(self.inflate)
 
+    @property
+    def ln_f_unit(self) -> float:
+        """What ln f changes by per unit of its coordinate."""
+        return 1.0 / np.sqrt(2.0 * max(self.measured, 1))
+
+    def weight(self, z: Draws) -> Float[np.ndarray, " n"]:
+        """1/f² of every draw."""
+        return np.exp(-2.0 * self.ln_f_unit * z[:, -1]) if self.inflate else np.ones(len(z))
+
     def features(self, z: Draws) -> Float[np.ndarray, "n h"]:
         """h for every draw."""
         return np.asarray(_features(jnp.asarray(z), jnp.asarray(self.pairs), jnp.asarray(self.triples)))
@@ -110,7 +119,7 @@ class Surrogate:
     def _conditional(self, z: Draws) -> tuple[Float[np.ndarray, "n s"], Float[np.ndarray, "n s"]]:
         """Mean and variance of s in its eigenvectors, given the sampled coordinates."""
         k, h = self.along.shape[1], self.data.shape[0] - len(self.share)
-        weight = np.exp(-2.0 * z[:, k:]) if self.inflate else np.ones((len(z), 1))
+        weight = self.weight(z)[:, None]
         precision = self.share * weight + (1.0 - self.share)
         y = self.features(z[:, :k])
         pull = weight * (y @ self.data[:h, h:] @ self.linear) + y @ self.prior[:h, h:] @ self.linear
@@ -139,7 +148,7 @@ class Surrogate:
         offset = x - self.centre - z[:, :k] @ self.along.T
         s = np.linalg.lstsq(self.across, offset.T, rcond=None)[0].T if len(self.share) else offset[:, :0]
         y = np.concatenate([self.features(z[:, :k]), s], axis=1)
-        weight = np.exp(-2.0 * z[:, k]) if self.inflate else 1.0
+        weight = self.weight(z)
         tilt = z[:, :k] @ self.slope + s @ self.skew
         return weight * np.sum((y @ self.data) * y, axis=1) + np.sum((y @ self.prior) * y, axis=1) + tilt
 
@@ -162,7 +171,7 @@ def _inflated(
     pairs: Array, triples: Array, data: Array, prior: Array, by_data: Array, by_prior: Array, share: Array,
     measured: Array, z: Array,
 ) -> Array:  # fmt: skip
-    ln_f = z[:, -1]
+    ln_f = z[:, -1] / jnp.sqrt(2.0 * measured)
     weight = jnp.exp(-2.0 * ln_f)
     h = _features(z[:, :-1], pairs, triples)
     chi2 = weight * jnp.sum((h @ data) * h, axis=1) + jnp.sum((h @ prior) * h, axis=1)

@@ -1,0 +1,66 @@
+"""A small calibration set on disk and what the commands make of it; no cache of compiled code."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from walop_jax.cli import app
+from walop_jax.data import write_calibration_set
+from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
+from walop_jax.likelihood.simulate import simulate
+from walop_jax.model.effects import effect_by_name
+
+PLAN = ObservingPlan(grid=5, standard_grid=2, polariser_angles=polariser_turn(8), moon_patches=3, standards=3)
+
+Call = Callable[..., Result]
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _no_cache():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("WALOP_JAX_CACHE", "off")
+        patch.setenv("COLUMNS", "200")
+        yield
+
+
+@pytest.fixture(scope="session")
+def call() -> Call:
+    """Run a command in this process; exceptions that are no exit code count as test failures."""
+
+    def run(*args: object) -> Result:
+        result = CliRunner().invoke(app, [str(arg) for arg in args])
+        if result.exception is not None and not isinstance(result.exception, SystemExit):
+            raise result.exception
+        return result
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def calset_file(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("sets") / "small.fits"
+    write_calibration_set(path, simulate(PLAN, seed=4).calset)
+    return path
+
+
+@pytest.fixture(scope="session")
+def spoilt_file(tmp_path_factory) -> Path:
+    """A set with an effect that the base model does not have."""
+    path = tmp_path_factory.mktemp("sets") / "spoilt.fits"
+    effect = effect_by_name("clp_wobble").of(PLAN.context(), amplitude=0.3, phase=1.0)
+    write_calibration_set(path, simulate(PLAN, seed=4, effects=(effect,)).calset)
+    return path
+
+
+@pytest.fixture(scope="session")
+def run(call, calset_file, tmp_path_factory) -> Path:
+    """A finished `refit`."""
+    path = tmp_path_factory.mktemp("runs") / "run"
+    result = call("refit", calset_file, "-o", path, "--quiet")
+    assert result.exit_code == 0, result.output
+    return path

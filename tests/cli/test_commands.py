@@ -1,0 +1,315 @@
+"""The commands, run in this process: results, exit codes, and the one line that an error is."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import tomllib
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+
+import walop_jax.data.product
+import walop_jax.fit.refit
+from walop_jax.data.product import read_product
+from walop_jax.fit.calibration import Calibration
+from walop_jax.fit.predict import Settings
+
+SUMMARY_KEYS = (
+    "chi2", "dof", "n_data", "parameters", "converged", "message", "seconds", "versions", "inputs",
+)  # fmt: skip
+
+
+def one_line(result) -> str:
+    """The error of a command that failed with exit code 1."""
+    assert result.exit_code == 1, result.output
+    assert "Traceback" not in result.output
+    errors = [line for line in result.stderr.splitlines() if line.startswith("walop-jax: error: ")]
+    assert len(errors) == 1, result.stderr
+    return errors[0]
+
+
+# ------------------------------------------------------------------------------------------------- refit
+
+
+def test_refit_writes_product_and_summary(run, calset_file):
+    assert sorted(entry.name for entry in run.iterdir()) == ["calibration.fits", "summary.json"]
+    summary = json.loads((run / "summary.json").read_text())
+    assert list(summary)[: len(SUMMARY_KEYS)] == list(SUMMARY_KEYS)
+    assert summary["converged"] is True
+    assert summary["trusted"] is True
+    assert 0.8 < summary["chi2"] / summary["dof"] < 1.2
+    product = read_product(run / "calibration.fits")
+    assert list(summary["parameters"]) == product.parameters.name.tolist()
+    entry = summary["parameters"]["half1.plate.quartz"]
+    assert entry["unit"] == "um"
+    assert abs(entry["value"] - 2407.0) < 5 * entry["sigma"] + 5
+    assert summary["inputs"][0]["path"] == str(calset_file)
+    assert len(summary["inputs"][0]["sha256"]) == 64
+    assert product.verdict.trusted
+    assert summary["chi2"] == pytest.approx(product.verdict.chi2, rel=1e-12)
+
+
+def test_refit_says_what_it_found(call, calset_file, tmp_path):
+    shown = call("refit", calset_file, "-o", tmp_path / "run")
+    assert "half2.plate.mgf2" in shown.stdout
+    assert "degrees of freedom" in shown.stdout
+    assert shown.stderr == ""
+    told = call("refit", calset_file, "-o", tmp_path / "run", "--json", "--overwrite", "--seed", 7)
+    summary = json.loads(told.stdout)
+    assert summary["seed"] == 7
+    assert summary == json.loads((tmp_path / "run" / "summary.json").read_text())
+    silent = call("refit", calset_file, "-o", tmp_path / "run", "--quiet", "--overwrite")
+    assert silent.output == ""
+
+
+def test_refit_leaves_results_alone(call, calset_file, run):
+    before = (run / "calibration.fits").read_bytes()
+    assert "holds calibration.fits already" in one_line(call("refit", calset_file, "-o", run))
+    assert (run / "calibration.fits").read_bytes() == before
+
+
+def test_a_misfit_is_written_but_not_trusted(call, spoilt_file, tmp_path):
+    result = call("refit", spoilt_file, "-o", tmp_path / "run")
+    assert result.exit_code == 0
+    assert "NOT trusted" in result.stdout
+    assert "does not explain the data" in result.stderr
+    assert "disagreement in the matrix" in result.stderr
+    product = read_product(tmp_path / "run" / "calibration.fits")
+    assert not product.verdict.trusted
+    assert product.verdict.converged
+    assert product.verdict.quality & 8192
+    assert any("does not explain" in text for text in product.verdict.warnings)
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["misfit"]["matrix_element"]["m22"] > 0
+    # A model with the effect does explain them.
+    (tmp_path / "m.toml").write_text('[model]\neffects = ["clp_wobble"]\n')
+    better = call("refit", spoilt_file, "-o", tmp_path / "named", "--model", tmp_path / "m.toml", "--json")
+    found = json.loads(better.stdout)
+    assert found["trusted"] is True
+    assert found["effects"] == ["clp_wobble"]
+    assert found["parameters"]["clp_wobble.amplitude"]["value"] == pytest.approx(0.3, abs=0.05)
+    cited = call("cite", tmp_path / "named").stdout
+    assert "effect clp_wobble: " in cited
+    # And the untrusted one says so wherever it is used.
+    (tmp_path / "p.csv").write_text("X,Y\n0,0\n")
+    used = call("matrix", tmp_path / "run", "--points", tmp_path / "p.csv", "-o", tmp_path / "o.csv")
+    assert used.exit_code == 0
+    assert "not trusted" in used.stderr
+
+
+def test_no_convergence_no_product(call, calset_file, tmp_path, monkeypatch):
+    monkeypatch.setattr(walop_jax.fit.refit, "FIRST_STEPS", 1)
+    monkeypatch.setattr(walop_jax.fit.refit, "MAXIMUM_STEPS", 1)
+    search = walop_jax.fit.refit._search
+    monkeypatch.setattr(walop_jax.fit.refit, "_search", lambda *args, **more: search(*args[:5], 1))
+    monkeypatch.setattr(walop_jax.fit.refit, "MAXIMUM_RESCALINGS", 0)
+    result = call("refit", calset_file, "-o", tmp_path / "run", "--json")
+    assert "did not converge" in one_line(result)
+    assert [entry.name for entry in (tmp_path / "run").iterdir()] == ["summary.failed.json"]
+    assert json.loads(result.stdout)["converged"] is False
+    monkeypatch.undo()
+    assert call("refit", calset_file, "-o", tmp_path / "run", "-q").exit_code == 0
+    assert sorted(e.name for e in (tmp_path / "run").iterdir()) == ["calibration.fits", "summary.json"]
+
+
+@pytest.mark.parametrize("error", [OSError("No space left on device"), KeyboardInterrupt(), MemoryError()])
+def test_an_interrupted_write_leaves_nothing(call, calset_file, tmp_path, monkeypatch, error):
+    def fail(*args):
+        raise error
+
+    monkeypatch.setattr(walop_jax.data.product, "sign_and_write", fail)
+    result = call("refit", calset_file, "-o", tmp_path / "run")
+    assert result.exit_code == (130 if isinstance(error, KeyboardInterrupt) else 1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_outputs_that_cannot_be(call, calset_file, tmp_path, monkeypatch):
+    assert "does not exist" in one_line(call("refit", calset_file, "-o", tmp_path / "no" / "run"))
+    (tmp_path / "file").write_text("")
+    assert "is a file" in one_line(call("refit", calset_file, "-o", tmp_path / "file"))
+    monkeypatch.setattr(os, "access", lambda path, mode, **more: not mode & os.W_OK)
+    assert "read-only" in one_line(call("refit", calset_file, "-o", tmp_path / "run"))
+    assert "read-only" in one_line(call("model", "-o", tmp_path / "m.toml"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('[model]\neffects = ["clp_woble"]', "clp_wobble"),
+        ('[parameters."half1.plate.quarz"]\nfree = false', "half1.plate.quartz"),
+        ("[model", "not valid TOML"),
+        ('[model]\ninstrument = "WALOP-NORTH"', "WALOP-SOUTH"),
+    ],
+)
+def test_bad_model_files(call, calset_file, tmp_path, text, message):
+    path = tmp_path / "m.toml"
+    path.write_text(text)
+    line = one_line(call("refit", calset_file, "-o", tmp_path / "run", "--model", path))
+    assert message in line
+    assert str(path) in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_missing_and_alien_inputs(call, run, calset_file, tmp_path):
+    assert "no such file" in one_line(call("refit", tmp_path / "none.fits", "-o", tmp_path / "run"))
+    missing = one_line(call("refit", calset_file, "-o", tmp_path / "run", "--model", tmp_path / "none.toml"))
+    assert "none.toml: cannot be read" in missing
+    assert "CALVERS" in one_line(call("refit", run / "calibration.fits", "-o", tmp_path / "run"))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("refit",),
+        ("refit", "x.fits"),
+        ("refti", "x"),
+        ("matrix", "x", "--pionts", "y"),
+        ("cite", "--seed", "x"),
+    ],
+)
+def test_wrong_usage(call, args):
+    assert call(*args).exit_code == 2
+
+
+# ------------------------------------------------------------------------------------------------ matrix
+
+
+@pytest.mark.parametrize("suffix", [".fits", ".csv", ".ecsv"])
+def test_matrix_adds_columns(call, run, tmp_path, suffix):
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-0.28, 0.28, (2, 20))
+    points = Table({"ID": np.arange(20), "X": x, "Y": y, "TEFF": np.where(np.arange(20) % 2, 5772.0, np.nan)})
+    points["CHWP_IN"], points["CHWP_ANGLE"] = np.arange(20) % 3 == 0, 45.0
+    points.write(tmp_path / f"points{suffix}")
+    output = tmp_path / f"out{suffix}"
+    result = call("matrix", run / "calibration.fits", "--points", tmp_path / f"points{suffix}", "-o", output)
+    assert result.exit_code == 0, result.output
+    table = Table.read(output)
+    assert table.colnames[:6] == ["ID", "X", "Y", "TEFF", "CHWP_IN", "CHWP_ANGLE"]
+    names = ["M21", "M22", "M23", "M31", "M32", "M33"]
+    assert table.colnames[6:] == [*names, *(f"{name}_ERR" for name in names), "FLAG"]
+    calibration = Calibration.from_product(read_product(run / "calibration.fits"))
+    settings = dataclasses.replace(
+        Settings.default(20),
+        teff=np.where(np.arange(20) % 2, 5772.0, np.nan),
+        chwp_angle=np.where(np.arange(20) % 3 == 0, 45.0, np.nan),
+    )
+    values, covariance = calibration.matrix(x, y, settings)
+    for k, name in enumerate(names):
+        np.testing.assert_allclose(table[name], values[:, k], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(table[f"{name}_ERR"], np.sqrt(covariance[:, k, k]), rtol=1e-9)
+
+
+def test_matrix_marks_what_is_outside(call, run, tmp_path):
+    (tmp_path / "p.csv").write_text("X,Y,FILTER\n0,0,SDSS-r\n0.1,0.1,SDSS-r\n0.4,0,SDSS-r\n0.33,0,SDSS-r\n")
+    result = call("matrix", run, "--points", tmp_path / "p.csv", "-o", tmp_path / "o.fits", "--json")
+    assert result.exit_code == 0
+    told = json.loads(result.stdout)
+    assert told["rows"] == 4
+    assert told["flags"]["32"] == 2
+    assert "beyond the calibrated field" in result.stderr
+    table = Table.read(tmp_path / "o.fits")
+    assert np.isnan(np.ma.filled(table["M22"], np.nan)).tolist() == [False, False, True, False]
+    assert (np.asarray(table["FLAG"]) & 32).tolist() == [0, 0, 32, 32]
+
+
+def test_matrix_errors_name_file_column_and_row(call, run, calset_file, tmp_path):
+    def ask(text, product=run, output="o.fits"):
+        (tmp_path / "p.csv").write_text(text)
+        return one_line(call("matrix", product, "--points", tmp_path / "p.csv", "-o", tmp_path / output))
+
+    line = ask("X,Y\n0,0\n0,north\n")
+    assert "p.csv Y: 'north' is not a number, in row 1" in line
+    line = ask("X,Y,FILTER\n0,0,SDSS-rr\n")
+    assert "SDSS-r" in line
+    assert "p.csv" in line
+    assert "run walop-jax refit" in ask("X,Y\n0,0\n", product=calset_file)
+    assert ".ecsv" in ask("X,Y\n0,0\n", output="o.txt")
+    (tmp_path / "o.fits").write_text("precious")
+    assert "exists already" in ask("X,Y\n0,0\n")
+    assert (tmp_path / "o.fits").read_text() == "precious"
+
+
+def test_matrix_refuses_damaged_products(call, run, tmp_path):
+    (tmp_path / "p.csv").write_text("X,Y\n0,0\n")
+    more = ("--points", tmp_path / "p.csv", "-o", tmp_path / "o.fits")
+
+    def ask(name):
+        return one_line(call("matrix", tmp_path / name, *more))
+
+    whole = (run / "calibration.fits").read_bytes()
+    (tmp_path / "c.fits").write_bytes(whole[: len(whole) // 2])
+    line = ask("c.fits")
+    assert "c.fits" in line
+    with fits.open(run / "calibration.fits") as hdus:
+        hdus[0].header["PRODVERS"] = 9
+        hdus.writeto(tmp_path / "n.fits", checksum=True)
+    line = ask("n.fits")
+    assert "newer walop-jax" in line
+
+
+# --------------------------------------------------------------------------------- inspect, model and cite
+
+
+def test_inspect_shows_a_set(call, calset_file):
+    result = call("inspect", calset_file)
+    assert result.exit_code == 0
+    for text in ("WALOP-SOUTH", "moon", "standard", "8 modulo 180°", "photon noise"):
+        assert text in result.stdout
+    found = json.loads(call("inspect", calset_file, "--json").stdout)["sets"][0]
+    assert found["points"] == 29
+    assert found["noise_ratio"] == pytest.approx(1.0, abs=0.05)
+    assert [finding["severity"] for finding in found["findings"]] == ["note"]
+
+
+def test_inspect_names_what_is_wrong(call, calset_file, tmp_path):
+    with fits.open(calset_file) as hdus:
+        hdus["INTENSITIES"].data["N_ERR"] *= 0.1
+        hdus["INTENSITIES"].data["FLAG"][::3] = 1
+        hdus["EXPOSURES"].data["CLP_ANGLE"] = np.where(hdus["EXPOSURES"].data["CLP_ANGLE"] > 60, 0.0, 22.5)
+        hdus.writeto(tmp_path / "odd.fits", checksum=True)
+    result = call("inspect", tmp_path / "odd.fits")
+    line = one_line(result)
+    assert "2 distinct polariser angle(s)" in line
+    assert "odd.fits" in line
+    assert "0.1 times the photon noise" in result.stdout
+    assert "saturated" in result.stdout
+    told = call("inspect", calset_file, tmp_path / "none.fits", "--json")
+    assert "no such file" in one_line(told)
+    sets = json.loads(told.stdout)["sets"]
+    assert "no such file" in sets[1]["error"]
+    assert sets[0]["points"] == 29
+
+
+def test_model_is_a_file_that_refit_takes(call, calset_file, tmp_path):
+    text = call("model", calset_file, "--effect", "clp_zero").stdout
+    table = tomllib.loads(text)
+    assert table["model"]["effects"] == ["clp_zero"]
+    assert "standard.STD00.q" in table["parameters"] or any("standard." in n for n in table["parameters"])
+    path = tmp_path / "m.toml"
+    path.write_text(text)
+    north = ("model", "--instrument", "WALOP-NORTH", "-o", path)
+    assert "exists already" in one_line(call(*north))
+    told = json.loads(call(*north, "--overwrite", "--json").stdout)
+    assert told["parameters"]["pupil.magnification"]["start"] == 19.5
+    assert tomllib.loads(path.read_text())["model"]["instrument"] == "WALOP-NORTH"
+
+
+def test_model_errors(call, calset_file, tmp_path):
+    assert "WALOP-SOUTH" in one_line(call("model", "--instrument", "WALOP-SUOTH"))
+    assert "clp_wobble" in one_line(call("model", "--effect", "clp_woble"))
+    assert call("model", calset_file, "--instrument", "WALOP-NORTH").exit_code == 2
+
+
+def test_cite_lists_sources(call, run):
+    for args in ((), (run,), (run / "calibration.fits",)):
+        text = call("cite", *args).stdout
+        for name in ("Maharana et al. 2022", "Yeh 1982", "Ghosh 1999", "Dodge 1984", "Moré 1978"):
+            assert name in text
+        assert "contract" not in text
+    assert json.loads(call("cite", "--json").stdout)[0]["what"] == "the instrument and its calibration"
