@@ -33,7 +33,7 @@ SMALL = ObservingPlan(
 
 
 class Study(NamedTuple):
-    """Pulls (set, parameter), squared errors of matrix elements and their predicted variances (set, point, 6)."""
+    """Pulls (set, parameter), squared errors of the matrix and predicted variances (set, point, 6)."""
 
     names: tuple[str, ...]
     pulls: np.ndarray

@@ -94,7 +94,7 @@ def test_unpolarised_light_is_shared_equally_by_the_nominal_instrument():
 
 
 def test_half_wave_plate_at_45_degrees_turns_x_into_y():
-    # On axis the retardance is 2π (2407 µm Δn(quartz) − 1930 µm Δn(MgF2)) / λ; its cosine is what is left of Q.
+    # On axis the retardance is 2π (2407 µm Δn(quartz) − 1930 µm Δn(MgF2)) / λ, of Q its cosine is left.
     # Δn at 0.62 µm: 0.00906 and 0.01179 (handbook values; the plates are 35 and 37 waves thick).
     stages = trace(nominal_instrument(), builders.monochromatic(0.62), Ray(clp_angle=0.0, chwp_angle=45.0))
     np.testing.assert_allclose(named(stages, "source")[0], [1, 1, 0, 0], atol=5e-5)

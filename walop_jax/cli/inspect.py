@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -57,6 +58,7 @@ def _show(report: Inspection) -> None:
     console = Console(highlight=False)
     console.print(f"[bold]{', '.join(report.files)}[/bold]", soft_wrap=True)
     low_x, high_x, low_y, high_y = report.field
+    counted = math.isfinite(report.median_counts)
     lines = {
         "instrument": f"{report.instrument}, {report.telescope} ({report.origin or 'origin not stated'})",
         "field points": f"{report.points}, X {low_x:+.3f} … {high_x:+.3f}°, Y {low_y:+.3f} … {high_y:+.3f}°",
@@ -64,8 +66,8 @@ def _show(report: Inspection) -> None:
         "used": f"{report.rows} of {report.possible} (exposure, point) pairs"
         + (f" at {report.looked_at} points looked at" if report.looked_at < report.points else ""),
         "flagged": ", ".join(f"{count} {name}" for name, count in report.flags.items()) or "none",
-        "median counts": f"{report.median_counts:.4g} electrons",
-        "errors": f"{report.noise_ratio**0.5:.4g} × the photon noise √N (median)",
+        "median counts": f"{report.median_counts:.4g} electrons" if counted else "none: KIND flux throughout",
+        "errors": f"{report.noise_ratio**0.5:.4g} × the photon noise √N (median)" if counted else "as stated",
         "standards": ", ".join(report.sources) or "none",
         "filters": ", ".join(report.filters),
     }

@@ -37,7 +37,10 @@ class Finding:
 
 @dataclasses.dataclass(frozen=True)
 class Group:
-    """Exposures that share kind, filter, calibration plate (text) and colour temperature (text)."""
+    """Exposures that share kind, filter, calibration plate (text) and colour temperature (text).
+
+    `teff` is "star" for standards, which have their own; `used` is the share of the points with used data.
+    """
 
     kind: str
     filter: str
@@ -145,7 +148,7 @@ def _groups(calset: CalibrationSet, share: np.ndarray) -> tuple[Group, ...]:
             str(e.kind[n]),
             str(e.filter[n]),
             f"{e.chwp_angle[n]:g} deg" if e.chwp_in[n] else "out",
-            f"{e.teff[n]:g} K" if np.isfinite(e.teff[n]) else "flat",
+            "star" if e.kind[n] == "standard" else (f"{e.teff[n]:g} K" if np.isfinite(e.teff[n]) else "flat"),
         )
         for n in range(len(e))
     ]

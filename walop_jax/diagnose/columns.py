@@ -93,7 +93,9 @@ def effect_candidates(
     return {probe.name: result[probe.name] for probe in wanted}
 
 
-def _swept(calset: CalibrationSet, model: Model, values: Vector, mine: Sequence[Probe]) -> dict[str, Candidate]:
+def _swept(
+    calset: CalibrationSet, model: Model, values: Vector, mine: Sequence[Probe]
+) -> dict[str, Candidate]:
     """Columns of one effect at many shapes: one compiled sweep for each of its discrete choices."""
     members = [(i, j) for i, probe in enumerate(mine) for j in range(len(probe.group))]
     by_choice: dict[tuple[tuple[str, object], ...], list[tuple[int, int]]] = {}

@@ -81,7 +81,8 @@ class Design:
         extra = len(self.residual) - self.rows
         scale = self.fit.noise_scale
         return [
-            dataclasses.replace(c, columns=np.pad(c.columns / scale, ((0, extra), (0, 0)))) for c in candidates
+            dataclasses.replace(c, columns=np.pad(c.columns / scale, ((0, extra), (0, 0))))
+            for c in candidates
         ]
 
     def cube(self, rows: Vector) -> Float[np.ndarray, "p e 4"]:
@@ -156,5 +157,5 @@ def held_out(design: Design, scheme: str) -> HeldOut:
         step = design.subset_step(~out)
         rows = np.flatnonzero(out)
         predicted = design.residual[rows] + design.jacobian[rows] @ step
-        squares[k], counts[k] = predicted @ predicted, len(rows)
+        squares[k], counts[k] = predicted @ predicted * design.fit.noise_scale**2, len(rows)
     return HeldOut(scheme, squares, counts)

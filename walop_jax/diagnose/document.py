@@ -14,7 +14,8 @@ def _step(step: Step) -> dict[str, Any]:
     return {
         "effect": step.effect,
         "parameters": {
-            name: {"value": value, "sigma": sigma, "unit": unit} for name, (value, sigma, unit) in step.parameters.items()
+            name: {"value": value, "sigma": sigma, "unit": unit}
+            for name, (value, sigma, unit) in step.parameters.items()
         },
         "score": step.score,
         "p_value": step.p_value,
@@ -29,7 +30,9 @@ def _step(step: Step) -> dict[str, Any]:
         "confirmed": step.confirmed,
         "log_bayes": step.log_bayes,
         "separation_sigma": {
-            name: value for name, value in sorted(step.separation.items(), key=lambda s: s[1]) if math.isfinite(value)
+            name: value
+            for name, value in sorted(step.separation.items(), key=lambda s: s[1])
+            if math.isfinite(value)
         },
     }
 

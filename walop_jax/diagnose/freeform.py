@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -48,9 +49,9 @@ class Measured:
         self.model: Cube = (self.counts * self.weight - self.residual) / flux
         self.known = np.asarray(problem.plan.exposures.flux_known)
         unpolarised = np.where(self.used[..., None], self.counts, 0.0).sum(axis=1)
-        self.level: Float[np.ndarray, "p 4"] = unpolarised / np.maximum(
-            np.where(self.used, self.flux, 0.0).sum(axis=1), 1e-300
-        )[:, None]
+        self.level: Float[np.ndarray, "p 4"] = (
+            unpolarised / np.maximum(np.where(self.used, self.flux, 0.0).sum(axis=1), 1e-300)[:, None]
+        )
 
     def column(self, pattern: Cube) -> Float[np.ndarray, " d"]:
         """Derivative of the residuals with respect to the amplitude of N_k → N_k + F · level_k · pattern."""
@@ -75,14 +76,14 @@ def strata(measured: Measured) -> Iterator[Candidate]:
     problem = measured.problem
     e, points = problem.calset.exposures, problem.calset.points
     shape = (len(points), len(e), 4)
-    smooth = np.asarray(legendre.basis(points.x, points.y, SMOOTH))
-    fine = np.asarray(legendre.basis(points.x, points.y, FINE))[:, smooth.shape[1] :]
+    smooth = np.asarray(legendre.basis(jnp.asarray(points.x), jnp.asarray(points.y), SMOOTH))
+    fine = np.asarray(legendre.basis(jnp.asarray(points.x), jnp.asarray(points.y), FINE))[
+        :, smooth.shape[1] :
+    ]
     stokes = problem.light(measured.values)
     for k, camera in enumerate(CAMERA_NAMES):
         for i, element in ((1, "q"), (2, "u")):
-            patterns = [
-                (term[:, None] * stokes[..., i])[..., None] * _camera(k) for term in smooth.T
-            ]
+            patterns = [(term[:, None] * stokes[..., i])[..., None] * _camera(k) for term in smooth.T]
             yield measured.candidate(f"vector {element} of {camera}", patterns)
         through = e.clp_in & measured.used.any(axis=0)
         angle = np.deg2rad(np.where(through, e.clp_angle, 0.0))
@@ -91,7 +92,9 @@ def strata(measured: Measured) -> Iterator[Candidate]:
                 continue
             waves = [np.where(through, wave(harmonic * angle), 0.0) for wave in (np.cos, np.sin)]
             patterns = [
-                (term[:, None] * wave[None, :])[..., None] * _camera(k) for term in smooth.T[:3] for wave in waves
+                (term[:, None] * wave[None, :])[..., None] * _camera(k)
+                for term in smooth.T[:3]
+                for wave in waves
             ]
             yield measured.candidate(f"{harmonic}θ of {camera}", patterns)
         yield measured.candidate(

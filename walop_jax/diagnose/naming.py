@@ -119,7 +119,12 @@ def without(model: Model, name: str, context: Context) -> Model:
 
 
 def equivalents(
-    calset: CalibrationSet, final: FitResult, design: Design, name: str, context: Context, rivals: Sequence[Probe]
+    calset: CalibrationSet,
+    final: FitResult,
+    design: Design,
+    name: str,
+    context: Context,
+    rivals: Sequence[Probe],
 ) -> tuple[dict[str, float], Float[np.ndarray, " d"]]:
     """Separation (σ) of every rival from an active effect, and the change of the residuals that the effect makes."""
     base = without(final.model, name, context)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -27,7 +28,9 @@ def _named(groups: dict[str, float]) -> str:
     return ", ".join(f"{name} {100 * share:.0f}%" for name, share in shares.items() if share >= SHARE * top)
 
 
-def _harmonics(design: Design, pattern: Float[np.ndarray, "p e 4"]) -> tuple[dict[str, float], Float[np.ndarray, " p"]]:
+def _harmonics(
+    design: Design, pattern: Float[np.ndarray, "p e 4"]
+) -> tuple[dict[str, float], Float[np.ndarray, " p"]]:
     """Power of each harmonic of the polariser angle, and the field map of the strongest one."""
     e = design.problem.calset.exposures
     use = np.flatnonzero(e.clp_in & design.measured.used.any(axis=0))
@@ -37,7 +40,9 @@ def _harmonics(design: Design, pattern: Float[np.ndarray, "p e 4"]) -> tuple[dic
     power: dict[str, float] = {}
     best, field = -1.0, pattern[:, use].sum(axis=(1, 2))
     for harmonic in HARMONICS:
-        waves = [np.ones_like(angle)] if harmonic == 0 else [np.cos(harmonic * angle), np.sin(harmonic * angle)]
+        waves = (
+            [np.ones_like(angle)] if harmonic == 0 else [np.cos(harmonic * angle), np.sin(harmonic * angle)]
+        )
         amplitudes = [np.einsum("pek,e->pk", pattern[:, use], wave / np.linalg.norm(wave)) for wave in waves]
         square = float(sum((a**2).sum() for a in amplitudes))
         power[f"{harmonic}θ"] = square
@@ -49,7 +54,7 @@ def _harmonics(design: Design, pattern: Float[np.ndarray, "p e 4"]) -> tuple[dic
 
 def _field_words(design: Design, field: Float[np.ndarray, " p"]) -> str:
     points = design.problem.calset.points
-    basis = np.asarray(legendre.basis(points.x, points.y, 4))
+    basis = np.asarray(legendre.basis(jnp.asarray(points.x), jnp.asarray(points.y), 4))
     degree = np.array([i + j for i, j in legendre.terms(4)])
     if len(field) <= len(degree):
         return "too few points to tell"

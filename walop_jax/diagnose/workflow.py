@@ -73,7 +73,9 @@ class Diagnosis:
 
     verdict: Verdict
     steps: tuple[Step, ...]
-    candidates: tuple[tuple[str, float, float], ...]  # effect, score, corrected p, of the last look at the base
+    candidates: tuple[
+        tuple[str, float, float], ...
+    ]  # effect, score, corrected p, of the last look at the base
     untestable: tuple[str, ...]
     unexplained: Unexplained | None
     p_value: float
@@ -86,7 +88,9 @@ class Diagnosis:
 class _Look:
     """One look at a fit: its design, the scores of everything, and the names in order of evidence."""
 
-    def __init__(self, problem: Problem, result: FitResult, wanted: Sequence[Probe], rng: np.random.Generator) -> None:
+    def __init__(
+        self, problem: Problem, result: FitResult, wanted: Sequence[Probe], rng: np.random.Generator
+    ) -> None:
         self.problem, self.result = problem, result
         active = {effect.name for effect in problem.model.template.effects}
         self.probes = [probe for probe in wanted if probe.effect.name not in active]
@@ -210,13 +214,20 @@ def _step(look: _Look, trial: naming.Trial) -> Step:
 
 
 def _finished(
-    step: Step, calset: CalibrationSet, final: FitResult, design: Design, context: Context, wanted: Sequence[Probe]
+    step: Step,
+    calset: CalibrationSet,
+    final: FitResult,
+    design: Design,
+    context: Context,
+    wanted: Sequence[Probe],
 ) -> Step:
     """The step with final parameters, what cannot be told from it, and where it sits."""
     active = {effect.name for effect in final.model.template.effects}
     rivals = [probe for probe in wanted if probe.effect.name not in active]
     separation, change = naming.equivalents(calset, final, design, step.effect, context, rivals)
-    close = sorted((name for name, s in separation.items() if s < naming.SEPARATION), key=lambda n: separation[n])
+    close = sorted(
+        (name for name, s in separation.items() if s < naming.SEPARATION), key=lambda n: separation[n]
+    )
     effect = next(e for e in final.model.template.effects if e.name == step.effect)
     parameters = {
         p.name.removeprefix(f"{step.effect}."): (float(final.values[i]), float(final.sigma[i]), p.unit)

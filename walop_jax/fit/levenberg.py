@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import lineax as lx
@@ -70,7 +70,7 @@ class Minimum:
 
 def _information(
     objective: Float[Array, ""], gradient: Float[Array, " n"], matrix: Float[Array, "n n"]
-) -> optx.FunctionInfo.EvalGradHessian:
+) -> Any:
     return optx.FunctionInfo.EvalGradHessian(
         objective, gradient, lx.MatrixLinearOperator(matrix, lx.positive_semidefinite_tag)
     )
@@ -176,7 +176,7 @@ def minimise(
     return Minimum(here, expansion, converged, message, steps, decrement, condition, tuple(history))
 
 
-def _arrays(expansion: Expansion, scale: Vector) -> optx.FunctionInfo.EvalGradHessian:
+def _arrays(expansion: Expansion, scale: Vector) -> Any:
     objective = expansion.objective if np.isfinite(expansion.objective) else np.inf
     return _information(
         jnp.asarray(0.5 * objective),

@@ -134,7 +134,9 @@ def _scale(model: Model) -> Vector:
 def _order_starts(problem: Problem) -> Iterator[tuple[str, Vector]]:
     """Start values one order of retardance away: first-order plates wrap every 2π."""
     wavelength = np.asarray(problem.plan.wavelength).mean()
-    birefringence = float(materials.MGF2_E.index(wavelength) - materials.MGF2_O.index(wavelength))
+    birefringence = float(
+        materials.MGF2_E.refractive_index(wavelength) - materials.MGF2_O.refractive_index(wavelength)
+    )
     one_wave = wavelength / birefringence
     for name in ("half2.plate.mgf2", "half1.plate.mgf2"):
         for sign in (-1, 1):

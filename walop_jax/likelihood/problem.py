@@ -173,7 +173,9 @@ class Problem:
         parts = [self._rows(engine.effect_columns(instrument, self.plan, probes, c), c) for c in self.chunks]
         return np.concatenate(parts)
 
-    def effect_columns_over_shapes(self, values: Vector, probes: Sequence[Effect]) -> Float[np.ndarray, "g d a"]:
+    def effect_columns_over_shapes(
+        self, values: Vector, probes: Sequence[Effect]
+    ) -> Float[np.ndarray, "g d a"]:
         """As `effect_columns` for one effect at many shapes, all with the same discrete choices."""
         instrument = self.model.instrument(values)
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *probes)

@@ -115,10 +115,10 @@ def simulate(
 ) -> Simulated:
     """Simulate a calibration run: the same plan, seed and effects give the same set, bit for bit.
 
-    `instrument` is the true one (default: drawn from the priors of the base model); its standards are replaced
-    by those of the simulated catalogue, `effects` are added to it. `noiseless` leaves the expected counts as
-    they are and states the errors that they would have. Effects that depend on the run are made with
-    `plan.context()`.
+    `instrument` is the true one (default: drawn from the priors of the base model); its standards are
+    replaced by those of the simulated catalogue, `effects` are added to it. `noiseless` leaves the expected
+    counts as they are and states the errors that they would have. Effects that depend on the run are made
+    with `plan.context()`.
     """
     build, stars, sky, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
     sources, standards = _catalogue(plan, stars)

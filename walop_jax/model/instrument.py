@@ -35,9 +35,9 @@ class MoonSky(Component):
 class Standards(Component):
     """Catalogue Stokes parameters of the standard stars, in the equatorial frame."""
 
+    names: tuple[str, ...] = eqx.field(static=True)
     q: Float[Array, " s"] = param(unit="", about="catalogue q", source="SOURCES table", scale=2e-4)
     u: Float[Array, " s"] = param(unit="", about="catalogue u", source="SOURCES table", scale=2e-4)
-    names: tuple[str, ...] = eqx.field(static=True)
 
     def labels(self, field: str) -> Sequence[str]:
         """One name per star."""
@@ -81,8 +81,8 @@ class Pupil(Component):
 class Half(Component):
     """One half of the pupil: wedge, half-wave plate, Wollaston prism."""
 
-    wedge: Scalar = param(unit="rad", about="wedge angle", source=CONTRACT, width=0.001, optical=True)
     plate: HalfWavePlate
+    wedge: Scalar = param(unit="rad", about="wedge angle", source=CONTRACT, width=0.001, optical=True)
     efficiency: Scalar = param(
         unit="", about="η of the analysers ½(1, ±η, 0, 0)", source=CONTRACT, width=0.0003
     )
@@ -92,10 +92,10 @@ class Half(Component):
 class Throughput(Component):
     """Throughput of each camera as a Legendre series over the field (total degree `degree`)."""
 
+    degree: int = eqx.field(static=True)
     coefficients: Float[Array, "4 t"] = param(
         unit="", about="Legendre coefficient P_i(x/0.3°) P_j(y/0.3°)", source=CONTRACT, scale=0.02, loose=0.5
     )
-    degree: int = eqx.field(static=True)
 
     def labels(self, field: str) -> Sequence[str]:
         """Camera and exponents: n0.p21 is camera N0, second degree in X, first in Y."""
@@ -138,8 +138,8 @@ def zero_order_quartz(mgf2: float, wavelength: float = 0.62) -> float:
     from walop_jax.model import materials as m
 
     lam = jnp.asarray(wavelength)
-    dn_mgf2 = float(m.MGF2_E.index(lam) - m.MGF2_O.index(lam))
-    dn_quartz = float(m.QUARTZ_E.index(lam) - m.QUARTZ_O.index(lam))
+    dn_mgf2 = float(m.MGF2_E.refractive_index(lam) - m.MGF2_O.refractive_index(lam))
+    dn_quartz = float(m.QUARTZ_E.refractive_index(lam) - m.QUARTZ_O.refractive_index(lam))
     return (mgf2 * dn_mgf2 - 0.5 * wavelength) / dn_quartz
 
 
@@ -168,17 +168,23 @@ def nominal_instrument(
     coefficients = np.zeros((4, len(legendre.terms(throughput_degree))))
     coefficients[:, 0] = throughput
     names, q, u = zip(*standards, strict=True) if standards else ((), (), ())
-    plate = HalfWavePlate(quartz=quartz, mgf2=mgf2)
+    number = jnp.asarray
+    plate = HalfWavePlate(quartz=number(quartz), mgf2=number(mgf2))
+    halves = [
+        Half(wedge=number(sign * wedge), plate=plate, efficiency=number(0.999), fast_axis=axis)
+        for sign, axis in zip((-1.0, 1.0), FAST_AXES, strict=True)
+    ]
+    lens = 0.0 if name == "WALOP-LAB" else 0.012
     return Instrument(
-        sky=MoonSky(depolarisation=0.8),
-        standard=Standards(q=np.asarray(q, float), u=np.asarray(u, float), names=tuple(names)),
+        sky=MoonSky(depolarisation=number(0.8)),
+        standard=Standards(names=tuple(names), q=number(np.array(q, float)), u=number(np.array(u, float))),
         polariser=Polariser(),
-        collimator=Collimator(diattenuation=0.0 if name == "WALOP-LAB" else 0.012, q=0.0, u=0.0),
+        collimator=Collimator(diattenuation=number(lens), q=number(0.0), u=number(0.0)),
         chwp=plate,
-        pupil=Pupil(magnification=magnification, distortion=distortion),
-        half1=Half(wedge=-wedge, plate=plate, efficiency=0.999, fast_axis=FAST_AXES[0]),
-        half2=Half(wedge=+wedge, plate=plate, efficiency=0.999, fast_axis=FAST_AXES[1]),
-        throughput=Throughput(coefficients=coefficients, degree=throughput_degree),
+        pupil=Pupil(magnification=number(magnification), distortion=number(distortion)),
+        half1=halves[0],
+        half2=halves[1],
+        throughput=Throughput(degree=throughput_degree, coefficients=number(coefficients)),
         effects=effects,
         plates=plates,
     )

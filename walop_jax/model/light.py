@@ -56,11 +56,16 @@ def _stack(
 ) -> tuple[Plate, ...]:
     axis = jnp.full_like(wavelength, jnp.deg2rad(fast_axis))
     stack: tuple[Plate, ...] = (
-        Plate(plate.quartz, materials.QUARTZ_O.index(wavelength), materials.QUARTZ_E.index(wavelength), axis),
+        Plate(
+            plate.quartz,
+            materials.QUARTZ_O.refractive_index(wavelength),
+            materials.QUARTZ_E.refractive_index(wavelength),
+            axis,
+        ),
         Plate(
             plate.mgf2,
-            materials.MGF2_O.index(wavelength),
-            materials.MGF2_E.index(wavelength),
+            materials.MGF2_O.refractive_index(wavelength),
+            materials.MGF2_E.refractive_index(wavelength),
             axis + 0.5 * jnp.pi,
         ),
     )
@@ -90,7 +95,7 @@ def plate_matrices(
     """
     wavelength = node_wavelengths(instrument, plan)
     direction = _pupil_direction(instrument, plan, x, y)
-    glass = materials.BK7.index(wavelength)
+    glass = materials.BK7.refractive_index(wavelength)
     cases: dict[float | str, tuple[str, tuple[Nodes, Nodes], tuple[Plate, ...]]] = {}
     for where, half in zip(("half1", "half2"), instrument.halves, strict=True):
         behind = optics.behind_wedge(direction, half.wedge, glass)

@@ -24,7 +24,7 @@ class Sellmeier(NamedTuple):
     strength: tuple[float, ...]
     pole: tuple[float, ...]
 
-    def index(self, wavelength: Float[Array, ...]) -> Float[Array, ...]:
+    def refractive_index(self, wavelength: Float[Array, ...]) -> Float[Array, ...]:
         """Refractive index at `wavelength` (µm)."""
         square = wavelength**2
         terms = sum(b * square / (square - c) for b, c in zip(self.strength, self.pole, strict=True))

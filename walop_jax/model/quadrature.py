@@ -12,6 +12,8 @@ Source      Golub & Welsch 1969, Math. Comp. 23, 221; discrete measures by the L
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from jaxtyping import Float
 
@@ -29,7 +31,7 @@ def tabulated_measure(wavelength: Vector, throughput: Vector) -> Rule:
         return wavelength, np.ones(1)
     pieces = [
         np.linspace(a, b, max(1, int(np.ceil((b - a) / FINEST - 1e-6))), endpoint=False)
-        for a, b in zip(wavelength[:-1], wavelength[1:], strict=True)
+        for a, b in itertools.pairwise(wavelength)
     ]
     fine = np.concatenate([*pieces, wavelength[-1:]])
     gap = np.diff(fine)

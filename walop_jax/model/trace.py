@@ -29,7 +29,7 @@ STOKES = ("I", "Q", "U", "V")
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """The light at one place: `rows` of `value` are one beam or the two halves, `columns` Stokes or cameras."""
+    """The light at one place: rows of `value` are one beam or two halves, columns Stokes or cameras."""
 
     name: str
     about: str

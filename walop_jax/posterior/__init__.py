@@ -3,9 +3,20 @@
 This room samples and says how far to believe it. It draws no figures, and knows no FITS.
 """
 
-from walop_jax.posterior.convergence import Convergence
-from walop_jax.posterior.sampling import Options, PosteriorSample, sample
 from walop_jax.posterior.accuracy import Accuracy
-from walop_jax.posterior.surrogate import Surrogate, build_surrogate
+from walop_jax.posterior.building import build_surrogate
+from walop_jax.posterior.convergence import Convergence
+from walop_jax.posterior.result import Options, PosteriorSample, Progress
+from walop_jax.posterior.sampling import sample
+from walop_jax.posterior.surrogate import Surrogate
 
-__all__ = ["Accuracy", "Convergence", "Options", "PosteriorSample", "Surrogate", "build_surrogate", "sample"]
+__all__ = [
+    "Accuracy",
+    "Convergence",
+    "Options",
+    "PosteriorSample",
+    "Progress",
+    "Surrogate",
+    "build_surrogate",
+    "sample",
+]

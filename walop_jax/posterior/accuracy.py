@@ -29,18 +29,24 @@ class Accuracy:
     @property
     def exact_enough(self) -> bool:
         """Whether sampling the surrogate is sampling the posterior: means to 0.1 σ, widths to 5 %."""
-        shift, width = (abs(value) - 3.0 * error for value, error in (self.shift[1:], (self.width[1] - 1.0, self.width[2])))
+        shift, width = (
+            abs(value) - 3.0 * error
+            for value, error in (self.shift[1:], (self.width[1] - 1.0, self.width[2]))
+        )
         return bool(np.isfinite(self.spread)) and self.efficiency > 0.5 and shift < 0.1 and width < 0.05
 
 
 def check(target: Target, surrogate: Surrogate, z: Draws, rng: np.random.Generator) -> Accuracy:
     """Compare with the exact posterior at coordinates z, which are draws of the surrogate's posterior.
 
-    With ρ = ln(exact/surrogate) and a standardised coefficient t, to first order the exact mean is off by Cov(ρ, t)
-    and the exact variance by the factor 1 + Cov(ρ, t²).
+    With ρ = ln(exact/surrogate) and a standardised coefficient t, to first order the exact mean is off by
+    Cov(ρ, t) and the exact variance by the factor 1 + Cov(ρ, t²).
     """
     x, weight = surrogate.draw(z, rng), surrogate.weight(z)
-    exact = [w * target.data(one) + float(np.sum(target.prior_rows(one) ** 2)) for w, one in zip(weight, x, strict=True)]
+    exact = [
+        w * target.data(one) + float(np.sum(target.prior_rows(one) ** 2))
+        for w, one in zip(weight, x, strict=True)
+    ]
     ln_ratio = -0.5 * (np.array(exact) - surrogate.joint(z, x))
     ln_ratio = ln_ratio - ln_ratio.mean()
     importance = np.exp(np.clip(ln_ratio, -50.0, 50.0))

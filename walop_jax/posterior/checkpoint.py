@@ -1,7 +1,7 @@
 """Checkpoints: a folder of HDF5 files, one per block of steps, each appearing whole or not at all.
 
-    surrogate.h5        the surrogate that is sampled, so that a resumed run samples the very same function
-    block-000001.h5     coordinates and ln p of all ensembles, walkers and random state at the end of the block
+    surrogate.h5       the surrogate that is sampled, so that a resumed run samples the very same function
+    block-000001.h5    coordinates and ln p of all ensembles; walkers and random state at its end
 
 Every file carries the fingerprint of data, model, priors, settings and versions. A file is written beside its
 place, flushed and renamed, and never touched again: a kill at any moment loses the block being computed.
@@ -65,7 +65,10 @@ class Checkpoints:
         return self.folder.is_dir() and any(self.folder.glob("*.h5"))
 
     def clear(self) -> None:
-        """Remove the checkpoints of an earlier run; the surrogate last, so that what is left is still whole."""
+        """Remove the checkpoints of an earlier run.
+
+        The surrogate last, so that what is left is still whole.
+        """
         for path in (*sorted(self.folder.glob("block-*.h5"), reverse=True), self.folder / SURROGATE):
             path.unlink(missing_ok=True)
 
@@ -87,7 +90,9 @@ class Checkpoints:
 
     # ------------------------------------------------------------------------------------------- the blocks
 
-    def save_block(self, number: int, walkers: Sequence[Walkers], blocks: Sequence[Block], seconds: float) -> None:
+    def save_block(
+        self, number: int, walkers: Sequence[Walkers], blocks: Sequence[Block], seconds: float
+    ) -> None:
         """Write one block of all ensembles."""
         arrays: dict[str, Any] = {
             "coordinates": np.stack([block.coordinates for block in blocks]),
@@ -130,17 +135,21 @@ class Checkpoints:
     def _read(self, path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         try:
             with h5py.File(path, "r") as file:
-                attributes = dict(file.attrs)
-                arrays = {name: np.asarray(file[name]) for name in file}
+                attributes: dict[str, Any] = {str(key): value for key, value in file.attrs.items()}
+                arrays = {str(name): np.asarray(file[str(name)]) for name in file}
         except (OSError, RuntimeError, KeyError) as error:
             raise fail(f"cannot be read: {error}", file=path, advice=_ADVICE) from error
         if attributes.pop("format", None) != FORMAT:
             raise fail("is a checkpoint of another format", file=path, advice=_ADVICE)
         if attributes.pop("content", None) != digest(*(arrays[name] for name in sorted(arrays))):
             raise fail("the content is not what was written", file=path, advice=_ADVICE)
-        before = json.loads(attributes.pop("fingerprint", "{}"))
-        changed = sorted(k for k in {*before, *self.fingerprint} if before.get(k) != self.fingerprint.get(k))
+        before: dict[str, str] = json.loads(str(attributes.pop("fingerprint", "{}")))
+        keys = sorted({*before, *self.fingerprint})
+        changed = [key for key in keys if before.get(key) != self.fingerprint.get(key)]
         if changed:
-            what = ", ".join(f"{k} ({before.get(k, 'none')[:12]} → {self.fingerprint.get(k, 'none')[:12]})" for k in changed)
+            what = ", ".join(
+                f"{k} ({before.get(k, 'none')[:12]} → {self.fingerprint.get(k, 'none')[:12]})"
+                for k in changed
+            )
             raise fail(f"was sampled with other {what}", file=path, advice=_ADVICE)
         return arrays, attributes

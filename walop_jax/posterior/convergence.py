@@ -1,16 +1,17 @@
 """Whether an ensemble has run long enough, and if not, how far it has to go.
 
-Autocorrelation   τ per quantity, averaged over walkers of all ensembles (Goodman & Weare 2010, CAMCoS 5, 65; Sokal's
-                  window with c = 5). Walkers of one ensemble are not independent chains, so R̂ is taken between
-                  ensembles only.
-R̂                √(1 + Var(means of half ensembles) / mean variance), of the values and of their distance from the
-                  median (Gelman & Rubin 1992; folded as in Vehtari et al. 2021, Bayesian Anal. 16, 667).
-Rules             N > 50 τ; τ the same within 25 % after N/4, N/2 and N steps; R̂ < 1.01.
+Autocorrelation   τ per quantity, averaged over walkers of all ensembles (Goodman & Weare 2010, CAMCoS 5, 65;
+                  Sokal's window with c = 5). Walkers of one ensemble are not independent chains, so R-hat
+                  is taken between ensembles only.
+R-hat             √(1 + Var(means of half ensembles) / mean variance), of the values and of their distance
+                  from the median (Gelman & Rubin 1992; folded: Vehtari et al. 2021, Bayesian Anal. 16, 667).
+Rules             N > 50 τ; τ the same within 25 % after N/4, N/2 and N steps; R-hat < 1.01.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -55,11 +56,13 @@ class Convergence:
         """One sentence for people."""
         if self.converged:
             return (
-                f"converged: {self.steps} steps, {self.steps / self.tau.max():.0f} τ, τ = {self.tau.max():.1f}, at least "
-                f"{self.ess.min():.0f} effective samples, R-hat {self.rhat.max():.4f}"
+                f"converged: {self.steps} steps, {self.steps / self.tau.max():.0f} τ, "
+                f"τ = {self.tau.max():.1f}, at least {self.ess.min():.0f} effective samples, "
+                f"R-hat {self.rhat.max():.4f}"
             )
         time = "" if not np.isfinite(seconds_per_step) else f" (about {self.needed * seconds_per_step:.0f} s)"
-        return f"NOT converged: {'; '.join(self.reasons)}. Go on for {self.needed} steps or more{time} with --resume"
+        reasons = "; ".join(self.reasons)
+        return f"NOT converged: {reasons}. Go on for {self.needed} steps or more{time} with --resume"
 
 
 def autocorrelation(chains: Chains) -> Float[np.ndarray, " k"]:
@@ -74,7 +77,10 @@ def autocorrelation(chains: Chains) -> Float[np.ndarray, " k"]:
 
 
 def between(chains: Chains) -> Float[np.ndarray, " k"]:
-    """R̂ between the halves of all ensembles, worst of plain and folded; NaN for a quantity that never moved."""
+    """R̂ between the halves of all ensembles, worst of plain and folded.
+
+    NaN for a quantity that never moved.
+    """
     e, n, w, k = chains.shape
     half = n // 2
     parts = chains[:, n - 2 * half :].reshape(2 * e, half * w, k)
@@ -96,7 +102,9 @@ def assess(chains: Chains, names: tuple[str, ...], thin: int = 1) -> Convergence
         nothing = np.full(k, np.nan)
         needed = LEAST_STORED * thin - steps
         reason = f"{steps} steps are too few to judge"
-        return Convergence(names, steps, nothing, (np.nan,) * 3, np.zeros(k), nothing, needed, (reason,))
+        return Convergence(
+            names, steps, nothing, (np.nan, np.nan, np.nan), np.zeros(k), nothing, needed, (reason,)
+        )
     quarter, half, tau = (autocorrelation(chains[:, :m]) * thin for m in (n // 4, n // 2, n))
     rhat = between(chains)
     history = (float(np.max(quarter)), float(np.max(half)), float(np.max(tau)))
@@ -105,9 +113,11 @@ def assess(chains: Chains, names: tuple[str, ...], thin: int = 1) -> Convergence
         stuck = [name for name, value in zip(names, tau, strict=True) if not np.isfinite(value)]
         return Convergence(names, steps, tau, history, np.zeros(k), rhat, steps, (f"{stuck[0]} never moved",))
     if steps <= LENGTHS * history[2]:
-        reasons.append(f"{steps} steps are {steps / history[2]:.0f} τ of {history[2]:.0f}, fewer than {LENGTHS:.0f}")
+        reasons.append(
+            f"{steps} steps are {steps / history[2]:.0f} τ of {history[2]:.0f}, fewer than {LENGTHS:.0f}"
+        )
         needed = max(needed, math.ceil(1.1 * LENGTHS * history[2]) - steps)
-    changes = [abs(b / a - 1.0) if a > 0 else np.inf for a, b in zip(history, history[1:], strict=False)]
+    changes = [abs(b / a - 1.0) if a > 0 else np.inf for a, b in itertools.pairwise(history)]
     if not max(changes) < STABLE:
         reasons.append("τ still changes: " + " → ".join(f"{value:.0f}" for value in history))
         needed = max(needed, steps)

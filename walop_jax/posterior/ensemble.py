@@ -2,14 +2,15 @@
 
 Moves, in coordinates in which the Laplace approximation is the unit normal:
 
-laplace   half of the steps propose a draw of N(0, 1.1² 1), whatever the position (accepted with the ratio of importance
-          weights), half are `de`. Where Laplace holds, neighbouring steps are all but independent; where it
-          does not, differential evolution carries the ensemble.
+laplace   half of the steps propose a draw of N(0, 1.1² 1), whatever the position (accepted with the ratio of
+          importance weights), half are `de`. Where Laplace holds, neighbouring steps are all but independent;
+          where it does not, differential evolution carries the ensemble.
 de        differential evolution (ter Braak 2006, Stat. Comput. 16, 239), one step in ten with γ = 1.
 stretch   emcee's default (Goodman & Weare 2010).
 
-emcee's DESnookerMove is not offered: in emcee 3.1.6 its proposals carry half the logarithm of the Jacobian that they need
-(dfm/emcee pull request 531), and widths come out 8 % too small at 16 dimensions with 20 % of it.
+emcee's DESnookerMove is not offered: in emcee 3.1.6 its proposals carry half the logarithm of the Jacobian
+that they need (dfm/emcee pull request 531), and widths come out 8 % too small at 16 dimensions with 20 % of
+it.
 """
 
 from __future__ import annotations
@@ -57,12 +58,20 @@ def moves(name: str) -> list[tuple[Any, float]]:
     """The mixture of moves of that name; ValueError for another."""
     evolution = [(emcee.moves.DEMove(), 1.0 - JUMPS), (emcee.moves.DEMove(gamma0=1.0), JUMPS)]
     if name == "laplace":
-        return [(emcee.moves.MHMove(_laplace_draws), 0.5), *((move, 0.5 * share) for move, share in evolution)]
+        return [
+            (emcee.moves.MHMove(_laplace_draws), 0.5),
+            *((move, 0.5 * share) for move, share in evolution),
+        ]
     if name == "de":
         return evolution
     if name == "stretch":
         return [(emcee.moves.StretchMove(), 1.0)]
     raise ValueError(f"unknown moves {name!r}: choose one of {', '.join(MOVES)}")
+
+
+def _state(state: Any) -> tuple[str, np.ndarray, int, int, float]:
+    assert isinstance(state, tuple), "the state of a Mersenne twister"
+    return state  # pyright: ignore[reportReturnType]
 
 
 def start(log_posterior: LogPosterior, count: int, dimension: int, seed: int, number: int) -> Walkers:
@@ -73,7 +82,7 @@ def start(log_posterior: LogPosterior, count: int, dimension: int, seed: int, nu
     value = log_posterior(coordinates)
     if not np.all(np.isfinite(value)):
         raise ValueError("the posterior is not finite around the fit")
-    return Walkers(coordinates, value, random.get_state(legacy=True))  # pyright: ignore[reportArgumentType]
+    return Walkers(coordinates, value, _state(random.get_state(legacy=True)))
 
 
 def advance(
@@ -88,5 +97,5 @@ def advance(
     for i, state in enumerate(run):
         coordinates[i], values[i] = state.coords, state.log_prob
     accepted = float(np.mean(sampler.backend.accepted)) / stored  # emcee counts the steps that it stores
-    last = Walkers(coordinates[-1].copy(), values[-1].copy(), sampler.random_state)
+    last = Walkers(coordinates[-1].copy(), values[-1].copy(), _state(sampler.random_state))
     return last, Block(coordinates, values, accepted)

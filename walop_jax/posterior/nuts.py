@@ -1,7 +1,7 @@
 """The exact posterior of all coefficients by NUTS, the cross-check of everything else in this room.
 
-In coordinates whitened by the covariance of the fit, x = x̂ + L w with L Lᵀ = C; no surrogate, nothing marginalised but
-the fluxes. Needs blackjax (`pip install walop-jax[nuts]`).
+In coordinates whitened by the covariance of the fit, x = x̂ + L w with L Lᵀ = C; no surrogate, nothing
+marginalised but the fluxes. Needs blackjax (`pip install walop-jax[nuts]`).
 Source   Hoffman & Gelman 2014, JMLR 15, 1593; blackjax (Cabezas et al. 2024, arXiv 2402.10797).
 """
 
@@ -29,7 +29,10 @@ TARGET_ACCEPTANCE = 0.8
 
 @dataclasses.dataclass(frozen=True)
 class NutsSample:
-    """Draws of the free parameters, one chain; `seconds` without warm-up and compilation, which `preparation` took."""
+    """Draws of the free parameters, one chain.
+
+    `seconds` without warm-up and compilation, which `preparation` took.
+    """
 
     names: tuple[str, ...]
     draws: Float[np.ndarray, "n f"]
@@ -48,16 +51,23 @@ def _kernel() -> Any:
 
 
 def whitened(target: Target) -> tuple[Callable[..., Float[Array, ""]], tuple[Any, ...]]:
-    """ln p of whitened coordinates and the arrays that it takes after them, so that nothing is compiled in."""
+    """ln p of whitened coordinates, and the arrays that it takes after them: none is compiled in."""
     problem = target.problem
     if len(problem.chunks) != 1:
-        raise ValueError("NUTS is a cross-check for sets that fit into one chunk: choose larger points_per_chunk")
+        raise ValueError(
+            "NUTS is a cross-check for sets that fit into one chunk: choose larger points_per_chunk"
+        )
     template, scale = problem.model.template, target.scale
     root = scale[:, None] * np.linalg.cholesky(target.covariance / np.outer(scale, scale))
     first, select = target.values(target.centre), problem.model.selection()
     offset = target.prior_rows(target.centre)
     slope = np.stack([target.prior_rows(target.centre + column) - offset for column in root.T], axis=1)
-    arrays = (template, problem.plan, problem.chunks[0], *(jnp.asarray(a) for a in (first, select @ root, offset, slope)))
+    arrays = (
+        template,
+        problem.plan,
+        problem.chunks[0],
+        *(jnp.asarray(a) for a in (first, select @ root, offset, slope)),
+    )
 
     residuals = inspect.unwrap(engine.residuals)  # to be compiled with the sampler, not on its own
 
@@ -76,7 +86,10 @@ def sample_nuts(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> NutsSample:
-    """One chain from the fit. Raises ImportError without blackjax, ValueError for data in more than one chunk."""
+    """One chain from the fit.
+
+    Raises ImportError without blackjax, ValueError for data in more than one chunk.
+    """
     blackjax = _kernel()
     log_density, arrays = whitened(target)
     began = time.perf_counter()

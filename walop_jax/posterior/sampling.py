@@ -6,132 +6,34 @@ import dataclasses
 import importlib.metadata
 import os
 import time
-from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from walop_jax.data.errors import fail
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.problem import Problem
-from walop_jax.posterior.accuracy import Accuracy, check
+from walop_jax.posterior.accuracy import check
+from walop_jax.posterior.building import build_surrogate
 from walop_jax.posterior.checkpoint import Checkpoints, digest
 from walop_jax.posterior.convergence import Chains, Convergence, assess
-from walop_jax.posterior.ensemble import MOVES, Block, Walkers, advance, start
-from walop_jax.posterior.surrogate import Surrogate, build_surrogate
-from walop_jax.posterior.target import LARGEST_SAMPLED, Target, choose_sampled
+from walop_jax.posterior.ensemble import Block, Walkers, advance, start
+from walop_jax.posterior.result import BURN_IN, INFLATION, Options, PosteriorSample, Progress, Report
+from walop_jax.posterior.surrogate import Surrogate
+from walop_jax.posterior.target import Target, choose_sampled
 
 Vector = Float[np.ndarray, " n"]
 
-BURN_IN = 0.2  # share of the steps that is not used
-INFLATION = "noise.ln_f"
 SOFTWARE = ("walop-jax", "jax", "jaxlib", "numpy", "emcee")
-
-
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """How to sample. `interval` is the length of a block, hence of what a kill can lose, in steps.
-
-    `walkers` 0 stands for twice the number of sampled coefficients, at least 64. `parameters` names what is
-    sampled (None: the physics coefficients). `checks` is the number of draws compared with the exact posterior.
-    """
-
-    seed: int = 0
-    walkers: int = 0
-    interval: int = 500
-    maximum_steps: int = 100_000
-    thin: int = 2
-    moves: str = MOVES[0]
-    order: int = 3
-    inflate: bool = False
-    draws: int = 4000
-    checks: int = 256
-    ensembles: int = 2
-    parameters: tuple[str, ...] | None = None
-
-    def __post_init__(self) -> None:
-        if self.moves not in MOVES:
-            raise ValueError(f"unknown moves {self.moves!r}: choose one of {', '.join(MOVES)}")
-        if self.ensembles < 2:
-            raise ValueError("at least two independent ensembles are needed to judge convergence")
-        if min(self.interval, self.thin, self.draws, self.checks, self.maximum_steps) < 1:
-            raise ValueError("interval, thin, draws, checks and maximum_steps must be 1 or more")
-        if self.interval % self.thin:
-            raise ValueError(f"interval {self.interval} must be a multiple of thin {self.thin}")
-        if self.parameters is not None and len(self.parameters) > LARGEST_SAMPLED:
-            raise ValueError(f"{len(self.parameters)} parameters to sample: at most {LARGEST_SAMPLED}")
-
-
-class Progress(NamedTuple):
-    """What a progress bar shows: what is being done, how much of it is done (0 … 1), τ in steps, ESS."""
-
-    stage: str
-    share: float
-    tau: float = float("nan")
-    ess: float = float("nan")
-
-
-Report = Callable[[Progress], None]
-
-
-@dataclasses.dataclass(frozen=True)
-class PosteriorSample:
-    """The posterior of all coefficients.
-
-    `draws` holds (ensemble, draw, parameter) of all parameters in tree order, tied and frozen ones included;
-    `mean` and `covariance` use every kept step. `trusted` needs convergence and a surrogate that is exact enough.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    draws: Float[np.ndarray, "e d n"]
-    log_posterior: Float[np.ndarray, "e d"]
-    ln_f: Float[np.ndarray, "e d"] | None
-    mean: Vector
-    covariance: Float[np.ndarray, "n n"]
-    chains: Chains
-    sampled: tuple[str, ...]
-    thin: int
-    convergence: Convergence
-    accuracy: Accuracy
-    acceptance: float
-    seconds: float
-    fingerprint: dict[str, str]
-
-    @property
-    def trusted(self) -> bool:
-        """Whether the posterior may be believed."""
-        return self.convergence.converged and self.accuracy.exact_enough
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What does not hold, in words."""
-        found = [] if self.convergence.converged else [self.convergence.message(self.seconds_per_step)]
-        if not self.accuracy.exact_enough:
-            a = self.accuracy
-            found.append(
-                f"the surrogate differs from the exact posterior: {a.shift[0]} by {a.shift[1]:+.2f} ± {a.shift[2]:.2f} σ, "
-                f"width of {a.width[0]} by a factor {a.width[1]:.2f} ± {a.width[2]:.2f}, weights {a.efficiency:.2f} "
-                "effective; sample fewer or better determined coefficients, or use NUTS"
-            )
-        return tuple(found)
-
-    @property
-    def seconds_per_step(self) -> float:
-        """Time per step of all ensembles."""
-        return self.seconds / max(self.convergence.steps / (1.0 - BURN_IN), 1.0)
-
-    def value(self, name: str) -> tuple[float, float]:
-        """Mean and standard deviation of a coefficient."""
-        i = self.names.index(name)
-        return float(self.mean[i]), float(np.sqrt(self.covariance[i, i]))
 
 
 def fingerprint(problem: Problem, target: Target, options: Options) -> dict[str, str]:
     """Hashes of everything that decides the chain."""
     model = problem.model
     data = [np.asarray(part) for chunk in problem.chunks for part in chunk if part is not None]
-    plan = [np.asarray(part) for part in (problem.plan.wavelength, problem.plan.node_weight, problem.plan.teff)]
+    plan = [
+        np.asarray(part) for part in (problem.plan.wavelength, problem.plan.node_weight, problem.plan.teff)
+    ]
     exposures = [np.asarray(part) for part in problem.plan.exposures if part is not None]
     parameters = [(p.name, p.start, p.free, p.tie, p.scale) for p in model.parameters]
     priors = [(p.name, p.prior, p.loose) for p in model.parameters]
@@ -140,12 +42,11 @@ def fingerprint(problem: Problem, target: Target, options: Options) -> dict[str,
         del chain[name]
     versions = {name: _version(name) for name in SOFTWARE}
     return {
-        "data": digest(*data, *plan, *exposures, problem.plan.settings),
-        "model": digest(model.name, parameters, [type(e).__name__ for e in model.template.effects], model.template.plates),
-        "priors": digest(priors),
-        "fit": digest(np.round(target.centre, 12), target.noise_scale),
-        "settings": digest(sorted(chain.items(), key=lambda item: item[0])),
-        "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
+        "data": digest(*data, *plan, *exposures, problem.plan.settings), "model": digest(model.name,
+        parameters, [type(e).__name__ for e in model.template.effects], model.template.plates), "priors":
+        digest(priors), "fit": digest(np.round(target.centre, 12), target.noise_scale), "settings":
+        digest(sorted(chain.items(), key=lambda item: item[0])), "versions": ", ".join(f"{name} {version}"
+        for name, version in versions.items()),
     }  # fmt: skip
 
 
@@ -178,8 +79,6 @@ def sample(
     if folder is not None:
         checkpoints = Checkpoints(folder, fingerprint(problem, target, options))
         if checkpoints.exists() and not resume:
-            from walop_jax.data.errors import fail
-
             raise fail("holds a chain already", file=folder, advice="go on with --resume, or --overwrite it")
     surrogate, build_seconds = _surrogate(target, options, checkpoints, report)
     run = _Run(surrogate, options, checkpoints)
@@ -192,7 +91,9 @@ def sample(
         numbers = (np.nan, np.nan) if verdict is None else (verdict.history[2], float(np.min(verdict.ess)))
         report(Progress("sampling", min(run.steps / max(goal, 1), 1.0), *numbers))
         run.go_on()
-    report(Progress("comparing with the exact posterior", 1.0, verdict.history[2], float(np.min(verdict.ess))))
+    report(
+        Progress("comparing with the exact posterior", 1.0, verdict.history[2], float(np.min(verdict.ess)))
+    )
     return _finish(target, run, verdict, options, build_seconds)
 
 
@@ -226,7 +127,9 @@ class _Run:
         d = surrogate.dimension
         count = options.walkers or max(64, 2 * d)
         if count < 2 * d or count % 2:
-            raise ValueError(f"{count} walkers for {d} sampled coefficients: an even number of at least {2 * d}")
+            raise ValueError(
+                f"{count} walkers for {d} sampled coefficients: an even number of at least {2 * d}"
+            )
         self.walkers: list[Walkers] = []
         for number in range(options.ensembles):
             self.walkers.append(start(self.log_posterior, count, d, options.seed, number))

@@ -6,19 +6,21 @@ near-linear ones in whitened coordinates s,
     x = x̂ + A z + (C_λφ C_φφ⁻¹) A z + S s          A Aᵀ = C_φφ,  S Sᵀ = C_λλ − C_λφ C_φφ⁻¹ C_φλ   (Laplace)
     r(z, s) ≈ r₀ + Γ y,    y = (h, s),    h = (1, z_i, z_i z_j, and z_i z_j z_k where the model bends most)
 
-Γ is fitted by least squares to exact residuals at design points. Only the Gram matrix of the exact residuals is
-kept, so χ² = yᵀ Q y costs the same for 10⁴ and 10⁹ data. s is marginalised:
+Γ is fitted by least squares to exact residuals at design points (`building`). Only the Gram matrix of the
+exact residuals is kept, so χ² = yᵀ Q y costs the same for 10⁴ and 10⁹ data. s is marginalised:
 
     −2 ln p(z) = h (Q_hh − Q_hs Q_ss⁻¹ Q_sh) h + z · ∇_z ln det H_ss
     s | z ~ N(−Q_ss⁻¹ Q_sh h − ½ ∇_s ln det H_ss, Q_ss⁻¹)
 
-H is the true half Hessian of the objective. Its determinant tilts the marginal, and the skewness behind it displaces
-the means of s from the mode; ∇ ln det H_ss = Σ_j (g(S_j) + g(−S_j) − 2 g(0)) from exact half gradients g.
+H is the true half Hessian of the objective. Its determinant tilts the marginal, and the skewness behind it
+displaces the means of s from the mode; ∇ ln det H_ss = Σ_j (g(S_j) + g(−S_j) − 2 g(0)) from exact half
+gradients g.
 
 With noise inflation the errors of the data are times f, and Q_ss = D/f² + P is diagonal in the common
 eigenvectors of D and P; − n ln f is added, ln f having the prior N(0, 1). Its coordinate is ln f √(2n).
 
-`accuracy.check` compares with the exact posterior, all coefficients, at draws of the surrogate's own posterior.
+`accuracy.check` compares with the exact posterior, all coefficients together, at draws of the surrogate's.
+
 Source   Laplace marginals: Tierney & Kadane 1986, JASA 81, 82. Compression as in reduced-order quadrature:
          Canizares et al. 2013, Phys. Rev. D 87, 124005.
 """
@@ -26,7 +28,6 @@ Source   Laplace marginals: Tierney & Kadane 1986, JASA 81, 82. Compression as i
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Callable
 from functools import partial
 
@@ -35,14 +36,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.model.compiled import compiled
-from walop_jax.posterior.target import Target, choose_sampled
 
 Matrix = Float[np.ndarray, "..."]
 Draws = Float[np.ndarray, "n k"]
 
-OVERSAMPLING = 1.5  # design points per feature
-SPREAD = 1.2  # of the design, in standard errors
-BENT = 8  # directions that get cubic terms
 LN_F_WIDTH = 1.0  # prior of ln f, the noise inflation
 
 
@@ -51,8 +48,9 @@ class Surrogate:
     """Everything needed to evaluate and to draw; `inflate` adds ln f as the last sampled coordinate.
 
     x = centre + along @ z + across @ s. `data` and `prior` are Q in the features y for the errors as given;
-    `linear` turns s into the common eigenvectors of both, with eigenvalues `share` for the data, 1 − `share` for
-    the priors, `slope` and `skew` are ∇_z and ∇_s of ln det H_ss. `pairs` and `triples` are the monomials of h.
+    `linear` turns s into the common eigenvectors of both, with eigenvalues `share` for the data, 1 −
+    `share` for the priors, `slope` and `skew` are ∇_z and ∇_s of ln det H_ss. `pairs` and `triples` are the
+    monomials of h.
     """
 
     names: tuple[str, ...]
@@ -87,10 +85,10 @@ class Surrogate:
 
     def features(self, z: Draws) -> Float[np.ndarray, "n h"]:
         """h for every draw."""
-        return np.asarray(_features(jnp.asarray(z), jnp.asarray(self.pairs), jnp.asarray(self.triples)))
+        return np.asarray(features_of(jnp.asarray(z), jnp.asarray(self.pairs), jnp.asarray(self.triples)))
 
     def log_posterior(self) -> Callable[[Draws], Float[np.ndarray, " n"]]:
-        """The jitted, batched marginal log-posterior of the sampled coordinates (+ ln f), for `vectorize=True`."""
+        """The jitted, batched marginal log-posterior of the sampled coordinates, for `vectorize=True`."""
         h = self.data.shape[0] - len(self.share)
         pairs, triples = jnp.asarray(self.pairs), jnp.asarray(self.triples)
         if self.inflate:
@@ -136,14 +134,17 @@ class Surrogate:
         return self.centre + z[:, : self.along.shape[1]] @ self.along.T + s @ self.across.T
 
     def moments(self, z: Draws) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, "f f"]]:
-        """Mean and covariance of all free parameters: E and Var of the conditional, averaged over draws (Rao–Blackwell)."""
+        """Mean and covariance of all free parameters.
+
+        E and Var of the conditional, averaged over draws (Rao–Blackwell).
+        """
         mean, variance = self._conditional(z)
         x = self.place(z, mean @ self.linear.T)
         inner = (self.across @ self.linear) * np.sqrt(variance.mean(axis=0))
         return x.mean(axis=0), np.cov(x, rowvar=False).reshape(2 * (len(self.centre),)) + inner @ inner.T
 
     def joint(self, z: Draws, x: Float[np.ndarray, "n f"]) -> Float[np.ndarray, " n"]:
-        """−2 ln posterior of the surrogate at full draws, inflation as in `Accuracy` (up to the same constant)."""
+        """−2 ln posterior of the surrogate at full draws: χ² at the errors of the draw, plus priors."""
         k = self.along.shape[1]
         offset = x - self.centre - z[:, :k] @ self.along.T
         s = np.linalg.lstsq(self.across, offset.T, rcond=None)[0].T if len(self.share) else offset[:, :0]
@@ -153,7 +154,8 @@ class Surrogate:
         return weight * np.sum((y @ self.data) * y, axis=1) + np.sum((y @ self.prior) * y, axis=1) + tilt
 
 
-def _features(z: Array, pairs: Array, triples: Array) -> Array:
+def features_of(z: Array, pairs: Array, triples: Array) -> Array:
+    """h of the module's equations, for every row of z."""
     parts = [jnp.ones((z.shape[0], 1)), z, z[:, pairs[:, 0]] * z[:, pairs[:, 1]]]
     if triples.shape[0]:
         parts.append(z[:, triples[:, 0]] * z[:, triples[:, 1]] * z[:, triples[:, 2]])
@@ -162,7 +164,7 @@ def _features(z: Array, pairs: Array, triples: Array) -> Array:
 
 @compiled
 def _plain(pairs: Array, triples: Array, schur: Array, z: Array) -> Array:
-    h = _features(z, pairs, triples)
+    h = features_of(z, pairs, triples)
     return -0.5 * jnp.sum((h @ schur) * h, axis=1)
 
 
@@ -173,136 +175,9 @@ def _inflated(
 ) -> Array:  # fmt: skip
     ln_f = z[:, -1] / jnp.sqrt(2.0 * measured)
     weight = jnp.exp(-2.0 * ln_f)
-    h = _features(z[:, :-1], pairs, triples)
+    h = features_of(z[:, :-1], pairs, triples)
     chi2 = weight * jnp.sum((h @ data) * h, axis=1) + jnp.sum((h @ prior) * h, axis=1)
     precision = weight[:, None] * share + (1.0 - share)
     pull = weight[:, None] * (h @ by_data.T) + h @ by_prior.T
     chi2 = chi2 - jnp.sum(pull**2 / precision, axis=1) + jnp.sum(jnp.log(precision), axis=1)
     return -0.5 * (chi2 + (ln_f / LN_F_WIDTH) ** 2) - measured * ln_f
-
-
-def _axes(covariance: Matrix, scale: Float[np.ndarray, " k"]) -> Matrix:
-    """A with A Aᵀ = covariance, columns along the principal axes in the units of `scale`."""
-    value, vector = np.linalg.eigh(covariance / np.outer(scale, scale))
-    return scale[:, None] * vector * np.sqrt(np.clip(value, value.max(initial=0.0) * 1e-15, None))
-
-
-def _coordinates(target: Target, sampled: Int[np.ndarray, " k"]) -> tuple[Matrix, Matrix]:
-    rest = np.setdiff1d(np.arange(len(target.free)), sampled)
-    c, scale = target.covariance, target.scale
-    own = _axes(c[np.ix_(sampled, sampled)], scale[sampled])
-    follow = np.linalg.solve(own, c[np.ix_(sampled, rest)]).T  # C_λφ A⁻ᵀ
-    along, across = np.zeros((len(c), len(sampled))), np.zeros((len(c), len(rest)))
-    along[sampled], along[rest] = own, follow
-    across[rest] = _axes(c[np.ix_(rest, rest)] - follow @ follow.T, scale[rest])
-    return along, across
-
-
-def _design(rng: np.random.Generator, points: int, width: int) -> Draws:
-    """Points ±u with u normal: odd and even parts of the residuals separate."""
-    half = SPREAD * rng.standard_normal((-(-points // 2), width))
-    return np.concatenate([half, -half])
-
-
-def _gram(target: Target, x: Float[np.ndarray, "m f"], progress: Callable[[int, int], None] | None) -> Matrix:
-    """Gram matrix of (r₀, r(x_1) − r₀, r(x_2) − r₀, …) over all data."""
-    gram, chunks = np.zeros((len(x) + 1, len(x) + 1)), target.problem.chunks
-    for number, chunk in enumerate(chunks):
-        first = target.residuals(target.centre, chunk)
-        rows = np.empty((len(x) + 1, first.size))
-        rows[0] = first
-        for m, here in enumerate(x, start=1):
-            rows[m] = target.residuals(here, chunk) - first
-            if progress is not None:
-                progress(number * len(x) + m, len(chunks) * len(x))
-        gram += rows @ rows.T
-    return gram
-
-
-def build_surrogate(
-    target: Target,
-    *,
-    sampled: Int[np.ndarray, " k"] | None = None,
-    order: int = 3,
-    inflate: bool = False,
-    seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
-) -> Surrogate:
-    """Fit the surrogate to exact residuals at about 1.5 design points per feature; `order` 2 or 3.
-
-    Raises ValueError for other orders.
-    """
-    if order not in (2, 3):
-        raise ValueError(f"order {order}: the surrogate is of order 2 or 3")
-    sampled = choose_sampled(target) if sampled is None else sampled
-    along, across = _coordinates(target, sampled)
-    k, s = along.shape[1], across.shape[1]
-    pairs = np.array(list(itertools.combinations_with_replacement(range(k), 2)), int).reshape(-1, 2)
-    triples = np.zeros((0, 3), int)
-    if order == 3:
-        triples = _cubic_terms(target, along, k)
-    n_features = 1 + k + len(pairs) + len(triples) + s
-    design = _design(np.random.default_rng([seed, 20]), int(OVERSAMPLING * n_features) + 2, k + s)
-    x = target.centre + design[:, :k] @ along.T + design[:, k:] @ across.T
-    y = np.concatenate(
-        [np.asarray(_features(*(jnp.asarray(a) for a in (design[:, :k], pairs, triples)))), design[:, k:]], axis=1
-    )
-    inverse = np.linalg.pinv(y)
-    gram = _gram(target, x, progress)
-    data = inverse @ gram[1:, 1:] @ inverse.T
-    cross = inverse @ gram[1:, 0]
-    data[0] += cross
-    data[:, 0] += cross
-    data[0, 0] += gram[0, 0]
-    prior = _prior_form(target, along, across, n_features)
-    h = n_features - s
-    linear, share = _common_axes(data[h:, h:], prior[h:, h:])
-    slope, skew = _determinant_slopes(target, along, across)
-    return Surrogate(
-        names=target.names, sampled=sampled, centre=target.centre, along=along, across=across, pairs=pairs,
-        triples=triples, data=0.5 * (data + data.T), prior=prior, linear=linear, share=share,
-        slope=slope, skew=skew, measured=target.measured, inflate=inflate,
-    )  # fmt: skip
-
-
-def _cubic_terms(target: Target, along: Matrix, k: int) -> Int[np.ndarray, "t 3"]:
-    bent = np.zeros(k)
-    for chunk in target.problem.chunks:
-        here = target.residuals(target.centre, chunk)
-        for i in range(k):
-            up, down = (target.residuals(target.centre + sign * along[:, i], chunk) for sign in (1, -1))
-            bent[i] += np.sum((0.5 * (up + down) - here) ** 2)
-    worst = np.sort(np.argsort(-bent)[:BENT])
-    return np.array(list(itertools.combinations_with_replacement(worst.tolist(), 3)), int)
-
-
-def _prior_form(target: Target, along: Matrix, across: Matrix, n_features: int) -> Matrix:
-    """Q of priors and loose pulls: they are linear in x, hence exact."""
-    first = target.prior_rows(target.centre)
-    k, s = along.shape[1], across.shape[1]
-    rows = np.zeros((len(first), n_features))
-    rows[:, 0] = first
-    for i in range(k):
-        rows[:, 1 + i] = target.prior_rows(target.centre + along[:, i]) - first
-    for i in range(s):
-        rows[:, n_features - s + i] = target.prior_rows(target.centre + across[:, i]) - first
-    return rows.T @ rows
-
-
-def _determinant_slopes(
-    target: Target, along: Matrix, across: Matrix
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " s"]]:
-    """Derivatives of ln det H_ss along both kinds of coordinates; columns of `across` make H_ss the unit matrix."""
-    total, first = np.zeros(len(target.centre)), target.half_gradient(target.centre)
-    for step in across.T:
-        total += target.half_gradient(target.centre + step) + target.half_gradient(target.centre - step) - 2.0 * first
-    return total @ along, total @ across
-
-
-def _common_axes(data: Matrix, prior: Matrix) -> tuple[Matrix, Float[np.ndarray, " s"]]:
-    """W with Wᵀ (D + P) W = 1 and Wᵀ D W diagonal."""
-    if len(data) == 0:
-        return np.zeros((0, 0)), np.zeros(0)
-    root = np.linalg.inv(np.linalg.cholesky(data + prior)).T
-    share, vector = np.linalg.eigh(root.T @ data @ root)
-    return root @ vector, np.clip(share, 0.0, 1.0)

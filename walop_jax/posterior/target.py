@@ -2,8 +2,8 @@
 
     −2 ln p(x) = χ²(data) / noise_scale² + priors + loose pulls          fluxes eliminated as in `engine`
 
-Sampled are the physics coefficients. The throughput series and the catalogue values of the standards are near-linear:
-they are marginalised in closed form (`surrogate`) and drawn afterwards.
+Sampled are the physics coefficients. The throughput series and the catalogue values of the standards are
+near-linear: they are marginalised in closed form (`surrogate`) and drawn afterwards.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ class Target:
         self.model = problem.model
         self.free = problem.model.free
         self.centre: Vector = np.asarray(result.values)[self.free]
-        self.covariance: Float[np.ndarray, "f f"] = np.asarray(result.covariance)[np.ix_(self.free, self.free)]
+        self.covariance: Float[np.ndarray, "f f"] = np.asarray(result.covariance)[
+            np.ix_(self.free, self.free)
+        ]
         self.noise_scale = result.noise_scale
         self._base, self._select = np.asarray(result.values), problem.model.selection()
         parameters = problem.model.parameters
@@ -91,7 +93,7 @@ def near_linear(target: Target) -> Int[np.ndarray, " s"]:
 
 
 def bending(target: Target, k: int) -> float:
-    """How far the residuals are from linear along parameter k: norm of their second-order part at one standard error.
+    """How far the residuals are from linear along parameter k: norm of the second order at one σ.
 
     The other parameters follow as the covariance of the fit says.
     """

@@ -74,8 +74,8 @@ def test_chwp_thickness_adds_to_the_base_model():
 def test_uncrossed_plates_add_their_retardance():
     """Turned by −90° the MgF2 lies parallel to the quartz: 2π (d₁Δn₁ + d₂Δn₂)/λ instead of the difference."""
     lam = jnp.asarray(LINE)
-    quartz = float(materials.QUARTZ_E.index(lam) - materials.QUARTZ_O.index(lam))
-    mgf2 = float(materials.MGF2_E.index(lam) - materials.MGF2_O.index(lam))
+    quartz = float(materials.QUARTZ_E.refractive_index(lam) - materials.QUARTZ_O.refractive_index(lam))
+    mgf2 = float(materials.MGF2_E.refractive_index(lam) - materials.MGF2_O.refractive_index(lam))
     layout = build_plan(builders.exposures({}), {"band": builders.monochromatic(LINE)})
     device = straight(effects=(make("hwp1_crossing", angle=-90.0),))
     matrix = np.asarray(light.plate_matrices(device, layout, jnp.asarray(0.0), jnp.asarray(0.0))["half1"][0])
@@ -91,9 +91,17 @@ def conditions(temperature=10.0, hours=0.0, width=0.0) -> Conditions:
 def stack(quartz=2407.0, mgf2=1930.0, lam=0.62) -> tuple[Plate, ...]:
     lam, zero = jnp.array([lam]), jnp.zeros(1)
     return (
-        Plate(jnp.asarray(quartz), materials.QUARTZ_O.index(lam), materials.QUARTZ_E.index(lam), zero),
         Plate(
-            jnp.asarray(mgf2), materials.MGF2_O.index(lam), materials.MGF2_E.index(lam), zero + 0.5 * jnp.pi
+            jnp.asarray(quartz),
+            materials.QUARTZ_O.refractive_index(lam),
+            materials.QUARTZ_E.refractive_index(lam),
+            zero,
+        ),
+        Plate(
+            jnp.asarray(mgf2),
+            materials.MGF2_O.refractive_index(lam),
+            materials.MGF2_E.refractive_index(lam),
+            zero + 0.5 * jnp.pi,
         ),
     )
 

@@ -1,0 +1,87 @@
+"""Differentiable end-to-end calibration of the WALOP four-camera imaging polarimeters.
+
+The public names are those of `__all__`; everything else lives in the rooms of the package and may move.
+Nothing is loaded before it is used, so that importing the package is free of charge. It computes in float64,
+which JAX must be told before anything else:
+
+    import jax
+    jax.config.update("jax_enable_x64", True)
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from walop_jax.data.calset import read_calibration_set
+    from walop_jax.data.errors import DataError
+    from walop_jax.data.write import write_calibration_set
+    from walop_jax.diagnose.workflow import diagnose as find_effects
+    from walop_jax.fit.calibration import Calibration
+    from walop_jax.fit.misfit import describe as describe_misfit
+    from walop_jax.fit.predict import Settings
+    from walop_jax.fit.refit import FitResult, refit
+    from walop_jax.likelihood.observing import ObservingPlan
+    from walop_jax.likelihood.problem import Problem, base_model
+    from walop_jax.likelihood.simulate import simulate
+    from walop_jax.model.effects import effect_by_name
+    from walop_jax.model.instrument import nominal_instrument
+    from walop_jax.model.specification import with_effects
+    from walop_jax.model.trace import Ray, trace
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Calibration",
+    "DataError",
+    "FitResult",
+    "ObservingPlan",
+    "Problem",
+    "Ray",
+    "Settings",
+    "base_model",
+    "describe_misfit",
+    "effect_by_name",
+    "find_effects",
+    "nominal_instrument",
+    "read_calibration_set",
+    "refit",
+    "simulate",
+    "trace",
+    "with_effects",
+    "write_calibration_set",
+]
+
+_HOME = {
+    "Calibration": ("fit.calibration", "Calibration"),
+    "DataError": ("data.errors", "DataError"),
+    "FitResult": ("fit.refit", "FitResult"),
+    "ObservingPlan": ("likelihood.observing", "ObservingPlan"),
+    "Problem": ("likelihood.problem", "Problem"),
+    "Ray": ("model.trace", "Ray"),
+    "Settings": ("fit.predict", "Settings"),
+    "base_model": ("likelihood.problem", "base_model"),
+    "describe_misfit": ("fit.misfit", "describe"),
+    "effect_by_name": ("model.effects", "effect_by_name"),
+    "find_effects": ("diagnose.workflow", "diagnose"),
+    "nominal_instrument": ("model.instrument", "nominal_instrument"),
+    "read_calibration_set": ("data.calset", "read_calibration_set"),
+    "refit": ("fit.refit", "refit"),
+    "simulate": ("likelihood.simulate", "simulate"),
+    "trace": ("model.trace", "trace"),
+    "with_effects": ("model.specification", "with_effects"),
+    "write_calibration_set": ("data.write", "write_calibration_set"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name from its room when it is first asked for."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    room, attribute = _HOME[name]
+    return getattr(importlib.import_module(f"{__name__}.{room}"), attribute)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

@@ -1,0 +1,57 @@
+"""From the folder of a fit back to its problem.
+
+The data are found, checked and fitted once more from where it ended.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from walop_jax.data import read_calibration_set
+from walop_jax.data.errors import fail
+from walop_jax.data.product import CalibrationProduct
+from walop_jax.fit.building import model_for
+from walop_jax.fit.refit import FitResult, fit
+from walop_jax.likelihood.problem import Problem
+
+SAME_FIT = 0.05  # standard errors
+
+
+def _locate(path: Path, run: Path) -> Path:
+    for folder in (Path(), run, run.parent):
+        if (folder / path).exists():
+            return folder / path
+    raise fail("the data of this run are not there any more", file=path, advice="put them back, or refit")
+
+
+def problem_of_run(
+    product: CalibrationProduct, run: Path, model_text: str | None = None
+) -> tuple[Problem, FitResult]:
+    """The problem and the fit behind a calibration product in the folder `run`.
+
+    Raises `DataError` when the data are missing or not those of the fit, and when the fit does not come out
+    as the product says (another model, or another version of the physics).
+    """
+    if not product.inputs:
+        raise fail("does not say what it was fitted to", file=run, advice="make it with walop-jax refit")
+    calset = read_calibration_set(*(_locate(Path(entry.path), run) for entry in product.inputs))
+    if sorted(entry.sha256 for entry in calset.inputs) != sorted(entry.sha256 for entry in product.inputs):
+        raise fail("the data have changed since the fit", file=product.inputs[0].path, advice="refit them")
+    text = "\n".join(product.model) if model_text is None else model_text
+    model = model_for(calset, text)
+    if model.names != tuple(str(name) for name in product.parameters.name):
+        raise fail(
+            "was fitted with another model", file=run, advice="run walop-jax refit with this model first"
+        )
+    problem = Problem(calset, model)
+    result = fit(problem, start=np.asarray(product.parameters.value, float))
+    away = np.abs(result.values - product.parameters.value) / np.where(result.sigma > 0, result.sigma, 1.0)
+    if not result.converged or np.max(away) > SAME_FIT:
+        name = model.names[int(np.argmax(away))]
+        raise fail(
+            f"fitted again, {name} moves by {np.max(away):.2g} standard errors", file=run,
+            advice="run walop-jax refit with this model and version first",
+        )  # fmt: skip
+    return problem, result

@@ -1,0 +1,173 @@
+"""A posterior as ArviZ InferenceData in a netCDF file, and as a table of intervals: all that knows ArviZ.
+
+Walkers of an ensemble are not independent chains, so a chain here is an ensemble: its draws are all walkers
+at steps spread evenly over the run. R-hat and effective sample sizes are those of `convergence`, kept as
+attributes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.data.atomic import atomic_path
+from walop_jax.data.errors import fail
+from walop_jax.posterior.result import INFLATION, PosteriorSample
+
+LEVELS = {"68": (0.1587, 0.8413), "95": (0.0228, 0.9772)}
+"""Quantiles of the intervals: ± 1 and ± 2 standard deviations of a normal distribution."""
+
+Column = tuple[np.ndarray, str, str]  # values, unit, description
+
+
+def _arviz() -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # its announcement of a refactoring
+        import arviz
+
+    return arviz
+
+
+def inference_data(sample: PosteriorSample) -> Any:
+    """ArviZ InferenceData: one variable per coefficient that varies, under its name, with its unit."""
+    arviz = _arviz()
+    varies = [i for i in range(len(sample.names)) if np.ptp(sample.draws[:, :, i]) > 0]
+    posterior = {sample.names[i]: sample.draws[:, :, i] for i in varies}
+    if sample.ln_f is not None:
+        posterior[INFLATION] = sample.ln_f
+    data = arviz.from_dict(posterior=posterior, sample_stats={"lp": sample.log_posterior})
+    for i in varies:
+        data.posterior[sample.names[i]].attrs["units"] = sample.units[i] or "1"
+    v = sample.convergence
+    for k, name in enumerate(sample.sampled):
+        evidence = {"autocorrelation_steps": v.tau[k], "effective_samples": v.ess[k], "r_hat": v.rhat[k]}
+        data.posterior[name].attrs.update({key: float(value) for key, value in evidence.items()})
+        data.posterior[name].attrs["sampled_by"] = "emcee"
+    data.posterior.attrs.update(
+        {
+            "converged": int(v.converged),
+            "trusted": int(sample.trusted),
+            "verdict": v.message(),
+            "steps": v.steps,
+            "acceptance": sample.acceptance,
+            "surrogate_efficiency": sample.accuracy.efficiency,
+            "surrogate_spread": sample.accuracy.spread,
+            "fingerprint": json.dumps(sample.fingerprint),
+            "fixed": json.dumps(
+                {n: float(sample.draws[0, 0, i]) for i, n in enumerate(sample.names) if i not in varies}
+            ),
+        }
+    )
+    return data
+
+
+def write_posterior(
+    path: str | os.PathLike[str], sample: PosteriorSample, *, overwrite: bool = False
+) -> None:
+    """Write `posterior.nc` (netCDF 4).
+
+    It appears whole or not at all. Raises `DataError` as `atomic_path` does.
+    """
+    data = inference_data(sample)
+    with atomic_path(path, overwrite=overwrite) as temporary, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        data.to_netcdf(str(temporary), engine="h5netcdf")
+
+
+def read_draws(path: str | os.PathLike[str], names: tuple[str, ...]) -> Float[np.ndarray, "d n"]:
+    """Draws of the parameters `names`, all chains one after the other; fixed ones keep their value.
+
+    Raises `DataError` for a file that cannot be read, is of another model or may not be trusted.
+    """
+    arviz = _arviz()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            data = arviz.from_netcdf(str(path), engine="h5netcdf")
+        posterior = data.posterior
+        fixed = json.loads(posterior.attrs["fixed"])
+        trusted = bool(posterior.attrs["trusted"])
+        held = {str(name): np.asarray(posterior[name].values).ravel() for name in posterior.data_vars}
+    except Exception as error:
+        raise fail(f"cannot be read: {error}", file=path, advice="run walop-jax sample again") from error
+    held.pop(INFLATION, None)
+    if set(held) | set(fixed) != set(names):
+        odd = sorted((set(held) | set(fixed)) ^ set(names))
+        raise fail(
+            f"is of another model ({', '.join(odd[:3])})", file=path, advice="run walop-jax sample again"
+        )
+    if not trusted:
+        verdict = posterior.attrs["verdict"]
+        raise fail(
+            f"is not to be trusted: {verdict}", file=path, advice="go on with walop-jax sample --resume"
+        )
+    count = len(next(iter(held.values())))
+    return np.stack([held.get(name, np.full(count, fixed.get(name, np.nan))) for name in names], axis=1)
+
+
+def intervals(sample: PosteriorSample) -> dict[str, Column]:
+    """Median, 68 and 95 % intervals of every coefficient that varies, as columns with unit and description.
+
+    τ, effective samples and R-hat are those of the sampled coefficients, NaN for those drawn from their
+    conditional distribution.
+    """
+    varies = [i for i in range(len(sample.names)) if np.ptp(sample.draws[:, :, i]) > 0]
+    values = sample.draws.reshape(-1, len(sample.names))[:, varies]
+    names, units = [sample.names[i] for i in varies], [sample.units[i] for i in varies]
+    if sample.ln_f is not None:
+        values = np.concatenate([values, sample.ln_f.reshape(-1, 1)], axis=1)
+        names, units = [*names, INFLATION], [*units, ""]
+    deviation = np.sqrt(np.diag(sample.covariance))[varies]
+    deviation = np.append(deviation, values[:, len(varies) :].std(axis=0))
+    columns: dict[str, Column] = {
+        "NAME": (np.array(names), "", "coefficient"),
+        "UNIT": (np.array(units), "", "unit of the numbers in this row"),
+        "MEDIAN": (np.median(values, axis=0), "", "posterior median"),
+        "SIGMA": (deviation, "", "posterior standard deviation"),
+    }
+    for label, levels in LEVELS.items():
+        for side, level in zip(("LOW", "HIGH"), levels, strict=True):
+            about = f"{'lower' if side == 'LOW' else 'upper'} end of the {label} % interval"
+            columns[f"{side}{label}"] = np.quantile(values, level, axis=0), "", about
+    v = sample.convergence
+    for name, numbers, about in (
+        ("TAU", v.tau, "autocorrelation time in steps"),
+        ("ESS", v.ess, "effective samples"),
+        ("RHAT", v.rhat, "R-hat between ensembles"),
+    ):
+        known = dict(zip(sample.sampled, numbers, strict=True))
+        columns[name] = np.array([known.get(name_, np.nan) for name_ in names]), "", about
+    return columns
+
+
+def report(sample: PosteriorSample) -> dict[str, Any]:
+    """What the run found, as plain data, for `sample.json`."""
+    v, a = sample.convergence, sample.accuracy
+    return {
+        "trusted": sample.trusted,
+        "converged": v.converged,
+        "message": v.message(sample.seconds_per_step),
+        "warnings": list(sample.warnings),
+        "steps": v.steps,
+        "walkers": int(sample.chains.shape[2]),
+        "ensembles": int(sample.chains.shape[0]),
+        "acceptance": sample.acceptance,
+        "autocorrelation_steps": {n: float(t) for n, t in zip(sample.sampled, v.tau, strict=True)},
+        "autocorrelation_history": list(v.history),
+        "effective_samples": {n: float(t) for n, t in zip(sample.sampled, v.ess, strict=True)},
+        "r_hat": {n: float(t) for n, t in zip(sample.sampled, v.rhat, strict=True)},
+        "surrogate": {
+            "draws_checked": a.count,
+            "spread": a.spread,
+            "efficiency": a.efficiency,
+            "largest_shift_sigma": list(a.shift),
+            "largest_width_factor": list(a.width),
+        },
+        "seconds": sample.seconds,
+        "fingerprint": sample.fingerprint,
+    }

@@ -1,0 +1,78 @@
+"""The instrument matrix by draws of the posterior instead of the linear propagation of a covariance."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.data.records import FilterCurve
+from walop_jax.fit.calibration import Calibration
+from walop_jax.fit.predict import Settings, analysis_vectors, settings_plan
+from walop_jax.model import light
+from walop_jax.model.specification import Model
+from walop_jax.posterior.output import read_draws
+
+DRAWS = 200
+
+
+def matrix_draws(
+    model: Model,
+    draws: Float[np.ndarray, "d n"],
+    settings: Settings,
+    filters: Mapping[str, FilterCurve],
+    x: Float[np.ndarray, " p"],
+    y: Float[np.ndarray, " p"],
+) -> Float[np.ndarray, "d p 6"]:
+    """m21, m22, m23, m31, m32, m33 at field positions (deg) for every draw of all parameters."""
+    numbers = [
+        np.nan_to_num(v, nan=-1e30) for v in (settings.teff, settings.chwp_angle, settings.temp, settings.ha)
+    ]
+    key = np.rec.fromarrays([settings.filter.astype(str), *numbers])
+    _, first, of_row = np.unique(key, return_index=True, return_inverse=True)
+    result = np.empty((len(draws), len(x), 6))
+    for k, index in enumerate(first):
+        rows = np.flatnonzero(of_row.reshape(-1) == k)
+        one = settings[index : index + 1]
+        plan = settings_plan(one, filters, model.template)
+        for i, values in enumerate(draws):
+            instrument = model.instrument(values)
+            vectors = analysis_vectors(instrument, plan, x[rows], y[rows])[:, 0]
+            matrix = light.instrument_matrix(jnp.asarray(vectors) @ light.telescope(instrument))
+            result[i, rows] = np.asarray(matrix).reshape(len(rows), 6)
+    return result
+
+
+@dataclasses.dataclass(frozen=True)
+class DrawnCalibration(Calibration):
+    """A calibration whose matrices, and their covariance, are means over draws of the posterior."""
+
+    draws: Float[np.ndarray, "d n"] = dataclasses.field(default_factory=lambda: np.empty((0, 0)))
+
+    def matrix(
+        self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings | None = None
+    ) -> tuple[Float[np.ndarray, "p 6"], Float[np.ndarray, "p 6 6"]]:
+        """As `Calibration.matrix`, by draws."""
+        settings = settings or Settings.default(len(x))
+        filters = {str(name): self.filter_curve(str(name)) for name in np.unique(settings.filter)}
+        m = matrix_draws(self.model, self.draws, settings, filters, np.asarray(x), np.asarray(y))
+        mean = m.mean(axis=0)
+        away = m - mean
+        return mean, np.einsum("dpi,dpj->pij", away, away) / (len(m) - 1)
+
+
+def with_draws(
+    calibration: Calibration, path: str | os.PathLike[str], count: int = DRAWS, seed: int = 0
+) -> DrawnCalibration:
+    """The calibration with draws from a `posterior.nc`.
+
+    `DataError` for a file of another model, or not trusted.
+    """
+    draws = read_draws(path, calibration.model.names)
+    chosen = np.random.default_rng(seed).permutation(len(draws))[:count]
+    known = {f.name: getattr(calibration, f.name) for f in dataclasses.fields(Calibration)}
+    return DrawnCalibration(**known, draws=draws[chosen])
