@@ -52,10 +52,10 @@ def residual_figure(
     left, middle, right = figure.subplots(1, 3)
     maps = [point_residuals(problem, values) for values in (before, after)]
     norm = LogNorm(0.7, max(2.0, float(np.nanmax(maps[0]))))
-    for axis, values, title in zip((left, middle), maps, ("before the fit", "after the fit"), strict=True):
-        _field_axes(axis, title)
-        shown = _scatter(axis, problem, values, norm)
-    bar = figure.colorbar(shown, ax=[left, middle], pad=0.02)
+    _field_axes(left, "before the fit")
+    _field_axes(middle, "after the fit")
+    _tiles(left, problem, maps[0], norm)
+    bar = figure.colorbar(_tiles(middle, problem, maps[1], norm), ax=[left, middle], pad=0.02)
     bar.set_label("rms residual (σ)", fontsize=8)
     bar.ax.tick_params(labelsize=7)
     middle.set_ylabel("")
@@ -87,7 +87,7 @@ def calibration_figure(
         far = float(np.nanmax(residual)) > 3.0
         low, high = (float(edge(residual)) for edge in (np.nanmin, np.nanmax))
         _field_axes(axis, title)
-        shown = _scatter(axis, problem, residual, Normalize(low, high) if far else Normalize(0.7, 1.3))
+        shown = _tiles(axis, problem, residual, Normalize(low, high) if far else Normalize(0.7, 1.3))
         bar = figure.colorbar(shown, ax=axis, pad=0.03, extend="neither" if far else "both")
         bar.set_label("rms residual (σ)", fontsize=8)
         bar.ax.tick_params(labelsize=7)
@@ -164,7 +164,7 @@ def _outer_labels(axes: Any) -> None:
         axis.label_outer()
 
 
-def _scatter(axis: Axes, problem: Problem, values: Float[np.ndarray, " p"], norm: Normalize) -> Any:
+def _tiles(axis: Axes, problem: Problem, values: Float[np.ndarray, " p"], norm: Normalize) -> Any:
     """Field points as tiles; the places of the standards, which lie between the others, are left out."""
     points, extended = problem.calset.points, problem.calset.exposures.kind != "standard"
     tiles = problem.used[:, extended].any(axis=1)

@@ -1,0 +1,62 @@
+"""`walop-jax trace`: the table of the stages, for an instrument as designed and as fitted."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from walop_jax.data import builtin_filter
+from walop_jax.data.product import read_product
+from walop_jax.fit.calibration import Calibration
+from walop_jax.model.instrument import nominal_instrument
+from walop_jax.model.trace import Ray, trace
+
+STAR = ("--x", 0.2, "--y", -0.1, "--q", 0.03, "--u", 0.01, "--teff", 5772)
+RAY = Ray(x=0.2, y=-0.1, q=0.03, u=0.01, teff=5772.0)
+
+
+def test_as_designed(call):
+    result = call("trace", *STAR, "--json")
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    stages = trace(nominal_instrument(), builtin_filter("SDSS-r"), RAY)
+    assert [stage["stage"] for stage in told] == [stage.name for stage in stages]
+    np.testing.assert_allclose(told[-1]["value"], stages[-1].value, rtol=1e-12)
+
+
+def test_as_fitted(call, run):
+    result = call("trace", run, *STAR, "--json")
+    assert result.exit_code == 0, result.output
+    calibration = Calibration.from_product(read_product(run / "calibration.fits"))
+    stages = trace(calibration.model.instrument(calibration.values), builtin_filter("SDSS-r"), RAY)
+    np.testing.assert_allclose(json.loads(result.stdout)[-1]["value"], stages[-1].value, rtol=1e-12)
+
+
+def test_the_table_has_a_line_for_every_stage(call):
+    lines = call("trace", "--angle", 30, "--chwp", 45).stdout.splitlines()
+    starts = [
+        "source",
+        "collimator",
+        "calibration plate",
+        "half-wave plates half 1",
+        "half-wave plates half 2",
+    ]
+    starts += ["Wollaston prisms", "cameras", "counts"]
+    assert [line for line in lines if not line.startswith(" ")].__len__() == len(starts)
+    for start in starts:
+        assert any(line.startswith(start) for line in lines)
+    # The polariser at 30°: Q = cos 60°, U = sin 60°, but for its extinction.
+    assert lines[1].split()[1:4] == ["1.000000", "0.499980", "0.865991"]
+
+
+@pytest.mark.parametrize("options", [("--q", 1.5), ("--instrument", "WALOP-WEST"), ("--filter", "SDSS-rr")])
+def test_wrong_usage(call, options):
+    assert call("trace", *options).exit_code == 2
+
+
+def test_a_run_that_is_not_there(call, tmp_path):
+    result = call("trace", tmp_path / "RUN")
+    assert result.exit_code == 1
+    assert "RUN" in result.stderr
