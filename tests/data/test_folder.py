@@ -49,9 +49,14 @@ def test_results_are_not_replaced_unasked(tmp_path):
 def test_an_interrupt_leaves_nothing(tmp_path, existing):
     if existing:
         fill(tmp_path / "run", "old")
-    with pytest.raises(KeyboardInterrupt), atomic_folder(tmp_path / "run", NAMES, overwrite=True) as folder:
-        (folder / "a.txt").write_text("half")
-        raise KeyboardInterrupt
+
+    def interrupted():
+        with atomic_folder(tmp_path / "run", NAMES, overwrite=True) as folder:
+            (folder / "a.txt").write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
     assert left(tmp_path) == (["run", "run/a.txt", "run/b.txt"] if existing else [])
     if existing:
         assert (tmp_path / "run" / "a.txt").read_text() == "old"

@@ -1,4 +1,4 @@
-"""Small calibration runs with everything drawn from the priors that a fit uses, noise included: for proofs of calibration.
+"""Small calibration runs, everything drawn from the priors that a fit uses: for proofs of calibration.
 
 Unlike `simulate`, the throughputs and the depolarisation of the sky have proper priors here, and errors are stated from
 expected counts, so that the posterior is exactly calibrated if the sampler is.
@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from walop_jax.data.records import Block, CalibrationSet
+from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table import TableIntensities
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.noise import PhotonNoise
@@ -72,9 +72,7 @@ class Worlds:
         expected = flux[:, :, None] * unit
         sigma = NOISE.sigma(expected)
         counts = expected + sigma * rng.standard_normal(expected.shape)
-        block = dataclasses.replace(self.block, counts=counts, sigma=sigma) if not isinstance(
-            self.block, tuple
-        ) else self.block._replace(counts=counts, sigma=sigma)
+        block = dataclasses.replace(self.block, counts=counts, sigma=sigma)
         calset = dataclasses.replace(self.blank, intensities=TableIntensities.dense(self.blank.points, block))
         return World(Problem(calset, self.model), truth)
 

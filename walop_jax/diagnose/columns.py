@@ -24,7 +24,7 @@ from walop_jax.model.specification import Model
 MANY_SHAPES = 8
 DEFAULT_WIDTH = 1.0
 
-Vector = Float[np.ndarray, " n"]
+Vector = Float[np.ndarray, " _"]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -74,7 +74,7 @@ class Design:
     @cached_property
     def projector(self) -> Projector:
         """Removes from columns what the free parameters could absorb."""
-        return Projector(self.residual, self.jacobian)
+        return Projector(self.jacobian)
 
     def padded(self, candidates: Sequence[Candidate]) -> list[Candidate]:
         """Candidates with zero rows for the priors."""

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnose.columns import Probe, effect_candidates
 from walop_jax.diagnose.design import Design
-from walop_jax.diagnose.score import Score, ScoreTable, _whitened
+from walop_jax.diagnose.score import Score, ScoreTable, whitened
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.problem import Problem
 from walop_jax.model.effects import Context, Effect
@@ -135,10 +135,25 @@ def equivalents(
     change = bare.residual[: bare.rows] - design.residual[: design.rows]
     extra = len(bare.residual) - bare.rows
     projected = bare.projector(np.pad(change, (0, extra)))
-    separation: dict[str, float] = {}
     candidates = bare.padded(list(effect_candidates(calset, base, base_values, rivals).values()))
-    for probe, candidate in zip(rivals, candidates, strict=True):
-        q = _whitened(bare.projector(candidate.columns))[0]
-        rest = float(np.linalg.norm(projected - q @ (q.T @ projected)))
+    columns = [(p, bare.projector(c.columns)) for p, c in zip(rivals, candidates, strict=True)]
+    return separations(projected, columns), change
+
+
+def separations(
+    change: Float[np.ndarray, " d"], rivals: Sequence[tuple[Probe, Float[np.ndarray, "d _"]]]
+) -> dict[str, float]:
+    """How far (σ) each rival stays from a projected change of the residuals when it does its best to follow."""
+    separation: dict[str, float] = {}
+    for probe, columns in rivals:
+        q = whitened(columns)[0]
+        rest = float(np.linalg.norm(change - q @ (q.T @ change)))
         separation[probe.effect.name] = min(rest, separation.get(probe.effect.name, np.inf))
-    return separation, change
+    return separation
+
+
+def close_rivals(
+    change: Float[np.ndarray, " d"], rivals: Sequence[tuple[Probe, Float[np.ndarray, "d _"]]]
+) -> frozenset[str]:
+    """The rivals that these data cannot tell from an effect that changes the residuals by `change`."""
+    return frozenset(name for name, s in separations(change, rivals).items() if s < SEPARATION)

@@ -21,14 +21,16 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import stats
 
-Vector = Float[np.ndarray, " n"]
-Matrix = Float[np.ndarray, "n k"]
+Vector = Float[np.ndarray, " _"]
+Matrix = Float[np.ndarray, "_ _"]
 
 ABSORBED = 1e-6  # surviving share of a column's square below which the base has swallowed it
+FAINTEST = 0.05  # standard deviations that a plausible amplitude must reach to be testable
 RANK_TOLERANCE = 1e-8
+COUNTED = 20  # draws below the smallest p found that make counting them precise enough
 DRAWS = 10_000
 
 
@@ -66,15 +68,14 @@ class Score:
 
 
 class Projector:
-    """Residuals and candidate columns with everything removed that the base parameters could absorb."""
+    """Removes from columns everything that the base parameters could absorb."""
 
-    def __init__(self, residual: Vector, jacobian: Matrix) -> None:
+    def __init__(self, jacobian: Matrix) -> None:
         norm = np.linalg.norm(jacobian, axis=0)
         self._q, _ = np.linalg.qr(jacobian / np.where(norm > 0, norm, 1.0))
-        self.residual = self(residual)
-        self.free = len(residual) - jacobian.shape[1]
+        self.free = jacobian.shape[0] - jacobian.shape[1]
 
-    def __call__(self, columns: np.ndarray) -> np.ndarray:
+    def __call__(self, columns: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """Project columns (twice: the second pass removes the rounding of the first)."""
         for _ in range(2):
             columns = columns - self._q @ (self._q.T @ columns)
@@ -114,7 +115,7 @@ def corrected_p(log_p: float, trials: float) -> float:
     return float(-np.expm1(trials * np.log1p(-min(p, 1.0 - 1e-16))))
 
 
-def _whitened(columns: Matrix) -> tuple[Matrix, Matrix]:
+def whitened(columns: Matrix) -> tuple[Matrix, Matrix]:
     """Orthonormal basis of the columns and the matrix W with basis = columns · W."""
     if columns.shape[1] == 0:
         return columns, np.zeros((0, 0))
@@ -129,66 +130,96 @@ def _whitened(columns: Matrix) -> tuple[Matrix, Matrix]:
 
 def canonical_correlations(first: Matrix, second: Matrix) -> Vector:
     """Cosines of the principal angles between two column spaces (Björck & Golub 1973)."""
-    a, b = _whitened(first)[0], _whitened(second)[0]
+    a, b = whitened(first)[0], whitened(second)[0]
     if a.shape[1] == 0 or b.shape[1] == 0:
         return np.zeros(0)
     return np.clip(np.linalg.svd(a.T @ b, compute_uv=False), 0.0, 1.0)
 
 
-def score_candidates(
-    projector: Projector,
-    candidates: Sequence[Candidate],
-    rng: np.random.Generator,
-    draws: int = DRAWS,
-) -> ScoreTable:
-    """Score all candidates against one fit and calibrate the smallest p by Monte Carlo in score space."""
-    projected: dict[str, Matrix] = {}
-    whitened: dict[str, tuple[Matrix, Matrix]] = {}
-    surviving: dict[str, float] = {}
-    for candidate in candidates:
-        columns = projector(candidate.columns)
-        before = np.sum(candidate.columns**2, axis=0)
-        after = np.sum(columns**2, axis=0)
-        share = np.where(before > 0, after / np.where(before > 0, before, 1.0), 0.0)
-        # An amplitude counts as testable when the base leaves something of it and when a plausible amplitude
-        # would stand out at all.
-        alive = (share > ABSORBED) & (np.sqrt(after) * candidate.widths > 0.05)
-        projected[candidate.name] = np.where(alive, columns, 0.0)
-        whitened[candidate.name] = _whitened(projected[candidate.name][:, alive])
-        surviving[candidate.name] = float(share.max(initial=0.0))
-    basis = [whitened[c.name][0] for c in candidates]
-    testable = [b for b in basis if b.shape[1]]
-    space = _whitened(np.column_stack(testable))[0] if testable else np.zeros((len(projector.residual), 0))
-    r = projector.residual
-    noise_scale = _complement_noise(projector, space)
-    scores = []
-    for candidate in candidates:
-        q, transform = whitened[candidate.name]
-        z = q.T @ r
-        statistic = float(z @ z) / noise_scale**2
-        rank = q.shape[1]
-        log_p = float(stats.chi2.logsf(statistic, rank)) if rank else 0.0
-        alive = np.any(projected[candidate.name] != 0, axis=0)
-        amplitudes, covariance = np.zeros(len(alive)), np.zeros((len(alive), len(alive)))
-        if rank:
-            amplitudes[alive] = -transform @ z
-            covariance[np.ix_(alive, alive)] = transform @ transform.T * noise_scale**2
-        scores.append(
-            Score(
-                name=candidate.name, statistic=statistic, rank=rank, p_value=float(np.exp(log_p)), log_p=log_p,
-                amplitudes=amplitudes, covariance=covariance,
-                log_bayes=_log_bayes(projected[candidate.name] / noise_scale, r / noise_scale, candidate.widths),
-                surviving=surviving[candidate.name], testable=rank > 0,
-            )
-        )  # fmt: skip
-    p_global, trials = _global_p(scores, basis, space, rng, draws)
-    return ScoreTable(tuple(scores), projected, noise_scale, p_global, trials)
+@dataclasses.dataclass(frozen=True)
+class _Prepared:
+    """A candidate projected off the base: all of that which the data do not decide."""
+
+    name: str
+    widths: Vector
+    columns: Matrix  # projected; amplitudes that the base absorbs are zero
+    alive: Bool[np.ndarray, " k"]
+    basis: Matrix  # orthonormal
+    transform: Matrix  # basis = columns[:, alive] @ transform
+    surviving: float
 
 
-def _complement_noise(projector: Projector, space: Matrix) -> float:
-    """Root mean square of the residuals outside the space of base and candidates (orthonormal columns)."""
-    r = projector.residual - space @ (space.T @ projector.residual)
-    return float(np.sqrt(r @ r / max(projector.free - space.shape[1], 1)))
+class Scorer:
+    """Candidates made ready for one fit: projected, and with the distribution of the smallest p under the base.
+
+    Nothing here depends on the residuals, so that many data sets of the same design can be scored in turn.
+    """
+
+    def __init__(
+        self,
+        projector: Projector,
+        candidates: Sequence[Candidate],
+        rng: np.random.Generator,
+        draws: int = DRAWS,
+    ) -> None:
+        self._projector = projector
+        self._prepared = [_prepare(projector, candidate) for candidate in candidates]
+        testable = [p.basis for p in self._prepared if p.basis.shape[1]]
+        rows = len(candidates[0].columns) if candidates else 0
+        self._space = whitened(np.column_stack(testable))[0] if testable else np.zeros((rows, 0))
+        self._smallest = _smallest_p([self._space.T @ b for b in testable], rng, draws)
+
+    def __call__(self, residual: Vector) -> ScoreTable:
+        """Score the residuals of a fit of this design."""
+        r = self._projector(residual)
+        rest = r - self._space @ (self._space.T @ r)
+        noise = float(np.sqrt(rest @ rest / max(self._projector.free - self._space.shape[1], 1)))
+        scores = tuple(_score(p, r, noise) for p in self._prepared)
+        p_global, trials = self._global_p(scores)
+        return ScoreTable(scores, {p.name: p.columns for p in self._prepared}, noise, p_global, trials)
+
+    def _global_p(self, scores: Sequence[Score]) -> tuple[float, float]:
+        found = min((score.log_p for score in scores if score.testable), default=0.0)
+        if not len(self._smallest):
+            return 1.0, 1.0
+        # Effective number of trials where the draws still count well (their 1 % quantile).
+        reference = float(np.quantile(self._smallest, 0.01))
+        trials = max(1.0, float(np.log1p(-0.01) / np.log1p(-np.exp(reference))))
+        below = int(np.sum(self._smallest <= found))
+        if below >= COUNTED:
+            return (1 + below) / (1 + len(self._smallest)), trials
+        return corrected_p(found, trials), trials
+
+
+def _prepare(projector: Projector, candidate: Candidate) -> _Prepared:
+    columns = projector(candidate.columns)
+    before = np.sum(candidate.columns**2, axis=0)
+    after = np.sum(columns**2, axis=0)
+    share = np.where(before > 0, after / np.where(before > 0, before, 1.0), 0.0)
+    # An amplitude is testable when the base leaves something of it and a plausible one would stand out at all.
+    alive = (share > ABSORBED) & (np.sqrt(after) * candidate.widths > FAINTEST)
+    columns = np.where(alive, columns, 0.0)
+    basis, transform = whitened(columns[:, alive])
+    return _Prepared(
+        candidate.name, candidate.widths, columns, alive, basis, transform, float(share.max(initial=0.0))
+    )
+
+
+def _score(prepared: _Prepared, r: Vector, noise: float) -> Score:
+    z = prepared.basis.T @ r
+    statistic, rank = float(z @ z) / noise**2, prepared.basis.shape[1]
+    log_p = float(stats.chi2.logsf(statistic, rank)) if rank else 0.0
+    alive = prepared.alive
+    amplitudes, covariance = np.zeros(len(alive)), np.zeros((len(alive), len(alive)))
+    if rank:
+        amplitudes[alive] = -prepared.transform @ z
+        covariance[np.ix_(alive, alive)] = prepared.transform @ prepared.transform.T * noise**2
+    return Score(
+        name=prepared.name, statistic=statistic, rank=rank, p_value=float(np.exp(log_p)), log_p=log_p,
+        amplitudes=amplitudes, covariance=covariance,
+        log_bayes=_log_bayes(prepared.columns / noise, r / noise, prepared.widths),
+        surviving=prepared.surviving, testable=rank > 0,
+    )  # fmt: skip
 
 
 def _log_bayes(columns: Matrix, r: Vector, widths: Vector) -> float:
@@ -206,23 +237,13 @@ def _log_survival(statistic: np.ndarray, rank: int) -> np.ndarray:
     return np.interp(statistic, grid, stats.chi2.logsf(grid, rank))
 
 
-def _global_p(
-    scores: Sequence[Score], basis: Sequence[Matrix], space: Matrix, rng: np.random.Generator, draws: int
-) -> tuple[float, float]:
-    testable = [(score, b) for score, b in zip(scores, basis, strict=True) if score.testable]
-    if not testable:
-        return 1.0, 1.0
-    maps = [space.T @ b for _, b in testable]
-    normal = rng.standard_normal((draws, space.shape[1]))
+def _smallest_p(maps: Sequence[Matrix], rng: np.random.Generator, draws: int) -> Vector:
+    """ln of the smallest p among all candidates, drawn under the base; `maps` take unit normals to whitened scores."""
+    if not maps:
+        return np.zeros(0)
+    normal = rng.standard_normal((draws, maps[0].shape[0]))
     smallest = np.zeros(draws)
     for m in maps:
         statistic = np.sum((normal @ m) ** 2, axis=1)
         np.minimum(smallest, _log_survival(statistic, m.shape[1]), out=smallest)
-    found = min(score.log_p for score, _ in testable)
-    below = int(np.sum(smallest <= found))
-    # Effective number of trials where the draws still count well (their 1 % quantile).
-    reference = float(np.quantile(smallest, 0.01))
-    trials = max(1.0, float(np.log1p(-0.01) / np.log1p(-np.exp(reference))))
-    if below >= 20:
-        return (1 + below) / (1 + draws), trials
-    return corrected_p(found, trials), trials
+    return smallest

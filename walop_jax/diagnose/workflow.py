@@ -22,7 +22,7 @@ from walop_jax.diagnose.columns import Probe, effect_candidates
 from walop_jax.diagnose.columns import probes as all_probes
 from walop_jax.diagnose.design import Design, HeldOut, held_out
 from walop_jax.diagnose.freeform import strata
-from walop_jax.diagnose.score import Score, ScoreTable, score_candidates
+from walop_jax.diagnose.score import Score, Scorer, ScoreTable
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.problem import Problem, base_model
 from walop_jax.model.effects import EFFECTS, Context, Effect
@@ -97,9 +97,8 @@ class _Look:
         self.design = Design.of(problem, result)
         named = effect_candidates(problem.calset, problem.model, result.values, self.probes)
         free = list(strata(self.design.measured))
-        self.table: ScoreTable = score_candidates(
-            self.design.projector, self.design.padded([*named.values(), *free]), rng
-        )
+        scorer = Scorer(self.design.projector, self.design.padded([*named.values(), *free]), rng)
+        self.table: ScoreTable = scorer(self.design.residual)
         self.ranked = naming.rank(self.table, self.probes)
         self.patterns = [self.table[c.name] for c in free]
 
@@ -257,6 +256,6 @@ def _unexplained(look: _Look) -> Unexplained:
         text = "patterns without a name: " + "; ".join(significant)
     else:
         text = "something is missing, no single pattern is significant by itself"
-    place = where.describe(look.design, look.design.projector.residual)
+    place = where.describe(look.design, look.design.residual)
     text += f". Residuals sit in: cameras {place['camera']}; kinds {place['kind']}; field {place['field']}"
     return Unexplained(look.table.p_global, text, patterns)

@@ -84,7 +84,8 @@ def build_surrogate(
         [np.asarray(features_of(*(jnp.asarray(a) for a in (design[:, :k], pairs, triples)))), design[:, k:]],
         axis=1,
     )
-    inverse = np.linalg.pinv(y)
+    q, r = np.linalg.qr(y)
+    inverse = np.linalg.solve(r, q.T)
     gram = _gram(target, x, progress)
     data = inverse @ gram[1:, 1:] @ inverse.T
     cross = inverse @ gram[1:, 0]

@@ -201,7 +201,7 @@ def _finish(
     values = np.array([target.values(one) for one in x]).reshape(e, flat.shape[1], -1)
     checked = z.reshape(-1, d)[_evenly(e * n * w, options.checks)]
     accuracy = check(target, surrogate, checked, rng)
-    mean, covariance = surrogate.moments(z.reshape(-1, d)[:: max(1, e * n * w // 200_000)])
+    mean, covariance = surrogate.moments(z.reshape(-1, d)[:: max(1, e * n * w // 50_000)])
     select = target.model.selection()
     return PosteriorSample(
         names=target.model.names,

@@ -10,17 +10,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.problem import Problem
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import leaves, unknown_name
+from walop_jax.model.specification import unravel
 
 Vector = Float[np.ndarray, " f"]
 LARGEST_SAMPLED = 20
 NEAR_LINEAR = ("Throughput", "Standards")
+
+
+@jax.jit  # a vector unravelled step by step costs more than the optics of a small set
+def _instrument(template: Instrument, values: Float[Array, " n"]) -> Instrument:
+    return unravel(template)(values)
 
 
 class Target:
@@ -66,7 +75,8 @@ class Target:
 
     def residuals(self, x: Vector, chunk: engine.PointData) -> Float[np.ndarray, " d"]:
         """Normalised residuals of one chunk of the data, errors times `noise_scale`."""
-        _, r = engine.residuals(self.model.instrument(self.values(x)), self.problem.plan, chunk)
+        instrument = _instrument(self.model.template, jnp.asarray(self.values(x)))
+        _, r = engine.residuals(instrument, self.problem.plan, chunk)
         return np.asarray(r).ravel() / self.noise_scale
 
     def prior_rows(self, x: Vector) -> Float[np.ndarray, " k"]:

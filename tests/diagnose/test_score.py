@@ -1,0 +1,110 @@
+"""The score test against closed forms, against a full refit, and against its own stated error rates."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from walop_jax.diagnose.score import Candidate, Projector, Scorer, canonical_correlations, corrected_p
+
+ROWS, FREE = 400, 6
+
+
+@pytest.fixture(scope="module")
+def design():
+    rng = np.random.default_rng(11)
+    base = rng.standard_normal((ROWS, FREE)) * np.logspace(-3, 3, FREE)
+    columns = {name: rng.standard_normal((ROWS, k)) for name, k in (("one", 1), ("two", 2), ("three", 3))}
+    candidates = [Candidate(name, c, np.ones(c.shape[1])) for name, c in columns.items()]
+    return base, columns, Scorer(Projector(base), candidates, rng)
+
+
+def refitted(residual, base):
+    """χ² after a linear fit, by numpy."""
+    x, *_ = np.linalg.lstsq(base, residual, rcond=None)
+    return np.sum((residual - base @ x) ** 2)
+
+
+def test_statistic_is_the_drop_of_chi2_in_a_joint_refit(design):
+    base, columns, scorer = design
+    r = np.random.default_rng(1).standard_normal(ROWS)
+    table = scorer(r)
+    for name, c in columns.items():
+        drop = refitted(r, base) - refitted(r, np.column_stack([base, c]))
+        assert table[name].statistic * table.noise_scale**2 == pytest.approx(drop, rel=1e-9)
+
+
+def test_amplitudes_are_those_of_the_joint_refit(design):
+    base, columns, scorer = design
+    r = np.random.default_rng(2).standard_normal(ROWS)
+    table = scorer(r)
+    for name, c in columns.items():
+        # r(ε) = r + C ε, so the refit's coefficients carry the opposite sign.
+        joint, *_ = np.linalg.lstsq(np.column_stack([base, c]), r, rcond=None)
+        np.testing.assert_allclose(table[name].amplitudes, -joint[FREE:], rtol=1e-8)
+        everything = np.column_stack([base, c])
+        covariance = np.linalg.inv(everything.T @ everything)[FREE:, FREE:] * table.noise_scale**2
+        np.testing.assert_allclose(table[name].covariance, covariance, rtol=1e-6)
+
+
+def test_evidence_is_the_ratio_of_gaussian_integrals(design):
+    base, columns, scorer = design
+    r = np.random.default_rng(3).standard_normal(ROWS)
+    table = scorer(r)
+    # Marginal likelihood with amplitudes N(0, 1) and flat base: compare densities of the projected data.
+    q = np.linalg.svd(base, full_matrices=True)[0][:, FREE:]
+    y = q.T @ r / table.noise_scale
+    for name, c in columns.items():
+        slope = q.T @ c / table.noise_scale
+        with_effect = stats.multivariate_normal(np.zeros(len(y)), np.eye(len(y)) + slope @ slope.T).logpdf(y)
+        without = stats.norm.logpdf(y).sum()
+        assert table[name].log_bayes == pytest.approx(with_effect - without, abs=1e-6)
+
+
+def test_what_the_base_absorbs_is_untestable(design):
+    base, _, _ = design
+    mixture = base @ np.arange(1.0, FREE + 1.0)[:, None]
+    scorer = Scorer(Projector(base), [Candidate("mimic", mixture, np.ones(1))], np.random.default_rng(0))
+    table = scorer(np.random.default_rng(4).standard_normal(ROWS))
+    assert not table["mimic"].testable
+    assert table.p_global == 1.0
+
+
+def test_false_alarms_come_at_the_stated_rate(design):
+    _, _, scorer = design
+    rng = np.random.default_rng(5)
+    p = np.array([scorer(rng.standard_normal(ROWS)).p_global for _ in range(2000)])
+    assert stats.kstest(p[p < 0.5], stats.uniform(0, 0.5).cdf).pvalue > 1e-3
+    assert stats.binomtest(int(np.sum(p < 0.05)), len(p), 0.05).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("scale", [0.9, 1.0, 1.1])
+def test_a_wrong_noise_scale_raises_no_alarms(design, scale):
+    _, _, scorer = design
+    rng = np.random.default_rng(6)
+    p = np.array([scorer(scale * rng.standard_normal(ROWS)).p_global for _ in range(500)])
+    assert stats.binomtest(int(np.sum(p < 0.05)), len(p), 0.05).pvalue > 1e-3
+
+
+def test_an_injected_effect_is_found_with_its_amplitude(design):
+    _, columns, scorer = design
+    truth = np.array([0.9, -0.7])
+    r = np.random.default_rng(7).standard_normal(ROWS) - columns["two"] @ truth
+    table = scorer(r)
+    assert table.ranked[0].name == "two"
+    assert table.p_global < 1e-6
+    score = table["two"]
+    pull = np.linalg.solve(np.linalg.cholesky(score.covariance), score.amplitudes - truth)
+    assert np.all(np.abs(pull) < 4)
+
+
+def test_canonical_correlations_of_hand_made_planes():
+    x, y, z = np.eye(3)
+    tilted = np.column_stack([x, np.cos(0.3) * y + np.sin(0.3) * z])
+    np.testing.assert_allclose(
+        np.sort(canonical_correlations(np.column_stack([x, y]), tilted)), [np.cos(0.3), 1.0], atol=1e-12
+    )
+
+
+def test_correction_for_trials():
+    assert corrected_p(np.log(0.01), 1.0) == pytest.approx(0.01)
+    assert corrected_p(np.log(1e-10), 50.0) == pytest.approx(5e-9, rel=1e-6)

@@ -1,0 +1,166 @@
+"""`sample` on a small world: the whole way, interrupted, refused, written and read back."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from walop_jax.data.errors import DataError
+from walop_jax.data.interval_table import write_columns
+from walop_jax.data.tables import read_input_table
+from walop_jax.fit.calibration import Calibration
+from walop_jax.fit.predict import Settings, matrices
+from walop_jax.posterior import Options, PosteriorSample, sample, sampling
+from walop_jax.posterior.output import inference_data, intervals, read_draws, report, write_posterior
+from walop_jax.posterior.propagate import matrix_draws, with_draws
+
+from .conftest import Scene
+
+OPTIONS = Options(seed=3, interval=200, draws=2000, checks=64)
+
+
+@pytest.fixture(autouse=True)
+def _built_once(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The surrogate of the scene, with or without inflation, instead of a new one for every test."""
+
+    def build(*args: Any, inflate: bool = False, **others: Any) -> Any:
+        return dataclasses.replace(scene.surrogate, inflate=inflate)
+
+    monkeypatch.setattr(sampling, "build_surrogate", build)
+
+
+@pytest.fixture(scope="module")
+def posterior(scene: Scene) -> PosteriorSample:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sampling, "build_surrogate", lambda *a, **k: scene.surrogate)
+        return sample(scene.world.problem, scene.result, OPTIONS)
+
+
+def test_posterior_agrees_with_laplace_where_that_holds(scene: Scene, posterior: PosteriorSample) -> None:
+    assert posterior.trusted, posterior.warnings
+    free = scene.world.problem.model.free
+    pull = (posterior.mean - scene.result.values)[free] / scene.result.sigma[free]
+    ratio = np.sqrt(np.diag(posterior.covariance))[free] / scene.result.sigma[free]
+    assert np.abs(pull).max() < 0.2
+    assert 0.9 < ratio.min() < ratio.max() < 1.1
+    drawn = posterior.draws.reshape(-1, len(posterior.names))
+    np.testing.assert_allclose(
+        drawn.std(axis=0)[free], np.sqrt(np.diag(posterior.covariance))[free], rtol=0.08
+    )
+    assert np.ptp(drawn[:, [i for i in range(len(posterior.names)) if i not in free]], axis=0).max() == 0.0
+    true = (posterior.mean - scene.world.truth)[free] / np.sqrt(np.diag(posterior.covariance))[free]
+    assert np.abs(true).max() < 4.5
+
+
+@pytest.mark.parametrize("cut", [1, 3])
+def test_interrupted_is_uninterrupted(scene: Scene, tmp_path: Path, cut: int) -> None:
+    problem, result = scene.world.problem, scene.result
+    options = dataclasses.replace(OPTIONS, moves="de", maximum_steps=1000)
+    whole = sample(problem, result, options, folder=tmp_path / "whole")
+    done = 0
+
+    def stop(progress: Any) -> None:
+        nonlocal done
+        done += progress.stage == "sampling"
+        if done > cut:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sample(problem, result, options, folder=tmp_path / "cut", report=stop)
+    assert len(list((tmp_path / "cut").glob("block-*.h5"))) == cut
+    resumed = sample(problem, result, options, folder=tmp_path / "cut", resume=True)
+    np.testing.assert_array_equal(resumed.chains, whole.chains)
+    np.testing.assert_array_equal(resumed.draws, whole.draws)
+    np.testing.assert_array_equal(resumed.covariance, whole.covariance)
+
+
+def test_resume_refuses_what_has_changed(scene: Scene, tmp_path: Path) -> None:
+    problem, result = scene.world.problem, scene.result
+    options = dataclasses.replace(OPTIONS, maximum_steps=200)
+    sample(problem, result, options, folder=tmp_path / "chain")
+    with pytest.raises(DataError, match="holds a chain already"):
+        sample(problem, result, options, folder=tmp_path / "chain")
+    with pytest.raises(DataError, match="other settings"):
+        sample(problem, result, dataclasses.replace(options, seed=4), folder=tmp_path / "chain", resume=True)
+    name = problem.model.names[problem.model.free[0]]
+    changed = problem.model.change(name, prior=(0.81, 0.02))
+    other = type(problem)(problem.calset, changed)
+    with pytest.raises(DataError, match="other priors"):
+        sample(other, result, options, folder=tmp_path / "chain", resume=True)
+
+
+def test_a_chain_cut_short_says_so(scene: Scene, tmp_path: Path) -> None:
+    options = dataclasses.replace(OPTIONS, moves="stretch", maximum_steps=200)
+    short = sample(scene.world.problem, scene.result, options)
+    assert not short.trusted
+    assert "Go on for" in short.warnings[0]
+    write_posterior(tmp_path / "short.nc", short)
+    with pytest.raises(DataError, match="not to be trusted"):
+        read_draws(tmp_path / "short.nc", short.names)
+
+
+def test_inflation_finds_the_noise_as_stated(scene: Scene) -> None:
+    options = dataclasses.replace(OPTIONS, inflate=True, interval=400)
+    inflated = sample(scene.world.problem, scene.result, options)
+    assert inflated.trusted, inflated.warnings
+    assert inflated.ln_f is not None
+    measured = scene.target.measured
+    expected = 0.5 * np.log(scene.result.posterior.data / (measured - len(scene.target.free)))
+    assert inflated.ln_f.mean() == pytest.approx(expected, abs=1.0 / np.sqrt(measured))
+    assert inflated.ln_f.std() == pytest.approx(1.0 / np.sqrt(2 * measured), rel=0.15)
+    assert "noise.ln_f" in intervals(inflated)["NAME"][0]
+
+
+def test_posterior_file_table_and_report(posterior: PosteriorSample, tmp_path: Path) -> None:
+    write_posterior(tmp_path / "posterior.nc", posterior)
+    draws = read_draws(tmp_path / "posterior.nc", posterior.names)
+    np.testing.assert_array_equal(draws, posterior.draws.reshape(draws.shape))
+    with pytest.raises(DataError, match="another model"):
+        read_draws(tmp_path / "posterior.nc", posterior.names[1:])
+    data = inference_data(posterior)
+    assert data.posterior["half1.plate.quartz"].attrs["units"] == "um"
+    assert data.posterior["half1.wedge"].shape == posterior.draws.shape[:2]
+    assert data.posterior.attrs["converged"] == 1
+
+    columns = intervals(posterior)
+    row = list(columns["NAME"][0]).index("half2.wedge")
+    low, middle, high = (columns[name][0][row] for name in ("LOW95", "MEDIAN", "HIGH95"))
+    sigma = columns["SIGMA"][0][row]
+    assert (high - low) / (4 * sigma) == pytest.approx(1.0, abs=0.1)
+    assert low < middle < high
+    for name in ("posterior.fits", "posterior.ecsv"):
+        write_columns(tmp_path / name, columns, {"TRUSTED": True})
+        table = read_input_table(tmp_path / name)
+        assert {"NAME", "MEDIAN", "LOW68", "HIGH68", "LOW95", "HIGH95"} <= set(table.names)
+    assert report(posterior)["trusted"] is True
+
+
+def test_matrix_by_draws_agrees_with_the_covariance(
+    scene: Scene, posterior: PosteriorSample, tmp_path: Path
+) -> None:
+    x, y = np.array([0.0, 0.2, -0.25]), np.array([0.0, 0.1, 0.2])
+    model, filters = scene.world.problem.model, scene.world.problem.calset.filters
+    drawn = matrix_draws(model, posterior.draws[0, :300], Settings.default(3), filters, x, y)
+    instrument = model.instrument(posterior.mean)
+    values, covariance = matrices(instrument, Settings.default(3), filters, x, y, posterior.covariance)
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    np.testing.assert_allclose(drawn.std(axis=0), sigma, rtol=0.2)
+    assert np.max(np.abs(drawn.mean(axis=0) - values) / sigma) < 0.3
+    write_posterior(tmp_path / "posterior.nc", posterior)
+    calibration = with_draws(
+        Calibration.from_fit(scene.result, scene.world.problem), tmp_path / "posterior.nc", 50
+    )
+    assert calibration.matrix(x, y)[1].shape == (3, 6, 6)
+
+
+def test_options_that_make_no_sense() -> None:
+    for wrong in (
+        {"moves": "walk"}, {"ensembles": 1}, {"interval": 3}, {"draws": 0},
+        {"parameters": tuple("abcdefghijklmnopqrstu")},
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=r"\w"):
+            Options(**wrong)  # pyright: ignore[reportArgumentType]
