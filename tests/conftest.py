@@ -21,6 +21,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         parser.addoption(f"--{name}", action="store_true", default=False, help=f"run {what} as well")
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep compiled code in pytest's own cache: workers share it, and a second run hardly compiles at all."""
+    cache = getattr(config, "cache", None)
+    if cache is not None:
+        jax.config.update("jax_compilation_cache_dir", str(cache.mkdir("xla")))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+        jax.config.update("jax_raise_persistent_cache_errors", False)
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     for name, what in OPTIONS.items():
         if config.getoption(f"--{name}"):

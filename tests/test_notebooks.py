@@ -24,7 +24,7 @@ def code_of(notebook: nbformat.NotebookNode) -> list[str]:
 
 
 def test_there_are_notebooks():
-    assert [path.name for path in NOTEBOOKS] == ["first_calibration.ipynb"]
+    assert [path.name for path in NOTEBOOKS] == ["first_calibration.ipynb", "posteriors.ipynb"]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

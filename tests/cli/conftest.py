@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
-from click.testing import Result
 from typer.testing import CliRunner
 
 from walop_jax.cli import app
@@ -17,7 +17,7 @@ from walop_jax.model.effects import effect_by_name
 
 PLAN = ObservingPlan(grid=5, standard_grid=2, polariser_angles=polariser_turn(8), moon_patches=3, standards=3)
 
-Call = Callable[..., Result]
+Call = Callable[..., Any]  # a `Result`: typer brings its own click, or uses an installed one
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -32,7 +32,7 @@ def _no_cache():
 def call() -> Call:
     """Run a command in this process; exceptions that are no exit code count as test failures."""
 
-    def run(*args: object) -> Result:
+    def run(*args: object) -> Any:
         result = CliRunner().invoke(app, [str(arg) for arg in args])
         if result.exception is not None and not isinstance(result.exception, SystemExit):
             raise result.exception

@@ -4,7 +4,7 @@ The full study, 20 sets as large as a real run (12 × 12 points):
 
     python -m pytest tests/fit/test_studies.py --long -s
 
-It prints what it found; the last run's numbers stand in the test.
+It prints what it found; what was measured stands in the test.
 """
 
 from __future__ import annotations
@@ -97,6 +97,9 @@ def study(plan: ObservingPlan, seeds: Sequence[int]) -> Study:
 
 @pytest.mark.long
 def test_twenty_runs_as_large_as_a_real_one():
+    # Measured with version 0.1.0: mean −0.009, rms 0.972, ratio 0.959; over 60 other seeds −0.006, 0.982, 1.032.
+    # There half1.efficiency is off by +0.5 of its error of 4e-6: N_ERR comes from the measured counts, so that
+    # near-dark cameras weigh more when they came out low. With errors from the expected counts it is +0.2 ± 0.13.
     found = study(ObservingPlan(), range(20))
     print("\n" + found.report())
     assert abs(found.pulls.mean()) < 0.2

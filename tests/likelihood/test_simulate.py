@@ -265,7 +265,7 @@ def test_counts_are_at_the_level_that_was_asked_for():
     "plan",
     [
         dataclasses.replace(SMALL, instrument="WALOP-NORTH"),
-        ObservingPlan.bench(polariser_angles=polariser_turn(6)),
+        dataclasses.replace(ObservingPlan.bench(), polariser_angles=polariser_turn(6)),
     ],
     ids=["north", "bench"],
 )

@@ -17,6 +17,15 @@ from walop_jax.model.specification import optical_indices
 POINTS = 144
 
 
+@pytest.fixture
+def no_cache():
+    """Compile for real: nothing is taken from the cache of compiled code."""
+    jax.config.update("jax_enable_compilation_cache", False)
+    yield
+    jax.config.update("jax_enable_compilation_cache", True)
+
+
+@pytest.mark.usefixtures("no_cache")
 def test_jacobian_of_the_optics_compiles_and_runs_quickly():
     """144 points, SDSS-r, all optical parameters, in seconds of processor time.
 

@@ -77,7 +77,7 @@ def test_autocorrelation_time_is_that_of_the_process() -> None:
 def test_a_short_chain_is_sent_back() -> None:
     verdict = assess(autoregressive(np.random.default_rng(1), 0.95, 400), ("a", "b"))
     assert not verdict.converged
-    assert verdict.steps + verdict.needed > 50 * 30
+    assert verdict.steps + verdict.needed > 50 * 20
     assert "NOT converged" in verdict.message(0.01)
     assert "Go on for" in verdict.message(0.01)
     assert not assess(np.zeros((2, 10, 4, 1)), ("a",)).converged

@@ -18,7 +18,7 @@ import numpy as np
 from emcee.autocorr import integrated_time
 from jaxtyping import Float
 
-Chains = Float[np.ndarray, "e n w k"]  # ensembles, stored steps, walkers, quantities
+Chains = Float[np.ndarray, "e t w k"]  # ensembles, stored steps, walkers, quantities
 
 LENGTHS = 50.0  # in units of τ
 STABLE = 0.25  # allowed relative change of τ over each of two doublings

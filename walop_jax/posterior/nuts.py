@@ -2,6 +2,9 @@
 
 In coordinates whitened by the covariance of the fit, x = x̂ + L w with L Lᵀ = C; no surrogate, nothing
 marginalised but the fluxes. Needs blackjax (`pip install walop-jax[nuts]`).
+Trajectories are cut after 2³ − 1 leapfrogs: in whitened coordinates all directions oscillate with one period,
+and half a period, x → −x, which NUTS would like, moves means at once and widths not at all.
+
 Source   Hoffman & Gelman 2014, JMLR 15, 1593; blackjax (Cabezas et al. 2024, arXiv 2402.10797).
 """
 
@@ -25,6 +28,7 @@ from walop_jax.model.specification import unravel
 from walop_jax.posterior.target import Target
 
 TARGET_ACCEPTANCE = 0.8
+DOUBLINGS = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +83,29 @@ def whitened(target: Target) -> tuple[Callable[..., Float[Array, ""]], tuple[Any
     return log_density, arrays
 
 
+class _StepSize:
+    """Dual averaging of the step size (Hoffman & Gelman 2014, section 3.2.1, their constants)."""
+
+    def __init__(self, first: float = 0.4) -> None:
+        self._centre = np.log(10 * first)
+        self._log, self._mean, self._error, self._count = np.log(first), np.log(first), 0.0, 0
+
+    def learn(self, acceptance: float) -> None:
+        self._count += 1
+        m = self._count
+        self._error += (TARGET_ACCEPTANCE - acceptance - self._error) / (m + 10)
+        self._log = self._centre - np.sqrt(m) / 0.05 * self._error
+        self._mean += m**-0.75 * (self._log - self._mean)
+
+    @property
+    def trial(self) -> float:
+        return float(np.exp(self._log))
+
+    @property
+    def settled(self) -> float:
+        return float(np.exp(self._mean))
+
+
 def sample_nuts(
     target: Target,
     draws: int = 1000,
@@ -95,24 +122,24 @@ def sample_nuts(
     began = time.perf_counter()
     one = jnp.ones(len(target.centre))
 
-    def warm(key: Array, position: Array, *arrays: Any) -> tuple[Any, Any]:
-        adaptation = blackjax.window_adaptation(
-            blackjax.nuts, lambda w: log_density(w, *arrays), target_acceptance_rate=TARGET_ACCEPTANCE
-        )
-        (state, parameters), _ = adaptation.run(key, position, num_steps=warm_up)
-        return state, parameters["step_size"]
+    def start(position: Array, *arrays: Any) -> Any:
+        return blackjax.nuts.init(position, lambda w: log_density(w, *arrays))
 
     def step(key: Array, state: Any, size: Array, *arrays: Any) -> tuple[Any, Any]:
-        return blackjax.nuts(lambda w: log_density(w, *arrays), size, one).step(key, state)
+        return blackjax.nuts(lambda w: log_density(w, *arrays), size, one, max_num_doublings=DOUBLINGS).step(
+            key, state
+        )
 
-    key = jax.random.key(seed)
-    state, size = compiled(warm)(jax.random.fold_in(key, 0), jnp.zeros(len(one)), *arrays)
-    go = compiled(step)
-    state, _ = go(jax.random.fold_in(key, 1), state, size, *arrays)
+    key, go, tuning = jax.random.key(seed), compiled(step), _StepSize()
+    state = compiled(start)(jnp.zeros(len(one)), *arrays)
+    for i in range(warm_up):
+        state, info = go(jax.random.fold_in(key, i), state, jnp.asarray(tuning.trial), *arrays)
+        tuning.learn(float(info.acceptance_rate))
+    size = jnp.asarray(tuning.settled)
     positions, divergences, gradients = np.empty((draws, len(one))), 0, 0
     ready = time.perf_counter()
     for i in range(draws):
-        state, info = go(jax.random.fold_in(key, 2 + i), state, size, *arrays)
+        state, info = go(jax.random.fold_in(key, warm_up + i), state, size, *arrays)
         positions[i] = np.asarray(state.position)
         divergences += int(info.is_divergent)
         gradients += int(info.num_integration_steps)

@@ -160,7 +160,7 @@ class _Run:
         if self.checkpoints is not None:
             self.checkpoints.save_block(len(self.blocks), self.walkers, blocks, seconds)
 
-    def kept(self) -> tuple[Chains, Float[np.ndarray, "e n w"]]:
+    def kept(self) -> tuple[Chains, Float[np.ndarray, "e t w"]]:
         """Stored positions and ln p after burn-in."""
         z = np.concatenate([np.stack([b.coordinates for b in blocks]) for blocks in self.blocks], axis=1)
         lnp = np.concatenate([np.stack([b.log_posterior for b in blocks]) for blocks in self.blocks], axis=1)

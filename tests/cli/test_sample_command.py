@@ -1,0 +1,76 @@
+"""`walop-jax sample`: a posterior beside a fit, kept, resumed, refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from walop_jax.data.product import read_product
+from walop_jax.fit.calibration import Calibration
+from walop_jax.posterior.output import read_draws
+
+
+@pytest.fixture(scope="module")
+def run_folder(call, calset_file: Path, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "RUN"
+    assert call("refit", calset_file, "-o", folder, "-q").exit_code == 0
+    return folder
+
+
+def test_sample_writes_everything_and_resumes(call, run_folder: Path, tmp_path: Path):
+    run = tmp_path / "RUN"
+    shutil.copytree(run_folder, run)
+    before = read_product(run / "calibration.fits")
+    short = call("sample", run, "--moves", "de", "--interval", 100, "--maximum-steps", 200)
+    assert short.exit_code == 1
+    assert "NOT converged" in short.stderr
+    assert read_product(run / "calibration.fits").content_hash() == before.content_hash()
+    assert json.loads((run / "sample.json").read_text())["converged"] is False
+    assert call("sample", run, "--moves", "de", "--interval", 100).exit_code == 1, "outputs are there already"
+    refused = call("sample", run, "--moves", "de", "--interval", 100, "--seed", 1, "--resume")
+    assert refused.exit_code == 1
+    assert "other settings" in refused.stderr
+
+    done = call("sample", run, "--moves", "de", "--interval", 100, "--resume", "--json")
+    assert done.exit_code == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["trusted"] is True
+    assert found["steps"] > 50 * max(found["autocorrelation_steps"].values())
+    for name in (
+        "posterior.nc",
+        "posterior.fits",
+        "posterior.ecsv",
+        "posterior_corner.png",
+        "posterior_trace.png",
+    ):
+        assert (run / name).stat().st_size > 1000
+    product = read_product(run / "calibration.fits")
+    assert product.verdict.covariance_from == "posterior"
+    np.testing.assert_array_equal(product.parameters.value, before.parameters.value)
+    free = before.parameters.sigma > 0
+    np.testing.assert_allclose(product.parameters.sigma[free] / before.parameters.sigma[free], 1.0, atol=0.25)
+    draws = read_draws(run / "posterior.nc", Calibration.from_product(product).model.names)
+    np.testing.assert_allclose(draws.std(axis=0)[free], product.parameters.sigma[free], rtol=0.1)
+
+    shutil.rmtree(run / "sampling")
+    (run / "sampling").mkdir()
+    again = call("sample", run, "--overwrite", "-q")
+    assert again.exit_code == 0, again.stderr
+
+
+def test_sample_says_what_is_wrong(call, run_folder: Path, calset_file: Path, tmp_path: Path):
+    assert "not a folder" in call("sample", calset_file).stderr
+    assert call("sample", tmp_path).exit_code == 1
+    run = tmp_path / "RUN"
+    shutil.copytree(run_folder, run)
+    model = tmp_path / "model.toml"
+    model.write_text('[model]\neffects = ["clp_zero"]\n')
+    refused = call("sample", run, "--model", model)
+    assert refused.exit_code == 1
+    assert "another model" in refused.stderr
+    assert "walks" in call("sample", run, "--moves", "walks").stderr
+    assert not (run / "sampling").exists()

@@ -1,0 +1,51 @@
+"""emcee on the surrogate against NUTS on the exact posterior of all coefficients, on a real set.
+
+python -m pytest tests/posterior/test_nuts.py --long -s
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from emcee.autocorr import integrated_time
+
+from walop_jax.data import read_calibration_set
+from walop_jax.fit.refit import fit
+from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.posterior import Options, sample
+from walop_jax.posterior.target import Target
+
+DRAWS = 4000
+
+
+def effective(x: np.ndarray) -> float:
+    return len(x) / float(integrated_time(x[:, None, None], quiet=True, tol=0)[0])
+
+
+@pytest.mark.long
+def test_emcee_agrees_with_nuts(shared_data: Path) -> None:
+    """Means to 0.1 σ, widths to 5 % beyond twice the sampling error of NUTS (ours is far smaller)."""
+    pytest.importorskip("blackjax")
+    from walop_jax.posterior.nuts import sample_nuts
+
+    calset = read_calibration_set(shared_data / "walop_south_a.fits")
+    problem = Problem(calset, base_model(calset))
+    result = fit(problem)
+    ours = sample(problem, result, Options(seed=1, interval=2000))
+    assert ours.trusted, ours.warnings
+    nuts = sample_nuts(Target(problem, result), DRAWS)
+    assert nuts.divergences == 0
+    for i, name in enumerate(nuts.names):
+        mean, sigma = ours.value(name)
+        x = nuts.draws[:, i]
+        shift, ratio = (mean - x.mean()) / sigma, sigma / x.std()
+        error = 1.0 / np.sqrt(2.0 * effective((x - x.mean()) ** 2))
+        fit_value, fit_sigma = result.value(name)
+        print(
+            f"{name:30s} shift {shift:+.3f} σ, width ratio {ratio:.3f} ± {error:.3f}; "
+            f"Laplace {(fit_value - x.mean()) / sigma:+.3f} σ, {fit_sigma / x.std():.3f}"
+        )
+        assert abs(shift) < 0.1, name
+        assert abs(ratio - 1.0) < 0.05 + 2.0 * error, name
