@@ -126,7 +126,11 @@ class Blind:
     def hidden(self, name: str, ratio: float) -> np.ndarray:
         """The residual pattern of a named effect, at a random one of its shapes that can be seen at all."""
         table = self.table()
-        shapes = [c for p, c in zip(self.probes, self.named, strict=True) if p.effect.name == name and table[p.name].testable]
+        shapes = [
+            c
+            for p, c in zip(self.probes, self.named, strict=True)
+            if p.effect.name == name and table[p.name].testable
+        ]
         return self.signal(shapes[self.rng.integers(len(shapes))], ratio)
 
     def visible(self) -> list[str]:
@@ -160,7 +164,9 @@ class Blind:
         scorer, left = self._scorer((), removed)
         table = scorer(residual)
         while table.p_global < ALARM and len(added) < MOST_STEPS:
-            ranked = [r for r in naming.rank(table, left) if table.corrected(r.score) < ALARM and r.log_bayes > 0]
+            ranked = [
+                r for r in naming.rank(table, left) if table.corrected(r.score) < ALARM and r.log_bayes > 0
+            ]
             if not ranked:
                 break
             added.append(ranked[0].probe.name)
@@ -172,16 +178,22 @@ class Blind:
         names = tuple(next(p.effect.name for p in self.probes if p.name == a) for a in added)
         return Verdict(kind, names, classes, amplitudes)
 
-    def _class(self, name: str, added: Sequence[str], residual: np.ndarray, removed: tuple[str, ...]) -> frozenset[str]:
+    def _class(
+        self, name: str, added: Sequence[str], residual: np.ndarray, removed: tuple[str, ...]
+    ) -> frozenset[str]:
         others = tuple(a for a in added if a != name)
         scorer, left = self._scorer(others, removed)
         table = scorer(residual)
         effect = next(p.effect for p in self.probes if p.name == name)
         change = table.projected[name] @ table[name].amplitudes
-        return naming.close_rivals(change, [(p, table.projected[p.name]) for p in left if p.effect is not effect])
+        return naming.close_rivals(
+            change, [(p, table.projected[p.name]) for p in left if p.effect is not effect]
+        )
 
 
-def study(blind: Blind, each: int, ratios: Sequence[float] = (6.0, 10.0, 30.0), nulls: int = 200) -> dict[str, object]:
+def study(
+    blind: Blind, each: int, ratios: Sequence[float] = (6.0, 10.0, 30.0), nulls: int = 200
+) -> dict[str, object]:
     """Draw scenes, judge them, then open the truths: the numbers of the acceptance list."""
     scenes: list[Scene] = [Scene((), 0.0, blind.noise()) for _ in range(nulls)]
     for name in blind.visible():
@@ -189,12 +201,18 @@ def study(blind: Blind, each: int, ratios: Sequence[float] = (6.0, 10.0, 30.0), 
             scenes += [Scene((name,), ratio, blind.noise() + blind.hidden(name, ratio)) for _ in range(each)]
     for shape in blind.outside:
         for ratio in (10.0, 30.0):
-            scenes += [Scene((f"outside: {shape.name}",), ratio, blind.noise() + blind.signal(shape, ratio)) for _ in range(each)]
+            scenes += [
+                Scene((f"outside: {shape.name}",), ratio, blind.noise() + blind.signal(shape, ratio))
+                for _ in range(each)
+            ]
     order = blind.rng.permutation(len(scenes))
     sealed = json.dumps([scenes[i].truth for i in order]).encode()
     verdicts = [blind.judge(scenes[i].residual) for i in order]
     opened = [scenes[i] for i in order]
-    if hashlib.sha256(json.dumps([s.truth for s in opened]).encode()).digest() != hashlib.sha256(sealed).digest():
+    if (
+        hashlib.sha256(json.dumps([s.truth for s in opened]).encode()).digest()
+        != hashlib.sha256(sealed).digest()
+    ):
         raise RuntimeError("the truths changed while the verdicts were made")
     return summarise(list(zip(opened, verdicts, strict=True)))
 
@@ -235,4 +253,10 @@ if __name__ == "__main__":
     from walop_jax.likelihood.simulate import simulate
 
     simulated, _ = simulate(ObservingPlan(), seed=20260)
-    print(json.dumps(study(Blind(simulated), int(sys.argv[1]) if len(sys.argv) > 1 else 10), indent=1, ensure_ascii=False))
+    print(
+        json.dumps(
+            study(Blind(simulated), int(sys.argv[1]) if len(sys.argv) > 1 else 10),
+            indent=1,
+            ensure_ascii=False,
+        )
+    )

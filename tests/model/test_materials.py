@@ -25,7 +25,9 @@ def test_index_has_the_published_check_values(name):
 @pytest.mark.parametrize("name", BIREFRINGENCE)
 def test_birefringence_has_the_published_value(name):
     lam = jnp.asarray(0.62)
-    found = getattr(materials, f"{name}_E").refractive_index(lam) - getattr(materials, f"{name}_O").refractive_index(lam)
+    found = getattr(materials, f"{name}_E").refractive_index(lam) - getattr(
+        materials, f"{name}_O"
+    ).refractive_index(lam)
     assert float(found) == pytest.approx(BIREFRINGENCE[name], abs=6e-7)
 
 

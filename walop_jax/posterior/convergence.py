@@ -71,7 +71,7 @@ def autocorrelation(chains: Chains) -> Float[np.ndarray, " k"]:
     tau = np.full(k, np.nan)
     for i in range(k):
         x = np.moveaxis(chains[..., i], 0, 1).reshape(n, e * w)
-        if np.all(x.std(axis=0) > 0):
+        if np.all(np.ptp(x, axis=0) > 0):
             tau[i] = float(integrated_time(x[:, :, None], quiet=True, tol=0)[0])
     return tau
 
