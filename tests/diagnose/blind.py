@@ -1,11 +1,12 @@
 """A blind suite at the level of scores: thousands of hidden effects through the rules of `diagnose`, no refits.
 
-One design (a simulated calibration set, its Jacobian, the columns of every effect and pattern) is rotated into the space
-that its columns span; what lies outside is pure noise. Scenes are drawn there, Gaussian noise plus an effect of known
-signal-to-noise ratio after projection, and go through the scoring, ranking and separating code of the package.
+One design (a simulated calibration set, its Jacobian, the columns of every effect and pattern) is rotated into
+the space that its columns span; what lies outside is pure noise. Scenes are drawn there, Gaussian noise plus an
+effect of known signal-to-noise ratio after projection, and go through the scoring, ranking and separating code of
+the package.
 Verdicts are written before the truths are opened.
 
-    python -m tests.diagnose.blind [scenes per effect and ratio]
+    python tests/diagnose/blind.py [scenes per effect and ratio]
 """
 
 from __future__ import annotations

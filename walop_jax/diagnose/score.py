@@ -75,7 +75,7 @@ class Projector:
         self._q, _ = np.linalg.qr(jacobian / np.where(norm > 0, norm, 1.0))
         self.free = jacobian.shape[0] - jacobian.shape[1]
 
-    def __call__(self, columns: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    def __call__(self, columns: np.ndarray) -> np.ndarray:
         """Project columns (twice: the second pass removes the rounding of the first)."""
         for _ in range(2):
             columns = columns - self._q @ (self._q.T @ columns)
