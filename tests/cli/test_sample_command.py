@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from walop_jax.data.product import read_product
+from walop_jax.data.tables import read_input_table
 from walop_jax.fit.calibration import Calibration
 from walop_jax.posterior.output import read_draws
 
@@ -56,10 +57,14 @@ def test_sample_writes_everything_and_resumes(call, run_folder: Path, tmp_path: 
     draws = read_draws(run / "posterior.nc", Calibration.from_product(product).model.names)
     np.testing.assert_allclose(draws.std(axis=0)[free], product.parameters.sigma[free], rtol=0.1)
 
-    shutil.rmtree(run / "sampling")
-    (run / "sampling").mkdir()
-    again = call("sample", run, "--overwrite", "-q")
-    assert again.exit_code == 0, again.stderr
+    points = tmp_path / "points.csv"
+    points.write_text("X,Y\n0.0,0.0\n0.2,-0.1\n")
+    for name, options in (("linear", []), ("drawn", ["--posterior", run / "posterior.nc"])):
+        result = call("matrix", run, "--points", points, "-o", tmp_path / f"{name}.ecsv", *options)
+        assert result.exit_code == 0, result.stderr
+    linear, drawn = (read_input_table(tmp_path / f"{name}.ecsv").table for name in ("linear", "drawn"))
+    np.testing.assert_allclose(drawn["M32_ERR"], linear["M32_ERR"], rtol=0.3)
+    np.testing.assert_allclose(drawn["M32"], linear["M32"], atol=float(max(linear["M32_ERR"])))
 
 
 def test_sample_says_what_is_wrong(call, run_folder: Path, calset_file: Path, tmp_path: Path):

@@ -172,12 +172,12 @@ def test_band_holds_uniform_ranks_and_no_others() -> None:
 
 def test_laplace_is_calibrated(study: Study) -> None:
     """The cheap version: the covariance of the fit in place of the posterior."""
-    outcomes = [study.laplace(seed) for seed in range(40)]
+    outcomes = [study.laplace(seed) for seed in range(20)]
     outside, text = judge(outcomes, quantities(study), 0.99)
     print(text)
     assert not outside, text
     ratio = np.mean([o.inside68 for o in outcomes])
-    assert 0.58 < ratio < 0.78, text
+    assert 0.55 < ratio < 0.81, text
 
 
 @pytest.mark.long

@@ -56,10 +56,10 @@ def test_posterior_agrees_with_laplace_where_that_holds(scene: Scene, posterior:
     assert np.abs(true).max() < 4.5
 
 
-@pytest.mark.parametrize("cut", [1, 3])
+@pytest.mark.parametrize("cut", [1, 2])
 def test_interrupted_is_uninterrupted(scene: Scene, tmp_path: Path, cut: int) -> None:
     problem, result = scene.world.problem, scene.result
-    options = dataclasses.replace(OPTIONS, moves="de", maximum_steps=1000)
+    options = dataclasses.replace(OPTIONS, moves="de", maximum_steps=600)
     whole = sample(problem, result, options, folder=tmp_path / "whole")
     done = 0
 
@@ -144,12 +144,12 @@ def test_matrix_by_draws_agrees_with_the_covariance(
 ) -> None:
     x, y = np.array([0.0, 0.2, -0.25]), np.array([0.0, 0.1, 0.2])
     model, filters = scene.world.problem.model, scene.world.problem.calset.filters
-    drawn = matrix_draws(model, posterior.draws[0, :300], Settings.default(3), filters, x, y)
+    drawn = matrix_draws(model, posterior.draws[0, :100], Settings.default(3), filters, x, y)
     instrument = model.instrument(posterior.mean)
     values, covariance = matrices(instrument, Settings.default(3), filters, x, y, posterior.covariance)
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    np.testing.assert_allclose(drawn.std(axis=0), sigma, rtol=0.2)
-    assert np.max(np.abs(drawn.mean(axis=0) - values) / sigma) < 0.3
+    np.testing.assert_allclose(drawn.std(axis=0), sigma, rtol=0.3)
+    assert np.max(np.abs(drawn.mean(axis=0) - values) / sigma) < 0.45
     write_posterior(tmp_path / "posterior.nc", posterior)
     calibration = with_draws(
         Calibration.from_fit(scene.result, scene.world.problem), tmp_path / "posterior.nc", 50

@@ -29,12 +29,19 @@ PointsOption = Annotated[
 OutputOption = Annotated[
     Path, typer.Option("--output", "-o", metavar="OUT", help="Table to write (.fits, .csv, .ecsv).")
 ]
+PosteriorOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--posterior", metavar="posterior.nc", help="Use draws of walop-jax sample, not the covariance."
+    ),
+]
 
 
 def matrix(
     product: Product,
     points: PointsOption,
     output: OutputOption,
+    posterior: PosteriorOption = None,
     overwrite: OverwriteOption = False,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -70,6 +77,10 @@ def matrix(
         tell("working out the matrix")
         with named(path):
             calibration = Calibration.from_product(held)
+        if posterior is not None:
+            from walop_jax.posterior.propagate import with_draws
+
+            calibration = with_draws(calibration, posterior)
         settings = Settings(wanted.filter, wanted.teff, wanted.chwp_angle, wanted.temp, wanted.ha)
         with named(points):
             columns = matrix_columns(calibration, wanted.x, wanted.y, settings, wanted.outside)

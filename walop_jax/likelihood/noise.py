@@ -39,7 +39,9 @@ class PhotonNoise:
         """
         if not (np.isfinite(expected).all() and np.all(expected >= 0.0)):
             raise ValueError("expected counts must be finite and not negative: no light is darker than none")
-        counts = rng.poisson(expected) + self.read_noise * rng.standard_normal(expected.shape)
+        # Read noise first: how many random numbers a Poisson draw takes depends on what is expected.
+        read = self.read_noise * rng.standard_normal(expected.shape)
+        counts = rng.poisson(expected) + read
         return counts, self.sigma(counts)
 
     def normalised_residuals(self, counts: Counts, expected: Counts) -> Counts:
