@@ -62,14 +62,16 @@ class Checkpoints:
 
     def exists(self) -> bool:
         """Whether a run has left anything here."""
-        return self.folder.is_dir() and any(self.folder.glob("*.h5"))
+        return (self.folder / SURROGATE).exists() or self.count() > 0
 
     def clear(self) -> None:
         """Remove the checkpoints of an earlier run.
 
         The surrogate last, so that what is left is still whole.
         """
-        for path in (*sorted(self.folder.glob("block-*.h5"), reverse=True), self.folder / SURROGATE):
+        blocks = sorted(self.folder.glob("block-*.h5"), reverse=True)
+        unfinished = self.folder.glob(".walop-*.h5")  # what a kill in the middle of writing leaves
+        for path in (*blocks, *unfinished, self.folder / SURROGATE):
             path.unlink(missing_ok=True)
 
     # --------------------------------------------------------------------------------------- the surrogate

@@ -1,0 +1,81 @@
+"""The whole workflow on sets made by other code, in which an effect is hidden (or nothing is)."""
+
+import json
+
+import numpy as np
+import pytest
+
+from walop_jax.data import read_calibration_set
+from walop_jax.diagnose.design import Design, exposure_folds, field_folds, held_out
+from walop_jax.diagnose.document import document
+from walop_jax.diagnose.workflow import diagnose
+from walop_jax.fit.refit import fit
+from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
+from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood.simulate import simulate
+
+
+@pytest.fixture(scope="module")
+def design():
+    plan = ObservingPlan(
+        grid=5, standard_grid=2, polariser_angles=polariser_turn(10), moon_patches=5, standards=5
+    )
+    calset, _ = simulate(plan, seed=31)
+    problem = Problem(calset, base_model(calset))
+    return Design.of(problem, fit(problem))
+
+
+def test_rows_and_priors_make_the_objective(design):
+    fitted = design.fit
+    assert design.residual @ design.residual == pytest.approx(fitted.posterior.objective, rel=1e-10)
+    scale = np.sqrt(np.diag(fitted.posterior.matrix))
+    gram = design.jacobian.T @ design.jacobian
+    np.testing.assert_allclose(
+        gram / np.outer(scale, scale), fitted.posterior.matrix / np.outer(scale, scale), atol=1e-9
+    )
+    assert np.abs(design.jacobian.T @ design.residual / scale).max() < 1e-3
+
+
+def test_folds_split_every_row_once_and_keep_exposures_and_blocks_whole(design):
+    for fold, group in ((exposure_folds(design), design.exposure), (field_folds(design), design.point)):
+        assert set(np.unique(fold)) <= set(range(5))
+        for one in np.unique(group):
+            assert len(np.unique(fold[group == one])) == 1
+
+
+@pytest.mark.parametrize("scheme", ["exposures", "field blocks"])
+def test_held_out_residuals_of_a_complete_model_are_noise(design, scheme):
+    """A row of four intensities with its flux eliminated holds three numbers: 3/4 each, a little more unseen."""
+    found = held_out(design, scheme)
+    assert found.counts.sum() == design.rows
+    assert 0.7 < found.mean < 0.95
+    assert found.mean > np.mean(design.residual[: design.rows] ** 2)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("name", "verdict", "effects"),
+    [
+        ("a", "consistent", set()),
+        ("b", "consistent", set()),
+        ("c", "effect_found", {"clp_wobble"}),
+        ("d", "effect_found", {"camera_leakage", "hwp2_axis"}),
+    ],
+)
+def test_sets_of_other_code(shared_data, name, verdict, effects):
+    truth = json.loads((shared_data / f"walop_south_{name}_truth.json").read_text())["effects"]
+    found = diagnose(read_calibration_set(shared_data / f"walop_south_{name}.fits"), progress=print)
+    content = document(found)
+    print(json.dumps(content, indent=1, ensure_ascii=False))
+    assert found.verdict == verdict
+    assert {step.effect for step in found.steps} == effects == set(truth)
+    assert all(step.confirmed for step in found.steps)
+    assert 0.97 < found.after.chi2 / found.after.dof < 1.03
+    for step in found.steps:
+        true = truth[step.effect]
+        if step.effect == "clp_wobble":
+            value, sigma, _ = step.parameters["amplitude"]
+            assert abs(value - np.rad2deg(true["amplitude"])) < 3 * sigma
+        else:
+            ((value, sigma, unit),) = step.parameters.values()
+            assert abs(value - (np.rad2deg(true) if unit == "deg" else true)) < 3 * sigma
