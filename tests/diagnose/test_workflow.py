@@ -18,7 +18,7 @@ from walop_jax.likelihood.simulate import simulate
 @pytest.fixture(scope="module")
 def design():
     plan = ObservingPlan(
-        grid=5, standard_grid=2, polariser_angles=polariser_turn(10), moon_patches=5, standards=5
+        grid=9, standard_grid=2, polariser_angles=polariser_turn(10), moon_patches=5, standards=5
     )
     calset, _ = simulate(plan, seed=31)
     problem = Problem(calset, base_model(calset))

@@ -14,7 +14,7 @@ from walop_jax.diagnose.score import Candidate, Projector
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.problem import Problem
 
-Vector = Float[np.ndarray, " d"]
+Vector = Float[np.ndarray, " _"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Design:
     fit: FitResult
     measured: Measured
     residual: Vector
-    jacobian: Float[np.ndarray, "d f"]
+    jacobian: Float[np.ndarray, "_ _"]
 
     @classmethod
     def of(cls, problem: Problem, fit: FitResult) -> Design:
@@ -41,7 +41,7 @@ class Design:
         return cls(problem, fit, measured, np.concatenate([data, prior]), np.vstack([slope, prior_slope]))
 
     @staticmethod
-    def _prior_rows(problem: Problem, values: Vector) -> tuple[Vector, Float[np.ndarray, "k f"]]:
+    def _prior_rows(problem: Problem, values: Vector) -> tuple[Vector, Float[np.ndarray, "_ _"]]:
         model = problem.model
         select = model.selection()
         residual, slope = [], []
@@ -92,7 +92,7 @@ class Design:
         cube[used] = rows[: self.rows].reshape(-1, 4)
         return cube
 
-    def subset_step(self, keep: Bool[np.ndarray, " d"]) -> Float[np.ndarray, " f"]:
+    def subset_step(self, keep: Bool[np.ndarray, " _"]) -> Float[np.ndarray, " _"]:
         """Change of the free parameters when only the data rows in `keep` (and the priors) are fitted.
 
         One Gauss–Newton step from the joint minimum: the change is a fraction of the standard errors, where the

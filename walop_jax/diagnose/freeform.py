@@ -53,7 +53,7 @@ class Measured:
             unpolarised / np.maximum(np.where(self.used, self.flux, 0.0).sum(axis=1), 1e-300)[:, None]
         )
 
-    def column(self, pattern: Cube) -> Float[np.ndarray, " d"]:
+    def column(self, pattern: Cube) -> Float[np.ndarray, " _"]:
         """Derivative of the residuals with respect to the amplitude of N_k → N_k + F · level_k · pattern."""
         change = self.flux[..., None] * pattern * self.level[:, None, :] * self.weight
         power = np.sum(self.model**2, axis=-1)

@@ -125,13 +125,16 @@ def equivalents(
     name: str,
     context: Context,
     rivals: Sequence[Probe],
-) -> tuple[dict[str, float], Float[np.ndarray, " d"]]:
+) -> tuple[dict[str, float], Float[np.ndarray, " _"]]:
     """Separation (σ) of every rival from an active effect, and the change of the residuals that the effect makes."""
     base = without(final.model, name, context)
-    values = dict(zip(final.model.names, final.values, strict=True))
-    base_values = np.array([values[p.name] for p in base.parameters])
+    kept = [final.model.index(p.name) for p in base.parameters]
+    base_values = final.values[kept]
     problem = Problem(calset, base)
-    bare = Design.of(problem, dataclasses.replace(final, model=base, values=base_values))
+    bare_fit = dataclasses.replace(
+        final, model=base, values=base_values, covariance=final.covariance[np.ix_(kept, kept)]
+    )
+    bare = Design.of(problem, bare_fit)
     change = bare.residual[: bare.rows] - design.residual[: design.rows]
     extra = len(bare.residual) - bare.rows
     projected = bare.projector(np.pad(change, (0, extra)))
@@ -141,7 +144,7 @@ def equivalents(
 
 
 def separations(
-    change: Float[np.ndarray, " d"], rivals: Sequence[tuple[Probe, Float[np.ndarray, "d _"]]]
+    change: Float[np.ndarray, " _"], rivals: Sequence[tuple[Probe, Float[np.ndarray, "_ _"]]]
 ) -> dict[str, float]:
     """How far (σ) each rival stays from a projected change of the residuals when it does its best to follow."""
     separation: dict[str, float] = {}
@@ -153,7 +156,7 @@ def separations(
 
 
 def close_rivals(
-    change: Float[np.ndarray, " d"], rivals: Sequence[tuple[Probe, Float[np.ndarray, "d _"]]]
+    change: Float[np.ndarray, " _"], rivals: Sequence[tuple[Probe, Float[np.ndarray, "_ _"]]]
 ) -> frozenset[str]:
     """The rivals that these data cannot tell from an effect that changes the residuals by `change`."""
     return frozenset(name for name, s in separations(change, rivals).items() if s < SEPARATION)

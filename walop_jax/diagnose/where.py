@@ -70,7 +70,7 @@ def _field_words(design: Design, field: Float[np.ndarray, " p"]) -> str:
     return _named(words)
 
 
-def describe(design: Design, rows: Float[np.ndarray, " d"]) -> dict[str, Any]:
+def describe(design: Design, rows: Float[np.ndarray, " _"]) -> dict[str, Any]:
     """Where a change of the residuals (data rows of `design`) sits, as the contract's `where`."""
     cube = design.cube(rows)
     square = cube**2

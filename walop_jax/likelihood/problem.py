@@ -186,7 +186,7 @@ class Problem:
         return np.concatenate(parts, axis=1)
 
     @staticmethod
-    def _rows(columns: Array, chunk: engine.PointData) -> Float[np.ndarray, "d n"]:
+    def _rows(columns: Array | np.ndarray, chunk: engine.PointData) -> Float[np.ndarray, "d n"]:
         used = np.asarray(chunk.weight[..., 0] > 0)
         cube = np.asarray(columns).reshape(*used.shape, 4, -1)
         return cube[used].reshape(-1, cube.shape[-1])
