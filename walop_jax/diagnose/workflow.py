@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnose import naming, where
@@ -32,11 +33,18 @@ ALARM = 0.01
 MOST_STEPS = 6
 Verdict = Literal["consistent", "effect_found", "unexplained"]
 Progress = Callable[[str], None]
+Cube = Float[np.ndarray, "p e 4"]
+_NOTHING = np.zeros((0, 0, 4))
 
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """One effect that was found, added and confirmed; `parameters` hold (value, sigma, unit)."""
+    """One effect that was found, added and confirmed; `parameters` hold (value, sigma, unit).
+
+    `residual_before`, `residual_after` and `signature` are in standard deviations, (point, exposure, camera): the
+    residuals (data − model) without and with the effect at the time it was added, and the change that it makes to
+    the residuals of the final model.
+    """
 
     effect: str
     parameters: dict[str, tuple[float, float, str]]
@@ -51,6 +59,9 @@ class Step:
     separation: dict[str, float] = dataclasses.field(default_factory=dict)
     separated_by: str = ""
     where: dict[str, Any] = dataclasses.field(default_factory=dict)
+    residual_before: Cube = _NOTHING
+    residual_after: Cube = _NOTHING
+    signature: Cube = _NOTHING
 
     @property
     def confirmed(self) -> bool:
@@ -209,6 +220,8 @@ def _step(look: _Look, trial: naming.Trial) -> Step:
         chi2_after=trial.fit.chi2,
         heldout_before=held_out(look.design, scheme),
         heldout_after=held_out(design, scheme),
+        residual_before=look.design.cube(look.design.residual),
+        residual_after=design.cube(design.residual),
     )
 
 
@@ -240,6 +253,7 @@ def _finished(
         separation=separation,
         separated_by=effect.separated_by if close else "",
         where=where.describe(design, change),
+        signature=design.cube(change),
     )
 
 
