@@ -34,7 +34,10 @@ MOST_STEPS = 6
 Verdict = Literal["consistent", "effect_found", "unexplained"]
 Progress = Callable[[str], None]
 Cube = Float[np.ndarray, "p e 4"]
-_NOTHING = np.zeros((0, 0, 4))
+
+
+def _no_cube() -> Cube:
+    return np.zeros((0, 0, 4))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,9 +62,9 @@ class Step:
     separation: dict[str, float] = dataclasses.field(default_factory=dict)
     separated_by: str = ""
     where: dict[str, Any] = dataclasses.field(default_factory=dict)
-    residual_before: Cube = _NOTHING
-    residual_after: Cube = _NOTHING
-    signature: Cube = _NOTHING
+    residual_before: Cube = dataclasses.field(default_factory=_no_cube)
+    residual_after: Cube = dataclasses.field(default_factory=_no_cube)
+    signature: Cube = dataclasses.field(default_factory=_no_cube)
 
     @property
     def confirmed(self) -> bool:
