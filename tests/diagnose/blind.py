@@ -1,12 +1,11 @@
 """A blind suite at the level of scores: thousands of hidden effects through the rules of `diagnose`, no refits.
 
-One design (a simulated calibration set, its Jacobian, the columns of every effect and pattern) is rotated into
-the space that its columns span; what lies outside is pure noise. Scenes are drawn there, Gaussian noise plus an
-effect of known signal-to-noise ratio after projection, and go through the scoring, ranking and separating code of
-the package.
+One design (a simulated calibration set, its Jacobian, the columns of every effect and pattern) spans a space of a
+thousand dimensions; what lies outside is pure noise. Scenes are drawn there: Gaussian noise plus an effect of known
+signal-to-noise ratio behind the projection. They go through the scoring, ranking and separating code of the package.
 Verdicts are written before the truths are opened.
 
-    python tests/diagnose/blind.py [scenes per effect and ratio]
+    PYTHONPATH=tests python tests/diagnose/blind.py [scenes per effect and ratio] [OUT.json]
 """
 
 from __future__ import annotations
@@ -17,41 +16,76 @@ import hashlib
 import json
 import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnose import naming
-from walop_jax.diagnose.columns import Probe, effect_candidates, probes
-from walop_jax.diagnose.design import Design
-from walop_jax.diagnose.freeform import strata
-from walop_jax.diagnose.score import Candidate, Projector, Scorer, ScoreTable, whitened
-from walop_jax.diagnose.workflow import ALARM, MOST_STEPS
+from walop_jax.diagnose.columns import Probe, probes
+from walop_jax.diagnose.freeform import SINGLE, Measured
+from walop_jax.diagnose.look import ALARM, Look
+from walop_jax.diagnose.score import Candidate, Scorer, ScoreSpace, separations, whitening
+from walop_jax.diagnose.workflow import MOST_STEPS
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.problem import Problem, base_model
 from walop_jax.model.effects import EFFECTS
 from walop_jax.model.specification import effect_context
 
-NOISE_ROWS = 2000
+SEPARABLE = 5.0  # σ between the truth and its nearest rival above which a name is asked for
+CONFOUNDED = 2.0  # below which a class is asked for
+DRAWS = 3000
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """What is hidden: effect names (or the label of an outside shape) and the residuals they make."""
+    """What is hidden (effect names, or the label of an outside shape), and how it looks.
 
+    `coordinates` are the residuals in the space of all columns, `rest` the squared length of what lies outside.
+    `separation` is that of the truth from its nearest rival, by design.
+    """
+
+    kind: str
     truth: tuple[str, ...]
     ratio: float
-    residual: np.ndarray
+    coordinates: np.ndarray
+    rest: float
+    separation: float = np.inf
+    amplitudes: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    probe: str = ""
+    removed: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """What the rules say of a scene."""
+    """What the rules say of a scene; `pulls` are those of the first name's amplitudes, for each of its probes."""
 
     kind: str
     named: tuple[str, ...]
     classes: tuple[frozenset[str], ...]
-    amplitudes: dict[str, float]
+    first_probe: str = ""
+    amplitudes: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    covariance: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
+
+
+def outside(measured: Measured) -> Iterator[Candidate]:
+    """Shapes that are in no catalogue."""
+    e, points = measured.problem.calset.exposures, measured.problem.calset.points
+    shape = (len(points), len(e), 4)
+    r = np.hypot(points.x, points.y)
+    through = e.clp_in
+    angle = np.deg2rad(np.where(through, e.clp_angle, 0.0))
+    sky = (e.kind == "moon") & ~through
+    camera = np.eye(4)[:, None, None]
+    patterns = {
+        "ring": np.exp(-((r - 0.2) ** 2) / (2 * 0.03**2))[:, None, None] * camera[2],
+        "step": np.where(points.x > 0.05, 1.0, 0.0)[:, None, None] * camera[1],
+        "six times the angle": np.where(through, np.cos(6 * angle), 0.0)[None, :, None] * camera[0],
+        "hysteresis": np.where(through & (np.arange(len(e)) % 2 == 0), 1.0, 0.0)[None, :, None] * camera[3],
+        "sky gradient": (points.x / 0.3)[:, None, None] * sky[None, :, None] * (camera[0] - camera[1]),
+    }
+    for name, pattern in patterns.items():
+        yield measured.candidate(name, [np.broadcast_to(pattern, shape)])
 
 
 class Blind:
@@ -61,203 +95,251 @@ class Blind:
         model = base_model(calset)
         problem = Problem(calset, model)
         result = fit(problem)
-        design = Design.of(problem, result)
-        self.probes: list[Probe] = list(probes(EFFECTS, effect_context(model.template, calset.exposures)))
-        named = design.padded(list(effect_candidates(calset, model, result.values, self.probes).values()))
-        free = design.padded(list(strata(design.measured)))
-        outside = design.padded(list(self._outside(design)))
-        every = np.column_stack([design.jacobian, *(c.columns for c in [*named, *free, *outside])])
-        turn = whitened(every)[0]
-        self.jacobian = self._rotated(turn, design.jacobian)
-        self.named = [self._candidate(turn, c) for c in named]
-        self.free = [self._candidate(turn, c) for c in free]
-        self.outside = [self._candidate(turn, c) for c in outside]
-        self._scorers: dict[tuple[tuple[str, ...], tuple[str, ...]], tuple[Scorer, list[Probe]]] = {}
-        self.projector = Projector(self.jacobian)
         self.rng = np.random.default_rng(seed)
-
-    @staticmethod
-    def _rotated(turn: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        return np.pad(turn.T @ columns, ((0, NOISE_ROWS), (0, 0)))
-
-    def _candidate(self, turn: np.ndarray, c: Candidate) -> Candidate:
-        return Candidate(c.name, self._rotated(turn, c.columns), c.widths)
-
-    @staticmethod
-    def _outside(design: Design) -> Iterator[Candidate]:
-        """Shapes that are in no catalogue."""
-        measured = design.measured
-        e, points = design.problem.calset.exposures, design.problem.calset.points
-        shape = (len(points), len(e), 4)
-        r = np.hypot(points.x, points.y)
-        through = e.clp_in
-        angle = np.deg2rad(np.where(through, e.clp_angle, 0.0))
-        sky = (e.kind == "moon") & ~through
-
-        def camera(k: int) -> np.ndarray:
-            return np.eye(4)[k][None, None]
-
-        ring = np.exp(-((r - 0.2) ** 2) / (2 * 0.02**2))[:, None, None]
-        step = np.where(points.x > 0.05, 1.0, 0.0)[:, None, None]
-        six = np.where(through, np.cos(6 * angle), 0.0)[None, :, None]
-        hysteresis = np.where(through & (np.arange(len(e)) % 2 == 0), 1.0, 0.0)[None, :, None]
-        pair = camera(0) - camera(1)
-        gradient = (points.x / 0.3)[:, None, None] * sky[None, :, None] * pair
-        patterns = {
-            "ring": ring * camera(2),
-            "step": step * camera(1),
-            "6θ": six * camera(0),
-            "hysteresis": hysteresis * camera(3),
-            "sky gradient": gradient,
-        }
-        for name, pattern in patterns.items():
-            yield measured.candidate(name, [np.broadcast_to(pattern, shape)])
+        wanted = list(probes(EFFECTS, effect_context(model.template, calset.exposures)))
+        look = Look(problem, result, wanted, self.rng)
+        self.probes: list[Probe] = look.probes
+        self.effect_of = {p.name: p.effect.name for p in self.probes}
+        self.space, self.nuisance = look.space, look.common_mode
+        self.places = self.space.places()
+        self._whitening = whitening(self.space.gram)
+        self._root = self.space.gram @ self._whitening
+        self.dimension = self._root.shape[1]
+        self.outside = {}
+        for shape in look.design.padded(list(outside(look.design.measured))):
+            column = look.design.projector(shape.columns[:, 0])
+            along = self._whitening.T @ (look.columns.T @ column)
+            self.outside[shape.name] = along, float(column @ column - along @ along)
+        self._scorers: dict[tuple[tuple[str, ...], tuple[str, ...]], tuple[Scorer, list[Probe]]] = {}
+        self.free = look.space.free
+        self.visible = sorted({p.effect.name for p in self.probes if look.table[p.name].testable})
+        self._testable = {p.name for p in self.probes if look.table[p.name].testable}
 
     # ------------------------------------------------------------------------------------------ drawing scenes
 
-    def noise(self) -> np.ndarray:
+    def noise(self) -> tuple[np.ndarray, float]:
         """Residuals of a set in which nothing is missing."""
-        return self.rng.standard_normal(len(self.jacobian))
+        return self.rng.standard_normal(self.dimension), float(self.rng.chisquare(self.free - self.dimension))
 
-    def signal(self, candidate: Candidate, ratio: float) -> np.ndarray:
-        """A random direction of a candidate at a signal-to-noise ratio (after projection)."""
-        direction = candidate.columns @ (self.rng.standard_normal(len(candidate.widths)) * candidate.widths)
-        return -direction * ratio / np.linalg.norm(self.projector(direction))
+    def null(self) -> Scene:
+        """Nothing missing."""
+        return Scene("null", (), 0.0, *self.noise())
 
-    def hidden(self, name: str, ratio: float) -> np.ndarray:
-        """The residual pattern of a named effect, at a random one of its shapes that can be seen at all."""
-        table = self.table()
-        shapes = [
-            c
-            for p, c in zip(self.probes, self.named, strict=True)
-            if p.effect.name == name and table[p.name].testable
+    def hidden(self, name: str, ratio: float, removed: tuple[str, ...] = (), kind: str = "named") -> Scene:
+        """A named effect at a random shape that can be seen at all, in a random direction."""
+        shapes = [p for p in self.probes if p.effect.name == name and p.name in self._testable]
+        probe = shapes[self.rng.integers(len(shapes))]
+        at, alive = self.places[probe.name], self.space.alive()[self.places[probe.name]]
+        gram = self.space.gram[at, at]
+        while True:
+            step = self.rng.standard_normal(len(alive)) * self.space.widths[at] * alive
+            step *= ratio / np.sqrt(step @ gram @ step)
+            sides = [n in probe.effect.one_sided for m in probe.group for n in probe.effect.amplitudes()
+                     for _ in range(np.size(getattr(m, n)))]  # fmt: skip
+            step = np.where(sides, np.abs(step), step)
+            if np.isclose(step @ gram @ step, ratio**2):
+                break
+        change = -self.space.gram[:, at] @ step
+        rivals = [p for p in self.probes if p.effect.name not in (name, *removed)]
+        distance = separations(self.space.subset([p.name for p in rivals]), *self._of(change, rivals, ratio))
+        z, rest = self.noise()
+        return Scene(
+            kind, (name,), ratio, z + self._whitening.T @ change, rest, min(distance.values()), step, probe.name,
+            removed,
+        )  # fmt: skip
+
+    def _of(self, change: np.ndarray, rivals: Sequence[Probe], ratio: float) -> tuple[np.ndarray, float]:
+        return change[self.space.chosen([p.name for p in rivals])], ratio**2
+
+    def pair(self, ratio: float) -> Scene:
+        """Two effects, each with the signal-to-noise ratio that is asked for by itself."""
+        first, second = self.rng.choice(len(self.visible), 2, replace=False)
+        a = self.hidden(self.visible[first], ratio)
+        b = self.hidden(self.visible[second], ratio)
+        z, rest = self.noise()
+        signal = [
+            -self._whitening.T @ self.space.gram[:, self.places[s.probe]] @ s.amplitudes for s in (a, b)
         ]
-        return self.signal(shapes[self.rng.integers(len(shapes))], ratio)
+        truth = (*a.truth, *b.truth)
+        return Scene("pair", truth, ratio, z + signal[0] + signal[1], rest, min(a.separation, b.separation))
 
-    def visible(self) -> list[str]:
-        """Effects that this design can show."""
-        table = self.table()
-        return sorted({p.effect.name for p in self.probes if table[p.name].testable})
-
-    def table(self) -> ScoreTable:
-        """Scores of pure noise: for what does not depend on the data."""
-        return self._scorer((), ())[0](np.ones(len(self.jacobian)))
+    def strange(self, name: str, ratio: float) -> Scene:
+        """A shape that is in no catalogue."""
+        along, beyond = self.outside[name]
+        length = np.sqrt(along @ along + beyond)
+        sign = self.rng.choice([-1.0, 1.0])
+        z, rest = self.noise()
+        beyond = beyond * (ratio / length) ** 2
+        rest += beyond + 2 * np.sqrt(beyond) * self.rng.standard_normal()
+        return Scene("outside", (name,), ratio, z + sign * along * ratio / length, max(rest, 0.0))
 
     # --------------------------------------------------------------------------------------------------- judging
 
     def _scorer(self, added: tuple[str, ...], removed: tuple[str, ...]) -> tuple[Scorer, list[Probe]]:
-        key = (added, removed)
-        if key not in self._scorers:
-            active = {p.effect.name for p in self.probes if p.name in added}
-            keep = [
-                (p, c) for p, c in zip(self.probes, self.named, strict=True)
-                if p.effect.name not in active | set(removed)
-            ]  # fmt: skip
-            base = np.column_stack([self.jacobian, *(c.columns for c in self.named if c.name in added)])
-            scorer = Scorer(Projector(base), [*(c for _, c in keep), *self.free], np.random.default_rng(7))
-            self._scorers[key] = scorer, [p for p, _ in keep]
-        return self._scorers[key]
+        if (added, removed) not in self._scorers:
+            space = self._space(added)
+            gone = {self.effect_of[a] for a in added} | set(removed)
+            left = [p for p in self.probes if p.effect.name not in gone]
+            names = [p.name for p in left] + [n for n in space.names if n not in self.effect_of]
+            draws = np.random.default_rng(7)
+            self._scorers[added, removed] = Scorer(space.subset(names), draws, DRAWS), left
+        return self._scorers[added, removed]
 
-    def judge(self, residual: np.ndarray, removed: tuple[str, ...] = ()) -> Verdict:
+    def _space(self, added: tuple[str, ...]) -> ScoreSpace:
+        space = self.space.with_base([SINGLE], self.nuisance)[0]
+        return space.with_base(list(added))[0] if added else space
+
+    def _reduced(self, s: np.ndarray, square: float, added: tuple[str, ...]) -> tuple[np.ndarray, float]:
+        space, reduce = self.space.with_base([SINGLE], self.nuisance)
+        s, square = reduce(s, square)
+        return space.with_base(list(added))[1](s, square) if added else (s, square)
+
+    def judge(self, scene: Scene) -> Verdict:
         """The workflow's rules with linear steps in place of refits."""
+        s0 = self._root @ scene.coordinates
+        square0 = float(scene.coordinates @ scene.coordinates) + scene.rest
         added: list[str] = []
-        amplitudes: dict[str, float] = {}
-        scorer, left = self._scorer((), removed)
-        table = scorer(residual)
-        while table.p_global < ALARM and len(added) < MOST_STEPS:
+        classes: list[frozenset[str]] = []
+        first: naming.Ranked | None = None
+        while True:
+            scorer, left = self._scorer(tuple(added), scene.removed)
+            s, square = self._reduced(s0, square0, tuple(added))
+            table = scorer(s[self.space.chosen(scorer.space.names)], square)
+            if table.p_global >= ALARM or len(added) >= MOST_STEPS:
+                break
+            patterns = [s.log_bayes for s in table.scores if s.testable and s.name not in self.effect_of]
+            least = min(0.0, max(patterns))
             ranked = [
-                r for r in naming.rank(table, left) if table.corrected(r.score) < ALARM and r.log_bayes > 0
+                r
+                for r in naming.rank(table, left)
+                if table.corrected(r.score) < ALARM and r.log_bayes > least
             ]
             if not ranked:
                 break
-            added.append(ranked[0].probe.name)
-            amplitudes[ranked[0].effect.name] = float(np.sqrt(ranked[0].score.statistic))
-            scorer, left = self._scorer(tuple(added), removed)
-            table = scorer(residual)
-        classes = tuple(self._class(name, added, residual, removed) for name in added)
+            best = ranked[0]
+            first = first or best
+            close = {r.effect.name for r in ranked[1:] if best.log_bayes - r.log_bayes < naming.EVEN_ODDS}
+            classes.append(frozenset(close | self._rivals(scorer.space, best, left)))
+            added.append(best.probe.name)
         kind = "unexplained" if table.p_global < ALARM else "effect_found" if added else "consistent"
-        names = tuple(next(p.effect.name for p in self.probes if p.name == a) for a in added)
-        return Verdict(kind, names, classes, amplitudes)
+        names = tuple(self.effect_of[a] for a in added)
+        if first is None:
+            return Verdict(kind, names, tuple(classes))
+        score = first.score
+        return Verdict(kind, names, tuple(classes), first.probe.name, score.amplitudes, score.covariance)
 
-    def _class(
-        self, name: str, added: Sequence[str], residual: np.ndarray, removed: tuple[str, ...]
-    ) -> frozenset[str]:
-        others = tuple(a for a in added if a != name)
-        scorer, left = self._scorer(others, removed)
-        table = scorer(residual)
-        effect = next(p.effect for p in self.probes if p.name == name)
-        change = table.projected[name] @ table[name].amplitudes
-        return naming.close_rivals(
-            change, [(p, table.projected[p.name]) for p in left if p.effect is not effect]
-        )
+    def _rivals(self, space: ScoreSpace, best: naming.Ranked, left: Sequence[Probe]) -> set[str]:
+        at = space.places()[best.probe.name]
+        change = space.gram[:, at] @ best.score.amplitudes
+        others = [p.name for p in left if p.effect is not best.effect]
+        length = float(best.score.amplitudes @ space.gram[at, at] @ best.score.amplitudes)
+        found = separations(space.subset(others), change[space.chosen(others)], length)
+        return {self.effect_of[name] for name, d in found.items() if d < naming.SEPARATION}
 
 
 def study(
     blind: Blind, each: int, ratios: Sequence[float] = (6.0, 10.0, 30.0), nulls: int = 200
 ) -> dict[str, object]:
     """Draw scenes, judge them, then open the truths: the numbers of the acceptance list."""
-    scenes: list[Scene] = [Scene((), 0.0, blind.noise()) for _ in range(nulls)]
-    for name in blind.visible():
+    scenes = [blind.null() for _ in range(nulls)]
+    for name in blind.visible:
         for ratio in ratios:
-            scenes += [Scene((name,), ratio, blind.noise() + blind.hidden(name, ratio)) for _ in range(each)]
+            scenes += [blind.hidden(name, ratio) for _ in range(each)]
+        scenes += [blind.hidden(name, ratio, (name,), "removed") for ratio in ratios[1:] for _ in range(each)]
+    scenes += [blind.pair(10.0) for _ in range(each * len(blind.visible) // 2)]
     for shape in blind.outside:
         for ratio in (10.0, 30.0):
-            scenes += [
-                Scene((f"outside: {shape.name}",), ratio, blind.noise() + blind.signal(shape, ratio))
-                for _ in range(each)
-            ]
+            scenes += [blind.strange(shape, ratio) for _ in range(2 * each)]
     order = blind.rng.permutation(len(scenes))
-    sealed = json.dumps([scenes[i].truth for i in order]).encode()
-    verdicts = [blind.judge(scenes[i].residual) for i in order]
+    sealed = _seal([scenes[i] for i in order])
+    verdicts = [blind.judge(scenes[i]) for i in order]
     opened = [scenes[i] for i in order]
-    if (
-        hashlib.sha256(json.dumps([s.truth for s in opened]).encode()).digest()
-        != hashlib.sha256(sealed).digest()
-    ):
+    if _seal(opened) != sealed:
         raise RuntimeError("the truths changed while the verdicts were made")
     return summarise(list(zip(opened, verdicts, strict=True)))
+
+
+def _seal(scenes: Sequence[Scene]) -> bytes:
+    return hashlib.sha256(json.dumps([(s.kind, s.truth) for s in scenes]).encode()).digest()
 
 
 def summarise(judged: Sequence[tuple[Scene, Verdict]]) -> dict[str, object]:
     """Rates over judged scenes, and the confusion of names."""
     rates: dict[str, list[bool]] = collections.defaultdict(list)
+    pulls: list[float] = []
     confusion: collections.Counter[tuple[str, str]] = collections.Counter()
     for scene, verdict in judged:
-        if not scene.truth:
+        said = "+".join(verdict.named) + f" [{verdict.kind}]"
+        ratio = f"{scene.ratio:g}"
+        found = verdict.kind == "effect_found"
+        if scene.kind == "null":
             rates["false alarm"].append(verdict.kind != "consistent")
-            continue
-        truth, ratio = scene.truth[0], f"{scene.ratio:g}"
-        if truth.startswith("outside"):
-            rates[f"outside unexplained {ratio}"].append(verdict.kind == "unexplained")
-            confusion[truth, "+".join(verdict.named) + f" [{verdict.kind}]"] += 1
-            continue
-        first = verdict.named[0] if verdict.named else verdict.kind
-        told = frozenset(verdict.named[:1]).union(*verdict.classes[:1])
-        rates[f"detected {ratio}"].append(verdict.kind != "consistent")
-        rates[f"top-1 {ratio}"].append(first == truth)
-        rates[f"in class {ratio}"].append(truth in told)
-        rates[f"confident and wrong {ratio}"].append(bool(verdict.named) and truth not in told)
-        rates[f"exactly one step {ratio}"].append(len(verdict.named) == 1 and verdict.kind == "effect_found")
-        if first != truth:
-            confusion[truth, first] += 1
+        elif scene.kind == "outside":
+            rates[f"outside: unexplained, SNR {ratio}"].append(verdict.kind == "unexplained")
+            rates[f"outside: unexplained, SNR {ratio}, {scene.truth[0]}"].append(
+                verdict.kind == "unexplained"
+            )
+            if verdict.kind != "unexplained":
+                confusion[f"outside: {scene.truth[0]}", said] += 1
+        elif scene.kind == "removed":
+            if scene.separation >= SEPARABLE:
+                rates[f"removed: given another name, SNR {ratio}, separable"].append(found)
+                if found:
+                    confusion[f"removed: {scene.truth[0]}", said] += 1
+        elif scene.kind == "pair":
+            if scene.separation >= SEPARABLE:
+                rates["pair: both named, SNR 10 each, separable"].append(
+                    set(scene.truth) == set(verdict.named)
+                )
+                told = set(verdict.named).union(*verdict.classes)
+                rates["pair: both named or in a class"].append(set(scene.truth) <= told)
+                if set(scene.truth) != set(verdict.named):
+                    confusion["pair: " + " and ".join(scene.truth), said] += 1
+        else:
+            truth = scene.truth[0]
+            first = verdict.named[0] if verdict.named else verdict.kind
+            told = frozenset(verdict.named[:1]).union(*verdict.classes[:1])
+            rates[f"detected, SNR {ratio}"].append(verdict.kind != "consistent")
+            wrong = found and truth not in told
+            rates[f"confident and wrong, SNR {ratio}"].append(wrong)
+            if scene.separation >= SEPARABLE:
+                rates[f"top-1 right, SNR {ratio}, separable"].append(first == truth)
+                rates[f"exactly the truth, SNR {ratio}, separable"].append(
+                    verdict.named == (truth,) and found
+                )
+            elif scene.separation < CONFOUNDED:
+                rates[f"a class with the truth in it, SNR {ratio}, confounded"].append(
+                    truth in told and len(told) > 1
+                )
+            if first != truth:
+                confusion[
+                    f"{truth}, SNR {ratio}", f"{first} [{verdict.kind}]" + (" CLASS" if truth in told else "")
+                ] += 1
+            elif verdict.first_probe == scene.probe:
+                sigma = np.sqrt(np.diag(verdict.covariance))
+                alive = sigma > 0
+                pulls += ((verdict.amplitudes - scene.amplitudes)[alive] / sigma[alive]).tolist()
     return {
         "rates": {name: (float(np.mean(v)), len(v)) for name, v in sorted(rates.items())},
-        "confusion": [(t, n, c) for (t, n), c in confusion.most_common(40)],
+        "amplitude pulls": {"rms": float(np.sqrt(np.mean(np.square(pulls)))), "count": len(pulls)},
+        "confusion": [(t, n, c) for (t, n), c in confusion.most_common(60)],
     }
+
+
+def main(each: int, output: Path | None) -> None:
+    """Run the study on a simulated set and print its numbers."""
+    from walop_jax.likelihood.observing import ObservingPlan
+    from walop_jax.likelihood.simulate import simulate
+
+    simulated, _ = simulate(ObservingPlan(), seed=20260)
+    text = json.dumps(study(Blind(simulated), each), indent=1, ensure_ascii=False)
+    print(text)
+    if output is not None:
+        output.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from walop_jax.likelihood.observing import ObservingPlan
-    from walop_jax.likelihood.simulate import simulate
-
-    simulated, _ = simulate(ObservingPlan(), seed=20260)
-    print(
-        json.dumps(
-            study(Blind(simulated), int(sys.argv[1]) if len(sys.argv) > 1 else 10),
-            indent=1,
-            ensure_ascii=False,
-        )
-    )
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 10, Path(sys.argv[2]) if len(sys.argv) > 2 else None)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from walop_jax.diagnose.freeform import Measured
-from walop_jax.diagnose.score import Candidate, Projector
+from walop_jax.diagnose.score import Candidate, Projector, whitening
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.problem import Problem
 
@@ -74,7 +74,21 @@ class Design:
     @cached_property
     def projector(self) -> Projector:
         """Removes from columns what the free parameters could absorb."""
-        return Projector(self.jacobian)
+        return Projector(self.jacobian, self.eliminated)
+
+    @property
+    def eliminated(self) -> int:
+        """Rows that carry no noise: one for every flux that was solved for, one for every weak pull."""
+        fluxes = int(self.measured.used[:, ~self.measured.known].sum())
+        pulls = len(self.residual) - self.rows - self.fit.n_priors
+        return fluxes + pulls
+
+    def without(self, name: str) -> tuple[Projector, Float[np.ndarray, "_ _"]]:
+        """What all parameters but those of one effect absorb, and an orthonormal basis of what these add to it."""
+        free = [self.fit.model.parameters[i].name.startswith(f"{name}.") for i in self.fit.model.free]
+        rest = Projector(self.jacobian[:, ~np.array(free)], self.eliminated)
+        own = rest(self.jacobian[:, np.array(free)])
+        return rest, own @ whitening(own.T @ own)
 
     def padded(self, candidates: Sequence[Candidate]) -> list[Candidate]:
         """Candidates with zero rows for the priors."""
@@ -104,6 +118,28 @@ class Design:
         norm = np.where(norm > 0, norm, 1.0)
         scaled = j / norm
         return -np.linalg.solve(scaled.T @ scaled + 1e-12 * np.eye(len(norm)), scaled.T @ r) / norm
+
+    def robust_ratio(self, name: str) -> float:
+        """Largest ratio of robust to stated errors among the parameters of an effect; NaN when it has none.
+
+        The robust ones let every exposure have a disturbance of its own: the "sandwich" H⁻¹ (Σ g_e g_eᵀ) H⁻¹ with
+        H = JᵀJ and g_e the gradient of exposure e (White 1982, Econometrica 50, 1; Liang & Zeger 1986, Biometrika 73,
+        13).
+        """
+        at = [
+            k
+            for k, i in enumerate(self.fit.model.free)
+            if self.fit.model.parameters[i].name.startswith(f"{name}.")
+        ]
+        if not at:
+            return float("nan")
+        norm = np.sqrt(np.sum(self.jacobian**2, axis=0))
+        scaled = self.jacobian / np.where(norm > 0, norm, 1.0)
+        inverse = np.linalg.pinv(scaled.T @ scaled, hermitian=True)[at]
+        pull = (scaled * self.residual[:, None])[: self.rows] @ inverse.T
+        by_exposure = np.zeros((self.measured.used.shape[1], len(at)))
+        np.add.at(by_exposure, self.exposure, pull)
+        return float(np.sqrt(np.max(np.sum(by_exposure**2, axis=0) / np.diag(inverse[:, at]))))
 
 
 HOLDOUT_FOLDS = 5

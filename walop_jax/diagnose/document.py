@@ -5,9 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from walop_jax.diagnose.workflow import Diagnosis, Step
+from walop_jax.diagnose.findings import Diagnosis, Step
 
 DIAGNOSIS = "diagnosis.json"
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def _step(step: Step) -> dict[str, Any]:
@@ -29,6 +33,9 @@ def _step(step: Step) -> dict[str, Any]:
         "heldout_scheme": step.heldout_before.scheme,
         "confirmed": step.confirmed,
         "log_bayes": step.log_bayes,
+        "change_of_qu": _number(step.change_of_qu),
+        "negligible": step.negligible,
+        "robust_error_ratio": _number(step.robust_ratio),
         "separation_sigma": {
             name: value
             for name, value in sorted(step.separation.items(), key=lambda s: s[1])
@@ -52,8 +59,24 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
             "p_value": unexplained.p_value,
             "description": unexplained.description,
             "patterns": [{"pattern": name, "p_value": p} for name, p in unexplained.patterns],
+            "free_form": list(unexplained.term),
+            "chi2_before": _number(unexplained.chi2_before),
+            "chi2_after": _number(unexplained.chi2_after),
+            "change_of_qu": _number(unexplained.change_of_qu),
         },
         "p_value": diagnosis.p_value,
+        "remaining_p_value": diagnosis.remaining_p,
+        "limits": [
+            {
+                "effect": limit.effect,
+                "parameter": limit.parameter,
+                "unit": limit.unit,
+                "value": limit.value,
+                "sigma": limit.sigma,
+                "below_95": limit.below,
+            }
+            for limit in diagnosis.limits
+        ],
         "cannot_be_tested": list(diagnosis.untestable),
         "chi2_per_dof_before": diagnosis.before.chi2 / max(diagnosis.before.dof, 1),
         "chi2_per_dof_after": diagnosis.after.chi2 / max(diagnosis.after.dof, 1),

@@ -4,7 +4,8 @@ Evidence       Laplace: ln B = ½ (O_base − O_g) − ½ (ln det H_g − ln det
                data and priors), H half its Hessian and w the prior widths of the added parameters.
 Equivalence    The change D of the residuals that the named effect makes, projected off the other parameters, is fitted
                by each rival; the length of what the rival cannot follow is the separation in standard deviations
-               (Atkinson & Fedorov 1975, Biometrika 62, 57). Below `SEPARATION` the data cannot tell the two apart.
+               (Atkinson & Fedorov 1975, Biometrika 62, 57). Below `SEPARATION` the data cannot tell the two apart, nor
+               when the evidence of their refits differs by less than `EVEN_ODDS`.
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnose.columns import Probe, effect_candidates
-from walop_jax.diagnose.design import Design
-from walop_jax.diagnose.score import Score, ScoreTable, whitened
+from walop_jax.diagnose.columns import Probe
+from walop_jax.diagnose.score import Score, ScoreTable
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.problem import Problem
 from walop_jax.model.effects import Context, Effect
-from walop_jax.model.specification import Model, with_effects
+from walop_jax.model.parameters import leaves
+from walop_jax.model.specification import Model, full_values, with_effects
 
 SEPARATION = 3.0
 MOST_LEADERS = 5
@@ -58,7 +59,7 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
         by_effect.setdefault(probe.effect, []).append((probe, table[probe.name]))
     ranked = []
     for effect, shapes in by_effect.items():
-        alive = [(probe, score) for probe, score in shapes if score.testable]
+        alive = [(p, s) for p, s in shapes if s.testable and follow_physics(effect, p.group, s)]
         if not alive:
             continue
         probe, score = max(alive, key=lambda item: item[1].log_bayes)
@@ -110,7 +111,45 @@ def start_of(item: Ranked) -> Effect:
     return item.effect.combine(item.probe.group, item.score.amplitudes)
 
 
-def without(model: Model, name: str, context: Context) -> Model:
+def follow_physics(effect: type[Effect], group: Sequence[Effect], score: Score) -> bool:
+    """Whether a linear step leaves one-sided amplitudes on their side, within `SEPARATION` standard deviations."""
+    sides = [
+        name in effect.one_sided
+        for member in group
+        for name in effect.amplitudes()
+        for _ in range(np.size(getattr(member, name)))
+    ]
+    sigma = np.sqrt(np.clip(np.diag(score.covariance), 0.0, None))
+    return bool(np.all((score.amplitudes >= -SEPARATION * sigma)[np.array(sides)]))
+
+
+def evidence_of_presence(result: FitResult, name: str, context: Context) -> float:
+    """ln B of a fitted model against the one without an effect: the density that prior and posterior have at neutral.
+
+    The Savage–Dickey ratio of nested models, Gaussian (Dickey 1971, Ann. Math. Stat. 42, 204). Infinite for an
+    effect without parameters.
+    """
+    effect = next(e for e in result.model.template.effects if e.name == name)
+    amplitudes = tuple(f"{name}.{label}" for f in effect.amplitudes() for label in effect.labels(f))
+    at = [result.model.index(a) for a in amplitudes]
+    at = [i for i in at if result.model.parameters[i].free and result.model.parameters[i].prior is not None]
+    if not at:
+        return float("inf")
+    neutral = dict(
+        zip(
+            (f"{name}.{leaf.name}" for leaf in leaves(effect)),
+            full_values(effect.at_neutral(context)),
+            strict=True,
+        )
+    )
+    away = result.values[at] - np.array([neutral[result.model.parameters[i].name] for i in at])
+    width = np.array([result.model.parameters[i].prior[1] for i in at])  # type: ignore[index]
+    covariance = result.covariance[np.ix_(at, at)] / np.outer(width, width)
+    away = away / width
+    return float(0.5 * away @ np.linalg.solve(covariance, away) + 0.5 * np.linalg.slogdet(covariance)[1])
+
+
+def without(model: Model, name: str) -> Model:
     """The model with one effect taken out."""
     rest = tuple(effect for effect in model.template.effects if effect.name != name)
     parameters = tuple(p for p in model.parameters if not p.name.startswith(f"{name}."))
@@ -118,45 +157,28 @@ def without(model: Model, name: str, context: Context) -> Model:
     return dataclasses.replace(model, template=template, parameters=parameters)
 
 
-def equivalents(
-    calset: CalibrationSet,
-    final: FitResult,
-    design: Design,
-    name: str,
-    context: Context,
-    rivals: Sequence[Probe],
-) -> tuple[dict[str, float], Float[np.ndarray, " _"]]:
-    """Separation (σ) of every rival from an active effect, and the change of the residuals that the effect makes."""
-    base = without(final.model, name, context)
-    kept = [final.model.index(p.name) for p in base.parameters]
-    base_values = final.values[kept]
-    problem = Problem(calset, base)
-    bare_fit = dataclasses.replace(
-        final, model=base, values=base_values, covariance=final.covariance[np.ix_(kept, kept)]
+def refit_without(calset: CalibrationSet, result: FitResult, name: str) -> tuple[Problem, FitResult]:
+    """Take an effect out of a fitted model and fit again."""
+    model = without(result.model, name)
+    start = dict(zip(result.model.names, result.values, strict=True))
+    problem = Problem(calset, model)
+    return problem, fit(
+        problem, start=np.array([start[n] for n in model.names]), noise_scale=result.noise_scale
     )
-    bare = Design.of(problem, bare_fit)
-    change = bare.residual[: bare.rows] - design.residual[: design.rows]
-    extra = len(bare.residual) - bare.rows
-    projected = bare.projector(np.pad(change, (0, extra)))
-    candidates = bare.padded(list(effect_candidates(calset, base, base_values, rivals).values()))
-    columns = [(p, bare.projector(c.columns)) for p, c in zip(rivals, candidates, strict=True)]
-    return separations(projected, columns), change
 
 
-def separations(
-    change: Float[np.ndarray, " _"], rivals: Sequence[tuple[Probe, Float[np.ndarray, "_ _"]]]
-) -> dict[str, float]:
-    """How far (σ) each rival stays from a projected change of the residuals when it does its best to follow."""
-    separation: dict[str, float] = {}
-    for probe, columns in rivals:
-        q = whitened(columns)[0]
-        rest = float(np.linalg.norm(change - q @ (q.T @ change)))
-        separation[probe.effect.name] = min(rest, separation.get(probe.effect.name, np.inf))
-    return separation
-
-
-def close_rivals(
-    change: Float[np.ndarray, " _"], rivals: Sequence[tuple[Probe, Float[np.ndarray, "_ _"]]]
-) -> frozenset[str]:
-    """The rivals that these data cannot tell from an effect that changes the residuals by `change`."""
-    return frozenset(name for name, s in separations(change, rivals).items() if s < SEPARATION)
+def signature(problem: Problem, result: FitResult, name: str, context: Context) -> Float[np.ndarray, " _"]:
+    """What an active effect does to the residuals (data rows): theirs without it, minus theirs with it."""
+    effect = next(e for e in result.model.template.effects if e.name == name)
+    if type(effect).is_structural():
+        model = without(result.model, name)
+        kept = [result.model.index(n) for n in model.names]
+        bare = Problem(problem.calset, model).residuals(result.values[kept])[1]
+    else:
+        values = result.values.copy()
+        neutral = full_values(effect.at_neutral(context))
+        for leaf, value in zip(leaves(effect), neutral, strict=True):
+            values[result.model.index(f"{name}.{leaf.name}")] = value
+        bare = problem.residuals(values)[1]
+    change = bare - problem.residuals(result.values)[1]
+    return change[problem.used].reshape(-1) / result.noise_scale

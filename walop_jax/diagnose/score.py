@@ -3,12 +3,13 @@
 Symbols      r whitened residuals at the best fit, prior rows appended; J = ∂r/∂θ of the free base parameters;
              C_g = ∂r/∂ε of the amplitudes of candidate g at zero.
 Projection   C̃ = (1 − QQᵀ) C with Q from the QR decomposition of J: what the base could have absorbed is removed.
-Statistic    T_g = s ᵀ I⁺ s with s = C̃ᵀ r and I = C̃ᵀ C̃; χ² with rank(I) degrees of freedom under the base model.
-             One-step amplitudes ε = −I⁺ s, covariance I⁺.
+Gram matrix  Everything below follows from G = C̃ᵀC̃, s = C̃ᵀr and r·r. A candidate joins the base by a Schur complement.
+Statistic    T_g = s_gᵀ G_gg⁺ s_g; χ² with rank(G_gg) degrees of freedom under the base model.
+             One-step amplitudes ε = −G_gg⁺ s_g, covariance G_gg⁺.
 Noise scale  T is divided by the mean square of the residuals in the complement of base and candidates, so that
              errors that are stated a few per cent too small or too large raise no alarm (an F statistic; the
              complement has thousands of degrees of freedom, so χ² serves).
-Global p     Under the base model the scores of all candidates together are N(0, C̃ᵀC̃): the smallest p of a draw is
+Global p     Under the base model the scores of all candidates together are N(0, G): the smallest p of a draw is
              compared with the smallest p found, 10⁴ times, without a model call. Beyond the reach of the draws the
              tail is continued with the effective number of trials that the draws themselves give.
 Sources      Rao 1948; Bera & Bilias 2001, J. Stat. Plan. Inference 97, 9 (score tests); Gross & Vitells 2010,
@@ -18,14 +19,16 @@ Sources      Rao 1948; Bera & Bilias 2001, J. Stat. Plan. Inference 97, 9 (score
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import stats
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
+Reduction = Callable[[Vector, float], tuple[Vector, float]]
 
 ABSORBED = 1e-6  # surviving share of a column's square below which the base has swallowed it
 FAINTEST = 0.05  # standard deviations that a plausible amplitude must reach to be testable
@@ -68,12 +71,16 @@ class Score:
 
 
 class Projector:
-    """Removes from columns everything that the base parameters could absorb."""
+    """Removes from columns everything that the base parameters could absorb.
 
-    def __init__(self, jacobian: Matrix) -> None:
+    `eliminated` counts the directions that are gone from residuals and columns already: one for every flux that
+    was solved for. `free` is what is left for noise.
+    """
+
+    def __init__(self, jacobian: Matrix, eliminated: int = 0) -> None:
         norm = np.linalg.norm(jacobian, axis=0)
         self._q, _ = np.linalg.qr(jacobian / np.where(norm > 0, norm, 1.0))
-        self.free = jacobian.shape[0] - jacobian.shape[1]
+        self.free = jacobian.shape[0] - jacobian.shape[1] - eliminated
 
     def __call__(self, columns: np.ndarray) -> np.ndarray:
         """Project columns (twice: the second pass removes the rounding of the first)."""
@@ -87,13 +94,16 @@ class ScoreTable:
     """Scores of all candidates against one fit, and the global significance of the best of them."""
 
     scores: tuple[Score, ...]
-    projected: Mapping[str, Matrix]
     noise_scale: float
     p_global: float
     trials: float
 
     def __getitem__(self, name: str) -> Score:
-        return next(score for score in self.scores if score.name == name)
+        return self._by_name[name]
+
+    @cached_property
+    def _by_name(self) -> Mapping[str, Score]:
+        return {score.name: score for score in self.scores}
 
     @property
     def ranked(self) -> tuple[Score, ...]:
@@ -104,10 +114,6 @@ class ScoreTable:
         """p of a candidate corrected for the number of candidates tried."""
         return corrected_p(score.log_p, self.trials)
 
-    def cosine(self, first: str, second: str) -> float:
-        """Largest canonical correlation between the projected columns of two candidates."""
-        return float(canonical_correlations(self.projected[first], self.projected[second]).max(initial=0.0))
-
 
 def corrected_p(log_p: float, trials: float) -> float:
     """Šidák correction 1 − (1 − p)^n, from ln p."""
@@ -115,68 +121,145 @@ def corrected_p(log_p: float, trials: float) -> float:
     return float(-np.expm1(trials * np.log1p(-min(p, 1.0 - 1e-16))))
 
 
-def whitened(columns: Matrix) -> tuple[Matrix, Matrix]:
-    """Orthonormal basis of the columns and the matrix W with basis = columns · W."""
-    if columns.shape[1] == 0:
-        return columns, np.zeros((0, 0))
-    norm = np.linalg.norm(columns, axis=0)
-    unit = columns / np.where(norm > 0, norm, 1.0)
-    value, vector = np.linalg.eigh(unit.T @ unit)
+def whitening(gram: Matrix) -> Matrix:
+    """W with Wᵀ G W = 1 on the range of a Gram matrix G (columns of no length or no independence are left out)."""
+    norm = np.sqrt(np.clip(np.diag(gram), 0.0, None))
+    scale = np.where(norm > 0, 1.0 / np.where(norm > 0, norm, 1.0), 0.0)
+    value, vector = np.linalg.eigh(gram * np.outer(scale, scale))
     keep = value > max(value.max(initial=0.0), 1e-300) * RANK_TOLERANCE
-    keep &= norm.max(initial=0.0) > 0
-    transform = (vector[:, keep] / np.sqrt(value[keep])) / np.where(norm > 0, norm, np.inf)[:, None]
-    return columns @ transform, transform
+    return scale[:, None] * vector[:, keep] / np.sqrt(value[keep])
 
 
 def canonical_correlations(first: Matrix, second: Matrix) -> Vector:
     """Cosines of the principal angles between two column spaces (Björck & Golub 1973)."""
-    a, b = whitened(first)[0], whitened(second)[0]
+    a, b = first @ whitening(first.T @ first), second @ whitening(second.T @ second)
     if a.shape[1] == 0 or b.shape[1] == 0:
         return np.zeros(0)
     return np.clip(np.linalg.svd(a.T @ b, compute_uv=False), 0.0, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
-class _Prepared:
-    """A candidate projected off the base: all of that which the data do not decide."""
+class ScoreSpace:
+    """The Gram matrix of all candidates behind the projection: all that the scores need of a design.
 
-    name: str
+    `before` are the squares of the columns ahead of any projection; `free` the degrees of freedom of the residuals.
+    """
+
+    names: tuple[str, ...]
+    sizes: tuple[int, ...]
     widths: Vector
-    columns: Matrix  # projected; amplitudes that the base absorbs are zero
-    alive: Bool[np.ndarray, " k"]
-    basis: Matrix  # orthonormal
-    transform: Matrix  # basis = columns[:, alive] @ transform
-    surviving: float
+    before: Vector
+    gram: Matrix
+    free: int
+
+    @classmethod
+    def of(cls, projector: Projector, candidates: Sequence[Candidate]) -> tuple[ScoreSpace, Matrix]:
+        """The space of candidates, and their projected columns side by side."""
+        columns = np.column_stack([c.columns for c in candidates])
+        before = np.sum(columns**2, axis=0)
+        columns = projector(columns)
+        space = cls(
+            names=tuple(c.name for c in candidates),
+            sizes=tuple(c.columns.shape[1] for c in candidates),
+            widths=np.concatenate([c.widths for c in candidates]),
+            before=before,
+            gram=columns.T @ columns,
+            free=projector.free,
+        )
+        return space, columns
+
+    def places(self) -> dict[str, slice]:
+        """Where the amplitudes of each candidate stand."""
+        stop = np.cumsum(self.sizes)
+        return {n: slice(int(b - k), int(b)) for n, k, b in zip(self.names, self.sizes, stop, strict=True)}
+
+    def chosen(self, names: Sequence[str]) -> Int[np.ndarray, " _"]:
+        """Positions of the amplitudes of some candidates."""
+        places = self.places()
+        return np.concatenate([np.arange(places[n].start, places[n].stop) for n in names])
+
+    def subset(self, names: Sequence[str]) -> ScoreSpace:
+        """The space of some of the candidates."""
+        keep, sizes = self.chosen(names), dict(zip(self.names, self.sizes, strict=True))
+        return ScoreSpace(
+            tuple(names), tuple(sizes[n] for n in names), self.widths[keep], self.before[keep],
+            self.gram[np.ix_(keep, keep)], self.free,
+        )  # fmt: skip
+
+    def alive(self) -> Bool[np.ndarray, " _"]:
+        """Amplitudes of which the base leaves something and that would stand out at a plausible size."""
+        after = np.clip(np.diag(self.gram), 0.0, None)
+        share = np.where(self.before > 0, after / np.where(self.before > 0, self.before, 1.0), 0.0)
+        return (share > ABSORBED) & (np.sqrt(after) * self.widths > FAINTEST)
+
+    def with_base(self, names: Sequence[str], widths: Vector | None = None) -> tuple[ScoreSpace, Reduction]:
+        """The space when some candidates have joined the base, and what takes (C̃ᵀr, r·r) there.
+
+        With `widths`, one for each of their amplitudes, these are nuisances that are known that well beforehand.
+        """
+        place, alive = self.chosen(names), self.alive()
+        inverse = np.zeros(len(place)) if widths is None else np.asarray(widths, float) ** -2
+        place, inverse = place[alive[place]], inverse[alive[place]]
+        w = whitening(self.gram[np.ix_(place, place)] + np.diag(inverse))
+        along = self.gram[:, place] @ w
+
+        def reduce(scores: Vector, square: float) -> tuple[Vector, float]:
+            taken = w.T @ scores[place]
+            return scores - along @ taken, square - float(taken @ taken)
+
+        free = self.free - (w.shape[1] if widths is None else 0)
+        return dataclasses.replace(self, gram=self.gram - along @ along.T, free=free), reduce
 
 
 class Scorer:
-    """Candidates made ready for one fit: projected, and with the distribution of the smallest p under the base.
+    """Candidates made ready for one design, with the distribution of the smallest p under the base.
 
     Nothing here depends on the residuals, so that many data sets of the same design can be scored in turn.
     """
 
-    def __init__(
-        self,
+    def __init__(self, space: ScoreSpace, rng: np.random.Generator, draws: int = DRAWS) -> None:
+        self.space = space
+        alive, gram = space.alive(), np.where(np.outer(space.alive(), space.alive()), space.gram, 0.0)
+        self._alive = alive
+        self._whitening = {name: whitening(gram[at, at]) for name, at in space.places().items()}
+        self._all = whitening(gram)
+        self._smallest = self._smallest_p(gram, rng, draws)
+
+    @classmethod
+    def of(
+        cls,
         projector: Projector,
         candidates: Sequence[Candidate],
         rng: np.random.Generator,
         draws: int = DRAWS,
-    ) -> None:
-        self._projector = projector
-        self._prepared = [_prepare(projector, candidate) for candidate in candidates]
-        testable = [p.basis for p in self._prepared if p.basis.shape[1]]
-        rows = len(candidates[0].columns) if candidates else 0
-        self._space = whitened(np.column_stack(testable))[0] if testable else np.zeros((rows, 0))
-        self._smallest = _smallest_p([self._space.T @ b for b in testable], rng, draws)
+    ) -> tuple[Scorer, Matrix]:
+        """A scorer of candidates and their projected columns."""
+        space, columns = ScoreSpace.of(projector, candidates)
+        return cls(space, rng, draws), columns
 
-    def __call__(self, residual: Vector) -> ScoreTable:
-        """Score the residuals of a fit of this design."""
-        r = self._projector(residual)
-        rest = r - self._space @ (self._space.T @ r)
-        noise = float(np.sqrt(rest @ rest / max(self._projector.free - self._space.shape[1], 1)))
-        scores = tuple(_score(p, r, noise) for p in self._prepared)
-        p_global, trials = self._global_p(scores)
-        return ScoreTable(scores, {p.name: p.columns for p in self._prepared}, noise, p_global, trials)
+    def __call__(self, scores: Vector, square: float) -> ScoreTable:
+        """The table from s = C̃ᵀr and r·r, both behind the projection."""
+        explained = self._all.T @ np.where(self._alive, scores, 0.0)
+        rest = max(square - float(explained @ explained), 0.0)
+        noise = float(np.sqrt(rest / max(self.space.free - self._all.shape[1], 1))) or 1.0
+        table = tuple(self._score(name, at, scores, noise) for name, at in self.space.places().items())
+        return ScoreTable(table, noise, *self._global_p(table))
+
+    def _score(self, name: str, at: slice, scores: Vector, noise: float) -> Score:
+        w, alive = self._whitening[name], self._alive[at]
+        z = w.T @ np.where(alive, scores[at], 0.0)
+        statistic, rank = float(z @ z) / noise**2, w.shape[1]
+        log_p = float(stats.chi2.logsf(statistic, rank)) if rank else 0.0
+        after = np.clip(np.diag(self.space.gram)[at], 0.0, None)
+        before = self.space.before[at]
+        share = np.where(before > 0, after / np.where(before > 0, before, 1.0), 0.0)
+        gram = np.where(np.outer(alive, alive), self.space.gram[at, at], 0.0)
+        return Score(
+            name=name, statistic=statistic, rank=rank, p_value=float(np.exp(log_p)), log_p=log_p,
+            amplitudes=-w @ z, covariance=w @ w.T * noise**2,
+            log_bayes=_log_bayes(gram / noise**2, np.where(alive, scores[at], 0.0) / noise**2, self.space.widths[at]),
+            surviving=float(share.max(initial=0.0)), testable=rank > 0,
+        )  # fmt: skip
 
     def _global_p(self, scores: Sequence[Score]) -> tuple[float, float]:
         found = min((score.log_p for score in scores if score.testable), default=0.0)
@@ -190,43 +273,26 @@ class Scorer:
             return (1 + below) / (1 + len(self._smallest)), trials
         return corrected_p(found, trials), trials
 
-
-def _prepare(projector: Projector, candidate: Candidate) -> _Prepared:
-    columns = projector(candidate.columns)
-    before = np.sum(candidate.columns**2, axis=0)
-    after = np.sum(columns**2, axis=0)
-    share = np.where(before > 0, after / np.where(before > 0, before, 1.0), 0.0)
-    # An amplitude is testable when the base leaves something of it and a plausible one would stand out at all.
-    alive = (share > ABSORBED) & (np.sqrt(after) * candidate.widths > FAINTEST)
-    columns = np.where(alive, columns, 0.0)
-    basis, transform = whitened(columns[:, alive])
-    return _Prepared(
-        candidate.name, candidate.widths, columns, alive, basis, transform, float(share.max(initial=0.0))
-    )
-
-
-def _score(prepared: _Prepared, r: Vector, noise: float) -> Score:
-    z = prepared.basis.T @ r
-    statistic, rank = float(z @ z) / noise**2, prepared.basis.shape[1]
-    log_p = float(stats.chi2.logsf(statistic, rank)) if rank else 0.0
-    alive = prepared.alive
-    amplitudes, covariance = np.zeros(len(alive)), np.zeros((len(alive), len(alive)))
-    if rank:
-        amplitudes[alive] = -prepared.transform @ z
-        covariance[np.ix_(alive, alive)] = prepared.transform @ prepared.transform.T * noise**2
-    return Score(
-        name=prepared.name, statistic=statistic, rank=rank, p_value=float(np.exp(log_p)), log_p=log_p,
-        amplitudes=amplitudes, covariance=covariance,
-        log_bayes=_log_bayes(prepared.columns / noise, r / noise, prepared.widths),
-        surviving=prepared.surviving, testable=rank > 0,
-    )  # fmt: skip
+    def _smallest_p(self, gram: Matrix, rng: np.random.Generator, draws: int) -> Vector:
+        """ln of the smallest p among all candidates, drawn under the base."""
+        if not self._all.shape[1]:
+            return np.zeros(0)
+        # Scores s = G W n have covariance G for unit normals n.
+        root = gram @ self._all
+        normal = rng.standard_normal((draws, root.shape[1]))
+        smallest = np.zeros(draws)
+        for name, at in self.space.places().items():
+            w = self._whitening[name]
+            if w.shape[1]:
+                statistic = np.sum((normal @ (root[at].T @ w)) ** 2, axis=1)
+                np.minimum(smallest, _log_survival(statistic, w.shape[1]), out=smallest)
+        return smallest
 
 
-def _log_bayes(columns: Matrix, r: Vector, widths: Vector) -> float:
-    """ln B = ½ sᵀ (I + Λ⁻¹)⁻¹ s − ½ ln det(1 + Λ^½ I Λ^½): evidence against the base, exact for a linear effect."""
-    scaled = columns * widths
-    information = scaled.T @ scaled + np.eye(len(widths))
-    s = scaled.T @ r
+def _log_bayes(gram: Matrix, scores: Vector, widths: Vector) -> float:
+    """ln B = ½ sᵀ (G + Λ⁻¹)⁻¹ s − ½ ln det(1 + Λ^½ G Λ^½): evidence against the base, exact for a linear effect."""
+    information = gram * np.outer(widths, widths) + np.eye(len(widths))
+    s = scores * widths
     _, log_det = np.linalg.slogdet(information)
     return float(0.5 * s @ np.linalg.solve(information, s) - 0.5 * log_det)
 
@@ -237,13 +303,15 @@ def _log_survival(statistic: np.ndarray, rank: int) -> np.ndarray:
     return np.interp(statistic, grid, stats.chi2.logsf(grid, rank))
 
 
-def _smallest_p(maps: Sequence[Matrix], rng: np.random.Generator, draws: int) -> Vector:
-    """ln of the smallest p among all candidates, drawn under the base; `maps` take unit normals to whitened scores."""
-    if not maps:
-        return np.zeros(0)
-    normal = rng.standard_normal((draws, maps[0].shape[0]))
-    smallest = np.zeros(draws)
-    for m in maps:
-        statistic = np.sum((normal @ m) ** 2, axis=1)
-        np.minimum(smallest, _log_survival(statistic, m.shape[1]), out=smallest)
-    return smallest
+def separations(space: ScoreSpace, scores: Vector, square: float) -> dict[str, float]:
+    """How far (σ) each candidate stays from a change D of the residuals when it does its best to follow.
+
+    `scores` are C̃ᵀD and `square` D·D, both behind the projection (Atkinson & Fedorov 1975, Biometrika 62, 57).
+    """
+    alive, found = space.alive(), {}
+    for name, at in space.places().items():
+        mask = alive[at]
+        w = whitening(np.where(np.outer(mask, mask), space.gram[at, at], 0.0))
+        z = w.T @ np.where(mask, scores[at], 0.0)
+        found[name] = float(np.sqrt(max(square - float(z @ z), 0.0)))
+    return found

@@ -23,7 +23,7 @@ from walop_jax.likelihood.observing import ObservingPlan
 from walop_jax.likelihood.problem import Problem
 from walop_jax.model import legendre, light
 from walop_jax.model.compiled import compiled
-from walop_jax.model.effects import EFFECTS
+from walop_jax.model.effects import in_order
 from walop_jax.model.effects.base import Effect, overridden
 from walop_jax.model.instrument import Instrument, Standards, nominal_instrument
 from walop_jax.model.parameters import leaves
@@ -125,9 +125,8 @@ def simulate(
     if instrument is None:
         nominal = nominal_instrument(plan.instrument, throughput_degree=plan.throughput_degree)
         instrument = draw_instrument(make_model(plan.instrument, nominal), build)
-    order = [kind.name for kind in EFFECTS]
-    active = sorted((*instrument.effects, *effects), key=lambda effect: order.index(effect.name))
-    truth = make_template(dataclasses.replace(instrument, standard=standards, effects=tuple(active)))
+    active = in_order((*instrument.effects, *effects))
+    truth = make_template(dataclasses.replace(instrument, standard=standards, effects=active))
     blank = _blank(plan, sources, seed)
     expected = _expected(blank, truth, _fluxes(plan, sky))
     detector = PhotonNoise(plan.read_noise)

@@ -194,7 +194,7 @@ def camera_vectors(
     analysed = 0.5 * (rows[:, half, 0] + sign[:, None] * rows[:, half, 1])
     vectors = throughput[:, None] * (analysed @ upstream(instrument, x, y))
     for effect in instrument.effects:
-        vectors = effect.cameras(vectors)
+        vectors = effect.cameras(vectors, x, y)
     return vectors
 
 
@@ -275,7 +275,10 @@ def counts(
     """Counts of the four cameras in every exposure at a field point, for light of unit flux and no ghosts."""
     vectors = camera_vectors(instrument, rows, throughput, x, y)
     light = stokes(instrument, plan.exposures, sky, source)
-    return jnp.einsum("eks,es->ek", vectors[band], light)
+    result = jnp.einsum("eks,es->ek", vectors[band], light)
+    for effect in instrument.effects:
+        result = effect.recorded(result, vectors[band, :, 0], plan.exposures, x, y)
+    return result
 
 
 def with_ghosts(

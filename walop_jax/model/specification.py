@@ -17,7 +17,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from walop_jax.data.records import Exposures
-from walop_jax.model.effects import EFFECTS, effect_by_name
+from walop_jax.model.effects import effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Component, leaves, unknown_name
@@ -207,7 +207,6 @@ def with_effects(model: Model, effects: Sequence[str | Effect], context: Context
     stands. Priors are centred on neutral, with the widths of the declarations. Raises ValueError for a name
     that does not exist and for an effect that is there already.
     """
-    order = [kind.name for kind in EFFECTS]
     active = list(model.template.effects)
     starts = {}
     for effect in effects:
@@ -217,12 +216,11 @@ def with_effects(model: Model, effects: Sequence[str | Effect], context: Context
         if effect.name in (other.name for other in active):
             raise ValueError(f"effect {effect.name!r} is in the model already")
         active.append(effect)
-        neutral = type(effect).neutral(context)
+        neutral = effect.at_neutral(context)
         names = [f"{effect.name}.{leaf.name}" for leaf in leaves(effect)]
         values = zip(full_values(effect), full_values(neutral), strict=True)
         starts |= dict(zip(names, values, strict=True))
-    active.sort(key=lambda effect: order.index(effect.name))
-    instrument = dataclasses.replace(model.template, effects=tuple(active))
+    instrument = dataclasses.replace(model.template, effects=in_order(active))
     known = {p.name: p for p in model.parameters}
     parameters = []
     for p in make_model(model.name, instrument).parameters:

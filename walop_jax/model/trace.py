@@ -118,7 +118,7 @@ def trace(instrument: Instrument, curve: FilterCurve, ray: Ray) -> tuple[Stage, 
     beams = throughput * beams
     stages.append(_cameras("cameras", "behind lenses, filter and detector of each camera", beams))
     stages.append(
-        _cameras("counts", "electrons per electron of flux", _between_cameras(instrument, plan, beams))
+        _cameras("counts", "electrons per electron of flux", _between_cameras(instrument, plan, beams, x, y))
     )
     return tuple(stages)
 
@@ -132,11 +132,13 @@ def _with_source(instrument: Instrument, ray: Ray) -> Instrument:
     return dataclasses.replace(instrument, standard=standard)
 
 
-def _between_cameras(instrument: Instrument, plan: Plan, beams: Float[Array, " 4"]) -> Float[Array, " 4"]:
+def _between_cameras(
+    instrument: Instrument, plan: Plan, beams: Float[Array, " 4"], x: Float[Array, ""], y: Float[Array, ""]
+) -> Float[Array, " 4"]:
     # These effects are linear in the cameras whatever the Stokes parameter: put the beams where I stands.
     vectors = jnp.zeros((plan.bands, 4, 4)).at[0, :, 0].set(beams)
     for effect in instrument.effects:
-        vectors = effect.cameras(vectors)
+        vectors = effect.cameras(vectors, x, y)
     return vectors[0, :, 0]
 
 

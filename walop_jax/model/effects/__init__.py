@@ -1,5 +1,7 @@
 """Physical effects beyond the base model: one file each, and `EFFECTS`, in the order light meets them."""
 
+from collections.abc import Iterable
+
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.effects.blemish import Blemish
 from walop_jax.model.effects.camera_gain_drift import CameraGainDrift
@@ -13,6 +15,7 @@ from walop_jax.model.effects.clp_zero import ClpZero
 from walop_jax.model.effects.etalon import Etalon
 from walop_jax.model.effects.filter_shift import FilterShift
 from walop_jax.model.effects.flexure import Flexure
+from walop_jax.model.effects.free_form import FreeForm
 from walop_jax.model.effects.ghost import Ghost
 from walop_jax.model.effects.hwp_temperature import HwpTemperature
 from walop_jax.model.effects.lens_birefringence import LensBirefringence
@@ -67,10 +70,16 @@ EFFECTS: tuple[type[Effect], ...] = (
 
 def effect_by_name(name: str) -> type[Effect]:
     """The effect of a canonical name; ValueError with the nearest names when there is none."""
-    for effect in EFFECTS:
+    for effect in (*EFFECTS, FreeForm):
         if effect.name == name:
             return effect
     raise unknown_name("effect", name, [effect.name for effect in EFFECTS])
 
 
-__all__ = ["EFFECTS", "Context", "Effect", "effect_by_name"]
+def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
+    """Effects in the order in which light meets them; what is not in the catalogue comes last."""
+    order = {effect.name: place for place, effect in enumerate(EFFECTS)}
+    return tuple(sorted(effects, key=lambda effect: order.get(effect.name, len(order))))
+
+
+__all__ = ["EFFECTS", "Context", "Effect", "FreeForm", "effect_by_name", "in_order"]

@@ -143,6 +143,10 @@ class Effect(Component):
         """Discrete choices that belong to the description of the effect, e.g. the number of a camera."""
         return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.metadata.get("static")}
 
+    def at_neutral(self, context: Context) -> Self:
+        """The same effect, discrete choices included, with values that change nothing."""
+        return type(self).of(context, **self.choices())
+
     def standard_form(self) -> Self:
         """The same effect with positive amplitude and with angles in their principal range."""
         return self
@@ -223,9 +227,20 @@ class Effect(Component):
         """Throughput of the cameras at a field point."""
         return throughput
 
-    def cameras(self, vectors: Float[Array, "b 4 4"]) -> Float[Array, "b 4 4"]:
+    def cameras(self, vectors: Float[Array, "b 4 4"], x: Scalar, y: Scalar) -> Float[Array, "b 4 4"]:
         """Analysis vectors (band, camera, Stokes) behind the throughput."""
         return vectors
+
+    def recorded(
+        self,
+        counts: Float[Array, "e 4"],
+        unpolarised: Float[Array, "e 4"],
+        exposures: ExposureArrays,
+        x: Scalar,
+        y: Scalar,
+    ) -> Float[Array, "e 4"]:
+        """Counts for light of unit flux; `unpolarised` are those of unpolarised light."""
+        return counts
 
     def mirrored(
         self, counts: Float[Array, "e 4"], opposite: Float[Array, "e 4"], extended: Bool[Array, " e"]

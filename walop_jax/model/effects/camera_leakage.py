@@ -35,6 +35,6 @@ class CameraLeakage(Effect):
         "of 3–5 % tell it from the extinction of the polariser, flux levels from stray light"
     )
 
-    def cameras(self, vectors: Float[Array, "b 4 4"]) -> Float[Array, "b 4 4"]:
+    def cameras(self, vectors: Float[Array, "b 4 4"], x: Scalar, y: Scalar) -> Float[Array, "b 4 4"]:
         """Mix the analysis vectors of orthogonal cameras."""
         return vectors + self.share * vectors[:, ORTHOGONAL, :]

@@ -1,0 +1,136 @@
+"""One look at a fit: its design, the scores of every effect and pattern, and the names in order of evidence."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+from walop_jax.diagnose import naming
+from walop_jax.diagnose.columns import Probe, effect_candidates
+from walop_jax.diagnose.design import Design
+from walop_jax.diagnose.findings import Limit
+from walop_jax.diagnose.freeform import SINGLE, strata
+from walop_jax.diagnose.score import Projector, Scorer, ScoreSpace, ScoreTable, separations
+from walop_jax.fit.refit import FitResult
+from walop_jax.likelihood.problem import Problem
+from walop_jax.model.effects import Effect
+from walop_jax.model.parameters import field_declarations
+
+Vector = Float[np.ndarray, " _"]
+Matrix = Float[np.ndarray, "_ _"]
+
+ALARM = 0.01
+COMMON_MODE = 0.05  # rms (σ of one intensity) of disturbances that one camera in one exposure may have
+PROBABILITY = 0.95
+
+
+@dataclasses.dataclass(frozen=True)
+class _Own:
+    """What the parameters of an active effect absorb: the projection without them, and the columns' share of it."""
+
+    rest: Projector
+    basis: Matrix
+    columns: Matrix  # basisᵀ C
+
+
+class Look:
+    """The scores of everything against one fit.
+
+    `ranked` are the effects in order of linear evidence, `patterns` the scores of the free-form strata; `space` and
+    `columns` are those of all candidates, effects first, behind the projection.
+    """
+
+    def __init__(
+        self, problem: Problem, result: FitResult, wanted: Sequence[Probe], rng: np.random.Generator
+    ) -> None:
+        self.problem, self.result = problem, result
+        active = [effect.name for effect in problem.model.template.effects]
+        self.probes = [probe for probe in wanted if probe.effect.name not in active]
+        self.design = Design.of(problem, result)
+        named = effect_candidates(problem.calset, problem.model, result.values, self.probes)
+        free = list(strata(self.design.measured))
+        candidates = self.design.padded([*named.values(), *free])
+        self._own = {}
+        for name in active:
+            rest, basis = self.design.without(name)
+            self._own[name] = _Own(rest, basis, np.column_stack([basis.T @ c.columns for c in candidates]))
+        self.space, self.columns = ScoreSpace.of(self.design.projector, candidates)
+        self.common_mode = self._common_mode()
+        space, reduce = self.space.with_base([SINGLE], self.common_mode)
+        r = self.design.projector(self.design.residual)
+        self.table: ScoreTable = Scorer(space, rng)(*reduce(self.columns.T @ r, float(r @ r)))
+        self.ranked = naming.rank(self.table, self.probes)
+        self.patterns = [self.table[c.name] for c in free]
+        # Where the base is excluded, a name competes with patterns that have none, not with the base.
+        self.least_evidence = min(0.0, max(s.log_bayes for s in self.patterns if s.testable))
+
+    def _common_mode(self) -> Vector:
+        """Prior widths of the gains of single exposures that amount to `COMMON_MODE` per intensity."""
+        at = self.space.places()[SINGLE]
+        points = np.repeat(self.design.measured.used.sum(axis=0), 3)
+        square = np.where(self.space.before[at] > 0, self.space.before[at], np.inf)
+        return np.maximum(COMMON_MODE * np.sqrt(points / square), 1e-30)
+
+    @property
+    def alarm(self) -> bool:
+        """Whether anything is missing at all."""
+        return self.table.p_global < ALARM
+
+    def summary(self) -> tuple[tuple[str, float, float], ...]:
+        """Effects with score and corrected p, most significant first."""
+        rows = [(r.effect.name, r.score.statistic, self.table.corrected(r.score)) for r in self.ranked]
+        return tuple(sorted(rows, key=lambda row: row[2]))
+
+    def limits(self) -> Iterator[Limit]:
+        """What each effect with a single amplitude stays below."""
+        for item in self.ranked:
+            names = item.effect.amplitudes()
+            if len(item.score.amplitudes) != 1 or sum(p.effect is item.effect for p in self.probes) > 1:
+                continue
+            value, sigma = float(item.score.amplitudes[0]), float(np.sqrt(item.score.covariance[0, 0]))
+            unit = field_declarations(item.effect)[names[0]].unit
+            one_sided = names[0] in item.effect.one_sided
+            below = upper_limit(value, sigma, one_sided=one_sided)
+            yield Limit(item.effect.name, names[0], unit, value, sigma, below)
+
+    def untestable(self, catalogue: Sequence[type[Effect]]) -> tuple[str, ...]:
+        """Effects that these data cannot show at any plausible size."""
+        seen = {probe.effect.name for probe in self.probes if self.table[probe.name].testable}
+        active = {effect.name for effect in self.problem.model.template.effects}
+        return tuple(
+            effect.name
+            for effect in catalogue
+            if effect.name not in seen | active and not effect.is_structural()
+        )
+
+    def separation(self, name: str, change: Vector) -> dict[str, float]:
+        """How far (σ) each rival stays from an active effect that changes the residuals (data rows) by `change`."""
+        own = self._own[name]
+        whole = np.pad(change, (0, len(self.design.residual) - len(change)))
+        projected = own.rest(whole)
+        space = dataclasses.replace(self.space, gram=self.space.gram + own.columns.T @ own.columns)
+        scores = self.columns.T @ projected + own.columns.T @ (own.basis.T @ projected)
+        by_probe = separations(space, scores, float(projected @ projected))
+        found: dict[str, float] = {}
+        for probe in self.probes:
+            effect = probe.effect.name
+            found[effect] = min(by_probe[probe.name], found.get(effect, np.inf))
+        return found
+
+    @cached_property
+    def significant(self) -> list[naming.Ranked]:
+        """Effects that are significant by themselves, best evidence first."""
+        return [r for r in self.ranked if self.table.corrected(r.score) < ALARM]
+
+
+def upper_limit(value: float, sigma: float, *, one_sided: bool) -> float:
+    """Size that an amplitude stays below with 95 % probability, for a flat prior (positive when one-sided)."""
+    if one_sided:
+        below_zero = stats.norm.cdf(-value / sigma)
+        return float(value + sigma * stats.norm.ppf(below_zero + PROBABILITY * (1.0 - below_zero)))
+    return float(stats.foldnorm.ppf(PROBABILITY, abs(value) / sigma, scale=sigma))

@@ -1,0 +1,136 @@
+"""Patterns without a name: what is left when no effect of the catalogue explains the data.
+
+Not a name, never a candidate: `diagnose` adds it, labelled, so that a calibration improves although nobody knows
+yet why. It holds only the blocks that it is made with, others have no elements.
+
+Equation    vectors     a_k → a_k + a_k0 · Σ_t v_kst P_t(x, y) e_s, s = q, u: any linear effect smooth in the field
+            harmonics   N_k → N_k + N⁰_k · Σ_ht (c_kht cos hθ + s_kht sin hθ) P_t(x, y), θ polariser angle
+            fine        N_k → N_k + N⁰_k · Σ_t f_kt P_t(x, y), P_t of higher degree than the throughput
+            exposures   N_k → N_k + N⁰_k · g_ek
+Symbols     a_k analysis vector of camera k, a_k0 its response to unpolarised light; N_k counts and N⁰_k those that
+            unpolarised light of the same flux would give; P_t products of Legendre polynomials
+Source      the strata of the free-form score test (`diagnose.freeform`), with the same plausible size
+Neutral     all zero
+Revealed by any data that no model explains
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, ClassVar, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from walop_jax.model import legendre
+from walop_jax.model.effects.base import Context, Effect, ExposureArrays, Scalar
+from walop_jax.model.parameters import param, unknown_name
+
+WIDTH = 0.003  # plausible size, in units of the response to unpolarised light
+SMOOTH, FINE, GRADIENT = 4, 8, 1  # degrees of the field polynomials
+HARMONICS = (1, 3, 4, 5, 6)
+BLOCKS = ("vectors", "harmonics", "fine", "exposures")
+CAMERAS = ("n0", "n1", "n2", "n3")
+_SMOOTH_TERMS = legendre.terms(SMOOTH)
+_GRADIENT_TERMS = legendre.terms(GRADIENT)
+_FINE_TERMS = legendre.terms(FINE)[len(_SMOOTH_TERMS) :]
+
+
+def _pattern(about: str) -> Any:
+    return param(unit="", about=about, source="free-form term, no physics behind it", width=WIDTH)
+
+
+def _tags(terms: Sequence[tuple[int, int]]) -> list[str]:
+    return [f"p{i}{j}" for i, j in terms]
+
+
+class FreeForm(Effect):
+    """Smooth patterns of the analysis vectors, harmonics of the polariser, fine structure, single exposures."""
+
+    vectors: Float[Array, "4 2 s"] = _pattern("change of an analysis vector, relative to its first element")
+    harmonics: Float[Array, "4 h 2 g"] = _pattern("harmonic of the polariser angle, cos and sin")
+    fine: Float[Array, "4 f"] = _pattern("fine structure over the field")
+    exposures: Float[Array, "e 4"] = _pattern("one camera in one exposure")
+    blocks: tuple[str, ...] = eqx.field(static=True, default=(), converter=tuple)
+
+    name: ClassVar[str] = "free_form"
+    revealed_by: ClassVar[str] = "any data that no model explains"
+    separated_by: ClassVar[str] = "a physical effect that explains the same pattern with fewer numbers"
+
+    @classmethod
+    def neutral(cls, context: Context) -> Self:
+        """All blocks, all zero."""
+        return cls.of(context, blocks=BLOCKS)
+
+    @classmethod
+    def of(cls, context: Context, **values: Any) -> Self:
+        """The blocks that are asked for, all zero. Raises ValueError for a block that does not exist."""
+        blocks = tuple(values.pop("blocks", BLOCKS))
+        for name in [*blocks, *values]:
+            if name not in BLOCKS:
+                raise unknown_name("block of free_form", name, BLOCKS)
+        shapes = {
+            "vectors": (4, 2, len(_SMOOTH_TERMS)),
+            "harmonics": (4, len(HARMONICS), 2, len(_GRADIENT_TERMS)),
+            "fine": (4, len(_FINE_TERMS)),
+            "exposures": (context.exposures, 4),
+        }
+        zeros = {
+            name: jnp.zeros(shape if name in blocks else (0, *shape[1:])) for name, shape in shapes.items()
+        }
+        return dataclasses.replace(cls(**zeros, blocks=blocks), **values)
+
+    @classmethod
+    def probes(cls, context: Context) -> tuple[tuple[Self, ...], ...]:
+        """None: a pattern is found by its own score test."""
+        del context
+        return ()
+
+    def labels(self, field: str) -> Sequence[str]:
+        """Names such as "vectors.n0.q.p12"; "harmonics.n3.4theta.sin.p10"; "exposures.7.n1" counts positions."""
+        if not getattr(self, field).size:
+            return []
+        if field == "exposures":
+            return [f"{field}.{i}.{camera}" for i in range(len(self.exposures)) for camera in CAMERAS]
+        if field == "fine":
+            inner = _tags(_FINE_TERMS)
+        elif field == "vectors":
+            inner = [f"{element}.{tag}" for element in "qu" for tag in _tags(_SMOOTH_TERMS)]
+        else:
+            inner = [
+                f"{h}theta.{wave}.{tag}"
+                for h in HARMONICS
+                for wave in ("cos", "sin")
+                for tag in _tags(_GRADIENT_TERMS)
+            ]
+        return [f"{field}.{camera}.{rest}" for camera in CAMERAS for rest in inner]
+
+    def cameras(self, vectors: Float[Array, "b 4 4"], x: Scalar, y: Scalar) -> Float[Array, "b 4 4"]:
+        """Add the smooth pattern to the q and u elements."""
+        if not self.vectors.size:
+            return vectors
+        change = self.vectors @ legendre.basis(x, y, SMOOTH)
+        return vectors.at[:, :, 1:3].add(vectors[:, :, :1] * change)
+
+    def recorded(
+        self,
+        counts: Float[Array, "e 4"],
+        unpolarised: Float[Array, "e 4"],
+        exposures: ExposureArrays,
+        x: Scalar,
+        y: Scalar,
+    ) -> Float[Array, "e 4"]:
+        """Add harmonics, fine structure and single exposures."""
+        share: Float[Array, "e 4"] = jnp.zeros_like(counts)
+        if self.harmonics.size:
+            angle = exposures.clp_angle[:, None] * jnp.asarray(HARMONICS)
+            waves = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+            size = self.harmonics @ legendre.basis(x, y, GRADIENT)
+            share += jnp.where(exposures.clp_in[:, None], jnp.einsum("ehw,khw->ek", waves, size), 0.0)
+        if self.fine.size:
+            share += self.fine @ legendre.basis(x, y, FINE)[len(_SMOOTH_TERMS) :]
+        if self.exposures.size:
+            share += self.exposures
+        return counts + unpolarised * share
