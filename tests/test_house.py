@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "walop_jax"
-ROOMS = ("data", "model", "likelihood", "fit", "posterior", "diagnose", "report", "cli")
+ROOMS = ("data", "model", "likelihood", "fit", "posterior", "science", "diagnose", "report", "cli")
 OWNERS = {
     "astropy": {"data"},
     "speclite": {"data"},
@@ -20,6 +20,7 @@ OWNERS = {
     "scipy": {"diagnose"},
     "emcee": {"posterior"},
     "matplotlib": {"report"},
+    "jinja2": {"report"},
     "typer": {"cli"},
     "rich": {"cli"},
     "tomlkit": {"cli", "model", "fit"},

@@ -29,6 +29,7 @@ QUALITY_BITS = {
     2048: "validity forced",
     4096: "non-physical Mueller matrix within tolerance",
     8192: "the model does not explain the data",
+    16384: "no Stokes parameters: too few cameras, too little light, or no u in the rows there are",
 }
 """Bits of QUALITY (of a product) and FLAG (of a row or pixel)."""
 

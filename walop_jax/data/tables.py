@@ -133,6 +133,33 @@ def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
     return _numbers(values, masked, str(column.unit or ""), name, rule, place)
 
 
+def vector_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
+    """A column with `rule.width` numbers in a row, or that many columns `name`0, `name`1, … side by side.
+
+    Text formats have no vectors, hence the second form; N_ERR is N0_ERR, N1_ERR, … there. Raises `DataError`
+    as `numeric_column` does, and for a row of another width.
+    """
+    place = Place(source.path, "")
+    width = rule.width or 1
+    if name not in source.names:
+        head, _, tail = name.partition("_")
+        parts = [f"{head}{k}{'_' + tail if tail else ''}" for k in range(width)]
+        if not any(part in source.names for part in parts):
+            if rule.missing is not None:
+                return np.full((source.rows, width), rule.missing)
+            advice = f"add it, or {parts[0]} … {parts[-1]} ({nearest(name, source.names)})"
+            raise place.fail("the column is missing", name, advice)
+        single = dataclasses.replace(rule, width=1)
+        return np.stack([numeric_column(source, part, single) for part in parts], axis=1)
+    column = source.table.columns[source.names.index(name)]
+    values = np.ma.getdata(np.ma.asarray(column))
+    if values.ndim != 2 or values.shape[1] != width:
+        what = f"has shape {values.shape[1:] or '()'} in a row, {width} values are needed"
+        raise place.fail(what, name, "one row holds the four cameras O1, E1, O2, E2")
+    masked = np.broadcast_to(np.asarray(getattr(column, "mask", False)), values.shape).ravel()
+    return _numbers(values.ravel(), masked, str(column.unit or ""), name, rule, place).reshape(values.shape)
+
+
 def _truth(values: np.ndarray, masked: np.ndarray, name: str, place: Place) -> Bool[np.ndarray, " n"]:
     text = np.char.lower(np.char.strip(values.astype(str)))
     true = np.isin(text, _TRUE) | np.isin(text, ["1.0"])
@@ -226,18 +253,25 @@ def field_points(source: InputTable, instrument: str) -> FieldPoints:
 
 
 def write_output_table(
-    path: str | os.PathLike[str], source: InputTable, added: Mapping[str, Any], *, overwrite: bool = False
+    path: str | os.PathLike[str],
+    source: InputTable,
+    added: Mapping[str, Any],
+    *,
+    overwrite: bool = False,
+    header: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a table with columns added (an old column of that name is replaced), in the format of the name.
 
-    A value of `added` is an array, or a pair of an array and its description. The file appears whole or not
-    at all. Raises `DataError` as `atomic_path` does, and for an unknown extension.
+    A value of `added` is an array, or a pair of an array and its description; `header` adds to the header of
+    the table (CSV has none). The file appears whole or not at all. Raises `DataError` as `atomic_path` does, and
+    for an unknown extension.
     """
     kind = table_format(path)
     check_output(path, overwrite=overwrite)
     table = source.table.copy(copy_data=False)
     for key in [key for key in table.meta if key.upper() in ("CHECKSUM", "DATASUM", "EXTNAME")]:
         del table.meta[key]
+    table.meta.update(header or {})
     present = {str(name).upper(): name for name in table.colnames}
     for name, values in added.items():
         if name in present:

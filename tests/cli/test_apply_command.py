@@ -1,0 +1,92 @@
+"""`walop-jax apply` from files to files: columns, header, flags, errors in one line."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from walop_jax.data.product import read_product
+
+ADDED = ["Q", "U", "Q_ERR", "U_ERR", "QU_COV", "P", "P_DEBIASED", "P_ERR", "EVPA", "EVPA_ERR", "FLAG"]
+
+
+def catalogue(path, rows=6, **columns):
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-0.2, 0.2, (2, rows))
+    table = Table({"ID": np.arange(rows), "X": x, "Y": y})
+    counts = rng.normal(1e6, 1e3, (rows, 4))
+    if str(path).endswith(".fits"):
+        table["N"], table["N_ERR"] = counts, np.sqrt(counts)
+    else:
+        for k in range(4):
+            table[f"N{k}"], table[f"N{k}_ERR"] = counts[:, k], np.sqrt(counts[:, k])
+    for name, values in columns.items():
+        table[name] = values
+    table.write(path, overwrite=True)
+    return path
+
+
+def one_line(result) -> str:
+    assert result.exit_code == 1
+    assert result.stderr.count("\n") == 1
+    return result.stderr
+
+
+@pytest.mark.parametrize("suffix", [".fits", ".csv", ".ecsv"])
+def test_apply_adds_columns(call, run, tmp_path, suffix):
+    source = catalogue(tmp_path / f"c{suffix}", ROTATOR=20.0)
+    output = tmp_path / f"o{suffix}"
+    result = call("apply", run / "calibration.fits", source, "-o", output, "--json")
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    assert told["rows"] == told["stars"] == 6
+    assert told["estimator"] == "MAS"
+    table, before = Table.read(output), Table.read(source)
+    assert table.colnames[: len(before.colnames)] == before.colnames
+    assert set(ADDED) <= set(table.colnames)
+    assert np.all((table["EVPA"] >= 0) & (table["EVPA"] < 180))
+    assert np.all(table["P_DEBIASED"] <= table["P"])
+    np.testing.assert_allclose(np.hypot(table["Q"], table["U"]), table["P"], rtol=1e-12)
+    if suffix != ".csv":
+        assert table.meta["QUFRAME"] == "sky"
+        assert table.meta["CALHASH"] == read_product(run / "calibration.fits").content_hash()
+        assert table.meta["PESTIM"].startswith("Plaszczynski")
+
+
+def test_other_estimator_and_combined_rows(call, run, tmp_path):
+    source = catalogue(tmp_path / "c.fits", ID=["a", "b", "a", "c", "b", "a"])
+    call("apply", run, source, "-o", tmp_path / "o.fits", "--debias", "WK", "--quiet")
+    table = Table.read(tmp_path / "o.fits")
+    assert table["NROWS"].tolist() == [3, 2, 3, 1, 2, 3]
+    assert len(set(table["Q"].tolist())) == 3
+    assert table.meta["PESTIM"].startswith("Wardle")
+    assert table.meta["QUFRAME"] == "instrument"
+
+
+def test_errors_name_what_is_wrong(call, run, tmp_path):
+    good = catalogue(tmp_path / "c.fits")
+    assert call("apply", run, good, "-o", tmp_path / "o.fits", "--debias", "MLE").exit_code == 2
+    assert call("apply", run, good, "-o", tmp_path / "o.fits", "--saturation", "-1").exit_code == 2
+    assert "no such file" in one_line(call("apply", run, tmp_path / "none.fits", "-o", tmp_path / "o.fits"))
+    line = one_line(
+        call("apply", run, catalogue(tmp_path / "f.fits", FILTER="SDSS-q"), "-o", tmp_path / "o.fits")
+    )
+    assert "f.fits" in line
+    assert "SDSS-r" in line
+    call("apply", run, good, "-o", tmp_path / "o.fits")
+    before = (tmp_path / "o.fits").read_bytes()
+    assert "exists already" in one_line(call("apply", run, good, "-o", tmp_path / "o.fits"))
+    assert (tmp_path / "o.fits").read_bytes() == before
+
+
+def test_rows_that_hold_nothing_are_said(call, run, tmp_path):
+    counts = np.full((6, 4), 1e6)
+    counts[0] = 0.0
+    source = catalogue(tmp_path / "c.fits", N=counts)
+    result = call("apply", run, source, "-o", tmp_path / "o.fits")
+    assert result.exit_code == 0
+    assert "1 star(s) without a result" in result.stderr
+    assert np.isnan(np.ma.filled(Table.read(tmp_path / "o.fits")["Q"], np.nan)[0])

@@ -1,0 +1,373 @@
+"""A calibration applied to catalogues: tables against the optics, errors against brute force, frames, flags."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from walop_jax.data import DataError
+from walop_jax.data.catalogue import read_catalogue
+from walop_jax.data.tables import read_input_table
+from walop_jax.fit.predict import Settings
+from walop_jax.likelihood.simulate import simulate
+from walop_jax.model.effects import effect_by_name
+from walop_jax.model.specification import with_effects
+from walop_jax.science.apply import apply, linearised, not_carried_over
+from walop_jax.science.vectors import AnalysisVectors, Setting
+
+SOUTH = "WALOP-SOUTH"
+
+
+@pytest.fixture(scope="module")
+def vectors(calibration) -> AnalysisVectors:
+    return AnalysisVectors(calibration)
+
+
+def stars(vectors, count, rng=None, plate=(None,), rotator=None, flux=4e6, teff=np.nan):
+    """A table of stars with exact vectors, every star once for each setting of the plate; and its truth."""
+    draw = np.random.default_rng(8)
+    x, y = draw.uniform(-0.28, 0.28, (2, count))
+    p, angle = draw.uniform(0, 0.05, count), draw.uniform(0, np.pi, count)
+    qu = np.stack([p * np.cos(2 * angle), p * np.sin(2 * angle)], axis=1)
+    rows = []
+    for k, setting in enumerate(plate):
+        turn = 0.0 if rotator is None else 2 * np.deg2rad(rotator[k])
+        seen = (qu[:, 0] + 1j * qu[:, 1]) * np.exp(-1j * turn)  # contract: EVPA in the ICS = sky − ROTATOR
+        a = vectors.exact(Setting("SDSS-r", setting), x, y, [teff])[:, 0]
+        n = flux * np.einsum("pks,ps->pk", a, np.stack([np.ones(count), seen.real, seen.imag], axis=1))
+        error = np.sqrt(n + 900.0)
+        if rng is not None:
+            n = n + error * rng.standard_normal(n.shape)
+        row = Table({"ID": np.arange(count), "X": x, "Y": y, "N": n, "N_ERR": error})
+        row["CHWP_ANGLE"] = np.nan if setting is None else setting
+        row["TEFF"] = teff
+        if rotator is not None:
+            row["ROTATOR"] = rotator[k]
+        rows.append(row)
+    table = Table({name: np.concatenate([r[name] for r in rows]) for name in rows[0].colnames})
+    return table, qu
+
+
+def read(table, tmp_path, **options):
+    table.write(tmp_path / "c.fits", overwrite=True)
+    return read_catalogue(read_input_table(tmp_path / "c.fits"), SOUTH, **options)
+
+
+# --------------------------------------------------------------------------------------------- the vectors
+
+
+def test_series_meet_the_optics(vectors, calibration):
+    """Anywhere in the field and at any colour, against the matrix that the calibration itself computes."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-0.34, 0.34, (2, 60))
+    teff = np.where(np.arange(60) % 4 == 0, np.nan, rng.uniform(2000, 30000, 60))
+    for plate in (None, 22.5):
+        a = vectors.coloured(Setting("SDSS-r", plate), x, y, teff)
+        rows = [(a[:, i] - a[:, i + 1]) / (a[:, i, :1] + a[:, i + 1, :1]) for i in (0, 2)]
+        settings = dataclasses.replace(
+            Settings.default(60), teff=teff, chwp_angle=np.full(60, np.nan if plate is None else plate)
+        )
+        values, _ = calibration.matrix(x, y, settings)
+        np.testing.assert_allclose(np.concatenate(rows, axis=1), values, atol=1e-6)
+
+
+def test_derivatives_meet_differences(vectors, calibration):
+    """To every parameter the vectors depend on, by changing it; one step of one standard error."""
+    x, y, teff = np.array([0.11, -0.2]), np.array([0.2, 0.05]), np.array([np.nan, 4500.0])
+    setting = Setting("SDSS-r", 22.5)
+    local = vectors.derivatives(setting, x, y, teff)
+    gain = np.random.default_rng(1).standard_normal((2, 2, 4))
+    s = np.array([1.0, 0.02, -0.01])
+    plain, throughput = (gain @ np.einsum("s,rksf->rkf", s, part) for part in local)
+    found = vectors.to_parameters(plain, throughput, x, y)
+    for k in [*range(0, found.shape[-1], 9), found.shape[-1] - 1]:
+        index = vectors.parameters[k]
+        step = np.sqrt(calibration.covariance[index, index])
+        shifted = []
+        for sign in (1, -1):
+            values = calibration.values.copy()
+            values[index] += sign * step
+            there = AnalysisVectors(dataclasses.replace(calibration, values=values))
+            a = there.exact(setting, x, y, [np.nan, 4500.0])[[0, 1], [0, 1]]
+            shifted.append(np.einsum("rik,rks,s->ri", gain, a, s))
+        difference = (shifted[0] - shifted[1]) / (2 * step)
+        scale = np.abs(difference).max()
+        np.testing.assert_allclose(found[..., k], difference, atol=3e-3 * scale)
+
+
+# --------------------------------------------------------------------------------------------- the answers
+
+
+@pytest.mark.parametrize("teff", [np.nan, 4200.0])
+def test_noiseless_stars_come_back(vectors, calibration, tmp_path, teff):
+    table, qu = stars(vectors, 30, plate=(None, 22.5), teff=teff)
+    found = apply(calibration, read(table, tmp_path))
+    np.testing.assert_allclose(found.qu, qu, atol=2e-6)  # the series are good to 1e-7 of the counts
+    assert np.all(found.chi2 < 1e-3)
+    assert found.rows.tolist() == [2] * 30
+
+
+def test_calibration_errors_are_those_of_a_wrong_calibration(vectors, calibration, tmp_path):
+    """Apply calibrations drawn from the covariance to the same counts: their scatter is what was promised.
+
+    Two rows of a star share the calibration; were they taken as independent, the errors would be too small.
+    """
+    table, _ = stars(vectors, 12, plate=(None, 22.5))
+    catalogue = read(table, tmp_path)
+    promised = apply(calibration, catalogue)
+    rng = np.random.default_rng(2)
+    value, vector = np.linalg.eigh(calibration.covariance)  # gauges make it singular
+    root = vector * np.sqrt(np.clip(value, 0.0, None))
+    draws = 40
+    found = []
+    for _ in range(draws):
+        values = calibration.values + root @ rng.standard_normal(len(root))
+        found.append(_brute_force(dataclasses.replace(calibration, values=values), catalogue))
+    ratio = np.var(found, axis=0, ddof=1) / np.einsum("sii->si", promised.calibration)
+    # 12 stars × 2 share their errors, so the mean ratio counts as some ten independent variances of 39 degrees.
+    assert np.mean(ratio) == pytest.approx(1.0, abs=4 * np.sqrt(2 / 39 / 5))
+    assert np.all((ratio > 0.3) & (ratio < 2.5))
+
+
+def _brute_force(calibration, catalogue):
+    """(q, u) by the exact optics of a calibration and Gauss–Newton steps written out for each star."""
+    vectors = AnalysisVectors(calibration)
+    points = catalogue.points
+    a = np.empty((len(catalogue), 4, 3))
+    for plate in (None, 22.5):
+        rows = np.isnan(points.chwp_angle) if plate is None else points.chwp_angle == plate
+        a[rows] = vectors.exact(Setting("SDSS-r", plate), points.x[rows], points.y[rows], [np.nan])[:, 0]
+    out = []
+    for star in range(catalogue.star.max() + 1):
+        rows = np.flatnonzero(catalogue.star == star)
+        qu = np.zeros(2)
+        for _ in range(6):
+            jacobian, residual = [], []
+            for r in rows:
+                w = 1 / catalogue.sigma[r]
+                model = w * (a[r] @ [1, *qu])
+                project = np.eye(4) - np.outer(model, model) / (model @ model)
+                flux = (w * catalogue.counts[r]) @ model / (model @ model)
+                jacobian.append(flux * project @ (w[:, None] * a[r, :, 1:]))
+                residual.append(project @ (w * catalogue.counts[r]))
+            qu = qu + np.linalg.lstsq(np.concatenate(jacobian), np.concatenate(residual), rcond=None)[0]
+        out.append(qu)
+    return np.array(out)
+
+
+def test_sky_is_the_instrument_turned(vectors, calibration, tmp_path):
+    """A star seen at three position angles is one star on the sky."""
+    table, qu = stars(vectors, 20, plate=(None, None, None), rotator=(0.0, 30.0, 112.0))
+    found = apply(calibration, read(table, tmp_path))
+    np.testing.assert_allclose(found.qu, qu, atol=2e-6)
+    single, _ = stars(vectors, 20, plate=(None,), rotator=(30.0,))
+    on_sky = apply(calibration, read(single, tmp_path))
+    del single["ROTATOR"]
+    inside = apply(calibration, read(single, tmp_path))
+    turn = np.exp(2j * np.deg2rad(30.0))
+    np.testing.assert_allclose(on_sky.qu @ [1, 1j], (inside.qu @ [1, 1j]) * turn, rtol=1e-9)
+    for name in ("photon", "calibration"):
+        np.testing.assert_allclose(
+            np.trace(getattr(on_sky, name), axis1=1, axis2=2),
+            np.trace(getattr(inside, name), axis1=1, axis2=2),
+            rtol=1e-6,
+        )
+
+
+def test_rows_one_by_one_are_the_same(vectors, calibration, tmp_path):
+    rng = np.random.default_rng(3)
+    table, _ = stars(vectors, 40, rng, plate=(None, 22.5), teff=5000.0, rotator=(10.0, 10.0))
+    whole = apply(calibration, read(table[rng.permutation(len(table))], tmp_path))
+    for star in (0, 7, 23, 39):
+        alone = apply(calibration, read(table[table["ID"] == star], tmp_path))
+        for field in dataclasses.fields(whole):
+            a, b = getattr(whole, field.name)[star], getattr(alone, field.name)[0]
+            scale = 1.0 if field.name in ("qu", "colour") else np.abs(np.max(a)) + 1e-30
+            np.testing.assert_allclose(a / scale, b / scale, rtol=0, atol=1e-12, err_msg=field.name)
+
+
+def test_colour_that_is_ignored(vectors, calibration, tmp_path):
+    """The stated error is what happens when the column is left out."""
+    table, qu = stars(vectors, 20, plate=(None,), teff=3600.0)
+    known = apply(calibration, read(table, tmp_path))
+    del table["TEFF"]
+    ignored = apply(calibration, read(table, tmp_path))
+    # To first order: in the zone without u the second order is some per cent of it.
+    np.testing.assert_allclose(ignored.qu - qu, known.colour, rtol=0.1, atol=3e-6)
+    assert np.abs(known.colour).max() > 2e-5
+    cool, hot = (stars(vectors, 20, plate=(None,), teff=t)[0] for t in (3500.0, 10000.0))
+    for other in (cool, hot):
+        del other["TEFF"]
+    half = 0.5 * (apply(calibration, read(hot, tmp_path)).qu - apply(calibration, read(cool, tmp_path)).qu)
+    np.testing.assert_allclose(np.abs(ignored.colour), np.abs(half), rtol=0.1, atol=3e-6)
+
+
+# ----------------------------------------------------------------------------------------- flags and effects
+
+
+def test_flags(vectors, calibration, tmp_path):
+    table, _ = stars(vectors, 8)
+    table["X"][0], table["Y"][0] = 0.33, 0.0  # in the instrument, beyond the points of the run
+    table["X"][1] = 0.5
+    table["TEFF"][2] = 1500.0
+    table["N"][3, 0] = np.nan
+    table["N_FLAG"] = np.array([0, 0, 0, 0, 1, 0, 0, 0])
+    table["N"][5, 1] = 9e6
+    table["N"][6] = 0.0
+    found = apply(calibration, read(table, tmp_path, saturation=8e6))
+    zone = found.flag & 16
+    others = found.flag & ~16
+    assert others.tolist()[:7] == [32, 32 | 128 | 16384, 64, 128, 128 | 256 | 16384, 128 | 256, 16384]
+    assert others[7] == 0
+    assert np.isnan(found.qu[[1, 4, 6]]).all()
+    assert np.isfinite(found.qu[[0, 2, 3, 5]]).all()
+    assert zone[1] == 16
+
+
+def test_the_zone_without_u(vectors, calibration, tmp_path):
+    """Where m33 → 0 one exposure holds no u. The plate at 22.5° brings it back; a turned rotator does as well."""
+    x, y = np.meshgrid(np.linspace(-0.28, 0.28, 15), np.linspace(-0.28, 0.28, 15))
+    values, _ = calibration.matrix(x.ravel(), y.ravel())
+    blind = np.argsort(np.abs(values[:, 1] * values[:, 5] - values[:, 2] * values[:, 4]))[:5]
+    base = Table({"X": x.ravel()[blind], "Y": y.ravel()[blind], "ID": np.arange(5)})
+    a = {p: vectors.exact(Setting("SDSS-r", p), base["X"], base["Y"], [np.nan])[:, 0] for p in (None, 22.5)}
+
+    def error(*rows):
+        parts = []
+        for plate, rotator in rows:
+            part = base.copy()
+            part["N"] = 4e6 * a[plate][..., 0]
+            part["N_ERR"] = np.sqrt(part["N"])
+            part["CHWP_ANGLE"], part["ROTATOR"] = np.nan if plate is None else plate, rotator
+            parts.append(part)
+        whole = Table({k: np.concatenate([p[k] for p in parts]) for k in parts[0].colnames})
+        found = apply(calibration, read(whole, tmp_path))
+        return np.sqrt(np.linalg.eigvalsh(found.covariance)[:, -1]), found.flag & 16
+
+    alone, flagged = error((None, 0.0))
+    assert np.all(flagged == 16)
+    assert np.all(alone > 0.01)
+    for rows in (((None, 0.0), (22.5, 0.0)), ((None, 0.0), (None, 45.0))):
+        together, flagged = error(*rows)
+        assert np.all(flagged == 0)
+        assert np.all(together < 0.2 * alone)
+
+
+def test_detectors_and_rotator_of_the_model(calset, calibration, tmp_path):
+    """Non-linearity that the calibration found is undone; a rotator zero turns the results."""
+    context = _context(calset)
+    effect = effect_by_name("nonlinearity").of(context, coefficient=0.02)
+    model = with_effects(calibration.model, [effect], context)
+    there = _with(calibration, model)
+    counts = np.array([[1e5, 5e5, 1e6, 2e6]])
+    np.testing.assert_allclose(linearised(there, counts * (1 + 0.02 * counts / 1e6)), counts, rtol=1e-12)
+    assert not_carried_over(there) == ()
+    drift = effect_by_name("camera_gain_drift").of(context)
+    assert not_carried_over(_with(calibration, with_effects(calibration.model, [drift], context))) == (
+        "camera_gain_drift",
+    )
+    turned = _with(
+        calibration,
+        with_effects(calibration.model, [effect_by_name("rotator_zero").of(context, angle=2.0)], context),
+        known=0.1,
+    )
+    table, _ = stars(AnalysisVectors(calibration), 6, rotator=(20.0,))
+    plain, moved = (apply(c, read(table, tmp_path)) for c in (calibration, turned))
+    turn = np.exp(2j * np.deg2rad(2.0))
+    np.testing.assert_allclose(moved.qu @ [1, 1j], plain.qu @ [1, 1j] * turn, rtol=1e-9)
+    # 0.1° of doubt in the zero adds (2 p · 0.1°)² across the direction of (q, u).
+    extra = np.trace(moved.calibration - plain.calibration, axis1=1, axis2=2)
+    p = np.hypot(*plain.qu.T)
+    np.testing.assert_allclose(extra, (2 * p * np.deg2rad(0.1)) ** 2, rtol=1e-4)  # a small difference
+
+
+def _context(calset):
+    from walop_jax.model.instrument import nominal_instrument
+    from walop_jax.model.specification import effect_context
+
+    return effect_context(nominal_instrument(calset.instrument), calset.exposures)
+
+
+def _with(calibration, model, known=0.0):
+    """The calibration with a model of more parameters at their start, with an error of `known` on the new."""
+    values, old = model.start, list(calibration.model.names)
+    covariance = np.diag(np.full(len(values), known**2))
+    where = np.array([model.names.index(name) for name in old])
+    values[where] = calibration.values
+    covariance[np.ix_(where, where)] = calibration.covariance
+    return dataclasses.replace(calibration, model=model, values=values, covariance=covariance)
+
+
+# ------------------------------------------------------------------------------------------------ catalogues
+
+
+def write(tmp_path, **columns):
+    table = {
+        "X": [0.0, 0.1],
+        "Y": [0.0, 0.1],
+        "N": np.full((2, 4), 1e5),
+        "N_ERR": np.full((2, 4), 300.0),
+    } | columns
+    Table({k: v for k, v in table.items() if v is not None}).write(tmp_path / "bad.fits")
+    return read_input_table(tmp_path / "bad.fits")
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"N": None}, "bad.fits N: the column is missing; add it, or N0 … N3"),
+        ({"N": np.full((2, 3), 1.0)}, "N: has shape"),
+        ({"N_ERR": np.array([[1.0, 1, 1, 1], [1, 0, 1, 1]])}, "N_ERR: is not above 0 in row 1"),
+        ({"ROTATOR": [0.0, np.nan], "ID": [5, 5]}, "ROTATOR: is missing in row 1"),
+        ({"N_FLAG": [0.5, 0.0]}, "N_FLAG: is neither one integer"),
+        ({"X": [0.0, np.nan]}, "X: is not finite in row 1"),
+    ],
+)
+def test_bad_catalogues(tmp_path, columns, message):
+    with pytest.raises(DataError, match=message.replace("(", r"\(")):
+        read_catalogue(write(tmp_path, **columns), SOUTH)
+
+
+def test_stars_are_ids_in_a_filter(tmp_path):
+    table = Table({"X": np.zeros(6), "Y": np.zeros(6), "ID": ["a", "b", "a", "", "a", ""]})
+    for k in range(4):
+        table[f"N{k}"], table[f"N{k}_ERR"] = 1e5, 300.0
+    table["FILTER"] = ["SDSS-r"] * 4 + ["NB", "SDSS-r"]
+    table.write(tmp_path / "c.csv")
+    star = read_catalogue(read_input_table(tmp_path / "c.csv"), SOUTH).star
+    assert star[0] == star[2]
+    assert len(set(star.tolist())) == 5
+
+
+def test_too_many_settings(calibration, calset, vectors, tmp_path):
+    table, _ = stars(vectors, 300)
+    table["CHWP_ANGLE"] = np.linspace(0, 90, 300)
+    with pytest.raises(DataError, match="300 different optical settings"):
+        apply(calibration, read(table, tmp_path))
+
+
+def test_simulated_observation_of_standards(calset, calibration, tmp_path):
+    """Standards of another run, noise and all: counts that the package drew, pulls of unit width."""
+    from science.conftest import PLAN
+
+    run = simulate(dataclasses.replace(PLAN, standards=6), seed=99, instrument=simulate(PLAN, seed=4).truth)
+    exposures, block = run.calset.exposures, run.calset.intensities.block(0, len(run.calset.points))
+    star, point = [], []
+    for p in range(len(run.calset.points)):
+        for e in np.flatnonzero(block.used[p] & (exposures.kind == "standard")):
+            point.append(p)
+            star.append(e)
+    point, star = np.array(point), np.array(star)
+    table = Table({"X": block.x[point], "Y": block.y[point], "N": block.counts[point, star]})
+    table["N_ERR"] = block.sigma[point, star]
+    table["CHWP_ANGLE"] = np.where(exposures.chwp_in[star], exposures.chwp_angle[star], np.nan)
+    table["ROTATOR"] = exposures.rotator[star]
+    source = block.source[point, star]
+    table["TEFF"] = run.calset.sources.teff[source]
+    found = apply(calibration, read(table, tmp_path))
+    truth = np.stack([np.asarray(run.truth.standard.q), np.asarray(run.truth.standard.u)], axis=1)[source]
+    chi2 = np.einsum("si,sij,sj->s", found.qu - truth, np.linalg.inv(found.covariance), found.qu - truth)
+    assert chi2.mean() == pytest.approx(2.0, abs=4 * 2 / np.sqrt(len(chi2)))

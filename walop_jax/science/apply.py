@@ -1,0 +1,271 @@
+"""A calibration applied to a science catalogue: q, u of every star with errors of photons and calibration.
+
+Rows are taken star by star in blocks that fit into memory. Nothing that is computed for a star depends on what else
+is in the catalogue.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from walop_jax.data.catalogue import Catalogue
+from walop_jax.data.errors import DataError
+from walop_jax.fit.calibration import Calibration
+from walop_jax.fit.predict import Settings
+from walop_jax.model.effects.base import overridden
+from walop_jax.model.plan import exposure_arrays
+from walop_jax.model.specification import unravel
+from walop_jax.science.estimate import calibration_shift, estimate
+from walop_jax.science.interpolation import COOLEST, colour_weights
+from walop_jax.science.vectors import COLOURS, AnalysisVectors, Setting
+
+BLOCK = 16384  # rows that are worked on together
+MOST_SETTINGS = 200
+ILL_POSED = 10.0  # ratio of the errors of the two principal directions from which FLAG 16 is set
+COOL, HOT = 3500.0, 10000.0
+"""Colour temperatures (K) between which stars without TEFF are taken to lie."""
+_NEUTRAL = Setting("")
+_CORRECTED = ("nonlinearity",)  # effects of the detectors that need to know nothing of the exposure
+_ROUNDS = 16
+
+
+@dataclasses.dataclass(frozen=True)
+class Stars:
+    """Stokes parameters of the stars of a catalogue, in the order of `Catalogue.star`.
+
+    On the sky (equatorial frame) where the catalogue has a ROTATOR, in the instrument frame elsewhere;
+    `covariance` is `photon` plus `calibration`. `colour` is the error of (q, u) if the colour of the star were
+    ignored; where TEFF is not known, half the difference between stars of 3500 K and 10 000 K, which is not
+    in the covariance. `flag` holds `QUALITY_BITS`; `rows` counts the rows of a star.
+    """
+
+    qu: Float[np.ndarray, "s 2"]
+    photon: Float[np.ndarray, "s 2 2"]
+    calibration: Float[np.ndarray, "s 2 2"]
+    colour: Float[np.ndarray, "s 2"]
+    chi2: Float[np.ndarray, " s"]
+    dof: Int[np.ndarray, " s"]
+    rows: Int[np.ndarray, " s"]
+    flag: Int[np.ndarray, " s"]
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "s 2 2"]:
+        """Covariance of (q, u), photons and calibration together."""
+        return self.photon + self.calibration
+
+
+def apply(
+    calibration: Calibration, catalogue: Catalogue, progress: Callable[[int, int], None] | None = None
+) -> Stars:
+    """Stokes parameters of all stars of a catalogue.
+
+    `progress` is told how many rows of how many are done. Raises `DataError` for a filter that nobody knows and
+    for a catalogue with more optical settings than can be tabulated.
+    """
+    vectors = AnalysisVectors(calibration)
+    settings, setting_of = _settings(calibration, catalogue)
+    counts = linearised(calibration, catalogue.counts)
+    offset, slope = _rotator_zero(vectors)
+    order = np.argsort(catalogue.star, kind="stable")
+    parts = []
+    for done, rows in _blocks(catalogue.star[order]):
+        rows = order[rows]
+        parts.append(
+            _block(vectors, catalogue, rows, counts[rows], settings, setting_of[rows], offset, slope)
+        )
+        if progress is not None:
+            progress(done, len(order))
+    return Stars(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Stars)))
+
+
+def _blocks(star: Int[np.ndarray, " n"]) -> Iterator[tuple[int, slice]]:
+    """Slices of about `BLOCK` rows that do not divide stars, each with the number of rows done after it."""
+    first = np.flatnonzero(np.diff(star, prepend=-1))
+    start = 0
+    while start < len(star):
+        at = np.searchsorted(first, start + BLOCK, side="right") - 1
+        end = len(star) if start + BLOCK >= len(star) else int(first[at])
+        if end <= start:  # a single star with more rows than a block
+            end = int(first[at + 1]) if at + 1 < len(first) else len(star)
+        yield end, slice(start, end)
+        start = end
+
+
+def _block(
+    vectors: AnalysisVectors,
+    catalogue: Catalogue,
+    rows: Int[np.ndarray, " r"],
+    counts: Float[np.ndarray, "r 4"],
+    settings: list[Setting],
+    setting_of: Int[np.ndarray, " r"],
+    offset: float,
+    slope: Float[np.ndarray, " k"],
+) -> Stars:
+    points, sigma = catalogue.points, catalogue.sigma[rows]
+    _, star = np.unique(catalogue.star[rows], return_inverse=True)
+    first = np.flatnonzero(np.diff(star, prepend=-1))
+    outside = points.outside[rows]
+    x, y = (np.where(outside, 0.0, values[rows]) for values in (points.x, points.y))
+    teff, sky = points.teff[rows], np.isfinite(catalogue.rotator[rows])
+    turn = 2.0 * np.where(sky, np.deg2rad(catalogue.rotator[rows]) + offset, 0.0)
+
+    spectra = np.empty((len(rows), COLOURS + 1, 4, 3))
+    for k, where in _members(setting_of):
+        spectra[where] = vectors.at(settings[k], x[where], y[where])
+    there = np.einsum("rc,rcks->rks", colour_weights(teff, COLOURS), spectra)
+    used = np.where(outside[:, None], np.nan, counts)
+    found = estimate(_turned(there, turn), used, sigma, star)
+
+    s = _instrument_stokes(found.qu[star], turn)
+    derivative = np.empty((len(rows), 2, len(vectors.parameters)))
+    for k, where in _members(setting_of):
+        local = vectors.derivatives(settings[k], x[where], y[where], teff[where])
+        plain, throughput = (found.gain[where] @ np.einsum("rs,rksf->rkf", s[where], part) for part in local)
+        derivative[where] = vectors.to_parameters(plain, throughput, x[where], y[where])
+    if slope.any():
+        dq, du = 2.0 * s[:, 2], -2.0 * s[:, 1]  # (q + iu) exp(−2i R) grows by −2i (q + iu) dR
+        turned = np.where(sky[:, None], there[..., 1] * dq[:, None] + there[..., 2] * du[:, None], 0.0)
+        derivative += (found.gain @ turned[..., None]) * slope
+    root = np.add.reduceat(-derivative, first) @ vectors.root
+    colour = np.einsum("rc,rcks,rs->rk", _ignored(teff), spectra, s, optimize=True)
+    shift = calibration_shift(found.gain, colour[..., None], star)[..., 0]
+    return Stars(
+        qu=found.qu,
+        photon=found.photon,
+        calibration=root @ root.swapaxes(1, 2),
+        colour=shift,
+        chi2=found.chi2,
+        dof=found.dof,
+        rows=np.diff(first, append=len(rows)),
+        flag=_flags(vectors, catalogue, rows, used, first, found.qu, found.condition),
+    )
+
+
+def _members(setting_of: Int[np.ndarray, " r"]) -> Iterator[tuple[int, Int[np.ndarray, " w"]]]:
+    for k in np.unique(setting_of):
+        yield int(k), np.flatnonzero(setting_of == k)
+
+
+def _turned(vectors: Float[np.ndarray, "r 4 3"], turn: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r 4 3"]:
+    """Analysis vectors for Stokes parameters on the sky; `turn` is twice the position angle of +X (rad).
+
+    (q + iu) of the instrument = (q + iu) of the sky × exp(−i turn).
+    """
+    cos, sin = np.cos(turn)[:, None], np.sin(turn)[:, None]
+    one, q, u = (vectors[..., k] for k in range(3))
+    return np.stack([one, cos * q - sin * u, sin * q + cos * u], axis=-1)
+
+
+def _instrument_stokes(
+    qu: Float[np.ndarray, "r 2"], turn: Float[np.ndarray, " r"]
+) -> Float[np.ndarray, "r 3"]:
+    """(1, q, u) in the instrument frame from (q, u) on the sky."""
+    cos, sin = np.cos(turn), np.sin(turn)
+    q, u = qu.T
+    return np.stack([np.ones_like(q), cos * q + sin * u, cos * u - sin * q], axis=-1)
+
+
+def _ignored(teff: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r c"]:
+    """Mixture of spectra that is the error of ignoring the colour (see `Stars.colour`)."""
+    flat = colour_weights(np.full(len(teff), np.nan), COLOURS)
+    half = 0.5 * np.subtract(*colour_weights(np.array([COOL, HOT]), COLOURS))
+    return np.where(np.isnan(teff)[:, None], half, flat - colour_weights(teff, COLOURS))
+
+
+# ------------------------------------------------------------------------------------- settings and flags
+
+
+def _settings(calibration: Calibration, catalogue: Catalogue) -> tuple[list[Setting], Int[np.ndarray, " n"]]:
+    """The optical settings of a catalogue and which of them every row has.
+
+    Temperature and hour angle count only where an effect of the model makes the optics depend on them.
+    """
+    points = catalogue.points
+    depends = {name for effect in calibration.model.template.effects for name in effect.optics_depend_on}
+    temperature = points.temp if "temperature" in depends else np.full(len(catalogue), _NEUTRAL.temperature)
+    hours = points.ha if "hour_angle" in depends else np.zeros(len(catalogue))
+    plate = np.where(np.isnan(points.chwp_angle), np.inf, np.mod(points.chwp_angle, 180.0))
+    _, band = np.unique(points.filter, return_inverse=True)
+    key = np.stack([band.reshape(-1), plate, temperature, hours], axis=1)
+    _, first, of = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    if len(first) > MOST_SETTINGS:
+        raise DataError(
+            f"TEMP, HA, CHWP_ANGLE: {len(first)} different optical settings, at most {MOST_SETTINGS} can be "
+            "tabulated; round TEMP to 0.1 Celsius and HA to 0.1 h, or take the catalogue in parts"
+        )
+    settings = [
+        Setting(
+            str(points.filter[k]),
+            None if np.isinf(plate[k]) else float(plate[k]),
+            float(temperature[k]),
+            float(hours[k]),
+        )
+        for k in first
+    ]
+    return settings, of.reshape(-1)
+
+
+def _flags(
+    vectors: AnalysisVectors,
+    catalogue: Catalogue,
+    rows: Int[np.ndarray, " r"],
+    counts: Float[np.ndarray, "r 4"],
+    first: Int[np.ndarray, " s"],
+    qu: Float[np.ndarray, "s 2"],
+    condition: Float[np.ndarray, " s"],
+) -> Int[np.ndarray, " s"]:
+    """Quality bits of every star: those of its rows and of the calibration, and 16 and 16384 of its own."""
+    points = catalogue.points
+    settings = Settings(*(getattr(points, f.name)[rows] for f in dataclasses.fields(Settings)))
+    square = np.tile([0.0, 1.0, 0.0, 0.0, 0.0, 1.0], (len(rows), 1))  # 16 is decided below, for all rows
+    bits = vectors.calibration.flags(points.x[rows], points.y[rows], settings, square)
+    bits[points.outside[rows]] |= 32
+    bits[settings.teff < COOLEST] |= 64
+    bits[~np.isfinite(counts * catalogue.sigma[rows]).all(axis=1)] |= 128
+    bits[catalogue.spoilt[rows]] |= 256
+    flag = np.bitwise_or.reduceat(bits, first) | vectors.calibration.verdict.quality
+    flag[~(condition < ILL_POSED)] |= 16
+    flag[~np.isfinite(qu).all(axis=1)] |= 16384
+    return flag
+
+
+# ---------------------------------------------------------------------------------- effects beyond the optics
+
+
+def linearised(calibration: Calibration, counts: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
+    """Counts as linear detectors would report them, by the non-linearity that the calibration has found."""
+    effects = [e for e in calibration.model.instrument(calibration.values).effects if e.name in _CORRECTED]
+    exposures = exposure_arrays(calibration.exposures)
+    true = counts
+    for _ in range(_ROUNDS if effects else 0):
+        seen = jnp.asarray(true)
+        for effect in effects:
+            seen = effect.detector(seen, exposures)
+        true = true + (counts - np.asarray(seen))
+    return true
+
+
+def not_carried_over(calibration: Calibration) -> tuple[str, ...]:
+    """Effects of the fitted model that belong to an exposure's detectors and cannot be undone in a catalogue."""
+    effects = calibration.model.template.effects
+    return tuple(e.name for e in effects if overridden((e,), "detector") and e.name not in _CORRECTED)
+
+
+def _rotator_zero(vectors: AnalysisVectors) -> tuple[float, Float[np.ndarray, " k"]]:
+    """What the model adds to ROTATOR (rad), and its derivatives to `vectors.parameters`."""
+    to_instrument = unravel(vectors.calibration.model.template)
+
+    def zero(values: jax.Array) -> jax.Array:
+        angle = jnp.zeros(())
+        for effect in to_instrument(values).effects:
+            angle = effect.rotator(angle)
+        return jnp.asarray(angle)
+
+    values = jnp.asarray(vectors.calibration.values)
+    return float(zero(values)), np.asarray(jax.grad(zero)(values))[vectors.parameters]

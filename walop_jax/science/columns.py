@@ -1,0 +1,56 @@
+"""What `walop-jax apply` adds to a catalogue: the columns, one value per row, and the cards of the header."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int
+
+from walop_jax.science.apply import COOL, HOT, Stars
+from walop_jax.science.polarisation import polarisation
+
+Columns = dict[str, tuple[np.ndarray, str]]
+
+
+def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) -> Columns:
+    """The columns of the contract, then what they rest on; all rows of a star hold the result of the star.
+
+    Raises ValueError for an unknown `estimator` of the degree of polarisation.
+    """
+    covariance = stars.covariance
+    light = polarisation(stars.qu, covariance, estimator)
+    error = np.sqrt(np.einsum("sii->si", covariance))
+    photon = np.sqrt(np.einsum("sii->si", stars.photon))
+    columns: Columns = {
+        "Q": (stars.qu[:, 0], "q of the star: on the sky where ROTATOR is given"),
+        "U": (stars.qu[:, 1], "u of the star: on the sky where ROTATOR is given"),
+        "Q_ERR": (error[:, 0], "standard error of Q: photons and calibration"),
+        "U_ERR": (error[:, 1], "standard error of U: photons and calibration"),
+        "QU_COV": (covariance[:, 0, 1], "covariance of Q and U: photons and calibration"),
+        "P": (light.degree, "degree of polarisation"),
+        "P_DEBIASED": (light.debiased, f"degree of polarisation without its bias, {estimator}"),
+        "P_ERR": (light.degree_error, "standard error of P"),
+        "EVPA": (light.angle, "[deg] electric vector angle: north to east, or from +X"),
+        "EVPA_ERR": (light.angle_error, "[deg] standard error of EVPA"),
+        "Q_PHOTON": (photon[:, 0], "the share of the photons in Q_ERR"),
+        "U_PHOTON": (photon[:, 1], "the share of the photons in U_ERR"),
+        "Q_COLOUR": (stars.colour[:, 0], "error of Q if TEFF is ignored; not in Q_ERR"),
+        "U_COLOUR": (stars.colour[:, 1], "error of U if TEFF is ignored; not in U_ERR"),
+        "CHI2": (stars.chi2, "chi squared of the rows of the star"),
+        "DOF": (stars.dof.astype(np.int32), "degrees of freedom of CHI2"),
+        "NROWS": (stars.rows.astype(np.int32), "rows that were combined"),
+        "FLAG": (stars.flag.astype(np.int32), "quality bits, 0 is good"),
+    }
+    return {name: (values[star], about) for name, (values, about) in columns.items()}
+
+
+def header(product: str, estimator: str, on_sky: float) -> dict[str, Any]:
+    """Cards of the output: the calibration (hash of its content), the estimator, the frame, the colours."""
+    frame = {0.0: "instrument", 1.0: "sky"}.get(on_sky, "sky where ROTATOR is given, else instrument")
+    return {
+        "CALHASH": product,
+        "PESTIM": "Plaszczynski et al. 2014" if estimator == "MAS" else "Wardle and Kronberg 1974",
+        "QUFRAME": frame,
+        "COLOURS": f"without TEFF: half the difference of {COOL:g} and {HOT:g} K",
+    }
