@@ -43,18 +43,20 @@ def diagnose(
 
     The verdict is consistent, effect_found or unexplained. Effects that the data cannot tell apart are listed
     together; effects that the data cannot show at all are listed as such. RUN/calibration.fits and
-    RUN/summary.json hold the extended model.
+    RUN/summary.json hold the extended model; RUN/diagnosis.fits what the pictures of `walop-jax report` need.
     """
     began = time.perf_counter()
     from walop_jax.data.folder import atomic_folder, check_folder
+    from walop_jax.data.pictures import PICTURES, write_pictures
     from walop_jax.data.product import write_product
     from walop_jax.fit.summary import PRODUCT, SUMMARY, summary
 
     text = "" if model is None else read_text(model)
-    check_folder(output, (PRODUCT, SUMMARY, "diagnosis.json"), overwrite=overwrite)
+    check_folder(output, (PRODUCT, SUMMARY, PICTURES, "diagnosis.json"), overwrite=overwrite)
     switch_on_jax()
     from walop_jax.data import read_calibration_set
     from walop_jax.diagnose.document import DIAGNOSIS, document
+    from walop_jax.diagnose.pictures import pictures
     from walop_jax.diagnose.workflow import diagnose as find
     from walop_jax.fit.building import model_for
     from walop_jax.fit.calibration import Calibration
@@ -71,11 +73,13 @@ def diagnose(
         misfit = None if found.after.explains_data else describe(found.problem, found.after.values)
         content = document(found)
         seconds = time.perf_counter() - began
-        with atomic_folder(output, (PRODUCT, SUMMARY, DIAGNOSIS), overwrite=overwrite) as folder:
+        drawn_from = pictures(found)
+        with atomic_folder(output, (PRODUCT, SUMMARY, DIAGNOSIS, PICTURES), overwrite=overwrite) as folder:
             write_product(folder / PRODUCT, product)
             fitted = summary(found.after, calset, seconds=seconds, misfit=misfit) | {"seed": seed}
             (folder / SUMMARY).write_text(json_text(fitted), encoding="utf-8")
             (folder / DIAGNOSIS).write_text(json_text(content), encoding="utf-8")
+            write_pictures(folder / PICTURES, drawn_from)
     if json:
         print_json(content)
     for sentence in found.after.warnings:

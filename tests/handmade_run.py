@@ -1,0 +1,164 @@
+"""The folder of a run, typed by hand: every number that a page may show is known here and computed nowhere."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from builders import NAN, exposures, monochromatic
+
+from walop_jax.data import empty_sources
+from walop_jax.data.frames import Grid
+from walop_jax.data.pictures import (
+    Comparison,
+    DiagnosisPictures,
+    ExposureLabels,
+    Ladder,
+    Shares,
+    write_pictures,
+)
+from walop_jax.data.product import (
+    CalibrationProduct,
+    MatrixMaps,
+    ParameterTable,
+    Verdict,
+    write_product,
+)
+from walop_jax.data.records import InputFile, Points, Site
+
+INPUT = "night <b>one</b> & two.fits"
+X, Y = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.2, 0.2, 3), np.linspace(-0.2, 0.2, 3)))
+
+SUMMARY: dict[str, Any] = {
+    "chi2": 1234.5, "dof": 1200, "n_data": 1608,
+    "parameters": {
+        "pupil.magnification": {"value": 15.7512, "sigma": 0.0213, "unit": ""},
+        "half1.wedge": {"value": -0.23012, "sigma": 0.00045, "unit": "rad"},
+        "throughput.n0.p00": {"value": 0.5, "sigma": 0.001, "unit": ""},
+        "clp_wobble.amplitude": {"value": 0.0613, "sigma": 0.0012, "unit": "deg"},
+        "half1.efficiency": {"value": 0.999, "sigma": 0.0, "unit": ""},
+    },
+    "converged": True, "message": "converged", "seconds": 3.0,
+    "versions": {"python": "3.11.7", "walop-jax": "0.1.0"},
+    "inputs": [{"path": INPUT, "sha256": "ab" * 32}],
+    "trusted": True, "quality": 0, "warnings": ["half1.wedge lies <far> out"], "instrument": "WALOP-SOUTH",
+    "free_parameters": 4, "misfit": None, "remarks": [],
+}  # fmt: skip
+
+DIAGNOSIS: dict[str, Any] = {
+    "verdict": "effect_found",
+    "steps": [
+        {
+            "effect": "clp_wobble",
+            "parameters": {"amplitude": {"value": 0.0613, "sigma": 0.0012, "unit": "deg"}},
+            "score": 321.5, "p_value": 2.1e-7, "chi2_before": 1950.25, "chi2_after": 1234.5,
+            "heldout_before": 1.25, "heldout_after": 0.752,
+            "equivalent": ["camera_gain_drift"], "separated_by": "polariser angles over a full turn",
+            "where": {"camera": "E1 60%, O1 40%", "clp_harmonic": "3θ 53%, 1θ 46%", "kind": "clp 100%"},
+        }
+    ],
+    "candidates": [
+        {"effect": "clp_wobble", "score": 321.5, "p_value": 2.1e-7},
+        {"effect": "ghost", "score": 4.75, "p_value": 0.64},
+    ],
+    "unexplained": None,
+    "p_value": 2.1e-7, "cannot_be_tested": ["chwp_axis"],
+    "chi2_per_dof_before": 1.625208, "chi2_per_dof_after": 1234.5 / 1200,
+}  # fmt: skip
+
+
+def product() -> CalibrationProduct:
+    names = list(SUMMARY["parameters"])
+    sigma = np.array([entry["sigma"] for entry in SUMMARY["parameters"].values()])
+    grid = Grid(5, 5, (3.0, 3.0), (0.0, 0.0), ((0.1, 0.0), (0.0, 0.1)))
+    ramp = np.linspace(-0.03, 0.02, 25).reshape(5, 5)
+    return CalibrationProduct(
+        instrument="WALOP-SOUTH",
+        site=Site("SAAO", -32.38, 20.81, 1798.0),
+        origin="a hand",
+        date="2026-11-21T10:00:00",
+        verdict=Verdict(1234.5, 1200, 1608, 1.0, True, True, 0),
+        parameters=ParameterTable(
+            name=np.array(names),
+            value=np.array([entry["value"] for entry in SUMMARY["parameters"].values()]),
+            sigma=sigma,
+            unit=np.array([entry["unit"] for entry in SUMMARY["parameters"].values()]),
+            prior_mean=np.array([15.63, -0.23, NAN, 0.0, NAN]),
+            prior_width=np.array([0.05, 0.001, NAN, 0.1, NAN]),
+            free=np.array([True, True, True, True, False]),
+        ),
+        covariance=np.diag(sigma**2),
+        maps=MatrixMaps(grid, "band", np.stack([ramp + k for k in range(6)]), np.full((6, 5, 5), 2e-4)),
+        field=(-0.2, 0.2, -0.2, 0.2),
+        exposures=exposures({"clp_angle": 0.0}, {"clp_angle": 45.0}),
+        filters={"band": monochromatic(0.62)},
+        sources=empty_sources(),
+        model=("[model]",),
+        inputs=(InputFile(Path("night.fits"), "ab" * 32),),
+        versions={"python": "3.11.7"},
+    )
+
+
+def comparison(effect: str, size: float = 6.0) -> Comparison:
+    """Camera k shows `size` · (k + 1) / 4 at one corner before, nothing but ±0.5 after."""
+    before = np.zeros((9, 4))
+    before[0] = size * np.array([1, 2, 3, -4]) / 4
+    after = np.full((9, 4), 0.5) * (-1.0) ** np.arange(9)[:, None]
+    angle = np.deg2rad(22.5 * np.arange(8))
+    wave = np.sin(3 * angle)[:, None] * np.array([1.0, -1.0, 0.5, 0.25])
+    return Comparison(
+        effect=effect,
+        combination="cos(3 theta - 57 deg), theta the polariser angle",
+        harmonic=3,
+        before=before,
+        after=after,
+        mean_before=0.1 * before,
+        mean_after=0.1 * after,
+        rms_before=np.abs(before) + 0.9,
+        rms_after=np.full((9, 4), 0.9),
+        curve_before=wave,
+        curve_error=np.full((8, 4), 0.05),
+        curve_after=np.zeros((8, 4)),
+    )
+
+
+def pictures(effects: tuple[str, ...] = ("clp_wobble",)) -> DiagnosisPictures:
+    return DiagnosisPictures(
+        points=Points(np.arange(9), X, Y),
+        exposures=ExposureLabels(
+            np.arange(8), np.array(["clp"] * 8), 61043.0 + 0.01 * np.arange(8), 22.5 * np.arange(8)
+        ),
+        ladder=Ladder(
+            np.array(["starting model", *effects]),
+            np.linspace(1950.25, 1234.5, len(effects) + 1),
+            np.full(len(effects) + 1, 1200),
+        ),
+        shares=Shares(
+            np.array(["camera"] * 4 + ["exposure"] * 8),
+            np.array(["O1", "E1", "O2", "E2", *(str(i) for i in range(8))]),
+            np.full(12, 100.0),
+            np.linspace(100.0, 300.0, 12),
+            np.full(12, 100.0),
+        ),
+        comparisons=(comparison(""), *(comparison(effect) for effect in effects)),
+    )
+
+
+def make_refit(folder: Path, **changes: Any) -> Path:
+    """A run as `refit` leaves it; `changes` replace entries of its summary."""
+    folder.mkdir(exist_ok=True)
+    (folder / "summary.json").write_text(json.dumps(SUMMARY | changes))
+    write_product(folder / "calibration.fits", product(), overwrite=True)
+    return folder
+
+
+def make_diagnosis(folder: Path, **changes: Any) -> Path:
+    """A run as `diagnose` leaves it; `changes` replace entries of its diagnosis."""
+    make_refit(folder)
+    content = DIAGNOSIS | changes
+    (folder / "diagnosis.json").write_text(json.dumps(content))
+    effects = tuple(step["effect"] for step in content["steps"])
+    write_pictures(folder / "diagnosis.fits", pictures(effects), overwrite=True)
+    return folder

@@ -1,0 +1,194 @@
+"""What the pictures of a diagnosis are drawn from: residuals over the field, over the exposures, and in groups.
+
+Combination  r_pk = Σ_e w_e r_pek / (Σ_e w_e² over the used ones)^½ keeps unit noise. The weights w are those of what
+             can be said in words (a harmonic of the polariser angle at its best phase, the mean of a kind of
+             exposures, a trend with time) that holds most of the power of the disagreement; if all of them hold less
+             than `ENOUGH` of what the best weights do (principal component over the exposures), the latter.
+Curve        c_ek = Σ_p v_pk r_pek / Σ_p v_pk², with v the field pattern of the difference in that camera, rms 1: a
+             pattern that changes sign over the field does not average out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from walop_jax.data.pictures import Comparison, DiagnosisPictures, ExposureLabels, Ladder, Shares
+from walop_jax.data.records import Exposures
+from walop_jax.diagnose.findings import Diagnosis
+from walop_jax.diagnose.where import HARMONICS
+from walop_jax.likelihood.problem import Problem
+from walop_jax.model.conventions import CAMERA_NAMES
+
+Cube = Float[np.ndarray, "p e 4"]
+PointMap = Float[np.ndarray, "p 4"]
+Weight = Float[np.ndarray, " e"]
+Used = Bool[np.ndarray, "p e"]
+
+ENOUGH = 0.3  # share of the best weights' power with which a combination in words is preferred
+PRESENT = 0.5  # share of Σ w² that the exposures of a point must hold for the point to be shown
+UNNAMED = "free_form"  # the effect that stands for patterns without a name
+SCALED = 2.0  # residuals are never scaled by less than this, if at all (`fit` scales from χ²/dof = 25 on)
+
+
+@dataclasses.dataclass(frozen=True)
+class Combination:
+    """Weights of the exposures (norm 1), what they are in words, and the harmonic of the polariser angle or −1."""
+
+    words: str
+    weight: Weight
+    harmonic: int = -1
+
+    def of(self, cube: Cube, used: Used) -> PointMap:
+        """The combined residuals of every point and camera; NaN where too few of the exposures are used."""
+        present = used @ self.weight**2
+        norm = np.where(present > PRESENT, np.sqrt(present), np.nan)
+        return np.einsum("pek,e->pk", cube, self.weight) / norm[:, None]
+
+
+def pictures(diagnosis: Diagnosis) -> DiagnosisPictures:
+    """The arrays from which the pictures of a diagnosis are drawn, residuals with the errors as given.
+
+    A free-form term that is in the final model without being a step comes as a last comparison of its own.
+    """
+    problem, start, final = diagnosis.problem, diagnosis.before, diagnosis.after
+    exposures, used = problem.calset.exposures, problem.used
+    after = problem.residuals(final.values)[1]
+    # Not the first step's: that step may have been dropped since.
+    before = after if start is final else Problem(problem.calset, start.model).residuals(start.values)[1]
+    pairs = [("", before, after)]
+    for step in diagnosis.steps:
+        cubes = (
+            _as_given(step.residual_before, step.chi2_before),
+            _as_given(step.residual_after, step.chi2_after),
+        )
+        pairs.append((step.effect, *cubes))
+    if _unnamed_term(diagnosis):
+        pairs.append((UNNAMED, pairs[-1][2] if diagnosis.steps else before, after))
+    angle = np.where(exposures.clp_in, exposures.clp_angle, np.nan)
+    return DiagnosisPictures(
+        points=problem.calset.points,
+        exposures=ExposureLabels(exposures.exposure, exposures.kind, exposures.mjd, angle),
+        ladder=_ladder(diagnosis),
+        shares=_shares(problem, before, after),
+        comparisons=tuple(compare(name, first, second, used, exposures) for name, first, second in pairs),
+    )
+
+
+def _unnamed_term(diagnosis: Diagnosis) -> bool:
+    present = {effect.name for effect in diagnosis.after.model.template.effects}
+    known = {effect.name for effect in diagnosis.before.model.template.effects}
+    return UNNAMED in present - known - {step.effect for step in diagnosis.steps}
+
+
+def _as_given(residual: Cube, chi2: float) -> Cube:
+    """Residuals in units of the errors as given: a fit far off has scaled them, its χ² it has not."""
+    scale = np.sqrt(chi2 / max(float(np.sum(residual**2)), 1e-300))
+    return residual * scale if scale > SCALED else residual
+
+
+def compare(effect: str, before: Cube, after: Cube, used: Used, exposures: Exposures) -> Comparison:
+    """Two cubes of residuals (σ; 0 where unused) side by side, in the combination that shows their difference.
+
+    Without a difference the combination is the one that shows the residuals themselves.
+    """
+    change = before - after
+    shown = change if np.any(change) else before
+    best = best_combination(shown, used, exposures)
+    pattern = np.nan_to_num(best.of(shown, used))
+    size = np.sqrt(np.mean(pattern**2, axis=0))
+    pattern = np.where(size > 0, pattern / np.where(size > 0, size, 1.0), 1.0)
+    power = used.T.astype(float) @ pattern**2
+    known = np.where(power > 0, power, np.nan)
+    curves = [np.einsum("pek,pk->ek", cube, pattern) / known for cube in (before, after)]
+    scatter = np.sqrt(np.einsum("pek,pk->ek", after**2, pattern**2)) / known
+    rows = used.sum(axis=1, keepdims=True)
+    rows = np.where(rows > 0, rows, np.nan)
+    return Comparison(
+        effect=effect,
+        combination=best.words,
+        harmonic=best.harmonic,
+        before=best.of(before, used),
+        after=best.of(after, used),
+        mean_before=before.sum(axis=1) / rows,
+        mean_after=after.sum(axis=1) / rows,
+        rms_before=np.sqrt((before**2).sum(axis=1) / rows),
+        rms_after=np.sqrt((after**2).sum(axis=1) / rows),
+        curve_before=curves[0],
+        curve_error=scatter,
+        curve_after=curves[1],
+    )
+
+
+def best_combination(cube: Cube, used: Used, exposures: Exposures) -> Combination:
+    """The combination of the exposures in which a pattern (σ) shows best, in words wherever that is possible."""
+
+    def power(combination: Combination) -> float:
+        return float(np.nansum(combination.of(cube, used) ** 2))
+
+    flat = np.moveaxis(cube, 1, -1).reshape(-1, cube.shape[1])
+    principal = np.linalg.eigh(flat.T @ flat)[1][:, -1]
+    principal = principal * (np.sign(principal[np.abs(principal).argmax()]) or 1.0)
+    free = Combination("the combination of all exposures that shows it best", principal)
+    named = max(_in_words(cube, used, exposures), key=power, default=free)
+    return named if power(named) >= ENOUGH * power(free) else free
+
+
+def _in_words(cube: Cube, used: Used, exposures: Exposures) -> Iterator[Combination]:
+    measured = used.any(axis=0)
+    through = exposures.clp_in & measured
+    angle = np.deg2rad(np.where(through, exposures.clp_angle, 0.0))
+    for harmonic in HARMONICS[1:]:
+        waves = [np.where(through, wave(harmonic * angle), 0.0) for wave in (np.cos, np.sin)]
+        phase = _best_phase(cube, waves)
+        weight = waves[0] * np.cos(phase) + waves[1] * np.sin(phase)
+        if np.linalg.norm(weight) > 1e-6:
+            words = f"cos({harmonic} theta - {np.rad2deg(phase) % 360:.0f} deg), theta the polariser angle"
+            yield Combination(words, weight / np.linalg.norm(weight), harmonic)
+    for kind in np.unique(exposures.kind[measured]):
+        weight = ((exposures.kind == kind) & measured).astype(float)
+        yield Combination(f"mean of the {kind} exposures", weight / np.linalg.norm(weight))
+    hours = np.where(measured, exposures.mjd - exposures.mjd[measured].mean(), 0.0)
+    if np.all(np.isfinite(hours)) and np.any(hours):
+        yield Combination("trend with time", hours / np.linalg.norm(hours))
+
+
+def _best_phase(cube: Cube, waves: list[Weight]) -> float:
+    """The phase φ at which cos φ · (cosine part) + sin φ · (sine part) has the largest power."""
+    cosine, sine = (np.einsum("pek,e->pk", cube, wave) for wave in waves)
+    return 0.5 * float(np.arctan2(2.0 * np.sum(cosine * sine), np.sum(cosine**2) - np.sum(sine**2)))
+
+
+def _ladder(diagnosis: Diagnosis) -> Ladder:
+    """Starting model, every addition, and the final fit where it is another one than that of the last addition."""
+    dof, rungs = diagnosis.before.dof, [("starting model", diagnosis.before.chi2, diagnosis.before.dof)]
+    for step in diagnosis.steps:
+        added = [p for p in diagnosis.after.model.parameters if p.name.startswith(f"{step.effect}.")]
+        dof -= sum(p.free and p.tie is None and p.prior is None for p in added)
+        rungs.append((step.effect, step.chi2_after, dof))
+    final = diagnosis.after
+    if abs(final.chi2 - rungs[-1][1]) > 1e-6 * final.chi2:
+        rungs.append((UNNAMED if _unnamed_term(diagnosis) else "final fit", final.chi2, final.dof))
+    model, chi2, freedom = zip(*rungs, strict=True)
+    return Ladder(np.array(model), np.array(chi2, float), np.array(freedom, int))
+
+
+def _shares(problem: Problem, before: Cube, after: Cube) -> Shares:
+    """Sums of squared residuals by camera, kind, filter and exposure."""
+    e = problem.calset.exposures
+    known = np.asarray(problem.plan.exposures.flux_known)
+    expected = problem.used.sum(axis=0)[:, None] * np.where(known, 1.0, 0.75)[:, None] * np.ones(4)
+    squares = [expected, (before**2).sum(axis=0), (after**2).sum(axis=0)]  # (exposure, camera)
+    members: list[tuple[str, str]] = []
+    sums: list[list[float]] = []
+    for k, camera in enumerate(CAMERA_NAMES):
+        members.append(("camera", camera))
+        sums.append([float(square[:, k].sum()) for square in squares])
+    for group, label in (("kind", e.kind), ("filter", e.filter), ("exposure", e.exposure)):
+        for member in np.unique(label):
+            members.append((group, str(member)))
+            sums.append([float(square[label == member].sum()) for square in squares])
+    return Shares(*np.array(members).T, *np.array(sums).T)
