@@ -14,13 +14,13 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.calibration import Calibration
 from walop_jax.fit.predict import Settings
 from walop_jax.likelihood.problem import Problem
+from walop_jax.report.style import FONT, blank, field_axes, outer_labels
 
 Map = Float[np.ndarray, "y x"]
 
@@ -29,7 +29,6 @@ _WEAK = 0.1  # |m22 m33 − m23 m32| below which a single exposure holds hardly 
 _ELEMENTS = ("$m_{21}$", "$m_{22}$", "$m_{23}$", "$m_{31}$", "$m_{32}$", "$m_{33}$")
 _PER_CENT = (0, 3)  # offsets of the zero: in per cent
 _FIXED = (4, 5)  # cross-talk and efficiency in u: from −1 to 1
-_FONT = 9
 
 
 def matrix_figure(calibration: Calibration, settings: Settings | None = None) -> Figure:
@@ -38,7 +37,7 @@ def matrix_figure(calibration: Calibration, settings: Settings | None = None) ->
     `settings` has one row (default: SDSS-r, flat spectrum, calibration plate out). Lines in m32 and m33 bound
     the zone where |m22 m33 − m23 m32| < 0.1: a single exposure holds hardly any u there.
     """
-    figure = _blank(7.4, 4.6)
+    figure = blank(7.4, 4.6)
     axes = figure.subplots(2, 3, sharex=True, sharey=True)
     _matrix_maps(figure, axes, calibration, settings)
     return figure
@@ -48,12 +47,12 @@ def residual_figure(
     problem: Problem, before: Float[np.ndarray, " n"], after: Float[np.ndarray, " n"]
 ) -> Figure:
     """Residuals of every field point at two full vectors of parameter values; a histogram of the second."""
-    figure = _blank(9.6, 3.2)
+    figure = blank(9.6, 3.2)
     left, middle, right = figure.subplots(1, 3)
     maps = [point_residuals(problem, values) for values in (before, after)]
     norm = LogNorm(0.7, max(2.0, float(np.nanmax(maps[0]))))
-    _field_axes(left, "before the fit")
-    _field_axes(middle, "after the fit")
+    field_axes(left, "before the fit")
+    field_axes(middle, "after the fit")
     _tiles(left, problem, maps[0], norm)
     bar = figure.colorbar(_tiles(middle, problem, maps[1], norm), ax=[left, middle], pad=0.02)
     bar.set_label("rms residual (σ)", fontsize=8)
@@ -73,7 +72,7 @@ def calibration_figure(
 
     `before` is a full vector of parameter values to compare with (default: the start of the fit).
     """
-    figure = _blank(10.2, 4.7)
+    figure = blank(10.2, 4.7)
     grid = figure.subplots(2, 4)
     _matrix_maps(figure, grid[:, :3], calibration, settings)
     start = calibration.model.start if before is None else before
@@ -86,12 +85,12 @@ def calibration_figure(
         residual = point_residuals(problem, values)
         far = float(np.nanmax(residual)) > 3.0
         low, high = (float(edge(residual)) for edge in (np.nanmin, np.nanmax))
-        _field_axes(axis, title)
+        field_axes(axis, title)
         shown = _tiles(axis, problem, residual, Normalize(low, high) if far else Normalize(0.7, 1.3))
         bar = figure.colorbar(shown, ax=axis, pad=0.03, extend="neither" if far else "both")
         bar.set_label("rms residual (σ)", fontsize=8)
         bar.ax.tick_params(labelsize=7)
-    _outer_labels(grid)
+    outer_labels(grid)
     return figure
 
 
@@ -107,11 +106,6 @@ def point_residuals(problem: Problem, values: Float[np.ndarray, " n"]) -> Float[
     return np.sqrt(np.where(freedom > 0, square / np.maximum(freedom, 1.0), np.nan))
 
 
-def _blank(width: float, height: float) -> Figure:
-    layout = ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.05)
-    return Figure(figsize=(width, height), dpi=120, layout=layout)
-
-
 def _matrix_maps(figure: Figure, axes: Any, calibration: Calibration, settings: Settings | None) -> None:
     low_x, high_x, low_y, high_y = calibration.field
     x, y = np.meshgrid(np.linspace(low_x, high_x, PIXELS), np.linspace(low_y, high_y, PIXELS))
@@ -123,12 +117,12 @@ def _matrix_maps(figure: Figure, axes: Any, calibration: Calibration, settings: 
     for i, axis in enumerate(np.ravel(axes)):
         shown = maps[i] * (100.0 if i in _PER_CENT else 1.0)
         name = _ELEMENTS[i] + (" (%)" if i in _PER_CENT else "")
-        _field_axes(axis, name)
+        field_axes(axis, name)
         image = _image(axis, shown, calibration.field, i)
         if i >= 4:
             axis.contour(x, y, weak, levels=[_WEAK], colors="0.15", linewidths=0.7)
         figure.colorbar(image, ax=axis, pad=0.03).ax.tick_params(labelsize=7)
-    _outer_labels(axes)
+    outer_labels(axes)
 
 
 def _image(axis: Axes, values: Map, field: tuple[float, float, float, float], element: int) -> Any:
@@ -146,22 +140,6 @@ def _image(axis: Axes, values: Map, field: tuple[float, float, float, float], el
         interpolation="bilinear",
         aspect="equal",
     )
-
-
-def _field_axes(axis: Axes, title: str) -> None:
-    axis.set_title(title, fontsize=_FONT)
-    axis.set_xlabel("X (deg)", fontsize=_FONT)
-    axis.set_ylabel("Y (deg)", fontsize=_FONT)
-    axis.tick_params(labelsize=7)
-    axis.set_aspect("equal")
-
-
-def _outer_labels(axes: Any) -> None:
-    for axis in np.ravel(axes):
-        axis.tick_params(labelsize=7)
-        axis.set_xlabel("X (deg)", fontsize=_FONT)
-        axis.set_ylabel("Y (deg)", fontsize=_FONT)
-        axis.label_outer()
 
 
 def _tiles(axis: Axes, problem: Problem, values: Float[np.ndarray, " p"], norm: Normalize) -> Any:
@@ -192,8 +170,8 @@ def _histogram(axis: Axes, problem: Problem, values: Float[np.ndarray, " n"]) ->
     )
     t = np.linspace(-4.0, 4.0, 201)
     axis.plot(t, np.exp(-0.5 * t**2) / np.sqrt(2 * np.pi), color="C3", lw=1.2, label="noise alone")
-    axis.set_xlabel("residual / its expected width", fontsize=_FONT)
-    axis.set_ylabel("density", fontsize=_FONT)
+    axis.set_xlabel("residual / its expected width", fontsize=FONT)
+    axis.set_ylabel("density", fontsize=FONT)
     axis.tick_params(labelsize=7)
     axis.legend(frameon=False, fontsize=8)
 
@@ -207,7 +185,7 @@ def modulation_figure(calset: CalibrationSet, points: Sequence[int]) -> Figure:
     e = calset.exposures
     shown = np.flatnonzero(e.clp_in & ~e.chwp_in)
     block = calset.intensities.block(0, len(calset.points))
-    figure = _blank(8.2, 3.2)
+    figure = blank(8.2, 3.2)
     angle = np.linspace(0.0, 360.0, 181)
     for axis, pair, name, ideal in zip(
         figure.subplots(1, 2, sharex=True, sharey=True), (0, 2), "qu", (np.cos, np.sin), strict=True
@@ -220,8 +198,8 @@ def modulation_figure(calset: CalibrationSet, points: Sequence[int]) -> Figure:
             axis.plot(
                 e.clp_angle[rows], (first - second) / (first + second), "os^Dv"[k % 5], ms=4, label=where
             )
-        axis.set_xlabel("polariser angle (deg)", fontsize=_FONT)
-        axis.set_ylabel(f"${name}_m$", fontsize=_FONT)
+        axis.set_xlabel("polariser angle (deg)", fontsize=FONT)
+        axis.set_ylabel(f"${name}_m$", fontsize=FONT)
         axis.set_xticks(np.arange(0, 361, 90))
         axis.tick_params(labelsize=7)
     figure.axes[0].legend(frameon=False, fontsize=7, title="(X, Y)", title_fontsize=7)

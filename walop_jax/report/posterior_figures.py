@@ -11,6 +11,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from walop_jax.data.atomic import atomic_path
+from walop_jax.report.wording import measured
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # corner imports ArviZ, which announces a refactoring once a day
@@ -42,12 +43,6 @@ def label(name: str, unit: str = "") -> str:
     """Symbol of a coefficient, with its unit."""
     text = LABELS.get(name, name)
     return f"{text} [{unit}]" if unit else text
-
-
-def measured(value: float, sigma: float) -> str:
-    """Value and error, two digits of the error: 0.23227 ± 0.00024."""
-    digits = max(0, 1 - int(np.floor(np.log10(sigma)))) if sigma > 0 else 6
-    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
 
 
 def corner_figure(
