@@ -1,0 +1,50 @@
+"""`walop-jax report`, run in this process."""
+
+from __future__ import annotations
+
+import json
+
+import handmade_run
+import pytest
+
+
+def one_line(result) -> str:
+    assert result.exit_code == 1, result.output
+    errors = [line for line in result.stderr.splitlines() if line.startswith("walop-jax: error: ")]
+    assert len(errors) == 1, result.stderr
+    return errors[0]
+
+
+def test_page_appears_in_the_run_and_is_not_replaced(call, tmp_path):
+    folder = handmade_run.make_refit(tmp_path / "run")
+    assert "report.html" in call("report", folder).stdout
+    first = (folder / "report.html").read_text()
+    assert first.startswith("<!DOCTYPE html>")
+    assert "exists already" in one_line(call("report", folder))
+    assert call("report", folder, "--overwrite", "--quiet").output == ""
+    assert sorted(entry.name for entry in folder.iterdir()) == [
+        "calibration.fits", "report.html", "summary.json",
+    ]  # fmt: skip
+
+
+def test_page_goes_where_it_is_asked_to(call, tmp_path):
+    folder = handmade_run.make_refit(tmp_path / "run")
+    told = json.loads(call("report", folder, "-o", tmp_path / "page.html", "--json").stdout)
+    assert told["page"] == str(tmp_path / "page.html")
+    assert told["bytes"] == (tmp_path / "page.html").stat().st_size
+    assert "walop-jax diagnose" in told["missing"][0]
+    assert not (folder / "report.html").exists()
+
+
+@pytest.mark.parametrize("name", ["nothing", "empty", "file"])
+def test_what_is_no_run_is_refused_with_advice(call, tmp_path, name):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").write_text("")
+    assert "give the RUN of walop-jax refit or diagnose" in one_line(call("report", tmp_path / name))
+
+
+def test_a_real_run_has_a_page(call, run, tmp_path):
+    assert call("report", run, "-o", tmp_path / "page.html").exit_code == 0
+    text = (tmp_path / "page.html").read_text()
+    assert "half2.plate.mgf2" in text
+    assert "Trusted" in text

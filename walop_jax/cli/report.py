@@ -1,0 +1,54 @@
+"""`walop-jax report`: one self-contained page about a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from walop_jax.cli.common import JsonOption, OverwriteOption, QuietOption, SeedOption, print_json, progress
+
+RunArgument = Annotated[
+    Path, typer.Argument(metavar="RUN", help="Folder of `walop-jax refit` or `diagnose`.")
+]
+OutputOption = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", metavar="FILE", help="Page to write (default: RUN/report.html)."),
+]
+
+
+def report(
+    run: RunArgument,
+    output: OutputOption = None,
+    overwrite: OverwriteOption = False,
+    seed: SeedOption = None,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Write one HTML page about a run, figures inside: no network, nothing beside it, ready to be mailed or printed.
+
+    The verdict, what was found, residuals before and after, maps of the matrix and of its errors, pulls from the
+    priors, all parameters, warnings, inputs and versions: what of it lies in RUN. The page says what is missing.
+    """
+    del seed  # nothing is random here
+    from walop_jax.data.atomic import atomic_path, check_output
+    from walop_jax.report.run import read_run
+
+    target = run / "report.html" if output is None else output
+    with progress(quiet or json) as tell:
+        tell("reading")
+        found = read_run(run)
+        check_output(target, overwrite=overwrite)
+        from walop_jax.report.page import render
+
+        tell("drawing")
+        text = render(found)
+        with atomic_path(target, overwrite=overwrite) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    if json:
+        print_json({"page": str(target), "bytes": len(text.encode()), "missing": list(found.missing)})
+    elif not quiet:
+        typer.echo(f"{target}: {len(text.encode()) / 1e6:.1f} MB")
+        for sentence in found.missing:
+            typer.echo(f"  {sentence}")
