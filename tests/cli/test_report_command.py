@@ -48,3 +48,14 @@ def test_a_real_run_has_a_page(call, run, tmp_path):
     text = (tmp_path / "page.html").read_text()
     assert "half2.plate.mgf2" in text
     assert "Trusted" in text
+
+
+@pytest.mark.long
+def test_a_real_diagnosis_has_its_pictures_and_its_page(call, spoilt_file, tmp_path):
+    folder = tmp_path / "run"
+    assert call("diagnose", spoilt_file, "-o", folder, "--quiet").exit_code == 0
+    assert sorted(entry.name for entry in folder.iterdir()) == [
+        "calibration.fits", "diagnosis.fits", "diagnosis.json", "summary.json",
+    ]  # fmt: skip
+    assert json.loads(call("report", folder, "--json").stdout)["missing"] == []
+    assert "consistent with clp_wobble" in (folder / "report.html").read_text()

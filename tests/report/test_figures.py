@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import threading
 
@@ -9,12 +10,15 @@ import numpy as np
 import pytest
 from matplotlib import pyplot
 
+from walop_jax.diagnose.findings import Diagnosis
+from walop_jax.diagnose.pictures import pictures
 from walop_jax.fit.calibration import Calibration
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
 from walop_jax.likelihood.problem import Problem, base_model
 from walop_jax.likelihood.simulate import simulate
 from walop_jax.report import figures
+from walop_jax.report.diagnosis_figures import signature_figure
 
 PLAN = ObservingPlan(grid=4, standard_grid=2, polariser_angles=polariser_turn(8), moon_patches=4, standards=3)
 
@@ -74,6 +78,27 @@ def test_modulation_is_that_of_the_data(fitted):
     for axis, pair in zip(figure.axes, (0, 2), strict=True):
         shown = axis.lines[1].get_ydata()
         np.testing.assert_allclose(shown, (n[:, pair] - n[:, pair + 1]) / (n[:, pair] + n[:, pair + 1]))
+
+
+def test_pictures_of_a_diagnosis_hold_its_residuals(fitted):
+    problem, result, _ = fitted
+    start = dataclasses.replace(result, values=problem.model.start)
+    found = Diagnosis(
+        verdict="consistent", steps=(), candidates=(), limits=(), untestable=(), unexplained=None, p_value=0.5,
+        remaining_p=0.5, before=start, after=result, problem=problem, seconds=0.0,
+    )  # fmt: skip
+    made = pictures(found)
+    before, after = (problem.residuals(values)[1] for values in (problem.model.start, result.values))
+    for group in ("camera", "kind", "filter", "exposure"):
+        rows = made.shares.group == group
+        assert made.shares.before[rows].sum() == pytest.approx((before**2).sum())
+        assert made.shares.after[rows].sum() == pytest.approx((after**2).sum())
+        assert made.shares.expected[rows].sum() == pytest.approx(3.0 * problem.used.sum())
+    assert made.ladder.chi2.tolist() == [result.chi2]
+    (whole,) = made.comparisons
+    rows = problem.used.sum(axis=1)[:, None]
+    np.testing.assert_allclose(whole.rms_after**2 * rows, (after**2).sum(axis=1), rtol=1e-9)
+    assert drawn(signature_figure(whole, made.exposures)).startswith(b"\x89PNG")
 
 
 def test_figures_may_be_made_in_threads(fitted):

@@ -17,7 +17,7 @@ from matplotlib.collections import PatchCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import NullLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 
 from walop_jax.data.pictures import Comparison, ExposureLabels, Ladder, PointMap, Shares
 from walop_jax.data.records import Points
@@ -71,17 +71,17 @@ def _maps(
     figure = blank(8.6, 0.55 + 1.75 * len(maps))
     axes = figure.subplots(len(maps), 4, sharex=True, sharey=True, squeeze=False)
     tiles: Any = None
-    for number, (title, values) in enumerate(maps.items()):
+    for number, values in enumerate(maps.values()):
         for k, axis in enumerate(axes[number]):
             field_axes(axis, f"camera {CAMERAS[k]}" if number == 0 else "")
+            axis.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10], prune="both"))
+            axis.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], prune="both"))
             tiles = _tiles(axis, points, shown, values[:, k], norm, colours)
             if signs:
                 _signs(axis, points, values[:, k], norm)
-        axes[number, 0].annotate(
-            title, (-0.52, 0.5), xycoords="axes fraction", rotation=90, ha="center", va="center",
-            fontsize=FONT, fontweight="bold",
-        )  # fmt: skip
     outer_labels(axes)
+    for axis, title in zip(axes[:, 0], maps, strict=True):
+        axis.set_ylabel(f"{title}\n\nY (deg)", fontsize=FONT)
     bar = figure.colorbar(tiles, ax=axes, pad=0.015, aspect=18 * len(maps), fraction=0.03)
     bar.set_label(label, fontsize=FONT)
     bar.ax.tick_params(labelsize=SMALL)
