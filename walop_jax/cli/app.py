@@ -19,6 +19,7 @@ COMMANDS = (
     "diagnose",
     "matrix",
     "apply",
+    "compare",
     "report",
     "model",
     "import-zemax",

@@ -252,6 +252,34 @@ def field_points(source: InputTable, instrument: str) -> FieldPoints:
     )  # fmt: skip
 
 
+def true_matrices(
+    path: str | os.PathLike[str], instrument: str
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n 6"]]:
+    """X, Y (deg) and M21 … M33 of a table of true matrices; `DataError` for what is missing or not finite."""
+    source = read_input_table(path)
+    points = field_points(source, instrument)
+    columns = [numeric_column(source, f"M{k}", Column("float")) for k in (21, 22, 23, 31, 32, 33)]
+    matrix = np.stack(columns, axis=1)
+    bad = np.flatnonzero(~np.isfinite(matrix).all(axis=1))
+    if bad.size:
+        raise fail(
+            f"not finite in {rows_text(bad)}", file=path, column="M21 … M33", advice="remove these rows"
+        )
+    return points.x, points.y, matrix
+
+
+def new_table(columns: Mapping[str, Any]) -> InputTable:
+    """A table of columns (arrays, or pairs of an array and its description), to be written."""
+    from astropy.table import Column as TableColumn
+    from astropy.table import Table
+
+    table = Table()
+    for name, values in columns.items():
+        values, description = values if isinstance(values, tuple) else (values, "")
+        table.add_column(TableColumn(values, name=name, description=description or None))
+    return InputTable(Path(), len(table), table)
+
+
 def write_output_table(
     path: str | os.PathLike[str],
     source: InputTable,

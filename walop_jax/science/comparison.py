@@ -1,0 +1,362 @@
+"""Paper II's method beside the joint model: the same data, the same stars, on the grid points and between them.
+
+Stars with p ≤ 5 % are seen through *reference* analysis vectors: those of the joint model, or of the true instrument
+where a truth table comes with the set. Paper II's polynomial gets their (q_m, u_m), the joint model their four
+intensities. Without a truth the error of the joint model is what its covariance promises.
+
+Why there are Δq and Δu. With throughput imbalance α an ideal pair of cameras measures r = (α + q)/(1 + αq), whose
+inverse is q = −α + r + α r² + …: squares are needed. But behind a polariser q² + u² = 1, so (q_m, u_m) runs round an
+ellipse on which 1, q_m² and u_m² are nearly dependent: coefficients may move by λ (1, −1, −1) and the polarised states
+hardly notice, while unpolarised light, near q_m = u_m = 0, is off by λ. Noise and the terms left out (q_m u_m, third
+order) decide λ. Where cross-talk makes u_m follow q_m, two more directions go the same way. One unpolarised exposure
+fixes what noise does not; intensities never have the question.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from walop_jax.data.filters import DEFAULT_FILTER
+from walop_jax.data.records import CalibrationSet
+from walop_jax.fit.calibration import Calibration
+from walop_jax.science.estimate import estimate
+from walop_jax.science.paper import (
+    LARGEST_P,
+    STARS,
+    PaperCalibration,
+    fit_paper,
+    fit_polynomials,
+    judged,
+    polariser_exposures,
+    polariser_states,
+    ratios,
+    sample_stars,
+    terms,
+    transmitted,
+)
+from walop_jax.science.vectors import AnalysisVectors, Setting
+
+GOAL = 0.001
+WEAK = 0.1  # |m22 m33 − m23 m32| below which one exposure holds hardly any u
+QUANTITIES = ("q", "u", "p")
+_ELECTRONS = 1e6  # of the stars; their photon noise does not enter
+
+Vectors = Float[np.ndarray, "p 4 3"]
+
+
+class Truth(NamedTuple):
+    """True instrument matrices (m21 … m33) at field positions (deg), for the colour of the polariser's source."""
+
+    x: Float[np.ndarray, " p"]
+    y: Float[np.ndarray, " p"]
+    matrix: Float[np.ndarray, "p 6"]
+
+
+Errors = Float[np.ndarray, "p 3"]
+
+
+def star_errors(found: Float[np.ndarray, "p n 2"], stars: Float[np.ndarray, "n 2"]) -> Errors:
+    """Errors of q, u and p at every point, rms over the stars."""
+    degree = np.hypot(*np.moveaxis(found, -1, 0)) - np.hypot(*stars.T)
+    return np.sqrt(np.stack([*np.mean((found - stars) ** 2, axis=1).T, np.mean(degree**2, axis=1)], axis=1))
+
+
+def joint_errors(vectors: Vectors, reference: Vectors, stars: Float[np.ndarray, "n 2"]) -> Errors:
+    """Errors of stars seen through `reference` and recovered, noise-free, with the vectors of a calibration."""
+    counts = _ELECTRONS * transmitted(reference, stars)
+    p, n = counts.shape[:2]
+    found = estimate(
+        np.repeat(vectors, n, axis=0), counts.reshape(-1, 4), np.sqrt(counts).reshape(-1, 4), np.arange(p * n)
+    )
+    return star_errors(found.qu.reshape(p, n, 2), stars)
+
+
+def promised_errors(
+    analysis: AnalysisVectors,
+    setting: Setting,
+    x: Float[np.ndarray, " p"],
+    y: Float[np.ndarray, " p"],
+    stars: Float[np.ndarray, "n 2"],
+) -> Errors:
+    """Errors that the covariance of the calibration promises, rms over the stars."""
+    vectors = analysis.coloured(setting, x, y)
+    counts = _ELECTRONS * transmitted(vectors, stars)
+    n = len(stars)
+    repeat = np.repeat(vectors, n, axis=0)
+    found = estimate(repeat, counts.reshape(-1, 4), np.sqrt(counts).reshape(-1, 4), np.arange(len(repeat)))
+    local = analysis.derivatives(setting, x, y, np.full(len(x), np.nan))
+    gain = found.gain.reshape(len(x), n, 2, 4)
+    s = np.concatenate([np.ones((n, 1)), stars], axis=1)
+    total = np.zeros((len(x), 3))
+    for k in range(n):
+        plain, throughput = (gain[:, k] @ np.einsum("s,pksf->pkf", s[k], part) for part in local)
+        root = analysis.to_parameters(plain, throughput, x, y) @ analysis.root
+        radial = np.einsum("c,pck->pk", stars[k] / np.hypot(*stars[k]), root)
+        total += np.stack([*np.sum(root**2, axis=2).T, np.sum(radial**2, axis=1)], axis=1)
+    return np.sqrt(total / n)
+
+
+def determinant(vectors: Vectors) -> Float[np.ndarray, " p"]:
+    """m22 m33 − m23 m32 at every point: what one exposure holds of (q, u)."""
+    rows = [(vectors[:, i] - vectors[:, i + 1]) / (vectors[:, i] + vectors[:, i + 1])[:, :1] for i in (0, 2)]
+    return rows[0][:, 1] * rows[1][:, 2] - rows[0][:, 2] * rows[1][:, 1]
+
+
+def statistics(errors: Errors, chosen: Bool[np.ndarray, " p"] | None = None) -> dict[str, dict[str, float]]:
+    """Median, rms, 95 % and maximum over the field of each error in per cent; share of the field under 0.1 %."""
+    errors = errors if chosen is None else errors[chosen]
+    return {
+        name: {
+            "median": 100.0 * float(np.median(values)),
+            "rms": 100.0 * float(np.sqrt(np.mean(values**2))),
+            "p95": 100.0 * float(np.quantile(values, 0.95)),
+            "max": 100.0 * float(np.max(values)),
+            "share_below_goal": float(np.mean(values < GOAL)),
+        }
+        for name, values in zip(QUANTITIES, errors.T, strict=True)
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Errors of both methods at some field points; `zone` marks |m22 m33 − m23 m32| < 0.1."""
+
+    x: Float[np.ndarray, " p"]
+    y: Float[np.ndarray, " p"]
+    paper: Errors
+    joint: Errors
+    zone: Bool[np.ndarray, " p"]
+
+    def document(self) -> dict[str, Any]:
+        """Statistics of both methods over all points and outside the zone without u."""
+        out: dict[str, Any] = {"points": len(self.x), "in_zone": int(self.zone.sum())}
+        for name, errors in (("paper", self.paper), ("joint", self.joint)):
+            out[name] = {"all": statistics(errors), "outside_zone": statistics(errors, ~self.zone)}
+        ratio = np.sqrt(np.mean(self.paper**2, axis=0) / np.mean(self.joint**2, axis=0))
+        out["rms_ratio"] = dict(zip(QUANTITIES, ratio.tolist(), strict=True))
+        return out
+
+
+@dataclasses.dataclass(frozen=True)
+class Offsets:
+    """Where Δq, Δu come from, point by point.
+
+    `found` as in the paper; `along` what the coefficients' departure along the weakest direction of the design
+    matrix makes of unpolarised light, `along_three` along its three weakest; `noiseless` Δ of a fit to noise-free
+    polarised states; `anchored` Δ when one unpolarised exposure is added to those of the set.
+    """
+
+    found: Float[np.ndarray, "p 2"]
+    along: Float[np.ndarray, "p 2"]
+    along_three: Float[np.ndarray, "p 2"]
+    noiseless: Float[np.ndarray, "p 2"]
+    anchored: Float[np.ndarray, "p 2"]
+    condition: Float[np.ndarray, " p"]
+
+    def document(self) -> dict[str, Any]:
+        """Sizes in per cent, and the share of the variance of Δ that the weakest direction explains."""
+
+        def size(values: Float[np.ndarray, "p 2"]) -> dict[str, float]:
+            rms, most = np.sqrt(np.mean(values**2, axis=0)), np.abs(values).max(axis=0)
+            return {
+                "rms_q": 100 * rms[0],
+                "rms_u": 100 * rms[1],
+                "max_q": 100 * most[0],
+                "max_u": 100 * most[1],
+            }
+
+        def explained(values: Float[np.ndarray, "p 2"]) -> dict[str, float]:
+            left = np.sum((self.found - values) ** 2, axis=0) / np.sum(self.found**2, axis=0)
+            return {"q": 1.0 - float(left[0]), "u": 1.0 - float(left[1])}
+
+        return {
+            "found": size(self.found),
+            "noiseless": size(self.noiseless),
+            "with_one_unpolarised_exposure": size(self.anchored),
+            "explained_by_weakest_direction": explained(self.along),
+            "explained_by_three_weakest_directions": explained(self.along_three),
+            "condition_number": {
+                "median": float(np.median(self.condition)),
+                "max": float(self.condition.max()),
+            },
+        }
+
+
+def offsets(
+    paper: PaperCalibration,
+    measured: Float[np.ndarray, "p e 2"],
+    states: Float[np.ndarray, "e 2"],
+    reference: Vectors,
+    stars: Float[np.ndarray, "n 2"],
+) -> Offsets:
+    """The reason for Δ shown on data: `measured` are the polarised states, `reference` the instrument."""
+    centre = ratios(reference[..., 0])  # (q_m, u_m) of unpolarised light
+    small = transmitted(reference, np.concatenate([np.zeros((1, 2)), stars]))
+    exact, _ = fit_polynomials(
+        np.concatenate([ratios(transmitted(reference, states)), ratios(small)], axis=1),
+        np.concatenate([states, np.zeros((1, 2)), stars]),
+    )
+    design = terms(measured)
+    scale = np.linalg.norm(design, axis=1)
+    directions = np.linalg.svd(design / scale[:, None], full_matrices=False)[2]
+    departure = (paper.coefficients - exact) * scale[:, None]
+
+    def along(count: int) -> Float[np.ndarray, "p 2"]:
+        weak = directions[:, -count:]
+        return np.einsum("pct,pnt,pnv,pv->pc", departure, weak, weak, terms(centre) / scale, optimize=True)
+
+    smooth, _ = fit_polynomials(ratios(transmitted(reference, states)), states)
+    anchored, _ = fit_polynomials(
+        np.concatenate([measured, centre[:, None]], axis=1), np.concatenate([states, np.zeros((1, 2))])
+    )
+
+    def delta(coefficients: Float[np.ndarray, "p 2 5"]) -> Float[np.ndarray, "p 2"]:
+        return judged(paper.x, paper.y, coefficients, paper.condition, reference, stars).delta
+
+    return Offsets(
+        delta(paper.coefficients), along(1), along(3), delta(smooth), delta(anchored), paper.condition
+    )
+
+
+# ------------------------------------------------------------------------------------- both methods, one set
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """Paper II's method and the joint model on one calibration set.
+
+    `grid` has the errors at the points that the polynomials were made for, `between` those elsewhere; `truth` says
+    whether the joint model was held against a truth there (its covariance otherwise).
+    """
+
+    paper: PaperCalibration
+    offsets: Offsets
+    grid: Place
+    between: Place
+    truth: bool
+    filter: str
+    teff: float
+
+    def document(self) -> dict[str, Any]:
+        """Everything as numbers in per cent; errors are rms over the stars, statistics over the field."""
+        spread = 100.0 * self.paper.spread
+        return {
+            "filter": self.filter,
+            "teff": self.teff,
+            "stars": STARS,
+            "largest_p": LARGEST_P,
+            "goal_percent": 100.0 * GOAL,
+            "joint_errors_from": "truth" if self.truth else "covariance",
+            "as_published": {
+                "sigma_q": _summary(spread[:, 0]),
+                "sigma_u": _summary(spread[:, 1]),
+                "share_sigma_u_below_goal": float(np.mean(spread[:, 1] < 100.0 * GOAL)),
+                "delta_max": dict(
+                    zip("qu", (100.0 * np.abs(self.paper.delta).max(axis=0)).tolist(), strict=True)
+                ),
+            },
+            "on_grid": self.grid.document(),
+            "between": self.between.document(),
+            "offsets": self.offsets.document(),
+        }
+
+    def columns(self) -> dict[str, tuple[np.ndarray, str]]:
+        """One row per point, the grid first: position, errors of both methods, what the paper gives."""
+        places = (self.grid, self.between)
+        count = len(self.between.x)
+        on_grid = np.arange(len(self.grid.x) + count) < len(self.grid.x)
+        columns = {
+            "X": (np.concatenate([p.x for p in places]), "[deg] field position"),
+            "Y": (np.concatenate([p.y for p in places]), "[deg] field position"),
+            "GRID": (on_grid, "a point with a polynomial of its own"),
+            "ZONE": (np.concatenate([p.zone for p in places]), "one exposure holds hardly any u"),
+        }
+        for k, quantity in enumerate(QUANTITIES):
+            for method in ("paper", "joint"):
+                errors = np.concatenate([getattr(p, method)[:, k] for p in places])
+                columns[f"{quantity}_{method}".upper()] = errors, f"rms error of {quantity}, {method}"
+        for name, values in (("DELTA", self.paper.delta), ("SIGMA", self.paper.spread)):
+            padded = np.concatenate([values, np.full((count, 2), np.nan)])
+            columns[f"{name}_Q"] = padded[:, 0], f"{name.lower()} of q as in Paper II"
+            columns[f"{name}_U"] = padded[:, 1], f"{name.lower()} of u as in Paper II"
+        return columns
+
+
+def _summary(values: Float[np.ndarray, " p"]) -> dict[str, float]:
+    return {"median": float(np.median(values)), "max": float(values.max())}
+
+
+def truth_vectors(joint: Vectors, matrix: Float[np.ndarray, "p 6"]) -> Vectors:
+    """Analysis vectors with true matrices (m21 … m33) and, what these do not hold, the sums of the joint model.
+
+    a± = ½ (S ± S₀ m) with S the sum of a pair of cameras; an error of S is second order in p.
+    """
+    pairs = []
+    for i, rows in ((0, matrix[:, :3]), (2, matrix[:, 3:])):
+        total = joint[:, i] + joint[:, i + 1]
+        difference = total[:, :1] * rows
+        pairs += [0.5 * (total + difference), 0.5 * (total - difference)]
+    return np.stack(pairs, axis=1)
+
+
+def compare(
+    calset: CalibrationSet,
+    calibration: Calibration,
+    truth: Truth | None = None,
+    filter_name: str = DEFAULT_FILTER,
+    seed: int = 0,
+    count: int = 400,
+) -> Comparison:
+    """Run Paper II's method on a set and judge it beside a calibration of the same set.
+
+    The stars have the colour of the source behind the polariser. Without `truth`, `count` random points lie
+    between the grid points. Raises `DataError` and ValueError as `fit_paper` and `PaperCalibration.between`.
+    """
+    stars = sample_stars(seed=seed)
+    paper = fit_paper(calset, filter_name, stars)
+    exposures = polariser_exposures(calset, filter_name)
+    teff = float(np.median(calset.exposures.teff[exposures]))
+    analysis, setting = AnalysisVectors(calibration), Setting(filter_name)
+
+    def vectors(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Vectors:
+        return analysis.coloured(setting, x, y, np.full(len(x), teff))
+
+    def place(
+        x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], local: PaperCalibration, true: Vectors | None
+    ) -> Place:
+        joint = vectors(x, y)
+        reference = joint if true is None else true
+        promised = promised_errors(analysis, setting, x, y, stars)
+        return Place(
+            x,
+            y,
+            star_errors(local.recover(ratios(transmitted(reference, stars))), stars),
+            promised if true is None else joint_errors(joint, reference, stars),
+            np.abs(determinant(reference)) < WEAK,
+        )
+
+    if truth is None:
+        rng = np.random.default_rng([seed, 1])
+        x, y = (rng.uniform(edge.min(), edge.max(), count) for edge in (paper.x, paper.y))
+        true = None
+    else:
+        x, y = truth.x, truth.y
+        true = truth_vectors(vectors(x, y), truth.matrix)
+    on_grid = vectors(paper.x, paper.y)
+    block = calset.intensities.block(0, len(calset.points))
+    whole = block.used[:, exposures].all(axis=1)
+    measured = ratios(block.counts[whole][:, exposures])
+    states = polariser_states(calset.exposures.clp_angle[exposures])
+    return Comparison(
+        paper=paper,
+        offsets=offsets(paper, measured, states, on_grid, stars),
+        grid=place(paper.x, paper.y, paper, None),
+        between=place(x, y, paper.between(x, y), true),
+        truth=truth is not None,
+        filter=filter_name,
+        teff=teff,
+    )
