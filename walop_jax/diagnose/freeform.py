@@ -52,10 +52,10 @@ class Measured:
         flux = np.where(self.flux == 0, 1.0, self.flux)[..., None]
         self.model: Cube = (self.counts * self.weight - self.residual) / flux
         self.known = np.asarray(problem.plan.exposures.flux_known)
-        unpolarised = np.where(self.used[..., None], self.counts, 0.0).sum(axis=1)
-        self.level: Float[np.ndarray, "p 4"] = (
-            unpolarised / np.maximum(np.where(self.used, self.flux, 0.0).sum(axis=1), 1e-300)[:, None]
-        )
+        # Of the model, not of the counts: patterns that know the noise would find it in the residuals.
+        unit = self.model / np.where(self.weight > 0, self.weight, 1.0)
+        seen = np.maximum(self.used.sum(axis=1), 1)[:, None]
+        self.level: Float[np.ndarray, "p 4"] = np.where(self.used[..., None], unit, 0.0).sum(axis=1) / seen
 
     def column(self, pattern: Cube) -> Float[np.ndarray, " _"]:
         """Derivative of the residuals with respect to the amplitude of N_k → N_k + F · level_k · pattern."""

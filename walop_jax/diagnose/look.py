@@ -24,7 +24,7 @@ from walop_jax.model.parameters import field_declarations
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
 
-ALARM = 0.01
+ALARM = 0.0027  # three standard deviations
 COMMON_MODE = 0.05  # rms (σ of one intensity) of disturbances that one camera in one exposure may have
 PROBABILITY = 0.95
 
