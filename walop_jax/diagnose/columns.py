@@ -8,6 +8,7 @@ amplitude: they cannot be differentiated, only tried (`naming.py`).
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -16,12 +17,14 @@ from jaxtyping import Float
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnose.score import Candidate
 from walop_jax.likelihood.problem import Problem
+from walop_jax.model import light
 from walop_jax.model.effects import Context, Effect
 from walop_jax.model.effects.base import overridden
 from walop_jax.model.parameters import field_declarations
 from walop_jax.model.specification import Model
 
 MANY_SHAPES = 8
+LEAST_SURVIVING = 1e-3  # a contrast of 1 % that the band reduces by this factor is 0.001 %: of no consequence
 DEFAULT_WIDTH = 1.0
 
 Vector = Float[np.ndarray, " _"]
@@ -59,6 +62,7 @@ def probes(catalogue: Sequence[type[Effect]], context: Context) -> Iterator[Prob
 
 
 def _kind_of_computation(effect: type[Effect], instance: Effect) -> tuple[object, ...]:
+    """What makes a computation costly: optics for every exposure, many nodes, derivatives of the plates."""
     return (
         effect.optics_depend_on,
         effect.fringes,
@@ -71,8 +75,9 @@ def _kind_of_computation(effect: type[Effect], instance: Effect) -> tuple[object
 def effect_candidates(
     calset: CalibrationSet, model: Model, values: Vector, wanted: Sequence[Probe]
 ) -> dict[str, Candidate]:
-    """Columns of all probes at the fit `values` of `model`, by probe name."""
-    several = {p.effect for p in wanted if sum(q.effect is p.effect for q in wanted) > MANY_SHAPES}
+    """Columns of all probes at the fit `values` of `model`, by probe name; without those that the bands blur away."""
+    number = Counter(p.effect for p in wanted)
+    several = {effect for effect, count in number.items() if count > MANY_SHAPES}
     result: dict[str, Candidate] = {}
     together: dict[tuple[object, ...], list[Probe]] = {}
     for probe in wanted:
@@ -90,19 +95,23 @@ def effect_candidates(
     for effect in several:
         mine = [probe for probe in wanted if probe.effect is effect]
         result |= _swept(calset, model, values, mine)
-    return {probe.name: result[probe.name] for probe in wanted}
+    return {probe.name: result[probe.name] for probe in wanted if probe.name in result}
 
 
 def _swept(
     calset: CalibrationSet, model: Model, values: Vector, mine: Sequence[Probe]
 ) -> dict[str, Candidate]:
     """Columns of one effect at many shapes: one compiled sweep for each of its discrete choices."""
+    problem = Problem(calset, model, probes=(mine[0].group[0],))
+    instrument = model.instrument(values)
+    nodes = np.asarray(light.node_wavelengths(instrument, problem.plan))
+    weight = np.asarray(light.band_weights(instrument, problem.plan))
+    mine = [probe for probe in mine if probe.group[0].survives(nodes, weight) > LEAST_SURVIVING]
     members = [(i, j) for i, probe in enumerate(mine) for j in range(len(probe.group))]
     by_choice: dict[tuple[tuple[str, object], ...], list[tuple[int, int]]] = {}
     for i, j in members:
         by_choice.setdefault(tuple(sorted(mine[i].group[j].choices().items())), []).append((i, j))
     found: dict[tuple[int, int], np.ndarray] = {}
-    problem = Problem(calset, model, probes=(mine[0].group[0],))
     for group in by_choice.values():
         columns = problem.effect_columns_over_shapes(values, [mine[i].group[j] for i, j in group])
         found |= dict(zip(group, columns, strict=True))

@@ -50,9 +50,10 @@ class Look:
     ) -> None:
         self.problem, self.result = problem, result
         active = [effect.name for effect in problem.model.template.effects]
-        self.probes = [probe for probe in wanted if probe.effect.name not in active]
         self.design = Design.of(problem, result)
-        named = effect_candidates(problem.calset, problem.model, result.values, self.probes)
+        inactive = [probe for probe in wanted if probe.effect.name not in active]
+        named = effect_candidates(problem.calset, problem.model, result.values, inactive)
+        self.probes = [probe for probe in inactive if probe.name in named]
         free = list(strata(self.design.measured))
         candidates = self.design.padded([*named.values(), *free])
         self._own = {}

@@ -277,15 +277,17 @@ class Scorer:
         """ln of the smallest p among all candidates, drawn under the base."""
         if not self._all.shape[1]:
             return np.zeros(0)
-        # Scores s = G W n have covariance G for unit normals n.
+        # Scores s = G W n have covariance G for unit normals n. Seven digits are plenty for what is only counted.
         root = gram @ self._all
-        normal = rng.standard_normal((draws, root.shape[1]))
-        smallest = np.zeros(draws)
-        for name, at in self.space.places().items():
-            w = self._whitening[name]
-            if w.shape[1]:
-                statistic = np.sum((normal @ (root[at].T @ w)) ** 2, axis=1)
-                np.minimum(smallest, _log_survival(statistic, w.shape[1]), out=smallest)
+        places = self.space.places()
+        maps = [root[places[name]].T @ w for name, w in self._whitening.items() if w.shape[1]]
+        normal = rng.standard_normal((draws, root.shape[1]), dtype=np.float32)
+        squares = (normal @ np.concatenate(maps, axis=1).astype(np.float32)) ** 2
+        smallest, first = np.zeros(draws), 0
+        for rank in (m.shape[1] for m in maps):
+            statistic = squares[:, first : first + rank].sum(axis=1)
+            np.minimum(smallest, _log_survival(statistic, rank), out=smallest)
+            first += rank
         return smallest
 
 

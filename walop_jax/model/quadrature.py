@@ -13,6 +13,7 @@ Source      Golub & Welsch 1969, Math. Comp. 23, 221; discrete measures by the L
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Float
@@ -41,27 +42,37 @@ def tabulated_measure(wavelength: Vector, throughput: Vector) -> Rule:
     return fine[inside], weight[inside] / weight[inside].sum()
 
 
-def gauss_rule(node: Vector, weight: Vector, count: int) -> Rule:
-    """Gauss rule with `count` nodes for a discrete measure whose weights sum to 1."""
-    if count >= len(node):
-        return node, weight
-    centre, half = 0.5 * (node[0] + node[-1]), 0.5 * (node[-1] - node[0])
-    t = (node - centre) / half
-    vectors = np.zeros((count, len(node)))
-    alpha, beta = np.zeros(count), np.zeros(count)
+def _recurrence(node: Vector, weight: Vector) -> Iterator[tuple[float, float]]:
+    """Diagonal and off-diagonal of the Jacobi matrix, row by row, of a measure on [−1, 1] whose weights sum to 1."""
+    vectors = np.zeros((0, len(node)))
     vector = np.sqrt(weight)
-    for k in range(count):
-        vectors[k] = vector
-        step = t * vector
-        alpha[k] = vector @ step
+    while True:
+        vectors = np.vstack([vectors, vector])
+        step = node * vector
+        alpha = float(vector @ step)
         # Twice is enough: full orthogonalisation keeps Lanczos from losing the rule.
         for _ in range(2):
-            step = step - vectors[: k + 1].T @ (vectors[: k + 1] @ step)
-        beta[k] = np.linalg.norm(step)
-        vector = step / beta[k]
-    jacobi = np.diag(alpha) + np.diag(beta[:-1], 1) + np.diag(beta[:-1], -1)
-    value, columns = np.linalg.eigh(jacobi)
-    return centre + half * value, columns[0] ** 2
+            step = step - vectors.T @ (vectors @ step)
+        beta = float(np.linalg.norm(step))
+        yield alpha, beta
+        vector = step / beta
+
+
+def gauss_rules(node: Vector, weight: Vector, counts: range) -> Iterator[Rule]:
+    """Gauss rules of growing numbers of nodes, fewer than the measure has; its weights sum to 1."""
+    centre, half = 0.5 * (node[0] + node[-1]), 0.5 * (node[-1] - node[0])
+    rows = _recurrence((node - centre) / half, weight)
+    known: list[tuple[float, float]] = []
+    for count in counts:
+        known += itertools.islice(rows, count - len(known))
+        alpha, beta = np.array(known).T
+        value, columns = np.linalg.eigh(np.diag(alpha) + np.diag(beta[:-1], 1) + np.diag(beta[:-1], -1))
+        yield centre + half * value, columns[0] ** 2
+
+
+def gauss_rule(node: Vector, weight: Vector, count: int) -> Rule:
+    """Gauss rule with `count` nodes for a discrete measure whose weights sum to 1."""
+    return next(gauss_rules(node, weight, range(count, count + 1))) if count < len(node) else (node, weight)
 
 
 def _fringe_error(
@@ -88,10 +99,8 @@ def band_rule(wavelength: Vector, throughput: Vector, tolerance: float = 1e-7, f
     fine, fine_weight = tabulated_measure(wavelength, throughput)
     # No rule follows a fringe with fewer than two nodes a cycle: there is no need to try those.
     cycles = 0.62 * fringes * (1.0 / fine[0] - 1.0 / fine[-1])
-    for count in range(max(1, int(2.0 * cycles)), MAXIMUM_NODES):
-        if count >= len(fine):
-            break
-        node, weight = gauss_rule(fine, fine_weight, count)
+    counts = range(max(1, int(2.0 * cycles)), min(MAXIMUM_NODES, len(fine)))
+    for node, weight in gauss_rules(fine, fine_weight, counts) if counts else ():
         if (
             _fringe_error(node, weight, fine, fine_weight, WAVES) < tolerance
             and _fringe_error(node, weight, fine, fine_weight, weak) < 100 * tolerance

@@ -143,6 +143,10 @@ class Effect(Component):
         """Discrete choices that belong to the description of the effect, e.g. the number of a camera."""
         return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.metadata.get("static")}
 
+    def survives(self, wavelength: Float[np.ndarray, " n"], weight: Float[np.ndarray, "b n"]) -> float:
+        """Share of the effect that the band integrals leave of it; 1 unless it oscillates with wavelength."""
+        return 1.0
+
     def at_neutral(self, context: Context) -> Self:
         """The same effect, discrete choices included, with values that change nothing."""
         return type(self).of(context, **self.choices())
