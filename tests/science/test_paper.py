@@ -15,7 +15,7 @@ from walop_jax.fit.refit import refit
 from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
 from walop_jax.likelihood.problem import Problem, base_model
 from walop_jax.likelihood.simulate import simulate
-from walop_jax.science import comparison, paper
+from walop_jax.science import accuracy, comparison, paper
 from walop_jax.science.estimate import estimate
 from walop_jax.science.vectors import AnalysisVectors, Setting
 
@@ -119,24 +119,24 @@ def test_between_is_bilinear_and_wants_a_grid():
 
 def test_statistics_by_hand():
     errors = np.outer([0.0002, 0.0004, 0.0030, 0.0008], [1.0, 0.5, 0.0])
-    found = comparison.statistics(errors)
+    found = accuracy.statistics(errors)
     assert found["q"]["median"] == pytest.approx(0.06)
     assert found["q"]["rms"] == pytest.approx(100 * np.sqrt((4 + 16 + 900 + 64) / 4) * 1e-4)
     assert found["q"]["max"] == pytest.approx(0.3)
     assert found["q"]["share_below_goal"] == 0.75
     assert found["p"]["share_below_goal"] == 1.0
-    assert comparison.statistics(errors, np.array([True, False, False, False]))["q"]["rms"] == pytest.approx(
+    assert accuracy.statistics(errors, np.array([True, False, False, False]))["q"]["rms"] == pytest.approx(
         0.02
     )
 
 
 def test_perfect_calibrations_make_no_error():
     vectors, stars = pair(0.02)[None], paper.sample_stars(20)
-    np.testing.assert_allclose(comparison.joint_errors(vectors, vectors, stars), 0, atol=1e-12)
+    np.testing.assert_allclose(accuracy.joint_errors(vectors, vectors, stars), 0, atol=1e-12)
     rows = [(vectors[:, i] - vectors[:, i + 1]) / (vectors[:, i] + vectors[:, i + 1])[:, :1] for i in (0, 2)]
-    again = comparison.truth_vectors(vectors, np.concatenate(rows, axis=1))
+    again = accuracy.truth_vectors(vectors, np.concatenate(rows, axis=1))
     np.testing.assert_allclose(again, vectors, atol=1e-15)
-    np.testing.assert_allclose(comparison.determinant(vectors), 1 - 0.02**2, atol=2e-3)
+    np.testing.assert_allclose(accuracy.determinant(vectors), 1 - 0.02**2, atol=2e-3)
 
 
 def test_too_few_angles_are_refused():
@@ -151,7 +151,7 @@ def test_promised_errors_are_the_covariance(calibration):
 
     analysis, setting = AnalysisVectors(calibration), Setting("SDSS-r")
     x, y, stars = np.array([-0.1, 0.05, 0.2]), np.array([-0.1, -0.2, 0.1]), paper.sample_stars(5)
-    promised = comparison.promised_errors(analysis, setting, x, y, stars)
+    promised = accuracy.promised_errors(analysis, setting, x, y, stars)
     reference = analysis.exact(setting, x, y, [np.nan])[:, 0]
     value, vector = np.linalg.eigh(calibration.covariance)
     root = vector * np.sqrt(np.clip(value, 0, None))
@@ -161,7 +161,7 @@ def test_promised_errors_are_the_covariance(calibration):
         values = calibration.values + root @ rng.standard_normal(len(root))
         there = AnalysisVectors(dataclasses.replace(calibration, values=values))
         squares.append(
-            comparison.joint_errors(there.exact(setting, x, y, [np.nan])[:, 0], reference, stars) ** 2
+            accuracy.joint_errors(there.exact(setting, x, y, [np.nan])[:, 0], reference, stars) ** 2
         )
     ratio = np.sqrt(np.mean(squares, axis=0)) / promised
     assert np.all((ratio > 0.7) & (ratio < 1.35))
@@ -198,13 +198,13 @@ def test_paper_and_joint_model_on_set_a(shared_data, fitted):
     ):
         true = truth.vectors(x, y)
         joint = analysis.coloured(Setting("SDSS-r"), x, y, np.full(len(x), 5772.0))
-        outside = np.abs(comparison.determinant(true)) >= 0.1
+        outside = np.abs(accuracy.determinant(true)) >= 0.1
         for method, errors in (
             (
                 "paper",
-                comparison.star_errors(local.recover(paper.ratios(paper.transmitted(true, stars))), stars),
+                accuracy.star_errors(local.recover(paper.ratios(paper.transmitted(true, stars))), stars),
             ),
-            ("joint", comparison.joint_errors(joint, true, stars)),
+            ("joint", accuracy.joint_errors(joint, true, stars)),
         ):
             rms[where, method] = 100 * np.sqrt(np.mean(errors[outside] ** 2, axis=0))
             rms[where, method, "share"] = np.mean(errors < 1e-3, axis=0)
@@ -241,7 +241,7 @@ def test_plates_combined_on_set_b(shared_data, fitted):
         rows = np.broadcast_to(np.stack(fitted_vectors, 1)[:, None], (n, m, r, 4, 3)).reshape(-1, 4, 3)
         flat = counts.reshape(-1, 4)
         found = estimate(rows, flat, np.sqrt(flat), np.repeat(np.arange(n * m), r))
-        errors[name] = comparison.star_errors(found.qu.reshape(n, m, 2), stars)
+        errors[name] = accuracy.star_errors(found.qu.reshape(n, m, 2), stars)
     for name in ("out and 22.5", "0 and 22.5"):
         assert errors[name].max() < 1e-4  # 0.01 % at every point of the field
     # 0° and 45° keep the blind zone, as the true matrices say as well.
@@ -274,5 +274,7 @@ def test_compare_writes_what_it_found(shared_data, tmp_path):
     table = Table.read(tmp_path / "run" / "comparison.fits")
     assert len(table) == 144 + 400
     assert np.isnan(np.ma.filled(table["DELTA_Q"], np.nan)[144:]).all()
-    assert sum(path.suffix == ".png" for path in (tmp_path / "run").iterdir()) == 3
+    assert sum(path.suffix == ".png" for path in (tmp_path / "run").iterdir()) == 4
+    assert told["colour"]["u"]["share_below_sensitivity"] > 0.9
+    assert told["full_moon"]["doubted"] == []
     assert CliRunner().invoke(app, arguments).exit_code == 1

@@ -28,9 +28,10 @@ from walop_jax.cli.refit import RunFolder
 FILES = (
     "comparison.json",
     "comparison.fits",
-    "comparison_histograms.png",
-    "comparison_maps.png",
-    "comparison_offsets.png",
+    "comparison_histogram.png",
+    "comparison_map.png",
+    "comparison_offset.png",
+    "comparison_spectral.png",
 )
 TruthOption = Annotated[
     Path | None,
@@ -54,7 +55,8 @@ def compare(
 
     A quadratic per grid point, a transmission model per camera, 100 stars with p up to 5 %, corrections Δq and
     Δu; on the grid points and between them. The reference is the joint model, or the truth that comes with a
-    simulated set. RUN/comparison.json has the statistics, comparison.fits every point, three figures the rest.
+    simulated set. RUN/comparison.json has the statistics, comparison.fits every point, four figures the rest: also
+    the spectral appendix and the full-Moon scheme.
     """
     from walop_jax.data.folder import atomic_folder, check_folder
 
@@ -67,7 +69,7 @@ def compare(
     from walop_jax.fit.calibration import Calibration
     from walop_jax.fit.refit import fit
     from walop_jax.likelihood.problem import Problem
-    from walop_jax.report.comparison_figures import histogram_figure, map_figure, offset_figure
+    from walop_jax.report import comparison_figures as figures
     from walop_jax.science.comparison import Truth
     from walop_jax.science.comparison import compare as both
 
@@ -88,7 +90,8 @@ def compare(
         with atomic_folder(output, FILES, overwrite=overwrite) as folder:
             (folder / FILES[0]).write_text(json_text(document), encoding="utf-8")
             write_output_table(folder / FILES[1], new_table(found.columns()), {})
-            for name, figure in zip(FILES[2:], (histogram_figure, map_figure, offset_figure), strict=True):
+            for name in FILES[2:]:
+                figure = getattr(figures, f"{name.removeprefix('comparison_').removesuffix('.png')}_figure")
                 figure(found).savefig(folder / name, dpi=130)
     if not result.trusted:
         warn("the joint fit is not trusted: see walop-jax refit")

@@ -7,7 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from walop_jax.science.comparison import GOAL, QUANTITIES, Comparison, Place
+from walop_jax.science.accuracy import GOAL, QUANTITIES, Place
+from walop_jax.science.comparison import Comparison
 
 _COLOURS = {"paper": "tab:orange", "joint": "tab:blue"}
 _NAMES = {"paper": "Paper II, point by point", "joint": "joint model"}
@@ -101,4 +102,28 @@ def offset_figure(comparison: Comparison) -> Figure:
     right.legend(fontsize=8)
     for axis in (left, middle, right):
         axis.tick_params(labelsize=7)
+    return figure
+
+
+def spectral_figure(comparison: Comparison) -> Figure:
+    """Efficiencies and cross-talk across the filter at the extreme point; Δq_m, Δu_m of stars of four colours."""
+    figure = Figure(figsize=(9.6, 3.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    lines = comparison.lines
+    for column, label in ((2, "$m_{22}$: q to q"), (6, "$m_{33}$: u to u"), (5, "$m_{32}$: q to u")):
+        left.plot(1000 * lines[:, 0], lines[:, column], label=label, lw=1.2)
+    left.set_xlabel("wavelength (nm)", fontsize=9)
+    left.set_title("the extreme point of the field", fontsize=9)
+    left.legend(fontsize=8)
+    spread = np.clip(100 * comparison.colours, 1e-5, None)
+    bins = np.geomspace(spread.min() * 0.9, spread.max() * 1.1, 30)
+    for c, name in ((0, r"$\Delta q_m$"), (1, r"$\Delta u_m$")):
+        right.hist(spread[:, c], bins, histtype="step", lw=1.5, label=name)
+    right.axvline(0.05, color="0.5", ls=":", lw=0.8)
+    right.set_xscale("log")
+    right.set_xlabel("difference between four colours, p = 1 % (%)", fontsize=9)
+    right.set_ylabel("grid points", fontsize=9)
+    right.legend(fontsize=8)
+    for axis in (left, right):
+        axis.tick_params(labelsize=8)
     return figure

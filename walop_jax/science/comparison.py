@@ -15,15 +15,30 @@ fixes what noise does not; intensities never have the question.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from walop_jax.data.errors import DataError
 from walop_jax.data.filters import DEFAULT_FILTER
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.calibration import Calibration
-from walop_jax.science.estimate import estimate
+from walop_jax.science.accuracy import (
+    GOAL,
+    QUANTITIES,
+    WEAK,
+    Place,
+    Truth,
+    Vectors,
+    determinant,
+    joint_errors,
+    promised_errors,
+    star_errors,
+    statistics,
+    truth_vectors,
+)
+from walop_jax.science.moon import full_moon_scheme, judge_patches
 from walop_jax.science.paper import (
     LARGEST_P,
     STARS,
@@ -38,107 +53,10 @@ from walop_jax.science.paper import (
     terms,
     transmitted,
 )
+from walop_jax.science.spectral import DEGREE, TEMPERATURES, colour_spread, efficiencies, spread_document
 from walop_jax.science.vectors import AnalysisVectors, Setting
 
-GOAL = 0.001
-WEAK = 0.1  # |m22 m33 − m23 m32| below which one exposure holds hardly any u
-QUANTITIES = ("q", "u", "p")
-_ELECTRONS = 1e6  # of the stars; their photon noise does not enter
-
-Vectors = Float[np.ndarray, "p 4 3"]
-
-
-class Truth(NamedTuple):
-    """True instrument matrices (m21 … m33) at field positions (deg), for the colour of the polariser's source."""
-
-    x: Float[np.ndarray, " p"]
-    y: Float[np.ndarray, " p"]
-    matrix: Float[np.ndarray, "p 6"]
-
-
-Errors = Float[np.ndarray, "p 3"]
-
-
-def star_errors(found: Float[np.ndarray, "p n 2"], stars: Float[np.ndarray, "n 2"]) -> Errors:
-    """Errors of q, u and p at every point, rms over the stars."""
-    degree = np.hypot(*np.moveaxis(found, -1, 0)) - np.hypot(*stars.T)
-    return np.sqrt(np.stack([*np.mean((found - stars) ** 2, axis=1).T, np.mean(degree**2, axis=1)], axis=1))
-
-
-def joint_errors(vectors: Vectors, reference: Vectors, stars: Float[np.ndarray, "n 2"]) -> Errors:
-    """Errors of stars seen through `reference` and recovered, noise-free, with the vectors of a calibration."""
-    counts = _ELECTRONS * transmitted(reference, stars)
-    p, n = counts.shape[:2]
-    found = estimate(
-        np.repeat(vectors, n, axis=0), counts.reshape(-1, 4), np.sqrt(counts).reshape(-1, 4), np.arange(p * n)
-    )
-    return star_errors(found.qu.reshape(p, n, 2), stars)
-
-
-def promised_errors(
-    analysis: AnalysisVectors,
-    setting: Setting,
-    x: Float[np.ndarray, " p"],
-    y: Float[np.ndarray, " p"],
-    stars: Float[np.ndarray, "n 2"],
-) -> Errors:
-    """Errors that the covariance of the calibration promises, rms over the stars."""
-    vectors = analysis.coloured(setting, x, y)
-    counts = _ELECTRONS * transmitted(vectors, stars)
-    n = len(stars)
-    repeat = np.repeat(vectors, n, axis=0)
-    found = estimate(repeat, counts.reshape(-1, 4), np.sqrt(counts).reshape(-1, 4), np.arange(len(repeat)))
-    local = analysis.derivatives(setting, x, y, np.full(len(x), np.nan))
-    gain = found.gain.reshape(len(x), n, 2, 4)
-    s = np.concatenate([np.ones((n, 1)), stars], axis=1)
-    total = np.zeros((len(x), 3))
-    for k in range(n):
-        plain, throughput = (gain[:, k] @ np.einsum("s,pksf->pkf", s[k], part) for part in local)
-        root = analysis.to_parameters(plain, throughput, x, y) @ analysis.root
-        radial = np.einsum("c,pck->pk", stars[k] / np.hypot(*stars[k]), root)
-        total += np.stack([*np.sum(root**2, axis=2).T, np.sum(radial**2, axis=1)], axis=1)
-    return np.sqrt(total / n)
-
-
-def determinant(vectors: Vectors) -> Float[np.ndarray, " p"]:
-    """m22 m33 − m23 m32 at every point: what one exposure holds of (q, u)."""
-    rows = [(vectors[:, i] - vectors[:, i + 1]) / (vectors[:, i] + vectors[:, i + 1])[:, :1] for i in (0, 2)]
-    return rows[0][:, 1] * rows[1][:, 2] - rows[0][:, 2] * rows[1][:, 1]
-
-
-def statistics(errors: Errors, chosen: Bool[np.ndarray, " p"] | None = None) -> dict[str, dict[str, float]]:
-    """Median, rms, 95 % and maximum over the field of each error in per cent; share of the field under 0.1 %."""
-    errors = errors if chosen is None else errors[chosen]
-    return {
-        name: {
-            "median": 100.0 * float(np.median(values)),
-            "rms": 100.0 * float(np.sqrt(np.mean(values**2))),
-            "p95": 100.0 * float(np.quantile(values, 0.95)),
-            "max": 100.0 * float(np.max(values)),
-            "share_below_goal": float(np.mean(values < GOAL)),
-        }
-        for name, values in zip(QUANTITIES, errors.T, strict=True)
-    }
-
-
-@dataclasses.dataclass(frozen=True)
-class Place:
-    """Errors of both methods at some field points; `zone` marks |m22 m33 − m23 m32| < 0.1."""
-
-    x: Float[np.ndarray, " p"]
-    y: Float[np.ndarray, " p"]
-    paper: Errors
-    joint: Errors
-    zone: Bool[np.ndarray, " p"]
-
-    def document(self) -> dict[str, Any]:
-        """Statistics of both methods over all points and outside the zone without u."""
-        out: dict[str, Any] = {"points": len(self.x), "in_zone": int(self.zone.sum())}
-        for name, errors in (("paper", self.paper), ("joint", self.joint)):
-            out[name] = {"all": statistics(errors), "outside_zone": statistics(errors, ~self.zone)}
-        ratio = np.sqrt(np.mean(self.paper**2, axis=0) / np.mean(self.joint**2, axis=0))
-        out["rms_ratio"] = dict(zip(QUANTITIES, ratio.tolist(), strict=True))
-        return out
+LINES = 81  # wavelengths across the filter
 
 
 @dataclasses.dataclass(frozen=True)
@@ -240,6 +158,9 @@ class Comparison:
     truth: bool
     filter: str
     teff: float
+    colours: Float[np.ndarray, "p 2"]
+    lines: Float[np.ndarray, "w 7"]
+    moon: dict[str, Any] | None
 
     def document(self) -> dict[str, Any]:
         """Everything as numbers in per cent; errors are rms over the stars, statistics over the field."""
@@ -262,6 +183,8 @@ class Comparison:
             "on_grid": self.grid.document(),
             "between": self.between.document(),
             "offsets": self.offsets.document(),
+            "colour": {"temperatures": list(TEMPERATURES), "degree": DEGREE} | spread_document(self.colours),
+            "full_moon": self.moon,
         }
 
     def columns(self) -> dict[str, tuple[np.ndarray, str]]:
@@ -288,19 +211,6 @@ class Comparison:
 
 def _summary(values: Float[np.ndarray, " p"]) -> dict[str, float]:
     return {"median": float(np.median(values)), "max": float(values.max())}
-
-
-def truth_vectors(joint: Vectors, matrix: Float[np.ndarray, "p 6"]) -> Vectors:
-    """Analysis vectors with true matrices (m21 … m33) and, what these do not hold, the sums of the joint model.
-
-    a± = ½ (S ± S₀ m) with S the sum of a pair of cameras; an error of S is second order in p.
-    """
-    pairs = []
-    for i, rows in ((0, matrix[:, :3]), (2, matrix[:, 3:])):
-        total = joint[:, i] + joint[:, i + 1]
-        difference = total[:, :1] * rows
-        pairs += [0.5 * (total + difference), 0.5 * (total - difference)]
-    return np.stack(pairs, axis=1)
 
 
 def compare(
@@ -351,6 +261,11 @@ def compare(
     whole = block.used[:, exposures].all(axis=1)
     measured = ratios(block.counts[whole][:, exposures])
     states = polariser_states(calset.exposures.clp_angle[exposures])
+    curve = calibration.filter_curve(filter_name)
+    lit = curve.wavelength[curve.throughput > 0.05 * curve.throughput.max()]
+    wavelength = np.linspace(lit[0], lit[-1], LINES)
+    far = int(np.argmax(paper.x + paper.y))
+    matrices = efficiencies(calibration, float(paper.x[far]), float(paper.y[far]), wavelength)
     return Comparison(
         paper=paper,
         offsets=offsets(paper, measured, states, on_grid, stars),
@@ -359,4 +274,34 @@ def compare(
         truth=truth is not None,
         filter=filter_name,
         teff=teff,
+        colours=colour_spread(calibration, paper.x, paper.y, filter_name=filter_name),
+        lines=np.concatenate([wavelength[:, None], matrices.reshape(LINES, 6)], axis=1),
+        moon=_moon(calset, calibration, paper, on_grid, stars),
     )
+
+
+def _moon(
+    calset: CalibrationSet,
+    calibration: Calibration,
+    paper: PaperCalibration,
+    reference: Vectors,
+    stars: Float[np.ndarray, "n 2"],
+) -> dict[str, Any] | None:
+    """Verdicts on the Moon patches, and the errors that the full-Moon scheme leaves at the grid points."""
+    e = calset.exposures
+    if not np.any((e.kind == "moon") & ~e.clp_in):
+        return None
+    patches = judge_patches(calset, calibration)
+    document = patches.document(e.exposure)
+    weight = patches.weight[~e.chwp_in[patches.exposure]]
+    try:
+        schemes = {
+            "equal_weights": full_moon_scheme(calset, paper),
+            "down_weighted": full_moon_scheme(calset, paper, weight),
+        }
+    except (DataError, ValueError) as error:
+        return document | {"scheme": None, "why_not": str(error)}
+    seen = ratios(transmitted(reference, stars))
+    outside = np.abs(determinant(reference)) >= WEAK
+    found = {name: star_errors(scheme.recover(seen), stars) for name, scheme in schemes.items()}
+    return document | {"scheme_outside_zone": {name: statistics(v, outside) for name, v in found.items()}}

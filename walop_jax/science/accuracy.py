@@ -1,0 +1,130 @@
+"""How far off stars come out of a calibration: errors of q, u and p over the field, true or promised.
+
+Test stars with p ≤ 5 % are seen, noise-free, through *reference* analysis vectors and recovered with a calibration; the
+error at a field point is the rms over the stars.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from walop_jax.science.estimate import estimate
+from walop_jax.science.paper import transmitted
+from walop_jax.science.vectors import AnalysisVectors, Setting
+
+GOAL = 0.001
+WEAK = 0.1  # |m22 m33 − m23 m32| below which one exposure holds hardly any u
+QUANTITIES = ("q", "u", "p")
+_ELECTRONS = 1e6  # of the stars; their photon noise does not enter
+
+Vectors = Float[np.ndarray, "p 4 3"]
+
+
+class Truth(NamedTuple):
+    """True instrument matrices (m21 … m33) at field positions (deg), for the colour of the polariser's source."""
+
+    x: Float[np.ndarray, " p"]
+    y: Float[np.ndarray, " p"]
+    matrix: Float[np.ndarray, "p 6"]
+
+
+Errors = Float[np.ndarray, "p 3"]
+
+
+def star_errors(found: Float[np.ndarray, "p n 2"], stars: Float[np.ndarray, "n 2"]) -> Errors:
+    """Errors of q, u and p at every point, rms over the stars."""
+    degree = np.hypot(*np.moveaxis(found, -1, 0)) - np.hypot(*stars.T)
+    return np.sqrt(np.stack([*np.mean((found - stars) ** 2, axis=1).T, np.mean(degree**2, axis=1)], axis=1))
+
+
+def joint_errors(vectors: Vectors, reference: Vectors, stars: Float[np.ndarray, "n 2"]) -> Errors:
+    """Errors of stars seen through `reference` and recovered, noise-free, with the vectors of a calibration."""
+    counts = _ELECTRONS * transmitted(reference, stars)
+    p, n = counts.shape[:2]
+    found = estimate(
+        np.repeat(vectors, n, axis=0), counts.reshape(-1, 4), np.sqrt(counts).reshape(-1, 4), np.arange(p * n)
+    )
+    return star_errors(found.qu.reshape(p, n, 2), stars)
+
+
+def promised_errors(
+    analysis: AnalysisVectors,
+    setting: Setting,
+    x: Float[np.ndarray, " p"],
+    y: Float[np.ndarray, " p"],
+    stars: Float[np.ndarray, "n 2"],
+) -> Errors:
+    """Errors that the covariance of the calibration promises, rms over the stars."""
+    vectors = analysis.coloured(setting, x, y)
+    counts = _ELECTRONS * transmitted(vectors, stars)
+    n = len(stars)
+    repeat = np.repeat(vectors, n, axis=0)
+    found = estimate(repeat, counts.reshape(-1, 4), np.sqrt(counts).reshape(-1, 4), np.arange(len(repeat)))
+    local = analysis.derivatives(setting, x, y, np.full(len(x), np.nan))
+    gain = found.gain.reshape(len(x), n, 2, 4)
+    s = np.concatenate([np.ones((n, 1)), stars], axis=1)
+    total = np.zeros((len(x), 3))
+    for k in range(n):
+        plain, throughput = (gain[:, k] @ np.einsum("s,pksf->pkf", s[k], part) for part in local)
+        root = analysis.to_parameters(plain, throughput, x, y) @ analysis.root
+        radial = np.einsum("c,pck->pk", stars[k] / np.hypot(*stars[k]), root)
+        total += np.stack([*np.sum(root**2, axis=2).T, np.sum(radial**2, axis=1)], axis=1)
+    return np.sqrt(total / n)
+
+
+def determinant(vectors: Vectors) -> Float[np.ndarray, " p"]:
+    """m22 m33 − m23 m32 at every point: what one exposure holds of (q, u)."""
+    rows = [(vectors[:, i] - vectors[:, i + 1]) / (vectors[:, i] + vectors[:, i + 1])[:, :1] for i in (0, 2)]
+    return rows[0][:, 1] * rows[1][:, 2] - rows[0][:, 2] * rows[1][:, 1]
+
+
+def statistics(errors: Errors, chosen: Bool[np.ndarray, " p"] | None = None) -> dict[str, dict[str, float]]:
+    """Median, rms, 95 % and maximum over the field of each error in per cent; share of the field under 0.1 %."""
+    errors = errors if chosen is None else errors[chosen]
+    return {
+        name: {
+            "median": 100.0 * float(np.median(values)),
+            "rms": 100.0 * float(np.sqrt(np.mean(values**2))),
+            "p95": 100.0 * float(np.quantile(values, 0.95)),
+            "max": 100.0 * float(np.max(values)),
+            "share_below_goal": float(np.mean(values < GOAL)),
+        }
+        for name, values in zip(QUANTITIES, errors.T, strict=True)
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Errors of both methods at some field points; `zone` marks |m22 m33 − m23 m32| < 0.1."""
+
+    x: Float[np.ndarray, " p"]
+    y: Float[np.ndarray, " p"]
+    paper: Errors
+    joint: Errors
+    zone: Bool[np.ndarray, " p"]
+
+    def document(self) -> dict[str, Any]:
+        """Statistics of both methods over all points and outside the zone without u."""
+        out: dict[str, Any] = {"points": len(self.x), "in_zone": int(self.zone.sum())}
+        for name, errors in (("paper", self.paper), ("joint", self.joint)):
+            out[name] = {"all": statistics(errors), "outside_zone": statistics(errors, ~self.zone)}
+        ratio = np.sqrt(np.mean(self.paper**2, axis=0) / np.mean(self.joint**2, axis=0))
+        out["rms_ratio"] = dict(zip(QUANTITIES, ratio.tolist(), strict=True))
+        return out
+
+
+def truth_vectors(joint: Vectors, matrix: Float[np.ndarray, "p 6"]) -> Vectors:
+    """Analysis vectors with true matrices (m21 … m33) and, what these do not hold, the sums of the joint model.
+
+    a± = ½ (S ± S₀ m) with S the sum of a pair of cameras; an error of S is second order in p.
+    """
+    pairs = []
+    for i, rows in ((0, matrix[:, :3]), (2, matrix[:, 3:])):
+        total = joint[:, i] + joint[:, i + 1]
+        difference = total[:, :1] * rows
+        pairs += [0.5 * (total + difference), 0.5 * (total - difference)]
+    return np.stack(pairs, axis=1)
