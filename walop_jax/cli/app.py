@@ -20,6 +20,8 @@ COMMANDS = (
     "matrix",
     "apply",
     "compare",
+    "certify",
+    "epoch",
     "report",
     "model",
     "import-zemax",

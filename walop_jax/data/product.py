@@ -1,6 +1,7 @@
 """The calibration product, `calibration.fits` (PRODVERS = 1): what a fit has learnt, complete in one file.
 
-    PRIMARY      instrument, verdict of the fit, versions of the software, hash of the content
+    PRIMARY      instrument, verdict of the fit, validity (dates, temperatures, filters), versions of the software,
+                 hash of the content
     PARAMETERS   NAME, VALUE, SIGMA, UNIT, PRIOR_MEAN, PRIOR_WIDTH, FREE
     COVARIANCE   image, in the order of PARAMETERS; tied and frozen parameters included
     M21 … M33    images of the instrument matrix over the field (filter of MAPFILT, flat photon spectrum,
@@ -152,6 +153,7 @@ def _primary(product: CalibrationProduct) -> fits.PrimaryHDU:
             f"FIELD{side}": (value, "[deg] extent of the field points used")
             for side, value in zip(("XMI", "XMA", "YMI", "YMA"), product.field, strict=True)
         },
+        **_validity(product),
         "CONTHASH": (product.content_hash(), ""),
     }
     for name, (value, comment) in cards.items():
@@ -161,6 +163,21 @@ def _primary(product: CalibrationProduct) -> fits.PrimaryHDU:
     for number, (name, version) in enumerate(product.versions.items(), start=1):
         primary.header[f"SOFT{number}"] = spelt(f"{name} {version}")
     return primary
+
+
+def _validity(product: CalibrationProduct) -> dict[str, tuple[Any, str]]:
+    """What the product may be applied to, for a look: EXPOSURES says the same."""
+    cards: dict[str, tuple[Any, str]] = {}
+    for values, names, comment in (
+        (product.exposures.mjd, ("MJD-BEG", "MJD-END"), "[d] UTC of the exposures"),
+        (product.exposures.temp, ("TEMPMIN", "TEMPMAX"), "[Celsius] of the exposures"),
+    ):
+        known = values[np.isfinite(values)]
+        if known.size:
+            cards |= {names[0]: (float(known.min()), comment), names[1]: (float(known.max()), comment)}
+    for number, name in enumerate(np.unique(product.exposures.filter).tolist(), start=1):
+        cards[f"FILTER{number}"] = (name, "")
+    return cards
 
 
 # ------------------------------------------------------------------------------------------------- reading

@@ -1,0 +1,174 @@
+"""Products that are certified or not, and epochs of an instrument that has changed or not."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import equinox as eqx
+import numpy as np
+import pytest
+from astropy.io import fits
+from scipy import stats
+from typer.testing import CliRunner
+
+from walop_jax.cli import app
+from walop_jax.data import write_calibration_set
+from walop_jax.data.product import write_product
+from walop_jax.fit.calibration import Calibration
+from walop_jax.fit.refit import refit
+from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
+from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood.simulate import simulate
+from walop_jax.science.certify import certify, validity
+from walop_jax.science.epoch import chi2_tail, departure, epoch
+
+PLAN = ObservingPlan(grid=5, standard_grid=2, polariser_angles=polariser_turn(8), moon_patches=3, standards=3)
+
+
+def calibrate(calset):
+    model = base_model(calset)
+    return Calibration.from_fit(refit(calset, model), Problem(calset, model))
+
+
+@pytest.fixture(scope="module")
+def first():
+    """An instrument, and what a first run has learnt of it."""
+    run = simulate(PLAN, seed=5)
+    calset = dataclasses.replace(run.calset, inputs=())
+    return run.truth, calibrate(calset)
+
+
+@pytest.fixture(scope="module")
+def product(first, tmp_path_factory):
+    from walop_jax.data import read_calibration_set
+
+    path = tmp_path_factory.mktemp("sets") / "first.fits"
+    write_calibration_set(path, simulate(PLAN, seed=5).calset)
+    return calibrate(read_calibration_set(path)).to_product()
+
+
+def failed(product):
+    return [check.name for check in certify(product) if not check.passed]
+
+
+def test_a_good_product_is_valid(product):
+    checks = certify(product)
+    assert [check.name for check in checks] == [
+        "converged", "explains the data", "conditioned", "covariance", "validity", "parents", "model", "maps",
+        "physics",
+    ]  # fmt: skip
+    assert failed(product) == []
+    known = validity(product)
+    assert known.filters == ("SDSS-r",)
+    assert known.mjd[0] == np.nanmin(product.exposures.mjd)
+
+
+def test_what_is_wrong_is_named(product):
+    def changed(**more):
+        return dataclasses.replace(product, **more)
+
+    def verdict(**more):
+        return changed(verdict=dataclasses.replace(product.verdict, **more))
+
+    assert failed(verdict(converged=False)) == ["converged"]
+    assert failed(verdict(trusted=False)) == ["explains the data"]
+    assert failed(verdict(quality=2)) == ["conditioned"]
+    broken = product.covariance.copy()
+    broken[0, 1] += 3 * np.sqrt(broken[0, 0] * broken[1, 1]) + 1e-6
+    assert "covariance" in failed(changed(covariance=broken))
+    exposures = dataclasses.replace(product.exposures, mjd=np.full(len(product.exposures), np.nan))
+    assert "validity" in failed(changed(exposures=exposures))
+    assert failed(changed(inputs=())) == ["parents"]
+    maps = dataclasses.replace(product.maps, values=product.maps.values + 1e-5)
+    assert failed(changed(maps=maps)) == ["maps"]
+    assert failed(changed(model=("[model]", 'effects = ["no_such"]'))) == ["model"]
+    values = product.parameters.value.copy()
+    values[product.parameters.name.tolist().index("half1.efficiency")] = (
+        1.2  # analyses more light than there is
+    )
+    assert "physics" in failed(changed(parameters=dataclasses.replace(product.parameters, value=values)))
+
+
+def test_validity_stands_in_the_header(product, tmp_path):
+    write_product(tmp_path / "p.fits", product)
+    header = fits.getheader(tmp_path / "p.fits")
+    known = validity(product)
+    assert (header["MJD-BEG"], header["MJD-END"]) == pytest.approx(known.mjd)
+    assert (header["TEMPMIN"], header["TEMPMAX"]) == pytest.approx(known.temperature)
+    assert header["FILTER1"] == "SDSS-r"
+
+
+def test_certify_from_the_command_line(product, tmp_path):
+    write_product(tmp_path / "good.fits", product)
+    result = CliRunner().invoke(app, ["certify", str(tmp_path / "good.fits"), "--json"])
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    assert told["valid"] is True
+    assert told["content"] == product.content_hash()
+    assert told["parents"] == [product.inputs[0].sha256]
+    bad = dataclasses.replace(product, verdict=dataclasses.replace(product.verdict, trusted=False))
+    write_product(tmp_path / "bad.fits", bad)
+    result = CliRunner().invoke(app, ["certify", str(tmp_path / "bad.fits"), "--quiet"])
+    assert result.exit_code == 1
+    assert "explains the data" in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+# ------------------------------------------------------------------------------------------------- epochs
+
+
+def test_tail_of_chi2_by_scipy():
+    for value, dof in ((1.0, 1), (30.0, 20), (120.0, 70), (0.0, 3)):
+        assert chi2_tail(value, dof) == pytest.approx(stats.chi2.sf(value, dof), rel=1e-10)
+
+
+def test_departure_by_hand():
+    """3-4-5: Δ = (3, 4) with unit errors, and a third parameter that nobody measured."""
+    change, covariance = np.array([3.0, 4.0, 0.0]), np.diag([1.0, 1.0, 0.0])
+    assert departure(change, covariance, np.array([1.0, 1.0, 1.0])) == (pytest.approx(25.0), 2)
+
+
+def test_an_instrument_that_has_not_changed_still_fits(first):
+    """Over six later runs of the same instrument T follows its χ², and no run is called a change."""
+    truth, old = first
+    found = [epoch(old, simulate(PLAN, seed=100 + k, instrument=truth).calset)[0] for k in range(6)]
+    assert all(entry.fits for entry in found)
+    k = found[0].directions
+    # The old calibration is one and the same: half of the variance of T is common to the six.
+    assert np.mean([entry.test for entry in found]) == pytest.approx(
+        k, abs=4 * np.sqrt(2 * k * (1 / 6 + 0.5))
+    )
+    assert np.mean([entry.chi2_old - entry.chi2_new for entry in found]) > 0
+    assert all(entry.star_errors["q"]["median"] < 0.05 for entry in found)
+
+
+def test_a_change_is_found_and_named(first):
+    """A wedge that has yielded by half a milliradian."""
+    truth, old = first
+    bent = eqx.tree_at(lambda i: i.half2.wedge, truth, truth.half2.wedge + 5e-4)
+    found, _ = epoch(old, simulate(PLAN, seed=200, instrument=bent).calset)
+    assert not found.fits
+    assert found.moved[0].name == "half2.wedge"
+    assert found.moved[0].new - found.moved[0].old == pytest.approx(5e-4, abs=4 * found.moved[0].error)
+    assert found.chi2_old > found.chi2_new + 100
+    assert found.star_errors["u"]["max"] > 0.05
+
+
+def test_epoch_from_the_command_line(product, first, tmp_path):
+    write_product(tmp_path / "old.fits", product)
+    write_calibration_set(tmp_path / "new.fits", simulate(PLAN, seed=300, instrument=first[0]).calset)
+    result = CliRunner().invoke(
+        app, ["epoch", str(tmp_path / "old.fits"), str(tmp_path / "new.fits"), "--json"]
+    )
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    assert told["fits"] is True
+    assert told["old"] == product.content_hash()
+    assert len(told["moved"]) > 50
+
+
+def test_another_instrument_is_refused(first):
+    calset = simulate(dataclasses.replace(PLAN, instrument="WALOP-NORTH")).calset
+    with pytest.raises(ValueError, match="of WALOP-NORTH, the calibration of WALOP-SOUTH"):
+        epoch(first[1], calset)

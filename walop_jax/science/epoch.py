@@ -1,0 +1,149 @@
+"""Does an old calibration still fit new data, and what has moved?
+
+The new set is fitted with the effects of the old model. What both fits have in common, the instrument's parameters, is
+compared: Δ = new − old with the covariance V, z = Δ/√V_ii, and over all directions T = Δᵀ V⁻¹ Δ, which is χ² for an
+instrument that has not changed.
+
+    V = C_old + C_new − C_old P C_new − C_new P C_old
+
+P is the inverse covariance of the priors: both fits lean on the same ones, which makes them more alike than two
+independent measurements; where neither has measured anything V vanishes, and such directions are left out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import gammaincc
+from jaxtyping import Float
+
+from walop_jax.data.records import CalibrationSet
+from walop_jax.fit.building import effects_text, model_for
+from walop_jax.fit.calibration import Calibration
+from walop_jax.fit.refit import fit
+from walop_jax.likelihood.problem import Problem
+from walop_jax.model.specification import Model
+from walop_jax.science.accuracy import WEAK, determinant, joint_errors, statistics
+from walop_jax.science.paper import sample_stars
+from walop_jax.science.vectors import AnalysisVectors, Setting
+
+NIGHTLY = ("sky.", "standard.")  # parameters of the sky and of stars, not of the instrument
+CHANCE = 0.01
+_KNOWN = 1e-7  # share of the largest eigenvalue below which a direction was measured by neither
+
+
+@dataclasses.dataclass(frozen=True)
+class Moved:
+    """A parameter before and after; `z` its change in standard errors of the change."""
+
+    name: str
+    unit: str
+    old: float
+    new: float
+    error: float
+    z: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Epoch:
+    """The verdict: `fits` unless the change is one that chance makes in less than 1 % of cases.
+
+    `moved` sorts parameters by |z|; `chi2_old` is of the new data with the old instrument; `star_errors` are
+    statistics (per cent) of what stars would be off, outside the zone without u, if the old calibration
+    were used and the new one true.
+    """
+
+    fits: bool
+    p_value: float
+    test: float
+    directions: int
+    chi2_old: float
+    chi2_new: float
+    dof: int
+    moved: tuple[Moved, ...]
+    star_errors: dict[str, dict[str, float]]
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return dataclasses.asdict(self)
+
+
+def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]:
+    """Fit a new set and compare with an old calibration; gives the comparison and the new calibration.
+
+    Raises ValueError for a set of another instrument and RuntimeError if the new fit does not converge.
+    """
+    if calset.instrument != old.model.name:
+        raise ValueError(f"the new set is of {calset.instrument}, the calibration of {old.model.name}")
+    model = model_for(calset, effects_text([effect.name for effect in old.model.template.effects]))
+    problem = Problem(calset, model)
+    result = fit(problem)
+    if not result.converged:
+        raise RuntimeError(f"the fit of the new set did not converge: {result.minimum.message}")
+    new = Calibration.from_fit(result, problem)
+    names = shared(old.model, model)
+    a = np.array([old.model.index(name) for name in names])
+    b = np.array([model.index(name) for name in names])
+    change = new.values[b] - old.values[a]
+    before, after = old.covariance[np.ix_(a, a)], new.covariance[np.ix_(b, b)]
+    width = np.array([(model[name].prior or (0.0, np.inf))[1] for name in names])
+    both = before @ (after / width[:, None] ** 2)
+    covariance = before + after - both - both.T
+    test, directions = departure(change, covariance, np.sqrt(np.diag(before + after)))
+    values = new.values.copy()
+    values[b] = old.values[a]
+    error = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+    moved = [
+        Moved(n, model[n].unit, float(old.values[i]), float(new.values[j]), float(s), float(d / s))
+        for n, i, j, d, s in zip(names, a, b, change, error, strict=True)
+        if s > 0
+    ]
+    p_value = chi2_tail(test, directions)
+    verdict = Epoch(
+        fits=p_value > CHANCE,
+        p_value=p_value,
+        test=test,
+        directions=directions,
+        chi2_old=problem.expand(values).chi2,
+        chi2_new=result.chi2,
+        dof=result.dof,
+        moved=tuple(sorted(moved, key=lambda entry: -abs(entry.z))),
+        star_errors=_star_errors(old, new),
+    )
+    return verdict, new
+
+
+def shared(old: Model, new: Model) -> list[str]:
+    """Names of the instrument's parameters that are free in both models."""
+    free = [{m.parameters[i].name for i in m.free} for m in (old, new)]
+    return [name for name in new.names if name in free[0] & free[1] and not name.startswith(NIGHTLY)]
+
+
+def departure(
+    change: Float[np.ndarray, " k"], covariance: Float[np.ndarray, "k k"], sigma: Float[np.ndarray, " k"]
+) -> tuple[float, int]:
+    """Δᵀ V⁻¹ Δ over the directions that were measured, and their number; `sigma` sets the scale of each parameter."""
+    known = sigma > 0
+    scaled = covariance[np.ix_(known, known)] / np.outer(sigma[known], sigma[known])
+    value, vector = np.linalg.eigh(scaled)
+    good = value > _KNOWN * value[-1]
+    along = vector[:, good].T @ (change[known] / sigma[known])
+    return float(np.sum(along**2 / value[good])), int(good.sum())
+
+
+def chi2_tail(value: float, dof: int) -> float:
+    """Probability that χ² with `dof` degrees of freedom exceeds a value: Q(dof/2, value/2)."""
+    return float(gammaincc(jnp.asarray(0.5 * dof), jnp.asarray(0.5 * value)))
+
+
+def _star_errors(old: Calibration, new: Calibration) -> dict[str, dict[str, float]]:
+    x, y = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 200))
+    low_x, high_x, low_y, high_y = new.field
+    x, y = 0.5 * ((low_x + high_x) + (high_x - low_x) * x), 0.5 * ((low_y + high_y) + (high_y - low_y) * y)
+    setting = Setting(str(np.unique(new.exposures.filter)[-1]))
+    vectors = [AnalysisVectors(c).exact(setting, x, y, [np.nan])[:, 0] for c in (old, new)]
+    errors = joint_errors(vectors[0], vectors[1], sample_stars())
+    return statistics(errors, np.abs(determinant(vectors[1])) >= WEAK)
