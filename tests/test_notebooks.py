@@ -24,7 +24,11 @@ def code_of(notebook: nbformat.NotebookNode) -> list[str]:
 
 
 def test_there_are_notebooks():
-    assert [path.name for path in NOTEBOOKS] == ["first_calibration.ipynb", "posteriors.ipynb"]
+    assert [path.name for path in NOTEBOOKS] == [
+        "first_calibration.ipynb",
+        "paper_versus_joint.ipynb",
+        "posteriors.ipynb",
+    ]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

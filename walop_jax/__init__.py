@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from walop_jax.model.instrument import nominal_instrument
     from walop_jax.model.specification import with_effects
     from walop_jax.model.trace import Ray, trace
+    from walop_jax.science.apply import apply
 
 __version__ = "0.1.0"
 
@@ -40,6 +41,7 @@ __all__ = [
     "Problem",
     "Ray",
     "Settings",
+    "apply",
     "base_model",
     "describe_misfit",
     "effect_by_name",
@@ -61,6 +63,7 @@ _HOME = {
     "Problem": ("likelihood.problem", "Problem"),
     "Ray": ("model.trace", "Ray"),
     "Settings": ("fit.predict", "Settings"),
+    "apply": ("science.apply", "apply"),
     "base_model": ("likelihood.problem", "base_model"),
     "describe_misfit": ("fit.misfit", "describe"),
     "effect_by_name": ("model.effects", "effect_by_name"),

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from walop_jax.science.accuracy import GOAL, QUANTITIES, Place
+from walop_jax.fit.calibration import Calibration
+from walop_jax.science.accuracy import GOAL, QUANTITIES, Place, plate_errors
 from walop_jax.science.comparison import Comparison
+from walop_jax.science.vectors import AnalysisVectors, Setting
 
 _COLOURS = {"paper": "tab:orange", "joint": "tab:blue"}
 _NAMES = {"paper": "Paper II, point by point", "joint": "joint model"}
 _RANGE = (1e-3, 10.0)  # per cent
+_PIXELS = 49
 
 
 def histogram_figure(comparison: Comparison) -> Figure:
@@ -40,7 +45,7 @@ def histogram_figure(comparison: Comparison) -> Figure:
 
 def map_figure(comparison: Comparison) -> Figure:
     """Maps of the errors of q and u of both methods between the grid points and on them."""
-    figure = Figure(figsize=(10.4, 5.0), layout="constrained")
+    figure = Figure(figsize=(10.4, 5.4), layout="constrained")
     axes = figure.subplots(2, 4, sharex=True, sharey=True)
     norm = LogNorm(2e-3, 2.0)
     shown = None
@@ -67,9 +72,11 @@ def map_figure(comparison: Comparison) -> Figure:
 
 
 def _contours(axis: Axes, place: Place, method: str, k: int, norm: LogNorm):  # type: ignore[no-untyped-def]
-    values = np.clip(100 * getattr(place, method)[:, k], norm.vmin, norm.vmax)
+    values = 100 * getattr(place, method)[:, k]
     levels = np.geomspace(norm.vmin or 1e-3, norm.vmax or 1.0, 13)
-    filled = axis.tricontourf(place.x, place.y, values, levels=levels, norm=norm, cmap="viridis")
+    filled = axis.tricontourf(
+        place.x, place.y, values, levels=levels, norm=norm, cmap="viridis", extend="both"
+    )
     axis.tricontour(place.x, place.y, values, levels=[100 * GOAL], colors="white", linewidths=0.8)
     return filled
 
@@ -126,4 +133,31 @@ def spectral_figure(comparison: Comparison) -> Figure:
     right.legend(fontsize=8)
     for axis in (left, right):
         axis.tick_params(labelsize=8)
+    return figure
+
+
+def plate_figure(calibration: Calibration, combinations: Sequence[Sequence[float | None]]) -> Figure:
+    """Maps of how much worse than an ideal instrument (q, u) are known with some settings of the calibration plate.
+
+    Each combination is a list of angles in degrees (None: out), one exposure each, and has a map of the photon error
+    in the worse direction.
+    """
+    analysis = AnalysisVectors(calibration)
+    low_x, high_x, low_y, high_y = calibration.field
+    x, y = np.meshgrid(np.linspace(low_x, high_x, _PIXELS), np.linspace(low_y, high_y, _PIXELS))
+    figure = Figure(figsize=(2.6 * len(combinations) + 0.9, 2.9), layout="constrained")
+    axes = figure.subplots(1, len(combinations), sharey=True, squeeze=False)[0]
+    norm, shown = LogNorm(1.0, 100.0), None
+    for axis, plates in zip(axes, combinations, strict=True):
+        settings = [Setting("SDSS-r", plate) for plate in plates]
+        worst = plate_errors(analysis, settings, x.ravel(), y.ravel()).reshape(x.shape)
+        shown = axis.pcolormesh(x, y, np.clip(worst, 1.0, 100.0), norm=norm, cmap="magma_r", rasterized=True)
+        names = ["out" if plate is None else f"{plate:g}°" for plate in plates]
+        axis.set_title("plate " + " and ".join(names), fontsize=9)
+        axis.set_aspect("equal")
+        axis.set_xlabel("X (deg)", fontsize=8)
+        axis.tick_params(labelsize=7)
+    axes[0].set_ylabel("Y (deg)", fontsize=8)
+    assert shown is not None
+    figure.colorbar(shown, ax=axes, pad=0.02).set_label("error / ideal instrument", fontsize=8)
     return figure

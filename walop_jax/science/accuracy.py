@@ -7,6 +7,7 @@ error at a field point is the rms over the stars.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,6 +75,31 @@ def promised_errors(
         radial = np.einsum("c,pck->pk", stars[k] / np.hypot(*stars[k]), root)
         total += np.stack([*np.sum(root**2, axis=2).T, np.sum(radial**2, axis=1)], axis=1)
     return np.sqrt(total / n)
+
+
+def plate_errors(
+    analysis: AnalysisVectors,
+    settings: Sequence[Setting],
+    x: Float[np.ndarray, " p"],
+    y: Float[np.ndarray, " p"],
+) -> Float[np.ndarray, " p"]:
+    """Photon error of (q, u) in the worse direction for an unpolarised star seen once through each setting.
+
+    In units of the error of q that an ideal instrument would have with the same light: 1 for a single exposure of
+    an ideal instrument, large where the settings hold hardly any u.
+    """
+    r, n = len(settings), len(x)
+    rows = np.stack([analysis.coloured(s, x, y) for s in settings], axis=1)
+    counts = _ELECTRONS * rows[..., 0]
+    found = estimate(
+        rows.reshape(-1, 4, 3),
+        counts.reshape(-1, 4),
+        np.sqrt(counts).reshape(-1, 4),
+        np.repeat(np.arange(n), r),
+    )
+    worst = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(found.photon, nan=np.inf))[:, 1])
+    # q = (N0 − N1)/(N0 + N1) with half of the electrons in its two cameras: σ² = 2 / all electrons.
+    return worst / np.sqrt(2.0 / counts.sum(axis=(1, 2)))
 
 
 def determinant(vectors: Vectors) -> Float[np.ndarray, " p"]:

@@ -79,7 +79,8 @@ class Offsets:
         """Sizes in per cent, and the share of the variance of Δ that the weakest direction explains."""
 
         def size(values: Float[np.ndarray, "p 2"]) -> dict[str, float]:
-            rms, most = np.sqrt(np.mean(values**2, axis=0)), np.abs(values).max(axis=0)
+            rms = np.sqrt(np.mean(values**2, axis=0)).tolist()
+            most = np.abs(values).max(axis=0).tolist()
             return {
                 "rms_q": 100 * rms[0],
                 "rms_u": 100 * rms[1],

@@ -8,7 +8,7 @@ Bias        Noise across the direction of (q, u) only ever lengthens the vector:
             estimators of p₀ are offered, both with b = σ_t, which is σ where C = σ² 1:
 
   MAS       p − b² (1 − exp(−p²/b²)) / 2p: the modified asymptotic estimator of Plaszczynski et al. 2014,
-            MNRAS 439, 4048, eq. 37. Smooth, never negative, tends to p/2 at low signal.
+            MNRAS 439, 4048. Smooth, never negative, tends to p/2 at low signal.
   WK        √(p² − b²), and 0 where p < b: Wardle & Kronberg 1974, ApJ 194, 249.
 """
 
