@@ -34,6 +34,7 @@ from walop_jax.model.specification import effect_context
 
 SEPARABLE = 5.0  # σ between the truth and its nearest rival above which a name is asked for
 CONFOUNDED = 2.0  # below which a class is asked for
+PLAUSIBLE = 5.0  # prior widths that a hidden amplitude may have
 DRAWS = 3000
 
 
@@ -125,20 +126,26 @@ class Blind:
         """Nothing missing."""
         return Scene("null", (), 0.0, *self.noise())
 
-    def hidden(self, name: str, ratio: float, removed: tuple[str, ...] = (), kind: str = "named") -> Scene:
-        """A named effect at a random shape that can be seen at all, in a random direction."""
+    def hidden(
+        self, name: str, ratio: float, removed: tuple[str, ...] = (), kind: str = "named"
+    ) -> Scene | None:
+        """A named effect at a random shape and direction; None when no plausible amplitude reaches the ratio."""
         shapes = [p for p in self.probes if p.effect.name == name and p.name in self._testable]
-        probe = shapes[self.rng.integers(len(shapes))]
-        at, alive = self.places[probe.name], self.space.alive()[self.places[probe.name]]
-        gram = self.space.gram[at, at]
-        while True:
+        for _ in range(100):
+            probe = shapes[self.rng.integers(len(shapes))]
+            at, alive = self.places[probe.name], self.space.alive()[self.places[probe.name]]
+            gram = self.space.gram[at, at]
             step = self.rng.standard_normal(len(alive)) * self.space.widths[at] * alive
             step *= ratio / np.sqrt(step @ gram @ step)
             sides = [n in probe.effect.one_sided for m in probe.group for n in probe.effect.amplitudes()
                      for _ in range(np.size(getattr(m, n)))]  # fmt: skip
             step = np.where(sides, np.abs(step), step)
-            if np.isclose(step @ gram @ step, ratio**2):
+            if np.isclose(step @ gram @ step, ratio**2) and np.all(
+                np.abs(step) <= PLAUSIBLE * self.space.widths[at]
+            ):
                 break
+        else:
+            return None
         change = -self.space.gram[:, at] @ step
         rivals = [p for p in self.probes if p.effect.name not in (name, *removed)]
         distance = separations(self.space.subset([p.name for p in rivals]), *self._of(change, rivals, ratio))
@@ -153,9 +160,11 @@ class Blind:
 
     def pair(self, ratio: float) -> Scene:
         """Two effects, each with the signal-to-noise ratio that is asked for by itself."""
-        first, second = self.rng.choice(len(self.visible), 2, replace=False)
-        a = self.hidden(self.visible[first], ratio)
-        b = self.hidden(self.visible[second], ratio)
+        a = b = None
+        while a is None or b is None:
+            first, second = self.rng.choice(len(self.visible), 2, replace=False)
+            a = self.hidden(self.visible[first], ratio)
+            b = self.hidden(self.visible[second], ratio)
         z, rest = self.noise()
         signal = [
             -self._whitening.T @ self.space.gram[:, self.places[s.probe]] @ s.amplitudes for s in (a, b)
@@ -243,9 +252,9 @@ def study(
     """Draw scenes, judge them, then open the truths: the numbers of the acceptance list."""
     scenes = [blind.null() for _ in range(nulls)]
     for name in blind.visible:
-        for ratio in ratios:
-            scenes += [blind.hidden(name, ratio) for _ in range(each)]
-        scenes += [blind.hidden(name, ratio, (name,), "removed") for ratio in ratios[1:] for _ in range(each)]
+        drawn = [blind.hidden(name, ratio) for ratio in ratios for _ in range(each)]
+        drawn += [blind.hidden(name, ratio, (name,), "removed") for ratio in ratios[1:] for _ in range(each)]
+        scenes += [scene for scene in drawn if scene is not None]
     scenes += [blind.pair(10.0) for _ in range(each * len(blind.visible) // 2)]
     for shape in blind.outside:
         for ratio in (10.0, 30.0):

@@ -34,6 +34,7 @@ from walop_jax.model.specification import effect_context, full_values
 
 RATIOS = (10.0, 30.0, 6.0)
 NULL_EVERY = 8
+PLAUSIBLE = 5.0  # prior widths that a hidden amplitude may have
 SEED = 20261121
 
 
@@ -49,11 +50,18 @@ class Hiding:
         self.context = effect_context(self.problem.model.template, calset.exposures)
         every = list(probes(EFFECTS, self.context))
         look = Look(self.problem, self.fit, every, np.random.default_rng(0))
-        self.probes = [p for p in every if look.table[p.name].testable]
+        self.probes = [p for p in look.probes if look.table[p.name].testable]
         self.names = sorted({p.effect.name for p in self.probes})
 
-    def draw(self, name: str, ratio: float, rng: np.random.Generator) -> Effect:
-        """The effect at a random shape."""
+    def draw(self, name: str, ratio: float, rng: np.random.Generator) -> Effect | None:
+        """The effect at a random shape; None when no plausible amplitude reaches the ratio in a few tries."""
+        for _ in range(20):
+            drawn = self._try(name, ratio, rng)
+            if drawn is not None:
+                return drawn
+        return None
+
+    def _try(self, name: str, ratio: float, rng: np.random.Generator) -> Effect | None:
         shapes = [p for p in self.probes if p.effect.name == name]
         probe = shapes[rng.integers(len(shapes))]
         group = (
@@ -67,8 +75,10 @@ class Hiding:
         step = rng.standard_normal(len(probe.widths)) * probe.widths
         if probe.effect.one_sided:
             step = np.abs(step)
-        length = np.linalg.norm(self.design.projector(candidate.columns @ step))
-        return probe.effect.combine(probe.group, step * ratio / length).standard_form()
+        step *= ratio / np.linalg.norm(self.design.projector(candidate.columns @ step))
+        if np.max(np.abs(step) / probe.widths) > PLAUSIBLE:
+            return None
+        return probe.effect.combine(probe.group, step).standard_form()
 
 
 def _jittered(effect: Effect, rng: np.random.Generator) -> Effect:
@@ -87,7 +97,10 @@ def scene(hiding: Hiding, number: int) -> dict[str, Any]:
     turn = number - number // NULL_EVERY
     name = hiding.names[turn % len(hiding.names)]
     ratio = RATIOS[(turn // len(hiding.names)) % len(RATIOS)]
-    hidden = [] if null else [hiding.draw(name, ratio, rng)]
+    effect = None if null else hiding.draw(name, ratio, rng)
+    if effect is None and not null:
+        return {"scene": number, "truth": name, "ratio": ratio, "verdict": "out of reach"}
+    hidden = [] if effect is None else [effect]
     calset, _ = simulate(hiding.plan, seed=int(rng.integers(2**31)), effects=hidden)
     found = diagnose(calset, seed=number)
     entry = {"scene": number, **_said(found)}
@@ -119,6 +132,8 @@ def report(entries: list[dict[str, Any]]) -> dict[str, Any]:
     rates: dict[str, list[bool]] = collections.defaultdict(list)
     pulls, misses = [], []
     for e in entries:
+        if e["verdict"] == "out of reach":
+            continue
         if e["truth"] is None:
             rates["false alarm"].append(e["verdict"] != "consistent")
             continue

@@ -25,7 +25,9 @@ from walop_jax.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from walop_jax.diagnose.workflow import Diagnosis
+    from collections.abc import Iterator
+
+    from walop_jax.diagnose.findings import Diagnosis, Step
 
 RunFolder = Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the results.")]
 
@@ -90,38 +92,44 @@ def diagnose(
 
 def _show(found: Diagnosis, output: Path) -> None:
     from rich.console import Console
-    from rich.table import Table
 
-    console = Console(highlight=False)
+    console = Console(highlight=False, soft_wrap=True)
     before, after = found.before, found.after
-    if found.steps:
-        table = Table(
-            "effect", "parameters", "χ² before", "after", "held out before", "after", "cannot be told from"
-        )
-        for step in found.steps:
-            values = "\n".join(
-                f"{name} = {value:.4g} ± {sigma:.2g} {unit}"
-                for name, (value, sigma, unit) in step.parameters.items()
-            )
-            table.add_row(
-                step.effect, values, f"{step.chi2_before:.1f}", f"{step.chi2_after:.1f}",
-                f"{step.heldout_before.mean:.4f}", f"{step.heldout_after.mean:.4f}", ", ".join(step.equivalent) or "–",
-            )  # fmt: skip
-        console.print(table)
-        for step in found.steps:
-            places = "; ".join(f"{key.replace('_', ' ')}: {value}" for key, value in step.where.items())
-            console.print(f"{step.effect} sits in  {places}", soft_wrap=True)
-            if step.separated_by:
-                console.print(f"{step.effect} would be separated by  {step.separated_by}", soft_wrap=True)
-    console.print(
-        f"χ²/dof {before.chi2 / max(before.dof, 1):.4f} → {after.chi2 / max(after.dof, 1):.4f}; "
-        f"significance of the disagreement before: p = {found.p_value:.2g}",
-        soft_wrap=True,
-    )
+    for step in found.steps:
+        console.print(f"{step.effect}", style="bold", markup=False)
+        for line in _about(step):
+            console.print(f"  {line}", markup=False)
     if found.unexplained is not None:
-        console.print(f"unexplained: {found.unexplained.description}", markup=False, soft_wrap=True)
+        console.print("without a name", style="bold")
+        console.print(f"  {found.unexplained.description}", markup=False)
+        if found.unexplained.term:
+            console.print(
+                f"  added as a free-form term ({', '.join(found.unexplained.term)}): "
+                f"χ² {found.unexplained.chi2_before:.1f} → {found.unexplained.chi2_after:.1f}",
+                markup=False,
+            )
     if found.untestable:
-        console.print(f"cannot be tested with these data: {', '.join(found.untestable)}", soft_wrap=True)
+        console.print(f"cannot be tested with these data: {', '.join(found.untestable)}")
     console.print(
-        f"verdict: {found.verdict}   ({found.seconds:.0f} s)   {output}", markup=False, soft_wrap=True
+        f"χ²/dof {before.chi2 / max(before.dof, 1):.4f} → {after.chi2 / max(after.dof, 1):.4f}; significance of the "
+        f"disagreement p = {found.p_value:.2g} → {found.remaining_p:.2g}"
     )
+    if found.caution:
+        warn(found.caution)
+    console.print(f"verdict: {found.verdict}   ({found.seconds:.0f} s)   {output}", markup=False)
+
+
+def _about(step: Step) -> Iterator[str]:
+    if step.parameters:
+        values = (f"{n} = {v:.4g} ± {s:.2g} {unit}".rstrip() for n, (v, s, unit) in step.parameters.items())
+        yield ", ".join(values)
+    yield (
+        f"χ² {step.chi2_before:.1f} → {step.chi2_after:.1f}; held out ({step.heldout_before.scheme}) "
+        f"{step.heldout_before.mean:.4f} → {step.heldout_after.mean:.4f}; p = {step.p_value:.1g}"
+    )
+    size = f"{100 * step.change_of_qu:.2g} %"
+    yield f"changes calibrated q and u by up to {size}{', which is negligible' if step.negligible else ''}"
+    yield "; ".join(f"{key.replace('_', ' ')}: {value}" for key, value in step.where.items())
+    if step.equivalent:
+        yield f"these data cannot tell it from {', '.join(step.equivalent)}"
+        yield f"to tell them apart: {step.separated_by}"

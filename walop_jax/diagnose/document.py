@@ -80,5 +80,6 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         "cannot_be_tested": list(diagnosis.untestable),
         "chi2_per_dof_before": diagnosis.before.chi2 / max(diagnosis.before.dof, 1),
         "chi2_per_dof_after": diagnosis.after.chi2 / max(diagnosis.after.dof, 1),
+        "caution": diagnosis.caution,
         "seconds": diagnosis.seconds,
     }

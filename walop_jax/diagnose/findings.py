@@ -18,6 +18,7 @@ Cube = Float[np.ndarray, "p e 4"]
 NEGLIGIBLE = (
     1e-4  # change of calibrated q and u (0.01 %) that does not matter for an instrument good to 0.1 %
 )
+MANY = 2  # names above which a single effect that nobody thought of is as likely
 LARGEST_ROBUST_RATIO = (
     1.5  # of errors that allow for common disturbances of an exposure, to errors that do not
 )
@@ -119,3 +120,20 @@ class Diagnosis:
     after: FitResult
     problem: Problem
     seconds: float
+
+    @property
+    def caution(self) -> str:
+        """What to bear in mind with these findings; empty when there is nothing."""
+        parts = []
+        if len(self.steps) > MANY:
+            parts.append(
+                f"{len(self.steps)} names were needed: something that is not in the catalogue can look like several "
+                "that are"
+            )
+        weak = [s.effect for s in self.steps if s.robust_ratio > LARGEST_ROBUST_RATIO]
+        if weak:
+            parts.append(
+                f"errors of {', '.join(weak)} are too small by more than a factor {LARGEST_ROBUST_RATIO} if single "
+                "exposures have disturbances of their own"
+            )
+        return "; ".join(parts)
