@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from walop_jax.data.tables import read_input_table
 from walop_jax.fit.predict import Settings
 from walop_jax.likelihood.simulate import simulate
 from walop_jax.model.effects import effect_by_name
-from walop_jax.model.specification import with_effects
+from walop_jax.model.instrument import nominal_instrument
+from walop_jax.model.specification import effect_context, make_model, with_effects
 from walop_jax.science.apply import apply, linearised, not_carried_over
 from walop_jax.science.vectors import AnalysisVectors, Setting
 
@@ -285,9 +287,6 @@ def test_detectors_and_rotator_of_the_model(calset, calibration, tmp_path):
 
 
 def _context(calset):
-    from walop_jax.model.instrument import nominal_instrument
-    from walop_jax.model.specification import effect_context
-
     return effect_context(nominal_instrument(calset.instrument), calset.exposures)
 
 
@@ -371,3 +370,37 @@ def test_simulated_observation_of_standards(calset, calibration, tmp_path):
     truth = np.stack([np.asarray(run.truth.standard.q), np.asarray(run.truth.standard.u)], axis=1)[source]
     chi2 = np.einsum("si,sij,sj->s", found.qu - truth, np.linalg.inv(found.covariance), found.qu - truth)
     assert chi2.mean() == pytest.approx(2.0, abs=4 * 2 / np.sqrt(len(chi2)))
+
+
+@pytest.mark.parametrize(("instrument", "edge"), [("WALOP-NORTH", 0.28), ("WALOP-LAB", 20.0)])
+def test_every_instrument_can_be_tabulated(calibration, instrument, edge):
+    """The check of the series at points that are no nodes is passed, or it would raise."""
+    model = make_model(instrument, nominal_instrument(instrument, throughput_degree=0))
+    other = dataclasses.replace(
+        calibration,
+        model=model,
+        values=model.start,
+        covariance=np.zeros((len(model.start),) * 2),
+        field=(-edge, edge, -edge, edge),
+    )
+    vectors = AnalysisVectors(other)
+    assert vectors.half_width == pytest.approx(min(1.25 * edge, 45.0))
+    series = vectors._vector_series(Setting("SDSS-r"))
+    assert series.half_width == vectors.half_width
+
+
+@pytest.mark.benchmark
+def test_a_hundred_thousand_rows_in_seconds(calibration, vectors, tmp_path):
+    """A million stars in a minute on one core are 17 000 a second; checking every shape, as tests do, takes its share."""
+    table, _ = stars(vectors, 50_000, plate=(None, 22.5), teff=5000.0, rotator=(0.0, 0.0))
+    catalogue = read(table, tmp_path)
+    small = read(table[:2], tmp_path)
+    apply(calibration, small)  # compile
+    began = time.process_time()
+    apply(calibration, small)
+    tables = time.process_time() - began
+    began = time.process_time()
+    apply(calibration, catalogue)
+    seconds = time.process_time() - began - tables
+    print(f"{len(catalogue) / seconds:.0f} rows/s, tables {tables:.1f} s")
+    assert len(catalogue) / seconds > 15_000

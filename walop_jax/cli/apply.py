@@ -54,9 +54,9 @@ def apply(
     calibration plate, and all hold the same result. With ROTATOR the results are on the sky.
 
     Errors hold photon noise and calibration; Q_COLOUR and U_COLOUR say what ignoring TEFF does. FLAG: 16 a
-    direction of (q, u) is hardly measured, 32 beyond the calibrated field, 64 filter, temperature or colour that
-    the calibration has not seen, 128 a camera is missing, 256 flagged or saturated counts, 16384 no result; bits
-    of the calibration itself are added to all rows.
+    direction of (q, u) is hardly measured, 32 beyond the calibrated field (no result a quarter beyond), 64
+    filter, temperature or colour that the calibration has not seen, 128 a camera is missing, 256 flagged or
+    saturated counts, 16384 no result; bits of the calibration itself are added to all rows.
     """
     began = time.perf_counter()
     del seed  # nothing is random here

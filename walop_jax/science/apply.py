@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from walop_jax.data.catalogue import Catalogue
 from walop_jax.data.errors import DataError
@@ -110,7 +110,7 @@ def _block(
     points, sigma = catalogue.points, catalogue.sigma[rows]
     _, star = np.unique(catalogue.star[rows], return_inverse=True)
     first = np.flatnonzero(np.diff(star, prepend=-1))
-    outside = points.outside[rows]
+    outside = _outside(vectors, catalogue, rows)
     x, y = (np.where(outside, 0.0, values[rows]) for values in (points.x, points.y))
     teff, sky = points.teff[rows], np.isfinite(catalogue.rotator[rows])
     turn = 2.0 * np.where(sky, np.deg2rad(catalogue.rotator[rows]) + offset, 0.0)
@@ -145,6 +145,15 @@ def _block(
         rows=np.diff(first, append=len(rows)),
         flag=_flags(vectors, catalogue, rows, used, first, found.qu, found.condition),
     )
+
+
+def _outside(
+    vectors: AnalysisVectors, catalogue: Catalogue, rows: Int[np.ndarray, " r"]
+) -> Bool[np.ndarray, " r"]:
+    """Rows beyond the field of the instrument, or too far beyond that of the calibration to mean anything."""
+    points = catalogue.points
+    far = np.maximum(np.abs(points.x[rows]), np.abs(points.y[rows])) > vectors.half_width
+    return points.outside[rows] | far
 
 
 def _members(setting_of: Int[np.ndarray, " r"]) -> Iterator[tuple[int, Int[np.ndarray, " w"]]]:
@@ -225,7 +234,7 @@ def _flags(
     settings = Settings(*(getattr(points, f.name)[rows] for f in dataclasses.fields(Settings)))
     square = np.tile([0.0, 1.0, 0.0, 0.0, 0.0, 1.0], (len(rows), 1))  # 16 is decided below, for all rows
     bits = vectors.calibration.flags(points.x[rows], points.y[rows], settings, square)
-    bits[points.outside[rows]] |= 32
+    bits[_outside(vectors, catalogue, rows)] |= 32
     bits[settings.teff < COOLEST] |= 64
     bits[~np.isfinite(counts * catalogue.sigma[rows]).all(axis=1)] |= 128
     bits[catalogue.spoilt[rows]] |= 256

@@ -33,9 +33,11 @@ from walop_jax.science.interpolation import FieldSeries, colour_nodes, colour_we
 
 COLOURS = 12  # colour temperatures of the vectors
 DERIVATIVE_COLOURS = 3
-FIELD_TERMS = (20, 28, 40, 56)  # tried in turn
-DERIVATIVE_TERMS = 14
+FIELD_TERMS = (20, 28, 40, 56, 80)  # tried in turn
+DERIVATIVE_TERMS = (14, 20, 28, 40)
 TOLERANCE = 1e-7  # of a vector's largest element
+DERIVATIVE_TOLERANCE = 1e-3  # of a derivative's largest value: errors of errors
+REACH = 1.25  # of the calibrated field: beyond, no polynomial of the throughput means anything
 _CHUNK = 100  # field points that are computed together
 _CHECKS = 24  # field points at which a series is checked
 
@@ -111,13 +113,14 @@ class AnalysisVectors:
     """The analysis vectors of a calibration, ready to be asked for at many field points.
 
     `parameters` are the positions, in the calibration's list, of the parameters that the vectors depend on;
-    `root` is a square root of their covariance, C = root rootᵀ.
+    `root` is a square root of their covariance, C = root rootᵀ. Positions reach to ±`half_width` (deg).
     """
 
     def __init__(self, calibration: Calibration) -> None:
         self.calibration = calibration
         self.instrument = calibration.model.instrument(calibration.values)
-        self.half_width = FIELD_LIMITS[calibration.model.name]
+        reach = REACH * float(np.abs(calibration.field).max())
+        self.half_width = min(FIELD_LIMITS[calibration.model.name], reach)
         self._tables: dict[Setting, _Table] = {}
         series = np.asarray(series_indices(self.instrument), int)
         uncertain = np.diag(calibration.covariance) > 0
@@ -219,19 +222,36 @@ class AnalysisVectors:
             error = float(np.abs(np.einsum("tc,pcks->ptks", weights, found) - truth).max() / truth.max())
             if error < TOLERANCE:
                 return series
-        raise RuntimeError(
-            f"the optics vary too fast over the field to be interpolated (error {error:.1e}, "
-            f"{TOLERANCE:g} is needed); an effect of the model has a very small scale"
-        )
+        raise RuntimeError(_too_fast(error, TOLERANCE))
 
     def _derivative_series(self, setting: Setting) -> FieldSeries:
         plan, bands = self._plan(setting, [np.nan, *colour_nodes(DERIVATIVE_COLOURS).tolist()])
-        x, y = field_nodes(DERIVATIVE_TERMS, self.half_width)
-        values = _in_chunks(lambda a, b: _derivatives_at(self.instrument, plan, a, b), x, y)
         n = len(self.calibration.values)
-        wanted = values[:, [*self._plain.tolist(), *range(n, n + 4)]][:, :, bands]
-        ordered = np.moveaxis(wanted, 1, -1)  # point, colour, camera, Stokes, parameter
-        return FieldSeries.through(self.half_width, ordered.reshape(len(x), -1))
+        wanted = [*self._plain.tolist(), *range(n, n + 4)]
+
+        def exact(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p f"]:
+            """Derivatives in the order point, (colour, camera, Stokes, parameter)."""
+            values = _in_chunks(lambda a, b: _derivatives_at(self.instrument, plan, a, b), x, y)
+            return np.moveaxis(values[:, wanted][:, :, bands], 1, -1).reshape(len(x), -1)
+
+        x, y = np.random.default_rng(2).uniform(-self.half_width, self.half_width, (2, _CHECKS))
+        truth = exact(x, y).reshape(-1, len(wanted))
+        size = np.abs(truth).max(axis=0)
+        error = np.inf
+        for count in DERIVATIVE_TERMS:
+            series = FieldSeries.through(self.half_width, exact(*field_nodes(count, self.half_width)))
+            off = np.abs(series(x, y).reshape(truth.shape) - truth).max(axis=0)
+            error = float(np.max(off / np.where(size > 0, size, 1.0)))
+            if error < DERIVATIVE_TOLERANCE:
+                return series
+        raise RuntimeError(_too_fast(error, DERIVATIVE_TOLERANCE))
+
+
+def _too_fast(error: float, tolerance: float) -> str:
+    return (
+        f"the optics vary too fast over the field to be interpolated (error {error:.1e}, {tolerance:g} is needed); an "
+        "effect of the model has a very small scale"
+    )
 
 
 def _in_chunks(function, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> np.ndarray:  # type: ignore[no-untyped-def]
