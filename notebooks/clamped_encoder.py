@@ -1,11 +1,10 @@
-"""Error of the polariser's encoder, twice per turn.
+"""Error of the polariser's encoder, three times per turn.
 
-Equation    θ = CLP_ANGLE + amplitude · sin(2 CLP_ANGLE − phase)
+Equation    θ = CLP_ANGLE + amplitude · sin(3 CLP_ANGLE − phase)
 Symbols     θ transmission axis in the ICS; amplitude [deg]; phase [rad]
-Source      an oval code disc, or one that is clamped too hard: the mean of two opposite reading heads cancels the
-            error once per turn, not the one twice per turn
+Source      a code disc that its three screws bend; two reading heads on opposite sides see the same error
 Neutral     amplitude = 0, whatever the phase
-Revealed by a constant and a side band at four times the polariser angle
+Revealed by side bands at one and five times the polariser angle
 """
 
 from __future__ import annotations
@@ -22,21 +21,23 @@ from walop_jax.model.parameters import param
 SOURCE = "notebook your_own_effect"
 
 
-class OvalEncoder(Effect):
-    """Transmission axis = CLP_ANGLE + amplitude · sin(2 CLP_ANGLE − phase)."""
+class ClampedEncoder(Effect):
+    """Transmission axis = CLP_ANGLE + amplitude · sin(3 CLP_ANGLE − phase)."""
 
     amplitude: float = param(unit="deg", about="largest error", source=SOURCE, width=0.05, default=0.0)
     phase: float = param(unit="rad", about="phase", source=SOURCE, scale=0.3, loose=10.0, default=0.0)
 
-    name: ClassVar[str] = "oval_encoder"
+    name: ClassVar[str] = "clamped_encoder"
     shape: ClassVar[tuple[str, ...]] = ("phase",)
     starts: ClassVar = (({"phase": 0.0}, {"phase": 0.5 * np.pi}),)
-    revealed_by: ClassVar[str] = "polariser exposures at many angles"
-    separated_by: ClassVar[str] = "the polariser turned in its mount: an error of the encoder stays with the encoder"
+    revealed_by: ClassVar[str] = "polariser exposures at many angles over a full turn"
+    separated_by: ClassVar[str] = (
+        "the polariser turned in its mount: an error of the encoder stays with the encoder"
+    )
 
     def polariser_angle(self, angle, exposures):
         """Add the error of the encoder, a function of its reading."""
-        return angle + jnp.deg2rad(self.amplitude) * jnp.sin(2 * exposures.clp_angle - self.phase)
+        return angle + jnp.deg2rad(self.amplitude) * jnp.sin(3 * exposures.clp_angle - self.phase)
 
     @classmethod
     def combine(cls, group, amplitudes):

@@ -197,13 +197,22 @@ class _Diagnosing:
         found = Unexplained(look.table.p_global, text, patterns[:3])
         blocks = tuple(dict.fromkeys(b for name, _ in significant if (b := block_of(name)) is not None))
         there = any(effect.name == FreeForm.name for effect in self.fit.model.template.effects)
-        return self._with_free_form(found, blocks) if blocks and not there else found
+        return self._with_free_form(look, found, blocks) if blocks and not there else found
 
-    def _with_free_form(self, found: Unexplained, blocks: tuple[str, ...]) -> Unexplained:
-        """Add a free-form term for patterns without a name, so that the calibration improves all the same."""
+    def _with_free_form(self, look: Look, found: Unexplained, blocks: tuple[str, ...]) -> Unexplained:
+        """Add a free-form term for patterns without a name, so that the calibration improves all the same.
+
+        It need not be probable, only useful: it stays when it predicts parts of the field that it has not seen.
+        """
         term = FreeForm.of(self.context, blocks=blocks)
         trial = naming.try_effect(self.calset, self.fit, term, self.context)
-        if not trial.fit.converged or trial.log_bayes <= 0:
+        if not trial.fit.converged:
+            return found
+        without, with_term = (
+            held_out(design, "field blocks").mean
+            for design in (look.design, Design.of(trial.problem, trial.fit))
+        )
+        if with_term >= without:
             return found
         before = self.fit
         self.problem, self.fit = trial.problem, trial.fit
