@@ -391,7 +391,7 @@ def test_every_instrument_can_be_tabulated(calibration, instrument, edge):
 
 @pytest.mark.benchmark
 def test_a_hundred_thousand_rows_in_seconds(calibration, vectors, tmp_path):
-    """A million stars in a minute on one core are 17 000 a second; checking every shape, as tests do, takes its share."""
+    """A million stars in a minute on one core are 17 000 a second; to check every shape costs some of that."""
     table, _ = stars(vectors, 50_000, plate=(None, 22.5), teff=5000.0, rotator=(0.0, 0.0))
     catalogue = read(table, tmp_path)
     small = read(table[:2], tmp_path)

@@ -222,30 +222,43 @@ def test_paper_and_joint_model_on_set_a(shared_data, fitted):
     assert rms["grid", "paper"][0] > 3 * rms["grid", "joint"][0]
 
 
-PLATES = {"0 and 45": (0.0, 45.0), "out and 22.5": (None, 22.5), "0 and 22.5": (0.0, 22.5)}
+# Settings of the calibration plate (None: out) and position angles of the rotator of two exposures.
+PAIRS = {
+    "0 and 45": ((0.0, 0.0), (45.0, 0.0)),
+    "out and 22.5": ((None, 0.0), (22.5, 0.0)),
+    "0 and 22.5": ((0.0, 0.0), (22.5, 0.0)),
+    "rotator": ((None, 0.0), (None, 45.0)),
+}
 
 
-def test_plates_combined_on_set_b(shared_data, fitted):
-    """Which settings of the calibration plate bring u back in the zone without it.
+def turned(vectors, rotator):
+    """Vectors for (q, u) on the sky, written out: q_ics = q cos 2R + u sin 2R, u_ics = u cos 2R − q sin 2R."""
+    c, s = np.cos(2 * np.deg2rad(rotator)), np.sin(2 * np.deg2rad(rotator))
+    return vectors @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
+
+
+def test_two_exposures_combined_on_set_b(shared_data, fitted):
+    """Which pairs of exposures bring u back in the zone without it.
 
     A half-wave plate at 0° turns u into −u, at 45° q into −q; neither lets u into a camera pair that holds only q.
-    At 22.5° it exchanges the two.
+    At 22.5° it exchanges the two, and so does an instrument turned by 45°.
     """
     _, calibration = fitted(shared_data / "walop_south_b.fits")
     truth = TrueInstrument(shared_data, "b")
     x, y, stars = truth.table["X"], truth.table["Y"], paper.sample_stars(20)
     analysis = AnalysisVectors(calibration)
     errors = {}
-    for name, plates in PLATES.items():
+    for name, pair_of in PAIRS.items():
         teff = np.full(len(x), 5772.0)
-        fitted_vectors = [analysis.coloured(Setting("SDSS-r", plate), x, y, teff) for plate in plates]
-        counts = np.stack([1e6 * paper.transmitted(truth.vectors(x, y, p), stars) for p in plates], axis=2)
+        ours = [turned(analysis.coloured(Setting("SDSS-r", plate), x, y, teff), r) for plate, r in pair_of]
+        theirs = [turned(truth.vectors(x, y, plate), r) for plate, r in pair_of]
+        counts = np.stack([1e6 * paper.transmitted(v, stars) for v in theirs], axis=2)
         n, m, r, _ = counts.shape
-        rows = np.broadcast_to(np.stack(fitted_vectors, 1)[:, None], (n, m, r, 4, 3)).reshape(-1, 4, 3)
+        rows = np.broadcast_to(np.stack(ours, 1)[:, None], (n, m, r, 4, 3)).reshape(-1, 4, 3)
         flat = counts.reshape(-1, 4)
         found = estimate(rows, flat, np.sqrt(flat), np.repeat(np.arange(n * m), r))
         errors[name] = accuracy.star_errors(found.qu.reshape(n, m, 2), stars)
-    for name in ("out and 22.5", "0 and 22.5"):
+    for name in ("out and 22.5", "0 and 22.5", "rotator"):
         assert errors[name].max() < 1e-4  # 0.01 % at every point of the field
     # 0° and 45° keep the blind zone, as the true matrices say as well.
     assert errors["0 and 45"].max() > 2e-4
