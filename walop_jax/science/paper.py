@@ -108,10 +108,11 @@ def polariser_exposures(calset: CalibrationSet, filter_name: str = DEFAULT_FILTE
     """
     e = calset.exposures
     rows = np.flatnonzero(e.clp_in & ~e.chwp_in & (e.filter == filter_name))
-    if len(np.unique(np.mod(e.clp_angle[rows], 180.0))) < len(TERMS):
+    angles = len(np.unique(np.round(np.mod(e.clp_angle[rows], 180.0), 6)))
+    if angles < len(TERMS):
         raise DataError(
-            f"EXPOSURES: {len(rows)} polariser exposures in {filter_name} with the calibration plate out; the "
-            f"polynomial of Paper II needs {len(TERMS)} different angles"
+            f"EXPOSURES: {angles} polariser angles (modulo 180°) in {filter_name} with the calibration plate out; "
+            f"the polynomial of Paper II needs {len(TERMS)}: observe more angles, or name another --filter"
         )
     return rows
 
