@@ -144,7 +144,7 @@ def test_perfect_calibrations_make_no_error():
 
 def test_too_few_angles_are_refused():
     plan = ObservingPlan(grid=3, polariser_angles=polariser_turn(4), moon_patches=0, standards=0)
-    with pytest.raises(DataError, match="4 polariser angles .* needs 5"):
+    with pytest.raises(DataError, match=r"4 polariser angles .* needs 5"):
         paper.fit_paper(simulate(plan).calset)
 
 
