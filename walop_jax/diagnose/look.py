@@ -27,6 +27,7 @@ Matrix = Float[np.ndarray, "_ _"]
 ALARM = 0.0027  # three standard deviations
 COMMON_MODE = 0.05  # rms (σ of one intensity) of disturbances that one camera in one exposure may have
 PROBABILITY = 0.95
+ALIKE = 0.01  # relative change of the counts up to which columns are kept
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,21 +42,32 @@ class _Own:
 class Look:
     """The scores of everything against one fit.
 
-    `ranked` are the effects in order of linear evidence, `patterns` the scores of the free-form strata; `space` and
-    `columns` are those of all candidates, effects first, behind the projection.
+    `named` are the columns of the effects ahead of any projection, `space` and `columns` those of all candidates,
+    effects first, behind it. `ranked` are the effects in order of linear evidence, `patterns` the scores of the
+    free-form strata.
     """
 
     def __init__(
-        self, problem: Problem, result: FitResult, wanted: Sequence[Probe], rng: np.random.Generator
+        self,
+        problem: Problem,
+        result: FitResult,
+        wanted: Sequence[Probe],
+        rng: np.random.Generator,
+        earlier: Look | None = None,
     ) -> None:
+        """`earlier` is a look at a smaller model, whose columns serve again where the light has hardly changed."""
         self.problem, self.result = problem, result
         active = [effect.name for effect in problem.model.template.effects]
         self.design = Design.of(problem, result)
         inactive = [probe for probe in wanted if probe.effect.name not in active]
-        named = effect_candidates(problem.calset, problem.model, result.values, inactive)
-        self.probes = [probe for probe in inactive if probe.name in named]
+        self.named = (
+            effect_candidates(problem.calset, problem.model, result.values, inactive)
+            if earlier is None or not self._is_like(earlier)
+            else earlier.named
+        )
+        self.probes = [probe for probe in inactive if probe.name in self.named]
         free = list(strata(self.design.measured))
-        candidates = self.design.padded([*named.values(), *free])
+        candidates = self.design.padded([*(self.named[probe.name] for probe in self.probes), *free])
         self._own = {}
         for name in active:
             rest, basis = self.design.without(name)
@@ -69,6 +81,11 @@ class Look:
         self.patterns = [self.table[c.name] for c in free]
         # Where the base is excluded, a name competes with patterns that have none, not with the base.
         self.least_evidence = min(0.0, max(s.log_bayes for s in self.patterns if s.testable))
+
+    def _is_like(self, earlier: Look) -> bool:
+        """Whether the expected counts differ so little that derivatives with respect to anything else do as well."""
+        ours, theirs = self.design.measured.model, earlier.design.measured.model
+        return bool(np.linalg.norm(ours - theirs) < ALIKE * np.linalg.norm(theirs))
 
     def _common_mode(self) -> Vector:
         """Prior widths of the gains of single exposures that amount to `COMMON_MODE` per intensity."""

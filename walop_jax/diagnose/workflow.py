@@ -86,13 +86,13 @@ class _Diagnosing:
             if added is None:
                 break
             self.tell(f"added {added}; scoring what is left")
-            look = self._look()
+            look = self._look(look)
         unexplained = None
         if look.alarm or not self.fit.explains_data:
             unexplained = self._unexplained(look)
             self.tell("something without a name is left")
         if self._drop_what_is_not_needed() or (unexplained is not None and unexplained.term):
-            look = self._look()
+            look = self._look(look)
         steps = tuple(self._finished(step, look) for step in self.steps)
         verdict: Verdict = "unexplained" if unexplained else "effect_found" if steps else "consistent"
         return Diagnosis(
@@ -110,8 +110,8 @@ class _Diagnosing:
             seconds=time.perf_counter() - began,
         )
 
-    def _look(self) -> Look:
-        return Look(self.problem, self.fit, self.wanted, self.rng)
+    def _look(self, earlier: Look | None = None) -> Look:
+        return Look(self.problem, self.fit, self.wanted, self.rng, earlier)
 
     # ------------------------------------------------------------------------------------------------ a name
 
@@ -140,9 +140,8 @@ class _Diagnosing:
             if step.confirmed:
                 self.steps.append(step)
                 self.problem, self.fit = trial.problem, trial.fit
-                if (
-                    self.fit.noise_scale > 1.0
-                ):  # the errors were scaled to fit at all: perhaps no longer needed
+                if self.fit.noise_scale > 1.0:
+                    # The errors were scaled to fit at all, which may no longer be needed.
                     self.fit = fit(self.problem, start=self.fit.values)
                 return step.effect
         return None
@@ -162,7 +161,7 @@ class _Diagnosing:
             effect=name,
             parameters={},
             score=score.statistic if score else look.result.chi2 - trial.fit.chi2,
-            p_value=look.table.corrected(score) if score else 0.0,
+            p_value=look.table.corrected(score) if score else look.table.p_global,
             log_bayes=trial.log_bayes,
             chi2_before=look.result.chi2,
             chi2_after=trial.fit.chi2,
