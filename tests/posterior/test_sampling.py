@@ -16,7 +16,7 @@ from walop_jax.fit.calibration import Calibration
 from walop_jax.fit.predict import Settings, matrices
 from walop_jax.posterior import Options, PosteriorSample, sample, sampling
 from walop_jax.posterior.output import inference_data, intervals, read_draws, report, write_posterior
-from walop_jax.posterior.propagate import matrix_draws, with_draws
+from walop_jax.posterior.propagate import matrix_draws, with_draws, with_moments
 
 from .conftest import Scene
 
@@ -155,6 +155,11 @@ def test_matrix_by_draws_agrees_with_the_covariance(
         Calibration.from_fit(scene.result, scene.world.problem), tmp_path / "posterior.nc", 50
     )
     assert calibration.matrix(x, y)[1].shape == (3, 6, 6)
+    moments = with_moments(Calibration.from_fit(scene.result, scene.world.problem), tmp_path / "posterior.nc")
+    flat = posterior.draws.reshape(-1, len(posterior.names))
+    np.testing.assert_allclose(moments.values, flat.mean(axis=0), rtol=1e-12)
+    away = flat - flat.mean(axis=0)
+    np.testing.assert_allclose(moments.covariance, away.T @ away / (len(flat) - 1), rtol=1e-9, atol=1e-18)
 
 
 def test_options_that_make_no_sense() -> None:

@@ -11,6 +11,7 @@ import typer
 from walop_jax.cli.common import (
     JsonOption,
     OverwriteOption,
+    PosteriorOption,
     QuietOption,
     SeedOption,
     named,
@@ -42,6 +43,7 @@ def apply(
     output: OutputOption,
     debias: DebiasOption = "MAS",
     saturation: SaturationOption = None,
+    posterior: PosteriorOption = None,
     overwrite: OverwriteOption = False,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -89,6 +91,10 @@ def apply(
         tell("tabulating the analysis vectors")
         with named(path):
             calibration = Calibration.from_product(held)
+        if posterior is not None:
+            from walop_jax.posterior.propagate import with_moments
+
+            calibration = with_moments(calibration, posterior)
         with named(catalogue):
             stars = stokes(calibration, rows, lambda done, all_: tell(f"{done} of {all_} rows"))
         tell("writing")

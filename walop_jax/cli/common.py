@@ -36,6 +36,14 @@ class CommandError(Exception):
     """A command failed for a reason that its one line of message states."""
 
 
+PosteriorOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--posterior", metavar="posterior.nc", help="Use draws of walop-jax sample, not the covariance."
+    ),
+]
+
+
 def guarded(command: Callable[..., None]) -> Callable[..., None]:
     """The command with every error turned into one line on stderr and exit code 1.
 

@@ -10,6 +10,7 @@ import typer
 from walop_jax.cli.common import (
     JsonOption,
     OverwriteOption,
+    PosteriorOption,
     QuietOption,
     SeedOption,
     named,
@@ -28,12 +29,6 @@ PointsOption = Annotated[
 ]
 OutputOption = Annotated[
     Path, typer.Option("--output", "-o", metavar="OUT", help="Table to write (.fits, .csv, .ecsv).")
-]
-PosteriorOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--posterior", metavar="posterior.nc", help="Use draws of walop-jax sample, not the covariance."
-    ),
 ]
 
 

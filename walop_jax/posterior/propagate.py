@@ -76,3 +76,12 @@ def with_draws(
     chosen = np.random.default_rng(seed).permutation(len(draws))[:count]
     known = {f.name: getattr(calibration, f.name) for f in dataclasses.fields(Calibration)}
     return DrawnCalibration(**known, draws=draws[chosen])
+
+
+def with_moments(calibration: Calibration, path: str | os.PathLike[str]) -> Calibration:
+    """The calibration with mean and covariance of all draws of a `posterior.nc` in place of the fit's.
+
+    For what is propagated linearly anyway, star by star. `DataError` as in `with_draws`.
+    """
+    draws = read_draws(path, calibration.model.names)
+    return dataclasses.replace(calibration, values=draws.mean(axis=0), covariance=np.cov(draws, rowvar=False))
