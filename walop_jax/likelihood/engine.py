@@ -3,7 +3,7 @@
 Three layers, each with its own small Jacobian:
 
 1. optics      band rows of a field point, derivatives with respect to the ~10 optical parameters only,
-               once per (point, band), however many exposures there are;
+               once per (point, band), however many exposures there are; or interpolated between `Nodes`;
 2. data        counts and normalised residuals of all exposures of the point: dot products;
 3. field       throughput is a series over the field, so at one point only its four values matter; the small
                Gram matrix of the point is expanded through the series afterwards.
@@ -27,6 +27,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
+from walop_jax.likelihood.nodes import Nodes, interpolated, rows_and_slopes
 from walop_jax.model import legendre, light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects.base import Effect, overridden
@@ -76,8 +77,24 @@ def field_sites(instrument: Instrument, point: PointData) -> tuple[Float[Array, 
     return point.x[None], point.y[None]
 
 
-def _rows_at(instrument: Instrument, plan: Plan, point: PointData) -> Float[Array, "m b 2 2 4"]:
-    return jax.vmap(light.band_rows, (None, None, 0, 0))(instrument, plan, *field_sites(instrument, point))
+def _rows_at(
+    instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None = None
+) -> Float[Array, "m b 2 2 4"]:
+    sites = field_sites(instrument, point)
+    if nodes is not None:
+        return interpolated(nodes, *sites)[0]
+    return jax.vmap(light.band_rows, (None, None, 0, 0))(instrument, plan, *sites)
+
+
+def _rows_and_slopes_at(
+    instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None
+) -> tuple[Float[Array, "m b 2 2 4"], Float[Array, "o m b 2 2 4"]]:
+    sites = field_sites(instrument, point)
+    if nodes is not None:
+        rows, slopes = interpolated(nodes, *sites)
+    else:
+        rows, slopes = jax.vmap(rows_and_slopes, (None, None, 0, 0))(instrument, plan, *sites)
+    return rows, jnp.swapaxes(slopes, 0, 1)
 
 
 def _throughput_at(instrument: Instrument, point: PointData) -> Float[Array, "m 4"]:
@@ -104,8 +121,10 @@ def _unit_counts(
     return light.with_ghosts(instrument, counts, opposite, point.source)
 
 
-def _point_prediction(instrument: Instrument, plan: Plan, point: PointData) -> Float[Array, "e 4"]:
-    rows, throughput = _rows_at(instrument, plan, point), _throughput_at(instrument, point)
+def _point_prediction(
+    instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None = None
+) -> Float[Array, "e 4"]:
+    rows, throughput = _rows_at(instrument, plan, point, nodes), _throughput_at(instrument, point)
     return _unit_counts(instrument, plan, rows, throughput, point)
 
 
@@ -133,15 +152,15 @@ def _real_counts(
 
 
 def _point_residuals(
-    instrument: Instrument, plan: Plan, point: PointData
+    instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None = None
 ) -> tuple[Float[Array, " e"], Float[Array, "e 4"]]:
-    unit = _point_prediction(instrument, plan, point)
+    unit = _point_prediction(instrument, plan, point, nodes)
     flux = _best_flux(instrument, plan, unit, point)
     return flux, (point.counts - _real_counts(instrument, plan, unit, flux)) * point.weight
 
 
 def _point_jacobian(
-    instrument: Instrument, plan: Plan, point: PointData
+    instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None = None
 ) -> tuple[Float[Array, " d"], Float[Array, "l d"]]:
     """Residuals of one point and their derivatives with respect to its local quantities.
 
@@ -153,17 +172,13 @@ def _point_jacobian(
     plain = np.setdiff1d(np.arange(values.size), series_indices(instrument))
     throughput = _throughput_at(instrument, point)
 
-    def optics(optical_values: Vector) -> Float[Array, "m b 2 2 4"]:
-        return _rows_at(to_instrument(values.at[optical].set(optical_values)), plan, point)
-
     def data(
         rows: Float[Array, "m b 2 2 4"], all_values: Vector, local: Float[Array, "m 4"]
     ) -> Float[Array, "e 4"]:
         return _unit_counts(to_instrument(all_values), plan, rows, local, point)
 
-    rows, push_optics = jax.linearize(optics, values[optical])
+    rows, d_rows = _rows_and_slopes_at(instrument, plan, point, nodes)
     unit, push = jax.linearize(data, rows, values, throughput)
-    d_rows = jax.vmap(push_optics)(jnp.eye(optical.size))
     each = jnp.eye(values.size)[plain]
 
     # Tangents: plain parameters first (the optical ones carry their rows), then the throughputs of the sites.
@@ -195,18 +210,22 @@ def _point_jacobian(
 
 
 def _point_normal(
-    instrument: Instrument, plan: Plan, point: PointData
+    instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None
 ) -> tuple[Float[Array, ""], Float[Array, " l"], Float[Array, "l l"]]:
     """χ², Jᵀr and JᵀJ of one point in its local quantities."""
-    r, jacobian = _point_jacobian(instrument, plan, point)
+    r, jacobian = _point_jacobian(instrument, plan, point, nodes)
     return r @ r, jacobian @ r, jacobian @ jacobian.T
 
 
-def _normal_equations(instrument: Instrument, plan: Plan, data: PointData) -> Normal:
+def _normal_equations(
+    instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes | None = None
+) -> Normal:
     values, _ = ravel_pytree(instrument)
     series = np.asarray(series_indices(instrument), int)
     plain = np.setdiff1d(np.arange(values.size), series)
-    chi2, gradient, gram = jax.vmap(_point_normal, in_axes=(None, None, 0))(instrument, plan, data)
+    chi2, gradient, gram = jax.vmap(_point_normal, in_axes=(None, None, 0, None))(
+        instrument, plan, data, nodes
+    )
     k = plain.size
     basis = legendre.basis(*jax.vmap(field_sites, (None, 0))(instrument, data), instrument.throughput.degree)
     g = jnp.zeros(values.size).at[plain].set(gradient[:, :k].sum(axis=0))
@@ -226,9 +245,9 @@ def _normal_equations(instrument: Instrument, plan: Plan, data: PointData) -> No
 
 
 def _residuals(
-    instrument: Instrument, plan: Plan, data: PointData
+    instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes | None = None
 ) -> tuple[Float[Array, "p e"], Float[Array, "p e 4"]]:
-    return jax.vmap(_point_residuals, in_axes=(None, None, 0))(instrument, plan, data)
+    return jax.vmap(_point_residuals, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
 
 
 def _prediction(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p e 4"]:

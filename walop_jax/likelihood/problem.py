@@ -14,17 +14,21 @@ from jaxtyping import Array, Bool, Float, Int
 from walop_jax.data.records import Block, CalibrationSet, Exposures, Sources
 from walop_jax.data.sky import moon_sky
 from walop_jax.likelihood import engine
+from walop_jax.likelihood.nodes import Nodes, accurate_nodes
+from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import require_double_precision
 from walop_jax.model.effects.base import Effect, overridden
-from walop_jax.model.instrument import nominal_instrument
+from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.plan import Plan, plan_for, with_median
-from walop_jax.model.specification import Model, make_model
+from walop_jax.model.specification import Model, make_model, optical_indices
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
 
 POINTS_PER_CHUNK = 256
 LARGEST_CHUNK = 2_000_000  # intensities × local quantities that a chunk may hold
+THINNEST = 1e-3  # deg: shortest side of a rectangle with nodes
+INTERPOLATE_ABOVE = 4096  # field points: more than ten times the nodes that the optics need
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +63,8 @@ class Problem:
     """The joint likelihood of one calibration set under one model.
 
     Field points are handled in chunks of equal size, so that a set larger than memory goes through the
-    same code.
+    same code. Of more than `INTERPOLATE_ABOVE` points, `expand` and `residuals` solve the optics on Chebyshev
+    nodes only (`likelihood/nodes.py`); `optics_error` is what that has cost in accuracy so far.
     """
 
     def __init__(
@@ -68,8 +73,12 @@ class Problem:
         model: Model,
         points_per_chunk: int | None = None,
         probes: tuple[Effect, ...] = (),
+        interpolate: bool | None = None,
     ) -> None:
-        """`probes` are effects that are not in the model but whose columns will be asked for."""
+        """`probes` are effects that are not in the model but whose columns will be asked for.
+
+        `interpolate` says whether the optics are interpolated over the field; None leaves it to the size of the set.
+        """
         require_double_precision()
         self.calset = calset
         self.model = model
@@ -83,6 +92,9 @@ class Problem:
         fits = max(1, LARGEST_CHUNK // (4 * len(calset.exposures) * local) * 4)
         chunk = points_per_chunk or min(POINTS_PER_CHUNK, fits)
         self.points_per_chunk = min(chunk, n_points)
+        self.interpolates = n_points > INTERPOLATE_ABOVE if interpolate is None else interpolate
+        self.optics_error = 0.0
+        self._nodes_per_side: int | None = None
 
     @cached_property
     def _in_memory(self) -> list[engine.PointData]:
@@ -98,6 +110,29 @@ class Problem:
     def chunks(self) -> list[engine.PointData]:
         """The data, chunk by chunk; the last chunk is padded with points of weight 0."""
         return self._in_memory
+
+    @cached_property
+    def _rectangle(self) -> Rectangle:
+        """The part of the field on which optics are needed; ghosts need those of the opposite points too."""
+        xy = np.stack([self.calset.points.x, self.calset.points.y])
+        low, high = xy.min(axis=1), xy.max(axis=1)
+        if self._mirrored:
+            low, high = np.minimum(low, -high), np.maximum(high, -low)
+        thin = 0.5 * np.maximum(THINNEST - (high - low), 0.0)
+        return Rectangle(low - thin, high + thin)
+
+    def _nodes(self, instrument: Instrument) -> Nodes | None:
+        """The optics on nodes of the field, None where they are solved point by point."""
+        if not self.interpolates:
+            return None
+        scale = np.array([p.scale for p in self.model.parameters])[list(optical_indices(instrument))]
+        nodes, error = accurate_nodes(instrument, self.plan, self._rectangle, scale, self._nodes_per_side)
+        if nodes is None:  # they oscillate over the field: no need to try again
+            self.interpolates = False
+            return None
+        if np.isfinite(error):
+            self._nodes_per_side, self.optics_error = nodes.per_side, max(self.optics_error, error)
+        return nodes
 
     # -------------------------------------------------------------------------------------- the posterior
 
@@ -125,9 +160,10 @@ class Problem:
         model cannot explain.
         """
         instrument = self.model.instrument(values)
+        nodes = self._nodes(instrument)
         data, gradient, matrix = 0.0, np.zeros(len(values)), np.zeros((len(values), len(values)))
         for chunk in self.chunks:
-            part = engine.normal_equations(instrument, self.plan, chunk)
+            part = engine.normal_equations(instrument, self.plan, chunk, nodes)
             data += float(part.chi2)
             gradient += np.asarray(part.gradient)
             matrix += np.asarray(part.matrix)
@@ -152,7 +188,8 @@ class Problem:
     def residuals(self, values: Vector) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e 4"]]:
         """Best flux and normalised residuals (data − model)/σ of every (point, exposure); 0 where unused."""
         instrument = self.model.instrument(values)
-        parts = [engine.residuals(instrument, self.plan, chunk) for chunk in self.chunks]
+        nodes = self._nodes(instrument)
+        parts = [engine.residuals(instrument, self.plan, chunk, nodes) for chunk in self.chunks]
         flux = np.concatenate([np.asarray(part[0]) for part in parts])
         residual = np.concatenate([np.asarray(part[1]) for part in parts])
         return flux[: len(self.calset.points)], residual[: len(self.calset.points)]
@@ -228,8 +265,10 @@ def _padded(block: Block, size: int) -> Block:
     def pad(array: np.ndarray, value: float) -> np.ndarray:
         return np.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1), constant_values=value)
 
+    # Positions of the first point: inside the field, where everything is finite.
     return Block(
-        x=pad(block.x, 0.0), y=pad(block.y, 0.0), counts=pad(block.counts, 0.0), sigma=pad(block.sigma, 1.0),
+        x=pad(block.x, block.x[0]), y=pad(block.y, block.y[0]),
+        counts=pad(block.counts, 0.0), sigma=pad(block.sigma, 1.0),
         used=pad(block.used, False), source=pad(block.source, -1),
     )  # fmt: skip
 

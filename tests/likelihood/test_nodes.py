@@ -1,0 +1,123 @@
+"""Optics interpolated over the field against optics solved point by point."""
+
+from __future__ import annotations
+
+import effect_scenes as scenes
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from walop_jax.fit.refit import fit
+from walop_jax.likelihood import engine, nodes
+from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
+from walop_jax.likelihood.problem import INTERPOLATE_ABOVE, Problem, base_model
+from walop_jax.likelihood.simulate import simulate
+from walop_jax.model.chebyshev import Rectangle
+from walop_jax.model.effects import effect_by_name
+from walop_jax.model.parameters import leaves
+from walop_jax.model.specification import full_values, optical_indices
+
+FIELD = Rectangle(np.full(2, -0.3), np.full(2, 0.3))
+SMALL = ObservingPlan(
+    grid=6, standard_grid=3, polariser_angles=polariser_turn(8, full_turn=True), plate=(None, 45.0),
+    moon_patches=4, standards=2, unpolarised=1,
+)  # fmt: skip
+
+
+def same(one, other, rtol=1e-8):
+    """χ², gradient and matrix agree, the latter two in units of the standard errors."""
+    assert float(one[0]) == pytest.approx(float(other[0]), rel=rtol)
+    gradient, matrix = np.asarray(other[1]), np.asarray(other[2])
+    size = np.sqrt(np.diag(matrix))
+    size = np.where(size > 0, size, 1.0)
+    np.testing.assert_allclose(np.asarray(one[1]) / size, gradient / size, atol=rtol * np.sqrt(other[0]))
+    np.testing.assert_allclose(
+        np.asarray(one[2]) / np.outer(size, size), matrix / np.outer(size, size), atol=rtol
+    )
+
+
+def scales(instrument):
+    every = [leaf.declaration.width or leaf.declaration.scale or 1.0 for leaf in leaves(instrument)]
+    return np.array(every)[list(optical_indices(instrument))]
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    return simulate(SMALL, seed=4)
+
+
+@pytest.fixture(scope="module")
+def exact(simulated):
+    return Problem(simulated.calset, base_model(simulated.calset))
+
+
+@pytest.fixture(scope="module")
+def quick(simulated):
+    return Problem(simulated.calset, base_model(simulated.calset), interpolate=True)
+
+
+def test_expansion_agrees(simulated, exact, quick):
+    """Calibration plate in and out, Moon sky, standards of several temperatures; at the truth and away from it."""
+    for values in (exact.model.start, full_values(simulated.truth)):
+        one, other = quick.expand(values), exact.expand(values)
+        same((one.data, one.gradient, one.matrix), (other.data, other.gradient, other.matrix))
+    assert 0.0 < quick.optics_error <= nodes.TOLERANCE
+    for one, other in zip(quick.residuals(values), exact.residuals(values), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-6)
+
+
+def test_fit_ends_at_the_same_place(exact, quick):
+    one, other = fit(quick), fit(exact)
+    assert one.converged
+    assert one.chi2 == pytest.approx(other.chi2, rel=1e-8)
+    known = other.sigma > 0
+    assert (np.abs(one.values - other.values)[known] < 1e-4 * other.sigma[known]).all()
+    np.testing.assert_allclose(one.sigma, other.sigma, rtol=1e-6)
+
+
+def test_optics_that_change_and_ghosts_go_through_the_same_tables():
+    """Flexure and temperature make optics of each exposure, ghosts need the opposite point, detectors the flux."""
+    effects = [
+        effect_by_name("flexure").of(scenes.CONTEXT, rate_x=0.004, rate_y=-0.002),
+        effect_by_name("hwp_temperature").of(scenes.CONTEXT, coefficient=0.8),
+        effect_by_name("ghost").of(scenes.CONTEXT, share=0.03),
+        effect_by_name("nonlinearity").of(scenes.CONTEXT, coefficient=0.02),
+    ]
+    device, plan = scenes.instrument(*effects), scenes.plan(effects)
+    data = scenes.points(plan)
+    rng = np.random.default_rng(7)
+    flux = np.where(np.asarray(plan.exposures.flux_known), 1.0, scenes.FLUX)[:, None]
+    counts = flux * np.asarray(engine.prediction(device, plan, data))
+    data = data._replace(
+        counts=jnp.asarray(counts * (1.0 + 0.002 * rng.standard_normal(counts.shape))),
+        weight=jnp.asarray(1.0 / np.sqrt(counts + 900.0)),
+    )
+    table, error = nodes.accurate_nodes(device, plan, FIELD, scales(device))
+    assert table is not None
+    assert error <= nodes.TOLERANCE
+    same(engine.normal_equations(device, plan, data, table), engine.normal_equations(device, plan, data))
+
+
+def test_error_is_measured(exact, simulated):
+    """Too few nodes are noticed, and the stated error is that of places nobody asked about."""
+    plan, scale = exact.plan, scales(simulated.truth)
+    table, stated = nodes.tabulate(simulated.truth, plan, FIELD, 8, scale)
+    assert nodes.TOLERANCE < stated < 0.01
+    x, y = np.random.default_rng(3).uniform(-0.3, 0.3, (2, nodes.AT_ONCE))
+    rows, _ = nodes._solve(simulated.truth, plan, jnp.asarray(x), jnp.asarray(y))
+    between, _ = nodes._interpolate(table, jnp.asarray(x), jnp.asarray(y))
+    assert 0.1 * stated < np.abs(np.asarray(between - rows)).max() < 3.0 * stated
+
+
+def test_what_cannot_be_interpolated_is_solved_point_by_point(simulated, exact, monkeypatch):
+    monkeypatch.setattr(nodes, "COUNTS", (6, 8))
+    problem = Problem(simulated.calset, base_model(simulated.calset), interpolate=True)
+    values = problem.model.start
+    assert problem.expand(values).data == exact.expand(values).data
+    assert not problem.interpolates
+
+
+def test_tables_of_a_few_hundred_points_are_exact(exact):
+    assert len(exact.calset.points) < INTERPOLATE_ABOVE
+    assert not exact.interpolates
+    assert exact.optics_error == 0.0
