@@ -27,6 +27,7 @@ Matrix = Float[np.ndarray, "_ _"]
 ALARM = 0.0027  # three standard deviations
 COMMON_MODE = 0.05  # rms (σ of one intensity) of disturbances that one camera in one exposure may have
 PROBABILITY = 0.95
+MOST_PATTERNS = 8
 ALIKE = 0.01  # relative change of the counts up to which columns are kept
 
 
@@ -76,7 +77,9 @@ class Look:
         self.common_mode = self._common_mode()
         space, reduce = self.space.with_base([SINGLE], self.common_mode)
         r = self.design.projector(self.design.residual)
-        self.table: ScoreTable = Scorer(space, rng)(*reduce(self.columns.T @ r, float(r @ r)))
+        self._scored = space, *reduce(self.columns.T @ r, float(r @ r))
+        self._rng = rng
+        self.table: ScoreTable = Scorer(space, rng)(*self._scored[1:])
         self.ranked = naming.rank(self.table, self.probes)
         self.patterns = [self.table[c.name] for c in free]
         # Where the base is excluded, a name competes with patterns that have none, not with the base.
@@ -93,6 +96,23 @@ class Look:
         points = np.repeat(self.design.measured.used.sum(axis=0), 3)
         square = np.where(self.space.before[at] > 0, self.space.before[at], np.inf)
         return np.maximum(COMMON_MODE * np.sqrt(points / square), 1e-30)
+
+    def patterns_needed(self) -> list[tuple[str, float]]:
+        """Patterns that together leave nothing significant, with corrected p: the most probable first, one by one."""
+        space, scores, square = self._scored
+        names = [score.name for score in self.patterns]
+        table, needed = self.table, []
+        while table.p_global < ALARM and len(needed) < MOST_PATTERNS:
+            left = [s for s in table.scores if s.name in names and s.testable and table.corrected(s) < ALARM]
+            if not left:
+                break
+            best = max(left, key=lambda s: s.log_bayes)
+            needed.append((best.name, table.corrected(best)))
+            names.remove(best.name)
+            space, reduce = space.with_base([best.name])
+            scores, square = reduce(scores, square)
+            table = Scorer(space, self._rng)(scores, square)
+        return needed
 
     @property
     def alarm(self) -> bool:

@@ -26,7 +26,7 @@ from walop_jax.diagnose.consequence import instrument_matrices, largest_change
 from walop_jax.diagnose.design import Design, held_out
 from walop_jax.diagnose.findings import Diagnosis, Step, Unexplained, Verdict
 from walop_jax.diagnose.freeform import block_of
-from walop_jax.diagnose.look import ALARM, Look
+from walop_jax.diagnose.look import Look
 from walop_jax.diagnose.score import Score
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.problem import Problem, base_model
@@ -176,16 +176,14 @@ class _Diagnosing:
     # --------------------------------------------------------------------------------------- what has no name
 
     def _unexplained(self, look: Look) -> Unexplained:
-        best = sorted((s for s in look.patterns if s.testable), key=lambda s: s.log_p)
-        patterns = tuple((s.name, look.table.corrected(s)) for s in best)
-        significant = [(name, p) for name, p in patterns if p < ALARM]
+        patterns = tuple(look.patterns_needed())
         if not look.alarm:
             text = (
                 f"residuals scatter more than N_ERR says (χ²/dof = {look.result.chi2 / look.result.dof:.3g}) "
                 "without any pattern that was looked for"
             )
-        elif significant:
-            listed = "; ".join(f"{name} (p = {p:.1g})" for name, p in significant[:3])
+        elif patterns:
+            listed = "; ".join(f"{name} (p = {p:.1g})" for name, p in patterns)
             text = f"patterns without a name: {listed}"
         else:
             text = "something is missing, no single pattern is significant by itself"
@@ -193,8 +191,8 @@ class _Diagnosing:
         text += (
             f". Residuals sit in: cameras {place['camera']}; kinds {place['kind']}; field {place['field']}"
         )
-        found = Unexplained(look.table.p_global, text, patterns[:3])
-        blocks = tuple(dict.fromkeys(b for name, _ in significant if (b := block_of(name)) is not None))
+        found = Unexplained(look.table.p_global, text, patterns)
+        blocks = tuple(dict.fromkeys(b for name, _ in patterns if (b := block_of(name)) is not None))
         there = any(effect.name == FreeForm.name for effect in self.fit.model.template.effects)
         return self._with_free_form(look, found, blocks) if blocks and not there else found
 
