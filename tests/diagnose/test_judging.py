@@ -73,15 +73,15 @@ def test_robust_errors_are_the_stated_ones_when_noise_is_as_stated(leaking):
 
 
 def test_robust_errors_see_disturbances_of_whole_exposures(leaking):
-    """Each exposure pulls the share by five times what noise lets it."""
+    """Each exposure pulls the magnification by five times what noise lets it."""
     design = Design.of(*leaking[3:])
-    column = design.without("camera_leakage")[1][: design.rows, 0]
+    column = design.without("pupil")[1][: design.rows, 0]
     length = np.sqrt(np.bincount(design.exposure, column**2))
     pull = 5.0 * np.random.default_rng(4).choice([-1.0, 1.0], length.size) / length
     disturbed = design.residual.copy()
     disturbed[: design.rows] += pull[design.exposure] * column
     assert (
-        dataclasses.replace(design, residual=design.projector(disturbed)).robust_ratio("camera_leakage") > 2.0
+        dataclasses.replace(design, residual=design.projector(disturbed)).robust_ratio("pupil") > 2.0
     )
 
 

@@ -72,7 +72,7 @@ class Calibration:
     def from_fit(cls, result: FitResult, problem: Problem) -> Calibration:
         """The calibration that a fit gives, with the verdict on it (see `quality`)."""
         calset = problem.calset
-        used = problem.used.any(axis=1)
+        used = problem.points_used
         x, y = calset.points.x[used], calset.points.y[used]
         verdict = Verdict(
             chi2=result.chi2,

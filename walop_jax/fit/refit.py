@@ -100,7 +100,7 @@ class FitResult:
 def check_identifiable(problem: Problem) -> None:
     """Raise ValueError when the exposures cannot determine an instrument at all."""
     e = problem.calset.exposures
-    through = e.clp_in & problem.used.any(axis=0)
+    through = e.clp_in & (problem.rows_used > 0)
     angles = np.unique(np.round(np.mod(e.clp_angle[through], 180.0), 3))
     if len(angles) < 3:
         raise ValueError(

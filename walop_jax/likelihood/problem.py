@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 
 import jax
@@ -11,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from walop_jax.data.records import Block, CalibrationSet, Exposures, Sources
-from walop_jax.data.sky import moon_sky
+from walop_jax.data.records import CalibrationSet, Sources
 from walop_jax.likelihood import engine
+from walop_jax.likelihood.chunks import Chunks, median_counts, slabs
 from walop_jax.likelihood.nodes import Nodes, accurate_nodes
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import require_double_precision
@@ -25,8 +26,11 @@ from walop_jax.model.specification import Model, make_model, optical_indices
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
 
+Watch = Callable[[int, float], None]
+
 POINTS_PER_CHUNK = 256
 LARGEST_CHUNK = 2_000_000  # intensities × local quantities that a chunk may hold
+SLAB_TO_COUNT = 1 << 15  # field points
 THINNEST = 1e-3  # deg: shortest side of a rectangle with nodes
 INTERPOLATE_ABOVE = 4096  # field points: more than ten times the nodes that the optics need
 
@@ -63,8 +67,10 @@ class Problem:
     """The joint likelihood of one calibration set under one model.
 
     Field points are handled in chunks of equal size, so that a set larger than memory goes through the
-    same code. Of more than `INTERPOLATE_ABOVE` points, `expand` and `residuals` solve the optics on Chebyshev
-    nodes only (`likelihood/nodes.py`); `optics_error` is what that has cost in accuracy so far.
+    same code (`likelihood/chunks.py`). Of more than `INTERPOLATE_ABOVE` points, `expand` and `residuals` solve
+    the optics on Chebyshev nodes only (`likelihood/nodes.py`); `optics_error` is what that has cost in accuracy
+    so far. `watch`, where one is set, is told about once a second how many points a pass has done and how many
+    it does in a second.
     """
 
     def __init__(
@@ -92,24 +98,27 @@ class Problem:
         fits = max(1, LARGEST_CHUNK // (4 * len(calset.exposures) * local) * 4)
         chunk = points_per_chunk or min(POINTS_PER_CHUNK, fits)
         self.points_per_chunk = min(chunk, n_points)
+        self._chunks = Chunks(calset, self.plan, self.points_per_chunk, mirrored=self._mirrored)
         self.interpolates = n_points > INTERPOLATE_ABOVE if interpolate is None else interpolate
         self.optics_error = 0.0
+        self.watch: Watch | None = None
         self._nodes_per_side: int | None = None
 
-    @cached_property
-    def _in_memory(self) -> list[engine.PointData]:
-        return list(self._load())
-
-    def _load(self) -> Iterator[engine.PointData]:
-        n, size = len(self.calset.points), self.points_per_chunk
-        for start in range(0, n, size):
-            block = self.calset.intensities.block(start, min(start + size, n))
-            yield point_data(self.calset, self.plan, _padded(block, size), mirrored=self._mirrored)
-
     @property
-    def chunks(self) -> list[engine.PointData]:
+    def chunks(self) -> Chunks:
         """The data, chunk by chunk; the last chunk is padded with points of weight 0."""
-        return self._in_memory
+        return self._chunks
+
+    def _watched(self) -> Iterator[engine.PointData]:
+        began = told = time.perf_counter()
+        n = len(self.calset.points)
+        for i, chunk in enumerate(self.chunks, start=1):
+            yield chunk
+            now = time.perf_counter()
+            if self.watch is not None and (now - told > 1.0 or i == len(self.chunks)):
+                done = min(i * self.points_per_chunk, n)
+                self.watch(done, done / (now - began))
+                told = now
 
     @cached_property
     def _rectangle(self) -> Rectangle:
@@ -162,7 +171,7 @@ class Problem:
         instrument = self.model.instrument(values)
         nodes = self._nodes(instrument)
         data, gradient, matrix = 0.0, np.zeros(len(values)), np.zeros((len(values), len(values)))
-        for chunk in self.chunks:
+        for chunk in self._watched():
             part = engine.normal_equations(instrument, self.plan, chunk, nodes)
             data += float(part.chi2)
             gradient += np.asarray(part.gradient)
@@ -239,85 +248,36 @@ class Problem:
     @cached_property
     def used(self) -> Bool[np.ndarray, "p e"]:
         """True where the four intensities of a (point, exposure) are used."""
-        used = np.concatenate([np.asarray(chunk.weight[..., 0] > 0) for chunk in self.chunks])
-        return used[: len(self.calset.points)]
+        return np.concatenate([slab.used for slab in slabs(self.calset, SLAB_TO_COUNT)])
+
+    @cached_property
+    def _census(self) -> tuple[Int[np.ndarray, " e"], Bool[np.ndarray, " p"]]:
+        """Points used in each exposure, and whether a point is used at all: one pass over the data."""
+        parts = [(slab.used.sum(axis=0), slab.used.any(axis=1)) for slab in slabs(self.calset, SLAB_TO_COUNT)]
+        return np.sum([part[0] for part in parts], axis=0), np.concatenate([part[1] for part in parts])
+
+    @property
+    def rows_used(self) -> Int[np.ndarray, " e"]:
+        """Number of points used in each exposure."""
+        return self._census[0]
+
+    @property
+    def points_used(self) -> Bool[np.ndarray, " p"]:
+        """True where a field point is used in any exposure."""
+        return self._census[1]
 
     @property
     def n_data(self) -> int:
         """Number of intensities used."""
-        return 4 * int(self.used.sum())
+        return 4 * int(self.rows_used.sum())
 
     @property
     def dof(self) -> int:
         """Three per used row (four when the flux is known), one per prior, minus the free parameters."""
-        rows = self.used.sum(axis=0)
         per_row = np.where(np.asarray(self.plan.exposures.flux_known), 4, 3)
         free = set(self.model.free.tolist())
         priors = sum(1 for i in self._priors[0] if int(i) in free)
-        return int(rows @ per_row) + priors - len(free)
-
-
-def _padded(block: Block, size: int) -> Block:
-    missing = size - len(block.x)
-    if missing == 0:
-        return block
-
-    def pad(array: np.ndarray, value: float) -> np.ndarray:
-        return np.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1), constant_values=value)
-
-    # Positions of the first point: inside the field, where everything is finite.
-    return Block(
-        x=pad(block.x, block.x[0]), y=pad(block.y, block.y[0]),
-        counts=pad(block.counts, 0.0), sigma=pad(block.sigma, 1.0),
-        used=pad(block.used, False), source=pad(block.source, -1),
-    )  # fmt: skip
-
-
-def sky_polarisation(calset: CalibrationSet, x: Vector, y: Vector) -> Float[np.ndarray, "p e 2"]:
-    """(q, u) in the ICS of the Moon sky for δ = 1 at field points; 0 in exposures of other kinds."""
-    e: Exposures = calset.exposures
-    sky = np.zeros((len(x), len(e), 2))
-    moon = np.flatnonzero((e.kind == "moon") & ~e.clp_in)
-    if moon.size:
-        q, u = moon_sky(e.mjd[moon], e.ra[moon], e.dec[moon], e.rotator[moon], calset.site, x, y)
-        sky[:, moon, 0], sky[:, moon, 1] = q, u
-    return sky
-
-
-def median_counts(calset: CalibrationSet, slab: int = 4096, most: int = 65536) -> Float[np.ndarray, "e 4"]:
-    """Median over the field of the measured counts of each camera in each exposure; 0 where nothing is used.
-
-    Of a set with more than `most` points, slabs spread evenly over it are enough.
-    """
-    n = len(calset.points)
-    starts = range(0, n, slab) if n <= most else np.linspace(0, n - slab, most // slab).astype(int)
-    counts = []
-    for start in starts:
-        block = calset.intensities.block(int(start), min(int(start) + slab, n))
-        counts.append(np.where(block.used[:, :, None], block.counts, np.nan))
-    every = np.concatenate(counts)
-    seen = np.isfinite(every[..., 0]).any(axis=0)
-    median = np.zeros(every.shape[1:])
-    median[seen] = np.nanmedian(every[:, seen], axis=0)
-    return median
-
-
-def point_data(
-    calset: CalibrationSet, plan: Plan, block: Block, *, mirrored: bool = False
-) -> engine.PointData:
-    """A block of measurements as the engine wants it; `mirrored` adds what ghosts need of the opposite points."""
-    band = np.take_along_axis(plan.band_of[None], block.source[:, :, None] + 1, axis=2)[:, :, 0]
-    weight = np.where(block.used[:, :, None], 1.0 / np.where(block.sigma > 0, block.sigma, 1.0), 0.0)
-    return engine.PointData(
-        x=jnp.asarray(block.x),
-        y=jnp.asarray(block.y),
-        counts=jnp.asarray(np.where(block.used[:, :, None], block.counts, 0.0)),
-        weight=jnp.asarray(weight),
-        sky=jnp.asarray(sky_polarisation(calset, block.x, block.y)),
-        source=jnp.asarray(block.source),
-        band=jnp.asarray(band),
-        opposite_sky=jnp.asarray(sky_polarisation(calset, -block.x, -block.y)) if mirrored else None,
-    )
+        return int(self.rows_used @ per_row) + priors - len(free)
 
 
 def standard_names(sources: Sources) -> tuple[str, ...]:
