@@ -1,0 +1,167 @@
+"""A calibration set as the engine wants it: chunks of field points of equal size, kept in memory or read anew.
+
+A set that fits into `KEEP_BELOW` bytes is turned into arrays once. A larger one is read, slab by slab, on every pass,
+the next slab while the engine works on this one: memory is that of two slabs however many points there are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.data.records import Block, CalibrationSet, Exposures
+from walop_jax.data.sky import moon_direction, rayleigh_sky
+from walop_jax.likelihood.engine import PointData
+from walop_jax.model.plan import Plan
+
+Vector = Float[np.ndarray, " n"]
+
+KEEP_BELOW = 1 << 30
+"""Bytes of point data that are kept in memory."""
+SLAB = 1 << 26
+"""Bytes of point data that are read together; reading takes about four times as much for a moment."""
+
+
+def bytes_per_point(exposures: int, *, mirrored: bool = False) -> int:
+    """Size of the point data of one field point: per exposure four counts and weights, sky, source and band."""
+    return 8 * (2 + exposures * (4 + 4 + (4 if mirrored else 2) + 1 + 1))
+
+
+class Chunks:
+    """The data chunk by chunk; the last chunk is padded with points of weight 0.
+
+    `size` points each. `kept` says whether they stay in memory; if not, going through them reads the set again.
+    """
+
+    def __init__(self, calset: CalibrationSet, plan: Plan, size: int, *, mirrored: bool = False) -> None:
+        self.calset, self.plan, self.size, self.mirrored = calset, plan, size, mirrored
+        self._points = len(calset.points)
+        each = bytes_per_point(len(calset.exposures), mirrored=mirrored)
+        self.kept = each * self._points <= KEEP_BELOW
+        # Whole chunks; and many of them, as pixels are read in whole rows of the frames.
+        self._slab = size * max(1, SLAB // (each * size))
+
+    def __len__(self) -> int:
+        return math.ceil(self._points / self.size)
+
+    def __getitem__(self, index: int) -> PointData:
+        if self.kept:
+            return self._in_memory[index]
+        start = range(len(self))[index] * self.size
+        block = self.calset.intensities.block(start, min(start + self.size, self._points))
+        return self.point_data(_padded(block, self.size))
+
+    def __iter__(self) -> Iterator[PointData]:
+        return iter(self._in_memory) if self.kept else self._read()
+
+    @cached_property
+    def _in_memory(self) -> list[PointData]:
+        return list(self._read())
+
+    def _read(self) -> Iterator[PointData]:
+        for slab in slabs(self.calset, self._slab):
+            for first in range(0, len(slab.x), self.size):
+                yield self.point_data(_padded(_part(slab, first, first + self.size), self.size))
+
+    def point_data(self, block: Block) -> PointData:
+        """A block of measurements as the engine wants it, with what ghosts need of the opposite points."""
+        band = np.take_along_axis(self.plan.band_of[None], block.source[:, :, None] + 1, axis=2)[:, :, 0]
+        weight = np.where(block.used[:, :, None], 1.0 / np.where(block.sigma > 0, block.sigma, 1.0), 0.0)
+        opposite = self.sky_polarisation(-block.x, -block.y) if self.mirrored else None
+        return PointData(
+            x=jnp.asarray(block.x),
+            y=jnp.asarray(block.y),
+            counts=jnp.asarray(np.where(block.used[:, :, None], block.counts, 0.0)),
+            weight=jnp.asarray(weight),
+            sky=jnp.asarray(self.sky_polarisation(block.x, block.y)),
+            source=jnp.asarray(block.source),
+            band=jnp.asarray(band),
+            opposite_sky=None if opposite is None else jnp.asarray(opposite),
+        )
+
+    @cached_property
+    def _moon(self) -> tuple[np.ndarray, Vector, Vector]:
+        """Rows of the exposures of the Moon sky, and where the Moon stands then."""
+        e: Exposures = self.calset.exposures
+        rows = np.flatnonzero((e.kind == "moon") & ~e.clp_in)
+        if not rows.size:
+            return rows, np.zeros(0), np.zeros(0)
+        ra, dec = moon_direction(e.mjd[rows], self.calset.site)
+        return rows, ra, dec
+
+    def sky_polarisation(self, x: Vector, y: Vector) -> Float[np.ndarray, "p e 2"]:
+        """(q, u) in the ICS of the Moon sky for δ = 1 at field points; 0 in exposures of other kinds."""
+        e: Exposures = self.calset.exposures
+        sky = np.zeros((len(x), len(e), 2))
+        rows, ra, dec = self._moon
+        if rows.size:
+            q, u = rayleigh_sky(ra, dec, e.ra[rows], e.dec[rows], e.rotator[rows], x, y)
+            sky[:, rows, 0], sky[:, rows, 1] = q, u
+        return sky
+
+
+def slabs(calset: CalibrationSet, size: int) -> Iterator[Block]:
+    """The data in slabs of `size` points; the next one is read while this one is in use."""
+    n = len(calset.points)
+    starts = range(0, n, size)
+
+    def read(start: int) -> Block:
+        return calset.intensities.block(start, min(start + size, n))
+
+    if len(starts) == 1:
+        yield read(0)
+        return
+    with ThreadPoolExecutor(1) as reader:
+        coming = reader.submit(read, 0)
+        for start in starts:
+            block = coming.result()
+            if start + size < n:
+                coming = reader.submit(read, start + size)
+            yield block
+
+
+def _part(block: Block, start: int, stop: int) -> Block:
+    return Block(
+        x=block.x[start:stop], y=block.y[start:stop], counts=block.counts[start:stop],
+        sigma=block.sigma[start:stop], used=block.used[start:stop], source=block.source[start:stop],
+    )  # fmt: skip
+
+
+def _padded(block: Block, size: int) -> Block:
+    missing = size - len(block.x)
+    if missing == 0:
+        return block
+
+    def pad(array: np.ndarray, value: float) -> np.ndarray:
+        return np.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1), constant_values=value)
+
+    # Positions of the first point: inside the field, where everything is finite.
+    return Block(
+        x=pad(block.x, block.x[0]), y=pad(block.y, block.y[0]),
+        counts=pad(block.counts, 0.0), sigma=pad(block.sigma, 1.0),
+        used=pad(block.used, False), source=pad(block.source, -1),
+    )  # fmt: skip
+
+
+def median_counts(calset: CalibrationSet, slab: int = 4096, most: int = 65536) -> Float[np.ndarray, "e 4"]:
+    """Median over the field of the measured counts of each camera in each exposure; 0 where nothing is used.
+
+    Of a set with more than `most` points, slabs spread evenly over it are enough.
+    """
+    n = len(calset.points)
+    starts = range(0, n, slab) if n <= most else np.linspace(0, n - slab, most // slab).astype(int)
+    counts = []
+    for start in starts:
+        block = calset.intensities.block(int(start), min(int(start) + slab, n))
+        counts.append(np.where(block.used[:, :, None], block.counts, np.nan))
+    every = np.concatenate(counts)
+    seen = np.isfinite(every[..., 0]).any(axis=0)
+    median = np.zeros(every.shape[1:])
+    median[seen] = np.nanmedian(every[:, seen], axis=0)
+    return median
