@@ -107,8 +107,8 @@ class Blind:
         self._root = self.space.gram @ self._whitening
         self.dimension = self._root.shape[1]
         self.outside = {}
-        for shape in look.design.padded(list(outside(look.design.measured))):
-            column = look.design.projector(shape.columns[:, 0])
+        for shape in outside(look.design.measured):
+            column = look.design.projector(look.design.stacked([shape.columns])[:, 0])
             along = self._whitening.T @ (look.columns.T @ column)
             self.outside[shape.name] = along, float(column @ column - along @ along)
         self._scorers: dict[tuple[tuple[str, ...], tuple[str, ...]], tuple[Scorer, list[Probe]]] = {}

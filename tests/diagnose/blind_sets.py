@@ -69,13 +69,12 @@ class Hiding:
         )
         probe = Probe(probe.name, probe.effect, group)
         problem, values = self.problem, self.fit.values
-        (candidate,) = self.design.padded(
-            list(effect_candidates(problem.calset, problem.model, values, [probe]).values())
-        )
+        candidate = effect_candidates(problem.calset, problem.model, values, [probe])[probe.name]
+        columns = self.design.stacked([candidate.columns])
         step = rng.standard_normal(len(probe.widths)) * probe.widths
         if probe.effect.one_sided:
             step = np.abs(step)
-        step *= ratio / np.linalg.norm(self.design.projector(candidate.columns @ step))
+        step *= ratio / np.linalg.norm(self.design.projector(columns @ step))
         if np.max(np.abs(step) / probe.widths) > PLAUSIBLE:
             return None
         return probe.effect.combine(probe.group, step).standard_form()

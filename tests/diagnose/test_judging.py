@@ -80,9 +80,7 @@ def test_robust_errors_see_disturbances_of_whole_exposures(leaking):
     pull = 5.0 * np.random.default_rng(4).choice([-1.0, 1.0], length.size) / length
     disturbed = design.residual.copy()
     disturbed[: design.rows] += pull[design.exposure] * column
-    assert (
-        dataclasses.replace(design, residual=design.projector(disturbed)).robust_ratio("pupil") > 2.0
-    )
+    assert dataclasses.replace(design, residual=design.projector(disturbed)).robust_ratio("pupil") > 2.0
 
 
 def test_patterns_do_not_know_the_noise(leaking):

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from walop_jax.diagnose.freeform import Measured
-from walop_jax.diagnose.score import Candidate, Projector, whitening
+from walop_jax.diagnose.score import Projector, whitening
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.problem import Problem
 
@@ -90,14 +89,19 @@ class Design:
         own = rest(self.jacobian[:, np.array(free)])
         return rest, own @ whitening(own.T @ own)
 
-    def padded(self, candidates: Sequence[Candidate]) -> list[Candidate]:
-        """Candidates with zero rows for the priors."""
-        extra = len(self.residual) - self.rows
-        scale = self.fit.noise_scale
-        return [
-            dataclasses.replace(c, columns=np.pad(c.columns / scale, ((0, extra), (0, 0))))
-            for c in candidates
-        ]
+    def stacked(self, columns: list[Float[np.ndarray, "_ _"]]) -> Float[np.ndarray, "_ _"]:
+        """Columns of data rows side by side, with zeros for the priors; the list is emptied.
+
+        Column by column in memory, and one piece after the other: of a large set there is room for one copy only.
+        """
+        count = sum(piece.shape[1] for piece in columns)
+        whole = np.zeros((len(self.residual), count), order="F")
+        first = 0
+        while columns:
+            piece = columns.pop(0)
+            np.divide(piece, self.fit.noise_scale, out=whole[: self.rows, first : first + piece.shape[1]])
+            first += piece.shape[1]
+        return whole
 
     def cube(self, rows: Vector) -> Float[np.ndarray, "p e 4"]:
         """Data rows put back into (point, exposure, camera); 0 where unused."""

@@ -67,13 +67,14 @@ class Look:
             else earlier.named
         )
         self.probes = [probe for probe in inactive if probe.name in self.named]
-        free = list(strata(self.design.measured))
-        candidates = self.design.padded([*(self.named[probe.name] for probe in self.probes), *free])
+        candidates = [*(self.named[probe.name] for probe in self.probes), *strata(self.design.measured)]
+        names, widths = [c.name for c in candidates], [c.widths for c in candidates]
+        self.columns = self.design.stacked([candidates.pop(0).columns for _ in names])
         self._own = {}
         for name in active:
             rest, basis = self.design.without(name)
-            self._own[name] = _Own(rest, basis, np.column_stack([basis.T @ c.columns for c in candidates]))
-        self.space, self.columns = ScoreSpace.of(self.design.projector, candidates)
+            self._own[name] = _Own(rest, basis, basis.T @ self.columns)
+        self.space = ScoreSpace.projected(self.design.projector, names, widths, self.columns)
         self.common_mode = self._common_mode()
         space, reduce = self.space.with_base([SINGLE], self.common_mode)
         r = self.design.projector(self.design.residual)
@@ -81,7 +82,7 @@ class Look:
         self._rng = rng
         self.table: ScoreTable = Scorer(space, rng)(*self._scored[1:])
         self.ranked = naming.rank(self.table, self.probes)
-        self.patterns = [self.table[c.name] for c in free]
+        self.patterns = [self.table[name] for name in names[len(self.probes) :]]
         # Where the base is excluded, a name competes with patterns that have none, not with the base.
         self.least_evidence = min(0.0, max(s.log_bayes for s in self.patterns if s.testable))
 

@@ -35,6 +35,7 @@ FAINTEST = 0.05  # standard deviations that a plausible amplitude must reach to 
 RANK_TOLERANCE = 1e-8
 COUNTED = 20  # draws below the smallest p found that make counting them precise enough
 DRAWS = 10_000
+AT_ONCE = 128  # columns that are projected together
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,17 +157,25 @@ class ScoreSpace:
     def of(cls, projector: Projector, candidates: Sequence[Candidate]) -> tuple[ScoreSpace, Matrix]:
         """The space of candidates, and their projected columns side by side."""
         columns = np.column_stack([c.columns for c in candidates])
-        before = np.sum(columns**2, axis=0)
-        columns = projector(columns)
-        space = cls(
-            names=tuple(c.name for c in candidates),
-            sizes=tuple(c.columns.shape[1] for c in candidates),
-            widths=np.concatenate([c.widths for c in candidates]),
+        names, widths = [c.name for c in candidates], [c.widths for c in candidates]
+        return cls.projected(projector, names, widths, columns), columns
+
+    @classmethod
+    def projected(
+        cls, projector: Projector, names: Sequence[str], widths: Sequence[Vector], columns: Matrix
+    ) -> ScoreSpace:
+        """The space of candidates whose columns stand side by side; these are projected in place."""
+        before = np.einsum("dk,dk->k", columns, columns)
+        for first in range(0, columns.shape[1], AT_ONCE):
+            columns[:, first : first + AT_ONCE] = projector(columns[:, first : first + AT_ONCE])
+        return cls(
+            names=tuple(names),
+            sizes=tuple(len(w) for w in widths),
+            widths=np.concatenate(widths),
             before=before,
             gram=columns.T @ columns,
             free=projector.free,
         )
-        return space, columns
 
     def places(self) -> dict[str, slice]:
         """Where the amplitudes of each candidate stand."""
