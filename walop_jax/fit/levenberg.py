@@ -176,6 +176,25 @@ def minimise(
     return Minimum(here, expansion, converged, message, steps, decrement, condition, tuple(history))
 
 
+def judged(minimum: Minimum, expansion: Expansion, scale: Vector, tolerance: float = TOLERANCE) -> Minimum:
+    """The same minimum with a better expansion at its place, and the gates applied to that."""
+    decrement, condition = scaled_gradient(expansion, scale)
+    converged = bool(minimum.converged and decrement < tolerance and condition <= LARGEST_CONDITION)
+    message = minimum.message
+    if converged:
+        message = f"converged: scaled gradient {decrement:.1e}"
+    elif minimum.converged:
+        message = f"not converged in full: scaled gradient {decrement:.1e}, condition number {condition:.1e}"
+    return dataclasses.replace(
+        minimum,
+        expansion=expansion,
+        converged=converged,
+        message=message,
+        scaled_gradient=decrement,
+        condition=condition,
+    )
+
+
 def _arrays(expansion: Expansion, scale: Vector) -> Any:
     objective = expansion.objective if np.isfinite(expansion.objective) else np.inf
     return _information(

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.levenberg import MAXIMUM_STEPS, Minimum, minimise
+from walop_jax.fit.levenberg import MAXIMUM_STEPS, TOLERANCE, Minimum, judged, minimise
 from walop_jax.likelihood.problem import Posterior, Problem, base_model
 from walop_jax.model import materials
 from walop_jax.model.specification import Model
@@ -163,10 +163,20 @@ def _search(
     report = None if progress is None else lambda step, chi2: progress(label, step, chi2)
 
     def expand(x: Vector) -> Posterior:
-        return problem.expand(first + select @ (x - origin), noise_scale)
+        return problem.expand(first + select @ (x - origin), noise_scale, sketch=problem.sketches)
 
-    minimum = minimise(expand, origin, _scale(model), maximum_steps=steps, progress=report)
+    # A sketch measures the scaled gradient to a few per cent: leave it some room.
+    tolerance = 0.5 * TOLERANCE if problem.sketches else TOLERANCE
+    minimum = minimise(
+        expand, origin, _scale(model), maximum_steps=steps, tolerance=tolerance, progress=report
+    )
     return _Found(minimum, first + select @ (minimum.x - origin))
+
+
+def _in_full(found: _Found, problem: Problem) -> _Found:
+    """The minimum with the matrix of all points, and the gates applied to that."""
+    posterior = problem.expand(found.values, _expansion(found).noise_scale)
+    return dataclasses.replace(found, minimum=judged(found.minimum, posterior, _scale(problem.model)))
 
 
 def fit(
@@ -184,6 +194,8 @@ def fit(
     one order of retardance away as well, and the result says so (`noise_scale`, `warnings`). A `noise_scale` that
     is given is kept, with no other start: so that fits can be compared; `worth` is the objective of the other fit,
     and a search that has not come below it when it should have converged is given up.
+    Of a very large set (`Problem.sketches`) the steps are taken with a sketch of the matrix; covariance and gates are
+    from all points.
     Raises ValueError when the exposures cannot determine the instrument.
     """
     began = time.perf_counter()
@@ -206,6 +218,8 @@ def fit(
             starts += 1
             if trial.minimum.expansion.objective < found.minimum.expansion.objective:
                 found = trial
+    if problem.sketches:
+        found = _in_full(found, problem)
     posterior = _expansion(found)
     result = FitResult(
         model=problem.model,

@@ -19,6 +19,7 @@ Flux           For each (exposure, point) with y = N/σ and a = model/σ over th
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -36,6 +37,9 @@ from walop_jax.model.plan import Plan
 from walop_jax.model.specification import optical_indices, series_indices
 
 Vector = Float[Array, " n"]
+BLOCK = 64  # field points whose Jacobians are worked on together
+LARGEST_BLOCK = 256  # up to so many points are one block
+THIN = 16  # one point of so many has a part in the matrix of a sketch
 NEWTON_STEPS = 3  # each squares the share of the detectors' distortion that is missing from the flux
 
 
@@ -217,9 +221,30 @@ def _point_normal(
     return r @ r, jacobian @ r, jacobian @ jacobian.T
 
 
+def _over_blocks(function: Callable[[PointData], Normal], data: PointData, block: int) -> Normal:
+    """The sum of a function over blocks of points, so that what it needs in between stays in the processor's cache.
+
+    Points that make no whole number of blocks, and few points, are one block.
+    """
+    points = data.x.shape[0]
+    if points <= LARGEST_BLOCK or points % block:
+        return function(data)
+    parts = jax.tree.map(lambda v: v.reshape(-1, block, *v.shape[1:]), data)
+    blank = jax.tree.map(
+        lambda v: jnp.zeros(v.shape), jax.eval_shape(function, jax.tree.map(lambda v: v[0], parts))
+    )
+    return jax.lax.scan(lambda sum_, part: (jax.tree.map(jnp.add, sum_, function(part)), None), blank, parts)[
+        0
+    ]
+
+
 def _normal_equations(
     instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes | None = None
 ) -> Normal:
+    return _over_blocks(lambda part: _block_equations(instrument, plan, part, nodes), data, BLOCK)
+
+
+def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes | None) -> Normal:
     values, _ = ravel_pytree(instrument)
     series = np.asarray(series_indices(instrument), int)
     plain = np.setdiff1d(np.arange(values.size), series)
@@ -242,6 +267,42 @@ def _normal_equations(
     matrix = matrix.at[np.ix_(plain, series)].set(cross).at[np.ix_(series, plain)].set(cross.T)
     matrix = matrix.at[np.ix_(series, series)].set(square)
     return Normal(chi2.sum(), g, matrix)
+
+
+def _sketched_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes) -> Normal:
+    """χ² and gradient of all points, the matrix from one of `THIN` of them, times `THIN`.
+
+    The gradient runs backwards, from the residuals to the rows at the nodes, and only there meets the slopes: a
+    tenth of the work of the matrix. χ² does not change with the flux at its best, so that is held.
+    """
+    values, to_instrument = ravel_pytree(instrument)
+    optical = np.asarray(optical_indices(instrument), int)
+
+    def slope(part: PointData) -> Normal:
+        def chi2(values: Vector, rows: Float[Array, "t b 2 2 4"]) -> Float[Array, ""]:
+            here, between = to_instrument(values), nodes._replace(rows=rows)
+
+            def of_point(point: PointData) -> Float[Array, ""]:
+                unit = _point_prediction(here, plan, point, between)
+                flux = jax.lax.stop_gradient(_best_flux(here, plan, unit, point))
+                return jnp.sum(((point.counts - _real_counts(here, plan, unit, flux)) * point.weight) ** 2)
+
+            return jnp.sum(jax.vmap(of_point)(part))
+
+        value, (direct, by_rows) = jax.value_and_grad(chi2, (0, 1))(values, nodes.rows)
+        by_optics = jnp.einsum("tbhrs,tobhrs->o", by_rows, nodes.slopes)
+        gradient = 0.5 * direct.at[optical].set(by_optics)
+        return Normal(value, gradient, no_matrix)
+
+    no_matrix = jnp.zeros((0, 0))
+    exact = _over_blocks(slope, data, LARGEST_BLOCK)
+    # Multiples of the golden section: spread evenly, and in step with no raster.
+    points = data.x.shape[0]
+    count = max(1, points // THIN)
+    chosen = (np.mod(np.arange(count) * 0.6180339887498949, 1.0) * points).astype(int)
+    some = jax.tree.map(lambda v: v[chosen], data)
+    matrix = _normal_equations(instrument, plan, some, nodes).matrix
+    return exact._replace(matrix=points / count * matrix)
 
 
 def _residuals(
@@ -330,6 +391,7 @@ def _effect_columns_over_shapes(
 
 
 normal_equations = compiled(_normal_equations)
+sketched_equations = compiled(_sketched_equations)
 effect_columns_over_shapes = compiled(_effect_columns_over_shapes)
 dense_jacobian = compiled(_dense_jacobian)
 effect_columns = compiled(_effect_columns)

@@ -32,6 +32,8 @@ POINTS_PER_CHUNK = 256
 LARGEST_CHUNK = 2_000_000  # intensities × local quantities that a chunk may hold
 SLAB_TO_COUNT = 1 << 15  # field points
 THINNEST = 1e-3  # deg: shortest side of a rectangle with nodes
+LARGE_CHUNK = 1024  # field points of a chunk of a set that is interpolated: the engine divides it further
+SKETCH_ABOVE = 65536  # field points above which the steps of a fit are taken with a sketch of the matrix
 INTERPOLATE_ABOVE = 4096  # field points: more than ten times the nodes that the optics need
 
 
@@ -96,10 +98,10 @@ class Problem:
         n_points = len(calset.points)
         local = len(model.parameters) - len(model.template.throughput.coefficients.ravel()) + 4
         fits = max(1, LARGEST_CHUNK // (4 * len(calset.exposures) * local) * 4)
-        chunk = points_per_chunk or min(POINTS_PER_CHUNK, fits)
-        self.points_per_chunk = min(chunk, n_points)
-        self._chunks = Chunks(calset, self.plan, self.points_per_chunk, mirrored=self._mirrored)
         self.interpolates = n_points > INTERPOLATE_ABOVE if interpolate is None else interpolate
+        usual = LARGE_CHUNK if n_points > INTERPOLATE_ABOVE else min(POINTS_PER_CHUNK, fits)
+        self.points_per_chunk = min(points_per_chunk or usual, n_points)
+        self._chunks = Chunks(calset, self.plan, self.points_per_chunk, mirrored=self._mirrored)
         self.optics_error = 0.0
         self.watch: Watch | None = None
         self._nodes_per_side: int | None = None
@@ -162,17 +164,26 @@ class Problem:
             [0.0 if p.loose is None or p.prior is not None else p.loose**-2 for p in self.model.parameters]
         )
 
-    def expand(self, values: Vector, noise_scale: float = 1.0) -> Posterior:
+    @property
+    def sketches(self) -> bool:
+        """Whether the set is so large that steps are better taken with a sketch of the matrix."""
+        return self.interpolates and len(self.calset.points) > SKETCH_ABOVE
+
+    def expand(self, values: Vector, noise_scale: float = 1.0, *, sketch: bool = False) -> Posterior:
         """χ² and its quadratic expansion at a full vector of parameter values.
 
         `noise_scale` multiplies the errors of the data (not the priors'): above 1 it stands for what the
-        model cannot explain.
+        model cannot explain. With `sketch` the matrix is estimated from a few points in a hundred, where optics
+        are interpolated; χ² and gradient are those of all points, at a fifth of the time.
         """
         instrument = self.model.instrument(values)
         nodes = self._nodes(instrument)
         data, gradient, matrix = 0.0, np.zeros(len(values)), np.zeros((len(values), len(values)))
         for chunk in self._watched():
-            part = engine.normal_equations(instrument, self.plan, chunk, nodes)
+            if sketch and nodes is not None:
+                part = engine.sketched_equations(instrument, self.plan, chunk, nodes)
+            else:
+                part = engine.normal_equations(instrument, self.plan, chunk, nodes)
             data += float(part.chi2)
             gradient += np.asarray(part.gradient)
             matrix += np.asarray(part.matrix)
