@@ -14,7 +14,7 @@ from walop_jax.data.records import Intensities
 from walop_jax.data.sky import moon_sky
 from walop_jax.fit.refit import refit
 from walop_jax.likelihood import chunks
-from walop_jax.likelihood.chunks import Chunks, bytes_per_point
+from walop_jax.likelihood.chunks import Chunks, bytes_per_point, thinned
 from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
 from walop_jax.likelihood.problem import Problem, base_model
 from walop_jax.likelihood.simulate import simulate
@@ -153,3 +153,16 @@ def test_a_pass_may_be_left_half_way(calset, streaming):
     assert first.x.shape == (16,)
     with ThreadPoolExecutor(1) as pool:
         assert pool.submit(lambda: len(list(problem.chunks))).result(timeout=60) == 6
+
+
+def test_a_sample_is_part_of_the_set(calset):
+    sample = thinned(calset, 30, run=5)
+    assert len(sample.points) == 30
+    assert thinned(calset, 81) is calset
+    rows = np.searchsorted(calset.points.point, sample.points.point)
+    whole, part = calset.intensities.block(0, 81), sample.intensities.block(0, 30)
+    assert len(np.unique(rows)) == 30
+    for field in dataclasses.fields(part):
+        np.testing.assert_array_equal(getattr(part, field.name), getattr(whole, field.name)[rows])
+    # Spread over the field: the mean position is near its centre.
+    assert np.abs([sample.points.x.mean(), sample.points.y.mean()]).max() < 0.3 * RUN.field

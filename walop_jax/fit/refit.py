@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.levenberg import MAXIMUM_STEPS, TOLERANCE, Minimum, judged, minimise
+from walop_jax.likelihood.chunks import thinned
 from walop_jax.likelihood.problem import Posterior, Problem, base_model
 from walop_jax.model import materials
 from walop_jax.model.specification import Model
@@ -23,6 +24,7 @@ PRIOR_EDGE = 4.0  # standard deviations
 FAR_OFF = 25.0  # χ²/dof above which other orders are tried and the errors scaled
 MAXIMUM_RESCALINGS = 4
 FIRST_STEPS = 20
+SAMPLE = 16384  # field points of a very large set on which its fit begins
 Progress = Callable[[str, int, float], None]
 
 
@@ -194,15 +196,19 @@ def fit(
     one order of retardance away as well, and the result says so (`noise_scale`, `warnings`). A `noise_scale` that
     is given is kept, with no other start: so that fits can be compared; `worth` is the objective of the other fit,
     and a search that has not come below it when it should have converged is given up.
-    Of a very large set (`Problem.sketches`) the steps are taken with a sketch of the matrix; covariance and gates are
-    from all points.
+    The fit of a very large set (`Problem.sketches`) begins on a sample of its points and takes its steps with a sketch
+    of the matrix; χ², gradient, covariance and gates are those of all points.
     Raises ValueError when the exposures cannot determine the instrument.
     """
     began = time.perf_counter()
     check_identifiable(problem)
     first = problem.model.start if start is None else np.asarray(start, float)
     fixed = noise_scale is not None
-    found, starts = _search(problem, "fit", first, noise_scale or 1.0, progress, FIRST_STEPS), 1
+    near = first
+    if problem.sketches:
+        sample = Problem(thinned(problem.calset, SAMPLE), problem.model)
+        near = _search(sample, "fit of a sample", first, noise_scale or 1.0, progress, FIRST_STEPS).values
+    found, starts = _search(problem, "fit", near, noise_scale or 1.0, progress, FIRST_STEPS), 1
     promising = _expansion(found).objective < worth if worth is not None else _raw(found, problem) < FAR_OFF
     if not found.minimum.converged and promising:
         found = _search(problem, "fit, continued", found.values, noise_scale or 1.0, progress)

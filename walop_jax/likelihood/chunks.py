@@ -6,6 +6,7 @@ the next slab while the engine works on this one: memory is that of two slabs ho
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -15,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.records import Block, CalibrationSet, Exposures
+from walop_jax.data.records import Block, CalibrationSet, Exposures, Points
 from walop_jax.data.sky import moon_direction, rayleigh_sky
+from walop_jax.data.table import TableIntensities
 from walop_jax.likelihood.engine import PointData
 from walop_jax.model.plan import Plan
 
@@ -147,6 +149,24 @@ def _padded(block: Block, size: int) -> Block:
         counts=pad(block.counts, 0.0), sigma=pad(block.sigma, 1.0),
         used=pad(block.used, False), source=pad(block.source, -1),
     )  # fmt: skip
+
+
+def thinned(calset: CalibrationSet, most: int, run: int = 256) -> CalibrationSet:
+    """A set of at most `most` of the points, in memory: runs of `run` neighbours spread evenly over all of them.
+
+    A set that is not larger than that comes back as it is.
+    """
+    n = len(calset.points)
+    if n <= most:
+        return calset
+    # Multiples of the golden section are in step with no raster.
+    places = np.mod(np.arange(max(1, most // run)) * 0.6180339887498949, 1.0)
+    starts = np.unique((places * (n // run)).astype(int)) * run
+    blocks = [calset.intensities.block(int(start), int(start) + run) for start in starts]
+    block = Block(*(np.concatenate([getattr(b, f.name) for b in blocks]) for f in dataclasses.fields(Block)))
+    index = (starts[:, None] + np.arange(run)).ravel()
+    points = Points(point=calset.points.point[index], x=block.x, y=block.y)
+    return dataclasses.replace(calset, points=points, intensities=TableIntensities.dense(points, block))
 
 
 def median_counts(calset: CalibrationSet, slab: int = 4096, most: int = 65536) -> Float[np.ndarray, "e 4"]:

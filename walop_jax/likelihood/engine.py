@@ -311,9 +311,11 @@ def _residuals(
     return jax.vmap(_point_residuals, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
 
 
-def _prediction(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p e 4"]:
+def _prediction(
+    instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes | None = None
+) -> Float[Array, "p e 4"]:
     """Counts for light of unit flux; `detected` takes electrons, flux × these, through the detectors."""
-    return jax.vmap(_point_prediction, in_axes=(None, None, 0))(instrument, plan, data)
+    return jax.vmap(_point_prediction, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
 
 
 def _dense_jacobian(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p d n"]:
