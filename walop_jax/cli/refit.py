@@ -71,6 +71,11 @@ def refit(
             chosen = model_for(calset, text)
         tell("preparing the fit")
         problem = Problem(calset, chosen)
+        if problem.sketches:
+            every = len(calset.points)
+            problem.watch = lambda done, rate: tell(
+                f"{done:,} of {every:,} points, {rate:,.0f} points/s, {(every - done) / rate:.0f} s left of this step"
+            )
         result = fit(problem, progress=lambda label, step, chi2: tell(f"{label}: step {step}, χ² {chi2:.7g}"))
         misfit = None
         if not result.explains_data:

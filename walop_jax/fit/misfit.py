@@ -14,8 +14,11 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.likelihood.chunks import thinned
 from walop_jax.likelihood.problem import Problem
 from walop_jax.model.conventions import CAMERA_NAMES, MATRIX_ELEMENTS
+
+LOOKED_AT = 65536  # field points
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +57,12 @@ class Misfit:
 
 
 def describe(problem: Problem, values: Float[np.ndarray, " n"]) -> Misfit:
-    """Group the residuals of a fit (full vector of parameter values)."""
+    """Group the residuals of a fit (full vector of parameter values).
+
+    Of a very large set, those of `LOOKED_AT` points spread over the field, the worst point among them.
+    """
+    if len(problem.calset.points) > LOOKED_AT:
+        problem = Problem(thinned(problem.calset, LOOKED_AT), problem.model)
     e, used = problem.calset.exposures, problem.used
     flux, residual = problem.residuals(values)
     square = residual**2

@@ -24,6 +24,9 @@ PRIOR_EDGE = 4.0  # standard deviations
 FAR_OFF = 25.0  # χ²/dof above which other orders are tried and the errors scaled
 MAXIMUM_RESCALINGS = 4
 FIRST_STEPS = 20
+# Scaled gradient of a very large set: 10⁻³ of a standard error is 10⁻⁶ in χ², and of a χ² of 10⁹ rounding leaves 10⁻⁷.
+# A sketch measures it to some ten per cent, so the search with it goes to half of that.
+LARGE_TOLERANCE = 1e-3
 SAMPLE = 16384  # field points of a very large set on which its fit begins
 Progress = Callable[[str, int, float], None]
 
@@ -167,8 +170,7 @@ def _search(
     def expand(x: Vector) -> Posterior:
         return problem.expand(first + select @ (x - origin), noise_scale, sketch=problem.sketches)
 
-    # A sketch measures the scaled gradient to a few per cent: leave it some room.
-    tolerance = 0.5 * TOLERANCE if problem.sketches else TOLERANCE
+    tolerance = 0.5 * LARGE_TOLERANCE if problem.sketches else TOLERANCE
     minimum = minimise(
         expand, origin, _scale(model), maximum_steps=steps, tolerance=tolerance, progress=report
     )
@@ -178,7 +180,9 @@ def _search(
 def _in_full(found: _Found, problem: Problem) -> _Found:
     """The minimum with the matrix of all points, and the gates applied to that."""
     posterior = problem.expand(found.values, _expansion(found).noise_scale)
-    return dataclasses.replace(found, minimum=judged(found.minimum, posterior, _scale(problem.model)))
+    return dataclasses.replace(
+        found, minimum=judged(found.minimum, posterior, _scale(problem.model), LARGE_TOLERANCE)
+    )
 
 
 def fit(
