@@ -120,9 +120,12 @@ def _show(found: Diagnosis, output: Path) -> None:
 
 
 def _about(step: Step) -> Iterator[str]:
-    if step.parameters:
-        values = (f"{n} = {v:.4g} ± {s:.2g} {unit}".rstrip() for n, (v, s, unit) in step.parameters.items())
+    values = [f"{name} = {value}" for name, value in step.choices.items()]
+    values += [f"{n} = {v:.4g} ± {s:.2g} {unit}".rstrip() for n, (v, s, unit) in step.parameters.items()]
+    if values:
         yield ", ".join(values)
+    for other in step.alternatives:
+        yield f"or as well {other}"
     yield (
         f"χ² {step.chi2_before:.1f} → {step.chi2_after:.1f}; held out ({step.heldout_before.scheme}) "
         f"{step.heldout_before.mean:.4f} → {step.heldout_after.mean:.4f}; p = {step.p_value:.1g}"

@@ -18,9 +18,13 @@ def _step(step: Step) -> dict[str, Any]:
     return {
         "effect": step.effect,
         "parameters": {
+            name: {"value": value, "sigma": 0.0, "unit": ""} for name, value in step.choices.items()
+        }
+        | {
             name: {"value": value, "sigma": sigma, "unit": unit}
             for name, (value, sigma, unit) in step.parameters.items()
         },
+        "alternatives": list(step.alternatives),
         "score": step.score,
         "p_value": step.p_value,
         "chi2_before": step.chi2_before,

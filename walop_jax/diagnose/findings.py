@@ -35,10 +35,11 @@ class Step:
     `score` and `p_value` (corrected for all that was tried) are of the linear test, `log_bayes` of the refit.
     `change_of_qu` is the largest change that adding it makes to calibrated q or u of a star with p ≤ 5 % at any field
     point, `robust_ratio` the errors of its parameters when every exposure may have a disturbance of its own, over
-    the errors stated. `equivalent` are the effects that this data set cannot tell from it, `separation` how far (σ)
-    each rival stays from it. `residual_before`, `residual_after` and `signature` are in standard deviations, (point,
-    exposure, camera): the residuals (data − model) without and with the effect at the time it was added, and the
-    change that it makes to the residuals of the final model.
+    the errors stated. `choices` are discrete (which camera, which star), `alternatives` other shapes of the same
+    effect that explain the data as well. `equivalent` are the effects that this data set cannot tell from it,
+    `separation` how far (σ) each rival stays from it. `residual_before`, `residual_after` and `signature` are in
+    standard deviations, (point, exposure, camera): the residuals (data − model) without and with the effect at the
+    time it was added, and the change that it makes to the residuals of the final model.
     """
 
     effect: str
@@ -52,6 +53,8 @@ class Step:
     heldout_after: HeldOut
     change_of_qu: float = float("nan")
     robust_ratio: float = float("nan")
+    choices: dict[str, Any] = dataclasses.field(default_factory=dict)
+    alternatives: tuple[str, ...] = ()
     equivalent: tuple[str, ...] = ()
     separation: dict[str, float] = dataclasses.field(default_factory=dict)
     separated_by: str = ""

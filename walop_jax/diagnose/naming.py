@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -27,6 +28,7 @@ from walop_jax.model.specification import Model, full_values, with_effects
 
 SEPARATION = 3.0
 MOST_LEADERS = 5
+MOST_SHAPES = 4  # of one effect from which it is refitted
 CLOSE = 8.0  # ln B below the best within which a rival is refitted
 LARGE = 150.0  # ln B above which the linear ranking is not trusted
 EVEN_ODDS = 3.0  # difference in ln B that is no preference
@@ -34,22 +36,30 @@ EVEN_ODDS = 3.0  # difference in ln B that is no preference
 
 @dataclasses.dataclass(frozen=True)
 class Ranked:
-    """An effect with its best probe: evidence averaged over its alternative shapes."""
+    """An effect with its best probe: evidence averaged over its alternative shapes; `others` may be as good."""
 
     effect: type[Effect]
     probe: Probe
     score: Score
     log_bayes: float
+    others: tuple[tuple[Probe, Score], ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
-    """An effect that was added and refitted."""
+    """An effect that was added and refitted; `alternatives` are other shapes of it that do as well, in words."""
 
     effect: type[Effect]
     problem: Problem
     fit: FitResult
     log_bayes: float
+    alternatives: tuple[str, ...] = ()
+
+    @property
+    def instance(self) -> Effect:
+        """The effect at its fitted values, in standard form."""
+        effects = self.fit.model.instrument(self.fit.values).effects
+        return next(e for e in effects if e.name == self.effect.name).standard_form()
 
 
 def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
@@ -62,10 +72,12 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
         alive = [(p, s) for p, s in shapes if s.testable and follow_physics(effect, p.group, s)]
         if not alive:
             continue
-        probe, score = max(alive, key=lambda item: item[1].log_bayes)
+        alive.sort(key=lambda item: -item[1].log_bayes)
+        (probe, score), best = alive[0], alive[0][1].log_bayes
         bayes = np.array([s.log_bayes for _, s in alive])
         mean = float(np.logaddexp.reduce(bayes) - np.log(len(shapes)))
-        ranked.append(Ranked(effect, probe, score, mean))
+        others = [item for item in alive[1:MOST_SHAPES] if item[1].log_bayes > best - max(CLOSE, 0.2 * best)]
+        ranked.append(Ranked(effect, probe, score, mean, tuple(others)))
     return sorted(ranked, key=lambda item: -item.log_bayes)
 
 
@@ -106,9 +118,37 @@ def try_effect(
     return Trial(type(instance), problem, result, bayes)
 
 
-def start_of(item: Ranked) -> Effect:
-    """The effect with the amplitudes that the linear step finds."""
-    return item.effect.combine(item.probe.group, item.score.amplitudes)
+def try_shapes(calset: CalibrationSet, base: FitResult, item: Ranked, context: Context, shapes: int) -> Trial:
+    """Refit an effect from the amplitudes of its linear steps at the shapes that may be best, and keep the best."""
+    places = ((item.probe, item.score), *item.others)
+    trials = [
+        try_effect(calset, base, item.effect.combine(probe.group, score.amplitudes), context, shapes)
+        for probe, score in places
+    ]
+    best = max(trials, key=lambda t: t.log_bayes if t.fit.converged else -np.inf)
+    alike = [t for t in trials if t.fit.converged and t.log_bayes > best.log_bayes - EVEN_ODDS]
+    told = dict.fromkeys(in_words(t.instance) for t in alike if _differ(t, best))
+    return dataclasses.replace(best, alternatives=tuple(told))
+
+
+def _differ(one: Trial, other: Trial) -> bool:
+    if one.instance.choices() != other.instance.choices():
+        return True
+    at = [i for i, name in enumerate(one.fit.model.names) if name.startswith(f"{one.effect.name}.")]
+    sigma = np.maximum(one.fit.sigma[at], other.fit.sigma[at])
+    away = full_values(one.instance) - full_values(other.instance)
+    return bool(np.any(np.abs(away) > SEPARATION * np.where(sigma > 0, sigma, np.inf)))
+
+
+def in_words(effect: Effect) -> str:
+    """Choices and values of an effect, e.g. "camera = 2, depth = 0.006"."""
+    values = {leaf.name: f"{v:.4g}" for leaf, v in zip(leaves(effect), full_values(effect), strict=True)}
+    return ", ".join(f"{name} = {value}" for name, value in (spoken_choices(effect) | values).items())
+
+
+def spoken_choices(effect: Effect) -> dict[str, Any]:
+    """Discrete choices that mean something to a reader: a camera, a crystal, a star."""
+    return {name: value for name, value in effect.choices().items() if isinstance(value, int | str)}
 
 
 def follow_physics(effect: type[Effect], group: Sequence[Effect], score: Score) -> bool:

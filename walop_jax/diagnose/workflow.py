@@ -118,8 +118,7 @@ class _Diagnosing:
     def _trials(self, look: Look) -> Iterator[naming.Trial]:
         for item in naming.leaders(look.significant) if look.significant else ():
             shapes = sum(probe.effect is item.effect for probe in look.probes)
-            start = naming.start_of(item)
-            yield naming.try_effect(self.calset, self.fit, start, self.context, shapes)
+            yield naming.try_shapes(self.calset, self.fit, item, self.context, shapes)
         active = {effect.name for effect in self.problem.model.template.effects}
         if self.fit.chi2 > MISFIT * self.fit.dof:
             for effect in self.catalogue:
@@ -169,6 +168,7 @@ class _Diagnosing:
             heldout_after=held_out(design, scheme),
             change_of_qu=change,
             equivalent=close,
+            alternatives=trial.alternatives,
             residual_before=look.design.cube(look.design.residual),
             residual_after=design.cube(design.residual),
         )
@@ -255,6 +255,7 @@ class _Diagnosing:
         return dataclasses.replace(
             step,
             parameters=parameters,
+            choices=naming.spoken_choices(effect),
             robust_ratio=look.design.robust_ratio(step.effect),
             equivalent=tuple(sorted(close, key=lambda name: separation.get(name, np.inf))),
             separation=separation,

@@ -25,8 +25,10 @@ def measured(value: float, sigma: float) -> str:
     return " ± ".join(digits(value, sigma)) if sigma > 0 else digits(value, sigma)[0]
 
 
-def digits(value: float | None, sigma: float | None) -> tuple[str, str]:
+def digits(value: float | str | None, sigma: float | None) -> tuple[str, str]:
     """Value and error as two texts, both to the second digit of the error; the error is empty where there is none."""
+    if isinstance(value, str):
+        return value, ""
     if value is None or not math.isfinite(value):
         return "–", ""
     if sigma is None or not 0 < sigma < math.inf:
