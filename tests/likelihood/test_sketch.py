@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from walop_jax.fit import misfit
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood import problem as likelihood
+from walop_jax.likelihood.chunks import thinned
 from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood.problem import Problem, base_model, evenly_covered
 from walop_jax.likelihood.simulate import simulate
 
 RUN = ObservingPlan(
@@ -68,3 +71,20 @@ def test_misfit_of_a_large_set_is_that_of_points_spread_over_it(made, monkeypatc
     assert some != full
     assert some.camera == pytest.approx(full.camera, rel=0.1)
     assert some.matrix_element == pytest.approx(full.matrix_element, rel=0.1)
+
+
+def test_exposures_of_a_few_points_are_never_left_to_chance(made):
+    """A standard star at three places among the pixels: a sixteenth of the points might hold none of them."""
+    chunk = made.chunks[0]
+    assert evenly_covered(chunk)
+    assert evenly_covered(chunk._replace(weight=chunk.weight.at[:, 2].set(0.0)))
+    assert not evenly_covered(chunk._replace(weight=chunk.weight.at[3:, 2].set(0.0)))
+    calset = thinned(made.calset, 512, run=512)
+    table = calset.intensities
+    rare = table.using((table.exposure != 2) | (table.point < 3))
+    for intensities, exact in ((table, False), (rare, True)):
+        problem = Problem(
+            dataclasses.replace(calset, intensities=intensities), made.model, 512, interpolate=True
+        )
+        sketch, full = (problem.expand(made.model.start, sketch=flag) for flag in (True, False))
+        assert np.array_equal(sketch.matrix, full.matrix) == exact

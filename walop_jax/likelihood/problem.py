@@ -174,13 +174,14 @@ class Problem:
 
         `noise_scale` multiplies the errors of the data (not the priors'): above 1 it stands for what the
         model cannot explain. With `sketch` the matrix is estimated from a few points in a hundred, where optics
-        are interpolated; χ² and gradient are those of all points, at a fifth of the time.
+        are interpolated and the points of a chunk all have the same exposures; χ² and gradient are those of all
+        points, at a fifth of the time.
         """
         instrument = self.model.instrument(values)
         nodes = self._nodes(instrument)
         data, gradient, matrix = 0.0, np.zeros(len(values)), np.zeros((len(values), len(values)))
         for chunk in self._watched():
-            if sketch and nodes is not None:
+            if sketch and nodes is not None and evenly_covered(chunk):
                 part = engine.sketched_equations(instrument, self.plan, chunk, nodes)
             else:
                 part = engine.normal_equations(instrument, self.plan, chunk, nodes)
@@ -289,6 +290,12 @@ class Problem:
         free = set(self.model.free.tolist())
         priors = sum(1 for i in self._priors[0] if int(i) in free)
         return int(self.rows_used @ per_row) + priors - len(free)
+
+
+def evenly_covered(chunk: engine.PointData) -> bool:
+    """Whether every exposure has most points of a chunk or none, so that a few points can stand for all."""
+    rows = (np.asarray(chunk.weight)[..., 0] > 0).sum(axis=0)
+    return bool(np.all((rows == 0) | (rows > 0.5 * chunk.x.shape[0])))
 
 
 def standard_names(sources: Sources) -> tuple[str, ...]:
