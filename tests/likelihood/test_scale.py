@@ -13,7 +13,8 @@ Measured on two cores of which other programs took most (load 5 to 8), one threa
     1 000 000     4.3 s    9.1 s     25.5 s     1.1 GB   refit 69 s: 5 steps and one in full
 
 The compiled code of a step is 47 kflop and 103 kB a point (3.9 µs: 12 Gflop/s, 26 GB/s), in full 274 kflop and 516 kB
-(26 µs: 10 Gflop/s, 20 GB/s; 17 µs in blocks of 64): memory traffic, not arithmetic, is what holds both back. Frames
+(26 µs: 10 Gflop/s, 20 GB/s; 17 µs in blocks of 64). Bytes are as the compiler counts them, caches or not; that smaller
+blocks are faster speaks for memory, not arithmetic, as what holds it back. Frames
 are read at 260 000 points/s. Hence 16.7 million points in 19 min under that load, linear in the points.
 """
 
