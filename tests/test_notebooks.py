@@ -10,6 +10,10 @@ import pytest
 
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+LONG = (
+    "paper_versus_joint",
+    "your_own_effect",
+)  # minutes each; the rooms that they call have tests of their own
 TIMEOUT = 900  # seconds per cell, on a machine that does other things as well
 
 
@@ -49,7 +53,11 @@ def test_notebooks_are_prose_and_calls(path: Path):
 # The machinery of Jupyter warns of its own future; its sockets may be collected late.
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, marks=pytest.mark.long) if p.stem in LONG else p for p in NOTEBOOKS],
+    ids=lambda path: path.stem,
+)
 def test_notebooks_run(path: Path):
     from nbclient import NotebookClient
 

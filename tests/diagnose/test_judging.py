@@ -136,6 +136,7 @@ def test_many_names_and_weak_errors_call_for_caution():
     assert "errors of a" in caution(("a", 2.0))
 
 
+@pytest.mark.long
 def test_what_has_no_name_stays_unexplained_and_is_carried_along():
     """Fine structure of one camera, nothing that the catalogue has: described, taken up, not named."""
     context = effect_context(base_model(simulate(PLAN, seed=1).calset).template, PLAN.exposures())
