@@ -28,10 +28,12 @@ def code_of(notebook: nbformat.NotebookNode) -> list[str]:
 
 
 def test_there_are_notebooks():
-    assert [path.name for path in NOTEBOOKS] == [
-        "first_calibration.ipynb",
-        "paper_versus_joint.ipynb",
-        "posteriors.ipynb",
+    assert [path.stem for path in NOTEBOOKS] == [
+        "first_calibration",
+        "hidden_effect",
+        "paper_versus_joint",
+        "posteriors",
+        "your_own_effect",
     ]
 
 
