@@ -10,15 +10,11 @@ from jaxtyping import Bool, Float
 
 from walop_jax.data.filters import DEFAULT_FILTER, builtin_filter
 from walop_jax.data.records import Exposures, FilterCurve, Points, Site
+from walop_jax.data.sites import SITES
 from walop_jax.data.sky import moon_direction
 from walop_jax.model.effects.base import Context
 
 NAN = float("nan")
-SITES: Mapping[str, Site] = {
-    "WALOP-SOUTH": Site("SAAO 1-m", -32.3795, 20.8107, 1798.0),
-    "WALOP-NORTH": Site("Skinakas 1.3-m", 35.2120, 24.8982, 1750.0),
-    "WALOP-LAB": Site("bench", 18.5590, 73.8250, 560.0),
-}
 FULL_MOON: Mapping[str, float] = {"WALOP-SOUTH": 61220.85, "WALOP-NORTH": 61042.90, "WALOP-LAB": 61042.90}
 """MJD (UTC) in a night of full Moon in which it stands high: 2026 June 29 (south), 2026 January 2 (north)."""
 
