@@ -34,6 +34,7 @@ from walop_jax.data.sky import (
 )
 from walop_jax.data.table import TableIntensities, empty_block
 from walop_jax.data.write import write_calibration_set, write_frames
+from walop_jax.data.zemax import import_transmissions
 
 __all__ = [
     "BUILTIN_FILTERS",
@@ -62,6 +63,7 @@ __all__ = [
     "check_output",
     "empty_block",
     "empty_sources",
+    "import_transmissions",
     "merge_calibration_sets",
     "moon_direction",
     "moon_sky",
