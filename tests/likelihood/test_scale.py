@@ -32,7 +32,7 @@ from walop_jax.data import Grid, read_calibration_set, write_frames
 from walop_jax.data.records import Block, CalibrationSet, Intensities
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood import engine
-from walop_jax.likelihood.chunks import Chunks, bytes_per_point, slabs
+from walop_jax.likelihood.chunks import Chunks, bytes_per_point
 from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
 from walop_jax.likelihood.problem import LARGE_CHUNK, Problem, base_model
 from walop_jax.likelihood.simulate import simulate
@@ -51,7 +51,7 @@ class Made(Intensities):
     def __init__(self, blank: CalibrationSet, truth):
         self.blank, self.truth = blank, truth
         self.problem = Problem(blank, base_model(blank), interpolate=True)
-        self.nodes = self.problem._nodes(truth)
+        self.nodes = self.problem.nodes(truth)
         self.chunks = Chunks(blank, self.problem.plan, LARGE_CHUNK)
         pool = np.random.default_rng(0).standard_normal((4096, EXPOSURES, 4))
         self.pool = pool / np.sqrt(np.mean(pool**2))  # or χ² would scatter as that of 4096 points
@@ -155,7 +155,7 @@ def test_work_per_point():
     calset = made(32)
     problem = Problem(calset, base_model(calset), points_per_chunk=engine.LARGEST_BLOCK, interpolate=True)
     instrument = problem.model.instrument()
-    arguments = (instrument, problem.plan, problem.chunks[0], problem._nodes(instrument))
+    arguments = (instrument, problem.plan, problem.chunks[0], problem.nodes(instrument))
     for label, function in (("in full", engine.normal_equations), ("step", engine.sketched_equations)):
         cost = jax.jit(function.__wrapped__).lower(*arguments).compile().cost_analysis()
         jax.block_until_ready(function(*arguments))

@@ -32,6 +32,19 @@ ModelOption = Annotated[
 ]
 
 
+ProcessesOption = Annotated[
+    str | None,
+    typer.Option(
+        "--processes",
+        metavar="INDEX/COUNT@HOST:PORT",
+        help="Share a large set with other processes that run the same command; auto: as Slurm or Open MPI say.",
+    ),
+]
+MemoryOption = Annotated[
+    float, typer.Option("--memory", metavar="GB", min=0.1, help="What the data of field points may take.")
+]
+
+
 class CommandError(Exception):
     """A command failed for a reason that its one line of message states."""
 
@@ -169,6 +182,26 @@ def switch_on_jax() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
         jax.config.update("jax_raise_persistent_cache_errors", False)
+
+
+@contextlib.contextmanager
+def shared(place: str | None) -> Iterator[bool]:
+    """Join the other processes of a computation, if `place` says where they are; gives whether this is the first one.
+
+    When one fails it ends at once, with its line of error: the others notice that it has gone.
+    """
+    if place is None:
+        yield True
+        return
+    from walop_jax.likelihood.processes import join, leave_at_once
+
+    crew = join(place)
+    try:
+        yield crew.index == 0
+    except BaseException as error:
+        complain(f"process {crew.index} of {crew.count}: {error or type(error).__name__}")
+        sys.stderr.flush()
+        leave_at_once(1)
 
 
 def product_path(run: Path) -> Path:

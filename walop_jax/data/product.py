@@ -6,6 +6,7 @@
     COVARIANCE   image, in the order of PARAMETERS; tied and frozen parameters included
     M21 … M33    images of the instrument matrix over the field (filter of MAPFILT, flat photon spectrum,
                  calibration plate out), M21_ERR … M33_ERR their standard errors; linear WCS in degrees
+    RESIDUAL…    of a large set: what the smooth model leaves, in cells of the field (see residual_map.py)
     FILTERS      the filter curves that were used          } as in a calibration set
     EXPOSURES    the exposures that went in                }
     SOURCES      the standards, if there were any          }
@@ -45,6 +46,7 @@ from walop_jax.data.product_records import (
     spelt,
 )
 from walop_jax.data.records import InputFile, Site
+from walop_jax.data.residual_map import read_residual_map, residual_hdus
 from walop_jax.data.schema import Column, Place, read_table
 from walop_jax.data.write import filter_columns, grid_cards, sign_and_write, table_hdu
 
@@ -120,6 +122,8 @@ def _hdus(product: CalibrationProduct, path: object) -> list[Any]:
         for name, image in zip(MATRIX_NAMES, maps, strict=True):
             images.append(fits.ImageHDU(image, name=name + suffix))
             images[-1].header.update(grid_cards(product.maps.grid))
+    if product.residuals is not None:
+        images += residual_hdus(product.residuals)
     return [_primary(product), made.pop("PARAMETERS"), *images, *made.values()]
 
 
@@ -269,6 +273,7 @@ def _from_hdus(opened: OpenFile) -> CalibrationProduct:
         if inputs is None
         else tuple(InputFile(Path(p), s) for p, s in zip(inputs["PATH"], inputs["SHA256"], strict=True)),
         versions=header.versions(),
+        residuals=read_residual_map(units, path),
     )  # fmt: skip
     if header.text("CONTHASH") != product.content_hash():
         raise fail(

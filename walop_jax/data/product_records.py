@@ -13,6 +13,8 @@ from walop_jax.data.frames import Grid
 from walop_jax.data.records import Exposures, FilterCurve, InputFile, Site, Sources
 
 MATRIX_NAMES = ("M21", "M22", "M23", "M31", "M32", "M33")
+RESIDUAL_NAMES = (*MATRIX_NAMES, "RATIO")
+"""Quantities of a residual map: corrections of the matrix, and of the throughput of cameras N2, N3."""
 
 QUALITY_BITS = {
     1: "not converged",
@@ -78,6 +80,37 @@ class MatrixMaps:
 
 
 @dataclasses.dataclass(frozen=True)
+class ResidualMap:
+    """What the smooth model leaves, in cells of the field: planes in the order of `RESIDUAL_NAMES`.
+
+    To be added to the matrix (throughput of N2, N3: relative); NaN where a cell has too few data. `chi2` is that of the
+    residuals before the correction, per degree of freedom. Through `filter` and with the calibration plate at
+    `chwp_angle` (deg, NaN out).
+    """
+
+    grid: Grid
+    filter: str
+    chwp_angle: float
+    values: Float[np.ndarray, "7 y x"]
+    errors: Float[np.ndarray, "7 y x"]
+    chi2: Float[np.ndarray, "y x"]
+
+    def excess(self) -> dict[str, float]:
+        """Rms over the field of every quantity beyond its standard errors; negative if below, as chance has it."""
+        found = {}
+        for name, value, error in zip(RESIDUAL_NAMES, self.values, self.errors, strict=True):
+            known = np.isfinite(value)
+            variance = float(np.mean(value[known] ** 2 - error[known] ** 2)) if known.any() else np.nan
+            found[name] = float(np.sign(variance) * np.sqrt(abs(variance)))
+        return found
+
+    def significance(self) -> float:
+        """How many standard deviations the scatter of all corrections lies above what their errors make it."""
+        squares = (self.values / self.errors)[np.isfinite(self.values)] ** 2
+        return float((squares.sum() - squares.size) / np.sqrt(2.0 * max(squares.size, 1)))
+
+
+@dataclasses.dataclass(frozen=True)
 class Verdict:
     """How far a product can be trusted; `quality` are bits of `QUALITY_BITS`.
 
@@ -119,6 +152,7 @@ class CalibrationProduct:
     model: tuple[str, ...]
     inputs: tuple[InputFile, ...] = ()
     versions: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    residuals: ResidualMap | None = None
 
     def __post_init__(self) -> None:
         n = len(self.parameters)
@@ -151,5 +185,7 @@ class CalibrationProduct:
             yield from (getattr(record, entry.name) for entry in dataclasses.fields(record))
         yield from (getattr(self.exposures, name) for name in ("exposure", "kind", "mjd", "filter"))
         yield from (self.covariance, self.maps.values, self.maps.errors)
+        if self.residuals is not None:
+            yield from (self.residuals.values, self.residuals.errors, self.residuals.chi2)
         for name, curve in self.filters.items():
             yield from (np.array([name]), curve.wavelength, curve.throughput)

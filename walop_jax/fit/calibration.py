@@ -18,6 +18,7 @@ from walop_jax.data.errors import DataError, nearest
 from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter
 from walop_jax.data.frames import Grid
 from walop_jax.data.product import CalibrationProduct, MatrixMaps, ParameterTable, Verdict, spelt
+from walop_jax.data.product_records import ResidualMap
 from walop_jax.data.records import Exposures, FilterCurve, InputFile, Site, Sources
 from walop_jax.fit.building import model_without_data
 from walop_jax.fit.model_file import render
@@ -67,13 +68,12 @@ class Calibration:
     origin: str
     field: tuple[float, float, float, float]
     inputs: tuple[InputFile, ...] = ()
+    residuals: ResidualMap | None = None
 
     @classmethod
     def from_fit(cls, result: FitResult, problem: Problem) -> Calibration:
         """The calibration that a fit gives, with the verdict on it (see `quality`)."""
         calset = problem.calset
-        used = problem.points_used
-        x, y = calset.points.x[used], calset.points.y[used]
         verdict = Verdict(
             chi2=result.chi2,
             dof=result.dof,
@@ -94,7 +94,7 @@ class Calibration:
             sources=calset.sources,
             site=calset.site,
             origin=calset.origin,
-            field=(float(x.min()), float(x.max()), float(y.min()), float(y.max())),
+            field=problem.field,
             inputs=calset.inputs,
         )
 
@@ -201,6 +201,7 @@ class Calibration:
             model=tuple(spelt(line) for line in render(self.model).splitlines() if line.strip()),
             inputs=self.inputs,
             versions=software_versions(),
+            residuals=self.residuals,
         )
 
     @classmethod
@@ -230,6 +231,7 @@ class Calibration:
             origin=product.origin,
             field=product.field,
             inputs=product.inputs,
+            residuals=product.residuals,
         )
 
 

@@ -30,6 +30,7 @@ Matrix = Float[np.ndarray, "n n"]
 MAXIMUM_STEPS = 60
 TOLERANCE = 1e-4
 LARGEST_CONDITION = 1e12
+STALE = 0.05  # of the distance left by a step
 _SEARCH = optx.ClassicalTrustRegion()
 _DESCENT = optx.DampedNewtonDescent(linear_solver=lx.Cholesky())
 
@@ -176,23 +177,52 @@ def minimise(
     return Minimum(here, expansion, converged, message, steps, decrement, condition, tuple(history))
 
 
-def judged(minimum: Minimum, expansion: Expansion, scale: Vector, tolerance: float = TOLERANCE) -> Minimum:
-    """The same minimum with a better expansion at its place, and the gates applied to that."""
+def polish(
+    expand: Callable[[Vector], Expansion],
+    slope: Callable[[Vector, Expansion], Expansion],
+    start: Vector,
+    scale: Vector,
+    *,
+    maximum_steps: int = MAXIMUM_STEPS,
+    tolerance: float = TOLERANCE,
+    progress: Callable[[int, float], None] | None = None,
+) -> Minimum:
+    """Newton steps from near the minimum, with a matrix that is computed anew only when it no longer serves.
+
+    `slope(x, near)` is an expansion at x with the matrix of `near`, at a fraction of the cost of `expand(x)`. A step
+    leaves as much of the distance as the matrix changes on the way there, relatively; where more than `STALE` is left,
+    the matrix is stale. Where a step leads upwards, `minimise` takes over. Never raises for a numerical outcome.
+    """
+    here = np.asarray(start, float)
+    expansion = expand(here)
+    history = [expansion.objective]
     decrement, condition = scaled_gradient(expansion, scale)
-    converged = bool(minimum.converged and decrement < tolerance and condition <= LARGEST_CONDITION)
-    message = minimum.message
-    if converged:
-        message = f"converged: scaled gradient {decrement:.1e}"
-    elif minimum.converged:
-        message = f"not converged in full: scaled gradient {decrement:.1e}, condition number {condition:.1e}"
-    return dataclasses.replace(
-        minimum,
-        expansion=expansion,
-        converged=converged,
-        message=message,
-        scaled_gradient=decrement,
-        condition=condition,
-    )
+    first, steps, message = decrement, 0, ""
+    while decrement >= tolerance and np.isfinite(decrement) and steps < maximum_steps:
+        steps += 1
+        there = here + _newton_step(expansion, scale)
+        trial = slope(there, expansion)
+        history.append(trial.objective)
+        # Near the end two objectives differ by less than their rounding.
+        if not trial.objective <= expansion.objective * (1.0 + 1e-12):
+            return minimise(expand, here, scale, tolerance=tolerance, progress=progress)
+        left, condition = scaled_gradient(trial, scale)
+        stale = left > max(STALE * decrement, tolerance)
+        here, expansion, decrement = there, expand(there) if stale else trial, left
+        if progress is not None:
+            progress(steps, expansion.objective)
+    converged = decrement < tolerance and condition <= LARGEST_CONDITION
+    message = f"converged: scaled gradient {decrement:.1e}, at first {first:.1e}"
+    if not converged:
+        message = f"not converged: scaled gradient {decrement:.1e}, condition number {condition:.1e}"
+    return Minimum(here, expansion, bool(converged), message, steps, decrement, condition, tuple(history))
+
+
+def _newton_step(expansion: Expansion, scale: Vector) -> Vector:
+    matrix, gradient = expansion.matrix * np.outer(scale, scale), expansion.gradient * scale
+    value, vector = np.linalg.eigh(matrix)
+    known = value > value[-1] * 1e-15
+    return -scale * (vector[:, known] @ ((vector.T @ gradient)[known] / value[known]))
 
 
 def _arrays(expansion: Expansion, scale: Vector) -> Any:

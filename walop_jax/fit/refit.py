@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.levenberg import MAXIMUM_STEPS, TOLERANCE, Minimum, judged, minimise
+from walop_jax.fit.levenberg import MAXIMUM_STEPS, Expansion, Minimum, minimise, polish
 from walop_jax.likelihood.chunks import thinned
 from walop_jax.likelihood.problem import Posterior, Problem, base_model
 from walop_jax.model import materials
@@ -24,10 +24,9 @@ PRIOR_EDGE = 4.0  # standard deviations
 FAR_OFF = 25.0  # χ²/dof above which other orders are tried and the errors scaled
 MAXIMUM_RESCALINGS = 4
 FIRST_STEPS = 20
-# Scaled gradient of a very large set: 10⁻³ of a standard error is 10⁻⁶ in χ², and of a χ² of 10⁹ rounding leaves 10⁻⁷.
-# A sketch measures it to some ten per cent, so the search with it goes to half of that.
+# Scaled gradient of a large set: 10⁻³ of a standard error is 10⁻⁶ in χ², and of a χ² of 10⁹ rounding leaves 10⁻⁷.
 LARGE_TOLERANCE = 1e-3
-SAMPLE = 16384  # field points of a very large set on which its fit begins
+SAMPLE = 16384  # field points of a large set on which its fit begins
 Progress = Callable[[str, int, float], None]
 
 
@@ -168,21 +167,46 @@ def _search(
     report = None if progress is None else lambda step, chi2: progress(label, step, chi2)
 
     def expand(x: Vector) -> Posterior:
-        return problem.expand(first + select @ (x - origin), noise_scale, sketch=problem.sketches)
+        return problem.expand(first + select @ (x - origin), noise_scale)
 
-    tolerance = 0.5 * LARGE_TOLERANCE if problem.sketches else TOLERANCE
-    minimum = minimise(
-        expand, origin, _scale(model), maximum_steps=steps, tolerance=tolerance, progress=report
-    )
+    minimum = minimise(expand, origin, _scale(model), maximum_steps=steps, progress=report)
     return _Found(minimum, first + select @ (minimum.x - origin))
 
 
-def _in_full(found: _Found, problem: Problem) -> _Found:
-    """The minimum with the matrix of all points, and the gates applied to that."""
-    posterior = problem.expand(found.values, _expansion(found).noise_scale)
-    return dataclasses.replace(
-        found, minimum=judged(found.minimum, posterior, _scale(problem.model), LARGE_TOLERANCE)
+def _near(
+    problem: Problem, first: Vector, noise_scale: float | None, worth: float | None, progress: Progress | None
+) -> tuple[Vector, float, int]:
+    """The minimum of a sample of a large set, the factor on the errors, and from how many places it was sought."""
+
+    def make() -> Vector:
+        sample = Problem(thinned(problem.calset, SAMPLE), problem.model)
+        found, starts = _sought(sample, first, noise_scale, worth, progress)
+        return np.append(found.values, [_expansion(found).noise_scale, starts])
+
+    journal = problem.passes.journal
+    key = f"sample {first.tobytes().hex()} {noise_scale} {worth}"
+    *values, scale, starts = make() if journal is None else journal.remembered(key, make)
+    return np.array(values), float(scale), int(starts)
+
+
+def _polished(problem: Problem, first: Vector, noise_scale: float, progress: Progress | None) -> _Found:
+    """The minimum of a large set from a place near it."""
+    model = problem.model
+    select = model.selection()
+    origin = first[model.free]
+
+    def full(x: Vector) -> Float[np.ndarray, " all"]:
+        return first + select @ (x - origin)
+
+    minimum = polish(
+        lambda x: problem.expand(full(x), noise_scale),
+        lambda x, there: problem.slope(full(x), _posterior(there)),
+        origin,
+        _scale(model),
+        tolerance=LARGE_TOLERANCE,
+        progress=None if progress is None else lambda step, chi2: progress("fit of all points", step, chi2),
     )
+    return _Found(minimum, full(minimum.x))
 
 
 def fit(
@@ -200,37 +224,19 @@ def fit(
     one order of retardance away as well, and the result says so (`noise_scale`, `warnings`). A `noise_scale` that
     is given is kept, with no other start: so that fits can be compared; `worth` is the objective of the other fit,
     and a search that has not come below it when it should have converged is given up.
-    The fit of a very large set (`Problem.sketches`) begins on a sample of its points and takes its steps with a sketch
-    of the matrix; χ², gradient, covariance and gates are those of all points.
+    The minimum of a large set (`Problem.is_large`) is sought on a sample of its points; a pass over all of them gives
+    the step from there to its own, and another one shows that nothing is left to do.
     Raises ValueError when the exposures cannot determine the instrument.
     """
     began = time.perf_counter()
-    check_identifiable(problem)
     first = problem.model.start if start is None else np.asarray(start, float)
-    fixed = noise_scale is not None
-    near = first
-    if problem.sketches:
-        sample = Problem(thinned(problem.calset, SAMPLE), problem.model)
-        near = _search(sample, "fit of a sample", first, noise_scale or 1.0, progress, FIRST_STEPS).values
-    found, starts = _search(problem, "fit", near, noise_scale or 1.0, progress, FIRST_STEPS), 1
-    promising = _expansion(found).objective < worth if worth is not None else _raw(found, problem) < FAR_OFF
-    if not found.minimum.converged and promising:
-        found = _search(problem, "fit, continued", found.values, noise_scale or 1.0, progress)
-    check_constrained(problem, _expansion(found))
-    for _ in range(0 if fixed else MAXIMUM_RESCALINGS):
-        scale = float(np.sqrt(_raw(found, problem)))
-        if scale**2 < FAR_OFF or abs(scale / _expansion(found).noise_scale - 1.0) < 0.1:
-            break
-        found = _search(problem, f"errors × {scale:.3g}", first, scale, progress)
-    if not fixed and _raw(found, problem) > FAR_OFF:
-        for label, other in _order_starts(problem):
-            trial = _search(problem, label, other, _expansion(found).noise_scale, progress)
-            starts += 1
-            if trial.minimum.expansion.objective < found.minimum.expansion.objective:
-                found = trial
-    if problem.sketches:
-        found = _in_full(found, problem)
+    if problem.is_large:
+        near, scale, starts = _near(problem, first, noise_scale, worth, progress)
+        found = _polished(problem, near, scale, progress)
+    else:
+        found, starts = _sought(problem, first, noise_scale, worth, progress)
     posterior = _expansion(found)
+    check_constrained(problem, posterior)
     result = FitResult(
         model=problem.model,
         values=found.values,
@@ -246,15 +252,43 @@ def fit(
     return dataclasses.replace(result, warnings=tuple(_warnings(result)))
 
 
+def _sought(
+    problem: Problem, first: Vector, noise_scale: float | None, worth: float | None, progress: Progress | None
+) -> tuple[_Found, int]:
+    """The minimum from start values that may be far away, and from how many places it was sought."""
+    check_identifiable(problem)
+    fixed = noise_scale is not None
+    found, starts = _search(problem, "fit", first, noise_scale or 1.0, progress, FIRST_STEPS), 1
+    promising = _expansion(found).objective < worth if worth is not None else _raw(found, problem) < FAR_OFF
+    if not found.minimum.converged and promising:
+        found = _search(problem, "fit, continued", found.values, noise_scale or 1.0, progress)
+    for _ in range(0 if fixed else MAXIMUM_RESCALINGS):
+        scale = float(np.sqrt(_raw(found, problem)))
+        if scale**2 < FAR_OFF or abs(scale / _expansion(found).noise_scale - 1.0) < 0.1:
+            break
+        found = _search(problem, f"errors × {scale:.3g}", first, scale, progress)
+    if not fixed and _raw(found, problem) > FAR_OFF:
+        for label, other in _order_starts(problem):
+            trial = _search(problem, label, other, _expansion(found).noise_scale, progress)
+            starts += 1
+            if trial.minimum.expansion.objective < found.minimum.expansion.objective:
+                found = trial
+    return found, starts
+
+
 def _raw(found: _Found, problem: Problem) -> float:
     """χ² of the data with their errors as given, per degree of freedom."""
     return _expansion(found).data / max(problem.dof, 1)
 
 
 def _expansion(found: _Found) -> Posterior:
-    if not isinstance(found.minimum.expansion, Posterior):
+    return _posterior(found.minimum.expansion)
+
+
+def _posterior(expansion: Expansion) -> Posterior:
+    if not isinstance(expansion, Posterior):
         raise TypeError("a fit needs a Posterior expansion")
-    return found.minimum.expansion
+    return expansion
 
 
 def _warnings(result: FitResult) -> Iterator[str]:

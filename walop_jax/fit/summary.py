@@ -3,20 +3,40 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from typing import Any
 
+from walop_jax.data.product_records import ResidualMap
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.calibration import quality, software_versions
 from walop_jax.fit.misfit import Misfit
+from walop_jax.fit.model_file import render
 from walop_jax.fit.refit import FitResult
+from walop_jax.model.specification import Model
 
 PRODUCT = "calibration.fits"
 SUMMARY = "summary.json"
 FAILED = "summary.failed.json"
 
 
+PARTIAL = "partial"
+"""Folder of the finished parts of a fit that was interrupted."""
+
+
+def identity(calset: CalibrationSet, model: Model) -> str:
+    """What the sums of a fit depend on besides parameter values: the data, the model and the software."""
+    texts = [*(entry.sha256 for entry in calset.inputs), render(model)]
+    texts += [f"{name} {version}" for name, version in software_versions().items()]
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()
+
+
 def summary(
-    result: FitResult, calset: CalibrationSet, *, seconds: float, misfit: Misfit | None = None
+    result: FitResult,
+    calset: CalibrationSet,
+    *,
+    seconds: float,
+    misfit: Misfit | None = None,
+    residuals: ResidualMap | None = None,
 ) -> dict[str, Any]:
     """What a fit found: the contract's keys first, then how far it can be trusted.
 
@@ -50,5 +70,13 @@ def summary(
         "condition_number": result.minimum.condition,
         "chi2_history": list(result.minimum.history),
         "misfit": None if misfit is None else dataclasses.asdict(misfit),
+        "residual_map": None
+        if residuals is None
+        else {
+            "cells": [residuals.grid.width, residuals.grid.height],
+            "filter": residuals.filter,
+            "rms_beyond_noise": residuals.excess(),
+            "significance": residuals.significance(),
+        },
         "remarks": list(calset.remarks),
     }

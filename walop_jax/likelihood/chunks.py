@@ -1,7 +1,7 @@
 """A calibration set as the engine wants it: chunks of field points of equal size, kept in memory or read anew.
 
-A set that fits into `KEEP_BELOW` bytes is turned into arrays once. A larger one is read, slab by slab, on every pass,
-the next slab while the engine works on this one: memory is that of two slabs however many points there are.
+A set that fits into half of the memory it may take is turned into arrays once. A larger one is read, slab by slab, on
+every pass: memory is that of a few slabs however many points there are.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 
 import jax.numpy as jnp
@@ -24,10 +23,14 @@ from walop_jax.model.plan import Plan
 
 Vector = Float[np.ndarray, " n"]
 
-KEEP_BELOW = 1 << 30
-"""Bytes of point data that are kept in memory."""
-SLAB = 1 << 26
-"""Bytes of point data that are read together; reading takes about four times as much for a moment."""
+MEMORY = 2e9
+"""Bytes that point data may take: half of them for a set that is kept, all of them for slabs being read."""
+READING = 5
+"""Bytes that reading takes for a moment, times those of the slab."""
+LARGEST_SLAB = 1 << 26
+"""Bytes of point data that are read together at most: larger slabs are no faster."""
+SLABS = 16
+"""A set is cut into so many slabs at least, if it has as many chunks: work for several threads and processes."""
 
 
 def bytes_per_point(exposures: int, *, mirrored: bool = False) -> int:
@@ -36,40 +39,64 @@ def bytes_per_point(exposures: int, *, mirrored: bool = False) -> int:
 
 
 class Chunks:
-    """The data chunk by chunk; the last chunk is padded with points of weight 0.
+    """The data chunk by chunk, some chunks to a slab; the last chunk is padded with points of weight 0.
 
-    `size` points each. `kept` says whether they stay in memory; if not, going through them reads the set again.
+    A chunk has `size` points, a slab `slab`. `kept` says whether they stay in memory; if not, going through them reads
+    the set again.
     """
 
-    def __init__(self, calset: CalibrationSet, plan: Plan, size: int, *, mirrored: bool = False) -> None:
+    def __init__(
+        self,
+        calset: CalibrationSet,
+        plan: Plan,
+        size: int,
+        *,
+        mirrored: bool = False,
+        memory: float | None = None,
+        threads: int = 1,
+    ) -> None:
+        """`memory` in bytes, None for `MEMORY`; `threads` is the number of slabs that are in use at a time."""
         self.calset, self.plan, self.size, self.mirrored = calset, plan, size, mirrored
         self._points = len(calset.points)
         each = bytes_per_point(len(calset.exposures), mirrored=mirrored)
-        self.kept = each * self._points <= KEEP_BELOW
+        memory = MEMORY if memory is None else memory
+        self.kept = 2 * each * self._points <= memory
         # Whole chunks; and many of them, as pixels are read in whole rows of the frames.
-        self._slab = size * max(1, SLAB // (each * size))
+        most = min(LARGEST_SLAB, int(memory) // (READING * threads), each * self._points // SLABS)
+        self.slab = size * max(1, most // (each * size))
+        self.memory = 2 * each * self._points if self.kept else READING * threads * each * self.slab
+        """Bytes that going through the data takes, estimated."""
 
     def __len__(self) -> int:
         return math.ceil(self._points / self.size)
 
     def __getitem__(self, index: int) -> PointData:
+        first = range(len(self))[index]
         if self.kept:
-            return self._in_memory[index]
-        start = range(len(self))[index] * self.size
-        block = self.calset.intensities.block(start, min(start + self.size, self._points))
-        return self.point_data(_padded(block, self.size))
+            return self._in_memory[first]
+        return self.read(first * self.size, (first + 1) * self.size)[0]
 
     def __iter__(self) -> Iterator[PointData]:
-        return iter(self._in_memory) if self.kept else self._read()
+        for start in range(0, self._points, self.slab):
+            yield from self.of_slab(start // self.slab)
+
+    def of_slab(self, number: int) -> list[PointData]:
+        """The chunks of a slab."""
+        if self.kept:
+            each = self.slab // self.size
+            return self._in_memory[number * each : (number + 1) * each]
+        return self.read(number * self.slab, (number + 1) * self.slab)
 
     @cached_property
     def _in_memory(self) -> list[PointData]:
-        return list(self._read())
+        starts = range(0, self._points, self.slab)
+        return [chunk for start in starts for chunk in self.read(start, start + self.slab)]
 
-    def _read(self) -> Iterator[PointData]:
-        for slab in slabs(self.calset, self._slab):
-            for first in range(0, len(slab.x), self.size):
-                yield self.point_data(_padded(_part(slab, first, first + self.size), self.size))
+    def read(self, start: int, stop: int) -> list[PointData]:
+        """The chunks of the points `start:stop`, read anew."""
+        block = self.calset.intensities.block(start, min(stop, self._points))
+        parts = (_part(block, n, n + self.size) for n in range(0, len(block.x), self.size))
+        return [self.point_data(_padded(part, self.size)) for part in parts]
 
     def point_data(self, block: Block) -> PointData:
         """A block of measurements as the engine wants it, with what ghosts need of the opposite points."""
@@ -108,26 +135,6 @@ class Chunks:
         return sky
 
 
-def slabs(calset: CalibrationSet, size: int) -> Iterator[Block]:
-    """The data in slabs of `size` points; the next one is read while this one is in use."""
-    n = len(calset.points)
-    starts = range(0, n, size)
-
-    def read(start: int) -> Block:
-        return calset.intensities.block(start, min(start + size, n))
-
-    if len(starts) == 1:
-        yield read(0)
-        return
-    with ThreadPoolExecutor(1) as reader:
-        coming = reader.submit(read, 0)
-        for start in starts:
-            block = coming.result()
-            if start + size < n:
-                coming = reader.submit(read, start + size)
-            yield block
-
-
 def _part(block: Block, start: int, stop: int) -> Block:
     return Block(
         x=block.x[start:stop], y=block.y[start:stop], counts=block.counts[start:stop],
@@ -154,11 +161,12 @@ def _padded(block: Block, size: int) -> Block:
 def thinned(calset: CalibrationSet, most: int, run: int = 256) -> CalibrationSet:
     """A set of at most `most` of the points, in memory: runs of `run` neighbours spread evenly over all of them.
 
-    A set that is not larger than that comes back as it is.
+    Runs are shorter where `most` would make fewer than 16. A set that is not larger than that comes back as it is.
     """
     n = len(calset.points)
     if n <= most:
         return calset
+    run = max(1, min(run, most // 16))
     # Multiples of the golden section are in step with no raster.
     places = np.mod(np.arange(max(1, most // run)) * 0.6180339887498949, 1.0)
     starts = np.unique((places * (n // run)).astype(int)) * run

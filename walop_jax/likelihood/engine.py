@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -41,9 +41,9 @@ from walop_jax.model.plan import Plan
 from walop_jax.model.specification import optical_indices, series_indices
 
 Vector = Float[Array, " n"]
+Result = TypeVar("Result")
 BLOCK = 64  # field points whose Jacobians are worked on together
 LARGEST_BLOCK = 256  # up to so many points are one block
-THIN = 16  # one point of so many has a part in the matrix of a sketch
 NEWTON_STEPS = 3  # each squares the share of the detectors' distortion that is missing from the flux
 
 
@@ -129,11 +129,20 @@ def _unit_counts(
     return light.with_ghosts(instrument, counts, opposite, point.source)
 
 
-def _point_prediction(
+def point_prediction(
     instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None = None
 ) -> Float[Array, "e 4"]:
+    """Counts of one point for light of unit flux, ahead of the detectors."""
     rows, throughput = _rows_at(instrument, plan, point, nodes), _throughput_at(instrument, point)
     return _unit_counts(instrument, plan, rows, throughput, point)
+
+
+def vectors_at(
+    instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None = None
+) -> Float[Array, "b 4 4"]:
+    """Analysis vectors of a point in every band."""
+    rows, throughput = _rows_at(instrument, plan, point, nodes)[0], _throughput_at(instrument, point)[0]
+    return light.camera_vectors(instrument, rows, throughput, point.x, point.y)
 
 
 def _best_flux(
@@ -159,10 +168,11 @@ def _real_counts(
     return light.detected(instrument, plan.exposures, flux[:, None] * unit)
 
 
-def _point_residuals(
+def point_residuals(
     instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None = None
 ) -> tuple[Float[Array, " e"], Float[Array, "e 4"]]:
-    unit = _point_prediction(instrument, plan, point, nodes)
+    """Best flux of every exposure of one point and the normalised residuals data − model."""
+    unit = point_prediction(instrument, plan, point, nodes)
     flux = _best_flux(instrument, plan, unit, point)
     return flux, (point.counts - _real_counts(instrument, plan, unit, flux)) * point.weight
 
@@ -225,7 +235,7 @@ def _point_normal(
     return r @ r, jacobian @ r, jacobian @ jacobian.T
 
 
-def _over_blocks(function: Callable[[PointData], Normal], data: PointData, block: int) -> Normal:
+def _over_blocks(function: Callable[[PointData], Result], data: PointData, block: int) -> Result:
     """The sum of a function over blocks of points, so that what it needs in between stays in the processor's cache.
 
     Points that make no whole number of blocks, and few points, are one block.
@@ -273,21 +283,23 @@ def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes:
     return Normal(chi2.sum(), g, matrix)
 
 
-def _sketched_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes) -> Normal:
-    """χ² and gradient of all points, the matrix from one of `THIN` of them, times `THIN`.
+def _slope_equations(
+    instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes
+) -> tuple[Float[Array, ""], Vector]:
+    """χ² and gradient of points without the matrix: a fifth of the work.
 
-    The gradient runs backwards, from the residuals to the rows at the nodes, and only there meets the slopes: a
-    tenth of the work of the matrix. χ² does not change with the flux at its best, so that is held.
+    The gradient runs backwards, from the residuals to the rows at the nodes, and only there meets the slopes. χ² does
+    not change with the flux at its best, so that is held.
     """
     values, to_instrument = ravel_pytree(instrument)
     optical = np.asarray(optical_indices(instrument), int)
 
-    def slope(part: PointData) -> Normal:
+    def slope(part: PointData) -> tuple[Float[Array, ""], Vector]:
         def chi2(values: Vector, rows: Float[Array, "t b 2 2 4"]) -> Float[Array, ""]:
             here, between = to_instrument(values), nodes._replace(rows=rows)
 
             def of_point(point: PointData) -> Float[Array, ""]:
-                unit = _point_prediction(here, plan, point, between)
+                unit = point_prediction(here, plan, point, between)
                 flux = jax.lax.stop_gradient(_best_flux(here, plan, unit, point))
                 return jnp.sum(((point.counts - _real_counts(here, plan, unit, flux)) * point.weight) ** 2)
 
@@ -295,31 +307,22 @@ def _sketched_equations(instrument: Instrument, plan: Plan, data: PointData, nod
 
         value, (direct, by_rows) = jax.value_and_grad(chi2, (0, 1))(values, nodes.rows)
         by_optics = jnp.einsum("tbhrs,tobhrs->o", by_rows, nodes.slopes)
-        gradient = 0.5 * direct.at[optical].set(by_optics)
-        return Normal(value, gradient, no_matrix)
+        return value, 0.5 * direct.at[optical].set(by_optics)
 
-    no_matrix = jnp.zeros((0, 0))
-    exact = _over_blocks(slope, data, LARGEST_BLOCK)
-    # Multiples of the golden section: spread evenly, and in step with no raster.
-    points = data.x.shape[0]
-    count = max(1, points // THIN)
-    chosen = (np.mod(np.arange(count) * 0.6180339887498949, 1.0) * points).astype(int)
-    some = jax.tree.map(lambda v: v[chosen], data)
-    matrix = _normal_equations(instrument, plan, some, nodes).matrix
-    return exact._replace(matrix=points / count * matrix)
+    return _over_blocks(slope, data, LARGEST_BLOCK)
 
 
 def _residuals(
     instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes | None = None
 ) -> tuple[Float[Array, "p e"], Float[Array, "p e 4"]]:
-    return jax.vmap(_point_residuals, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
+    return jax.vmap(point_residuals, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
 
 
 def _prediction(
     instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes | None = None
 ) -> Float[Array, "p e 4"]:
     """Counts for light of unit flux; `detected` takes electrons, flux × these, through the detectors."""
-    return jax.vmap(_point_prediction, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
+    return jax.vmap(point_prediction, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
 
 
 def _dense_jacobian(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p d n"]:
@@ -348,12 +351,12 @@ def _point_effect_columns(
         return dataclasses.replace(instrument, effects=(*instrument.effects, *changed))
 
     at_neutral = with_amplitudes(neutral)
-    unit = _point_prediction(at_neutral, plan, point)
+    unit = point_prediction(at_neutral, plan, point)
     flux = _best_flux(at_neutral, plan, unit, point)
 
     def counts(amplitudes: list[Float[Array, ...]]) -> Float[Array, "e 4"]:
         active = with_amplitudes(amplitudes)
-        return _real_counts(active, plan, _point_prediction(active, plan, point), flux)
+        return _real_counts(active, plan, point_prediction(active, plan, point), flux)
 
     _, push = jax.linearize(counts, neutral)
     flat, to_tree = ravel_pytree(neutral)
@@ -397,7 +400,7 @@ def _effect_columns_over_shapes(
 
 
 normal_equations = compiled(_normal_equations)
-sketched_equations = compiled(_sketched_equations)
+slope_equations = compiled(_slope_equations)
 effect_columns_over_shapes = compiled(_effect_columns_over_shapes)
 dense_jacobian = compiled(_dense_jacobian)
 effect_columns = compiled(_effect_columns)

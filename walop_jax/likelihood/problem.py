@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import time
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Callable, Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +15,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.data.records import CalibrationSet, Sources
 from walop_jax.likelihood import engine
-from walop_jax.likelihood.chunks import Chunks, median_counts, slabs
+from walop_jax.likelihood.chunks import Chunks, median_counts
 from walop_jax.likelihood.nodes import Nodes, accurate_nodes
+from walop_jax.likelihood.passes import Part, Passes, threads_at_work
+from walop_jax.likelihood.processes import Processes
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import require_double_precision
 from walop_jax.model.effects.base import Effect, overridden
@@ -26,14 +29,11 @@ from walop_jax.model.specification import Model, make_model, optical_indices
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
 
-Watch = Callable[[int, float], None]
-
 POINTS_PER_CHUNK = 256
 LARGEST_CHUNK = 2_000_000  # intensities × local quantities that a chunk may hold
-SLAB_TO_COUNT = 1 << 15  # field points
 THINNEST = 1e-3  # deg: shortest side of a rectangle with nodes
 LARGE_CHUNK = 1024  # field points of a chunk of a set that is interpolated: the engine divides it further
-SKETCH_ABOVE = 65536  # field points above which the steps of a fit are taken with a sketch of the matrix
+LARGE_ABOVE = 65536  # field points above which the matrix of a fit is computed as seldom as can be
 INTERPOLATE_ABOVE = 4096  # field points: more than ten times the nodes that the optics need
 
 
@@ -65,14 +65,19 @@ class Posterior:
         return self.data / self.noise_scale**2 + self.priors + self.loose
 
 
+class _Census(NamedTuple):
+    rows: Int[np.ndarray, " e"]
+    field: Float[np.ndarray, 4]
+
+
 class Problem:
     """The joint likelihood of one calibration set under one model.
 
     Field points are handled in chunks of equal size, so that a set larger than memory goes through the
-    same code (`likelihood/chunks.py`). Of more than `INTERPOLATE_ABOVE` points, `expand` and `residuals` solve
-    the optics on Chebyshev nodes only (`likelihood/nodes.py`); `optics_error` is what that has cost in accuracy
-    so far. `watch`, where one is set, is told about once a second how many points a pass has done and how many
-    it does in a second.
+    same code (`likelihood/chunks.py`), several of them at a time (`likelihood/passes.py`); a large set is shared
+    with the other processes of `jax.distributed`, if there are any. Of more than `INTERPOLATE_ABOVE` points, `expand`,
+    `slope` and `residuals` solve the optics on Chebyshev nodes only (`likelihood/nodes.py`); `optics_error` is what
+    that has cost in accuracy so far. `passes.watch` is told how far a pass is, `passes.journal` keeps what is done.
     """
 
     def __init__(
@@ -82,10 +87,12 @@ class Problem:
         points_per_chunk: int | None = None,
         probes: tuple[Effect, ...] = (),
         interpolate: bool | None = None,
+        memory: float | None = None,
     ) -> None:
         """`probes` are effects that are not in the model but whose columns will be asked for.
 
         `interpolate` says whether the optics are interpolated over the field; None leaves it to the size of the set.
+        `memory` (bytes) is what the data of the points may take, None for the usual 2 GB.
         """
         require_double_precision()
         self.calset = calset
@@ -101,26 +108,44 @@ class Problem:
         self.interpolates = n_points > INTERPOLATE_ABOVE if interpolate is None else interpolate
         usual = LARGE_CHUNK if n_points > INTERPOLATE_ABOVE else min(POINTS_PER_CHUNK, fits)
         self.points_per_chunk = min(points_per_chunk or usual, n_points)
-        self._chunks = Chunks(calset, self.plan, self.points_per_chunk, mirrored=self._mirrored)
+        self.chunks = Chunks(
+            calset,
+            self.plan,
+            self.points_per_chunk,
+            mirrored=self._mirrored,
+            memory=memory,
+            threads=threads_at_work(),
+        )
+        self.is_large = self.interpolates and n_points > LARGE_ABOVE
+        processes = Processes.present() if self.is_large else Processes()
+        self.passes = Passes(n_points, self.chunks.slab, processes=processes)
         self.optics_error = 0.0
-        self.watch: Watch | None = None
         self._nodes_per_side: int | None = None
+        self._census: _Census | None = None
 
-    @property
-    def chunks(self) -> Chunks:
-        """The data, chunk by chunk; the last chunk is padded with points of weight 0."""
-        return self._chunks
+    def _total(
+        self,
+        label: str,
+        key: str,
+        function: Callable[[engine.PointData], Sequence[Array]],
+        shapes: Sequence[tuple[int, ...]],
+    ) -> list[np.ndarray]:
+        """Sums over all points of the arrays that `function` gives for a chunk, the points counted on the way."""
 
-    def _watched(self) -> Iterator[engine.PointData]:
-        began = told = time.perf_counter()
-        n = len(self.calset.points)
-        for i, chunk in enumerate(self.chunks, start=1):
-            yield chunk
-            now = time.perf_counter()
-            if self.watch is not None and (now - told > 1.0 or i == len(self.chunks)):
-                done = min(i * self.points_per_chunk, n)
-                self.watch(done, done / (now - began))
-                told = now
+        def work(number: int) -> Part:
+            chunks = self.chunks.of_slab(number)
+            sums = np.zeros(sum(math.prod(shape) for shape in shapes))
+            for chunk in chunks:
+                sums += np.concatenate([sums[:0], *(np.ravel(array) for array in function(chunk))])
+            used = np.concatenate([np.asarray(chunk.weight[..., 0]) > 0 for chunk in chunks])
+            x, y = (np.concatenate([np.asarray(getattr(chunk, name)) for chunk in chunks]) for name in "xy")
+            extent = np.stack([-x, x, -y, y])[:, used.any(axis=1)].max(axis=1, initial=-np.inf)
+            return Part(np.concatenate([sums, used.sum(axis=0)]), extent)
+
+        total = self.passes.total(label, key, work)
+        *arrays, rows = np.split(total.sums, np.cumsum([math.prod(shape) for shape in shapes]))
+        self._census = _Census(rows.astype(int), total.extent * np.array([-1.0, 1.0, -1.0, 1.0]))
+        return [array.reshape(shape) for array, shape in zip(arrays, shapes, strict=True)]
 
     @cached_property
     def _rectangle(self) -> Rectangle:
@@ -132,7 +157,7 @@ class Problem:
         thin = 0.5 * np.maximum(THINNEST - (high - low), 0.0)
         return Rectangle(low - thin, high + thin)
 
-    def _nodes(self, instrument: Instrument) -> Nodes | None:
+    def nodes(self, instrument: Instrument) -> Nodes | None:
         """The optics on nodes of the field, None where they are solved point by point."""
         if not self.interpolates:
             return None
@@ -164,52 +189,73 @@ class Problem:
             [0.0 if p.loose is None or p.prior is not None else p.loose**-2 for p in self.model.parameters]
         )
 
-    @property
-    def sketches(self) -> bool:
-        """Whether the set is so large that steps are better taken with a sketch of the matrix."""
-        return self.interpolates and len(self.calset.points) > SKETCH_ABOVE
-
-    def expand(self, values: Vector, noise_scale: float = 1.0, *, sketch: bool = False) -> Posterior:
+    def expand(self, values: Vector, noise_scale: float = 1.0) -> Posterior:
         """χ² and its quadratic expansion at a full vector of parameter values.
 
         `noise_scale` multiplies the errors of the data (not the priors'): above 1 it stands for what the
-        model cannot explain. With `sketch` the matrix is estimated from a few points in a hundred, where optics
-        are interpolated and the points of a chunk all have the same exposures; χ² and gradient are those of all
-        points, at a fifth of the time.
+        model cannot explain.
         """
-        instrument = self.model.instrument(values)
-        nodes = self._nodes(instrument)
-        data, gradient, matrix = 0.0, np.zeros(len(values)), np.zeros((len(values), len(values)))
-        for chunk in self._watched():
-            if sketch and nodes is not None and evenly_covered(chunk):
-                part = engine.sketched_equations(instrument, self.plan, chunk, nodes)
-            else:
-                part = engine.normal_equations(instrument, self.plan, chunk, nodes)
-            data += float(part.chi2)
-            gradient += np.asarray(part.gradient)
-            matrix += np.asarray(part.matrix)
-        gradient, matrix = gradient / noise_scale**2, matrix / noise_scale**2
+        values = self._agreed(values)
+        instrument, n = self.model.instrument(values), len(values)
+        nodes = self.nodes(instrument)
+        data, gradient, matrix = self._total(
+            "χ², gradient and matrix",
+            f"matrix {values.tobytes().hex()}",
+            lambda chunk: engine.normal_equations(instrument, self.plan, chunk, nodes),
+            ((), (n,), (n, n)),
+        )
+        matrix = matrix / noise_scale**2
+        index, _, width = self._priors
+        matrix[index, index] += width**-2
+        matrix[np.diag_indices_from(matrix)] += self._loose
+        select = self.model.selection()
+        return self._posterior(values, float(data), gradient, noise_scale, select.T @ matrix @ select)
+
+    def slope(self, values: Vector, near: Posterior) -> Posterior:
+        """As `expand`, with the matrix of an expansion nearby: a third of the time, where optics are interpolated."""
+        values = self._agreed(values)
+        instrument, n = self.model.instrument(values), len(values)
+        nodes = self.nodes(instrument)
+        if nodes is None:
+            return self.expand(values, near.noise_scale)
+        data, gradient = self._total(
+            "χ² and gradient",
+            f"gradient {values.tobytes().hex()}",
+            lambda chunk: engine.slope_equations(instrument, self.plan, chunk, nodes),
+            ((), (n,)),
+        )
+        return self._posterior(values, float(data), gradient, near.noise_scale, near.matrix)
+
+    def _agreed(self, values: Vector) -> Vector:
+        return self.passes.processes.agreed("values", np.asarray(values, float))
+
+    def _posterior(
+        self,
+        values: Vector,
+        data: float,
+        gradient: Vector,
+        noise_scale: float,
+        matrix: Float[np.ndarray, "free free"],
+    ) -> Posterior:
+        gradient = gradient / noise_scale**2
         index, mean, width = self._priors
         pull = (values[index] - mean) / width
         gradient[index] += pull / width
-        matrix[index, index] += width**-2
         away = values - self.model.start
         gradient += self._loose * away
-        matrix[np.diag_indices_from(matrix)] += self._loose
-        select = self.model.selection()
         return Posterior(
             data=data,
             priors=float(pull @ pull),
             loose=float(self._loose @ away**2),
             noise_scale=noise_scale,
-            gradient=select.T @ gradient,
-            matrix=select.T @ matrix @ select,
+            gradient=self.model.selection().T @ gradient,
+            matrix=matrix,
         )
 
     def residuals(self, values: Vector) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e 4"]]:
         """Best flux and normalised residuals (data − model)/σ of every (point, exposure); 0 where unused."""
         instrument = self.model.instrument(values)
-        nodes = self._nodes(instrument)
+        nodes = self.nodes(instrument)
         parts = [engine.residuals(instrument, self.plan, chunk, nodes) for chunk in self.chunks]
         flux = np.concatenate([np.asarray(part[0]) for part in parts])
         residual = np.concatenate([np.asarray(part[1]) for part in parts])
@@ -260,23 +306,26 @@ class Problem:
     @cached_property
     def used(self) -> Bool[np.ndarray, "p e"]:
         """True where the four intensities of a (point, exposure) are used."""
-        return np.concatenate([slab.used for slab in slabs(self.calset, SLAB_TO_COUNT)])
+        parts = [np.asarray(chunk.weight[..., 0]) > 0 for chunk in self.chunks]
+        return np.concatenate(parts)[: len(self.calset.points)]
 
-    @cached_property
-    def _census(self) -> tuple[Int[np.ndarray, " e"], Bool[np.ndarray, " p"]]:
-        """Points used in each exposure, and whether a point is used at all: one pass over the data."""
-        parts = [(slab.used.sum(axis=0), slab.used.any(axis=1)) for slab in slabs(self.calset, SLAB_TO_COUNT)]
-        return np.sum([part[0] for part in parts], axis=0), np.concatenate([part[1] for part in parts])
+    def _counted(self) -> _Census:
+        if self._census is None:  # the first pass counts; before that, one that does nothing else
+            self._total("counting", "census", lambda _: (), ())
+        if self._census is None:
+            raise RuntimeError("a pass over the points has counted nothing")
+        return self._census
 
     @property
     def rows_used(self) -> Int[np.ndarray, " e"]:
         """Number of points used in each exposure."""
-        return self._census[0]
+        return self._counted().rows
 
     @property
-    def points_used(self) -> Bool[np.ndarray, " p"]:
-        """True where a field point is used in any exposure."""
-        return self._census[1]
+    def field(self) -> tuple[float, float, float, float]:
+        """Smallest and largest x, smallest and largest y (deg) of the points that are used in any exposure."""
+        low_x, high_x, low_y, high_y = self._counted().field.tolist()
+        return low_x, high_x, low_y, high_y
 
     @property
     def n_data(self) -> int:
@@ -290,12 +339,6 @@ class Problem:
         free = set(self.model.free.tolist())
         priors = sum(1 for i in self._priors[0] if int(i) in free)
         return int(self.rows_used @ per_row) + priors - len(free)
-
-
-def evenly_covered(chunk: engine.PointData) -> bool:
-    """Whether every exposure has most points of a chunk or none, so that a few points can stand for all."""
-    rows = (np.asarray(chunk.weight)[..., 0] > 0).sum(axis=0)
-    return bool(np.all((rows == 0) | (rows > 0.5 * chunk.x.shape[0])))
 
 
 def standard_names(sources: Sources) -> tuple[str, ...]:

@@ -1,0 +1,172 @@
+"""Large sets: the gradient without the matrix, the minimum from a sample and a pass or two, and what of it is kept."""
+
+from __future__ import annotations
+
+
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from walop_jax.fit import misfit, refit
+from walop_jax.fit.refit import fit
+from walop_jax.likelihood import engine
+from walop_jax.likelihood import problem as likelihood
+from walop_jax.likelihood.chunks import thinned
+from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
+from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood.simulate import simulate
+
+RUN = ObservingPlan(
+    grid=72, standard_grid=1, standards=0, unpolarised=0, moon_patches=3,
+    polariser_angles=polariser_turn(8, full_turn=True), throughput_degree=2,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def made():
+    calset = simulate(RUN, seed=12).calset
+    return Problem(calset, base_model(calset, throughput_degree=2), points_per_chunk=512, interpolate=True)
+
+
+@pytest.fixture(scope="module")
+def fitted(made):
+    return fit(made)
+
+
+@pytest.fixture
+def large(made, monkeypatch):
+    """The same set, handled as if it were too large for a matrix at every step."""
+    monkeypatch.setattr(likelihood, "LARGE_ABOVE", 0)
+    monkeypatch.setattr(refit, "SAMPLE", 1024)
+    return Problem(made.calset, made.model, points_per_chunk=512)
+
+
+def test_slope_is_that_of_the_expansion(made):
+    values = made.model.start
+    full = made.expand(values)
+    slope = made.slope(values, full)
+    size = np.sqrt(np.diag(full.matrix))
+    assert slope.data == pytest.approx(full.data, rel=1e-12)
+    assert slope.matrix is full.matrix
+    np.testing.assert_allclose(slope.gradient / size, full.gradient / size, atol=1e-10 * np.sqrt(full.data))
+
+
+def test_slope_keeps_the_factor_on_the_errors(made):
+    values = made.model.start
+    full = made.expand(values, noise_scale=3.0)
+    slope = made.slope(values, full)
+    assert slope.objective == pytest.approx(full.objective, rel=1e-12)
+    size = np.sqrt(np.diag(full.matrix))
+    np.testing.assert_allclose(slope.gradient / size, full.gradient / size, atol=1e-10 * np.sqrt(full.data))
+
+
+def test_blocks_change_nothing(made):
+    """Chunks of 512 go in blocks of 64; chunks of 250 are one block each."""
+    other = Problem(made.calset, made.model, points_per_chunk=250, interpolate=True)
+    one, two = made.expand(made.model.start), other.expand(made.model.start)
+    size = np.sqrt(np.diag(two.matrix))
+    assert one.data == pytest.approx(two.data, rel=1e-12)
+    np.testing.assert_allclose(
+        one.matrix / np.outer(size, size), two.matrix / np.outer(size, size), atol=1e-11
+    )
+
+
+def test_the_fit_of_a_large_set_ends_where_the_usual_one_ends(large, fitted):
+    assert large.is_large
+    found = fit(large)
+    assert found.converged
+    assert found.minimum.steps <= 3
+    assert found.chi2 == pytest.approx(fitted.chi2, rel=1e-9)
+    known = fitted.sigma > 0
+    assert (np.abs(found.values - fitted.values)[known] < 2e-3 * fitted.sigma[known]).all()
+    # The matrix is that of the sample's minimum, some nine standard errors away.
+    np.testing.assert_allclose(found.sigma, fitted.sigma, rtol=5e-3)
+    assert (found.dof, found.n_data) == (fitted.dof, fitted.n_data)
+    assert large.field == made_field(large)
+
+
+def made_field(problem):
+    x, y = problem.calset.points.x, problem.calset.points.y
+    return (x.min(), x.max(), y.min(), y.max())
+
+
+def test_frames_and_table_path_agree_to_1e_8(made, monkeypatch):
+    """144 of the points: interpolated optics, blocks and a fit from a sample, beside the path that tables take."""
+    sample = thinned(made.calset, 144, run=1)
+    assert len(sample.points) == 144
+    plain = Problem(sample, made.model)
+    assert not plain.interpolates
+    monkeypatch.setattr(likelihood, "LARGE_ABOVE", 0)
+    monkeypatch.setattr(refit, "LARGE_TOLERANCE", 1e-6)
+    monkeypatch.setattr(refit, "SAMPLE", 72)
+    frames = Problem(sample, made.model, points_per_chunk=16, interpolate=True)
+    assert frames.is_large
+    a, b = plain.expand(made.model.start), frames.expand(made.model.start)
+    size = np.sqrt(np.diag(a.matrix))
+    assert a.data == pytest.approx(b.data, rel=1e-8)
+    np.testing.assert_allclose(b.gradient / size, a.gradient / size, atol=1e-8 * np.sqrt(a.data))
+    np.testing.assert_allclose(b.matrix / np.outer(size, size), a.matrix / np.outer(size, size), atol=1e-8)
+    monkeypatch.setattr("walop_jax.fit.refit.minimise", _tight(refit.minimise))
+    one, other = fit(plain), fit(frames)
+    assert other.chi2 == pytest.approx(one.chi2, rel=1e-8)
+    scale = np.array([p.scale for p in made.model.parameters])
+    np.testing.assert_allclose(other.values / scale, one.values / scale, atol=1e-8)
+
+
+def _tight(minimise):
+    def tighter(*args, **options):
+        return minimise(*args, **(options | {"tolerance": 1e-5}))
+
+    return tighter
+
+
+def test_optimistix_on_residuals_in_memory_finds_the_same(made, monkeypatch):
+    """The reference: `optimistix.LevenbergMarquardt` on the residuals themselves, derivatives by JAX."""
+    sample = thinned(made.calset, 49, run=1)
+    problem = Problem(sample, made.model)
+    model, chunk = problem.model, problem.chunks[0]
+    scale = np.array([model.parameters[i].scale for i in model.free])
+    select = model.selection() * scale
+    index, mean, width = problem._priors
+    _, to_instrument = ravel_pytree(model.instrument())
+
+    def residuals(x, _):
+        values = jnp.asarray(model.start) + select @ x
+        _, data = engine._residuals(to_instrument(values), problem.plan, chunk)
+        loose = jnp.sqrt(problem._loose) * (values - model.start)
+        return jnp.concatenate([data.ravel(), (values[index] - mean) / width, loose])
+
+    solver = optx.LevenbergMarquardt(rtol=1e-13, atol=1e-13)
+    solution = optx.least_squares(residuals, solver, jnp.zeros(len(scale)), max_steps=200, throw=False)
+    monkeypatch.setattr(refit, "LARGE_TOLERANCE", 1e-8)
+    ours = refit._polished(problem, fit(problem).values, 1.0, None)
+    assert ours.minimum.converged
+    reference = model.start + select @ np.asarray(solution.value)
+    everything = np.array([p.scale for p in model.parameters])
+    np.testing.assert_allclose(ours.values / everything, reference / everything, atol=1e-8)
+    objective = float(jnp.sum(residuals(solution.value, None) ** 2))
+    assert ours.minimum.expansion.objective == pytest.approx(objective, rel=1e-10)
+
+
+def test_misfit_of_a_large_set_is_that_of_points_spread_over_it(made, monkeypatch):
+    values = made.model.start
+    full = misfit.describe(made, values)
+    monkeypatch.setattr(misfit, "LOOKED_AT", 2560)
+    some = misfit.describe(made, values)
+    assert some != full
+    assert some.camera == pytest.approx(full.camera, rel=0.1)
+    assert some.matrix_element == pytest.approx(full.matrix_element, rel=0.1)
+
+
+def test_memory_is_bounded_by_what_is_allowed(made):
+    """Small memory: small slabs, read anew; the estimate stays below what was allowed."""
+    for memory in (1e9, 1e8, 5e6):
+        problem = Problem(made.calset, made.model, 64, interpolate=True, memory=memory)
+        assert problem.chunks.memory <= memory
+    assert not problem.chunks.kept
+    again = problem.expand(made.model.start)
+    assert again.data == pytest.approx(made.expand(made.model.start).data, rel=1e-12)
+
+
