@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -138,15 +137,17 @@ def test_optimistix_on_residuals_in_memory_finds_the_same(made, monkeypatch):
         loose = jnp.sqrt(problem._loose) * (values - model.start)
         return jnp.concatenate([data.ravel(), (values[index] - mean) / width, loose])
 
-    solver = optx.LevenbergMarquardt(rtol=1e-13, atol=1e-13)
-    solution = optx.least_squares(residuals, solver, jnp.zeros(len(scale)), max_steps=200, throw=False)
+    x = jnp.zeros(len(scale))
+    # The second one takes away the damping that the first still has when it stops.
+    for solver in (optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6), optx.GaussNewton(rtol=1e-12, atol=1e-12)):
+        x = optx.least_squares(residuals, solver, x, max_steps=60, throw=False).value
     monkeypatch.setattr(refit, "LARGE_TOLERANCE", 1e-8)
     ours = refit._polished(problem, fit(problem).values, 1.0, None)
     assert ours.minimum.converged
-    reference = model.start + select @ np.asarray(solution.value)
+    reference = model.start + select @ np.asarray(x)
     everything = np.array([p.scale for p in model.parameters])
     np.testing.assert_allclose(ours.values / everything, reference / everything, atol=1e-8)
-    objective = float(jnp.sum(residuals(solution.value, None) ** 2))
+    objective = float(jnp.sum(residuals(x, None) ** 2))
     assert ours.minimum.expansion.objective == pytest.approx(objective, rel=1e-10)
 
 
@@ -168,5 +169,3 @@ def test_memory_is_bounded_by_what_is_allowed(made):
     assert not problem.chunks.kept
     again = problem.expand(made.model.start)
     assert again.data == pytest.approx(made.expand(made.model.start).data, rel=1e-12)
-
-

@@ -1,4 +1,4 @@
-"""Passes over many points: on any number of threads, devices and processes the same; resumed as if never interrupted."""
+"""Passes over many points: the same on any number of threads, devices and processes, and when they are resumed."""
 
 from __future__ import annotations
 

@@ -185,6 +185,19 @@ def switch_on_jax() -> None:
 
 
 @contextlib.contextmanager
+def _standard_output_to_error() -> Iterator[None]:
+    """What a library prints by itself must not end up in the machine-readable result."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
+@contextlib.contextmanager
 def shared(place: str | None) -> Iterator[bool]:
     """Join the other processes of a computation, if `place` says where they are; gives whether this is the first one.
 
@@ -195,7 +208,8 @@ def shared(place: str | None) -> Iterator[bool]:
         return
     from walop_jax.likelihood.processes import join, leave_at_once
 
-    crew = join(place)
+    with _standard_output_to_error():
+        crew = join(place)
     try:
         yield crew.index == 0
     except BaseException as error:

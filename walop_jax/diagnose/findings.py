@@ -123,11 +123,18 @@ class Diagnosis:
     after: FitResult
     problem: Problem
     seconds: float
+    points: int
 
     @property
     def caution(self) -> str:
         """What to bear in mind with these findings; empty when there is nothing."""
         parts = []
+        looked_at = len(self.problem.calset.points)
+        if looked_at < self.points:
+            parts.append(
+                f"{looked_at} of {self.points} field points were looked at, and fitted: refit all of them with the "
+                "model found"
+            )
         if len(self.steps) > MANY:
             parts.append(
                 f"{len(self.steps)} names were needed: something that is not in the catalogue can look like several "

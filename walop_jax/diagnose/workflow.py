@@ -29,10 +29,12 @@ from walop_jax.diagnose.freeform import block_of
 from walop_jax.diagnose.look import Look
 from walop_jax.diagnose.score import Score
 from walop_jax.fit.refit import FitResult, fit
+from walop_jax.likelihood.chunks import thinned
 from walop_jax.likelihood.problem import Problem, base_model
 from walop_jax.model.effects import EFFECTS, Context, Effect, FreeForm
 from walop_jax.model.specification import Model, effect_context, full_values
 
+LARGEST_ROWS = 100_000  # 800 columns of four cameras each take 2.5 GB
 MOST_STEPS = 6
 NEEDED = 1.0  # ln B that an effect must be worth to the final model to stay in it
 MISFIT = 1.5  # χ²/dof above which effects that cannot be differentiated are tried
@@ -49,11 +51,14 @@ def diagnose(
 ) -> Diagnosis:
     """Find what `model` (default: the base model) lacks to explain a calibration set.
 
-    `catalogue` are the effects that may be named. Raises what `fit` raises.
+    `catalogue` are the effects that may be named. Of a set with more than `LARGEST_ROWS` (exposure, point) pairs,
+    points spread over the field are looked at. Raises what `fit` raises.
     """
     began = time.perf_counter()
     tell = progress or (lambda text: None)
-    return _Diagnosing(calset, model or base_model(calset), catalogue, seed, tell).run(began)
+    some = thinned(calset, max(1, LARGEST_ROWS // len(calset.exposures)), run=1)
+    found = _Diagnosing(some, model or base_model(calset), catalogue, seed, tell).run(began)
+    return dataclasses.replace(found, points=len(calset.points))
 
 
 class _Diagnosing:
@@ -108,6 +113,7 @@ class _Diagnosing:
             after=self.fit,
             problem=self.problem,
             seconds=time.perf_counter() - began,
+            points=len(self.calset.points),
         )
 
     def _look(self, earlier: Look | None = None) -> Look:

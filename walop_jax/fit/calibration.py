@@ -32,7 +32,9 @@ Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
 
 MAP_SIZE = 31  # pixels along each axis of the maps of a product: 0.02° over ±0.3°
-ILL_CONDITIONED = 1e10
+ILL_CONDITIONED = (
+    1e6  # for each intensity: eigenvalues of data grow with their number, those of priors do not
+)
 EXCESS_NOISE = 0.5  # sigma
 HIGH_CROSSTALK = 10.0  # condition number of the local 2 × 2 inverse
 TEMPERATURE_MARGIN = 2.0  # K beyond the temperatures of the exposures
@@ -249,7 +251,7 @@ def rebuild(product: CalibrationProduct) -> Model:
 def quality(result: FitResult) -> int:
     """Quality bits of a fit as a whole (`QUALITY_BITS`): 1, 2, 4, 8 and 8192."""
     bits = 0 if result.converged else 1
-    bits |= 2 if result.minimum.condition > ILL_CONDITIONED else 0
+    bits |= 2 if result.minimum.condition > ILL_CONDITIONED * result.n_data else 0
     bits |= 4 if len(at_prior_edge(result)) else 0
     ratio = result.chi2 / max(result.dof, 1)
     bits |= 8 if max(ratio, result.noise_scale**2) > 1.0 + EXCESS_NOISE**2 else 0

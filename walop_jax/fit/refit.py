@@ -27,6 +27,9 @@ FIRST_STEPS = 20
 # Scaled gradient of a large set: 10⁻³ of a standard error is 10⁻⁶ in χ², and of a χ² of 10⁹ rounding leaves 10⁻⁷.
 LARGE_TOLERANCE = 1e-3
 SAMPLE = 16384  # field points of a large set on which its fit begins
+# Points of a set for each one of its sample: the sample's minimum is some six standard errors from that of the set,
+# which a step leaves a thousandth of.
+FARTHEST = 32
 Progress = Callable[[str, int, float], None]
 
 
@@ -176,10 +179,17 @@ def _search(
 def _near(
     problem: Problem, first: Vector, noise_scale: float | None, worth: float | None, progress: Progress | None
 ) -> tuple[Vector, float, int]:
-    """The minimum of a sample of a large set, the factor on the errors, and from how many places it was sought."""
+    """The minimum of a sample of a large set, the factor on the errors, and from how many places it was sought.
+
+    The sample of a very large set is large itself.
+    """
 
     def make() -> Vector:
-        sample = Problem(thinned(problem.calset, SAMPLE), problem.model)
+        points = max(SAMPLE, len(problem.calset.points) // FARTHEST)
+        sample = Problem(thinned(problem.calset, points), problem.model)
+        if sample.is_large:
+            near, scale, starts = _near(sample, first, noise_scale, worth, progress)
+            return np.append(_polished(sample, near, scale, progress).values, [scale, starts])
         found, starts = _sought(sample, first, noise_scale, worth, progress)
         return np.append(found.values, [_expansion(found).noise_scale, starts])
 

@@ -13,11 +13,10 @@ from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from walop_jax.data.records import Block, CalibrationSet, Exposures, Points
+from walop_jax.data.records import Block, CalibrationSet, Exposures, Intensities, Points
 from walop_jax.data.sky import moon_direction, rayleigh_sky
-from walop_jax.data.table import TableIntensities
 from walop_jax.likelihood.engine import PointData
 from walop_jax.model.plan import Plan
 
@@ -158,23 +157,45 @@ def _padded(block: Block, size: int) -> Block:
     )  # fmt: skip
 
 
-def thinned(calset: CalibrationSet, most: int, run: int = 256) -> CalibrationSet:
-    """A set of at most `most` of the points, in memory: runs of `run` neighbours spread evenly over all of them.
+class Runs(Intensities):
+    """Runs of `run` neighbouring points of a set, beginning at the points `starts`."""
 
-    Runs are shorter where `most` would make fewer than 16. A set that is not larger than that comes back as it is.
+    def __init__(self, whole: Intensities, starts: Int[np.ndarray, " s"], run: int) -> None:
+        self.whole, self.starts, self.run = whole, starts, run
+
+    def block(self, start: int, stop: int) -> Block:
+        """Return the data of the points `start:stop` of the runs, read from the whole set."""
+        blocks = []
+        for number in range(start // self.run, math.ceil(stop / self.run)):
+            first, origin = number * self.run, int(self.starts[number])
+            low, high = max(start, first) - first, min(stop, first + self.run) - first
+            blocks.append(self.whole.block(origin + low, origin + high))
+        return Block(
+            *(np.concatenate([getattr(b, f.name) for b in blocks]) for f in dataclasses.fields(Block))
+        )
+
+    @property
+    def rows(self) -> int:
+        """Number of used (exposure, point) pairs; reads all of them."""
+        return sum(int(self.whole.block(n, n + self.run).used.sum()) for n in self.starts.tolist())
+
+
+def thinned(calset: CalibrationSet, most: int, run: int = 256) -> CalibrationSet:
+    """A set of at most `most` of the points: runs of at least `run` neighbours spread evenly over all of them.
+
+    There are 16 runs or more and 128 at most, so they are shorter or longer than that in a very small or a very large
+    sample. A set that is not larger than that comes back as it is.
     """
     n = len(calset.points)
     if n <= most:
         return calset
-    run = max(1, min(run, most // 16))
+    run = max(1, min(max(run, most // 128), most // 16))
     # Multiples of the golden section are in step with no raster.
     places = np.mod(np.arange(max(1, most // run)) * 0.6180339887498949, 1.0)
     starts = np.unique((places * (n // run)).astype(int)) * run
-    blocks = [calset.intensities.block(int(start), int(start) + run) for start in starts]
-    block = Block(*(np.concatenate([getattr(b, f.name) for b in blocks]) for f in dataclasses.fields(Block)))
     index = (starts[:, None] + np.arange(run)).ravel()
-    points = Points(point=calset.points.point[index], x=block.x, y=block.y)
-    return dataclasses.replace(calset, points=points, intensities=TableIntensities.dense(points, block))
+    points = Points(*(getattr(calset.points, f.name)[index] for f in dataclasses.fields(Points)))
+    return dataclasses.replace(calset, points=points, intensities=Runs(calset.intensities, starts, run))
 
 
 def median_counts(calset: CalibrationSet, slab: int = 4096, most: int = 65536) -> Float[np.ndarray, "e 4"]:

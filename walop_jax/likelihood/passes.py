@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import math
 import os
 import time
@@ -38,6 +39,16 @@ class Part(NamedTuple):
     def __add__(self, other: Part) -> Part:  # pyright: ignore[reportIncompatibleMethodOverride]
         return Part(self.sums + other.sums, np.maximum(self.extent, other.extent))
 
+    @property
+    def packed(self) -> Vector:
+        """All of it in one array."""
+        return np.concatenate(self)
+
+    @classmethod
+    def unpacked(cls, values: Vector) -> Part:
+        """What `packed` holds."""
+        return cls(values[:-4], values[-4:])
+
 
 @dataclasses.dataclass
 class Passes:
@@ -59,26 +70,29 @@ class Passes:
         slabs = math.ceil(self.points / self.slab)
         mine, journal = self.processes.share(slabs), self.journal if key is not None else None
         key = f"{key} slab {self.slab}"
-        if not mine:
-            raise ValueError(f"{self.processes.count} processes for {slabs} slabs of points: use fewer")
         done = {} if journal is None else journal.read(key)
-        found = {n: Part(sums[:-4], sums[-4:]) for n, sums in done.items()}
-        found = {n: part for n, part in found.items() if n in mine}
-        todo = [n for n in mine if n not in found]
+        todo = [n for n in mine if n not in done]
+        total: Part | None = None
         began = told = time.perf_counter()
         with contextlib.closing(self._each(todo, work)) as parts:
-            for count, (number, part) in enumerate(zip(todo, parts, strict=True), start=1):
-                found[number] = part
-                if journal is not None:
-                    journal.append(key, number, np.concatenate(part))
+            fresh = 0
+            for count, number in enumerate(mine, start=1):
+                if number in done:
+                    part = Part.unpacked(done[number])
+                else:
+                    part, fresh = next(parts), fresh + 1
+                    if journal is not None:
+                        journal.append(key, number, part.packed)
+                total = part if total is None else total + part
                 now = time.perf_counter()
-                if self.watch is not None and (now - told > 1.0 or count == len(todo)):
-                    rate = count * self.slab * self.processes.count / (now - began)
-                    self.watch(label, min(len(found) * self.slab * self.processes.count, self.points), rate)
+                if self.watch is not None and fresh and (now - told > 1.0 or count == len(mine)):
+                    rate = fresh * self.slab * self.processes.count / (now - began)
+                    self.watch(label, min(count * self.slab * self.processes.count, self.points), rate)
                     told = now
-        total = sum_of([found[n] for n in mine])
-        rows = self.processes.gather(f"{label} {key}", np.concatenate(total))
-        return sum_of([Part(row[:-4], row[-4:]) for row in rows])
+        if total is None:
+            raise ValueError(f"{self.processes.count} processes for {slabs} slabs of points: use fewer")
+        rows = self.processes.gather(f"{label} {key}", total.packed)
+        return functools.reduce(Part.__add__, map(Part.unpacked, rows))
 
     def _each(self, numbers: list[int], work: Callable[[int], Part]) -> Generator[Part, None, None]:
         devices = jax.local_devices()
@@ -100,14 +114,6 @@ class Passes:
             yield from pool.map(on_device, entries[1:])
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
-
-
-def sum_of(parts: list[Part]) -> Part:
-    """The parts added up in their order."""
-    total = parts[0]
-    for part in parts[1:]:
-        total = total + part
-    return total
 
 
 def threads_at_work() -> int:

@@ -100,7 +100,9 @@ def join(place: str) -> Processes:
         raise LostProcessError(
             f"the processes did not find each other at {place}: {_first_line(error)}"
         ) from error
-    return Processes.present()
+    here = Processes.present()
+    here.gather("joined", np.zeros(1))  # whoever cannot be reached is missed now
+    return here
 
 
 def leave_at_once(code: int) -> None:

@@ -70,7 +70,15 @@ def _point_sums(
     return jnp.concatenate([jnp.stack([chi2, freedom]), right, left])
 
 
-_sums = compiled(jax.vmap(_point_sums, in_axes=(None, None, None, 0, None)))
+def _chunk_sums(
+    instrument: Instrument, plan: Plan, chosen: Bool[Array, " e"], data: engine.PointData, nodes: Nodes | None
+) -> Float[Array, "p n"]:
+    return jax.lax.map(
+        lambda point: _point_sums(instrument, plan, chosen, point, nodes), data, batch_size=engine.BLOCK
+    )
+
+
+_sums = compiled(_chunk_sums)
 
 
 def cells_for(problem: Problem) -> Grid:

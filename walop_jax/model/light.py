@@ -28,6 +28,7 @@ from walop_jax.model.plates import Plate
 
 Scalar = Float[Array, ""]
 Nodes = Float[Array, " n"]
+FEW_BANDS = 3
 _MUELLER = {"waves": plate_models.stack_mueller, "fixed_axis": plate_models.fixed_axis_mueller}
 
 
@@ -275,7 +276,13 @@ def counts(
     """Counts of the four cameras in every exposure at a field point, for light of unit flux and no ghosts."""
     vectors = camera_vectors(instrument, rows, throughput, x, y)
     light = stokes(instrument, plan.exposures, sky, source)
-    result = jnp.einsum("eks,es->ek", vectors[band], light)
+    if (
+        len(vectors) <= FEW_BANDS
+    ):  # a product of matrices, where picking vectors would copy them for every exposure
+        in_band = jax.nn.one_hot(band, len(vectors), dtype=light.dtype)
+        result = jnp.einsum("bks,eb,es->ek", vectors, in_band, light)
+    else:
+        result = jnp.einsum("eks,es->ek", vectors[band], light)
     for effect in instrument.effects:
         result = effect.recorded(result, vectors[band, :, 0], plan.exposures, x, y)
     return result

@@ -167,6 +167,8 @@ def _figures(run: Run) -> dict[str, str]:
     if run.product is not None:
         made["matrix"] = product_figures.matrix_maps_figure(run.product.maps)
         made["errors"] = product_figures.matrix_errors_figure(run.product.maps)
+        if run.product.residuals is not None:
+            made["remainder"] = product_figures.residual_map_figure(run.product.residuals)
     if run.pictures is not None:
         pictures = run.pictures
         whole = pictures.comparisons[0]

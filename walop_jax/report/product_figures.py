@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from walop_jax.data.product_records import MatrixMaps
+from walop_jax.data.product_records import MatrixMaps, ResidualMap
 from walop_jax.report.style import DIVERGING, SMALL, blank, field_axes, largest, outer_labels
 
 ELEMENTS = ("$m_{21}$", "$m_{22}$", "$m_{23}$", "$m_{31}$", "$m_{32}$", "$m_{33}$")
@@ -68,7 +68,34 @@ def matrix_errors_figure(maps: MatrixMaps) -> Figure:
     return figure
 
 
-def extent(maps: MatrixMaps) -> tuple[float, float, float, float]:
+def residual_map_figure(residuals: ResidualMap) -> Figure:
+    """What the smooth model leaves of the matrix and of the ratio of the pairs (%), and χ²/dof before that correction.
+
+    The six elements share one scale, which the median error and the largest corrections but one in a hundred set.
+    """
+    figure = blank(8.6, 4.3)
+    axes = figure.subplots(2, 4, sharex=True, sharey=True)
+    titles = (*(f"$\\delta${name} (%)" for name in ELEMENTS), "N2, N3 : N0, N1 (%)", "χ²/dof")
+    # Row by row: the three elements of a pair, then the other quantity.
+    order = (0, 1, 2, 6, 3, 4, 5, 7)
+    matrix = 100.0 * np.abs(residuals.values[:6])
+    for axis, i in zip(axes.ravel(), order, strict=True):
+        values = residuals.chi2 if i == 7 else 100.0 * residuals.values[i]
+        shown = matrix if i < 6 else np.abs(values)
+        far = max(float(np.nanpercentile(shown, 99)), 1e-12) if np.isfinite(shown).any() else 1.0
+        norm, colours = Normalize(-far, far), DIVERGING
+        if i == 7:
+            norm, colours = Normalize(float(np.nanmin(values)), far), "viridis"
+        field_axes(axis, titles[i])
+        image = axis.imshow(
+            values, origin="lower", extent=extent(residuals), norm=norm, cmap=colours, interpolation="nearest"
+        )
+        figure.colorbar(image, ax=axis, pad=0.03, shrink=0.8).ax.tick_params(labelsize=SMALL)
+    outer_labels(axes)
+    return figure
+
+
+def extent(maps: MatrixMaps | ResidualMap) -> tuple[float, float, float, float]:
     """Outer edges of the pixels, degrees: left, right, bottom, top."""
     points, grid = maps.grid.points, maps.grid
     half_x, half_y = 0.5 * abs(grid.matrix[0][0]), 0.5 * abs(grid.matrix[1][1])

@@ -1,0 +1,178 @@
+"""`refit` of frames that are handled like those of whole detectors: residual map, interruption, two processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from walop_jax.data import Grid, write_frames
+from walop_jax.data.errors import DataError
+from walop_jax.data.product import read_product, write_product
+from walop_jax.data.product_records import RESIDUAL_NAMES
+from walop_jax.fit import refit
+from walop_jax.fit.calibration import Calibration
+from walop_jax.likelihood import problem as likelihood
+from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
+from walop_jax.likelihood.simulate import simulate
+from walop_jax.report import product_figures
+
+SIDE = 72
+RUN = ObservingPlan(
+    grid=SIDE, standard_grid=1, standards=0, unpolarised=0, moon_patches=3, polariser_angles=polariser_turn(6)
+)  # fmt: skip
+# The commands in another process, with sets large from the first point on and slabs of 256 points.
+LARGE = """
+import sys
+from walop_jax.likelihood import chunks, problem
+from walop_jax.fit import refit
+problem.LARGE_ABOVE, problem.LARGE_CHUNK, refit.SAMPLE, chunks.MEMORY = 0, 256, 1024, 1e6
+from walop_jax.cli import main
+main()
+"""
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    step = 2 * RUN.field / (SIDE - 1)
+    grid = Grid(SIDE, SIDE, (1.0, 1.0), (-RUN.field, -RUN.field), ((step, 0.0), (0.0, step)))
+    path = tmp_path_factory.mktemp("frames") / "frames.fits"
+    write_frames(path, simulate(RUN, seed=6).calset, grid, dtype="f8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(frames, tmp_path_factory):
+    """A run in a process of its own, not interrupted."""
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    process = start("refit", frames, "-o", folder, "--json")
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 0, err
+    return folder, json.loads(out)
+
+
+def start(*arguments: object) -> subprocess.Popen:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "WALOP_JAX_CACHE": "off"}
+    command = [sys.executable, "-c", LARGE, *map(str, arguments)]
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    )
+
+
+def test_the_calibration_carries_a_residual_map(finished):
+    folder, summary = finished
+    assert sorted(entry.name for entry in folder.iterdir()) == ["calibration.fits", "summary.json"]
+    assert summary["converged"]
+    assert summary["steps"] <= 3
+    residuals = read_product(folder / "calibration.fits").residuals
+    assert summary["residual_map"]["cells"] == [9, 9]
+    assert residuals.values.shape == (len(RESIDUAL_NAMES), 9, 9)
+    # Nothing is hidden in this set.
+    assert abs(summary["residual_map"]["significance"]) < 5
+    assert summary["residual_map"]["significance"] == pytest.approx(residuals.significance())
+    np.testing.assert_allclose(residuals.chi2, 1.0, atol=6 * np.sqrt(2 / (64 * 9 * 3)))
+    with fits.open(folder / "calibration.fits") as hdus:
+        header = hdus["RESIDUAL"].header
+        assert [header[f"PLANE{n}"] for n in range(1, 8)] == list(RESIDUAL_NAMES)
+        assert header["CTYPE1"] == "X"
+        # The centre of the first cell, by the coordinates of the header.
+        first = header["CRVAL1"] + (1 - header["CRPIX1"]) * header["CD1_1"]
+        assert first == pytest.approx(-RUN.field + RUN.field / 9)
+
+
+def test_the_map_stays_with_the_calibration(finished, tmp_path):
+    product = read_product(finished[0] / "calibration.fits")
+    again = Calibration.from_product(product).to_product()
+    assert again.content_hash() == product.content_hash()
+    write_product(tmp_path / "copy.fits", again)
+    np.testing.assert_array_equal(
+        read_product(tmp_path / "copy.fits").residuals.values, product.residuals.values
+    )
+    figure = product_figures.residual_map_figure(product.residuals)
+    assert len(figure.axes) == 16
+
+
+@pytest.mark.parametrize("name", ["RESIDUAL_ERR", "RESIDUAL_CHI2"])
+def test_a_map_with_a_part_missing_is_refused(finished, tmp_path, name):
+    with fits.open(finished[0] / "calibration.fits") as hdus:
+        del hdus[name]
+        hdus.writeto(tmp_path / "short.fits")
+    with pytest.raises(DataError, match=f"{name}.*missing"):
+        read_product(tmp_path / "short.fits")
+
+
+def test_a_changed_map_is_found_out(finished, tmp_path):
+    with fits.open(finished[0] / "calibration.fits") as hdus:
+        hdus["RESIDUAL"].data[0, 0, 0] += 1.0
+        hdus.writeto(tmp_path / "changed.fits", checksum=True)
+    with pytest.raises(DataError, match="not what was written"):
+        read_product(tmp_path / "changed.fits")
+
+
+def test_a_killed_fit_goes_on_where_it_was(frames, finished, tmp_path):
+    run = tmp_path / "run"
+    process = start("refit", frames, "-o", run)
+    deadline = time.monotonic() + 200
+    while sum(file.stat().st_size for file in run.glob("partial/*.sums")) < 400_000:
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert not (run / "calibration.fits").exists()
+    kept = {file.name: file.stat().st_size for file in run.glob("partial/*.sums")}
+    again = start("refit", frames, "-o", run, "--json")
+    while again.poll() is None and len(list(run.glob("partial/*.sums"))) <= len(kept):
+        time.sleep(0.02)
+    out, err = again.communicate(timeout=300)
+    assert again.returncode == 0, err
+    assert not (run / "partial").exists()
+    summary = json.loads(out)
+    assert summary["parameters"] == finished[1]["parameters"]
+    assert summary["chi2"] == finished[1]["chi2"]
+    assert read_product(run / "calibration.fits").content_hash() == (
+        read_product(finished[0] / "calibration.fits").content_hash()
+    )
+
+
+def test_two_processes_write_one_calibration(frames, finished, tmp_path):
+    with socket.socket() as one:
+        one.bind(("localhost", 0))
+        port = one.getsockname()[1]
+    run = tmp_path / "run"
+    both = [
+        start("refit", frames, "-o", run, "--processes", f"{n}/2@localhost:{port}", "--json") for n in (0, 1)
+    ]
+    (out, err), (silent, other) = (process.communicate(timeout=300) for process in both)
+    assert [process.returncode for process in both] == [0, 0], err + other
+    assert silent == ""
+    summary = json.loads(out)
+    for name, entry in finished[1]["parameters"].items():
+        assert summary["parameters"][name]["value"] == pytest.approx(entry["value"], rel=1e-10, abs=1e-10)
+    assert sorted(entry.name for entry in run.iterdir()) == ["calibration.fits", "summary.json"]
+    one, alone = (read_product(folder / "calibration.fits").residuals for folder in (run, finished[0]))
+    np.testing.assert_allclose(one.values, alone.values, atol=1e-10)
+
+
+def test_a_wrong_place_is_one_line(call, frames, tmp_path):
+    result = call("refit", frames, "-o", tmp_path / "run", "--processes", "2/2@localhost:1")
+    assert result.exit_code == 1
+    assert "INDEX counts from 0 to 1" in result.stderr
+
+
+def test_small_memory_changes_nothing(call, frames, tmp_path, monkeypatch):
+    monkeypatch.setattr(likelihood, "LARGE_ABOVE", 0)
+    monkeypatch.setattr(refit, "SAMPLE", 1024)
+    found = [
+        json.loads(call("refit", frames, "-o", tmp_path / memory, "--memory", memory, "--json").stdout)
+        for memory in ("4", "0.1")
+    ]
+    assert found[0]["parameters"] == found[1]["parameters"]
