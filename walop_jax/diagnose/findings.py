@@ -38,8 +38,8 @@ class Step:
     the errors stated. `choices` are discrete (which camera, which star), `alternatives` other shapes of the same
     effect that explain the data as well. `equivalent` are the effects that this data set cannot tell from it,
     `separation` how far (σ) each rival stays from it. `residual_before`, `residual_after` and `signature` are in
-    standard deviations, (point, exposure, camera): the residuals (data − model) without and with the effect at the
-    time it was added, and the change that it makes to the residuals of the final model.
+    standard deviations, (point, exposure, camera): the residuals (data − model; errors as given) without and with the
+    effect at the time it was added, and the change that it makes to the residuals of the final model.
     """
 
     effect: str

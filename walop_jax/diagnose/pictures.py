@@ -31,7 +31,6 @@ Used = Bool[np.ndarray, "p e"]
 ENOUGH = 0.3  # share of the best weights' power with which a combination in words is preferred
 PRESENT = 0.5  # share of Σ w² that the exposures of a point must hold for the point to be shown
 UNNAMED = "free_form"  # the effect that stands for patterns without a name
-SCALED = 2.0  # residuals are never scaled by less than this, if at all (`fit` scales from χ²/dof = 25 on)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,12 +59,7 @@ def pictures(diagnosis: Diagnosis) -> DiagnosisPictures:
     # Not the first step's: that step may have been dropped since.
     before = after if start is final else Problem(problem.calset, start.model).residuals(start.values)[1]
     pairs = [("", before, after)]
-    for step in diagnosis.steps:
-        cubes = (
-            _as_given(step.residual_before, step.chi2_before),
-            _as_given(step.residual_after, step.chi2_after),
-        )
-        pairs.append((step.effect, *cubes))
+    pairs += [(step.effect, step.residual_before, step.residual_after) for step in diagnosis.steps]
     if _unnamed_term(diagnosis):
         pairs.append((UNNAMED, pairs[-1][2] if diagnosis.steps else before, after))
     angle = np.where(exposures.clp_in, exposures.clp_angle, np.nan)
@@ -82,12 +76,6 @@ def _unnamed_term(diagnosis: Diagnosis) -> bool:
     present = {effect.name for effect in diagnosis.after.model.template.effects}
     known = {effect.name for effect in diagnosis.before.model.template.effects}
     return UNNAMED in present - known - {step.effect for step in diagnosis.steps}
-
-
-def _as_given(residual: Cube, chi2: float) -> Cube:
-    """Residuals in units of the errors as given: a fit far off has scaled them, its χ² it has not."""
-    scale = np.sqrt(chi2 / max(float(np.sum(residual**2)), 1e-300))
-    return residual * scale if scale > SCALED else residual
 
 
 def compare(effect: str, before: Cube, after: Cube, used: Used, exposures: Exposures) -> Comparison:

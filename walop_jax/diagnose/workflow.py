@@ -169,8 +169,8 @@ class _Diagnosing:
             change_of_qu=change,
             equivalent=close,
             alternatives=trial.alternatives,
-            residual_before=look.design.cube(look.design.residual),
-            residual_after=design.cube(design.residual),
+            residual_before=look.design.measured.residual,
+            residual_after=design.measured.residual,
         )
 
     # --------------------------------------------------------------------------------------- what has no name
