@@ -22,6 +22,7 @@ from walop_jax.diagnose.findings import Diagnosis
 from walop_jax.diagnose.where import HARMONICS
 from walop_jax.likelihood.problem import Problem
 from walop_jax.model.conventions import CAMERA_NAMES
+from walop_jax.model.effects import FreeForm
 
 Cube = Float[np.ndarray, "p e 4"]
 PointMap = Float[np.ndarray, "p 4"]
@@ -30,7 +31,7 @@ Used = Bool[np.ndarray, "p e"]
 
 ENOUGH = 0.3  # share of the best weights' power with which a combination in words is preferred
 PRESENT = 0.5  # share of Σ w² that the exposures of a point must hold for the point to be shown
-UNNAMED = "free_form"  # the effect that stands for patterns without a name
+UNNAMED = FreeForm.name  # the effect that stands for patterns without a name
 
 
 @dataclasses.dataclass(frozen=True)
