@@ -261,7 +261,6 @@ class _Diagnosing:
             separation=separation,
             separated_by=effect.separated_by if close else "",
             where=where.describe(look.design, change),
-            signature=look.design.cube(change),
         )
 
 
