@@ -134,7 +134,7 @@ def try_shapes(calset: CalibrationSet, base: FitResult, item: Ranked, context: C
 def _differ(one: Trial, other: Trial) -> bool:
     if one.instance.choices() != other.instance.choices():
         return True
-    at = [i for i, name in enumerate(one.fit.model.names) if name.startswith(f"{one.effect.name}.")]
+    at = one.fit.model.positions(one.effect.name)
     sigma = np.maximum(one.fit.sigma[at], other.fit.sigma[at])
     away = full_values(one.instance) - full_values(other.instance)
     return bool(np.any(np.abs(away) > SEPARATION * np.where(sigma > 0, sigma, np.inf)))
@@ -192,7 +192,8 @@ def evidence_of_presence(result: FitResult, name: str, context: Context) -> floa
 def without(model: Model, name: str) -> Model:
     """The model with one effect taken out."""
     rest = tuple(effect for effect in model.template.effects if effect.name != name)
-    parameters = tuple(p for p in model.parameters if not p.name.startswith(f"{name}."))
+    own = model.positions(name)
+    parameters = tuple(p for i, p in enumerate(model.parameters) if i not in own)
     template = dataclasses.replace(model.template, effects=rest)
     return dataclasses.replace(model, template=template, parameters=parameters)
 
@@ -216,9 +217,7 @@ def signature(problem: Problem, result: FitResult, name: str, context: Context) 
         bare = Problem(problem.calset, model).residuals(result.values[kept])[1]
     else:
         values = result.values.copy()
-        neutral = full_values(effect.at_neutral(context))
-        for leaf, value in zip(leaves(effect), neutral, strict=True):
-            values[result.model.index(f"{name}.{leaf.name}")] = value
+        values[result.model.positions(name)] = full_values(effect.at_neutral(context))
         bare = problem.residuals(values)[1]
     change = bare - problem.residuals(result.values)[1]
     return change[problem.used].reshape(-1) / result.noise_scale

@@ -153,12 +153,12 @@ def _best_phase(cube: Cube, waves: list[Weight]) -> float:
 
 def _ladder(diagnosis: Diagnosis) -> Ladder:
     """Starting model, every addition, and the final fit where it is another one than that of the last addition."""
+    final = diagnosis.after
     dof, rungs = diagnosis.before.dof, [("starting model", diagnosis.before.chi2, diagnosis.before.dof)]
     for step in diagnosis.steps:
-        added = [p for p in diagnosis.after.model.parameters if p.name.startswith(f"{step.effect}.")]
+        added = [final.model.parameters[i] for i in final.model.positions(step.effect)]
         dof -= sum(p.free and p.tie is None and p.prior is None for p in added)
         rungs.append((step.effect, step.chi2_after, dof))
-    final = diagnosis.after
     if abs(final.chi2 - rungs[-1][1]) > 1e-6 * final.chi2:
         rungs.append((UNNAMED if _unnamed_term(diagnosis) else "final fit", final.chi2, final.dof))
     model, chi2, freedom = zip(*rungs, strict=True)

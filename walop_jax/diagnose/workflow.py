@@ -247,8 +247,7 @@ class _Diagnosing:
         effect = _active(self.fit, step.effect)
         standard = full_values(effect.standard_form()) if not type(effect).is_structural() else ()
         parameters = {}
-        own = [i for i, p in enumerate(self.fit.model.parameters) if p.name.startswith(f"{step.effect}.")]
-        for i, value in zip(own, standard, strict=True):
+        for i, value in zip(self.fit.model.positions(step.effect), standard, strict=True):
             p = self.fit.model.parameters[i]
             label = p.name.removeprefix(f"{step.effect}.")
             parameters[label] = (float(value), float(self.fit.sigma[i]), p.unit)

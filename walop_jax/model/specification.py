@@ -86,6 +86,10 @@ class Model:
         except ValueError:
             raise unknown_name("parameter", name, self.names) from None
 
+    def positions(self, component: str) -> Int[np.ndarray, " _"]:
+        """Positions of the parameters of a component or an effect, in tree order; none where the model has none."""
+        return np.array([i for i, name in enumerate(self.names) if name.startswith(f"{component}.")], int)
+
     def change(self, name: str, **changes: Any) -> Model:
         """The model with fields of one parameter replaced."""
         i = self.index(name)
