@@ -58,8 +58,7 @@ class Trial:
     @property
     def instance(self) -> Effect:
         """The effect at its fitted values, in standard form."""
-        effects = self.fit.model.instrument(self.fit.values).effects
-        return next(e for e in effects if e.name == self.effect.name).standard_form()
+        return self.fit.model.instrument(self.fit.values).effect(self.effect.name).standard_form()
 
 
 def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
@@ -169,7 +168,7 @@ def evidence_of_presence(result: FitResult, name: str, context: Context) -> floa
     The Savage–Dickey ratio of nested models, Gaussian (Dickey 1971, Ann. Math. Stat. 42, 204). Infinite for an
     effect without parameters.
     """
-    effect = next(e for e in result.model.template.effects if e.name == name)
+    effect = result.model.template.effect(name)
     amplitudes = tuple(f"{name}.{label}" for f in effect.amplitudes() for label in effect.labels(f))
     at = [result.model.index(a) for a in amplitudes]
     at = [i for i in at if result.model.parameters[i].free and result.model.parameters[i].prior is not None]
@@ -210,7 +209,7 @@ def refit_without(calset: CalibrationSet, result: FitResult, name: str) -> tuple
 
 def signature(problem: Problem, result: FitResult, name: str, context: Context) -> Float[np.ndarray, " _"]:
     """What an active effect does to the residuals (data rows): theirs without it, minus theirs with it."""
-    effect = next(e for e in result.model.template.effects if e.name == name)
+    effect = result.model.template.effect(name)
     if type(effect).is_structural():
         model = without(result.model, name)
         kept = [result.model.index(n) for n in model.names]

@@ -149,7 +149,7 @@ class _Diagnosing:
         name = trial.effect.name
         score: Score | None = next((r.score for r in look.ranked if r.effect is trial.effect), None)
         design = Design.of(trial.problem, trial.fit)
-        effect = _active(trial.fit, name)
+        effect = trial.fit.model.instrument(trial.fit.values).effect(name)
         # An effect with a number for every exposure cannot predict exposures that it has not seen.
         many = any(np.size(getattr(effect, f)) > 4 for f in effect.amplitudes())
         scheme = "field blocks" if many else "exposures"
@@ -244,7 +244,7 @@ class _Diagnosing:
         separation = look.separation(step.effect, change)
         close = {name for name, s in separation.items() if s < naming.SEPARATION} | set(step.equivalent)
         close -= {other.effect for other in self.steps}
-        effect = _active(self.fit, step.effect)
+        effect = self.fit.model.instrument(self.fit.values).effect(step.effect)
         standard = full_values(effect.standard_form()) if not type(effect).is_structural() else ()
         parameters = {}
         for i, value in zip(self.fit.model.positions(step.effect), standard, strict=True):
@@ -261,8 +261,3 @@ class _Diagnosing:
             separated_by=effect.separated_by if close else "",
             where=where.describe(look.design, change),
         )
-
-
-def _active(result: FitResult, name: str) -> Effect:
-    """An active effect of a fitted model, at its fitted values."""
-    return next(e for e in result.model.instrument(result.values).effects if e.name == name)
