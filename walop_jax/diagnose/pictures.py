@@ -74,9 +74,8 @@ def pictures(diagnosis: Diagnosis) -> DiagnosisPictures:
 
 
 def _unnamed_term(diagnosis: Diagnosis) -> bool:
-    present = {effect.name for effect in diagnosis.after.model.template.effects}
-    known = {effect.name for effect in diagnosis.before.model.template.effects}
-    return UNNAMED in present - known - {step.effect for step in diagnosis.steps}
+    known = [*diagnosis.before.model.effect_names, *(step.effect for step in diagnosis.steps)]
+    return UNNAMED in diagnosis.after.model.effect_names and UNNAMED not in known
 
 
 def compare(effect: str, before: Cube, after: Cube, used: Used, exposures: Exposures) -> Comparison:

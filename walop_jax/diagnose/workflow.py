@@ -119,10 +119,9 @@ class _Diagnosing:
         for item in naming.leaders(look.significant) if look.significant else ():
             shapes = sum(probe.effect is item.effect for probe in look.probes)
             yield naming.try_shapes(self.calset, self.fit, item, self.context, shapes)
-        active = {effect.name for effect in self.problem.model.template.effects}
         if self.fit.chi2 > MISFIT * self.fit.dof:
             for effect in self.catalogue:
-                if effect.is_structural() and effect.name not in active:
+                if effect.is_structural() and effect.name not in self.problem.model.effect_names:
                     yield naming.try_effect(self.calset, self.fit, effect.neutral(self.context), self.context)
 
     def _add_best(self, look: Look) -> str | None:
@@ -193,7 +192,7 @@ class _Diagnosing:
         )
         found = Unexplained(look.table.p_global, text, patterns)
         blocks = tuple(dict.fromkeys(b for name, _ in patterns if (b := block_of(name)) is not None))
-        there = any(effect.name == FreeForm.name for effect in self.fit.model.template.effects)
+        there = FreeForm.name in self.fit.model.effect_names
         return self._with_free_form(look, found, blocks) if blocks and not there else found
 
     def _with_free_form(self, look: Look, found: Unexplained, blocks: tuple[str, ...]) -> Unexplained:

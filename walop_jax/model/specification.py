@@ -76,6 +76,11 @@ class Model:
         """Names of all parameters, in tree order."""
         return tuple(p.name for p in self.parameters)
 
+    @property
+    def effect_names(self) -> tuple[str, ...]:
+        """Names of the active effects, in the order light meets them."""
+        return tuple(effect.name for effect in self.template.effects)
+
     def __getitem__(self, name: str) -> Parameter:
         return self.parameters[self.index(name)]
 
