@@ -68,7 +68,7 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
         by_effect.setdefault(probe.effect, []).append((probe, table[probe.name]))
     ranked = []
     for effect, shapes in by_effect.items():
-        alive = [(p, s) for p, s in shapes if s.testable and follow_physics(effect, p.group, s)]
+        alive = [(p, s) for p, s in shapes if s.testable and follow_physics(p, s)]
         if not alive:
             continue
         alive.sort(key=lambda item: -item[1].log_bayes)
@@ -150,16 +150,10 @@ def spoken_choices(effect: Effect) -> dict[str, Any]:
     return {name: value for name, value in effect.choices().items() if isinstance(value, int | str)}
 
 
-def follow_physics(effect: type[Effect], group: Sequence[Effect], score: Score) -> bool:
+def follow_physics(probe: Probe, score: Score) -> bool:
     """Whether a linear step leaves one-sided amplitudes on their side, within `SEPARATION` standard deviations."""
-    sides = [
-        name in effect.one_sided
-        for member in group
-        for name in effect.amplitudes()
-        for _ in range(np.size(getattr(member, name)))
-    ]
     sigma = np.sqrt(np.clip(np.diag(score.covariance), 0.0, None))
-    return bool(np.all((score.amplitudes >= -SEPARATION * sigma)[np.array(sides)]))
+    return bool(np.all((score.amplitudes >= -SEPARATION * sigma)[probe.one_sided]))
 
 
 def evidence_of_presence(result: FitResult, name: str, context: Context) -> float:
