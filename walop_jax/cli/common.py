@@ -30,18 +30,23 @@ ModelOption = Annotated[
     Path | None,
     typer.Option("--model", metavar="MODEL.toml", help="Model file: what is free, tied, known, added."),
 ]
-
-
-class CommandError(Exception):
-    """A command failed for a reason that its one line of message states."""
-
-
+RunFolder = Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the results.")]
+Product = Annotated[
+    Path, typer.Argument(metavar="RUN/calibration.fits", help="Calibration product, or the folder of a run.")
+]
 PosteriorOption = Annotated[
     Path | None,
     typer.Option(
         "--posterior", metavar="posterior.nc", help="Use draws of walop-jax sample, not the covariance."
     ),
 ]
+OutputTable = Annotated[
+    Path, typer.Option("--output", "-o", metavar="OUT", help="Table to write (.fits, .csv, .ecsv).")
+]
+
+
+class CommandError(Exception):
+    """A command failed for a reason that its one line of message states."""
 
 
 def guarded(command: Callable[..., None]) -> Callable[..., None]:

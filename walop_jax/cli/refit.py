@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from walop_jax.cli.common import (
     CalsetFiles,
@@ -15,6 +13,7 @@ from walop_jax.cli.common import (
     ModelOption,
     OverwriteOption,
     QuietOption,
+    RunFolder,
     SeedOption,
     json_text,
     named,
@@ -27,8 +26,6 @@ from walop_jax.cli.common import (
 
 if TYPE_CHECKING:
     from walop_jax.fit.refit import FitResult
-
-RunFolder = Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the results.")]
 
 
 def refit(
