@@ -135,12 +135,6 @@ def zero_error(hdus):
     hdus["E2"].data[:, 1, 3] = 0.0
 
 
-def coarse(hdus):
-    for hdu in hdus[1:]:
-        if "CTYPE1" in hdu.header:
-            hdu.header["CD1_1"] = 50.0
-
-
 def constant(hdus):
     for k in range(4):
         hdus[f"N{k}"].data[:] = 7.0

@@ -137,9 +137,7 @@ class Blind:
             gram = self.space.gram[at, at]
             step = self.rng.standard_normal(len(alive)) * self.space.widths[at] * alive
             step *= ratio / np.sqrt(step @ gram @ step)
-            sides = [n in probe.effect.one_sided for m in probe.group for n in probe.effect.amplitudes()
-                     for _ in range(np.size(getattr(m, n)))]  # fmt: skip
-            step = np.where(sides, np.abs(step), step)
+            step = np.where(probe.one_sided, np.abs(step), step)
             if np.isclose(step @ gram @ step, ratio**2) and np.all(
                 np.abs(step) <= PLAUSIBLE * self.space.widths[at]
             ):

@@ -72,8 +72,7 @@ class Hiding:
         candidate = effect_candidates(problem.calset, problem.model, values, [probe])[probe.name]
         columns = self.design.stacked([candidate.columns])
         step = rng.standard_normal(len(probe.widths)) * probe.widths
-        if probe.effect.one_sided:
-            step = np.abs(step)
+        step = np.where(probe.one_sided, np.abs(step), step)
         step *= ratio / np.linalg.norm(self.design.projector(columns @ step))
         if np.max(np.abs(step) / probe.widths) > PLAUSIBLE:
             return None

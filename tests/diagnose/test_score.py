@@ -9,7 +9,6 @@ from walop_jax.diagnose.score import (
     Projector,
     Scorer,
     ScoreSpace,
-    canonical_correlations,
     corrected_p,
     separations,
 )
@@ -22,7 +21,9 @@ class Scoring:
 
     def __init__(self, projector, candidates, rng):
         self.projector = projector
-        self.scorer, self.columns = Scorer.of(projector, candidates, rng)
+        self.columns = np.column_stack([c.columns for c in candidates])
+        names, widths = [c.name for c in candidates], [c.widths for c in candidates]
+        self.scorer = Scorer(ScoreSpace.projected(projector, names, widths, self.columns), rng)
 
     def __call__(self, residual):
         r = self.projector(residual)
@@ -117,14 +118,6 @@ def test_an_injected_effect_is_found_with_its_amplitude(design):
     assert np.all(np.abs(pull) < 4)
 
 
-def test_canonical_correlations_of_hand_made_planes():
-    x, y, z = np.eye(3)
-    tilted = np.column_stack([x, np.cos(0.3) * y + np.sin(0.3) * z])
-    np.testing.assert_allclose(
-        np.sort(canonical_correlations(np.column_stack([x, y]), tilted)), [np.cos(0.3), 1.0], atol=1e-12
-    )
-
-
 def test_correction_for_trials():
     assert corrected_p(np.log(0.01), 1.0) == pytest.approx(0.01)
     assert corrected_p(np.log(1e-10), 50.0) == pytest.approx(5e-9, rel=1e-6)
@@ -173,7 +166,6 @@ def test_separation_is_the_distance_to_the_closest_change_a_rival_can_make(desig
     for name, c in columns.items():
         rest = refitted(columns["two"] @ np.array([2.0, 1.0]), np.column_stack([base, c]))
         assert found[name] == pytest.approx(np.sqrt(rest), abs=1e-5)
-    assert isinstance(scoring.scorer.space, ScoreSpace)
 
 
 def test_fluxes_that_were_solved_for_leave_less_room_for_noise():

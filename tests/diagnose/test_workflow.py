@@ -1,5 +1,6 @@
 """The whole workflow on sets made by other code, in which an effect is hidden (or nothing is)."""
 
+import dataclasses
 import json
 import time
 
@@ -41,6 +42,15 @@ def test_rows_and_priors_make_the_objective(design):
         gram / np.outer(scale, scale), fitted.posterior.matrix / np.outer(scale, scale), atol=1e-9
     )
     assert np.abs(design.jacobian.T @ design.residual / scale).max() < 1e-3
+
+
+def test_measured_residuals_keep_the_errors_as_given(design):
+    """Errors that a fit has scaled act on the rows of the design only."""
+    posterior = dataclasses.replace(design.fit.posterior, noise_scale=3.0)
+    scaled = Design.of(design.problem, dataclasses.replace(design.fit, posterior=posterior))
+    assert np.sum(scaled.measured.residual**2) == pytest.approx(posterior.data, rel=1e-10)
+    rows = 3.0 * scaled.cube(scaled.residual)
+    np.testing.assert_allclose(rows, scaled.measured.residual, rtol=1e-12)
 
 
 def test_folds_split_every_row_once_and_keep_exposures_and_blocks_whole(design):

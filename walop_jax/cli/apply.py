@@ -10,8 +10,10 @@ import typer
 
 from walop_jax.cli.common import (
     JsonOption,
+    OutputTable,
     OverwriteOption,
     PosteriorOption,
+    Product,
     QuietOption,
     SeedOption,
     named,
@@ -21,7 +23,6 @@ from walop_jax.cli.common import (
     switch_on_jax,
     warn,
 )
-from walop_jax.cli.matrix import OutputOption, Product
 
 CatalogueFile = Annotated[
     Path, typer.Argument(metavar="CATALOGUE", help="FITS, CSV or ECSV with X, Y, N, N_ERR.")
@@ -40,7 +41,7 @@ SaturationOption = Annotated[
 def apply(
     product: Product,
     catalogue: CatalogueFile,
-    output: OutputOption,
+    output: OutputTable,
     debias: DebiasOption = "MAS",
     saturation: SaturationOption = None,
     posterior: PosteriorOption = None,

@@ -7,6 +7,7 @@ import typer
 from walop_jax.cli.common import (
     CommandError,
     JsonOption,
+    Product,
     QuietOption,
     SeedOption,
     named,
@@ -14,7 +15,6 @@ from walop_jax.cli.common import (
     product_path,
     switch_on_jax,
 )
-from walop_jax.cli.matrix import Product
 
 
 def certify(

@@ -30,8 +30,6 @@ ModelOption = Annotated[
     Path | None,
     typer.Option("--model", metavar="MODEL.toml", help="Model file: what is free, tied, known, added."),
 ]
-
-
 ProcessesOption = Annotated[
     str | None,
     typer.Option(
@@ -44,17 +42,23 @@ MemoryOption = Annotated[
     float, typer.Option("--memory", metavar="GB", min=0.1, help="What the data of field points may take.")
 ]
 
-
-class CommandError(Exception):
-    """A command failed for a reason that its one line of message states."""
-
-
+RunFolder = Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the results.")]
+Product = Annotated[
+    Path, typer.Argument(metavar="RUN/calibration.fits", help="Calibration product, or the folder of a run.")
+]
 PosteriorOption = Annotated[
     Path | None,
     typer.Option(
         "--posterior", metavar="posterior.nc", help="Use draws of walop-jax sample, not the covariance."
     ),
 ]
+OutputTable = Annotated[
+    Path, typer.Option("--output", "-o", metavar="OUT", help="Table to write (.fits, .csv, .ecsv).")
+]
+
+
+class CommandError(Exception):
+    """A command failed for a reason that its one line of message states."""
 
 
 def guarded(command: Callable[..., None]) -> Callable[..., None]:

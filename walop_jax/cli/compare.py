@@ -14,6 +14,7 @@ from walop_jax.cli.common import (
     ModelOption,
     OverwriteOption,
     QuietOption,
+    RunFolder,
     SeedOption,
     json_text,
     named,
@@ -23,7 +24,6 @@ from walop_jax.cli.common import (
     switch_on_jax,
     warn,
 )
-from walop_jax.cli.refit import RunFolder
 
 FILES = (
     "comparison.json",

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from walop_jax.cli.common import (
     CalsetFiles,
@@ -14,6 +12,7 @@ from walop_jax.cli.common import (
     ModelOption,
     OverwriteOption,
     QuietOption,
+    RunFolder,
     SeedOption,
     json_text,
     named,
@@ -28,8 +27,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from walop_jax.diagnose.findings import Diagnosis, Step
-
-RunFolder = Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the results.")]
 
 
 def diagnose(

@@ -9,8 +9,10 @@ import typer
 
 from walop_jax.cli.common import (
     JsonOption,
+    OutputTable,
     OverwriteOption,
     PosteriorOption,
+    Product,
     QuietOption,
     SeedOption,
     named,
@@ -21,21 +23,15 @@ from walop_jax.cli.common import (
     warn,
 )
 
-Product = Annotated[
-    Path, typer.Argument(metavar="RUN/calibration.fits", help="Calibration product, or the folder of a run.")
-]
 PointsOption = Annotated[
     Path, typer.Option("--points", metavar="TABLE", help="FITS, CSV or ECSV with X, Y in degrees.")
-]
-OutputOption = Annotated[
-    Path, typer.Option("--output", "-o", metavar="OUT", help="Table to write (.fits, .csv, .ecsv).")
 ]
 
 
 def matrix(
     product: Product,
     points: PointsOption,
-    output: OutputOption,
+    output: OutputTable,
     posterior: PosteriorOption = None,
     overwrite: OverwriteOption = False,
     seed: SeedOption = None,

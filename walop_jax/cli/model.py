@@ -72,7 +72,7 @@ def model(
         print_json(
             {
                 "instrument": made.name,
-                "effects": [entry.name for entry in made.template.effects],
+                "effects": list(made.effect_names),
                 "output": None if output is None else str(output),
                 "parameters": {
                     p.name: {

@@ -7,9 +7,7 @@ import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from walop_jax.cli.common import (
     CalsetFiles,
@@ -20,6 +18,7 @@ from walop_jax.cli.common import (
     OverwriteOption,
     ProcessesOption,
     QuietOption,
+    RunFolder,
     SeedOption,
     json_text,
     named,
@@ -35,8 +34,6 @@ if TYPE_CHECKING:
     from walop_jax.data.product_records import ResidualMap
     from walop_jax.fit.refit import FitResult
     from walop_jax.likelihood.problem import Problem
-
-RunFolder = Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the results.")]
 
 
 def refit(

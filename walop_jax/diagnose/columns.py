@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnose.score import Candidate
@@ -38,15 +38,22 @@ class Probe:
     effect: type[Effect]
     group: tuple[Effect, ...]
 
+    def _fields(self) -> Iterator[str]:
+        """The parameter that each amplitude belongs to, member by member."""
+        for member in self.group:
+            for name in self.effect.amplitudes():
+                yield from [name] * np.size(getattr(member, name))
+
     @property
     def widths(self) -> Vector:
         """Prior widths of the amplitudes, member by member."""
         declared = field_declarations(self.effect)
-        widths = []
-        for member in self.group:
-            for name in self.effect.amplitudes():
-                widths += [declared[name].width or DEFAULT_WIDTH] * np.size(getattr(member, name))
-        return np.array(widths)
+        return np.array([declared[name].width or DEFAULT_WIDTH for name in self._fields()])
+
+    @property
+    def one_sided(self) -> Bool[np.ndarray, " _"]:
+        """Which amplitudes physics keeps above neutral, member by member."""
+        return np.array([name in self.effect.one_sided for name in self._fields()], bool)
 
 
 def probes(catalogue: Sequence[type[Effect]], context: Context) -> Iterator[Probe]:

@@ -82,11 +82,15 @@ class Design:
         pulls = len(self.residual) - self.rows - self.fit.n_priors
         return fluxes + pulls
 
+    def _columns_of(self, name: str) -> Bool[np.ndarray, " f"]:
+        """Which columns of the Jacobian are those of an effect."""
+        return np.isin(self.fit.model.free, self.fit.model.positions(name))
+
     def without(self, name: str) -> tuple[Projector, Float[np.ndarray, "_ _"]]:
         """What all parameters but those of one effect absorb, and an orthonormal basis of what these add to it."""
-        free = [self.fit.model.parameters[i].name.startswith(f"{name}.") for i in self.fit.model.free]
-        rest = Projector(self.jacobian[:, ~np.array(free)], self.eliminated)
-        own = rest(self.jacobian[:, np.array(free)])
+        of_effect = self._columns_of(name)
+        rest = Projector(self.jacobian[:, ~of_effect], self.eliminated)
+        own = rest(self.jacobian[:, of_effect])
         return rest, own @ whitening(own.T @ own)
 
     def stacked(self, columns: list[Float[np.ndarray, "_ _"]]) -> Float[np.ndarray, "_ _"]:
@@ -130,12 +134,8 @@ class Design:
         H = JᵀJ and g_e the gradient of exposure e (White 1982, Econometrica 50, 1; Liang & Zeger 1986, Biometrika 73,
         13).
         """
-        at = [
-            k
-            for k, i in enumerate(self.fit.model.free)
-            if self.fit.model.parameters[i].name.startswith(f"{name}.")
-        ]
-        if not at:
+        at = np.flatnonzero(self._columns_of(name))
+        if not len(at):
             return float("nan")
         norm = np.sqrt(np.sum(self.jacobian**2, axis=0))
         scaled = self.jacobian / np.where(norm > 0, norm, 1.0)

@@ -37,9 +37,9 @@ class Step:
     point, `robust_ratio` the errors of its parameters when every exposure may have a disturbance of its own, over
     the errors stated. `choices` are discrete (which camera, which star), `alternatives` other shapes of the same
     effect that explain the data as well. `equivalent` are the effects that this data set cannot tell from it,
-    `separation` how far (σ) each rival stays from it. `residual_before`, `residual_after` and `signature` are in
-    standard deviations, (point, exposure, camera): the residuals (data − model) without and with the effect at the
-    time it was added, and the change that it makes to the residuals of the final model.
+    `separation` how far (σ) each rival stays from it. `residual_before` and `residual_after` are the residuals
+    (data − model, in standard deviations as given; point, exposure, camera) without and with the effect at the time it
+    was added.
     """
 
     effect: str
@@ -61,7 +61,6 @@ class Step:
     where: dict[str, Any] = dataclasses.field(default_factory=dict)
     residual_before: Cube = dataclasses.field(default_factory=_no_cube)
     residual_after: Cube = dataclasses.field(default_factory=_no_cube)
-    signature: Cube = dataclasses.field(default_factory=_no_cube)
 
     @property
     def confirmed(self) -> bool:

@@ -58,7 +58,7 @@ class Look:
     ) -> None:
         """`earlier` is a look at a smaller model, whose columns serve again where the light has hardly changed."""
         self.problem, self.result = problem, result
-        active = [effect.name for effect in problem.model.template.effects]
+        active = problem.model.effect_names
         self.design = Design.of(problem, result)
         inactive = [probe for probe in wanted if probe.effect.name not in active]
         self.named = (
@@ -140,11 +140,9 @@ class Look:
     def untestable(self, catalogue: Sequence[type[Effect]]) -> tuple[str, ...]:
         """Effects that these data cannot show at any plausible size."""
         seen = {probe.effect.name for probe in self.probes if self.table[probe.name].testable}
-        active = {effect.name for effect in self.problem.model.template.effects}
+        seen.update(self.problem.model.effect_names)
         return tuple(
-            effect.name
-            for effect in catalogue
-            if effect.name not in seen | active and not effect.is_structural()
+            effect.name for effect in catalogue if effect.name not in seen and not effect.is_structural()
         )
 
     def separation(self, name: str, change: Vector) -> dict[str, float]:

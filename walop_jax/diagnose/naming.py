@@ -58,8 +58,7 @@ class Trial:
     @property
     def instance(self) -> Effect:
         """The effect at its fitted values, in standard form."""
-        effects = self.fit.model.instrument(self.fit.values).effects
-        return next(e for e in effects if e.name == self.effect.name).standard_form()
+        return self.fit.model.instrument(self.fit.values).effect(self.effect.name).standard_form()
 
 
 def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
@@ -69,7 +68,7 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
         by_effect.setdefault(probe.effect, []).append((probe, table[probe.name]))
     ranked = []
     for effect, shapes in by_effect.items():
-        alive = [(p, s) for p, s in shapes if s.testable and follow_physics(effect, p.group, s)]
+        alive = [(p, s) for p, s in shapes if s.testable and follow_physics(p, s)]
         if not alive:
             continue
         alive.sort(key=lambda item: -item[1].log_bayes)
@@ -134,7 +133,7 @@ def try_shapes(calset: CalibrationSet, base: FitResult, item: Ranked, context: C
 def _differ(one: Trial, other: Trial) -> bool:
     if one.instance.choices() != other.instance.choices():
         return True
-    at = [i for i, name in enumerate(one.fit.model.names) if name.startswith(f"{one.effect.name}.")]
+    at = one.fit.model.positions(one.effect.name)
     sigma = np.maximum(one.fit.sigma[at], other.fit.sigma[at])
     away = full_values(one.instance) - full_values(other.instance)
     return bool(np.any(np.abs(away) > SEPARATION * np.where(sigma > 0, sigma, np.inf)))
@@ -151,16 +150,10 @@ def spoken_choices(effect: Effect) -> dict[str, Any]:
     return {name: value for name, value in effect.choices().items() if isinstance(value, int | str)}
 
 
-def follow_physics(effect: type[Effect], group: Sequence[Effect], score: Score) -> bool:
+def follow_physics(probe: Probe, score: Score) -> bool:
     """Whether a linear step leaves one-sided amplitudes on their side, within `SEPARATION` standard deviations."""
-    sides = [
-        name in effect.one_sided
-        for member in group
-        for name in effect.amplitudes()
-        for _ in range(np.size(getattr(member, name)))
-    ]
     sigma = np.sqrt(np.clip(np.diag(score.covariance), 0.0, None))
-    return bool(np.all((score.amplitudes >= -SEPARATION * sigma)[np.array(sides)]))
+    return bool(np.all((score.amplitudes >= -SEPARATION * sigma)[probe.one_sided]))
 
 
 def evidence_of_presence(result: FitResult, name: str, context: Context) -> float:
@@ -169,7 +162,7 @@ def evidence_of_presence(result: FitResult, name: str, context: Context) -> floa
     The Savage–Dickey ratio of nested models, Gaussian (Dickey 1971, Ann. Math. Stat. 42, 204). Infinite for an
     effect without parameters.
     """
-    effect = next(e for e in result.model.template.effects if e.name == name)
+    effect = result.model.template.effect(name)
     amplitudes = tuple(f"{name}.{label}" for f in effect.amplitudes() for label in effect.labels(f))
     at = [result.model.index(a) for a in amplitudes]
     at = [i for i in at if result.model.parameters[i].free and result.model.parameters[i].prior is not None]
@@ -192,7 +185,8 @@ def evidence_of_presence(result: FitResult, name: str, context: Context) -> floa
 def without(model: Model, name: str) -> Model:
     """The model with one effect taken out."""
     rest = tuple(effect for effect in model.template.effects if effect.name != name)
-    parameters = tuple(p for p in model.parameters if not p.name.startswith(f"{name}."))
+    own = model.positions(name)
+    parameters = tuple(p for i, p in enumerate(model.parameters) if i not in own)
     template = dataclasses.replace(model.template, effects=rest)
     return dataclasses.replace(model, template=template, parameters=parameters)
 
@@ -209,16 +203,14 @@ def refit_without(calset: CalibrationSet, result: FitResult, name: str) -> tuple
 
 def signature(problem: Problem, result: FitResult, name: str, context: Context) -> Float[np.ndarray, " _"]:
     """What an active effect does to the residuals (data rows): theirs without it, minus theirs with it."""
-    effect = next(e for e in result.model.template.effects if e.name == name)
+    effect = result.model.template.effect(name)
     if type(effect).is_structural():
         model = without(result.model, name)
         kept = [result.model.index(n) for n in model.names]
         bare = Problem(problem.calset, model).residuals(result.values[kept])[1]
     else:
         values = result.values.copy()
-        neutral = full_values(effect.at_neutral(context))
-        for leaf, value in zip(leaves(effect), neutral, strict=True):
-            values[result.model.index(f"{name}.{leaf.name}")] = value
+        values[result.model.positions(name)] = full_values(effect.at_neutral(context))
         bare = problem.residuals(values)[1]
     change = bare - problem.residuals(result.values)[1]
     return change[problem.used].reshape(-1) / result.noise_scale

@@ -22,6 +22,7 @@ from walop_jax.diagnose.findings import Diagnosis
 from walop_jax.diagnose.where import HARMONICS
 from walop_jax.likelihood.problem import Problem
 from walop_jax.model.conventions import CAMERA_NAMES
+from walop_jax.model.effects import FreeForm
 
 Cube = Float[np.ndarray, "p e 4"]
 PointMap = Float[np.ndarray, "p 4"]
@@ -30,8 +31,7 @@ Used = Bool[np.ndarray, "p e"]
 
 ENOUGH = 0.3  # share of the best weights' power with which a combination in words is preferred
 PRESENT = 0.5  # share of Σ w² that the exposures of a point must hold for the point to be shown
-UNNAMED = "free_form"  # the effect that stands for patterns without a name
-SCALED = 2.0  # residuals are never scaled by less than this, if at all (`fit` scales from χ²/dof = 25 on)
+UNNAMED = FreeForm.name  # the effect that stands for patterns without a name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,12 +60,7 @@ def pictures(diagnosis: Diagnosis) -> DiagnosisPictures:
     # Not the first step's: that step may have been dropped since.
     before = after if start is final else Problem(problem.calset, start.model).residuals(start.values)[1]
     pairs = [("", before, after)]
-    for step in diagnosis.steps:
-        cubes = (
-            _as_given(step.residual_before, step.chi2_before),
-            _as_given(step.residual_after, step.chi2_after),
-        )
-        pairs.append((step.effect, *cubes))
+    pairs += [(step.effect, step.residual_before, step.residual_after) for step in diagnosis.steps]
     if _unnamed_term(diagnosis):
         pairs.append((UNNAMED, pairs[-1][2] if diagnosis.steps else before, after))
     angle = np.where(exposures.clp_in, exposures.clp_angle, np.nan)
@@ -79,15 +74,8 @@ def pictures(diagnosis: Diagnosis) -> DiagnosisPictures:
 
 
 def _unnamed_term(diagnosis: Diagnosis) -> bool:
-    present = {effect.name for effect in diagnosis.after.model.template.effects}
-    known = {effect.name for effect in diagnosis.before.model.template.effects}
-    return UNNAMED in present - known - {step.effect for step in diagnosis.steps}
-
-
-def _as_given(residual: Cube, chi2: float) -> Cube:
-    """Residuals in units of the errors as given: a fit far off has scaled them, its χ² it has not."""
-    scale = np.sqrt(chi2 / max(float(np.sum(residual**2)), 1e-300))
-    return residual * scale if scale > SCALED else residual
+    known = [*diagnosis.before.model.effect_names, *(step.effect for step in diagnosis.steps)]
+    return UNNAMED in diagnosis.after.model.effect_names and UNNAMED not in known
 
 
 def compare(effect: str, before: Cube, after: Cube, used: Used, exposures: Exposures) -> Comparison:
@@ -164,12 +152,12 @@ def _best_phase(cube: Cube, waves: list[Weight]) -> float:
 
 def _ladder(diagnosis: Diagnosis) -> Ladder:
     """Starting model, every addition, and the final fit where it is another one than that of the last addition."""
+    final = diagnosis.after
     dof, rungs = diagnosis.before.dof, [("starting model", diagnosis.before.chi2, diagnosis.before.dof)]
     for step in diagnosis.steps:
-        added = [p for p in diagnosis.after.model.parameters if p.name.startswith(f"{step.effect}.")]
+        added = [final.model.parameters[i] for i in final.model.positions(step.effect)]
         dof -= sum(p.free and p.tie is None and p.prior is None for p in added)
         rungs.append((step.effect, step.chi2_after, dof))
-    final = diagnosis.after
     if abs(final.chi2 - rungs[-1][1]) > 1e-6 * final.chi2:
         rungs.append((UNNAMED if _unnamed_term(diagnosis) else "final fit", final.chi2, final.dof))
     model, chi2, freedom = zip(*rungs, strict=True)

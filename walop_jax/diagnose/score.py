@@ -131,14 +131,6 @@ def whitening(gram: Matrix) -> Matrix:
     return scale[:, None] * vector[:, keep] / np.sqrt(value[keep])
 
 
-def canonical_correlations(first: Matrix, second: Matrix) -> Vector:
-    """Cosines of the principal angles between two column spaces (Björck & Golub 1973)."""
-    a, b = first @ whitening(first.T @ first), second @ whitening(second.T @ second)
-    if a.shape[1] == 0 or b.shape[1] == 0:
-        return np.zeros(0)
-    return np.clip(np.linalg.svd(a.T @ b, compute_uv=False), 0.0, 1.0)
-
-
 @dataclasses.dataclass(frozen=True)
 class ScoreSpace:
     """The Gram matrix of all candidates behind the projection: all that the scores need of a design.
@@ -152,13 +144,6 @@ class ScoreSpace:
     before: Vector
     gram: Matrix
     free: int
-
-    @classmethod
-    def of(cls, projector: Projector, candidates: Sequence[Candidate]) -> tuple[ScoreSpace, Matrix]:
-        """The space of candidates, and their projected columns side by side."""
-        columns = np.column_stack([c.columns for c in candidates])
-        names, widths = [c.name for c in candidates], [c.widths for c in candidates]
-        return cls.projected(projector, names, widths, columns), columns
 
     @classmethod
     def projected(
@@ -233,18 +218,6 @@ class Scorer:
         self._whitening = {name: whitening(gram[at, at]) for name, at in space.places().items()}
         self._all = whitening(gram)
         self._smallest = self._smallest_p(gram, rng, draws)
-
-    @classmethod
-    def of(
-        cls,
-        projector: Projector,
-        candidates: Sequence[Candidate],
-        rng: np.random.Generator,
-        draws: int = DRAWS,
-    ) -> tuple[Scorer, Matrix]:
-        """A scorer of candidates and their projected columns."""
-        space, columns = ScoreSpace.of(projector, candidates)
-        return cls(space, rng, draws), columns
 
     def __call__(self, scores: Vector, square: float) -> ScoreTable:
         """The table from s = C̃ᵀr and r·r, both behind the projection."""

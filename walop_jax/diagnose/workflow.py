@@ -125,10 +125,9 @@ class _Diagnosing:
         for item in naming.leaders(look.significant) if look.significant else ():
             shapes = sum(probe.effect is item.effect for probe in look.probes)
             yield naming.try_shapes(self.calset, self.fit, item, self.context, shapes)
-        active = {effect.name for effect in self.problem.model.template.effects}
         if self.fit.chi2 > MISFIT * self.fit.dof:
             for effect in self.catalogue:
-                if effect.is_structural() and effect.name not in active:
+                if effect.is_structural() and effect.name not in self.problem.model.effect_names:
                     yield naming.try_effect(self.calset, self.fit, effect.neutral(self.context), self.context)
 
     def _add_best(self, look: Look) -> str | None:
@@ -155,7 +154,7 @@ class _Diagnosing:
         name = trial.effect.name
         score: Score | None = next((r.score for r in look.ranked if r.effect is trial.effect), None)
         design = Design.of(trial.problem, trial.fit)
-        effect = _active(trial.fit, name)
+        effect = trial.fit.model.instrument(trial.fit.values).effect(name)
         # An effect with a number for every exposure cannot predict exposures that it has not seen.
         many = any(np.size(getattr(effect, f)) > 4 for f in effect.amplitudes())
         scheme = "field blocks" if many else "exposures"
@@ -175,8 +174,8 @@ class _Diagnosing:
             change_of_qu=change,
             equivalent=close,
             alternatives=trial.alternatives,
-            residual_before=look.design.cube(look.design.residual),
-            residual_after=design.cube(design.residual),
+            residual_before=look.design.measured.residual,
+            residual_after=design.measured.residual,
         )
 
     # --------------------------------------------------------------------------------------- what has no name
@@ -199,7 +198,7 @@ class _Diagnosing:
         )
         found = Unexplained(look.table.p_global, text, patterns)
         blocks = tuple(dict.fromkeys(b for name, _ in patterns if (b := block_of(name)) is not None))
-        there = any(effect.name == FreeForm.name for effect in self.fit.model.template.effects)
+        there = FreeForm.name in self.fit.model.effect_names
         return self._with_free_form(look, found, blocks) if blocks and not there else found
 
     def _with_free_form(self, look: Look, found: Unexplained, blocks: tuple[str, ...]) -> Unexplained:
@@ -250,11 +249,10 @@ class _Diagnosing:
         separation = look.separation(step.effect, change)
         close = {name for name, s in separation.items() if s < naming.SEPARATION} | set(step.equivalent)
         close -= {other.effect for other in self.steps}
-        effect = _active(self.fit, step.effect)
+        effect = self.fit.model.instrument(self.fit.values).effect(step.effect)
         standard = full_values(effect.standard_form()) if not type(effect).is_structural() else ()
         parameters = {}
-        own = [i for i, p in enumerate(self.fit.model.parameters) if p.name.startswith(f"{step.effect}.")]
-        for i, value in zip(own, standard, strict=True):
+        for i, value in zip(self.fit.model.positions(step.effect), standard, strict=True):
             p = self.fit.model.parameters[i]
             label = p.name.removeprefix(f"{step.effect}.")
             parameters[label] = (float(value), float(self.fit.sigma[i]), p.unit)
@@ -267,10 +265,4 @@ class _Diagnosing:
             separation=separation,
             separated_by=effect.separated_by if close else "",
             where=where.describe(look.design, change),
-            signature=look.design.cube(change),
         )
-
-
-def _active(result: FitResult, name: str) -> Effect:
-    """An active effect of a fitted model, at its fitted values."""
-    return next(e for e in result.model.instrument(result.values).effects if e.name == name)

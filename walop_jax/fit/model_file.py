@@ -57,7 +57,7 @@ def render(model: Model) -> str:
     table["instrument"] = model.name
     table["plates"] = model.template.plates
     table["throughput_degree"] = model.template.throughput.degree
-    table["effects"] = [effect.name for effect in model.template.effects]
+    table["effects"] = list(model.effect_names)
     document["model"] = table
     choices = {effect.name: effect.choices() for effect in model.template.effects}
     if any(choices.values()):

@@ -18,6 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from walop_jax.data.records import Exposures, FilterCurve
+from walop_jax.likelihood.nodes import rows_and_slopes
 from walop_jax.model import legendre, light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
@@ -95,9 +96,6 @@ def _point_matrix(
     basis = legendre.basis(x, y, instrument.throughput.degree)
     throughput = light.throughput_at(instrument, x, y)
 
-    def optics(optical_values: Float[Array, " o"]) -> Float[Array, "b 2 2 4"]:
-        return light.band_rows(to_instrument(values.at[optical].set(optical_values)), plan, x, y)
-
     def matrix(
         rows: Float[Array, "b 2 2 4"], all_values: Float[Array, " n"], local: Float[Array, 4]
     ) -> Float[Array, "b 2 3"]:
@@ -105,11 +103,9 @@ def _point_matrix(
         vectors = light.camera_vectors(there, rows, local, x, y)
         return light.instrument_matrix(vectors @ light.telescope(there))
 
-    rows, push_optics = jax.linearize(optics, values[optical])
+    rows, slopes = rows_and_slopes(instrument, plan, x, y)
     m, push = jax.linearize(matrix, rows, values, throughput)
-    d_rows = (
-        jnp.zeros((values.size, *rows.shape)).at[optical].set(jax.vmap(push_optics)(jnp.eye(optical.size)))
-    )
+    d_rows = jnp.zeros((values.size, *rows.shape)).at[optical].set(slopes)
     unit = jnp.eye(values.size)
     d_plain = jax.vmap(lambda dr, dv: push(dr, dv, jnp.zeros(4)))(d_rows[plain], unit[plain])
     zero_rows, zero_values = jnp.zeros_like(rows), jnp.zeros_like(values)

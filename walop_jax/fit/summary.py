@@ -60,7 +60,7 @@ def summary(
         "quality": quality(result),
         "warnings": list(result.warnings),
         "instrument": result.model.name,
-        "effects": [effect.name for effect in result.model.template.effects],
+        "effects": list(result.model.effect_names),
         "free_parameters": len(result.model.free),
         "noise_scale": result.noise_scale,
         "steps": result.minimum.steps,

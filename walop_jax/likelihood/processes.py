@@ -23,7 +23,7 @@ HEARTBEAT = 30
 """Seconds of silence after which a process counts as dead."""
 
 
-class LostProcessError(RuntimeError):
+class LostProcessError(ConnectionError):
     """Another process of the same computation has gone or does something else."""
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from walop_jax.model import legendre
 from walop_jax.model.conventions import CAMERAS, EXTINCTION, FAST_AXES
 from walop_jax.model.effects.base import Effect
-from walop_jax.model.parameters import Component, param
+from walop_jax.model.parameters import Component, param, unknown_name
 
 CONTRACT = "calibration contract, section 3"
 PAPER = "Maharana et al. 2022, Paper II"
@@ -121,6 +121,13 @@ class Instrument(Component):
     def halves(self) -> tuple[Half, Half]:
         """Both halves of the pupil."""
         return self.half1, self.half2
+
+    def effect(self, name: str) -> Effect:
+        """The active effect of a name; ValueError when there is none."""
+        for effect in self.effects:
+            if effect.name == name:
+                return effect
+        raise unknown_name("active effect", name, [effect.name for effect in self.effects])
 
 
 PLATE_MODELS = ("waves", "fixed_axis")

@@ -76,6 +76,11 @@ class Model:
         """Names of all parameters, in tree order."""
         return tuple(p.name for p in self.parameters)
 
+    @property
+    def effect_names(self) -> tuple[str, ...]:
+        """Names of the active effects, in the order light meets them."""
+        return tuple(effect.name for effect in self.template.effects)
+
     def __getitem__(self, name: str) -> Parameter:
         return self.parameters[self.index(name)]
 
@@ -85,6 +90,10 @@ class Model:
             return self.names.index(name)
         except ValueError:
             raise unknown_name("parameter", name, self.names) from None
+
+    def positions(self, component: str) -> Int[np.ndarray, " _"]:
+        """Positions of the parameters of a component or an effect, in tree order; none where the model has none."""
+        return np.array([i for i, name in enumerate(self.names) if name.startswith(f"{component}.")], int)
 
     def change(self, name: str, **changes: Any) -> Model:
         """The model with fields of one parameter replaced."""

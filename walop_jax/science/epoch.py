@@ -78,7 +78,7 @@ def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]
     """
     if calset.instrument != old.model.name:
         raise ValueError(f"the new set is of {calset.instrument}, the calibration of {old.model.name}")
-    model = model_for(calset, effects_text([effect.name for effect in old.model.template.effects]))
+    model = model_for(calset, effects_text(old.model.effect_names))
     problem = Problem(calset, model)
     result = fit(problem)
     if not result.converged:

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, Int
 from walop_jax.data.checks import FIELD_LIMITS
 from walop_jax.fit.calibration import Calibration
 from walop_jax.fit.predict import Settings, settings_plan
+from walop_jax.likelihood.nodes import rows_and_slopes
 from walop_jax.model import legendre, light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
@@ -77,21 +78,16 @@ def _derivatives(
     optical = np.asarray(optical_indices(instrument), int)
     plain = np.setdiff1d(np.arange(values.size), np.asarray(series_indices(instrument), int))
 
-    def optics(optical_values: Float[Array, " o"]) -> Float[Array, "b 2 2 4"]:
-        return light.band_rows(to_instrument(values.at[optical].set(optical_values)), plan, x, y)
-
     def vectors(
         rows: Float[Array, "b 2 2 4"], all_values: Float[Array, " n"], local: Float[Array, 4]
     ) -> Float[Array, "b 4 3"]:
         there = to_instrument(all_values)
         return (light.camera_vectors(there, rows, local, x, y) @ light.telescope(there))[..., :3]
 
-    rows, push_optics = jax.linearize(optics, values[optical])
+    rows, slopes = rows_and_slopes(instrument, plan, x, y)
     out, push = jax.linearize(vectors, rows, values, light.throughput_at(instrument, x, y))
     no_rows, no_values, no_local = jnp.zeros_like(rows), jnp.zeros_like(values), jnp.zeros(4)
-    d_rows = (
-        jnp.zeros((values.size, *rows.shape)).at[optical].set(jax.vmap(push_optics)(jnp.eye(optical.size)))
-    )
+    d_rows = jnp.zeros((values.size, *rows.shape)).at[optical].set(slopes)
     d_plain = jax.vmap(lambda dr, dv: push(dr, dv, no_local))(d_rows[plain], jnp.eye(values.size)[plain])
     d_local = jax.vmap(lambda dt: push(no_rows, no_values, dt))(jnp.eye(4))
     return jnp.concatenate([jnp.zeros((values.size, *out.shape)).at[plain].set(d_plain), d_local])

@@ -25,7 +25,20 @@ def test_names_and_order_follow_the_light():
     )  # fmt: skip
     assert model.names[: len(MODEL.names)] == MODEL.names
     assert model["half1.efficiency"].start == 0.9985
-    assert model.instrument().effects[1].name == "clp_wobble"
+    assert model.effect_names == ("moon_patch", "clp_wobble", "nonlinearity")
+
+
+def test_what_belongs_to_a_component_is_found_by_its_name():
+    model = with_effects(MODEL, ["clp_zero", "clp_wobble"], scenes.CONTEXT)
+    wobble = model.template.effect("clp_wobble")
+    assert [model.names[i] for i in model.positions("clp_wobble")] == [
+        "clp_wobble.amplitude", "clp_wobble.phase"
+    ]  # fmt: skip
+    assert wobble.name == "clp_wobble"
+    assert len(model.positions("half1")) == 4
+    assert len(model.positions("clp")) == 0
+    with pytest.raises(ValueError, match="nearest: clp_wobble"):
+        model.template.effect("clp_wobbel")
 
 
 def test_an_instance_starts_where_it_stands_with_a_prior_about_neutral():
