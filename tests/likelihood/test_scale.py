@@ -25,6 +25,7 @@ import resource
 import time
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -187,7 +188,7 @@ def matrix_error(calset, truth, result) -> tuple[float, float]:
     calibration = Calibration.from_fit(result, Problem(calset, result.model))
     found, covariance = calibration.matrix(x, y)
     plan = settings_plan(Settings.default(1), calset.filters, truth)
-    exact = instrument_matrix(analysis_vectors(truth, plan, x, y)[:, 0])
+    exact = instrument_matrix(jnp.asarray(analysis_vectors(truth, plan, x, y)[:, 0]))
     error = found - np.asarray(exact).reshape(len(x), 6)
     return float(np.sqrt(np.mean(error**2))), float(
         np.sqrt(np.mean(np.trace(covariance, axis1=1, axis2=2) / 6))
@@ -205,7 +206,7 @@ def test_errors_fall_with_the_points():
         "\n   points  rms error   expected   errors from counts   fifth and sixth order of the throughput lacking"
     )
     rows = []
-    for side in (12, 24, 48, 96, 192, 384, 768):
+    for side in (12, 48, 192, 384):
         row = []
         for degree, from_counts in ((4, False), (4, True), (6, False)):
             plan = dataclasses.replace(RUN, throughput_degree=degree, electrons=1e4)

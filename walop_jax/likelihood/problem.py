@@ -126,7 +126,7 @@ class Problem:
     def _total(
         self,
         label: str,
-        key: str,
+        key: str | None,
         function: Callable[[engine.PointData], Sequence[Array]],
         shapes: Sequence[tuple[int, ...]],
     ) -> list[np.ndarray]:
