@@ -176,3 +176,11 @@ def test_small_memory_changes_nothing(call, frames, tmp_path, monkeypatch):
         for memory in ("4", "0.1")
     ]
     assert found[0]["parameters"] == found[1]["parameters"]
+
+
+def test_sampling_so_many_points_is_refused_with_advice(call, finished, monkeypatch):
+    monkeypatch.setattr(likelihood, "LARGE_ABOVE", 0)
+    monkeypatch.setattr(likelihood, "INTERPOLATE_ABOVE", 0)
+    result = call("sample", finished[0])
+    assert result.exit_code == 1
+    assert "calibration.fits holds its covariance" in result.stderr

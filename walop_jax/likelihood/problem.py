@@ -253,7 +253,10 @@ class Problem:
         )
 
     def residuals(self, values: Vector) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e 4"]]:
-        """Best flux and normalised residuals (data − model)/σ of every (point, exposure); 0 where unused."""
+        """Best flux and normalised residuals (data − model)/σ of every (point, exposure); 0 where unused.
+
+        All of them at once: for whole frames take a sample (`chunks.thinned`).
+        """
         instrument = self.model.instrument(values)
         nodes = self.nodes(instrument)
         parts = [engine.residuals(instrument, self.plan, chunk, nodes) for chunk in self.chunks]

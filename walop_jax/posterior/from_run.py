@@ -14,7 +14,7 @@ from walop_jax.data.errors import fail
 from walop_jax.data.product import CalibrationProduct
 from walop_jax.fit.building import model_for
 from walop_jax.fit.refit import FitResult, fit
-from walop_jax.likelihood.problem import Problem
+from walop_jax.likelihood.problem import LARGE_ABOVE, Problem
 
 SAME_FIT = 0.05  # standard errors
 
@@ -31,8 +31,8 @@ def problem_of_run(
 ) -> tuple[Problem, FitResult]:
     """The problem and the fit behind a calibration product in the folder `run`.
 
-    Raises `DataError` when the data are missing or not those of the fit, and when the fit does not come out
-    as the product says (another model, or another version of the physics).
+    Raises `DataError` when the data are missing, not those of the fit or too many to be sampled, and when the fit does
+    not come out as the product says (another model, or another version of the physics).
     """
     if not product.inputs:
         raise fail("does not say what it was fitted to", file=run, advice="make it with walop-jax refit")
@@ -46,6 +46,13 @@ def problem_of_run(
             "was fitted with another model", file=run, advice="run walop-jax refit with this model first"
         )
     problem = Problem(calset, model)
+    if problem.is_large:
+        raise fail(
+            f"has {len(calset.points)} field points: the posterior of so many is as good as normal, and "
+            "calibration.fits holds its covariance",
+            file=product.inputs[0].path,
+            advice=f"sample sets of up to {LARGE_ABOVE} points",
+        )
     result = fit(problem, start=np.asarray(product.parameters.value, float))
     away = np.abs(result.values - product.parameters.value) / np.where(result.sigma > 0, result.sigma, 1.0)
     if not result.converged or np.max(away) > SAME_FIT:
