@@ -1,21 +1,25 @@
-"""What an iteration costs in time and memory, from a table of 144 points to whole frames.
+"""What a pass costs in time and memory, from a table of 144 points to whole frames.
 
     OMP_NUM_THREADS=1 python -m pytest tests/likelihood/test_scale.py --benchmark -s
 
-prints the table. Points lie on a square raster, 25 exposures of the polariser, four cameras; counts are made slab by
+prints the tables. Points lie on a square raster, 25 exposures of the polariser, four cameras; counts are made slab by
 slab when they are asked for, never stored whole. Reading such slabs from FITS is timed on its own.
 
-Measured on two cores of which other programs took most (load 5 to 8), one thread for BLAS:
+Two cores, nothing else running, one thread for BLAS, warm:
 
-    points        data      step     in full    peak
-    144                    0.05 s     0.05 s    0.7 GB   exact optics, 350 µs a point
-    14 400                 0.16 s     0.38 s    0.7 GB
-    1 000 000     4.3 s    9.1 s     25.5 s     1.1 GB   refit 69 s: 5 steps and one in full
+      points      data     gradient   with the matrix   peak
+         144                 0.036 s       0.036 s      0.65 GB   optics solved at every point
+      14 400     0.01 s      0.15  s       0.31  s      0.71 GB   kept in memory
+   1 000 000     3.2  s      4.7   s      10.7   s      1.55 GB
+  16 777 216                86     s     183     s      2.1  GB   fit 373 s: a sample, the matrix once, two gradients
 
-The compiled code of a step is 47 kflop and 103 kB a point (3.9 µs: 12 Gflop/s, 26 GB/s), in full 274 kflop and 516 kB
-(26 µs: 10 Gflop/s, 20 GB/s; 17 µs in blocks of 64). Bytes are as the compiler counts them, caches or not; that smaller
-blocks are faster speaks for memory, not arithmetic, as what holds it back. Frames
-are read at 260 000 points/s. Hence 16.7 million points in 19 min under that load, linear in the points.
+The last row is `walop-jax refit` of a file of 14 GB with whole frames, in a process of its own with an empty cache: 486 s
+from start to end, of which 113 go to checksums, compilation, the residual map and the product. One million points on one
+core take 35 s, on two in two threads 26 s, in two processes of one core each 21 s (the same to 10⁻¹¹).
+
+The compiled code does 276 kflop and 381 kB a point with the matrix (14.8 µs of one core: 19 Gflop/s, 26 GB/s), 29 kflop
+and 47 kB for a gradient (4.1 µs: 7 Gflop/s, 12 GB/s); bytes are as the compiler counts them, caches or not. Reading
+takes 3.3 µs of one core, so that a gradient waits for its data as long as it computes.
 """
 
 from __future__ import annotations

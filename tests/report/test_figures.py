@@ -85,7 +85,7 @@ def test_pictures_of_a_diagnosis_hold_its_residuals(fitted):
     start = dataclasses.replace(result, values=problem.model.start)
     found = Diagnosis(
         verdict="consistent", steps=(), candidates=(), limits=(), untestable=(), unexplained=None, p_value=0.5,
-        remaining_p=0.5, before=start, after=result, problem=problem, seconds=0.0,
+        remaining_p=0.5, before=start, after=result, problem=problem, seconds=0.0, points=20,
     )  # fmt: skip
     made = pictures(found)
     before, after = (problem.residuals(values)[1] for values in (problem.model.start, result.values))

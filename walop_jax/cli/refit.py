@@ -55,9 +55,9 @@ def refit(
     A fit that does not converge leaves RUN/summary.failed.json, no calibration, and exit code 1. One that
     converges without explaining the data is written with TRUSTED = F and warnings, exit code 0.
 
-    Sets of more than 65536 points (whole frames) are read in slabs, anew on every pass. Finished slabs are kept in
-    RUN/partial until the end: the same command goes on where it was interrupted. The calibration holds a map of what
-    the smooth model leaves.
+    Sets of more than 65536 points (whole frames) are read in slabs, anew on every pass. Finished slabs
+    are kept in RUN/partial until the end: the same command goes on where it was interrupted. The
+    calibration holds a map of what the smooth model leaves.
     """
     began = time.perf_counter()
     from walop_jax.data.folder import check_folder
@@ -80,8 +80,8 @@ def refit(
         calset = read_calibration_set(*calsets)
         with named(model):
             chosen = model_for(calset, text)
-        tell("preparing the fit")
         problem = Problem(calset, chosen, memory=memory * 1e9)
+        tell(f"preparing the fit; data will take {problem.chunks.memory / 1e9:.2g} GB")
         if problem.is_large:
             passes = problem.passes
             here = f"{passes.processes.index}/{passes.processes.count}"

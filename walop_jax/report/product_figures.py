@@ -73,9 +73,9 @@ def residual_map_figure(residuals: ResidualMap) -> Figure:
 
     The six elements share one scale, which the median error and the largest corrections but one in a hundred set.
     """
-    figure = blank(8.6, 4.3)
+    figure = blank(9.4, 4.0)
     axes = figure.subplots(2, 4, sharex=True, sharey=True)
-    titles = (*(f"$\\delta${name} (%)" for name in ELEMENTS), "N2, N3 : N0, N1 (%)", "χ²/dof")
+    titles = (*(f"$\\delta${name} (%)" for name in ELEMENTS), "N2, N3 / N0, N1 (%)", "χ²/dof")
     # Row by row: the three elements of a pair, then the other quantity.
     order = (0, 1, 2, 6, 3, 4, 5, 7)
     matrix = 100.0 * np.abs(residuals.values[:6])
