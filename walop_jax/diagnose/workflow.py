@@ -28,6 +28,7 @@ from walop_jax.diagnose.findings import Diagnosis, Step, Unexplained, Verdict
 from walop_jax.diagnose.freeform import block_of
 from walop_jax.diagnose.look import Look
 from walop_jax.diagnose.score import Score
+from walop_jax.diagnose.telling import comparison
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.chunks import thinned
 from walop_jax.likelihood.problem import Problem, base_model
@@ -143,39 +144,37 @@ class _Diagnosing:
             step = self._step(look, trial, close)
             if step.confirmed:
                 self.steps.append(step)
-                self.problem, self.fit = trial.problem, trial.fit
-                if self.fit.noise_scale > 1.0:
-                    # The errors were scaled to fit at all, which may no longer be needed.
-                    self.fit = fit(self.problem, start=self.fit.values)
+                self._adopt(trial.problem, trial.fit)
+                if self.fit is not trial.fit:
+                    after = Design.of(self.problem, self.fit)
+                    self.steps[-1] = dataclasses.replace(step, **comparison(step.effect, look.design, after))
                 return step.effect
         return None
+
+    def _adopt(self, problem: Problem, result: FitResult) -> None:
+        """Go on with a fit: errors as given where they need not be scaled any more, refuted priors widened."""
+        if result.noise_scale > 1.0:
+            result = fit(problem, start=result.values)
+        model = problem.model
+        for step in self.steps:
+            model = naming.with_refuted_priors_widened(model, result.values, step.effect)
+        if model is not problem.model:
+            problem = Problem(self.calset, model)
+            result = fit(problem, start=result.values)
+        self.problem, self.fit = problem, result
 
     def _step(self, look: Look, trial: naming.Trial, close: tuple[str, ...]) -> Step:
         name = trial.effect.name
         score: Score | None = next((r.score for r in look.ranked if r.effect is trial.effect), None)
-        design = Design.of(trial.problem, trial.fit)
-        effect = trial.fit.model.instrument(trial.fit.values).effect(name)
-        # An effect with a number for every exposure cannot predict exposures that it has not seen.
-        many = any(np.size(getattr(effect, f)) > 4 for f in effect.amplitudes())
-        scheme = "field blocks" if many else "exposures"
-        change = largest_change(
-            instrument_matrices(look.result, self.calset), instrument_matrices(trial.fit, self.calset)
-        )
         return Step(
             effect=name,
             parameters={},
             score=score.statistic if score else look.result.chi2 - trial.fit.chi2,
             p_value=look.table.corrected(score) if score else look.table.p_global,
             log_bayes=trial.log_bayes,
-            chi2_before=look.result.chi2,
-            chi2_after=trial.fit.chi2,
-            heldout_before=held_out(look.design, scheme),
-            heldout_after=held_out(design, scheme),
-            change_of_qu=change,
             equivalent=close,
             alternatives=trial.alternatives,
-            residual_before=look.design.measured.residual,
-            residual_after=design.measured.residual,
+            **comparison(name, look.design, Design.of(trial.problem, trial.fit)),
         )
 
     # --------------------------------------------------------------------------------------- what has no name
@@ -217,12 +216,12 @@ class _Diagnosing:
         if with_term >= without:
             return found
         before = self.fit
-        self.problem, self.fit = trial.problem, trial.fit
+        self._adopt(trial.problem, trial.fit)
         change = largest_change(
-            instrument_matrices(before, self.calset), instrument_matrices(trial.fit, self.calset)
+            instrument_matrices(before, self.calset), instrument_matrices(self.fit, self.calset)
         )
         return dataclasses.replace(
-            found, term=blocks, chi2_before=before.chi2, chi2_after=trial.fit.chi2, change_of_qu=change
+            found, term=blocks, chi2_before=before.chi2, chi2_after=self.fit.chi2, change_of_qu=change
         )
 
     # ---------------------------------------------------------------------------------------------- the end
@@ -238,8 +237,8 @@ class _Diagnosing:
             if worth[least] >= NEEDED:
                 break
             self.tell(f"{least} is no longer needed")
-            self.problem, self.fit = naming.refit_without(self.calset, self.fit, least)
             self.steps = [s for s in self.steps if s.effect != least]
+            self._adopt(*naming.refit_without(self.calset, self.fit, least))
             dropped = True
         return dropped
 
@@ -259,6 +258,7 @@ class _Diagnosing:
         return dataclasses.replace(
             step,
             parameters=parameters,
+            far=naming.beyond_prior(self.fit, step.effect),
             choices=naming.spoken_choices(effect),
             robust_ratio=look.design.robust_ratio(step.effect),
             equivalent=tuple(sorted(close, key=lambda name: separation.get(name, np.inf))),
