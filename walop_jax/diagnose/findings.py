@@ -40,7 +40,7 @@ class Step:
     effect that explain the data as well. `equivalent` are the effects that this data set cannot tell from it,
     `separation` how far (σ) each rival stays from it. `residual_before` and `residual_after` are the residuals
     (data − model, in standard deviations as given; point, exposure, camera) without and with the effect at the time it
-    was added.
+    was added; where another name has been dropped since, they and χ² are of fits without that name.
     """
 
     effect: str

@@ -3,9 +3,9 @@
 1. Fit the model. 2. Score every effect of the catalogue and every pattern of the free-form basis; global p by Monte
 Carlo. 3. Below `ALARM`: refit the leaders and take the one with the highest evidence that data which took no part in
 the fit confirm, provided that it is significant after correction for all that was tried. 4. It joins the model, and
-everything is fitted again. 5. Repeat. 6. What no name explains is added as a free-form term, labelled, and the
-verdict is `unexplained`. 7. Drop names that the final model does not need. 8. List for each name what the data cannot
-tell from it, and give the verdict.
+everything is fitted again. 5. Repeat. 6. Drop names that are not needed beside the others. 7. What no name explains is
+added as a free-form term, labelled, and the verdict is `unexplained`; names that only stood in for it are dropped as
+well. 8. List for each name what the data cannot tell from it, and give the verdict.
 
 An effect is named whatever its size; `Step.negligible` says when it does not matter for q and u.
 """
@@ -28,7 +28,7 @@ from walop_jax.diagnose.findings import Diagnosis, Step, Unexplained, Verdict
 from walop_jax.diagnose.freeform import block_of
 from walop_jax.diagnose.look import Look
 from walop_jax.diagnose.score import Score
-from walop_jax.diagnose.telling import comparison
+from walop_jax.diagnose.telling import comparison, retold
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.chunks import thinned
 from walop_jax.likelihood.problem import Problem, base_model
@@ -85,20 +85,8 @@ class _Diagnosing:
     def run(self, began: float) -> Diagnosis:
         before = self.fit
         self.tell("scoring every effect and pattern")
-        look = first = self._look()
-        while look.alarm and len(self.steps) < MOST_STEPS:
-            self.tell(f"p = {look.table.p_global:.2g}: something is missing; trying names")
-            added = self._add_best(look)
-            if added is None:
-                break
-            self.tell(f"added {added}; scoring what is left")
-            look = self._look(look)
-        unexplained = None
-        if look.alarm or not self.fit.explains_data:
-            unexplained = self._unexplained(look)
-            self.tell("something without a name is left")
-        if self._drop_what_is_not_needed() or (unexplained is not None and unexplained.term):
-            look = self._look(look)
+        first = self._look()
+        look, unexplained = self._conclude(first, self._add_names(first))
         steps = tuple(self._finished(step, look) for step in self.steps)
         verdict: Verdict = "unexplained" if unexplained else "effect_found" if steps else "consistent"
         return Diagnosis(
@@ -121,6 +109,17 @@ class _Diagnosing:
         return Look(self.problem, self.fit, self.wanted, self.rng, earlier)
 
     # ------------------------------------------------------------------------------------------------ a name
+
+    def _add_names(self, look: Look) -> Look:
+        """Add names until nothing is missing or none is found; the look at what they leave."""
+        while look.alarm and len(self.steps) < MOST_STEPS:
+            self.tell(f"p = {look.table.p_global:.2g}: something is missing; trying names")
+            added = self._add_best(look)
+            if added is None:
+                break
+            self.tell(f"added {added}; scoring what is left")
+            look = self._look(look)
+        return look
 
     def _trials(self, look: Look) -> Iterator[naming.Trial]:
         for item in naming.leaders(look.significant) if look.significant else ():
@@ -225,6 +224,25 @@ class _Diagnosing:
         )
 
     # ---------------------------------------------------------------------------------------------- the end
+
+    def _conclude(self, first: Look, look: Look) -> tuple[Look, Unexplained | None]:
+        """Drop what is not needed, then ask what is left without a name: the look at the final model, and that."""
+        dropped = self._drop_what_is_not_needed()
+        while True:
+            if dropped:
+                look = self._look(first)
+                self.steps = retold(self.steps, first.design, look.design)
+            if not look.alarm and self.fit.explains_data:
+                return look, None
+            self.tell("something without a name is left")
+            unexplained = self._unexplained(look)
+            if not unexplained.term:
+                return look, unexplained
+            dropped = self._drop_what_is_not_needed()
+            if not dropped:
+                return self._look(look), unexplained
+            # Those names only stood in for what has none: what is it without them?
+            self._adopt(*naming.refit_without(self.calset, self.fit, FreeForm.name))
 
     def _drop_what_is_not_needed(self) -> bool:
         """Take out, one by one, names that the final model does not need; whether there were any."""
