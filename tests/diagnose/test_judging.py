@@ -66,6 +66,22 @@ def test_taking_it_out_again_gives_the_fit_without(leaking):
     assert again.chi2 == pytest.approx(base.chi2, abs=1e-3)
 
 
+def test_a_prior_is_widened_only_where_the_data_refute_it(leaking):
+    *_, extended = leaking
+    model, at = extended.model, extended.model.index("camera_leakage.share")
+    mean, width = model.parameters[at].prior
+    for away, expected in ((3.9, width), (-3.9, width), (12.0, 12.0 * width), (-12.0, 12.0 * width)):
+        values = extended.values.copy()
+        values[at] = mean + away * width
+        wide = naming.with_refuted_priors_widened(model, values, "camera_leakage")
+        assert wide["camera_leakage.share"].prior == (mean, pytest.approx(expected))
+        assert wide.change("camera_leakage.share", prior=(mean, width)) == model
+        beyond = naming.beyond_prior(
+            dataclasses.replace(extended, model=wide, values=values), "camera_leakage"
+        )
+        assert beyond == ({"share": pytest.approx(12.0)} if abs(away) > 4.0 else {})
+
+
 def test_robust_errors_are_the_stated_ones_when_noise_is_as_stated(leaking):
     design = Design.of(*leaking[3:])
     assert 0.6 < design.robust_ratio("camera_leakage") < 1.5
@@ -127,13 +143,15 @@ def test_every_block_of_the_free_form_term_answers_to_a_stratum(leaking):
 
 
 def test_many_names_and_weak_errors_call_for_caution():
-    def caution(*steps):
-        named = [SimpleNamespace(effect=name, robust_ratio=ratio) for name, ratio in steps]
-        return Diagnosis.caution.fget(SimpleNamespace(steps=named))
+    def caution(*steps, far=None):
+        named = [SimpleNamespace(effect=name, robust_ratio=ratio, far=far or {}) for name, ratio in steps]
+        problem = SimpleNamespace(calset=SimpleNamespace(points=range(9)))
+        return Diagnosis.caution.fget(SimpleNamespace(steps=named, problem=problem, points=9))
 
     assert caution() == caution(("a", 1.1), ("b", float("nan"))) == ""
     assert "3 names" in caution(*((name, 1.0) for name in "abc"))
     assert "errors of a" in caution(("a", 2.0))
+    assert "a.angle (6 widths)" in caution(("a", 1.0), far={"angle": 6.1})
 
 
 @pytest.mark.long

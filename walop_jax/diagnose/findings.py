@@ -33,13 +33,14 @@ class Step:
     """One effect that was found, added and confirmed; `parameters` hold (value, sigma, unit).
 
     `score` and `p_value` (corrected for all that was tried) are of the linear test, `log_bayes` of the refit.
+    `far` are amplitudes that lie beyond what their prior allows, in its widths: the data have refuted that prior.
     `change_of_qu` is the largest change that adding it makes to calibrated q or u of a star with p ≤ 5 % at any field
     point, `robust_ratio` the errors of its parameters when every exposure may have a disturbance of its own, over
     the errors stated. `choices` are discrete (which camera, which star), `alternatives` other shapes of the same
     effect that explain the data as well. `equivalent` are the effects that this data set cannot tell from it,
     `separation` how far (σ) each rival stays from it. `residual_before` and `residual_after` are the residuals
     (data − model, in standard deviations as given; point, exposure, camera) without and with the effect at the time it
-    was added.
+    was added; where another name has been dropped since, they and χ² are of fits without that name.
     """
 
     effect: str
@@ -53,6 +54,7 @@ class Step:
     heldout_after: HeldOut
     change_of_qu: float = float("nan")
     robust_ratio: float = float("nan")
+    far: dict[str, float] = dataclasses.field(default_factory=dict)
     choices: dict[str, Any] = dataclasses.field(default_factory=dict)
     alternatives: tuple[str, ...] = ()
     equivalent: tuple[str, ...] = ()
@@ -139,6 +141,11 @@ class Diagnosis:
                 f"{len(self.steps)} names were needed: something that is not in the catalogue can look like several "
                 "that are"
             )
+        far = [
+            f"{s.effect}.{name} ({widths:.0f} widths)" for s in self.steps for name, widths in s.far.items()
+        ]
+        if far:
+            parts.append(f"far beyond its prior, which was widened: {', '.join(far)}")
         weak = [s.effect for s in self.steps if s.robust_ratio > LARGEST_ROBUST_RATIO]
         if weak:
             parts.append(

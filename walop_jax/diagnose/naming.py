@@ -20,7 +20,7 @@ from jaxtyping import Float
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnose.columns import Probe
 from walop_jax.diagnose.score import Score, ScoreTable
-from walop_jax.fit.refit import FitResult, fit
+from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
 from walop_jax.likelihood.problem import Problem
 from walop_jax.model.effects import Context, Effect
 from walop_jax.model.parameters import leaves
@@ -156,6 +156,40 @@ def follow_physics(probe: Probe, score: Score) -> bool:
     return bool(np.all((score.amplitudes >= -SEPARATION * sigma)[probe.one_sided]))
 
 
+def amplitude_positions(model: Model, name: str) -> list[int]:
+    """Positions of the free amplitudes of an active effect that have a prior."""
+    effect = model.template.effect(name)
+    at = [model.index(f"{name}.{label}") for f in effect.amplitudes() for label in effect.labels(f)]
+    return [i for i in at if model.parameters[i].free and model.parameters[i].prior is not None]
+
+
+def with_refuted_priors_widened(model: Model, values: Float[np.ndarray, " n"], name: str) -> Model:
+    """The model in which amplitudes of an effect that lie far outside of their priors lie one width from the mean.
+
+    A prior says how large such an effect usually is. One that the data refute would go on pulling at the value and
+    count the square of its distance as a misfit, of data that are explained to within the noise.
+    """
+    for i in amplitude_positions(model, name):
+        mean, width = model.parameters[i].prior  # type: ignore[misc]
+        away = abs(float(values[i]) - mean)
+        if away > PRIOR_EDGE * width:
+            model = model.change(model.names[i], prior=(mean, away))
+    return model
+
+
+def beyond_prior(result: FitResult, name: str) -> dict[str, float]:
+    """Amplitudes of an effect that lie beyond the prior of their declaration, widened or not, in its widths."""
+    effect = result.model.template.effect(name)
+    declared = {f"{name}.{leaf.name}": leaf.declaration.width for leaf in leaves(effect)}
+    found = {}
+    for i in amplitude_positions(result.model, name):
+        p = result.model.parameters[i]
+        widths = abs(float(result.values[i]) - p.prior[0]) / (declared[p.name] or np.inf)  # type: ignore[index]
+        if widths > PRIOR_EDGE:
+            found[p.name.removeprefix(f"{name}.")] = widths
+    return found
+
+
 def evidence_of_presence(result: FitResult, name: str, context: Context) -> float:
     """ln B of a fitted model against the one without an effect: the density that prior and posterior have at neutral.
 
@@ -163,9 +197,7 @@ def evidence_of_presence(result: FitResult, name: str, context: Context) -> floa
     effect without parameters.
     """
     effect = result.model.template.effect(name)
-    amplitudes = tuple(f"{name}.{label}" for f in effect.amplitudes() for label in effect.labels(f))
-    at = [result.model.index(a) for a in amplitudes]
-    at = [i for i in at if result.model.parameters[i].free and result.model.parameters[i].prior is not None]
+    at = amplitude_positions(result.model, name)
     if not at:
         return float("inf")
     neutral = dict(
@@ -192,13 +224,11 @@ def without(model: Model, name: str) -> Model:
 
 
 def refit_without(calset: CalibrationSet, result: FitResult, name: str) -> tuple[Problem, FitResult]:
-    """Take an effect out of a fitted model and fit again."""
+    """Take an effect out of a fitted model and fit again, with errors scaled only if what is left needs it."""
     model = without(result.model, name)
     start = dict(zip(result.model.names, result.values, strict=True))
     problem = Problem(calset, model)
-    return problem, fit(
-        problem, start=np.array([start[n] for n in model.names]), noise_scale=result.noise_scale
-    )
+    return problem, fit(problem, start=np.array([start[n] for n in model.names]))
 
 
 def signature(problem: Problem, result: FitResult, name: str, context: Context) -> Float[np.ndarray, " _"]:

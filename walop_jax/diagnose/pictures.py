@@ -57,7 +57,6 @@ def pictures(diagnosis: Diagnosis) -> DiagnosisPictures:
     problem, start, final = diagnosis.problem, diagnosis.before, diagnosis.after
     exposures, used = problem.calset.exposures, problem.used
     after = problem.residuals(final.values)[1]
-    # Not the first step's: that step may have been dropped since.
     before = after if start is final else Problem(problem.calset, start.model).residuals(start.values)[1]
     pairs = [("", before, after)]
     pairs += [(step.effect, step.residual_before, step.residual_after) for step in diagnosis.steps]

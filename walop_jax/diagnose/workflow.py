@@ -3,9 +3,9 @@
 1. Fit the model. 2. Score every effect of the catalogue and every pattern of the free-form basis; global p by Monte
 Carlo. 3. Below `ALARM`: refit the leaders and take the one with the highest evidence that data which took no part in
 the fit confirm, provided that it is significant after correction for all that was tried. 4. It joins the model, and
-everything is fitted again. 5. Repeat. 6. What no name explains is added as a free-form term, labelled, and the
-verdict is `unexplained`. 7. Drop names that the final model does not need. 8. List for each name what the data cannot
-tell from it, and give the verdict.
+everything is fitted again. 5. Repeat. 6. Drop names that are not needed beside the others. 7. What no name explains is
+added as a free-form term, labelled, and the verdict is `unexplained`; names that only stood in for it are dropped as
+well. 8. List for each name what the data cannot tell from it, and give the verdict.
 
 An effect is named whatever its size; `Step.negligible` says when it does not matter for q and u.
 """
@@ -28,6 +28,7 @@ from walop_jax.diagnose.findings import Diagnosis, Step, Unexplained, Verdict
 from walop_jax.diagnose.freeform import block_of
 from walop_jax.diagnose.look import Look
 from walop_jax.diagnose.score import Score
+from walop_jax.diagnose.telling import comparison, retold
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.chunks import thinned
 from walop_jax.likelihood.problem import Problem, base_model
@@ -84,20 +85,8 @@ class _Diagnosing:
     def run(self, began: float) -> Diagnosis:
         before = self.fit
         self.tell("scoring every effect and pattern")
-        look = first = self._look()
-        while look.alarm and len(self.steps) < MOST_STEPS:
-            self.tell(f"p = {look.table.p_global:.2g}: something is missing; trying names")
-            added = self._add_best(look)
-            if added is None:
-                break
-            self.tell(f"added {added}; scoring what is left")
-            look = self._look(look)
-        unexplained = None
-        if look.alarm or not self.fit.explains_data:
-            unexplained = self._unexplained(look)
-            self.tell("something without a name is left")
-        if self._drop_what_is_not_needed() or (unexplained is not None and unexplained.term):
-            look = self._look(look)
+        first = self._look()
+        look, unexplained = self._conclude(first, self._add_names(first))
         steps = tuple(self._finished(step, look) for step in self.steps)
         verdict: Verdict = "unexplained" if unexplained else "effect_found" if steps else "consistent"
         return Diagnosis(
@@ -121,6 +110,17 @@ class _Diagnosing:
 
     # ------------------------------------------------------------------------------------------------ a name
 
+    def _add_names(self, look: Look) -> Look:
+        """Add names until nothing is missing or none is found; the look at what they leave."""
+        while look.alarm and len(self.steps) < MOST_STEPS:
+            self.tell(f"p = {look.table.p_global:.2g}: something is missing; trying names")
+            added = self._add_best(look)
+            if added is None:
+                break
+            self.tell(f"added {added}; scoring what is left")
+            look = self._look(look)
+        return look
+
     def _trials(self, look: Look) -> Iterator[naming.Trial]:
         for item in naming.leaders(look.significant) if look.significant else ():
             shapes = sum(probe.effect is item.effect for probe in look.probes)
@@ -143,39 +143,37 @@ class _Diagnosing:
             step = self._step(look, trial, close)
             if step.confirmed:
                 self.steps.append(step)
-                self.problem, self.fit = trial.problem, trial.fit
-                if self.fit.noise_scale > 1.0:
-                    # The errors were scaled to fit at all, which may no longer be needed.
-                    self.fit = fit(self.problem, start=self.fit.values)
+                self._adopt(trial.problem, trial.fit)
+                if self.fit is not trial.fit:
+                    after = Design.of(self.problem, self.fit)
+                    self.steps[-1] = dataclasses.replace(step, **comparison(step.effect, look.design, after))
                 return step.effect
         return None
+
+    def _adopt(self, problem: Problem, result: FitResult) -> None:
+        """Go on with a fit: errors as given where they need not be scaled any more, refuted priors widened."""
+        if result.noise_scale > 1.0:
+            result = fit(problem, start=result.values)
+        model = problem.model
+        for step in self.steps:
+            model = naming.with_refuted_priors_widened(model, result.values, step.effect)
+        if model is not problem.model:
+            problem = Problem(self.calset, model)
+            result = fit(problem, start=result.values)
+        self.problem, self.fit = problem, result
 
     def _step(self, look: Look, trial: naming.Trial, close: tuple[str, ...]) -> Step:
         name = trial.effect.name
         score: Score | None = next((r.score for r in look.ranked if r.effect is trial.effect), None)
-        design = Design.of(trial.problem, trial.fit)
-        effect = trial.fit.model.instrument(trial.fit.values).effect(name)
-        # An effect with a number for every exposure cannot predict exposures that it has not seen.
-        many = any(np.size(getattr(effect, f)) > 4 for f in effect.amplitudes())
-        scheme = "field blocks" if many else "exposures"
-        change = largest_change(
-            instrument_matrices(look.result, self.calset), instrument_matrices(trial.fit, self.calset)
-        )
         return Step(
             effect=name,
             parameters={},
             score=score.statistic if score else look.result.chi2 - trial.fit.chi2,
             p_value=look.table.corrected(score) if score else look.table.p_global,
             log_bayes=trial.log_bayes,
-            chi2_before=look.result.chi2,
-            chi2_after=trial.fit.chi2,
-            heldout_before=held_out(look.design, scheme),
-            heldout_after=held_out(design, scheme),
-            change_of_qu=change,
             equivalent=close,
             alternatives=trial.alternatives,
-            residual_before=look.design.measured.residual,
-            residual_after=design.measured.residual,
+            **comparison(name, look.design, Design.of(trial.problem, trial.fit)),
         )
 
     # --------------------------------------------------------------------------------------- what has no name
@@ -217,15 +215,34 @@ class _Diagnosing:
         if with_term >= without:
             return found
         before = self.fit
-        self.problem, self.fit = trial.problem, trial.fit
+        self._adopt(trial.problem, trial.fit)
         change = largest_change(
-            instrument_matrices(before, self.calset), instrument_matrices(trial.fit, self.calset)
+            instrument_matrices(before, self.calset), instrument_matrices(self.fit, self.calset)
         )
         return dataclasses.replace(
-            found, term=blocks, chi2_before=before.chi2, chi2_after=trial.fit.chi2, change_of_qu=change
+            found, term=blocks, chi2_before=before.chi2, chi2_after=self.fit.chi2, change_of_qu=change
         )
 
     # ---------------------------------------------------------------------------------------------- the end
+
+    def _conclude(self, first: Look, look: Look) -> tuple[Look, Unexplained | None]:
+        """Drop what is not needed, then ask what is left without a name: the look at the final model, and that."""
+        dropped = self._drop_what_is_not_needed()
+        while True:
+            if dropped:
+                look = self._look(first)
+                self.steps = retold(self.steps, first.design, look.design)
+            if not look.alarm and self.fit.explains_data:
+                return look, None
+            self.tell("something without a name is left")
+            unexplained = self._unexplained(look)
+            if not unexplained.term:
+                return look, unexplained
+            dropped = self._drop_what_is_not_needed()
+            if not dropped:
+                return self._look(look), unexplained
+            # Those names only stood in for what has none: what is it without them?
+            self._adopt(*naming.refit_without(self.calset, self.fit, FreeForm.name))
 
     def _drop_what_is_not_needed(self) -> bool:
         """Take out, one by one, names that the final model does not need; whether there were any."""
@@ -238,8 +255,8 @@ class _Diagnosing:
             if worth[least] >= NEEDED:
                 break
             self.tell(f"{least} is no longer needed")
-            self.problem, self.fit = naming.refit_without(self.calset, self.fit, least)
             self.steps = [s for s in self.steps if s.effect != least]
+            self._adopt(*naming.refit_without(self.calset, self.fit, least))
             dropped = True
         return dropped
 
@@ -259,6 +276,7 @@ class _Diagnosing:
         return dataclasses.replace(
             step,
             parameters=parameters,
+            far=naming.beyond_prior(self.fit, step.effect),
             choices=naming.spoken_choices(effect),
             robust_ratio=look.design.robust_ratio(step.effect),
             equivalent=tuple(sorted(close, key=lambda name: separation.get(name, np.inf))),

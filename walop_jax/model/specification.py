@@ -103,13 +103,6 @@ class Model:
             self, parameters=(*self.parameters[:i], changed, *self.parameters[i + 1 :])
         )
 
-    def started_at(self, values: Vector) -> Model:
-        """The model with all start values replaced (full vector, tree order)."""
-        changed = tuple(
-            dataclasses.replace(p, start=float(v)) for p, v in zip(self.parameters, values, strict=True)
-        )
-        return dataclasses.replace(self, parameters=changed)
-
     # ------------------------------------------------------------------------------ vectors and the tree
 
     @property
