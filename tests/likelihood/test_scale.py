@@ -13,9 +13,9 @@ Two cores, nothing else running, one thread for BLAS, warm:
    1 000 000     3.2  s      4.7   s      10.7   s      1.55 GB
   16 777 216                86     s     183     s      2.1  GB   fit 373 s: a sample, the matrix once, two gradients
 
-The last row is `walop-jax refit` of a file of 14 GB with whole frames, in a process of its own with an empty cache: 486 s
-from start to end, of which 113 go to checksums, compilation, the residual map and the product. One million points on one
-core take 35 s, on two in two threads 26 s, in two processes of one core each 21 s (the same to 10⁻¹¹).
+The last row is `walop-jax refit` of a file of 14 GB with whole frames, in a process of its own with an empty cache:
+486 s from start to end, of which 113 go to checksums, compilation, the residual map and the product. One million points
+on one core take 35 s, on two in two threads 26 s, in two processes of one core each 21 s (the same to 10⁻¹¹).
 
 The compiled code does 276 kflop and 381 kB a point with the matrix (14.8 µs of one core: 19 Gflop/s, 26 GB/s), 29 kflop
 and 47 kB for a gradient (4.1 µs: 7 Gflop/s, 12 GB/s); bytes are as the compiler counts them, caches or not. Reading
