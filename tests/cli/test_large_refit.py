@@ -49,6 +49,14 @@ def frames(tmp_path_factory):
     return path
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _compiled_once(tmp_path_factory):
+    """The processes of this module share a cache of compiled code."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("WALOP_JAX_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.fixture(scope="module")
 def finished(frames, tmp_path_factory):
     """A run in a process of its own, not interrupted."""
@@ -60,7 +68,7 @@ def finished(frames, tmp_path_factory):
 
 
 def start(*arguments: object) -> subprocess.Popen:
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "WALOP_JAX_CACHE": "off"}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, "-c", LARGE, *map(str, arguments)]
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
@@ -143,6 +151,7 @@ def test_a_killed_fit_goes_on_where_it_was(frames, finished, tmp_path):
     )
 
 
+@pytest.mark.long
 def test_two_processes_write_one_calibration(frames, finished, tmp_path):
     with socket.socket() as one:
         one.bind(("localhost", 0))
@@ -168,6 +177,7 @@ def test_a_wrong_place_is_one_line(call, frames, tmp_path):
     assert "INDEX counts from 0 to 1" in result.stderr
 
 
+@pytest.mark.long
 def test_small_memory_changes_nothing(call, frames, tmp_path, monkeypatch):
     monkeypatch.setattr(likelihood, "LARGE_ABOVE", 0)
     monkeypatch.setattr(refit, "SAMPLE", 1024)

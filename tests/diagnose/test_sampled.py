@@ -15,6 +15,25 @@ PLAN = ObservingPlan(
 )  # fmt: skip
 
 
+class SeenError(Exception):
+    pass
+
+
+def test_a_sample_of_a_large_set_is_looked_at(monkeypatch):
+    calset = simulate(PLAN, seed=4).calset
+    monkeypatch.setattr(workflow, "LARGEST_ROWS", 40 * len(calset.exposures))
+
+    def looked_at(some, *_):
+        assert len(some.points) == 40
+        assert set(some.points.point) < set(calset.points.point)
+        raise SeenError
+
+    monkeypatch.setattr(workflow, "_Diagnosing", looked_at)
+    with pytest.raises(SeenError):
+        diagnose(calset)
+
+
+@pytest.mark.long
 def test_findings_of_a_sample_say_so(monkeypatch):
     effect = effect_by_name("clp_wobble").of(PLAN.context(), amplitude=0.3, phase=1.0)
     calset = simulate(PLAN, seed=4, effects=(effect,)).calset

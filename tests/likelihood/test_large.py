@@ -121,9 +121,10 @@ def _tight(minimise):
     return tighter
 
 
+@pytest.mark.long
 def test_optimistix_on_residuals_in_memory_finds_the_same(made, monkeypatch):
     """The reference: `optimistix.LevenbergMarquardt` on the residuals themselves, derivatives by JAX."""
-    sample = thinned(made.calset, 49, run=1)
+    sample = thinned(made.calset, 20, run=1)
     problem = Problem(sample, made.model)
     model, chunk = problem.model, problem.chunks[0]
     scale = np.array([model.parameters[i].scale for i in model.free])
