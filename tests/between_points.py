@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 
-from walop_jax.fit.calibration import Calibration
-from walop_jax.fit.predict import Settings
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.matrix import Settings
 
 EASY = 0.1  # determinant of the 2 × 2 matrix above which one exposure holds q and u
 

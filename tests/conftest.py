@@ -7,6 +7,7 @@ from pathlib import Path
 import jax
 import jaxtyping
 import pytest
+from handmade_set import Handmade
 
 jax.config.update("jax_enable_x64", True)  # the package itself never switches it on
 # Every annotated shape and type of the package is checked, under pytest only. Must precede its import.
@@ -45,3 +46,9 @@ def shared_data() -> Path:
     if not (SHARED_DATA / "walop_south_a.fits").exists():
         pytest.skip("calibration sets with known truth are not beside the project (../shared/data)")
     return SHARED_DATA
+
+
+@pytest.fixture
+def handmade(tmp_path: Path) -> Handmade:
+    """A calibration set made with astropy alone, to be spoilt."""
+    return Handmade(tmp_path)

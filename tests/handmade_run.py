@@ -9,9 +9,17 @@ from typing import Any
 import numpy as np
 from builders import NAN, exposures, monochromatic
 
+from walop_jax.calibration.product import (
+    CalibrationProduct,
+    MatrixMaps,
+    ParameterTable,
+    Verdict,
+    write_product,
+)
 from walop_jax.data import empty_sources
 from walop_jax.data.frames import Grid
-from walop_jax.data.pictures import (
+from walop_jax.data.records import InputFile, Points, Site
+from walop_jax.diagnosis.figure_file import (
     Comparison,
     DiagnosisPictures,
     ExposureLabels,
@@ -19,14 +27,6 @@ from walop_jax.data.pictures import (
     Shares,
     write_pictures,
 )
-from walop_jax.data.product import (
-    CalibrationProduct,
-    MatrixMaps,
-    ParameterTable,
-    Verdict,
-    write_product,
-)
-from walop_jax.data.records import InputFile, Points, Site
 
 INPUT = "night <b>one</b> & two.fits"
 X, Y = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.2, 0.2, 3), np.linspace(-0.2, 0.2, 3)))

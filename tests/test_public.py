@@ -36,9 +36,9 @@ def test_importing_loads_nothing():
 
 def test_public_names_are_not_hidden_by_rooms():
     # Importing a room sets an attribute of the package, which would win over a public name.
-    import walop_jax.diagnose
+    import walop_jax.diagnosis
     import walop_jax.fit
-    import walop_jax.report
+    import walop_jax.reports
 
     for name in walop_jax.__all__:
         assert type(getattr(walop_jax, name)).__name__ != "module"

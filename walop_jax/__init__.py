@@ -14,22 +14,22 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from walop_jax.calibration.calibration import Calibration
+    from walop_jax.calibration.matrix import Settings
     from walop_jax.data.calset import read_calibration_set
-    from walop_jax.data.errors import DataError
     from walop_jax.data.write import write_calibration_set
-    from walop_jax.diagnose.workflow import diagnose as find_effects
-    from walop_jax.fit.calibration import Calibration
+    from walop_jax.diagnosis.workflow import diagnose as find_effects
     from walop_jax.fit.misfit import describe as describe_misfit
-    from walop_jax.fit.predict import Settings
     from walop_jax.fit.refit import FitResult, refit
-    from walop_jax.likelihood.observing import ObservingPlan
+    from walop_jax.io.errors import DataError
     from walop_jax.likelihood.problem import Problem, base_model
-    from walop_jax.likelihood.simulate import simulate
     from walop_jax.model.effects import effect_by_name
     from walop_jax.model.instrument import nominal_instrument
     from walop_jax.model.specification import with_effects
     from walop_jax.model.trace import Ray, trace
     from walop_jax.science.apply import apply
+    from walop_jax.simulation.observing_plan import ObservingPlan
+    from walop_jax.simulation.simulate import simulate
 
 __version__ = "0.1.0"
 
@@ -56,22 +56,22 @@ __all__ = [
 ]
 
 _HOME = {
-    "Calibration": ("fit.calibration", "Calibration"),
-    "DataError": ("data.errors", "DataError"),
+    "Calibration": ("calibration.calibration", "Calibration"),
+    "DataError": ("io.errors", "DataError"),
     "FitResult": ("fit.refit", "FitResult"),
-    "ObservingPlan": ("likelihood.observing", "ObservingPlan"),
+    "ObservingPlan": ("simulation.observing_plan", "ObservingPlan"),
     "Problem": ("likelihood.problem", "Problem"),
     "Ray": ("model.trace", "Ray"),
-    "Settings": ("fit.predict", "Settings"),
+    "Settings": ("calibration.matrix", "Settings"),
     "apply": ("science.apply", "apply"),
     "base_model": ("likelihood.problem", "base_model"),
     "describe_misfit": ("fit.misfit", "describe"),
     "effect_by_name": ("model.effects", "effect_by_name"),
-    "find_effects": ("diagnose.workflow", "diagnose"),
+    "find_effects": ("diagnosis.workflow", "diagnose"),
     "nominal_instrument": ("model.instrument", "nominal_instrument"),
     "read_calibration_set": ("data.calset", "read_calibration_set"),
     "refit": ("fit.refit", "refit"),
-    "simulate": ("likelihood.simulate", "simulate"),
+    "simulate": ("simulation.simulate", "simulate"),
     "trace": ("model.trace", "trace"),
     "with_effects": ("model.specification", "with_effects"),
     "write_calibration_set": ("data.write", "write_calibration_set"),

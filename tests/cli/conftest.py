@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from walop_jax.cli import app
 from walop_jax.data import write_calibration_set
-from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
-from walop_jax.likelihood.simulate import simulate
 from walop_jax.model.effects import effect_by_name
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
 
 PLAN = ObservingPlan(grid=5, standard_grid=2, polariser_angles=polariser_turn(8), moon_patches=3, standards=3)
 

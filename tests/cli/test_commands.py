@@ -12,11 +12,11 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-import walop_jax.data.product
+import walop_jax.calibration.product
 import walop_jax.fit.refit
-from walop_jax.data.product import read_product
-from walop_jax.fit.calibration import Calibration
-from walop_jax.fit.predict import Settings
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.matrix import Settings
+from walop_jax.calibration.product import read_product
 
 SUMMARY_KEYS = (
     "chi2", "dof", "n_data", "parameters", "converged", "message", "seconds", "versions", "inputs",
@@ -121,7 +121,7 @@ def test_an_interrupted_write_leaves_nothing(call, calset_file, tmp_path, monkey
     def fail(*args):
         raise error
 
-    monkeypatch.setattr(walop_jax.data.product, "sign_and_write", fail)
+    monkeypatch.setattr(walop_jax.calibration.product, "sign_and_write", fail)
     result = call("refit", calset_file, "-o", tmp_path / "run")
     assert result.exit_code == (130 if isinstance(error, KeyboardInterrupt) else 1)
     assert list(tmp_path.iterdir()) == []

@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.product import read_product, write_product
+from walop_jax.calibration.records import RESIDUAL_NAMES
 from walop_jax.data import Grid, write_frames
-from walop_jax.data.errors import DataError
-from walop_jax.data.product import read_product, write_product
-from walop_jax.data.product_records import RESIDUAL_NAMES
 from walop_jax.fit import refit
-from walop_jax.fit.calibration import Calibration
+from walop_jax.io.errors import DataError
 from walop_jax.likelihood import problem as likelihood
-from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
-from walop_jax.likelihood.simulate import simulate
-from walop_jax.report import product_figures
+from walop_jax.reports import product_figures
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
 
 SIDE = 72
 RUN = ObservingPlan(

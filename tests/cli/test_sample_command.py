@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from walop_jax.data.product import read_product
-from walop_jax.data.tables import read_input_table
-from walop_jax.fit.calibration import Calibration
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.product import read_product
+from walop_jax.data.user_tables import read_input_table
 from walop_jax.posterior.output import read_draws
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from walop_jax.cli.simulate import parsed_effect
 from walop_jax.data import read_calibration_set
-from walop_jax.likelihood.observing import ObservingPlan
 from walop_jax.model.effects import EFFECTS
+from walop_jax.simulation.observing_plan import ObservingPlan
 
 SMALL = ("--grid", 3, "--standard-grid", 1, "--angles", 4, "--moon-patches", 2, "--standards", 3)
 CONTEXT = ObservingPlan().context()

@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.product import read_product
 from walop_jax.data import builtin_filter
-from walop_jax.data.product import read_product
-from walop_jax.fit.calibration import Calibration
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.trace import Ray, trace
 

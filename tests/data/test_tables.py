@@ -8,7 +8,7 @@ from astropy import units
 from astropy.table import MaskedColumn, Table
 
 from walop_jax.data import DataError
-from walop_jax.data.tables import field_points, read_input_table, write_output_table
+from walop_jax.data.user_tables import field_points, read_input_table, write_output_table
 
 SOUTH = "WALOP-SOUTH"
 

@@ -24,9 +24,9 @@ from scipy.sparse import lil_matrix
 
 from walop_jax.data import read_calibration_set, write_calibration_set
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood.observing import ObservingPlan
 from walop_jax.likelihood.problem import Problem, base_model
-from walop_jax.likelihood.simulate import simulate
+from walop_jax.simulation.observing_plan import ObservingPlan
+from walop_jax.simulation.simulate import simulate
 
 
 def scipy_fit(path):

@@ -16,16 +16,16 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from walop_jax.calibration.matrix import Settings, matrices
 from walop_jax.data.records import CalibrationSet
-from walop_jax.data.table import TableIntensities
+from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.levenberg import minimise
-from walop_jax.fit.predict import Settings, matrices
 from walop_jax.fit.refit import FitResult, fit, refit
-from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
 from walop_jax.likelihood.problem import Problem, base_model
-from walop_jax.likelihood.simulate import simulate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import full_values
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
 
 SMALL = ObservingPlan(
     grid=6, standard_grid=3, polariser_angles=polariser_turn(8, full_turn=True), moon_patches=4, standards=4

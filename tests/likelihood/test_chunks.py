@@ -11,13 +11,13 @@ import pytest
 
 from walop_jax.data import Grid, read_calibration_set, write_frames
 from walop_jax.data.records import Intensities
-from walop_jax.data.sky import moon_sky
 from walop_jax.fit.refit import refit
 from walop_jax.likelihood import chunks
 from walop_jax.likelihood.chunks import Chunks, bytes_per_point, thinned
-from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
 from walop_jax.likelihood.problem import Problem, base_model
-from walop_jax.likelihood.simulate import simulate
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
+from walop_jax.sky.moon import moon_sky
 
 SIDE = 9
 RUN = ObservingPlan(

@@ -13,9 +13,9 @@ from walop_jax.fit.refit import fit
 from walop_jax.likelihood import engine
 from walop_jax.likelihood import problem as likelihood
 from walop_jax.likelihood.chunks import thinned
-from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
 from walop_jax.likelihood.problem import Problem, base_model
-from walop_jax.likelihood.simulate import simulate
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
 
 RUN = ObservingPlan(
     grid=72, standard_grid=1, standards=0, unpolarised=0, moon_patches=3,

@@ -9,13 +9,13 @@ import pytest
 
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood import engine, nodes
-from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
 from walop_jax.likelihood.problem import INTERPOLATE_ABOVE, Problem, base_model
-from walop_jax.likelihood.simulate import simulate
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.parameters import leaves
 from walop_jax.model.specification import full_values, optical_indices
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
 
 FIELD = Rectangle(np.full(2, -0.3), np.full(2, 0.3))
 SMALL = ObservingPlan(

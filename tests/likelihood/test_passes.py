@@ -19,10 +19,10 @@ from walop_jax.fit.refit import fit
 from walop_jax.likelihood import passes, processes
 from walop_jax.likelihood import problem as likelihood
 from walop_jax.likelihood.journal import Journal
-from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
 from walop_jax.likelihood.problem import Problem, base_model
 from walop_jax.likelihood.processes import LostProcessError, Processes
-from walop_jax.likelihood.simulate import simulate
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
 
 RUN = ObservingPlan(
     grid=40, standard_grid=1, standards=0, unpolarised=0, moon_patches=3,

@@ -33,18 +33,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_plan
+from walop_jax.calibration.residual_map import residual_map
 from walop_jax.data import Grid, read_calibration_set, write_frames
 from walop_jax.data.records import Block, CalibrationSet, Intensities
-from walop_jax.fit.calibration import Calibration
-from walop_jax.fit.predict import Settings, analysis_vectors, settings_plan
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.chunks import Chunks
-from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
 from walop_jax.likelihood.problem import Problem, base_model
-from walop_jax.likelihood.remainder import residual_map
-from walop_jax.likelihood.simulate import simulate
 from walop_jax.model.light import instrument_matrix
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
 
 EXPOSURES, ELECTRONS, READ_NOISE = 25, 1e6, 30.0
 TILE = 1024

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from walop_jax.fit.predict import Settings, analysis_vectors, settings_plan
+from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_plan
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled

@@ -13,7 +13,7 @@ import emcee
 import numpy as np
 import pytest
 
-from walop_jax.data.errors import DataError
+from walop_jax.io.errors import DataError
 from walop_jax.posterior.checkpoint import Checkpoints
 from walop_jax.posterior.convergence import assess, between
 from walop_jax.posterior.ensemble import MOVES, advance, start

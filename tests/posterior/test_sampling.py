@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from walop_jax.data.errors import DataError
-from walop_jax.data.interval_table import write_columns
-from walop_jax.data.tables import read_input_table
-from walop_jax.fit.calibration import Calibration
-from walop_jax.fit.predict import Settings, matrices
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.matrix import Settings, matrices
+from walop_jax.data.user_tables import read_input_table
+from walop_jax.io.errors import DataError
+from walop_jax.io.plain_tables import write_columns
 from walop_jax.posterior import Options, PosteriorSample, sample, sampling
 from walop_jax.posterior.output import inference_data, intervals, read_draws, report, write_posterior
 from walop_jax.posterior.propagate import matrix_draws, with_draws, with_moments

@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from walop_jax.posterior.accuracy import check
-from walop_jax.posterior.building import build_surrogate
 from walop_jax.posterior.surrogate import Surrogate
+from walop_jax.posterior.surrogate_accuracy import check
+from walop_jax.posterior.surrogate_builder import build_surrogate
 from walop_jax.posterior.target import Target, bending, choose_sampled, near_linear
 
 from .conftest import Scene

@@ -13,13 +13,13 @@ import numpy as np
 from scipy import stats
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.data.table import TableIntensities
+from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.noise import PhotonNoise
-from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
 from walop_jax.likelihood.problem import Problem, base_model
-from walop_jax.likelihood.simulate import simulate
 from walop_jax.model.specification import Model
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
 
 PLAN = ObservingPlan(
     grid=4,

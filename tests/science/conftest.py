@@ -1,31 +1,5 @@
-"""A calibration of a small simulated run, shared by the tests of this room."""
+"""The small simulated run and its calibration (`small_run.py`) for the tests of this room."""
 
-from __future__ import annotations
+from small_run import calibration, calset
 
-import pytest
-
-from walop_jax.fit.calibration import Calibration
-from walop_jax.fit.refit import refit
-from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
-from walop_jax.likelihood.problem import Problem, base_model
-from walop_jax.likelihood.simulate import simulate
-
-PLAN = ObservingPlan(
-    grid=5,
-    standard_grid=2,
-    polariser_angles=polariser_turn(8),
-    moon_patches=3,
-    standards=3,
-    plate=(None, 0.0, 22.5),
-)
-
-
-@pytest.fixture(scope="session")
-def calset():
-    return simulate(PLAN, seed=4).calset
-
-
-@pytest.fixture(scope="session")
-def calibration(calset) -> Calibration:
-    model = base_model(calset)
-    return Calibration.from_fit(refit(calset, model), Problem(calset, model))
+__all__ = ["calibration", "calset"]

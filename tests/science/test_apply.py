@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
+from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.matrix import Settings
 from walop_jax.data import DataError
 from walop_jax.data.catalogue import read_catalogue
-from walop_jax.data.tables import read_input_table
-from walop_jax.fit.predict import Settings
-from walop_jax.likelihood.simulate import simulate
+from walop_jax.data.user_tables import read_input_table
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.specification import effect_context, make_model, with_effects
 from walop_jax.science.apply import apply, linearised, not_carried_over
-from walop_jax.science.vectors import AnalysisVectors, Setting
+from walop_jax.simulation.simulate import simulate
 
 SOUTH = "WALOP-SOUTH"
 

@@ -12,16 +12,16 @@ from astropy.io import fits
 from scipy import stats
 from typer.testing import CliRunner
 
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.certify import certify, validity
+from walop_jax.calibration.product import write_product
 from walop_jax.cli import app
 from walop_jax.data import write_calibration_set
-from walop_jax.data.product import write_product
-from walop_jax.fit.calibration import Calibration
 from walop_jax.fit.refit import refit
-from walop_jax.likelihood.observing import ObservingPlan, polariser_turn
 from walop_jax.likelihood.problem import Problem, base_model
-from walop_jax.likelihood.simulate import simulate
-from walop_jax.science.certify import certify, validity
 from walop_jax.science.epoch import chi2_tail, departure, epoch
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
 
 PLAN = ObservingPlan(grid=5, standard_grid=2, polariser_angles=polariser_turn(8), moon_patches=3, standards=3)
 

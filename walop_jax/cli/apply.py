@@ -63,10 +63,10 @@ def apply(
     """
     began = time.perf_counter()
     del seed  # nothing is random here
-    from walop_jax.data.atomic import check_output
+    from walop_jax.calibration.product import read_product
     from walop_jax.data.catalogue import read_catalogue
-    from walop_jax.data.product import read_product
-    from walop_jax.data.tables import read_input_table, table_format, write_output_table
+    from walop_jax.data.user_tables import read_input_table, table_format, write_output_table
+    from walop_jax.io.atomic import check_output
     from walop_jax.science.polarisation import ESTIMATORS
 
     if debias not in ESTIMATORS:
@@ -83,10 +83,10 @@ def apply(
     switch_on_jax()
     import numpy as np
 
-    from walop_jax.fit.calibration import Calibration
+    from walop_jax.calibration.calibration import Calibration
     from walop_jax.science.apply import apply as stokes
     from walop_jax.science.apply import not_carried_over
-    from walop_jax.science.columns import header, stokes_columns
+    from walop_jax.science.stokes_columns import header, stokes_columns
 
     with progress(quiet or json) as tell:
         tell("tabulating the analysis vectors")

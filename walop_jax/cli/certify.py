@@ -26,13 +26,13 @@ def certify(
     calibration sets it was made from, maps against parameters, and that no camera sees less than no light.
     """
     del seed  # nothing is random
-    from walop_jax.data.product import PRODVERS, read_product
+    from walop_jax.calibration.product import PRODVERS, read_product
 
     path = product_path(product)
     held = read_product(path)
     switch_on_jax()
-    from walop_jax.science.certify import certify as examine
-    from walop_jax.science.certify import validity
+    from walop_jax.calibration.certify import certify as examine
+    from walop_jax.calibration.certify import validity
 
     with named(path):
         checks = examine(held)

@@ -28,13 +28,13 @@ def cite(
 ) -> None:
     """List the sources of the physics in a fitted model, effects included."""
     del quiet, seed  # the list is all there is, and nothing is random
-    from walop_jax.data.product import read_product
+    from walop_jax.calibration.product import read_product
 
     held = None if run is None else read_product(product_path(run))
     switch_on_jax()
+    from walop_jax.calibration.calibration import rebuild
     from walop_jax.fit import levenberg
-    from walop_jax.fit.building import model_without_data
-    from walop_jax.fit.calibration import rebuild
+    from walop_jax.fit.model_builder import model_without_data
     from walop_jax.model.references import Reference, references, stated_source
 
     with named(run):

@@ -58,20 +58,20 @@ def compare(
     simulated set. RUN/comparison.json has the statistics, comparison.fits every point, four figures the rest: also
     the spectral appendix and the full-Moon scheme.
     """
-    from walop_jax.data.folder import atomic_folder, check_folder
+    from walop_jax.io.folder import atomic_folder, check_folder
 
     text = "" if model is None else read_text(model)
     check_folder(output, FILES, overwrite=overwrite)
     switch_on_jax()
+    from walop_jax.calibration.calibration import Calibration
     from walop_jax.data import read_calibration_set
-    from walop_jax.data.tables import new_table, true_matrices, write_output_table
-    from walop_jax.fit.building import model_for
-    from walop_jax.fit.calibration import Calibration
+    from walop_jax.data.user_tables import new_table, true_matrices, write_output_table
+    from walop_jax.fit.model_builder import model_for
     from walop_jax.fit.refit import fit
     from walop_jax.likelihood.problem import Problem
-    from walop_jax.report import comparison_figures as figures
-    from walop_jax.science.comparison import Truth
-    from walop_jax.science.comparison import compare as both
+    from walop_jax.paper.comparison import Truth
+    from walop_jax.paper.comparison import compare as both
+    from walop_jax.reports import comparison_figures as figures
 
     with progress(quiet or json) as tell:
         tell("reading")

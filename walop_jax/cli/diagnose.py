@@ -26,7 +26,7 @@ from walop_jax.cli.common import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from walop_jax.diagnose.findings import Diagnosis, Step
+    from walop_jax.diagnosis.findings import Diagnosis, Step
 
 
 def diagnose(
@@ -45,21 +45,21 @@ def diagnose(
     RUN/summary.json hold the extended model; RUN/diagnosis.fits what the pictures of `walop-jax report` need.
     """
     began = time.perf_counter()
-    from walop_jax.data.folder import atomic_folder, check_folder
-    from walop_jax.data.pictures import PICTURES, write_pictures
-    from walop_jax.data.product import write_product
-    from walop_jax.fit.summary import PRODUCT, SUMMARY, summary
+    from walop_jax.calibration.product import write_product
+    from walop_jax.calibration.summary import PRODUCT, SUMMARY, summary
+    from walop_jax.diagnosis.figure_file import PICTURES, write_pictures
+    from walop_jax.io.folder import atomic_folder, check_folder
 
     text = "" if model is None else read_text(model)
     check_folder(output, (PRODUCT, SUMMARY, PICTURES, "diagnosis.json"), overwrite=overwrite)
     switch_on_jax()
+    from walop_jax.calibration.calibration import Calibration
     from walop_jax.data import read_calibration_set
-    from walop_jax.diagnose.document import DIAGNOSIS, document
-    from walop_jax.diagnose.pictures import pictures
-    from walop_jax.diagnose.workflow import diagnose as find
-    from walop_jax.fit.building import model_for
-    from walop_jax.fit.calibration import Calibration
+    from walop_jax.diagnosis.document import DIAGNOSIS, document
+    from walop_jax.diagnosis.figure_data import pictures
+    from walop_jax.diagnosis.workflow import diagnose as find
     from walop_jax.fit.misfit import describe
+    from walop_jax.fit.model_builder import model_for
 
     with progress(quiet or json) as tell:
         tell("reading")

@@ -38,14 +38,14 @@ def epoch(
     the old calibration were used on. The effects of the old model are those of the new fit.
     """
     del seed  # nothing is random
+    from walop_jax.calibration.product import read_product
     from walop_jax.data import read_calibration_set
-    from walop_jax.data.product import read_product
 
     path = product_path(old)
     held = read_product(path)
     calset = read_calibration_set(*calsets)
     switch_on_jax()
-    from walop_jax.fit.calibration import Calibration
+    from walop_jax.calibration.calibration import Calibration
     from walop_jax.science.epoch import epoch as compare
 
     with progress(quiet or json) as tell:

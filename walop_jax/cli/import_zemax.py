@@ -70,7 +70,7 @@ def import_zemax(
         raise typer.BadParameter(f"{error} is not a share, as in 0.001", param_hint="--error")
     from walop_jax.data import check_output, import_transmissions, write_calibration_set
     from walop_jax.data.checks import INSTRUMENTS
-    from walop_jax.data.errors import nearest
+    from walop_jax.io.errors import nearest
 
     if instrument is not None and instrument.upper() not in INSTRUMENTS:
         raise typer.BadParameter(

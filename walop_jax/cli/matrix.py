@@ -48,9 +48,9 @@ def matrix(
     of the instrument (0.35 degrees) there is no value: NaN and FLAG 32.
     """
     del seed  # nothing is random here
-    from walop_jax.data.atomic import check_output
-    from walop_jax.data.product import read_product
-    from walop_jax.data.tables import field_points, read_input_table, table_format, write_output_table
+    from walop_jax.calibration.product import read_product
+    from walop_jax.data.user_tables import field_points, read_input_table, table_format, write_output_table
+    from walop_jax.io.atomic import check_output
 
     table_format(output)
     check_output(output, overwrite=overwrite)
@@ -60,9 +60,9 @@ def matrix(
     wanted = field_points(table, held.instrument)
 
     switch_on_jax()
-    from walop_jax.fit.calibration import Calibration
-    from walop_jax.fit.predict import Settings
-    from walop_jax.fit.tabulate import matrix_columns
+    from walop_jax.calibration.calibration import Calibration
+    from walop_jax.calibration.matrix import Settings
+    from walop_jax.calibration.matrix_table import matrix_columns
 
     with progress(quiet or json) as tell:
         tell("working out the matrix")

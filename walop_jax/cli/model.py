@@ -49,12 +49,12 @@ def model(
     del seed  # nothing is random here
     if calsets and instrument:
         raise typer.BadParameter("the calibration sets say which instrument it is", param_hint="--instrument")
-    from walop_jax.data.atomic import atomic_path, check_output
+    from walop_jax.io.atomic import atomic_path, check_output
 
     if output is not None:
         check_output(output, overwrite=overwrite)
     switch_on_jax()
-    from walop_jax.fit.building import effects_text, model_for, model_without_data
+    from walop_jax.fit.model_builder import effects_text, model_for, model_without_data
     from walop_jax.fit.model_file import render
 
     text = effects_text(effect or [])

@@ -31,7 +31,7 @@ from walop_jax.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from walop_jax.data.product_records import ResidualMap
+    from walop_jax.calibration.records import ResidualMap
     from walop_jax.fit.refit import FitResult
     from walop_jax.likelihood.problem import Problem
 
@@ -60,21 +60,21 @@ def refit(
     calibration holds a map of what the smooth model leaves.
     """
     began = time.perf_counter()
-    from walop_jax.data.folder import check_folder
-    from walop_jax.fit.summary import PRODUCT, SUMMARY
+    from walop_jax.calibration.summary import PRODUCT, SUMMARY
+    from walop_jax.io.folder import check_folder
 
     text = "" if model is None else read_text(model)
     check_folder(output, (PRODUCT, SUMMARY), overwrite=overwrite)
     switch_on_jax()
     with shared(processes) as first, progress(quiet or json or not first) as tell:
+        from walop_jax.calibration.residual_map import residual_map
+        from walop_jax.calibration.summary import PARTIAL, identity, summary
         from walop_jax.data import read_calibration_set
-        from walop_jax.fit.building import model_for
         from walop_jax.fit.misfit import describe
+        from walop_jax.fit.model_builder import model_for
         from walop_jax.fit.refit import fit
-        from walop_jax.fit.summary import PARTIAL, identity, summary
         from walop_jax.likelihood.journal import Journal
         from walop_jax.likelihood.problem import Problem
-        from walop_jax.likelihood.remainder import residual_map
 
         tell("reading")
         calset = read_calibration_set(*calsets)
@@ -130,11 +130,11 @@ def _write(
     overwrite: bool,
 ) -> None:
     """The files of a run; what was kept of a fit on the way goes."""
-    from walop_jax.data.atomic import atomic_path
-    from walop_jax.data.folder import atomic_folder
-    from walop_jax.data.product import write_product
-    from walop_jax.fit.calibration import Calibration
-    from walop_jax.fit.summary import FAILED, PARTIAL, PRODUCT, SUMMARY
+    from walop_jax.calibration.calibration import Calibration
+    from walop_jax.calibration.product import write_product
+    from walop_jax.calibration.summary import FAILED, PARTIAL, PRODUCT, SUMMARY
+    from walop_jax.io.atomic import atomic_path
+    from walop_jax.io.folder import atomic_folder
 
     if not result.converged:
         output.mkdir(exist_ok=True)

@@ -32,15 +32,15 @@ def report(
     priors, all parameters, warnings, inputs and versions: what of it lies in RUN. The page says what is missing.
     """
     del seed  # nothing is random here
-    from walop_jax.data.atomic import atomic_path, check_output
-    from walop_jax.report.run import read_run
+    from walop_jax.io.atomic import atomic_path, check_output
+    from walop_jax.reports.run import read_run
 
     target = run / "report.html" if output is None else output
     with progress(quiet or json) as tell:
         tell("reading")
         found = read_run(run)
         check_output(target, overwrite=overwrite)
-        from walop_jax.report.page import render
+        from walop_jax.reports.page import render
 
         tell("drawing")
         text = render(found)

@@ -24,7 +24,7 @@ from walop_jax.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from walop_jax.data.product import CalibrationProduct
+    from walop_jax.calibration.product import CalibrationProduct
     from walop_jax.posterior import PosteriorSample, Progress
 
 CHAINS = "sampling"
@@ -67,8 +67,8 @@ def sample(
     data, model, priors, settings or versions have changed. A chain that has not converged is written and
     marked so, with exit code 1; the covariance of the fit then stays in calibration.fits.
     """
-    from walop_jax.data.errors import fail
-    from walop_jax.data.product import read_product
+    from walop_jax.calibration.product import read_product
+    from walop_jax.io.errors import fail
 
     if not run.is_dir():
         raise CommandError(f"{run}: is not a folder; give the RUN of walop-jax refit")
@@ -112,12 +112,12 @@ def sample(
 def _write(run: Path, product: CalibrationProduct, found: PosteriorSample) -> dict[str, Any]:
     import numpy as np
 
-    from walop_jax.data.folder import atomic_folder
-    from walop_jax.data.interval_table import write_columns
-    from walop_jax.data.product import write_product
-    from walop_jax.fit.calibration import Calibration
+    from walop_jax.calibration.calibration import Calibration
+    from walop_jax.calibration.product import write_product
+    from walop_jax.io.folder import atomic_folder
+    from walop_jax.io.plain_tables import write_columns
     from walop_jax.posterior.output import intervals, report, write_posterior
-    from walop_jax.report.posterior_figures import corner_figure, save_figure, trace_figure
+    from walop_jax.reports.posterior_figures import corner_figure, save_figure, trace_figure
 
     summary = report(found)
     units = [dict(zip(found.names, found.units, strict=True)).get(name, "") for name in found.sampled]

@@ -20,8 +20,8 @@ from walop_jax.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from walop_jax.likelihood.observing import ObservingPlan
     from walop_jax.model.effects.base import Context, Effect
+    from walop_jax.simulation.observing_plan import ObservingPlan
 
 OutputOption = Annotated[
     Path, typer.Option("--output", "-o", metavar="CALSET", help="Calibration set to write (FITS).")
@@ -73,15 +73,15 @@ def simulate(
 
     The light path is the one that a fit uses; noise is that of photons and of the detectors (30 electrons).
     """
-    from walop_jax.data.atomic import atomic_path, check_output
     from walop_jax.data.write import write_calibration_set
+    from walop_jax.io.atomic import atomic_path, check_output
 
     check_output(output, overwrite=overwrite)
     if truth is not None:
         check_output(truth, overwrite=overwrite)
     switch_on_jax()
-    from walop_jax.likelihood import simulate as simulation
-    from walop_jax.likelihood.observing import NARROW_BANDS, ObservingPlan, polariser_turn
+    from walop_jax.simulation import simulate as simulation
+    from walop_jax.simulation.observing_plan import NARROW_BANDS, ObservingPlan, polariser_turn
 
     turn = polariser_turn(angles, full_turn=full_turn)
     try:
@@ -178,8 +178,8 @@ def _value(text: str, name: str) -> Any:
 
 
 def _truth(plan: ObservingPlan, seed: int, true: Any) -> Mapping[str, Any]:
-    from walop_jax.likelihood.simulate import truth_values
     from walop_jax.model.parameters import leaves
+    from walop_jax.simulation.simulate import truth_values
 
     units = {leaf.name: leaf.declaration.unit for leaf in leaves(true)}
     return {

@@ -104,8 +104,8 @@ def _instrument(product: Path | None, name: str, filter_name: str) -> tuple[Inst
             return nominal_instrument(name.upper()), builtin_filter(filter_name)
         except ValueError as error:
             raise typer.BadParameter(str(error)) from None
-    from walop_jax.data.product import read_product
-    from walop_jax.fit.calibration import Calibration
+    from walop_jax.calibration.calibration import Calibration
+    from walop_jax.calibration.product import read_product
 
     path = product_path(product)
     with named(path):

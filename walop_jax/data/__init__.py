@@ -4,10 +4,8 @@ This room turns files into plain immutable records and back. Units are checked a
 gone afterwards: inside the package a number has the unit that the record's docstring gives.
 """
 
-from walop_jax.data.atomic import atomic_path, check_output
 from walop_jax.data.calset import CALVERS, empty_sources, read_calibration_set, with_builtins
 from walop_jax.data.checks import INSTRUMENTS
-from walop_jax.data.errors import DataError, nearest
 from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter
 from walop_jax.data.frames import FrameIntensities, Grid
 from walop_jax.data.merge import JoinedIntensities, merge_calibration_sets
@@ -25,16 +23,11 @@ from walop_jax.data.records import (
     Site,
     Sources,
 )
-from walop_jax.data.sky import (
-    moon_direction,
-    moon_sky,
-    rayleigh_sky,
-    sky_to_instrument,
-    standard_rotation,
-)
-from walop_jax.data.table import TableIntensities, empty_block
+from walop_jax.data.table_intensities import TableIntensities, empty_block
 from walop_jax.data.write import write_calibration_set, write_frames
 from walop_jax.data.zemax import import_transmissions
+from walop_jax.io.atomic import atomic_path, check_output
+from walop_jax.io.errors import DataError, nearest
 
 __all__ = [
     "BUILTIN_FILTERS",
@@ -65,13 +58,8 @@ __all__ = [
     "empty_sources",
     "import_transmissions",
     "merge_calibration_sets",
-    "moon_direction",
-    "moon_sky",
     "nearest",
-    "rayleigh_sky",
     "read_calibration_set",
-    "sky_to_instrument",
-    "standard_rotation",
     "with_builtins",
     "write_calibration_set",
     "write_frames",

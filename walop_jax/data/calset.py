@@ -10,11 +10,9 @@ import numpy as np
 
 from walop_jax.data import schema
 from walop_jax.data.checks import INSTRUMENTS, make_exposures, make_filters, make_points, make_sources
-from walop_jax.data.errors import DataError, fail, nearest
 from walop_jax.data.filters import builtin_filter
 from walop_jax.data.frames import COUNT_NAMES, ERROR_NAMES, FrameIntensities, frame_stack
 from walop_jax.data.merge import merge_calibration_sets
-from walop_jax.data.opening import UNREADABLE, OpenFile, one_line, open_fits
 from walop_jax.data.records import (
     CalibrationSet,
     Exposures,
@@ -26,7 +24,9 @@ from walop_jax.data.records import (
     Sources,
 )
 from walop_jax.data.schema import Place, read_table
-from walop_jax.data.table import TableIntensities, mask_repeats, table_intensities, usable
+from walop_jax.data.table_intensities import TableIntensities, mask_repeats, table_intensities, usable
+from walop_jax.io.errors import DataError, fail, nearest
+from walop_jax.io.fits_reading import UNREADABLE, OpenFile, one_line, open_fits
 
 CALVERS = 1
 """Version of the file format that is written, and the newest that is read."""

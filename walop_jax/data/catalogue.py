@@ -19,9 +19,9 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data.errors import rows_text
 from walop_jax.data.schema import Column, Place
-from walop_jax.data.tables import FieldPoints, InputTable, field_points, numeric_column, vector_column
+from walop_jax.data.user_tables import FieldPoints, InputTable, field_points, numeric_column, vector_column
+from walop_jax.io.errors import rows_text
 
 _COUNTS = Column("float", "electron", width=4)
 _ROTATOR = Column("float", "deg", float("nan"))

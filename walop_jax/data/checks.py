@@ -7,17 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.data.errors import nearest, rows_text
 from walop_jax.data.filters import BUILTIN_FILTERS
 from walop_jax.data.records import KINDS, Exposures, FilterCurve, Points, Site, Sources
 from walop_jax.data.schema import Place
-from walop_jax.data.sky import EPHEMERIS_MJD
+from walop_jax.io.errors import nearest, rows_text
 
 INSTRUMENTS = ("WALOP-SOUTH", "WALOP-NORTH", "WALOP-LAB")
 """Values of INSTRUME that a calibration set may have."""
 
 FIELD_LIMITS = {"WALOP-SOUTH": 0.35, "WALOP-NORTH": 0.35, "WALOP-LAB": 45.0}
 """Largest |X|, |Y| in degrees; on the laboratory bench X is the tilt of the plate."""
+
+EPHEMERIS_MJD = (15020.0, 88069.0)
+"""Where astropy's built-in ephemeris (ERFA `moon98`, the years 1900 to 2100) is meant to be used."""
 
 _WAVELENGTH = (0.3, 1.1)  # µm, where silicon detectors see
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from walop_jax.data.errors import fail, nearest
 from walop_jax.data.records import FilterCurve
+from walop_jax.io.errors import fail, nearest
 
 DEFAULT_FILTER = "SDSS-r"
 """What an exposure without a FILTER was taken through."""

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.errors import fail
 from walop_jax.data.records import Block, Intensities, Points
 from walop_jax.data.schema import Place, convert_unit
-from walop_jax.data.table import empty_block, usable
+from walop_jax.data.table_intensities import empty_block, usable
+from walop_jax.io.errors import fail
 
 COUNT_NAMES = ("N0", "N1", "N2", "N3")
 ERROR_NAMES = ("E0", "E1", "E2", "E3")

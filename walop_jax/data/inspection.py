@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from walop_jax.data.records import FLAG_BITS, CalibrationSet
-from walop_jax.data.table import TableIntensities
+from walop_jax.data.table_intensities import TableIntensities
 
 Severity = Literal["fault", "doubt", "note"]
 

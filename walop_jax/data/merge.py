@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.data.errors import DataError, fail
 from walop_jax.data.frames import FrameIntensities, Grid
 from walop_jax.data.records import (
     Block,
@@ -19,7 +18,8 @@ from walop_jax.data.records import (
     Site,
     Sources,
 )
-from walop_jax.data.table import TableIntensities, empty_block, mask_repeats
+from walop_jax.data.table_intensities import TableIntensities, empty_block, mask_repeats
+from walop_jax.io.errors import DataError, fail
 
 
 class JoinedIntensities(Intensities):

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from astropy import units
 
-from walop_jax.data.errors import fail, nearest, rows_text
+from walop_jax.io.errors import fail, nearest, rows_text
 
 Kind = Literal["int", "float", "bool", "str"]
 

@@ -11,13 +11,13 @@ import numpy as np
 from astropy.io import fits
 
 from walop_jax.data import schema
-from walop_jax.data.atomic import atomic_path
 from walop_jax.data.calset import CALVERS
-from walop_jax.data.errors import fail
 from walop_jax.data.frames import COUNT_NAMES, ERROR_NAMES, Grid
-from walop_jax.data.opening import checksum_text, data_sum, padded
 from walop_jax.data.records import CalibrationSet, FilterCurve
-from walop_jax.data.table import TableIntensities
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.io.atomic import atomic_path
+from walop_jax.io.errors import fail
+from walop_jax.io.fits_reading import checksum_text, data_sum, padded
 
 _CODES = {"int": "J", "float": "D", "bool": "L"}
 _SLAB = 1 << 18  # (exposure, pixel) pairs that are written at a time

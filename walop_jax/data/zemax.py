@@ -27,12 +27,12 @@ from jaxtyping import Float
 from walop_jax.data import schema
 from walop_jax.data.calset import empty_sources
 from walop_jax.data.checks import INSTRUMENTS, make_exposures, make_filters, make_points
-from walop_jax.data.errors import fail, nearest
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.schema import Place
 from walop_jax.data.sites import SITES
-from walop_jax.data.table import table_intensities
+from walop_jax.data.table_intensities import table_intensities
 from walop_jax.data.zemax_text import HEADING, TransmissionExport, read_export
+from walop_jax.io.errors import fail, nearest
 
 CAMERA_CONFIGURATIONS = (1, 3, 2, 4)
 """Configurations of the design that are the cameras O1, E1, O2, E2."""

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.errors import DataError, fail
+from walop_jax.io.errors import DataError, fail
 
 HEADING = "Polarization Transmission Data"
 """First line of every export."""

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from walop_jax.data.records import Block, CalibrationSet, Exposures, Intensities, Points
-from walop_jax.data.sky import moon_direction, rayleigh_sky
 from walop_jax.likelihood.engine import PointData
 from walop_jax.model.plan import Plan
+from walop_jax.sky.moon import moon_direction, rayleigh_sky
 
 Vector = Float[np.ndarray, " n"]
 

@@ -3,12 +3,12 @@
 This room samples and says how far to believe it. It draws no figures, and knows no FITS.
 """
 
-from walop_jax.posterior.accuracy import Accuracy
-from walop_jax.posterior.building import build_surrogate
 from walop_jax.posterior.convergence import Convergence
 from walop_jax.posterior.result import Options, PosteriorSample, Progress
 from walop_jax.posterior.sampling import sample
 from walop_jax.posterior.surrogate import Surrogate
+from walop_jax.posterior.surrogate_accuracy import Accuracy
+from walop_jax.posterior.surrogate_builder import build_surrogate
 
 __all__ = [
     "Accuracy",

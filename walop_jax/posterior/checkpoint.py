@@ -21,8 +21,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from walop_jax.data.atomic import atomic_path
-from walop_jax.data.errors import fail
+from walop_jax.io.atomic import atomic_path
+from walop_jax.io.errors import fail
 from walop_jax.posterior.ensemble import Block, Walkers
 from walop_jax.posterior.surrogate import Surrogate
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from walop_jax.calibration.product import CalibrationProduct
 from walop_jax.data import read_calibration_set
-from walop_jax.data.errors import fail
-from walop_jax.data.product import CalibrationProduct
-from walop_jax.fit.building import model_for
+from walop_jax.fit.model_builder import model_for
 from walop_jax.fit.refit import FitResult, fit
+from walop_jax.io.errors import fail
 from walop_jax.likelihood.problem import LARGE_ABOVE, Problem
 
 SAME_FIT = 0.05  # standard errors

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.atomic import atomic_path
-from walop_jax.data.errors import fail
+from walop_jax.io.atomic import atomic_path
+from walop_jax.io.errors import fail
 from walop_jax.posterior.result import INFLATION, PosteriorSample
 
 LEVELS = {"68": (0.1587, 0.8413), "95": (0.0228, 0.9772)}

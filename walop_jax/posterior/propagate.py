@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_plan
 from walop_jax.data.records import FilterCurve
-from walop_jax.fit.calibration import Calibration
-from walop_jax.fit.predict import Settings, analysis_vectors, settings_plan
 from walop_jax.model import light
 from walop_jax.model.specification import Model
 from walop_jax.posterior.output import read_draws

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.posterior.accuracy import Accuracy
 from walop_jax.posterior.convergence import Chains, Convergence
 from walop_jax.posterior.ensemble import MOVES
+from walop_jax.posterior.surrogate_accuracy import Accuracy
 from walop_jax.posterior.target import LARGEST_SAMPLED
 
 Vector = Float[np.ndarray, " n"]

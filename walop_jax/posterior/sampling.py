@@ -10,16 +10,16 @@ import time
 import numpy as np
 from jaxtyping import Float, Int
 
-from walop_jax.data.errors import fail
 from walop_jax.fit.refit import FitResult
+from walop_jax.io.errors import fail
 from walop_jax.likelihood.problem import Problem
-from walop_jax.posterior.accuracy import check
-from walop_jax.posterior.building import build_surrogate
 from walop_jax.posterior.checkpoint import Checkpoints, digest
 from walop_jax.posterior.convergence import Chains, Convergence, assess
 from walop_jax.posterior.ensemble import Block, Walkers, advance, start
 from walop_jax.posterior.result import BURN_IN, INFLATION, Options, PosteriorSample, Progress, Report
 from walop_jax.posterior.surrogate import Surrogate
+from walop_jax.posterior.surrogate_accuracy import check
+from walop_jax.posterior.surrogate_builder import build_surrogate
 from walop_jax.posterior.target import Target, choose_sampled
 
 Vector = Float[np.ndarray, " n"]

@@ -14,16 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from walop_jax.calibration.analysis_vectors import COLOURS, AnalysisVectors, Setting
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.field_series import COOLEST, colour_weights
+from walop_jax.calibration.matrix import Settings
 from walop_jax.data.catalogue import Catalogue
-from walop_jax.data.errors import DataError
-from walop_jax.fit.calibration import Calibration
-from walop_jax.fit.predict import Settings
+from walop_jax.io.errors import DataError
 from walop_jax.model.effects.base import overridden
 from walop_jax.model.plan import exposure_arrays
 from walop_jax.model.specification import unravel
 from walop_jax.science.estimate import calibration_shift, estimate
-from walop_jax.science.interpolation import COOLEST, colour_weights
-from walop_jax.science.vectors import COLOURS, AnalysisVectors, Setting
 
 BLOCK = 16384  # rows that are worked on together
 MOST_SETTINGS = 200

@@ -20,15 +20,14 @@ import numpy as np
 from jax.scipy.special import gammaincc
 from jaxtyping import Float
 
+from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.building import effects_text, model_for
-from walop_jax.fit.calibration import Calibration
+from walop_jax.fit.model_builder import effects_text, model_for
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.problem import Problem
 from walop_jax.model.specification import Model
-from walop_jax.science.accuracy import WEAK, determinant, joint_errors, statistics
-from walop_jax.science.paper import sample_stars
-from walop_jax.science.vectors import AnalysisVectors, Setting
+from walop_jax.science.star_errors import WEAK, determinant, joint_errors, sample_stars, statistics
 
 NIGHTLY = ("sky.", "standard.")  # parameters of the sky and of stars, not of the instrument
 CHANCE = 0.01

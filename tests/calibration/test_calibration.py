@@ -1,0 +1,277 @@
+"""A calibration: the matrix that it predicts, the way into a product and back, and the truth."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from between_points import between_points
+
+from walop_jax.calibration.calibration import Calibration, at_prior_edge, quality
+from walop_jax.calibration.matrix import Settings
+from walop_jax.calibration.matrix_table import matrix_columns
+from walop_jax.calibration.product import read_product, write_product
+from walop_jax.data import DataError, read_calibration_set
+from walop_jax.fit.model_builder import model_for, model_without_data
+from walop_jax.fit.model_file import render
+from walop_jax.fit.refit import FitResult, fit
+from walop_jax.likelihood.problem import Problem
+from walop_jax.model.references import references
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
+
+TINY = ObservingPlan(
+    grid=5,
+    standard_grid=2,
+    polariser_angles=polariser_turn(8),
+    moon_patches=3,
+    standards=3,
+    plate=(None, 45.0),
+)
+X, Y = np.array([-0.21, 0.03, 0.2]), np.array([0.1, -0.05, 0.22])
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    calset = simulate(TINY, seed=3).calset
+    return Problem(calset, model_for(calset))
+
+
+@pytest.fixture(scope="module")
+def result(problem) -> FitResult:
+    return fit(problem)
+
+
+@pytest.fixture(scope="module")
+def calibration(result, problem) -> Calibration:
+    return Calibration.from_fit(result, problem)
+
+
+@pytest.fixture(scope="module")
+def product_file(calibration, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("product") / "calibration.fits"
+    write_product(path, calibration.to_product())
+    return path
+
+
+def starting(problem: Problem, result: FitResult, text: str) -> Calibration:
+    """A calibration at the start values of a model, never fitted: for what does not depend on the data."""
+    model = model_for(problem.calset, text)
+    spread = 1e-3 * np.linspace(0.1, 1.0, len(model.names))
+    unfitted = dataclasses.replace(result, model=model, values=model.start, covariance=np.diag(spread**2))
+    return Calibration.from_fit(unfitted, problem)
+
+
+def test_the_fit_is_trusted(result, calibration):
+    assert result.trusted
+    assert calibration.verdict.trusted
+    assert calibration.verdict.quality == 0
+
+
+def test_matrix_from_the_product_is_that_of_the_fit(calibration, product_file):
+    back = Calibration.from_product(read_product(product_file))
+    count = len(X)
+    settings = Settings(
+        np.full(count, "SDSS-r"), np.array([np.nan, 4000.0, 9000.0]), np.array([np.nan, 45.0, 45.0]),
+        np.full(count, 10.0), np.zeros(count),
+    )  # fmt: skip
+    for ask in (None, settings):
+        one, other = calibration.matrix(X, Y, ask), back.matrix(X, Y, ask)
+        np.testing.assert_allclose(other[0], one[0], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(other[1], one[1], rtol=1e-9, atol=0)
+    np.testing.assert_array_equal(back.values, calibration.values)
+    assert back.model.names == calibration.model.names
+    assert render(back.model) == render(calibration.model)
+    assert back.verdict == calibration.verdict
+
+
+def test_a_product_of_a_product_is_the_same(product_file):
+    product = read_product(product_file)
+    again = Calibration.from_product(product).to_product()
+    assert again.content_hash() == product.content_hash()
+
+
+def test_rows_are_computed_each_with_its_own_numbers(calibration):
+    """Colour temperature, point and plate go by row, whatever stands beside it, across chunks too."""
+    rng = np.random.default_rng(1)
+    count = 40  # more than a small chunk
+    x, y = rng.uniform(-0.25, 0.25, (2, count))
+    teff = np.where(rng.random(count) < 0.3, np.nan, rng.uniform(3000, 9000, count))
+    plate = np.where(rng.random(count) < 0.5, np.nan, 45.0)
+    settings = Settings(np.full(count, "SDSS-r"), teff, plate, np.full(count, 10.0), np.zeros(count))
+    values, covariance = calibration.matrix(x, y, settings)
+    for row in (0, 7, 39):
+        one = calibration.matrix(x[[row]], y[[row]], settings[np.array([row])])
+        np.testing.assert_allclose(one[0][0], values[row], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(one[1][0], covariance[row], rtol=1e-8, atol=1e-18)
+    hot, cold = (dataclasses.replace(settings, teff=np.full(count, t)) for t in (9000.0, 3000.0))
+    difference = calibration.matrix(x, y, hot)[0] - calibration.matrix(x, y, cold)[0]
+    assert np.abs(difference).max() > 1e-3
+
+
+def test_covariance_is_that_of_finite_differences(calibration):
+    """C_m = J C_θ Jᵀ with J by central differences in the directions that matter most."""
+    value, vector = np.linalg.eigh(calibration.covariance)
+    total = np.zeros((len(X), 6, 6))
+    for variance, direction in zip(value[value > 0], vector.T[value > 0], strict=True):
+        step = np.sqrt(variance) * direction
+        up, down = (
+            dataclasses.replace(calibration, values=calibration.values + sign * 0.1 * step).matrix(X, Y)[0]
+            for sign in (1, -1)
+        )
+        slope = (up - down) / 0.2
+        total += slope[:, :, None] * slope[:, None, :]
+    np.testing.assert_allclose(calibration.matrix(X, Y)[1], total, rtol=2e-3, atol=1e-14)
+
+
+def test_flags_say_what_is_special(calibration):
+    x, y = np.array([0.0, 0.29, 0.33, 0.0]), np.array([0.0, 0.29, 0.0, 0.0])
+    settings = dataclasses.replace(
+        Settings.default(4), filter=np.array(["SDSS-r", "SDSS-r", "SDSS-r", "other"])
+    )
+    values = np.tile([0.0, 1.0, 0.0, 0.0, 0.0, 1.0], (4, 1))
+    values[0] = [0.0, 1.0, 0.0, 0.0, 0.0, 0.05]
+    assert calibration.flags(x, y, settings, values).tolist() == [16, 0, 32, 64]
+    values[0, 1:3] = 0.0  # singular
+    assert calibration.flags(x, y, settings, values)[0] == 16
+
+
+def test_temperature_counts_where_the_model_depends_on_it(problem, result):
+    plain = starting(problem, result, "")
+    warm = starting(problem, result, '[model]\neffects = ["hwp_temperature"]\n')
+    settings = dataclasses.replace(Settings.default(2), temp=np.array([10.0, 30.0]))
+    x, values = np.zeros(2), np.tile([0.0, 1, 0, 0, 0, 1], (2, 1))
+    assert plain.flags(x, x, settings, values).tolist() == [0, 0]
+    assert warm.flags(x, x, settings, values).tolist() == [0, 64]
+
+
+def test_points_outside_have_no_value(calibration):
+    columns = matrix_columns(calibration, X, Y, Settings.default(3), np.array([False, True, False]))
+    assert list(columns)[:6] == ["M21", "M22", "M23", "M31", "M32", "M33"]
+    assert np.isnan(columns["M22"][0]).tolist() == [False, True, False]
+    assert columns["FLAG"][0][1] == 32
+    np.testing.assert_array_equal(columns["M33"][0][[0, 2]], calibration.matrix(X, Y)[0][[0, 2], 5])
+
+
+def test_unknown_filter_names_the_nearest(calibration):
+    settings = dataclasses.replace(Settings.default(3), filter=np.full(3, "SDSS-R"))
+    with pytest.raises(DataError, match="SDSS-r"):
+        calibration.matrix(X, Y, settings)
+
+
+EFFECTS = """
+[model]
+effects = ["moon_patch", "clp_wobble", "blemish", "standard_outlier"]
+[effects.blemish]
+camera = 2
+[effects.standard_outlier]
+source = "{star}"
+[parameters."blemish.depth"]
+start = 0.05
+[parameters."half2.plate.mgf2"]
+tie = "half1.plate.mgf2"
+"""
+
+
+def test_effects_and_their_choices_survive_the_product(problem, result, tmp_path):
+    star = problem.model.template.standard.names[1]
+    calibration = starting(problem, result, EFFECTS.format(star=star))
+    write_product(tmp_path / "c.fits", calibration.to_product())
+    back = Calibration.from_product(read_product(tmp_path / "c.fits"))
+    assert back.model.names == calibration.model.names
+    effects = {effect.name: effect for effect in back.model.template.effects}
+    assert list(effects) == ["moon_patch", "standard_outlier", "clp_wobble", "blemish"]
+    assert effects["blemish"].camera == 2
+    assert effects["standard_outlier"].source == star
+    assert back.model["half2.plate.mgf2"].tie == "half1.plate.mgf2"
+    assert sum(name.startswith("moon_patch.") for name in back.model.names) == 2 * TINY.moon_patches
+    np.testing.assert_array_equal(back.matrix(X, Y)[0], calibration.matrix(X, Y)[0])
+    cited = {entry.what: entry.source for entry in references(back.model)}
+    assert "Blinov et al. 2023" in cited["effect standard_outlier"]
+    assert not any("contract" in source for source in cited.values())
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('[model]\neffects = ["clp_woble"]', "clp_wobble"),
+        ('[parameters."half1.plate.quarz"]\nstart = 1.0', "half1.plate.quartz"),
+        ('[model]\neffects = ["blemish"]\n[effects.blemish]\ncamara = 1', "camera"),
+        ('[model]\neffects = ["blemish"]\n[effects.blemish]\ncamera = 7', "camera"),
+        ("[effects.blemish]\ncamera = 1", "blemish"),
+        ("[models]", "model"),
+        ("model = 3", "table"),
+        ('[model]\ninstrument = "WALOP-NORTH"', "WALOP-SOUTH"),
+        ('[model]\nplates = "thick"', "fixed_axis"),
+    ],
+)
+def test_model_files_that_cannot_be_meant(problem, text, message):
+    with pytest.raises(ValueError, match=message):
+        model_for(problem.calset, text)
+
+
+def test_models_without_data():
+    assert model_without_data("WALOP-LAB").name == "WALOP-LAB"
+    model = model_without_data("WALOP-SOUTH", '[model]\neffects = ["clp_zero"]\nplates = "fixed_axis"')
+    assert model.template.plates == "fixed_axis"
+    assert "clp_zero.angle" in model.names
+    with pytest.raises(ValueError, match="WALOP-SOUTH"):
+        model_without_data("WALOP-SUD")
+
+
+def test_quality_bits_follow_the_fit(result):
+    good = quality(result)
+    assert good == 0
+    minimum = dataclasses.replace(result.minimum, converged=False, condition=1e11)
+    posterior = dataclasses.replace(result.posterior, data=10.0 * result.dof)
+    values = result.values.copy()
+    index = result.model.index("pupil.magnification")
+    values[index] += 5 * result.model.parameters[index].prior[1]
+    bad = dataclasses.replace(result, minimum=minimum, posterior=posterior, values=values)
+    assert quality(bad) == 1 | 2 | 4 | 8 | 8192
+    assert at_prior_edge(bad) == ("pupil.magnification",)
+    slightly = dataclasses.replace(result.posterior, data=result.dof * 1.0 + 20.0 * np.sqrt(result.dof))
+    assert quality(dataclasses.replace(result, posterior=slightly)) & ~8 == 8192
+
+
+def test_a_product_of_other_physics_is_refused(calibration):
+    product = calibration.to_product()
+    table = product.parameters
+    names = table.name.copy()
+    names[0] = "sky.colour"
+    changed = dataclasses.replace(product, parameters=dataclasses.replace(table, name=names))
+    with pytest.raises(DataError, match=r"sky\.colour"):
+        Calibration.from_product(changed)
+
+
+# ---------------------------------------------------------------------- against sets made outside the project
+
+
+@pytest.mark.parametrize(
+    ("name", "limit"),
+    [
+        # Measured in November 2026: q 0.00388, u 0.00668 % (a) and q 0.00174, u 0.00692 % (b).
+        ("a", (0.005, 0.015)),
+        ("b", (0.0025, 0.007)),
+    ],
+)
+def test_error_between_grid_points(shared_data, name, limit):
+    calset = read_calibration_set(shared_data / f"walop_south_{name}.fits")
+    problem = Problem(calset, model_for(calset))
+    result = fit(problem)
+    assert result.converged
+    assert result.trusted
+    assert 0.97 < result.chi2 / result.dof < 1.03
+    error, pulls, easy = between_points(
+        shared_data / f"walop_south_{name}_truth.fits", Calibration.from_fit(result, problem)
+    )
+    print(
+        f"set {name}: χ²/dof {result.chi2 / result.dof:.4f}, {result.minimum.steps} steps; error in q, u "
+        f"{error[0]:.5f}, {error[1]:.5f} % at {100 * easy:.0f} % of the points; rms pulls of the "
+        f"matrix {np.sqrt(np.mean(pulls**2, axis=0)).round(2)}"
+    )
+    assert error[0] <= limit[0]
+    assert error[1] <= limit[1]
+    assert np.sqrt(np.mean(pulls**2)) < 2.0

@@ -1,0 +1,227 @@
+"""The calibration product: what is written comes back, and what is not as written is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+import walop_jax.calibration.product
+from walop_jax.calibration.product import (
+    CalibrationProduct,
+    MatrixMaps,
+    ParameterTable,
+    Verdict,
+    read_product,
+    spelt,
+    write_product,
+)
+from walop_jax.data import DataError, read_calibration_set
+from walop_jax.data.frames import Grid
+
+NAN = float("nan")
+
+
+@pytest.fixture
+def product(handmade) -> CalibrationProduct:
+    calset = read_calibration_set(handmade.write())
+    rng = np.random.default_rng(5)
+    root = rng.standard_normal((3, 3)) * 1e-3
+    covariance = root @ root.T
+    grid = Grid(4, 3, (2.5, 2.0), (0.0, 0.0), ((0.1, 0.0), (0.0, 0.2)))
+    return CalibrationProduct(
+        instrument=calset.instrument,
+        site=calset.site,
+        origin=calset.origin,
+        date="2026-11-21T10:00:00",
+        verdict=Verdict(
+            1.0 / 3.0 * 1e5, 33000, 44000, 1.0, True, False, 8192, ("chi2/dof = 1.5", "look at it")
+        ),
+        parameters=ParameterTable(
+            name=np.array(["pupil.magnification", "collimator.q", "throughput.n0.p00"]),
+            value=np.array([15.63, 1.0 / 3.0, 0.5]),
+            sigma=np.sqrt(np.diag(covariance)),
+            unit=np.array(["", "deg-2", "um"]),
+            prior_mean=np.array([15.63, 0.0, NAN]),
+            prior_width=np.array([0.05, 0.0015, NAN]),
+            free=np.array([True, True, False]),
+        ),
+        covariance=covariance,
+        maps=MatrixMaps(grid, "SDSS-r", rng.random((6, 3, 4)), rng.random((6, 3, 4))),
+        field=(-0.29, 0.29, -1.0 / 3.0, 0.25),
+        exposures=calset.exposures,
+        filters=calset.filters,
+        sources=calset.sources,
+        model=("[model]", 'instrument = "WALOP-SOUTH"', "# a comment"),
+        inputs=calset.inputs,
+        versions={"python": "3.11.7", "walop-jax": "0.1.0"},
+    )
+
+
+@pytest.fixture
+def path(product, tmp_path):
+    path = tmp_path / "calibration.fits"
+    write_product(path, product)
+    return path
+
+
+def assert_equal(one, other):
+    """Records are equal, arrays bit for bit."""
+    for field in dataclasses.fields(one):
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        if dataclasses.is_dataclass(a):
+            assert_equal(a, b)
+        elif isinstance(a, np.ndarray):
+            np.testing.assert_array_equal(a, b)
+        elif field.name == "filters":
+            assert list(a) == list(b)
+            for name in a:
+                assert_equal(a[name], b[name])
+        else:
+            assert a == b, field.name
+
+
+def test_round_trip_is_exact(product, path):
+    back = read_product(path)
+    assert_equal(product, back)
+    assert back.content_hash() == product.content_hash()
+
+
+def test_is_ordinary_fits(path):
+    with fits.open(path, checksum=True) as hdus:
+        head = hdus[0].header
+        assert (head["PRODVERS"], head["TRUSTED"], head["CONVERGD"], head["QUALITY"]) == (
+            1,
+            False,
+            True,
+            8192,
+        )
+        assert head["SOFT2"] == "walop-jax 0.1.0"
+        assert hdus["PARAMETERS"].data["NAME"][1] == "collimator.q"
+        image = hdus["M22_ERR"].header
+        assert (image["CTYPE1"], image["CUNIT2"], image["CD2_2"]) == ("X", "deg", 0.2)
+        assert hdus["WARNINGS"].data["TEXT"].tolist() == ["chi2/dof = 1.5", "look at it"]
+
+
+def test_no_sources_no_warnings_no_inputs(product, tmp_path):
+    verdict = dataclasses.replace(product.verdict, warnings=())
+    bare = dataclasses.replace(product, verdict=verdict, inputs=())
+    write_product(tmp_path / "bare.fits", bare)
+    assert_equal(bare, read_product(tmp_path / "bare.fits"))
+
+
+def test_the_hash_is_of_the_content(product):
+    later = dataclasses.replace(product, date="2027-01-01T00:00:00", versions={"python": "4.0"})
+    assert later.content_hash() == product.content_hash()
+    values = product.parameters.value.copy()
+    values[1] = np.nextafter(values[1], 1.0)
+    moved = dataclasses.replace(product, parameters=dataclasses.replace(product.parameters, value=values))
+    assert moved.content_hash() != product.content_hash()
+    warned = dataclasses.replace(product, verdict=dataclasses.replace(product.verdict, trusted=True))
+    assert warned.content_hash() != product.content_hash()
+
+
+def test_signs_are_spelt_out():
+    assert spelt("χ²/dof = 1.2 × 3\n at  40°") == "chi2/dof = 1.2 x 3 at 40 deg"
+    assert spelt("Gál") == "G\\xe1l"
+
+
+def rewrite(path, change):
+    """Change a product with astropy, checksums and all."""
+    with fits.open(path) as hdus:
+        loaded = fits.HDUList([hdu.copy() for hdu in hdus])
+    change(loaded)
+    loaded.writeto(path, checksum=True, overwrite=True)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda h: h[0].header.set("PRODVERS", 2), "newer walop-jax"),
+        (lambda h: h[0].header.set("PRODVERS", "one"), "not a version"),
+        (lambda h: h[0].header.remove("PRODVERS"), "is missing"),
+        (lambda h: h[0].header.set("INSTRUME", "WALOP-SUOTH"), "WALOP-SOUTH"),
+        (lambda h: h[0].header.set("TRUSTED", True), "not what was written"),
+        (lambda h: h[0].header.set("TRUSTED", 1), "not T or F"),
+        (lambda h: h[0].header.set("CHI2", 5.0), "not what was written"),
+        (lambda h: h[0].header.remove("DOF"), "DOF"),
+        (lambda h: h["PARAMETERS"].data["VALUE"].__setitem__(1, 0.4), "not what was written"),
+        (lambda h: h["PARAMETERS"].data["SIGMA"].__setitem__(1, 0.4), "does not agree with SIGMA"),
+        (lambda h: h["PARAMETERS"].data["NAME"].__setitem__(1, "pupil.magnification"), "there twice"),
+        (lambda h: h["COVARIANCE"].data.__setitem__((0, 1), 1.0), "not a covariance"),
+        (lambda h: h["M22"].data.__setitem__((0, 1), np.nan), "not finite"),
+        (lambda h: h["M22"].header.set("CD1_1", 0.3), "grid of M21"),
+        (lambda h: h.__delitem__("M33_ERR"), r"\[M33_ERR\].*missing"),
+        (lambda h: h.__delitem__("PARAMETERS"), r"\[PARAMETERS\].*missing"),
+        (lambda h: h.__delitem__("MODEL"), r"\[MODEL\].*missing"),
+        (lambda h: h["FILTERS"].data["FILTER"].__setitem__(0, "ODD"), "not|neither"),
+    ],
+)
+def test_what_is_not_as_written_is_refused(path, change, message):
+    rewrite(path, change)
+    with pytest.raises(DataError, match=message) as caught:
+        read_product(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_calibration_set_is_not_a_product(handmade):
+    with pytest.raises(DataError, match="walop-jax refit"):
+        read_product(handmade.write())
+
+
+def test_missing_truncated_and_alien_files(path, tmp_path):
+    with pytest.raises(DataError, match="no such file"):
+        read_product(tmp_path / "none.fits")
+    whole = path.read_bytes()
+    for length in (0, 100, 2880, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:length])
+        with pytest.raises(DataError):
+            read_product(path)
+    path.write_text("not FITS at all")
+    with pytest.raises(DataError, match="FITS"):
+        read_product(path)
+
+
+def test_flipped_bytes_never_change_the_answer(product, path):
+    whole = path.read_bytes()
+    rng = np.random.default_rng(11)
+    for place in rng.integers(0, len(whole), 150):
+        broken = bytearray(whole)
+        broken[place] ^= int(rng.integers(1, 256))
+        path.write_bytes(bytes(broken))
+        try:
+            back = read_product(path)
+        except DataError:
+            continue
+        assert back.content_hash() == product.content_hash()
+
+
+def test_an_existing_product_is_not_lost(product, path, monkeypatch):
+    before = path.read_bytes()
+    with pytest.raises(DataError, match="exists already"):
+        write_product(path, product)
+
+    def interrupted(*args, **kwargs):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(walop_jax.calibration.product, "sign_and_write", interrupted)
+    with pytest.raises(DataError, match="No space left"):
+        write_product(path, product, overwrite=True)
+    assert path.read_bytes() == before
+    assert [entry.name for entry in path.parent.glob("*calibration*")] == ["calibration.fits"]
+    assert not list(path.parent.glob(".walop-*"))
+
+
+def test_inputs_with_foreign_letters(product, tmp_path):
+    entry = dataclasses.replace(product.inputs[0], path=tmp_path / "Säugling Ω.fits")
+    write_product(tmp_path / "p.fits", dataclasses.replace(product, inputs=(entry,)))
+    shutil.move(tmp_path / "p.fits", tmp_path / "Straße.fits")
+    assert "S\\xe4ugling" in str(read_product(tmp_path / "Straße.fits").inputs[0].path)
+
+
+def test_shapes_are_checked(product):
+    with pytest.raises(ValueError, match="3 parameters"):
+        dataclasses.replace(product, covariance=np.eye(2))

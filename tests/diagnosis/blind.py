@@ -1,0 +1,352 @@
+"""A blind suite at the level of scores: thousands of hidden effects through the rules of `diagnose`, no refits.
+
+One design (a simulated calibration set, its Jacobian, the columns of every effect and pattern) spans a space of a
+thousand dimensions; what lies outside is pure noise. Scenes are drawn there: Gaussian noise plus an effect of known
+signal-to-noise ratio behind the projection. They go through the scoring, ranking and separating code of the package.
+Verdicts are written before the truths are opened.
+
+    PYTHONPATH=tests python tests/diagnosis/blind.py [scenes per effect and ratio] [OUT.json]
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import hashlib
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from walop_jax.data.records import CalibrationSet
+from walop_jax.diagnosis import naming
+from walop_jax.diagnosis.effect_columns import Probe, probes
+from walop_jax.diagnosis.examination import ALARM, Look
+from walop_jax.diagnosis.freeform import SINGLE, Measured
+from walop_jax.diagnosis.score import Candidate, Scorer, ScoreSpace, separations, whitening
+from walop_jax.diagnosis.workflow import MOST_STEPS
+from walop_jax.fit.refit import fit
+from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.model.effects import EFFECTS
+from walop_jax.model.specification import effect_context
+
+SEPARABLE = 5.0  # σ between the truth and its nearest rival above which a name is asked for
+CONFOUNDED = 2.0  # below which a class is asked for
+PLAUSIBLE = 5.0  # prior widths that a hidden amplitude may have
+DRAWS = 3000
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """What is hidden (effect names, or the label of an outside shape), and how it looks.
+
+    `coordinates` are the residuals in the space of all columns, `rest` the squared length of what lies outside.
+    `separation` is that of the truth from its nearest rival, by design.
+    """
+
+    kind: str
+    truth: tuple[str, ...]
+    ratio: float
+    coordinates: np.ndarray
+    rest: float
+    separation: float = np.inf
+    amplitudes: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    probe: str = ""
+    removed: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """What the rules say of a scene; `pulls` are those of the first name's amplitudes, for each of its probes."""
+
+    kind: str
+    named: tuple[str, ...]
+    classes: tuple[frozenset[str], ...]
+    first_probe: str = ""
+    amplitudes: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    covariance: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
+
+
+def outside(measured: Measured) -> Iterator[Candidate]:
+    """Shapes that are in no catalogue."""
+    e, points = measured.problem.calset.exposures, measured.problem.calset.points
+    shape = (len(points), len(e), 4)
+    r = np.hypot(points.x, points.y)
+    through = e.clp_in
+    angle = np.deg2rad(np.where(through, e.clp_angle, 0.0))
+    sky = (e.kind == "moon") & ~through
+    camera = np.eye(4)[:, None, None]
+    patterns = {
+        "ring": np.exp(-((r - 0.2) ** 2) / (2 * 0.03**2))[:, None, None] * camera[2],
+        "step": np.where(points.x > 0.05, 1.0, 0.0)[:, None, None] * camera[1],
+        "six times the angle": np.where(through, np.cos(6 * angle), 0.0)[None, :, None] * camera[0],
+        "hysteresis": np.where(through & (np.arange(len(e)) % 2 == 0), 1.0, 0.0)[None, :, None] * camera[3],
+        "sky gradient": (points.x / 0.3)[:, None, None] * sky[None, :, None] * (camera[0] - camera[1]),
+    }
+    for name, pattern in patterns.items():
+        yield measured.candidate(name, [np.broadcast_to(pattern, shape)])
+
+
+class Blind:
+    """A design made ready for drawing and judging scenes."""
+
+    def __init__(self, calset: CalibrationSet, seed: int = 1) -> None:
+        model = base_model(calset)
+        problem = Problem(calset, model)
+        result = fit(problem)
+        self.rng = np.random.default_rng(seed)
+        wanted = list(probes(EFFECTS, effect_context(model.template, calset.exposures)))
+        look = Look(problem, result, wanted, self.rng)
+        self.probes: list[Probe] = look.probes
+        self.effect_of = {p.name: p.effect.name for p in self.probes}
+        self.space, self.nuisance = look.space, look.common_mode
+        self.places = self.space.places()
+        self._whitening = whitening(self.space.gram)
+        self._root = self.space.gram @ self._whitening
+        self.dimension = self._root.shape[1]
+        self.outside = {}
+        for shape in outside(look.design.measured):
+            column = look.design.projector(look.design.stacked([shape.columns])[:, 0])
+            along = self._whitening.T @ (look.columns.T @ column)
+            self.outside[shape.name] = along, float(column @ column - along @ along)
+        self._scorers: dict[tuple[tuple[str, ...], tuple[str, ...]], tuple[Scorer, list[Probe]]] = {}
+        self.free = look.space.free
+        self.visible = sorted({p.effect.name for p in self.probes if look.table[p.name].testable})
+        self._testable = {p.name for p in self.probes if look.table[p.name].testable}
+
+    # ------------------------------------------------------------------------------------------ drawing scenes
+
+    def noise(self) -> tuple[np.ndarray, float]:
+        """Residuals of a set in which nothing is missing."""
+        return self.rng.standard_normal(self.dimension), float(self.rng.chisquare(self.free - self.dimension))
+
+    def null(self) -> Scene:
+        """Nothing missing."""
+        return Scene("null", (), 0.0, *self.noise())
+
+    def hidden(
+        self, name: str, ratio: float, removed: tuple[str, ...] = (), kind: str = "named"
+    ) -> Scene | None:
+        """A named effect at a random shape and direction; None when no plausible amplitude reaches the ratio."""
+        shapes = [p for p in self.probes if p.effect.name == name and p.name in self._testable]
+        for _ in range(100):
+            probe = shapes[self.rng.integers(len(shapes))]
+            at, alive = self.places[probe.name], self.space.alive()[self.places[probe.name]]
+            gram = self.space.gram[at, at]
+            step = self.rng.standard_normal(len(alive)) * self.space.widths[at] * alive
+            step *= ratio / np.sqrt(step @ gram @ step)
+            step = np.where(probe.one_sided, np.abs(step), step)
+            if np.isclose(step @ gram @ step, ratio**2) and np.all(
+                np.abs(step) <= PLAUSIBLE * self.space.widths[at]
+            ):
+                break
+        else:
+            return None
+        change = -self.space.gram[:, at] @ step
+        rivals = [p for p in self.probes if p.effect.name not in (name, *removed)]
+        distance = separations(self.space.subset([p.name for p in rivals]), *self._of(change, rivals, ratio))
+        z, rest = self.noise()
+        return Scene(
+            kind, (name,), ratio, z + self._whitening.T @ change, rest, min(distance.values()), step, probe.name,
+            removed,
+        )  # fmt: skip
+
+    def _of(self, change: np.ndarray, rivals: Sequence[Probe], ratio: float) -> tuple[np.ndarray, float]:
+        return change[self.space.chosen([p.name for p in rivals])], ratio**2
+
+    def pair(self, ratio: float) -> Scene:
+        """Two effects, each with the signal-to-noise ratio that is asked for by itself."""
+        a = b = None
+        while a is None or b is None:
+            first, second = self.rng.choice(len(self.visible), 2, replace=False)
+            a = self.hidden(self.visible[first], ratio)
+            b = self.hidden(self.visible[second], ratio)
+        z, rest = self.noise()
+        signal = [
+            -self._whitening.T @ self.space.gram[:, self.places[s.probe]] @ s.amplitudes for s in (a, b)
+        ]
+        truth = (*a.truth, *b.truth)
+        return Scene("pair", truth, ratio, z + signal[0] + signal[1], rest, min(a.separation, b.separation))
+
+    def strange(self, name: str, ratio: float) -> Scene:
+        """A shape that is in no catalogue."""
+        along, beyond = self.outside[name]
+        length = np.sqrt(along @ along + beyond)
+        sign = self.rng.choice([-1.0, 1.0])
+        z, rest = self.noise()
+        beyond = beyond * (ratio / length) ** 2
+        rest += beyond + 2 * np.sqrt(beyond) * self.rng.standard_normal()
+        return Scene("outside", (name,), ratio, z + sign * along * ratio / length, max(rest, 0.0))
+
+    # --------------------------------------------------------------------------------------------------- judging
+
+    def _scorer(self, added: tuple[str, ...], removed: tuple[str, ...]) -> tuple[Scorer, list[Probe]]:
+        if (added, removed) not in self._scorers:
+            space = self._space(added)
+            gone = {self.effect_of[a] for a in added} | set(removed)
+            left = [p for p in self.probes if p.effect.name not in gone]
+            names = [p.name for p in left] + [n for n in space.names if n not in self.effect_of]
+            draws = np.random.default_rng(7)
+            self._scorers[added, removed] = Scorer(space.subset(names), draws, DRAWS), left
+        return self._scorers[added, removed]
+
+    def _space(self, added: tuple[str, ...]) -> ScoreSpace:
+        space = self.space.with_base([SINGLE], self.nuisance)[0]
+        return space.with_base(list(added))[0] if added else space
+
+    def _reduced(self, s: np.ndarray, square: float, added: tuple[str, ...]) -> tuple[np.ndarray, float]:
+        space, reduce = self.space.with_base([SINGLE], self.nuisance)
+        s, square = reduce(s, square)
+        return space.with_base(list(added))[1](s, square) if added else (s, square)
+
+    def judge(self, scene: Scene) -> Verdict:
+        """The workflow's rules with linear steps in place of refits."""
+        s0 = self._root @ scene.coordinates
+        square0 = float(scene.coordinates @ scene.coordinates) + scene.rest
+        added: list[str] = []
+        classes: list[frozenset[str]] = []
+        first: naming.Ranked | None = None
+        while True:
+            scorer, left = self._scorer(tuple(added), scene.removed)
+            s, square = self._reduced(s0, square0, tuple(added))
+            table = scorer(s[self.space.chosen(scorer.space.names)], square)
+            if table.p_global >= ALARM or len(added) >= MOST_STEPS:
+                break
+            patterns = [s.log_bayes for s in table.scores if s.testable and s.name not in self.effect_of]
+            least = min(0.0, max(patterns))
+            ranked = [
+                r
+                for r in naming.rank(table, left)
+                if table.corrected(r.score) < ALARM and r.log_bayes > least
+            ]
+            if not ranked:
+                break
+            best = ranked[0]
+            first = first or best
+            close = {r.effect.name for r in ranked[1:] if best.log_bayes - r.log_bayes < naming.EVEN_ODDS}
+            classes.append(frozenset(close | self._rivals(scorer.space, best, left)))
+            added.append(best.probe.name)
+        kind = "unexplained" if table.p_global < ALARM else "effect_found" if added else "consistent"
+        names = tuple(self.effect_of[a] for a in added)
+        if first is None:
+            return Verdict(kind, names, tuple(classes))
+        score = first.score
+        return Verdict(kind, names, tuple(classes), first.probe.name, score.amplitudes, score.covariance)
+
+    def _rivals(self, space: ScoreSpace, best: naming.Ranked, left: Sequence[Probe]) -> set[str]:
+        at = space.places()[best.probe.name]
+        change = space.gram[:, at] @ best.score.amplitudes
+        others = [p.name for p in left if p.effect is not best.effect]
+        length = float(best.score.amplitudes @ space.gram[at, at] @ best.score.amplitudes)
+        found = separations(space.subset(others), change[space.chosen(others)], length)
+        return {self.effect_of[name] for name, d in found.items() if d < naming.SEPARATION}
+
+
+def study(
+    blind: Blind, each: int, ratios: Sequence[float] = (6.0, 10.0, 30.0), nulls: int = 200
+) -> dict[str, object]:
+    """Draw scenes, judge them, then open the truths: the numbers of the acceptance list."""
+    scenes = [blind.null() for _ in range(nulls)]
+    for name in blind.visible:
+        drawn = [blind.hidden(name, ratio) for ratio in ratios for _ in range(each)]
+        drawn += [blind.hidden(name, ratio, (name,), "removed") for ratio in ratios[1:] for _ in range(each)]
+        scenes += [scene for scene in drawn if scene is not None]
+    scenes += [blind.pair(10.0) for _ in range(each * len(blind.visible) // 2)]
+    for shape in blind.outside:
+        for ratio in (10.0, 30.0):
+            scenes += [blind.strange(shape, ratio) for _ in range(2 * each)]
+    order = blind.rng.permutation(len(scenes))
+    sealed = _seal([scenes[i] for i in order])
+    verdicts = [blind.judge(scenes[i]) for i in order]
+    opened = [scenes[i] for i in order]
+    if _seal(opened) != sealed:
+        raise RuntimeError("the truths changed while the verdicts were made")
+    return summarise(list(zip(opened, verdicts, strict=True)))
+
+
+def _seal(scenes: Sequence[Scene]) -> bytes:
+    return hashlib.sha256(json.dumps([(s.kind, s.truth) for s in scenes]).encode()).digest()
+
+
+def summarise(judged: Sequence[tuple[Scene, Verdict]]) -> dict[str, object]:
+    """Rates over judged scenes, and the confusion of names."""
+    rates: dict[str, list[bool]] = collections.defaultdict(list)
+    pulls: list[float] = []
+    confusion: collections.Counter[tuple[str, str]] = collections.Counter()
+    for scene, verdict in judged:
+        said = "+".join(verdict.named) + f" [{verdict.kind}]"
+        ratio = f"{scene.ratio:g}"
+        found = verdict.kind == "effect_found"
+        if scene.kind == "null":
+            rates["false alarm"].append(verdict.kind != "consistent")
+        elif scene.kind == "outside":
+            rates[f"outside: unexplained, SNR {ratio}"].append(verdict.kind == "unexplained")
+            rates[f"outside: unexplained, SNR {ratio}, {scene.truth[0]}"].append(
+                verdict.kind == "unexplained"
+            )
+            if verdict.kind != "unexplained":
+                confusion[f"outside: {scene.truth[0]}", said] += 1
+        elif scene.kind == "removed":
+            if scene.separation >= SEPARABLE:
+                rates[f"removed: given another name, SNR {ratio}, separable"].append(found)
+                if found:
+                    confusion[f"removed: {scene.truth[0]}", said] += 1
+        elif scene.kind == "pair":
+            if scene.separation >= SEPARABLE:
+                rates["pair: both named, SNR 10 each, separable"].append(
+                    set(scene.truth) == set(verdict.named)
+                )
+                told = set(verdict.named).union(*verdict.classes)
+                rates["pair: both named or in a class"].append(set(scene.truth) <= told)
+                if set(scene.truth) != set(verdict.named):
+                    confusion["pair: " + " and ".join(scene.truth), said] += 1
+        else:
+            truth = scene.truth[0]
+            first = verdict.named[0] if verdict.named else verdict.kind
+            told = frozenset(verdict.named[:1]).union(*verdict.classes[:1])
+            rates[f"detected, SNR {ratio}"].append(verdict.kind != "consistent")
+            wrong = found and truth not in told
+            rates[f"confident and wrong, SNR {ratio}"].append(wrong)
+            if scene.separation >= SEPARABLE:
+                rates[f"top-1 right, SNR {ratio}, separable"].append(first == truth)
+                rates[f"exactly the truth, SNR {ratio}, separable"].append(
+                    verdict.named == (truth,) and found
+                )
+            elif scene.separation < CONFOUNDED:
+                rates[f"a class with the truth in it, SNR {ratio}, confounded"].append(
+                    truth in told and len(told) > 1
+                )
+            if first != truth:
+                confusion[
+                    f"{truth}, SNR {ratio}", f"{first} [{verdict.kind}]" + (" CLASS" if truth in told else "")
+                ] += 1
+            elif verdict.first_probe == scene.probe:
+                sigma = np.sqrt(np.diag(verdict.covariance))
+                alive = sigma > 0
+                pulls += ((verdict.amplitudes - scene.amplitudes)[alive] / sigma[alive]).tolist()
+    return {
+        "rates": {name: (float(np.mean(v)), len(v)) for name, v in sorted(rates.items())},
+        "amplitude pulls": {"rms": float(np.sqrt(np.mean(np.square(pulls)))), "count": len(pulls)},
+        "confusion": [(t, n, c) for (t, n), c in confusion.most_common(60)],
+    }
+
+
+def main(each: int, output: Path | None) -> None:
+    """Run the study on a simulated set and print its numbers."""
+    from walop_jax.simulation.observing_plan import ObservingPlan
+    from walop_jax.simulation.simulate import simulate
+
+    simulated, _ = simulate(ObservingPlan(), seed=20260)
+    text = json.dumps(study(Blind(simulated), each), indent=1, ensure_ascii=False)
+    print(text)
+    if output is not None:
+        output.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 10, Path(sys.argv[2]) if len(sys.argv) > 2 else None)

@@ -1,0 +1,140 @@
+"""Names that are not needed in the end: nothing of what is told refers to them, and strong effects are explained."""
+
+import dataclasses
+import itertools
+from types import SimpleNamespace
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+
+from walop_jax.diagnosis import naming, workflow
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.examination import Look
+from walop_jax.diagnosis.figure_data import pictures
+from walop_jax.diagnosis.findings import Unexplained
+from walop_jax.diagnosis.workflow import diagnose
+from walop_jax.fit.refit import FitResult, fit
+from walop_jax.likelihood.problem import Problem
+from walop_jax.model.effects import FreeForm, effect_by_name
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
+
+# That of test_judging.py: the two share compiled code.
+PLAN = ObservingPlan(
+    grid=6, standard_grid=2, polariser_angles=polariser_turn(12), moon_patches=4, standards=4
+)
+ZERO, WOBBLE, LEAKAGE, DRIFT = map(
+    effect_by_name, ("clp_zero", "clp_wobble", "camera_leakage", "camera_gain_drift")
+)
+
+
+def diagnosed(effects, catalogue, seed=1):
+    """A diagnosis of a simulated set, and what it told on the way."""
+    calset, _ = simulate(PLAN, seed=seed, effects=effects)
+    told = []
+    found = diagnose(calset, catalogue=catalogue, progress=told.append)
+    return found, told
+
+
+def lead_from_the_first_fit_to_the_last(found):
+    ends = [found.before.chi2, *(step.chi2_after for step in found.steps)]
+    assert [step.chi2_before for step in found.steps] == ends[:-1]
+    assert ends[-1] == found.after.chi2
+    for one, next_one in itertools.pairwise(found.steps):
+        assert one.heldout_after.mean == next_one.heldout_before.mean
+        np.testing.assert_array_equal(one.residual_after, next_one.residual_before)
+    ladder = pictures(found).ladder
+    assert list(ladder.model) == ["starting model", *(step.effect for step in found.steps)]
+    assert (ladder.dof[0], ladder.dof[-1]) == (found.before.dof, found.after.dof)
+    return True
+
+
+@pytest.fixture(scope="module")
+def strong():
+    """An encoder error of 3°, thirty times the usual: a zero point is named first."""
+    found, told = diagnosed([dataclasses.replace(WOBBLE(), amplitude=3.0)], (ZERO, WOBBLE))
+    assert "added clp_zero; scoring what is left" in told
+    assert "clp_zero is no longer needed" in told
+    return found
+
+
+def test_a_strong_effect_is_explained_to_within_the_noise(strong):
+    """The prior of an amplitude that lies thirty widths away neither counts as a misfit nor pulls at the value."""
+    assert strong.verdict == "effect_found"
+    assert strong.after.trusted
+    assert strong.after.chi2 / strong.after.dof == pytest.approx(1.0, abs=0.12)
+    value, sigma, _ = strong.steps[0].parameters["amplitude"]
+    assert abs(value - 3.0) < 3 * sigma
+    assert strong.steps[0].far == {"amplitude": pytest.approx(10 * value)}
+    assert "clp_wobble.amplitude (30 widths)" in strong.caution
+
+
+def test_after_a_drop_the_steps_tell_of_models_without_the_dropped_name(strong):
+    assert [step.effect for step in strong.steps] == ["clp_wobble"]
+    assert lead_from_the_first_fit_to_the_last(strong)
+
+
+def test_a_dropped_effect_is_one_of_those_not_found(strong):
+    assert "clp_zero" in {limit.effect for limit in strong.limits}
+    assert "clp_zero" in strong.steps[0].separation
+
+
+class Rehearsal(workflow._Diagnosing):
+    """A diagnosis with parts played by dummies: something is missing as long as a name stands that is not needed."""
+
+    def __init__(self):
+        self.calset, self.catalogue, self.problem = SimpleNamespace(points=()), (), Mock(spec=Problem)
+        self.fit = Mock(spec=FitResult, explains_data=True)
+        self.steps = ["name"]
+        self.tell = lambda text: None
+
+    def _look(self, earlier=None):
+        look = Mock(spec=Look, alarm=bool(self.steps), design=Mock(spec=Design))
+        look.table = SimpleNamespace(p_global=float(not self.steps))
+        look.summary.return_value = look.limits.return_value = look.untestable.return_value = ()
+        return look
+
+    def _add_best(self, look):
+        return None
+
+    def _drop_what_is_not_needed(self):
+        dropped, self.steps = bool(self.steps), []
+        return dropped
+
+    def _unexplained(self, look):
+        return Unexplained(look.table.p_global, "", ())
+
+
+def test_what_has_no_name_is_asked_of_the_model_without_needless_names():
+    found = Rehearsal().run(0.0)
+    assert (found.verdict, found.unexplained, found.remaining_p) == ("consistent", None, 1.0)
+
+
+@pytest.mark.long
+def test_after_a_drop_several_steps_follow_one_another():
+    effects = [dataclasses.replace(WOBBLE(), amplitude=3.0), dataclasses.replace(LEAKAGE(), share=1e-3)]
+    found, told = diagnosed(effects, (ZERO, WOBBLE, LEAKAGE))
+    assert "clp_zero is no longer needed" in told
+    assert [step.effect for step in found.steps] == ["clp_wobble", "camera_leakage"]
+    assert lead_from_the_first_fit_to_the_last(found)
+    model = naming.without(found.after.model, "camera_leakage")
+    alone = fit(Problem(found.problem.calset, model))
+    assert found.steps[0].chi2_after == pytest.approx(alone.chi2, rel=1e-6)
+    assert [list(step.far) for step in found.steps] == [["amplitude"], []]
+
+
+@pytest.mark.long
+def test_what_has_no_name_is_told_without_the_name_that_stood_in_for_it():
+    """Gains that differ from exposure to exposure: by chance they look like a drift."""
+    pattern = FreeForm.of(PLAN.context(), blocks=("exposures",))
+    gains = np.abs(1e-3 * np.random.default_rng(3).standard_normal(pattern.exposures.shape))
+    found, told = diagnosed([dataclasses.replace(pattern, exposures=gains)], (DRIFT,), seed=3)
+    assert "camera_gain_drift is no longer needed" in told
+    assert found.verdict == "unexplained"
+    assert not found.steps
+    assert found.unexplained.term == ("exposures",)
+    assert found.unexplained.chi2_before == pytest.approx(found.before.chi2, rel=1e-9)
+    assert found.unexplained.chi2_after == found.after.chi2
+    assert found.unexplained.p_value == pytest.approx(found.p_value, rel=0.5)
+    assert list(pictures(found).ladder.model) == ["starting model", "free_form"]

@@ -1,0 +1,171 @@
+"""What a diagnosis weighs: evidence, consequences, limits, robust errors, and what stays without a name."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from walop_jax.diagnosis import naming
+from walop_jax.diagnosis.change_of_stokes import largest_change
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.examination import upper_limit
+from walop_jax.diagnosis.findings import Diagnosis
+from walop_jax.diagnosis.freeform import Measured, block_of, strata
+from walop_jax.diagnosis.workflow import diagnose
+from walop_jax.fit.refit import fit
+from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.model.effects import FreeForm, effect_by_name
+from walop_jax.model.effects.free_form import BLOCKS
+from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
+
+PLAN = ObservingPlan(
+    grid=6, standard_grid=2, polariser_angles=polariser_turn(12), moon_patches=4, standards=4
+)
+
+
+@pytest.fixture(scope="module")
+def leaking():
+    """A set with some leakage, its fit without and with that effect, and the context."""
+    effect = dataclasses.replace(effect_by_name("camera_leakage")(), share=4e-4)
+    calset, _ = simulate(PLAN, seed=8, effects=[effect])
+    model = base_model(calset)
+    context = effect_context(model.template, calset.exposures)
+    base = fit(Problem(calset, model))
+    problem = Problem(calset, with_effects(model, ["camera_leakage"], context))
+    return calset, context, base, problem, fit(problem)
+
+
+def test_density_at_neutral_is_the_evidence_of_two_fits(leaking):
+    """Savage–Dickey against Laplace evidence of the models with and without: both Gaussian, so alike."""
+    _, context, base, _, extended = leaking
+    by_fits = naming.log_evidence_ratio(base, extended)
+    assert by_fits > 5.0
+    assert naming.evidence_of_presence(extended, "camera_leakage", context) == pytest.approx(by_fits, abs=0.5)
+
+
+def test_signature_is_what_taking_the_effect_away_does(leaking):
+    """To first order, the effect's column times its amplitude."""
+    calset, context, base, problem, extended = leaking
+    probe = effect_by_name("camera_leakage").probes(context)[0]
+    bare = Problem(calset, base.model, probes=probe)
+    kept = [extended.model.index(name) for name in base.model.names]
+    column = bare.effect_columns(extended.values[kept], probe)[:, 0]
+    share, _ = extended.value("camera_leakage.share")
+    found = naming.signature(problem, extended, "camera_leakage", context)
+    np.testing.assert_allclose(found, -column * share, atol=2e-2 * np.abs(found).max())
+
+
+def test_taking_it_out_again_gives_the_fit_without(leaking):
+    calset, _, base, _, extended = leaking
+    _, again = naming.refit_without(calset, extended, "camera_leakage")
+    assert again.model.names == base.model.names
+    assert again.chi2 == pytest.approx(base.chi2, abs=1e-3)
+
+
+def test_a_prior_is_widened_only_where_the_data_refute_it(leaking):
+    *_, extended = leaking
+    model, at = extended.model, extended.model.index("camera_leakage.share")
+    mean, width = model.parameters[at].prior
+    for away, expected in ((3.9, width), (-3.9, width), (12.0, 12.0 * width), (-12.0, 12.0 * width)):
+        values = extended.values.copy()
+        values[at] = mean + away * width
+        wide = naming.with_refuted_priors_widened(model, values, "camera_leakage")
+        assert wide["camera_leakage.share"].prior == (mean, pytest.approx(expected))
+        assert wide.change("camera_leakage.share", prior=(mean, width)) == model
+        beyond = naming.beyond_prior(
+            dataclasses.replace(extended, model=wide, values=values), "camera_leakage"
+        )
+        assert beyond == ({"share": pytest.approx(12.0)} if abs(away) > 4.0 else {})
+
+
+def test_robust_errors_are_the_stated_ones_when_noise_is_as_stated(leaking):
+    design = Design.of(*leaking[3:])
+    assert 0.6 < design.robust_ratio("camera_leakage") < 1.5
+    assert np.isnan(design.robust_ratio("ghost"))
+
+
+def test_robust_errors_see_disturbances_of_whole_exposures(leaking):
+    """Each exposure pulls the magnification by five times what noise lets it."""
+    design = Design.of(*leaking[3:])
+    column = design.without("pupil")[1][: design.rows, 0]
+    length = np.sqrt(np.bincount(design.exposure, column**2))
+    pull = 5.0 * np.random.default_rng(4).choice([-1.0, 1.0], length.size) / length
+    disturbed = design.residual.copy()
+    disturbed[: design.rows] += pull[design.exposure] * column
+    assert dataclasses.replace(design, residual=design.projector(disturbed)).robust_ratio("pupil") > 2.0
+
+
+def test_patterns_do_not_know_the_noise(leaking):
+    """Columns of two sets that differ by nothing but their noise differ by no more than their fits do."""
+    calset, _, base, _, _ = leaking
+    other, _ = simulate(
+        PLAN,
+        seed=8,
+        effects=[dataclasses.replace(effect_by_name("camera_leakage")(), share=4e-4)],
+        noiseless=True,
+    )
+    ours, exact = (Measured(Problem(s, base.model), base.values).level for s in (calset, other))
+    np.testing.assert_allclose(ours, exact, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("value", "sigma"), [(0.0, 1.0), (2.0, 0.5), (-1.5, 1.0)])
+def test_limits_against_integrals(value, sigma):
+    """95 % of a flat-prior posterior below the limit: of |a|, or of a > 0."""
+    posterior = stats.norm(value, sigma).pdf
+    two = upper_limit(value, sigma, one_sided=False)
+    assert integrate.quad(posterior, -two, two)[0] == pytest.approx(0.95, abs=1e-6)
+    one = upper_limit(value, sigma, one_sided=True)
+    inside, whole = (integrate.quad(posterior, 0, end)[0] for end in (one, value + 12 * sigma))
+    assert inside / whole == pytest.approx(0.95, abs=1e-6)
+
+
+def test_consequences_by_hand():
+    """An ideal instrument; a constant of 0.001 in q moves q by that, 1 % less efficiency moves 5 % by 0.05 %."""
+    ideal = np.array([[[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]])
+    assert largest_change(ideal, ideal) == 0.0
+    offset, weak = ideal.copy(), ideal.copy()
+    offset[0, 0, 0] = 1e-3
+    weak[0, 0, 1] = 0.99
+    assert largest_change(ideal, offset) == pytest.approx(1e-3)
+    assert largest_change(ideal, weak) == pytest.approx(5e-4)
+    blind = np.array([[[0.0, 1.0, 0.0], [0.0, 1.0, 0.01]]])
+    assert np.isnan(largest_change(blind, offset))
+
+
+def test_every_block_of_the_free_form_term_answers_to_a_stratum(leaking):
+    _, _, _, problem, extended = leaking
+    names = [candidate.name for candidate in strata(Measured(problem, extended.values))]
+    assert {block_of(name) for name in names} == {*BLOCKS, None}
+
+
+def test_many_names_and_weak_errors_call_for_caution():
+    def caution(*steps, far=None):
+        named = [SimpleNamespace(effect=name, robust_ratio=ratio, far=far or {}) for name, ratio in steps]
+        problem = SimpleNamespace(calset=SimpleNamespace(points=range(9)))
+        return Diagnosis.caution.fget(SimpleNamespace(steps=named, problem=problem, points=9))
+
+    assert caution() == caution(("a", 1.1), ("b", float("nan"))) == ""
+    assert "3 names" in caution(*((name, 1.0) for name in "abc"))
+    assert "errors of a" in caution(("a", 2.0))
+    assert "a.angle (6 widths)" in caution(("a", 1.0), far={"angle": 6.1})
+
+
+@pytest.mark.long
+def test_what_has_no_name_stays_unexplained_and_is_carried_along():
+    """Fine structure of one camera, nothing that the catalogue has: described, taken up, not named."""
+    context = effect_context(base_model(simulate(PLAN, seed=1).calset).template, PLAN.exposures())
+    rng = np.random.default_rng(2)
+    pattern = FreeForm.of(context, blocks=("harmonics",))
+    waves = np.zeros(pattern.harmonics.shape)
+    waves[0, 2] = 4e-4 * rng.standard_normal(waves[0, 2].shape)  # four times the angle, camera O1
+    calset, _ = simulate(PLAN, seed=5, effects=[dataclasses.replace(pattern, harmonics=waves)])
+    found = diagnose(calset)
+    assert found.verdict == "unexplained"
+    assert "4θ of O1" in found.unexplained.description
+    assert "harmonics" in found.unexplained.term
+    assert found.unexplained.chi2_after < found.unexplained.chi2_before
+    assert found.after.explains_data

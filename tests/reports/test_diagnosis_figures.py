@@ -1,0 +1,91 @@
+"""Figures of a diagnosis show what they say: one symmetric scale, the dots and lines of the arrays."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import handmade_run
+import numpy as np
+import pytest
+from matplotlib.collections import PatchCollection
+
+from walop_jax.reports import diagnosis_figures as figures
+from walop_jax.reports import product_figures
+
+
+def tiles(figure) -> list[PatchCollection]:
+    return [c for axis in figure.axes for c in axis.collections if isinstance(c, PatchCollection)]
+
+
+def test_residual_maps_share_one_symmetric_scale():
+    pictures = handmade_run.pictures()
+    one = pictures.comparisons[1]
+    figure = figures.residual_maps(pictures.points, {"before": one.before, "after": one.after})
+    maps = tiles(figure)
+    assert len(maps) == 8
+    # The largest residual by hand: −6 in camera E2, without the effect.
+    assert {shown.get_clim() for shown in maps} == {(-6.0, 6.0)}
+    for k in range(4):
+        np.testing.assert_array_equal(maps[k].get_array(), one.before[:, k])
+        np.testing.assert_array_equal(maps[4 + k].get_array(), one.after[:, k])
+    signs = [
+        [text.get_text() for text in axis.texts if len(text.get_text()) == 1] for axis in figure.axes[:8]
+    ]
+    assert signs == [[], [], ["+"], ["−"], [], [], [], []]  # 1.5, 3.0, 4.5 and −6.0 σ at one corner
+
+
+def test_points_without_data_are_left_out():
+    pictures = handmade_run.pictures()
+    before = pictures.comparisons[1].before.copy()
+    before[4] = np.nan
+    shown = tiles(figures.residual_maps(pictures.points, {"": before}))[0]
+    assert len(shown.get_array()) == 8
+    figures.residual_maps(pictures.points, {"": np.full((9, 4), np.nan)})
+
+
+@pytest.mark.parametrize(
+    ("harmonic", "abscissa"), [(3, "polariser angle (deg)"), (-1, "time since the first exposure (h)")]
+)
+def test_signature_lies_beside_the_data(harmonic, abscissa):
+    pictures = handmade_run.pictures()
+    out = dataclasses.replace(pictures.exposures, clp_angle=np.full(8, np.nan))
+    one = dataclasses.replace(pictures.comparisons[1], harmonic=harmonic)
+    figure = figures.signature_figure(one, pictures.exposures if harmonic > 0 else out)
+    assert figure.axes[4].get_xlabel() == abscissa
+    for k, axis in enumerate(figure.axes[:4]):
+        effect = next(line for line in axis.lines if line.get_label() == "effect")
+        np.testing.assert_allclose(effect.get_ydata(), one.curve_explained[:, k])
+        dots = axis.containers[0].lines[0]
+        np.testing.assert_allclose(dots.get_ydata(), one.curve_before[:, k])
+        x = 22.5 * np.arange(8) if harmonic > 0 else 0.24 * np.arange(8)
+        np.testing.assert_allclose(dots.get_xdata(), x, atol=1e-6)
+
+
+def test_exposures_at_one_angle_are_averaged():
+    pictures = handmade_run.pictures()
+    angle = np.repeat([0.0, 45.0, 90.0, 135.0], 2)
+    figure = figures.signature_figure(
+        pictures.comparisons[1], dataclasses.replace(pictures.exposures, clp_angle=angle)
+    )
+    dots = figure.axes[0].containers[0].lines[0]
+    np.testing.assert_allclose(
+        dots.get_ydata(), pictures.comparisons[1].curve_before[:, 0].reshape(4, 2).mean(axis=1)
+    )
+
+
+def test_ladder_shows_chi2_per_degree_of_freedom():
+    figure = figures.ladder_figure(handmade_run.pictures().ladder)
+    axis = figure.axes[0]
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["starting model", "+ clp_wobble"]
+    assert [text.get_text() for text in axis.texts] == ["1.625", "1.029"]
+
+
+def test_maps_of_a_product_are_those_of_the_file():
+    maps = handmade_run.product().maps
+    figure = product_figures.matrix_maps_figure(maps)
+    first = figure.axes[0].images[0]
+    np.testing.assert_allclose(first.get_array(), 100.0 * maps.values[0])
+    assert first.get_clim() == pytest.approx((-3.0, 3.0))  # −3 to 2 per cent, symmetric
+    assert first.get_extent() == pytest.approx((-0.25, 0.25, -0.25, 0.25))
+    errors = product_figures.matrix_errors_figure(maps)
+    np.testing.assert_allclose(errors.axes[5].images[0].get_array(), 0.02)

@@ -1,0 +1,116 @@
+"""Figures show what they say: numbers behind them are checked, pictures are drawn without a screen."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import threading
+
+import numpy as np
+import pytest
+from matplotlib import pyplot
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.diagnosis.figure_data import pictures
+from walop_jax.diagnosis.findings import Diagnosis
+from walop_jax.fit.refit import fit
+from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.reports import figures
+from walop_jax.reports.diagnosis_figures import signature_figure
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
+
+PLAN = ObservingPlan(grid=4, standard_grid=2, polariser_angles=polariser_turn(8), moon_patches=4, standards=3)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    calset, _ = simulate(PLAN, 1)
+    problem = Problem(calset, base_model(calset))
+    result = fit(problem)
+    return problem, result, Calibration.from_fit(result, problem)
+
+
+def drawn(figure) -> bytes:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png")
+    return stream.getvalue()
+
+
+def test_residuals_of_points_are_noise_after_a_fit(fitted):
+    problem, result, _ = fitted
+    after = figures.point_residuals(problem, result.values)
+    assert after.shape == (16 + 4,)
+    assert np.sqrt(np.nanmean(after**2)) == pytest.approx(1.0, abs=0.15)
+    assert figures.point_residuals(problem, problem.model.start).min() > 5.0
+
+
+def test_every_figure_can_be_drawn(fitted):
+    problem, result, calibration = fitted
+    made = {
+        "calibration": figures.calibration_figure(problem, calibration),
+        "matrix": figures.matrix_figure(calibration),
+        "residual": figures.residual_figure(problem, problem.model.start, result.values),
+        "modulation": figures.modulation_figure(problem.calset, [0, 5]),
+    }
+    for name, figure in made.items():
+        assert drawn(figure).startswith(b"\x89PNG"), name
+    assert pyplot.get_fignums() == []  # nothing was registered with the global state
+
+
+def test_maps_show_the_matrix(fitted):
+    _, _, calibration = fitted
+    figure = figures.matrix_figure(calibration)
+    low_x, high_x, low_y, high_y = calibration.field
+    corner, _ = calibration.matrix(np.array([low_x, high_x]), np.array([low_y, high_y]))
+    for k, axis in enumerate(figure.axes[:6]):
+        image = np.asarray(axis.images[0].get_array())
+        scale = 100.0 if k in (0, 3) else 1.0
+        np.testing.assert_allclose([image[0, 0], image[-1, -1]], scale * corner[:, k], rtol=1e-9)
+
+
+def test_modulation_is_that_of_the_data(fitted):
+    problem, _, _ = fitted
+    figure = figures.modulation_figure(problem.calset, [3])
+    block = problem.calset.intensities.block(3, 4)
+    clp = problem.calset.exposures.clp_in
+    n = block.counts[0, clp]
+    for axis, pair in zip(figure.axes, (0, 2), strict=True):
+        shown = axis.lines[1].get_ydata()
+        np.testing.assert_allclose(shown, (n[:, pair] - n[:, pair + 1]) / (n[:, pair] + n[:, pair + 1]))
+
+
+def test_pictures_of_a_diagnosis_hold_its_residuals(fitted):
+    problem, result, _ = fitted
+    start = dataclasses.replace(result, values=problem.model.start)
+    found = Diagnosis(
+        verdict="consistent", steps=(), candidates=(), limits=(), untestable=(), unexplained=None, p_value=0.5,
+        remaining_p=0.5, before=start, after=result, problem=problem, seconds=0.0, points=20,
+    )  # fmt: skip
+    made = pictures(found)
+    before, after = (problem.residuals(values)[1] for values in (problem.model.start, result.values))
+    for group in ("camera", "kind", "filter", "exposure"):
+        rows = made.shares.group == group
+        assert made.shares.before[rows].sum() == pytest.approx((before**2).sum())
+        assert made.shares.after[rows].sum() == pytest.approx((after**2).sum())
+        assert made.shares.expected[rows].sum() == pytest.approx(3.0 * problem.used.sum())
+    assert made.ladder.chi2.tolist() == [result.chi2]
+    (whole,) = made.comparisons
+    rows = problem.used.sum(axis=1)[:, None]
+    np.testing.assert_allclose(whole.rms_after**2 * rows, (after**2).sum(axis=1), rtol=1e-9)
+    assert drawn(signature_figure(whole, made.exposures)).startswith(b"\x89PNG")
+
+
+def test_figures_may_be_made_in_threads(fitted):
+    problem, _, _ = fitted
+    made: list[bytes] = []
+    threads = [
+        threading.Thread(target=lambda: made.append(drawn(figures.modulation_figure(problem.calset, [0]))))
+        for _ in range(2)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(made) == 2
+    assert made[0] == made[1]

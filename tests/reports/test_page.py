@@ -1,0 +1,319 @@
+"""The page about a run: whole by itself, true to the files, honest about what is missing."""
+
+from __future__ import annotations
+
+import json
+import re
+from html.parser import HTMLParser
+
+import handmade_run
+import numpy as np
+import pytest
+
+from walop_jax.io.errors import DataError
+from walop_jax.io.plain_tables import write_columns
+from walop_jax.reports.page import render
+from walop_jax.reports.run import read_run
+from walop_jax.reports.wording import digits, probability, verdict_of_diagnosis
+
+VOID = {"meta", "img", "br", "link", "hr", "input"}
+
+
+class Page(HTMLParser):
+    """Checks that tags nest; keeps texts, headings, table rows and what is referred to."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.text = ""
+        self.headings: list[str] = []
+        self.rows: list[list[str]] = []
+        self.references: list[str] = []
+        self.ids: list[str] = []
+        self.images: list[dict[str, str | None]] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        self.references += [given[name] for name in ("src", "href", "srcset", "data") if given.get(name)]
+        self.ids += [given["id"]] if "id" in given else []
+        if tag == "img":
+            self.images.append(given)
+        if tag not in VOID:
+            self.open.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+        if tag in ("h2", "h3"):
+            self.headings.append("")
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if "style" in self.open:
+            return
+        self.text += data
+        if self.open and self.open[-1] in ("td", "th"):
+            self.rows[-1][-1] += data
+        if {"h2", "h3"} & set(self.open):
+            self.headings[-1] += data
+
+    def row(self, name: str) -> list[str]:
+        """The first row of any table that begins with `name`."""
+        return next(row for row in self.rows if row and row[0] == name)
+
+
+def number(text: str) -> float:
+    return float(text.replace("−", "-"))
+
+
+@pytest.fixture(scope="module")
+def diagnosed(tmp_path_factory):
+    folder = handmade_run.make_diagnosis(tmp_path_factory.mktemp("runs") / "a <i>run")
+    return render(read_run(folder))
+
+
+@pytest.fixture(scope="module")
+def refitted(tmp_path_factory):
+    return render(read_run(handmade_run.make_refit(tmp_path_factory.mktemp("runs") / "run")))
+
+
+def test_page_stands_by_itself(diagnosed, refitted):
+    for text in (diagnosed, refitted):
+        page = Page(text)
+        for reference in page.references:
+            inside = reference.startswith("data:image/") or reference.removeprefix("#") in page.ids
+            assert inside, reference[:80]
+        outside = re.sub(r"data:image/[^\"]*", "", text)
+        assert not re.search(r"https?:|url\(|@import|<script|<link|<iframe", outside)
+        assert all(image["alt"] for image in page.images)
+
+
+def test_every_section_is_there(diagnosed, refitted):
+    both = [
+        "Warnings",
+        "Instrument matrix",
+        "Largest pulls from the priors",
+        "Parameters",
+        "Inputs and versions",
+    ]
+    page = Page(refitted)
+    assert page.headings == ["What this page lacks", *both]
+    assert len(page.images) == 2
+    page = Page(diagnosed)
+    assert [heading for heading in page.headings if heading in both] == both
+    wanted = {"What was found", "Residuals before and after", "Candidates", "What these data cannot test",
+              "What is unexplained", "Where clp_wobble sits"}  # fmt: skip
+    assert wanted <= set(page.headings)
+    assert len(page.images) == 6  # maps, curves, ladder, shares, matrix, errors
+    assert "What this page lacks" not in page.headings
+
+
+def test_verdict_and_what_was_found(diagnosed):
+    text = " ".join(Page(diagnosed).text.split())
+    assert (
+        "The starting model does not explain these data (χ²/dof = 1.625, p = 2.1 × 10⁻⁷). They are consistent with "
+        "clp_wobble (error of the polariser's encoder, once per turn: amplitude = 0.0613 ± 0.0012 deg), with which "
+        "χ²/dof is 1.029. They cannot tell clp_wobble from camera_gain_drift."
+    ) in text
+    assert "Would be separated by: polariser angles over a full turn." in text
+    assert "caused by" not in text
+    assert "cos(3θ − 57°), θ the polariser angle" in text
+    assert "chwp_axis – fast axes of the half-wave plates" in text
+
+
+def test_numbers_are_those_of_the_files(diagnosed):
+    page = Page(diagnosed)
+    for name, entry in handmade_run.SUMMARY["parameters"].items():
+        row = [row for row in page.rows if row and row[0] == name][-1]  # the table of pulls comes before
+        assert number(row[1]) == pytest.approx(entry["value"], abs=0.06 * entry["sigma"])
+        assert (
+            row[2] == "fixed"
+            if entry["sigma"] == 0
+            else number(row[2]) == pytest.approx(entry["sigma"], rel=0.05)
+        )
+        assert row[3] == entry["unit"]
+    assert [number(v) for v in page.row("+ clp_wobble")[1:]] == [1234.5, 1200, 1.029, 715.8]
+    assert number(page.row("starting model")[1]) == pytest.approx(1950.25, abs=0.06)
+    assert page.row("ghost")[2:] == ["4.75", "0.64"]
+    # (15.7512 − 15.63) / 0.05 and (−0.23012 + 0.23) / 0.001, the farthest first
+    pulls = [row for row in page.rows if len(row) == 5 and row[4].startswith(("+", "−"))]
+    assert [(row[0], row[4]) for row in pulls] == [
+        ("pupil.magnification", "+2.42"), ("clp_wobble.amplitude", "+0.61"), ("half1.wedge", "−0.12"),
+    ]  # fmt: skip
+
+
+def test_names_are_escaped(diagnosed):
+    assert "<b>one" not in diagnosed
+    assert "&lt;b&gt;one&lt;/b&gt; &amp; two.fits" in diagnosed
+    assert "a <i>run" not in diagnosed
+    assert "half1.wedge lies <far> out" in Page(diagnosed).text
+
+
+def test_missing_pieces_are_named(tmp_path):
+    run = handmade_run.make_diagnosis(tmp_path / "run")
+    (run / "diagnosis.fits").unlink()
+    (run / "calibration.fits").write_bytes(b"no FITS")
+    found = read_run(run)
+    text = Page(render(found)).text
+    assert [sentence.split()[0] for sentence in found.missing] == ["calibration.fits", "diagnosis.fits"]
+    assert all(" ".join(sentence.split()) in " ".join(text.split()) for sentence in found.missing)
+    assert "The pictures of this diagnosis are not in the folder." in text
+
+
+def test_files_of_different_diagnoses_are_not_mixed(tmp_path):
+    run = handmade_run.make_diagnosis(tmp_path / "run", steps=[], verdict="consistent")
+    handmade_run.write_pictures(run / "diagnosis.fits", handmade_run.pictures(), overwrite=True)
+    assert "diagnosis.fits is of another diagnosis" in read_run(run).missing[0]
+    handmade_run.make_refit(run, chi2=1300.0)
+    assert "diagnosis.json is of another fit" in read_run(run).missing[1]
+
+
+def test_a_summary_with_the_contract_alone_is_enough(tmp_path):
+    run = handmade_run.make_refit(tmp_path / "run")
+    keys = ("chi2", "dof", "n_data", "parameters", "converged", "message", "seconds", "versions", "inputs")
+    (run / "summary.json").write_text(json.dumps({key: handmade_run.SUMMARY[key] for key in keys}))
+    assert "Trusted" in Page(render(read_run(run))).text
+
+
+def test_unexplained_and_unknown_names(tmp_path):
+    step = handmade_run.DIAGNOSIS["steps"][0]
+    many = {f"vectors_{i}": {"value": 0.1 * i, "sigma": 0.2, "unit": ""} for i in range(40)}
+    steps = [step, step | {"effect": "free_form", "parameters": many, "equivalent": []}]
+    unexplained = {"p_value": 1e-30, "description": "patterns <without> a name", "patterns": []}
+    run = handmade_run.make_diagnosis(
+        tmp_path / "run", verdict="unexplained", steps=steps, unexplained=unexplained
+    )
+    page = Page(render(read_run(run)))
+    assert "patterns <without> a name (p < 10⁻¹⁵)" in page.text
+    assert "free_form (patterns without a name: 40 parameters)" in " ".join(page.text.split())
+    assert page.row("vectors_7")[1] == "0.70"
+    assert len(page.images) == 9  # two steps (the second of a kind that has no name), rms over all exposures
+
+
+def test_a_fit_that_is_not_trusted_says_so(tmp_path):
+    misfit = {
+        "camera": {"O1": 3.25}, "kind": {"clp": 4.0}, "filter": {"band": 4.0}, "calibration_plate": {"out": 4.0},
+        "matrix_element": {"m21": 0.0123, "m22": None},
+    }  # fmt: skip
+    run = handmade_run.make_refit(tmp_path / "run", trusted=False, quality=8192, misfit=misfit)
+    page = Page(render(read_run(run)))
+    assert "Not trusted" in page.text
+    assert "Quality bit set: the model does not explain the data." in page.text
+    assert ["", "m22", "–"] in page.rows
+    assert ["rms disagreement over the field (%)", "m21", "1.23"] in page.rows
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda run: (run / "summary.json").unlink(), "holds no summary.json; give the RUN"),
+        (lambda run: (run / "summary.json").rename(run / "summary.failed.json"), "did not converge"),
+        (lambda run: (run / "summary.json").write_text("{"), "summary.json: cannot be read"),
+        (lambda run: (run / "summary.json").write_text('{"chi2": 1}'), "summary.json: has no 'dof'"),
+        (lambda run: (run / "summary.json").write_text("[1]"), "summary.json: has no 'chi2'"),
+    ],
+)
+def test_what_is_no_run_is_refused(tmp_path, spoil, said):
+    run = handmade_run.make_refit(tmp_path / "run")
+    spoil(run)
+    with pytest.raises(DataError, match=re.escape(said)):
+        read_run(run)
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "shown"),
+    [
+        (0.0613, 0.0012, ("0.0613", "0.0012")),
+        (2408.2491, 0.7512, ("2408.25", "0.75")),
+        (-1234.5, 67.0, ("−1234", "67")),
+        (1.2346e-10, 2.2e-12, ("1.235e−10", "2.2e−12")),
+        (0.5, 0.0, ("0.5", "")),
+        (None, None, ("–", "")),
+    ],
+)
+def test_two_digits_of_the_error(value, sigma, shown):
+    assert digits(value, sigma) == shown
+
+
+def test_probabilities_in_words():
+    assert [probability(p) for p in (0.426, 2.13e-7, 1e-300, 0.0, None)] == [
+        "= 0.43", "= 2.1 × 10⁻⁷", "< 10⁻¹⁵", "< 10⁻¹⁵", "unknown",
+    ]  # fmt: skip
+
+
+def test_consistent_data_are_called_so():
+    found = {"verdict": "consistent", "steps": [], "p_value": 0.426, "chi2_per_dof_before": 1.002}
+    label, sentence = verdict_of_diagnosis(found)
+    assert label == "Consistent"
+    assert "consistent with the starting model (χ²/dof = 1.002)" in sentence
+
+
+def test_a_free_form_term_is_shown_as_what_it_is(tmp_path):
+    unexplained = {
+        "p_value": 1e-30, "description": "patterns without a name", "patterns": [], "free_form": ["harmonics"],
+        "chi2_before": 1950.25, "chi2_after": 1234.5, "change_of_qu": 0.00123,
+    }  # fmt: skip
+    run = handmade_run.make_diagnosis(
+        tmp_path / "run", verdict="unexplained", steps=[], unexplained=unexplained
+    )
+    handmade_run.write_pictures(run / "diagnosis.fits", handmade_run.pictures(("free_form",)), overwrite=True)
+    found = read_run(run)
+    assert found.missing == ()
+    page = Page(render(found))
+    text = " ".join(page.text.split())
+    assert (
+        "A free-form term (harmonics) stands for it in this calibration: χ² goes from 1950.2 to 1234.5"
+        in text
+    )
+    assert "by at most 0.12 %" in text
+    assert len(page.images) == 6
+
+
+def test_a_sampled_run_shows_its_posterior(tmp_path):
+    run = handmade_run.make_refit(tmp_path / "run")
+    (run / "posterior.nc").write_bytes(b"")
+    assert [s.split()[0] for s in read_run(run).missing[1:]] == [
+        "sample.json",
+        "posterior.ecsv",
+        "posterior_corner.png",
+    ]
+    (run / "sample.json").write_text('{"message": "converged after 5000 steps", "trusted": true}')
+    (run / "posterior_corner.png").write_bytes(b"\x89PNG")
+    numbers = np.array([[15.751, 15.730, 15.772, 15.709, 15.793, 812.0], [0.5, 0.4, 0.6, 0.3, 0.7, np.nan]])
+    names = ("MEDIAN", "LOW68", "HIGH68", "LOW95", "HIGH95", "ESS")
+    columns = {"NAME": (np.array(["pupil.magnification", "throughput.n0.p00"]), "", "")}
+    columns |= {"UNIT": (np.array(["", "deg"]), "", "")}
+    columns |= {name: (values, "", "") for name, values in zip(names, numbers.T, strict=True)}
+    write_columns(run / "posterior.ecsv", columns)
+    page = Page(render(read_run(run)))
+    shown = ["pupil.magnification", "15.751", "15.730 … 15.772", "15.709 … 15.793", "", "812"]
+    assert shown in page.rows
+    assert not any(row[0] == "throughput.n0.p00" and len(row) == 6 for row in page.rows)  # not sampled
+    assert "converged after 5000 steps – trusted." in " ".join(page.text.split())
+    assert page.images[-1]["src"] == "data:image/png;base64,iVBORw=="
+
+
+def test_limits_and_consequences(tmp_path):
+    limit = {
+        "effect": "ghost",
+        "parameter": "share",
+        "unit": "",
+        "value": 1e-4,
+        "sigma": 2e-4,
+        "below_95": 5e-4,
+    }
+    step = handmade_run.DIAGNOSIS["steps"][0] | {
+        "change_of_qu": 2e-5,
+        "negligible": True,
+        "robust_error_ratio": 2.5,
+    }
+    page = Page(render(read_run(handmade_run.make_diagnosis(tmp_path / "run", limits=[limit], steps=[step]))))
+    assert ["ghost", "share", "0.00010", "0.00020", "0.0005", ""] in page.rows
+    text = " ".join(page.text.split())
+    assert "by at most 0.002 %, which hardly matters." in text
+    assert "are 2.5 times as large" in text

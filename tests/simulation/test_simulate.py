@@ -1,0 +1,341 @@
+"""Synthetic calibration sets: what was planned is in them, their truth explains them, a seed decides all."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import shlex
+import sys
+from pathlib import Path
+from subprocess import run
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from walop_jax.data import (
+    TableIntensities,
+    merge_calibration_sets,
+    read_calibration_set,
+    write_calibration_set,
+)
+from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.model import legendre
+from walop_jax.model.effects import effect_by_name
+from walop_jax.model.instrument import nominal_instrument
+from walop_jax.model.specification import full_values, make_model, with_effects
+from walop_jax.simulation.observing_plan import (
+    NARROW_BANDS,
+    SITES,
+    ObservingPlan,
+    filter_curve,
+    polariser_turn,
+)
+from walop_jax.simulation.simulate import Simulated, draw_instrument, simulate, truth_values
+from walop_jax.sky.moon import moon_direction
+
+FITS_DATA = Path(__file__).resolve().parents[2] / "fits_data"
+SMALL = ObservingPlan(
+    grid=4, standard_grid=2, polariser_angles=polariser_turn(6), moon_patches=4, standards=3, unpolarised=1
+)
+
+
+def block_of(simulated: Simulated):
+    return simulated.calset.intensities.block(0, len(simulated.calset.points))
+
+
+def at_truth(simulated: Simulated) -> tuple[Problem, np.ndarray]:
+    """The base model of a set, with the effects that are in it, at the true values."""
+    model = base_model(simulated.calset)
+    added = [type(e).of(SMALL.context(), **e.choices()) for e in simulated.truth.effects]
+    model = with_effects(model, added, SMALL.context()) if added else model
+    return Problem(simulated.calset, model), full_values(simulated.truth)
+
+
+def chi2(problem: Problem, values: np.ndarray) -> float:
+    return float((problem.residuals(values)[1] ** 2).sum())
+
+
+# ---------------------------------------------------------------------------------------------- the plan
+
+
+def test_the_plan_is_what_the_set_holds():
+    calset, _ = simulate(ObservingPlan(), 0)
+    e, p = calset.exposures, calset.points
+    assert [int((e.kind == kind).sum()) for kind in ("clp", "moon", "standard")] == [15, 8, 8]
+    np.testing.assert_allclose(e.clp_angle[e.clp_in], np.arange(0, 169, 12))
+    assert len(p) == 144 + 25
+    assert np.abs(p.x).max() == np.abs(p.y).max() == 0.29
+    np.testing.assert_allclose(np.unique(np.round(p.x[144:], 6)), [-0.232, -0.116, 0.0, 0.116, 0.232])
+    assert calset.intensities.rows == 144 * 23 + 25 * 8
+    assert np.all(np.diff(e.mjd) > 0)
+    assert np.all(calset.sources.q[:2] == 0.0)
+    degree = np.hypot(calset.sources.q, calset.sources.u)[2:]
+    assert degree.min() >= 0.01
+    assert degree.max() <= 0.06
+
+
+def test_plates_and_narrow_bands_multiply_the_polariser_and_alternate_on_the_sky():
+    plan = dataclasses.replace(SMALL, plate=(None, 0.0, 45.0), filters=("SDSS-r", *NARROW_BANDS))
+    e = simulate(plan, 1).calset.exposures
+    assert (e.kind == "clp").sum() == 6 * 3 * 3
+    assert set(e.filter[e.kind != "clp"]) == {"SDSS-r"}
+    np.testing.assert_array_equal(e.chwp_angle[e.kind == "moon"], [np.nan, 0.0, 45.0, np.nan])
+
+
+@pytest.mark.parametrize("instrument", ["WALOP-SOUTH", "WALOP-NORTH"])
+@pytest.mark.parametrize("mjd", [None, 60000.0])
+def test_patches_lie_around_the_moon_wherever_it_is(instrument: str, mjd: float | None):
+    plan = ObservingPlan(instrument, mjd=mjd)
+    e = plan.exposures()
+    moon = e.kind == "moon"
+    ra, dec = (np.deg2rad(a) for a in moon_direction(e.mjd[moon], plan.site))
+    field_ra, field_dec = np.deg2rad(e.ra[moon]), np.deg2rad(e.dec[moon])
+    # Haversine form, exact for small angles too.
+    chord = (
+        np.sin((field_dec - dec) / 2) ** 2
+        + np.cos(dec) * np.cos(field_dec) * np.sin((field_ra - ra) / 2) ** 2
+    )
+    separation = np.rad2deg(2 * np.arcsin(np.sqrt(chord)))
+    assert separation.min() > 8.0
+    assert separation.max() < 20.0
+    assert np.ptp(separation) > 8.0
+    assert len(set(e.rotator[moon])) == 4
+
+
+@pytest.mark.parametrize("instrument", ["WALOP-SOUTH", "WALOP-NORTH"])
+def test_default_nights_are_full_moon_and_the_moon_is_up(instrument: str):
+    from astropy import units
+    from astropy.coordinates import AltAz, EarthLocation, SkyCoord, get_body
+    from astropy.time import Time
+    from astropy.utils import iers
+
+    plan = ObservingPlan(instrument)
+    e = plan.exposures()
+    moon = e.kind == "moon"
+    site = SITES[instrument]
+    with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("iers_degraded_accuracy", "ignore"):
+        time = Time(e.mjd[moon], format="mjd")
+        place = EarthLocation.from_geodetic(site.longitude, site.latitude, site.elevation)
+        moon_there, sun_there = (get_body(body, time, place) for body in ("moon", "sun"))
+        separation = moon_there.separation(sun_there, origin_mismatch="ignore")
+        frame = AltAz(obstime=time, location=place)
+        fields = SkyCoord(e.ra[moon] * units.deg, e.dec[moon] * units.deg).transform_to(frame)
+        sun = sun_there.transform_to(frame)
+        # Hour angles of the plan against astropy's, to a minute.
+        sidereal = time.sidereal_time("mean", site.longitude * units.deg)
+        hour_angle = (sidereal - fields.icrs.ra).wrap_at("180d").hourangle
+    assert separation.deg.min() > 165.0
+    assert fields.alt.deg.min() > 25.0
+    assert sun.alt.deg.max() < -18.0
+    np.testing.assert_allclose(e.ha[moon], hour_angle, atol=1.0 / 60.0)
+
+
+def test_narrow_bands_are_fifteen_nanometres_wide():
+    for name, centre in NARROW_BANDS.items():
+        curve = filter_curve(name)
+        inside = curve.wavelength[curve.throughput >= 0.5 - 1e-9]
+        assert inside[[0, -1]] == pytest.approx([centre - 0.0075, centre + 0.0075])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"instrument": "WALOP-EAST"}, "unknown instrument"),
+        ({"grid": 0}, "grid"),
+        ({"standards": -1}, "negative"),
+        ({"electrons": 0.0}, "light"),
+        ({"filters": ("SDSS-q",)}, "SDSS-q"),
+        ({"plate": ()}, "calibration plate"),
+        ({"polariser_angles": ()}, "polariser angle"),
+    ],
+)
+def test_impossible_plans_are_refused(change: dict, message: str):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(SMALL, **change)
+
+
+# ---------------------------------------------------------------------------------------- as-built values
+
+
+def test_as_built_values_follow_their_priors():
+    model = make_model("WALOP-SOUTH", nominal_instrument())
+    rng = np.random.default_rng(2)
+    drawn = np.array([full_values(draw_instrument(model, rng)) for _ in range(400)])
+    for i, p in enumerate(model.parameters):
+        if p.prior is not None:
+            z = (drawn[:, i] - p.prior[0]) / p.prior[1]
+            assert abs(z.mean()) < 0.25, p.name
+            assert z.std() == pytest.approx(1.0, abs=0.2), p.name
+    assert drawn[:, model.index("half1.efficiency")].max() <= 1.0
+    np.testing.assert_array_equal(drawn[:, model.index("throughput.n0.p00")], 0.5)  # the gauge
+    assert drawn[:, model.index("throughput.n2.p00")].std() == pytest.approx(0.03 * np.sqrt(2), rel=0.15)
+
+
+def test_throughputs_have_two_per_cent_of_structure():
+    model = make_model("WALOP-SOUTH", nominal_instrument())
+    rng = np.random.default_rng(3)
+    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-0.3, 0.3, 21)] * 2))
+    basis = np.asarray(legendre.basis(jnp.asarray(x), jnp.asarray(y), 4))
+    relative = []
+    for _ in range(200):
+        maps = np.asarray(draw_instrument(model, rng).throughput.coefficients) @ basis.T
+        relative.append(maps / maps.mean(axis=1, keepdims=True) - 1.0)
+    assert np.sqrt(np.mean(np.square(relative))) == pytest.approx(0.02, rel=0.15)
+
+
+def test_tied_parameters_are_built_alike():
+    model = make_model("WALOP-SOUTH", nominal_instrument())
+    model = model.change("half2.plate.mgf2", tie="half1.plate.mgf2")
+    built = draw_instrument(model, np.random.default_rng(4))
+    assert float(built.half2.plate.mgf2) == float(built.half1.plate.mgf2)
+
+
+def test_stars_scatter_around_their_catalogue():
+    pulls = []
+    for seed in range(20):
+        calset, truth = simulate(dataclasses.replace(SMALL, grid=1), seed, noiseless=True)
+        pulls.append((np.asarray(truth.standard.q) - calset.sources.q) / calset.sources.q_err)
+    assert np.mean(pulls) == pytest.approx(0.0, abs=0.4)
+    assert np.std(pulls) == pytest.approx(1.0, abs=0.25)
+
+
+# ------------------------------------------------------------------------------------------ light and noise
+
+
+def test_a_seed_decides_everything():
+    one, two, other = (simulate(SMALL, seed) for seed in (7, 7, 8))
+    first, second, third = (block_of(s) for s in (one, two, other))
+    np.testing.assert_array_equal(first.counts, second.counts)
+    np.testing.assert_array_equal(first.sigma, second.sigma)
+    np.testing.assert_array_equal(full_values(one.truth), full_values(two.truth))
+    assert not np.any(first.counts[first.used] == third.counts[third.used])
+
+
+def test_the_truth_explains_the_data():
+    simulated = simulate(SMALL, 9)
+    problem, true = at_truth(simulated)
+    rows = simulated.calset.intensities.rows
+    assert chi2(problem, true) == pytest.approx(3 * rows, abs=4 * np.sqrt(6 * rows))
+    assert list(truth_values(simulated.truth)) == list(problem.model.names)
+
+
+def test_without_noise_nothing_is_left():
+    simulated = simulate(SMALL, 9, noiseless=True)
+    problem, true = at_truth(simulated)
+    assert chi2(problem, true) < 1e-15
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("clp_wobble", {"amplitude": 0.06, "phase": 1.1}),
+        ("ghost", {"share": 0.01}),
+        ("pedestal", {"level": 0.01}),
+        ("nonlinearity", {"coefficient": 0.02}),
+        ("standard_outlier", {"source": "STD01", "q": 0.003}),
+    ],
+)
+def test_effects_are_in_the_data(name: str, values: dict):
+    effect = effect_by_name(name).of(SMALL.context(), **values)
+    with_it = simulate(SMALL, 10, effects=[effect], noiseless=True)
+    without = simulate(SMALL, 10, noiseless=True)
+    changed, plain = (block_of(s) for s in (with_it, without))
+    assert np.abs(changed.counts[changed.used] / plain.counts[plain.used] - 1.0).max() > 1e-4
+    problem, true = at_truth(with_it)
+    assert chi2(problem, true) < 1e-6
+    bare = Problem(with_it.calset, base_model(with_it.calset))
+    assert chi2(bare, full_values(without.truth)) > 10.0
+
+
+def test_an_instrument_may_be_given():
+    given = nominal_instrument()
+    calset, truth = simulate(SMALL, 11, instrument=given)
+    assert float(truth.pupil.magnification) == 15.63
+    assert truth.standard.names == SMALL.star_names
+    assert calset.sources.name.tolist() == list(SMALL.star_names)
+
+
+def test_counts_are_at_the_level_that_was_asked_for():
+    block = block_of(simulate(dataclasses.replace(SMALL, electrons=1e5), 12))
+    level = block.counts[block.used].mean()
+    # Transparency 0.7 … 1, and 14 % of the light is reflected by two plates in air.
+    assert 0.6e5 < level < 1e5
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        dataclasses.replace(SMALL, instrument="WALOP-NORTH"),
+        dataclasses.replace(ObservingPlan.bench(), polariser_angles=polariser_turn(6)),
+    ],
+    ids=["north", "bench"],
+)
+def test_other_instruments(plan: ObservingPlan, tmp_path: Path):
+    calset, truth = simulate(plan, 13)
+    write_calibration_set(tmp_path / "set.fits", calset)
+    again = read_calibration_set(tmp_path / "set.fits")
+    assert again.instrument == plan.instrument
+    problem = Problem(again, base_model(again, throughput_degree=plan.throughput_degree))
+    rows = calset.intensities.rows
+    assert chi2(problem, full_values(truth)) == pytest.approx(3 * rows, abs=4 * np.sqrt(6 * rows))
+
+
+def test_two_nights_can_be_merged():
+    nights = [
+        simulate(dataclasses.replace(SMALL, mjd=61220.85 + night, standards=0), 14).calset for night in (0, 1)
+    ]
+    assert len(merge_calibration_sets(*nights).exposures) == 2 * len(nights[0].exposures)
+
+
+# ------------------------------------------------------------------------------------- the set in fits_data
+
+
+def documented_command(name: str) -> list[str]:
+    """The command in the README, or in the sealed file of a set whose README keeps quiet about what is in it."""
+    readme, sealed = FITS_DATA / "README.md", FITS_DATA / f"{name}_sealed.json"
+    text = (
+        json.loads(sealed.read_text(encoding="utf-8"))["command"]
+        if sealed.exists()
+        else readme.read_text(encoding="utf-8")
+    )
+    found = re.search(r"^walop-jax (simulate .*)$", text, re.MULTILINE)
+    assert found is not None
+    return shlex.split(found[1])
+
+
+@pytest.mark.parametrize(
+    ("name", "truth"),
+    [
+        ("walop_south_small", "walop_south_small_truth"),
+        ("walop_south_hidden", "walop_south_hidden_sealed"),
+    ],
+)
+def test_the_documented_command_makes_the_set_in_fits_data(tmp_path: Path, name: str, truth: str):
+    arguments = [
+        str(tmp_path / Path(word).name) if word.startswith("fits_data/") else word
+        for word in documented_command(name)
+    ]
+    run([sys.executable, "-c", "from walop_jax.cli import main; main()", *arguments], check=True)
+    stored = read_calibration_set(FITS_DATA / f"{name}.fits")
+    made = read_calibration_set(tmp_path / f"{name}.fits")
+    for part in ("exposures", "points", "sources"):
+        ours, theirs = getattr(made, part), getattr(stored, part)
+        for field in dataclasses.fields(ours):
+            values, reference = getattr(ours, field.name), getattr(theirs, field.name)
+            if values.dtype.kind == "f":
+                np.testing.assert_allclose(values, reference, rtol=1e-13, atol=1e-13)
+            else:
+                np.testing.assert_array_equal(values, reference)
+    assert isinstance(made.intensities, TableIntensities)
+    assert isinstance(stored.intensities, TableIntensities)
+    # Electrons are drawn whole, so the last digit of an expectation may cost one here and there, or all of a point.
+    off = np.abs(made.intensities.counts - stored.intensities.counts).max(axis=1)
+    assert np.mean(off < 3.0) > 0.95
+    assert (FITS_DATA / f"{name}.fits").stat().st_size < 300_000
+    made_truth, stored_truth = (
+        json.loads((folder / f"{truth}.json").read_text(encoding="utf-8")) for folder in (tmp_path, FITS_DATA)
+    )
+    stored_truth.pop("command", None)
+    assert made_truth == stored_truth

@@ -1,0 +1,267 @@
+"""A calibration: what a fit has learnt of an instrument, ready to be asked for the matrix in the field.
+
+It is made from a fit, goes into a calibration product and comes back from one with the same answers.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import importlib.metadata
+import platform
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from walop_jax.calibration.matrix import Settings, matrices
+from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, ParameterTable, Verdict, spelt
+from walop_jax.calibration.records import ResidualMap
+from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter
+from walop_jax.data.frames import Grid
+from walop_jax.data.records import Exposures, FilterCurve, InputFile, Site, Sources
+from walop_jax.fit.model_builder import model_without_data
+from walop_jax.fit.model_file import render
+from walop_jax.fit.refit import PRIOR_EDGE, FitResult
+from walop_jax.io.errors import DataError, nearest
+from walop_jax.likelihood.problem import Problem, standard_names
+from walop_jax.model.instrument import nominal_instrument
+from walop_jax.model.specification import Model, effect_context
+
+Vector = Float[np.ndarray, " n"]
+Matrix = Float[np.ndarray, "n n"]
+
+MAP_SIZE = 31  # pixels along each axis of the maps of a product: 0.02° over ±0.3°
+ILL_CONDITIONED = (
+    1e6  # for each intensity: eigenvalues of data grow with their number, those of priors do not
+)
+EXCESS_NOISE = 0.5  # sigma
+HIGH_CROSSTALK = 10.0  # condition number of the local 2 × 2 inverse
+TEMPERATURE_MARGIN = 2.0  # K beyond the temperatures of the exposures
+SOFTWARE = ("walop-jax", "jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy", "astropy", "speclite")
+
+
+def software_versions() -> dict[str, str]:
+    """Versions of Python, of this package and of what its results rest on."""
+    versions = {"python": platform.python_version()}
+    for name in SOFTWARE:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = "unknown"
+    return versions
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibration:
+    """An instrument as fitted: model, values and covariance of all parameters, and where they come from.
+
+    `field` is (smallest x, largest x, smallest y, largest y) in degrees of the points that were used.
+    """
+
+    model: Model
+    values: Vector
+    covariance: Matrix
+    verdict: Verdict
+    filters: Mapping[str, FilterCurve]
+    exposures: Exposures
+    sources: Sources
+    site: Site
+    origin: str
+    field: tuple[float, float, float, float]
+    inputs: tuple[InputFile, ...] = ()
+    residuals: ResidualMap | None = None
+
+    @classmethod
+    def from_fit(cls, result: FitResult, problem: Problem) -> Calibration:
+        """The calibration that a fit gives, with the verdict on it (see `quality`)."""
+        calset = problem.calset
+        verdict = Verdict(
+            chi2=result.chi2,
+            dof=result.dof,
+            n_data=result.n_data,
+            noise_scale=result.noise_scale,
+            converged=result.converged,
+            trusted=result.trusted,
+            quality=quality(result),
+            warnings=result.warnings,
+        )
+        return cls(
+            model=result.model,
+            values=result.values,
+            covariance=0.5 * (result.covariance + result.covariance.T),
+            verdict=verdict,
+            filters=calset.filters,
+            exposures=calset.exposures,
+            sources=calset.sources,
+            site=calset.site,
+            origin=calset.origin,
+            field=problem.field,
+            inputs=calset.inputs,
+        )
+
+    @property
+    def sigma(self) -> Vector:
+        """Standard errors of all parameters."""
+        return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
+
+    # ------------------------------------------------------------------------------- asking for the matrix
+
+    def matrix(
+        self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings | None = None
+    ) -> tuple[Float[np.ndarray, "p 6"], Float[np.ndarray, "p 6 6"]]:
+        """m21, m22, m23, m31, m32, m33 and their covariance at field positions (deg), a setting for each.
+
+        Without `settings`: SDSS-r, a flat photon spectrum, calibration plate out. Raises `DataError` for a
+        filter that neither the calibration nor the package knows.
+        """
+        settings = settings or Settings.default(len(x))
+        filters = {str(name): self.filter_curve(str(name)) for name in np.unique(settings.filter)}
+        instrument = self.model.instrument(self.values)
+        return matrices(instrument, settings, filters, np.asarray(x), np.asarray(y), self.covariance)
+
+    def filter_curve(self, name: str) -> FilterCurve:
+        """The curve of a filter; `DataError` with the nearest names when there is none."""
+        if name in self.filters:
+            return self.filters[name]
+        if name in BUILTIN_FILTERS:
+            return builtin_filter(name)
+        known = (*self.filters, *BUILTIN_FILTERS)
+        raise DataError(f"FILTER: the calibration has no filter {name!r}; {nearest(name, known)}")
+
+    def flags(
+        self,
+        x: Float[np.ndarray, " p"],
+        y: Float[np.ndarray, " p"],
+        settings: Settings,
+        values: Float[np.ndarray, "p 6"],
+    ) -> Int[np.ndarray, " p"]:
+        """Quality bits (`QUALITY_BITS`) of matrices at field positions: 16, 32 and 64."""
+        flags = np.zeros(len(x), np.int64)
+        blocks = values[:, [[1, 2], [4, 5]]]
+        known = np.all(np.isfinite(values), axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            condition = np.linalg.cond(np.where(known[:, None, None], blocks, np.eye(2)))
+        flags[~(condition <= HIGH_CROSSTALK)] |= 16
+        margin = 0.5 / MAP_SIZE * (self.field[1] - self.field[0])
+        low_x, low_y = self.field[0] - margin, self.field[2] - margin
+        high_x, high_y = self.field[1] + margin, self.field[3] + margin
+        flags[(x < low_x) | (x > high_x) | (y < low_y) | (y > high_y)] |= 32
+        flags[~np.isin(settings.filter, np.unique(self.exposures.filter))] |= 64
+        if any("temperature" in effect.optics_depend_on for effect in self.model.template.effects):
+            low, high = np.nanmin(self.exposures.temp), np.nanmax(self.exposures.temp)
+            beyond = (settings.temp < low - TEMPERATURE_MARGIN) | (settings.temp > high + TEMPERATURE_MARGIN)
+            flags[beyond] |= 64
+        return flags
+
+    def maps(self, size: int = MAP_SIZE) -> MatrixMaps:
+        """The matrix over the field on a regular grid, for a look at it.
+
+        Through SDSS-r, or the first filter of the exposures where they do not use that.
+        """
+        used = [str(name) for name in np.unique(self.exposures.filter)]
+        name = DEFAULT_FILTER if DEFAULT_FILTER in used or not used else used[0]
+        half = float(np.ceil(np.max(np.abs(self.field)) * 50.0) / 50.0) or 0.3
+        step = 2.0 * half / (size - 1)
+        centre = 0.5 * (size + 1)
+        grid = Grid(size, size, (centre, centre), (0.0, 0.0), ((step, 0.0), (0.0, step)))
+        points = grid.points
+        values, covariance = self.matrix(points.x, points.y, Settings.default(size * size, name))
+        errors = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
+        planes = (6, size, size)
+        return MatrixMaps(grid, name, values.T.reshape(planes), errors.T.reshape(planes))
+
+    # ------------------------------------------------------------------------------- into a file and back
+
+    def to_product(self) -> CalibrationProduct:
+        """The record that `write_product` writes; its texts are in plain ASCII."""
+        parameters = self.model.parameters
+        priors = np.array([p.prior or (np.nan, np.nan) for p in parameters]).reshape(-1, 2)
+        maps = self.maps()
+        texts = tuple(spelt(text) for text in self.verdict.warnings)
+        return CalibrationProduct(
+            instrument=self.model.name,
+            site=self.site,
+            origin=spelt(self.origin),
+            date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds").replace("+00:00", ""),
+            verdict=dataclasses.replace(self.verdict, warnings=texts),
+            parameters=ParameterTable(
+                name=np.array([p.name for p in parameters]),
+                value=self.values,
+                sigma=self.sigma,
+                unit=np.array([p.unit for p in parameters]),
+                prior_mean=priors[:, 0],
+                prior_width=priors[:, 1],
+                free=np.array([p.free and p.tie is None for p in parameters]),
+            ),
+            covariance=self.covariance,
+            maps=maps,
+            field=self.field,
+            exposures=self.exposures,
+            filters=self.filters,
+            sources=self.sources,
+            model=tuple(spelt(line) for line in render(self.model).splitlines() if line.strip()),
+            inputs=self.inputs,
+            versions=software_versions(),
+            residuals=self.residuals,
+        )
+
+    @classmethod
+    def from_product(cls, product: CalibrationProduct) -> Calibration:
+        """The calibration that a product holds.
+
+        Raises ValueError if the model of the product cannot be rebuilt, or has other parameters than it
+        lists.
+        """
+        model = rebuild(product)
+        names = tuple(str(name) for name in product.parameters.name)
+        if model.names != names:
+            odd = sorted(set(model.names) ^ set(names))
+            raise DataError(
+                f"the model of the product has other parameters than it lists ({', '.join(odd[:3])}): it was "
+                "made by a version with other physics; fit again"
+            )
+        return cls(
+            model=model,
+            values=product.parameters.value,
+            covariance=product.covariance,
+            verdict=product.verdict,
+            filters=product.filters,
+            exposures=product.exposures,
+            sources=product.sources,
+            site=product.site,
+            origin=product.origin,
+            field=product.field,
+            inputs=product.inputs,
+            residuals=product.residuals,
+        )
+
+
+def rebuild(product: CalibrationProduct) -> Model:
+    """The model of a product from its lines of TOML, its standards and its exposures."""
+    sources = product.sources
+    names = standard_names(sources)
+    standards = list(zip(names, sources.q.tolist(), sources.u.tolist(), strict=True))
+    context = effect_context(nominal_instrument(product.instrument, standards=standards), product.exposures)
+    return model_without_data(
+        product.instrument, "\n".join(product.model), standards=standards, context=context
+    )
+
+
+def quality(result: FitResult) -> int:
+    """Quality bits of a fit as a whole (`QUALITY_BITS`): 1, 2, 4, 8 and 8192."""
+    bits = 0 if result.converged else 1
+    bits |= 2 if result.minimum.condition > ILL_CONDITIONED * result.n_data else 0
+    bits |= 4 if len(at_prior_edge(result)) else 0
+    ratio = result.chi2 / max(result.dof, 1)
+    bits |= 8 if max(ratio, result.noise_scale**2) > 1.0 + EXCESS_NOISE**2 else 0
+    return bits | (0 if result.explains_data else 8192)
+
+
+def at_prior_edge(result: FitResult) -> tuple[str, ...]:
+    """Names of the parameters that lie more than 4 prior widths from their prior."""
+    return tuple(
+        p.name
+        for p, value in zip(result.model.parameters, result.values, strict=True)
+        if p.free and p.prior is not None and abs(value - p.prior[0]) > PRIOR_EDGE * p.prior[1]
+    )

@@ -1,0 +1,126 @@
+"""Is a calibration product fit for use? Checks that fail closed: one that does not hold makes the product invalid.
+
+A product is read with its checksums, version and content hash before it comes here (`data/product.py`); what is left
+to find out is whether it says what its own parameters say, and whether that is physics.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.product import CalibrationProduct
+from walop_jax.data.checks import FIELD_LIMITS
+from walop_jax.data.filters import BUILTIN_FILTERS
+
+SAME = 1e-7  # between maps in the file and maps of its parameters, on another machine
+NEGATIVE = 1e-4  # of the response to unpolarised light: what "less than no light" may be
+_POINTS = 64
+
+
+class Check(NamedTuple):
+    """One property of a product: whether it holds, and in words what was found."""
+
+    name: str
+    passed: bool
+    found: str
+
+
+class Validity(NamedTuple):
+    """What a product may be applied to: MJD of its exposures, their filters, their temperatures (Celsius)."""
+
+    mjd: tuple[float, float]
+    filters: tuple[str, ...]
+    temperature: tuple[float, float]
+
+
+def validity(product: CalibrationProduct) -> Validity:
+    """Dates, filters and temperatures of the exposures that a product was made from; NaN where none are known."""
+    e = product.exposures
+    return Validity(_range(e.mjd), tuple(np.unique(e.filter).tolist()), _range(e.temp))
+
+
+def _range(values: Float[np.ndarray, " e"]) -> tuple[float, float]:
+    known = values[np.isfinite(values)]
+    return (float(known.min()), float(known.max())) if known.size else (float("nan"), float("nan"))
+
+
+def certify(product: CalibrationProduct) -> list[Check]:
+    """All checks of a product that could be read, in a fixed order; those behind a failed one may be missing."""
+    checks = [*_verdict(product), _covariance(product), _validity(product), _parents(product)]
+    try:
+        calibration = Calibration.from_product(product)
+    except ValueError as error:
+        return [*checks, Check("model", False, f"cannot be rebuilt: {error}")]
+    checks.append(Check("model", True, f"{len(calibration.model.names)} parameters rebuilt by name"))
+    return [*checks, _maps(product, calibration), _physics(calibration)]
+
+
+def _verdict(product: CalibrationProduct) -> list[Check]:
+    v = product.verdict
+    return [
+        Check(
+            "converged", v.converged and not v.quality & 1, "the minimum was reached" if v.converged else "no"
+        ),
+        Check(
+            "explains the data",
+            v.trusted and not v.quality & 8192,
+            f"χ²/dof = {v.chi2 / max(v.dof, 1):.4f}" + "".join(f"; {text}" for text in v.warnings),
+        ),
+        Check("conditioned", not v.quality & 2, "ill-conditioned" if v.quality & 2 else "well"),
+    ]
+
+
+def _covariance(product: CalibrationProduct) -> Check:
+    c = product.covariance
+    sigma = np.sqrt(np.clip(np.diag(c), 0.0, None))
+    scale = np.where(sigma > 0, sigma, 1.0)
+    correlation = c / np.outer(scale, scale)
+    lowest = float(np.linalg.eigvalsh(0.5 * (correlation + correlation.T))[0])
+    lopsided = float(np.abs(correlation - correlation.T).max())
+    differing = float(np.abs(product.parameters.sigma - sigma).max(initial=0.0) / scale.max())
+    good = lowest > -1e-8 and lopsided < 1e-10 and differing < 1e-10
+    return Check("covariance", good, f"smallest eigenvalue of the correlation {lowest:.1e}")
+
+
+def _validity(product: CalibrationProduct) -> Check:
+    known = validity(product)
+    unknown = [name for name in known.filters if name not in product.filters and name not in BUILTIN_FILTERS]
+    good = bool(np.isfinite(known.mjd[0])) and not unknown
+    found = f"MJD {known.mjd[0]:.2f} to {known.mjd[1]:.2f}, {', '.join(known.filters)}"
+    if np.isfinite(known.temperature[0]):
+        found += f", {known.temperature[0]:.1f} to {known.temperature[1]:.1f} Celsius"
+    return Check("validity", good, found + (f"; no curve of {', '.join(unknown)}" if unknown else ""))
+
+
+def _parents(product: CalibrationProduct) -> Check:
+    bad = [entry for entry in product.inputs if not re.fullmatch(r"[0-9a-f]{64}", entry.sha256)]
+    good = bool(product.inputs) and not bad
+    return Check(
+        "parents", good, f"{len(product.inputs)} calibration set(s) by SHA-256" if good else "not known"
+    )
+
+
+def _maps(product: CalibrationProduct, calibration: Calibration) -> Check:
+    again = calibration.maps(product.maps.values.shape[1])
+    if again.grid != product.maps.grid:
+        return Check("maps", False, "do not lie on the grid that this program makes")
+    off = float(np.abs(again.values - product.maps.values).max())
+    errors = float(np.abs(again.errors / np.maximum(product.maps.errors, 1e-30) - 1.0).max())
+    return Check("maps", off < SAME and errors < 1e-4, f"differ from those of the parameters by {off:.1e}")
+
+
+def _physics(calibration: Calibration) -> Check:
+    """No camera sees less than no light, whatever the polarisation: a₀ ≥ √(a₁² + a₂²)."""
+    limit = min(FIELD_LIMITS[calibration.model.name], float(np.abs(calibration.field).max()))
+    x, y = np.random.default_rng(0).uniform(-limit, limit, (2, _POINTS))
+    name = str(np.unique(calibration.exposures.filter)[0])
+    vectors = AnalysisVectors(calibration).exact(Setting(name), x, y, [np.nan])[:, 0]
+    darkest = float(np.min(1.0 - np.hypot(vectors[..., 1], vectors[..., 2]) / vectors[..., 0]))
+    good = bool(np.all(vectors[..., 0] > 0)) and darkest > -NEGATIVE
+    return Check("physics", good, f"least light a camera sees: {darkest:.1e} of unpolarised")

@@ -1,0 +1,37 @@
+"""The instrument matrix as columns of a table: values, errors and flags, row by row."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.matrix import Settings
+from walop_jax.calibration.product import MATRIX_NAMES
+
+
+def matrix_columns(
+    calibration: Calibration,
+    x: Float[np.ndarray, " p"],
+    y: Float[np.ndarray, " p"],
+    settings: Settings,
+    outside: Bool[np.ndarray, " p"],
+) -> dict[str, tuple[np.ndarray, str]]:
+    """M21 … M33, their standard errors and FLAG, each with its description; NaN and 32 where `outside`.
+
+    Raises `DataError` for a filter that neither the calibration nor the package knows.
+    """
+    values, errors = np.full((len(x), 6), np.nan), np.full((len(x), 6), np.nan)
+    inside = np.flatnonzero(~outside)
+    if inside.size:
+        values[inside], covariance = calibration.matrix(x[inside], y[inside], settings[inside])
+        errors[inside] = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
+    flag = np.full(len(x), 32, np.int32)
+    flag[inside] = calibration.flags(x[inside], y[inside], settings[inside], values[inside])
+    columns: dict[str, tuple[np.ndarray, str]] = {}
+    for k, name in enumerate(MATRIX_NAMES):
+        columns[name] = values[:, k], f"element {name.lower()} of the instrument matrix"
+    for k, name in enumerate(MATRIX_NAMES):
+        columns[f"{name}_ERR"] = errors[:, k], f"standard error of {name}"
+    columns["FLAG"] = flag, "16 high cross-talk, 32 beyond the calibrated field, 64 filter or temperature"
+    return columns

@@ -1,0 +1,82 @@
+"""The summary of a fit as plain data, `summary.json`."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from typing import Any
+
+from walop_jax.calibration.calibration import quality, software_versions
+from walop_jax.calibration.records import ResidualMap
+from walop_jax.data.records import CalibrationSet
+from walop_jax.fit.misfit import Misfit
+from walop_jax.fit.model_file import render
+from walop_jax.fit.refit import FitResult
+from walop_jax.model.specification import Model
+
+PRODUCT = "calibration.fits"
+SUMMARY = "summary.json"
+FAILED = "summary.failed.json"
+
+
+PARTIAL = "partial"
+"""Folder of the finished parts of a fit that was interrupted."""
+
+
+def identity(calset: CalibrationSet, model: Model) -> str:
+    """What the sums of a fit depend on besides parameter values: the data, the model and the software."""
+    texts = [*(entry.sha256 for entry in calset.inputs), render(model)]
+    texts += [f"{name} {version}" for name, version in software_versions().items()]
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()
+
+
+def summary(
+    result: FitResult,
+    calset: CalibrationSet,
+    *,
+    seconds: float,
+    misfit: Misfit | None = None,
+    residuals: ResidualMap | None = None,
+) -> dict[str, Any]:
+    """What a fit found: the contract's keys first, then how far it can be trusted.
+
+    Frozen parameters have sigma 0.
+    """
+    parameters = {
+        p.name: {"value": float(value), "sigma": float(sigma), "unit": p.unit}
+        for p, value, sigma in zip(result.model.parameters, result.values, result.sigma, strict=True)
+    }
+    return {
+        "chi2": result.chi2,
+        "dof": result.dof,
+        "n_data": result.n_data,
+        "parameters": parameters,
+        "converged": result.converged,
+        "message": result.minimum.message,
+        "seconds": seconds,
+        "versions": software_versions(),
+        "inputs": [{"path": str(entry.path), "sha256": entry.sha256} for entry in calset.inputs],
+        "trusted": result.trusted,
+        "quality": quality(result),
+        "warnings": list(result.warnings),
+        "instrument": result.model.name,
+        "effects": list(result.model.effect_names),
+        "free_parameters": len(result.model.free),
+        "noise_scale": result.noise_scale,
+        "steps": result.minimum.steps,
+        "starts": result.starts,
+        "seconds_fit": result.seconds,
+        "scaled_gradient": result.minimum.scaled_gradient,
+        "condition_number": result.minimum.condition,
+        "chi2_history": list(result.minimum.history),
+        "misfit": None if misfit is None else dataclasses.asdict(misfit),
+        "residual_map": None
+        if residuals is None
+        else {
+            "cells": [residuals.grid.width, residuals.grid.height],
+            "filter": residuals.filter,
+            "rms_beyond_noise": residuals.excess(),
+            "significance": residuals.significance(),
+        },
+        "remarks": list(calset.remarks),
+    }

@@ -1,0 +1,273 @@
+"""Intensities that stand in a table: kept in memory row by row, handed out as dense blocks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from walop_jax.data.records import Block, Exposures, Intensities, Points, Sources
+from walop_jax.data.schema import Place
+from walop_jax.io.errors import rows_text
+
+_NEGATIVE = 5.0
+"""Counts below minus this many sigma are no bias-subtracted counts but a fault."""
+
+_SPOILT = 0.2
+"""Above this share of unusable rows the set is refused, not masked."""
+
+
+class TableIntensities(Intensities):
+    """One row per (exposure, point), in the order of the file.
+
+    `exposure`, `point` and `source` are rows of the calibration set's tables (`source` −1: none), `counts`
+    and `sigma` electrons as in the file, `flag` its bits, `used` which rows take part.
+    """
+
+    def __init__(
+        self,
+        exposures: int,
+        points: Points,
+        *,
+        exposure: Int[np.ndarray, " r"],
+        point: Int[np.ndarray, " r"],
+        source: Int[np.ndarray, " r"],
+        counts: Float[np.ndarray, "r 4"],
+        sigma: Float[np.ndarray, "r 4"],
+        flag: Int[np.ndarray, " r"],
+        used: Bool[np.ndarray, " r"],
+    ) -> None:
+        self.exposures = exposures
+        self.points = points
+        self.exposure, self.point, self.source = exposure, point, source
+        self.counts, self.sigma, self.flag, self.used = counts, sigma, flag, used
+        good = np.flatnonzero(used)
+        self._order = good[np.argsort(point[good], kind="stable")]
+        self._bounds = np.searchsorted(point[self._order], np.arange(len(points) + 1))
+
+    @classmethod
+    def dense(cls, points: Points, block: Block) -> TableIntensities:
+        """Make a table of the used part of a block that holds all `points`, as a simulator gives it."""
+        point, exposure = np.nonzero(block.used)
+        return cls(
+            block.used.shape[1],
+            points,
+            exposure=exposure,
+            point=point,
+            source=block.source[point, exposure],
+            counts=block.counts[point, exposure],
+            sigma=block.sigma[point, exposure],
+            flag=np.zeros(len(point), dtype=np.int64),
+            used=np.ones(len(point), dtype=bool),
+        )
+
+    def using(self, used: Bool[np.ndarray, " r"]) -> TableIntensities:
+        """Return the same rows with another choice of which take part."""
+        return TableIntensities(
+            self.exposures,
+            self.points,
+            exposure=self.exposure,
+            point=self.point,
+            source=self.source,
+            counts=self.counts,
+            sigma=self.sigma,
+            flag=self.flag,
+            used=used,
+        )
+
+    @property
+    def rows(self) -> int:
+        """Number of used rows."""
+        return len(self._order)
+
+    def block(self, start: int, stop: int) -> Block:
+        """Return the data of the field points `start:stop`, dense in the exposures."""
+        start, stop, _ = slice(start, stop).indices(len(self.points))
+        stop = max(start, stop)
+        rows = self._order[self._bounds[start] : self._bounds[stop]]
+        block = empty_block(self.points.x[start:stop], self.points.y[start:stop], self.exposures)
+        at = (self.point[rows] - start, self.exposure[rows])
+        block.counts[at] = self.counts[rows]
+        block.sigma[at] = self.sigma[rows]
+        block.used[at] = True
+        block.source[at] = self.source[rows]
+        return block
+
+
+def empty_block(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], exposures: int) -> Block:
+    """Return a block without any measurement: counts 0, sigma 1, nothing used. `x`, `y` in degrees."""
+    shape = (len(x), exposures)
+    return Block(
+        x=x,
+        y=y,
+        counts=np.zeros((*shape, 4)),
+        sigma=np.ones((*shape, 4)),
+        used=np.zeros(shape, dtype=bool),
+        source=np.full(shape, -1, dtype=np.int64),
+    )
+
+
+def usable(
+    counts: Float[np.ndarray, "*r 4"], sigma: Float[np.ndarray, "*r 4"], flag: Int[np.ndarray, "*r"]
+) -> tuple[Bool[np.ndarray, "*r"], Bool[np.ndarray, "*r"], Bool[np.ndarray, "*r"]]:
+    """Sort measurements (electrons) into used, spoilt and impossible ones; flagged ones are none of these.
+
+    Spoilt: not finite, or more negative than noise explains. Impossible: an error that is zero or negative.
+    """
+    open_ = flag == 0
+    with np.errstate(invalid="ignore"):
+        impossible = open_ & np.any(np.isfinite(sigma) & (sigma <= 0), axis=-1)
+        good = np.all(np.isfinite(counts) & np.isfinite(sigma) & (counts >= -_NEGATIVE * sigma), axis=-1)
+    return open_ & good & ~impossible, open_ & ~good & ~impossible, impossible
+
+
+def table_intensities(
+    table: dict[str, Any], exposures: Exposures, points: Points, sources: Sources, place: Place
+) -> tuple[TableIntensities, list[str]]:
+    """Check the rows of an INTENSITIES table against the other tables; return them and remarks.
+
+    Raises `DataError` for identifiers that do not exist, repeated (EXPOSURE, POINT) pairs, errors that are
+    not positive, too many spoilt rows, nothing used, and counts that are all equal.
+    """
+    exposure = _rows_of(table["EXPOSURE"], exposures.exposure, "EXPOSURE", "EXPOSURES", place)
+    point = _rows_of(table["POINT"], points.point, "POINT", "POINTS", place)
+    pair = exposure * len(points) + point
+    _, inverse, number = np.unique(pair, return_inverse=True, return_counts=True)
+    if np.any(twice := number[inverse] > 1):
+        first = np.flatnonzero(pair == pair[np.argmax(twice)])
+        raise place.fail(
+            f"EXPOSURE {table['EXPOSURE'][first[0]]}, POINT {table['POINT'][first[0]]} is there twice, "
+            f"in {rows_text(first)}",
+            "EXPOSURE, POINT",
+            f"keep one row of each pair ({int(twice.sum())} rows are concerned)",
+        )
+    counts, sigma, flag = table["N"], table["N_ERR"], table["FLAG"]
+    used, spoilt, impossible = usable(counts, sigma, flag)
+    if np.any(impossible):
+        raise place.fail(
+            f"is zero or negative in {rows_text(np.flatnonzero(impossible))}",
+            "N_ERR",
+            "give the true error, or set FLAG",
+        )
+    remarks = _judge(counts, used, spoilt, place)
+    source, more = _source_rows(table["SOURCE"], exposures, exposure, sources, used, place)
+    intensities = TableIntensities(
+        len(exposures),
+        points,
+        exposure=exposure,
+        point=point,
+        source=source,
+        counts=counts,
+        sigma=sigma,
+        flag=flag,
+        used=used,
+    )
+    return intensities, remarks + more
+
+
+def _judge(counts: np.ndarray, used: np.ndarray, spoilt: np.ndarray, place: Place) -> list[str]:
+    """Refuse data that cannot be what they should; remark on what has been masked."""
+    bad = np.flatnonzero(spoilt)
+    if len(bad) > _SPOILT * len(spoilt):
+        cameras = [f"N[{k}]" for k in range(4) if not np.any(np.isfinite(counts[:, k]))]
+        raise place.fail(
+            f"{100 * len(bad) / len(spoilt):.0f} % of the rows are not finite or far below zero "
+            f"({rows_text(bad)}){', no data at all in ' + ', '.join(cameras) if cameras else ''}",
+            "N, N_ERR",
+            "repair the reduction, or set FLAG where it fails",
+        )
+    if not np.any(used):
+        raise place.fail("no row can be used: all are flagged or spoilt", "FLAG", "look at the reduction")
+    values = counts[used]
+    if np.count_nonzero(used) > 1 and np.all(values == values[0, 0]):
+        raise place.fail(f"all counts are equal ({values[0, 0]:g})", "N", "these are not measurements")
+    where = f"{place.file} [{place.extension}]"
+    remarks = []
+    if len(bad):
+        remarks.append(f"{where} N, N_ERR: not finite or below −5 sigma in {rows_text(bad)}, not used")
+    if flagged := len(used) - np.count_nonzero(used) - len(bad):
+        remarks.append(f"{where} FLAG: set in {flagged} of {len(used)} rows, not used")
+    return remarks
+
+
+def _rows_of(ids: np.ndarray, known: np.ndarray, column: str, table: str, place: Place) -> np.ndarray:
+    """Turn identifiers into rows of the table that defines them."""
+    order = np.argsort(known, kind="stable")
+    at = np.minimum(np.searchsorted(known[order], ids), len(known) - 1)
+    rows = order[at]
+    if np.any(absent := known[rows] != ids):
+        bad = np.flatnonzero(absent)
+        near = known[np.argmin(np.abs(known - ids[bad[0]]))]
+        raise place.fail(
+            f"{column} {ids[bad[0]]} does not exist in {table}, asked for in {rows_text(bad)}",
+            column,
+            f"the nearest is {near}; add it there or correct it here",
+        )
+    return rows
+
+
+def _source_rows(
+    ids: np.ndarray,
+    exposures: Exposures,
+    exposure: np.ndarray,
+    sources: Sources,
+    used: np.ndarray,
+    place: Place,
+) -> tuple[np.ndarray, list[str]]:
+    """Turn SOURCE into rows of SOURCES; a standard needs one, any other source may be unlisted."""
+    rows = np.full(len(ids), -1, dtype=np.int64)
+    if len(sources):
+        order = np.argsort(sources.source, kind="stable")
+        at = order[np.minimum(np.searchsorted(sources.source[order], ids), len(order) - 1)]
+        rows = np.where((sources.source[at] == ids) & (ids >= 0), at, -1)
+    standard = ((exposures.kind == "standard") & ~exposures.clp_in)[exposure] & used
+    if np.any(bad := standard & (rows < 0)):
+        first = np.flatnonzero(bad)
+        known = ", ".join(str(entry) for entry in sources.source[:10]) or "none"
+        raise place.fail(
+            f"a standard star needs a row of SOURCES; {ids[first[0]]} is not one, in {rows_text(first)}",
+            "SOURCE",
+            f"SOURCES has {known}",
+        )
+    lost = np.flatnonzero(used & (ids >= 0) & (rows < 0))
+    remark = f"{place.file} [{place.extension}] SOURCE: not in SOURCES, taken as unknown in {rows_text(lost)}"
+    return rows, [remark] if len(lost) else []
+
+
+def mask_repeats(intensities: TableIntensities, exposures: Exposures) -> tuple[TableIntensities, list[str]]:
+    """Find exposures that are copies of an earlier one and stop using them, lest errors shrink; say which.
+
+    A copy has the same time, settings, points and counts to the last bit. Exposures that share only time
+    and settings are remarked on.
+    """
+    names = [name for name in exposures.__dataclass_fields__ if name != "exposure"]
+    groups: dict[tuple[str, ...], list[int]] = {}
+    for row in np.flatnonzero(np.isfinite(exposures.mjd)):
+        groups.setdefault(tuple(str(getattr(exposures, name)[row]) for name in names), []).append(int(row))
+    used = intensities.used.copy()
+    remarks: list[str] = []
+    alike: list[str] = []
+    for first, *others in groups.values():
+        for other in others:
+            ids = f"exposures {exposures.exposure[first]} and {exposures.exposure[other]}"
+            if not _same_data(intensities, first, other):
+                alike.append(ids)
+                continue
+            remarks.append(f"{ids} are the same to the last bit, the second is not used")
+            used[intensities.exposure == other] = False
+    if alike:
+        more = f" (and {len(alike) - 1} pairs more)" if len(alike) > 1 else ""
+        remarks.append(f"{alike[0]} have the same time and settings but different counts{more}")
+    return intensities.using(used), remarks
+
+
+def _same_data(intensities: TableIntensities, first: int, second: int) -> bool:
+    rows = [np.flatnonzero(intensities.exposure == entry) for entry in (first, second)]
+    rows = [entry[np.argsort(intensities.point[entry])] for entry in rows]
+    if len(rows[0]) == 0 or len(rows[0]) != len(rows[1]):
+        return False
+    return all(
+        np.array_equal(getattr(intensities, name)[rows[0]], getattr(intensities, name)[rows[1]])
+        for name in ("point", "counts")
+    )

@@ -1,0 +1,296 @@
+"""Tables that astronomers bring along (FITS, CSV, ECSV): columns by name, checked, with units taken care of.
+
+Column names know no upper and lower case. A cell that is empty or masked is NaN, or the value that the column
+has where it is absent.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Shaped
+
+from walop_jax.data.checks import FIELD_LIMITS
+from walop_jax.data.filters import DEFAULT_FILTER
+from walop_jax.data.schema import Column, Place, convert_unit
+from walop_jax.io.atomic import atomic_path, check_output
+from walop_jax.io.errors import DataError, fail, nearest, rows_text
+from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits
+from walop_jax.io.plain_tables import table_format
+
+_NAN = float("nan")
+_TRUE, _FALSE = ("true", "t", "1", "yes"), ("false", "f", "0", "no", "")
+POINT_COLUMNS: Mapping[str, Column] = {
+    "X": Column("float", "deg"),
+    "Y": Column("float", "deg"),
+    "TEFF": Column("float", "K", _NAN),
+    "CHWP_IN": Column("bool", missing=False),
+    "CHWP_ANGLE": Column("float", "deg", _NAN),
+    "FILTER": Column("str", missing=DEFAULT_FILTER),
+    "TEMP": Column("float", "Celsius", 10.0),
+    "HA": Column("float", "h", 0.0),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class InputTable:
+    """A table as it was read, to be handed back with columns added; `rows` is its length."""
+
+    path: Path
+    rows: int
+    table: Any
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its columns in capitals."""
+        return tuple(str(name).upper() for name in self.table.colnames)
+
+
+def read_input_table(path: str | os.PathLike[str]) -> InputTable:
+    """Read a table with whatever columns it has.
+
+    Raises `DataError` if the file is missing, damaged, no table, has no rows, or names a column twice.
+    """
+    from astropy.table import Table  # imported here: it takes a third of a second
+
+    path, kind = Path(path), table_format(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if kind == "fits":
+                with open_fits(path) as opened:
+                    number = next(
+                        (n for n, h in enumerate(opened.hdus) if type(h).__name__ == "BinTableHDU"), None
+                    )
+                    if number is None:
+                        raise fail("has no table", file=path, advice="write one, or use a CSV file")
+                    table: Any = Table.read(opened.hdus[number], character_as_bytes=False)
+            else:
+                table = Table.read(path, format=kind)
+    except DataError:
+        raise
+    except FileNotFoundError:
+        raise fail("there is no such file", file=path, advice="check the name") from None
+    except (*UNREADABLE, UnicodeError) as error:
+        what = f"cannot be read as a table: {one_line(error)}"
+        raise fail(what, file=path, advice="write it again") from error
+    if len(table) == 0:
+        raise fail("has no rows", file=path, advice="nothing to be done")
+    names = [str(name).upper() for name in table.colnames]
+    for name in names:
+        if names.count(name) > 1:
+            raise fail("the column is there twice", file=path, column=name, advice="rename one of them")
+    return InputTable(path, len(table), table)
+
+
+def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
+    """A column as an array in the unit, and of the kind, that `rule` asks for.
+
+    Raises `DataError` naming file, column and rows for what cannot be converted.
+    """
+    place = Place(source.path, "")
+    if name not in source.names:
+        if rule.missing is None:
+            advice = f"add it ({nearest(name, source.names)})"
+            raise place.fail("the column is missing", name, advice)
+        return np.full(source.rows, rule.missing)
+    column = source.table.columns[source.names.index(name)]
+    masked = np.asarray(getattr(column, "mask", np.zeros(source.rows, bool)))
+    values = np.ma.getdata(np.ma.asarray(column))
+    if values.ndim != 1:
+        raise place.fail(f"has shape {values.shape[1:]} in a row, one value is needed", name, "split it")
+    if rule.kind == "str":
+        text = np.char.strip(values.astype(str))
+        return np.where(masked | (text == ""), str(rule.missing), text)
+    if rule.kind == "bool":
+        return _truth(values, masked, name, place)
+    return _numbers(values, masked, str(column.unit or ""), name, rule, place)
+
+
+def vector_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
+    """A column with `rule.width` numbers in a row, or that many columns `name`0, `name`1, … side by side.
+
+    Text formats have no vectors, hence the second form; N_ERR is N0_ERR, N1_ERR, … there. Raises `DataError`
+    as `numeric_column` does, and for a row of another width.
+    """
+    place = Place(source.path, "")
+    width = rule.width or 1
+    if name not in source.names:
+        head, _, tail = name.partition("_")
+        parts = [f"{head}{k}{'_' + tail if tail else ''}" for k in range(width)]
+        if not any(part in source.names for part in parts):
+            if rule.missing is not None:
+                return np.full((source.rows, width), rule.missing)
+            advice = f"add it, or {parts[0]} … {parts[-1]} ({nearest(name, source.names)})"
+            raise place.fail("the column is missing", name, advice)
+        single = dataclasses.replace(rule, width=1)
+        return np.stack([numeric_column(source, part, single) for part in parts], axis=1)
+    column = source.table.columns[source.names.index(name)]
+    values = np.ma.getdata(np.ma.asarray(column))
+    if values.ndim != 2 or values.shape[1] != width:
+        what = f"has shape {values.shape[1:] or '()'} in a row, {width} values are needed"
+        raise place.fail(what, name, "one row holds the four cameras O1, E1, O2, E2")
+    masked = np.broadcast_to(np.asarray(getattr(column, "mask", False)), values.shape).ravel()
+    return _numbers(values.ravel(), masked, str(column.unit or ""), name, rule, place).reshape(values.shape)
+
+
+def _truth(values: np.ndarray, masked: np.ndarray, name: str, place: Place) -> Bool[np.ndarray, " n"]:
+    text = np.char.lower(np.char.strip(values.astype(str)))
+    true = np.isin(text, _TRUE) | np.isin(text, ["1.0"])
+    bad = ~(true | np.isin(text, _FALSE) | np.isin(text, ["0.0"]) | masked)
+    if np.any(bad):
+        rows = np.flatnonzero(bad)
+        what = f"{values[rows[0]]!s} is neither true nor false, in {rows_text(rows)}"
+        raise place.fail(what, name, "write T or F")
+    return true & ~masked
+
+
+def _numbers(
+    values: np.ndarray, masked: np.ndarray, unit: str, name: str, rule: Column, place: Place
+) -> Float[np.ndarray, " n"]:
+    if values.dtype.kind in "OSU":
+        numbers = np.full(len(values), np.nan)
+        for row, text in enumerate(values.astype(str).tolist()):
+            if masked[row] or not text.strip():
+                continue
+            try:
+                numbers[row] = float(text)
+            except ValueError:
+                raise place.fail(
+                    f"{text!r} is not a number, in {rows_text([row])}", name, "correct it or leave it empty"
+                ) from None
+    elif values.dtype.kind in "fiu":
+        numbers = values.astype(np.float64)
+    else:
+        raise place.fail(f"holds {values.dtype.name} values", name, "write it as a numeric column")
+    empty = masked | np.isnan(numbers)
+    if unit:
+        numbers = convert_unit(numbers, unit, rule.unit, name, place)
+    return np.where(empty, float("nan" if rule.missing is None else str(rule.missing)), numbers)
+
+
+@dataclasses.dataclass(frozen=True)
+class FieldPoints:
+    """Where, and under which optical settings, an instrument matrix is asked for.
+
+    `x`, `y` in degrees; `teff` in K (NaN: flat spectrum); `chwp_angle` in degrees (NaN: plate out); `temp` in
+    Celsius; `ha` in hours. `outside` marks points beyond the field of the instrument.
+    """
+
+    x: Float[np.ndarray, " n"]
+    y: Float[np.ndarray, " n"]
+    teff: Float[np.ndarray, " n"]
+    chwp_angle: Float[np.ndarray, " n"]
+    filter: Shaped[np.ndarray, " n"]
+    temp: Float[np.ndarray, " n"]
+    ha: Float[np.ndarray, " n"]
+    outside: Bool[np.ndarray, " n"]
+
+
+def field_points(source: InputTable, instrument: str) -> FieldPoints:
+    """The X, Y and optional settings of a table of field points of an instrument.
+
+    Without CHWP_IN the calibration plate is in the beam where CHWP_ANGLE has a value. Single points outside
+    the field are marked; if most of them lie outside, the unit must be wrong.
+
+    Raises `DataError` naming file, column and row for anything that cannot be meant.
+    """
+    place = Place(source.path, "")
+    columns = {name: numeric_column(source, name, rule) for name, rule in POINT_COLUMNS.items()}
+    x, y, angle, teff = (columns[name] for name in ("X", "Y", "CHWP_ANGLE", "TEFF"))
+    inside = columns["CHWP_IN"] if "CHWP_IN" in source.names else np.isfinite(angle)
+
+    def refuse(bad: np.ndarray, what: str, column: str, advice: str) -> None:
+        if np.any(bad):
+            raise place.fail(f"{what} in {rows_text(np.flatnonzero(bad))}", column, advice)
+
+    for name in ("X", "Y", "TEMP", "HA"):
+        refuse(~np.isfinite(columns[name]), "is not finite", name, "correct or remove these rows")
+    refuse(inside & ~np.isfinite(angle), "is not finite", "CHWP_ANGLE", "CHWP_IN is true: give the angle")
+    refuse(np.abs(angle) > 36000, "exceeds ±36000", "CHWP_ANGLE", "encoder readings are in degrees")
+    cold = ~np.isnan(teff) & ~((teff >= 500) & (teff < 1e6))
+    refuse(cold, "is no temperature of a source", "TEFF", "give kelvin, or leave it empty: flat spectrum")
+    refuse(np.abs(columns["TEMP"]) > 150, "exceeds ±150", "TEMP", "degrees Celsius: are these kelvin?")
+    refuse(np.abs(columns["HA"]) > 24, "exceeds ±24", "HA", "hours: are these degrees?")
+    limit = FIELD_LIMITS[instrument]
+    outside = np.maximum(np.abs(x), np.abs(y)) > limit
+    if np.mean(outside) > 0.5:
+        raise place.fail(
+            f"most points lie outside ±{limit:g}° of {instrument}: {rows_text(np.flatnonzero(outside))}",
+            "X, Y",
+            "field coordinates are in degrees: are these arcmin or pixels?",
+        )
+    return FieldPoints(
+        x=x, y=y, teff=teff, chwp_angle=np.where(inside, angle, np.nan), filter=columns["FILTER"],
+        temp=columns["TEMP"], ha=columns["HA"], outside=outside,
+    )  # fmt: skip
+
+
+def true_matrices(
+    path: str | os.PathLike[str], instrument: str
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n 6"]]:
+    """X, Y (deg) and M21 … M33 of a table of true matrices; `DataError` for what is missing or not finite."""
+    source = read_input_table(path)
+    points = field_points(source, instrument)
+    columns = [numeric_column(source, f"M{k}", Column("float")) for k in (21, 22, 23, 31, 32, 33)]
+    matrix = np.stack(columns, axis=1)
+    bad = np.flatnonzero(~np.isfinite(matrix).all(axis=1))
+    if bad.size:
+        raise fail(
+            f"not finite in {rows_text(bad)}", file=path, column="M21 … M33", advice="remove these rows"
+        )
+    return points.x, points.y, matrix
+
+
+def new_table(columns: Mapping[str, Any]) -> InputTable:
+    """A table of columns (arrays, or pairs of an array and its description), to be written."""
+    from astropy.table import Column as TableColumn
+    from astropy.table import Table
+
+    table = Table()
+    for name, values in columns.items():
+        values, description = values if isinstance(values, tuple) else (values, "")
+        table.add_column(TableColumn(values, name=name, description=description or None))
+    return InputTable(Path(), len(table), table)
+
+
+def write_output_table(
+    path: str | os.PathLike[str],
+    source: InputTable,
+    added: Mapping[str, Any],
+    *,
+    overwrite: bool = False,
+    header: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a table with columns added (an old column of that name is replaced), in the format of the name.
+
+    A value of `added` is an array, or a pair of an array and its description; `header` adds to the header of
+    the table (CSV has none). The file appears whole or not at all. Raises `DataError` as `atomic_path` does, and
+    for an unknown extension.
+    """
+    kind = table_format(path)
+    check_output(path, overwrite=overwrite)
+    table = source.table.copy(copy_data=False)
+    for key in [key for key in table.meta if key.upper() in ("CHECKSUM", "DATASUM", "EXTNAME")]:
+        del table.meta[key]
+    table.meta.update(header or {})
+    present = {str(name).upper(): name for name in table.colnames}
+    for name, values in added.items():
+        if name in present:
+            table.remove_column(present[name])
+        values, description = values if isinstance(values, tuple) else (values, "")
+        table[name] = values
+        if description:
+            table[name].description = description
+    with atomic_path(path, overwrite=overwrite) as temporary, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            table.write(temporary, format=kind, overwrite=True)
+        except (ValueError, TypeError) as error:
+            raise fail(f"cannot be written: {one_line(error)}", file=path, advice="try .ecsv") from error

@@ -1,0 +1,173 @@
+"""One look at a fit: its design, the scores of every effect and pattern, and the names in order of evidence."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+from walop_jax.diagnosis import naming
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.effect_columns import Probe, effect_candidates
+from walop_jax.diagnosis.findings import Limit
+from walop_jax.diagnosis.freeform import SINGLE, strata
+from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable, separations
+from walop_jax.fit.refit import FitResult
+from walop_jax.likelihood.problem import Problem
+from walop_jax.model.effects import Effect
+from walop_jax.model.parameters import field_declarations
+
+Vector = Float[np.ndarray, " _"]
+Matrix = Float[np.ndarray, "_ _"]
+
+ALARM = 0.0027  # three standard deviations
+COMMON_MODE = 0.05  # rms (σ of one intensity) of disturbances that one camera in one exposure may have
+PROBABILITY = 0.95
+MOST_PATTERNS = 8
+ALIKE = 0.01  # relative change of the counts up to which columns are kept
+
+
+@dataclasses.dataclass(frozen=True)
+class _Own:
+    """What the parameters of an active effect absorb: the projection without them, and the columns' share of it."""
+
+    rest: Projector
+    basis: Matrix
+    columns: Matrix  # basisᵀ C
+
+
+class Look:
+    """The scores of everything against one fit.
+
+    `named` are the columns of the effects ahead of any projection, `space` and `columns` those of all candidates,
+    effects first, behind it. `ranked` are the effects in order of linear evidence, `patterns` the scores of the
+    free-form strata.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        result: FitResult,
+        wanted: Sequence[Probe],
+        rng: np.random.Generator,
+        earlier: Look | None = None,
+    ) -> None:
+        """`earlier` is a look at a smaller model, whose columns serve again where the light has hardly changed."""
+        self.problem, self.result = problem, result
+        active = problem.model.effect_names
+        self.design = Design.of(problem, result)
+        inactive = [probe for probe in wanted if probe.effect.name not in active]
+        self.named = (
+            effect_candidates(problem.calset, problem.model, result.values, inactive)
+            if earlier is None or not self._is_like(earlier)
+            else earlier.named
+        )
+        self.probes = [probe for probe in inactive if probe.name in self.named]
+        candidates = [*(self.named[probe.name] for probe in self.probes), *strata(self.design.measured)]
+        names, widths = [c.name for c in candidates], [c.widths for c in candidates]
+        self.columns = self.design.stacked([candidates.pop(0).columns for _ in names])
+        self._own = {}
+        for name in active:
+            rest, basis = self.design.without(name)
+            self._own[name] = _Own(rest, basis, basis.T @ self.columns)
+        self.space = ScoreSpace.projected(self.design.projector, names, widths, self.columns)
+        self.common_mode = self._common_mode()
+        space, reduce = self.space.with_base([SINGLE], self.common_mode)
+        r = self.design.projector(self.design.residual)
+        self._scored = space, *reduce(self.columns.T @ r, float(r @ r))
+        self._rng = rng
+        self.table: ScoreTable = Scorer(space, rng)(*self._scored[1:])
+        self.ranked = naming.rank(self.table, self.probes)
+        self.patterns = [self.table[name] for name in names[len(self.probes) :]]
+        # Where the base is excluded, a name competes with patterns that have none, not with the base.
+        self.least_evidence = min(0.0, max(s.log_bayes for s in self.patterns if s.testable))
+
+    def _is_like(self, earlier: Look) -> bool:
+        """Whether the expected counts differ so little that derivatives with respect to anything else do as well."""
+        ours, theirs = self.design.measured.model, earlier.design.measured.model
+        return bool(np.linalg.norm(ours - theirs) < ALIKE * np.linalg.norm(theirs))
+
+    def _common_mode(self) -> Vector:
+        """Prior widths of the gains of single exposures that amount to `COMMON_MODE` per intensity."""
+        at = self.space.places()[SINGLE]
+        points = np.repeat(self.design.measured.used.sum(axis=0), 3)
+        square = np.where(self.space.before[at] > 0, self.space.before[at], np.inf)
+        return np.maximum(COMMON_MODE * np.sqrt(points / square), 1e-30)
+
+    def patterns_needed(self) -> list[tuple[str, float]]:
+        """Patterns that together leave nothing significant, with corrected p: the most probable first, one by one."""
+        space, scores, square = self._scored
+        names = [score.name for score in self.patterns]
+        table, needed = self.table, []
+        while table.p_global < ALARM and len(needed) < MOST_PATTERNS:
+            left = [s for s in table.scores if s.name in names and s.testable and table.corrected(s) < ALARM]
+            if not left:
+                break
+            best = max(left, key=lambda s: s.log_bayes)
+            needed.append((best.name, table.corrected(best)))
+            names.remove(best.name)
+            space, reduce = space.with_base([best.name])
+            scores, square = reduce(scores, square)
+            table = Scorer(space, self._rng)(scores, square)
+        return needed
+
+    @property
+    def alarm(self) -> bool:
+        """Whether anything is missing at all."""
+        return self.table.p_global < ALARM
+
+    def summary(self) -> tuple[tuple[str, float, float], ...]:
+        """Effects with score and corrected p, most significant first."""
+        rows = [(r.effect.name, r.score.statistic, self.table.corrected(r.score)) for r in self.ranked]
+        return tuple(sorted(rows, key=lambda row: row[2]))
+
+    def limits(self) -> Iterator[Limit]:
+        """What each effect with a single amplitude stays below."""
+        for item in self.ranked:
+            names = item.effect.amplitudes()
+            if len(item.score.amplitudes) != 1 or sum(p.effect is item.effect for p in self.probes) > 1:
+                continue
+            value, sigma = float(item.score.amplitudes[0]), float(np.sqrt(item.score.covariance[0, 0]))
+            unit = field_declarations(item.effect)[names[0]].unit
+            one_sided = names[0] in item.effect.one_sided
+            below = upper_limit(value, sigma, one_sided=one_sided)
+            yield Limit(item.effect.name, names[0], unit, value, sigma, below)
+
+    def untestable(self, catalogue: Sequence[type[Effect]]) -> tuple[str, ...]:
+        """Effects that these data cannot show at any plausible size."""
+        seen = {probe.effect.name for probe in self.probes if self.table[probe.name].testable}
+        seen.update(self.problem.model.effect_names)
+        return tuple(
+            effect.name for effect in catalogue if effect.name not in seen and not effect.is_structural()
+        )
+
+    def separation(self, name: str, change: Vector) -> dict[str, float]:
+        """How far (σ) each rival stays from an active effect that changes the residuals (data rows) by `change`."""
+        own = self._own[name]
+        whole = np.pad(change, (0, len(self.design.residual) - len(change)))
+        projected = own.rest(whole)
+        space = dataclasses.replace(self.space, gram=self.space.gram + own.columns.T @ own.columns)
+        scores = self.columns.T @ projected + own.columns.T @ (own.basis.T @ projected)
+        by_probe = separations(space, scores, float(projected @ projected))
+        found: dict[str, float] = {}
+        for probe in self.probes:
+            effect = probe.effect.name
+            found[effect] = min(by_probe[probe.name], found.get(effect, np.inf))
+        return found
+
+    @cached_property
+    def significant(self) -> list[naming.Ranked]:
+        """Effects that are significant by themselves, best evidence first."""
+        return [r for r in self.ranked if self.table.corrected(r.score) < ALARM]
+
+
+def upper_limit(value: float, sigma: float, *, one_sided: bool) -> float:
+    """Size that an amplitude stays below with 95 % probability, for a flat prior (positive when one-sided)."""
+    if one_sided:
+        below_zero = stats.norm.cdf(-value / sigma)
+        return float(value + sigma * stats.norm.ppf(below_zero + PROBABILITY * (1.0 - below_zero)))
+    return float(stats.foldnorm.ppf(PROBABILITY, abs(value) / sigma, scale=sigma))

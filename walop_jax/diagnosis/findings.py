@@ -1,0 +1,155 @@
+"""What a diagnosis finds, as values."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.diagnosis.design import HeldOut
+from walop_jax.fit.refit import FitResult
+from walop_jax.likelihood.problem import Problem
+
+Verdict = Literal["consistent", "effect_found", "unexplained"]
+Cube = Float[np.ndarray, "p e 4"]
+
+NEGLIGIBLE = (
+    1e-4  # change of calibrated q and u (0.01 %) that does not matter for an instrument good to 0.1 %
+)
+MANY = 2  # names above which a single effect that nobody thought of is as likely
+LARGEST_ROBUST_RATIO = (
+    1.5  # of errors that allow for common disturbances of an exposure, to errors that do not
+)
+
+
+def _no_cube() -> Cube:
+    return np.zeros((0, 0, 4))
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """One effect that was found, added and confirmed; `parameters` hold (value, sigma, unit).
+
+    `score` and `p_value` (corrected for all that was tried) are of the linear test, `log_bayes` of the refit.
+    `far` are amplitudes that lie beyond what their prior allows, in its widths: the data have refuted that prior.
+    `change_of_qu` is the largest change that adding it makes to calibrated q or u of a star with p ≤ 5 % at any field
+    point, `robust_ratio` the errors of its parameters when every exposure may have a disturbance of its own, over
+    the errors stated. `choices` are discrete (which camera, which star), `alternatives` other shapes of the same
+    effect that explain the data as well. `equivalent` are the effects that this data set cannot tell from it,
+    `separation` how far (σ) each rival stays from it. `residual_before` and `residual_after` are the residuals
+    (data − model, in standard deviations as given; point, exposure, camera) without and with the effect at the time it
+    was added; where another name has been dropped since, they and χ² are of fits without that name.
+    """
+
+    effect: str
+    parameters: dict[str, tuple[float, float, str]]
+    score: float
+    p_value: float
+    log_bayes: float
+    chi2_before: float
+    chi2_after: float
+    heldout_before: HeldOut
+    heldout_after: HeldOut
+    change_of_qu: float = float("nan")
+    robust_ratio: float = float("nan")
+    far: dict[str, float] = dataclasses.field(default_factory=dict)
+    choices: dict[str, Any] = dataclasses.field(default_factory=dict)
+    alternatives: tuple[str, ...] = ()
+    equivalent: tuple[str, ...] = ()
+    separation: dict[str, float] = dataclasses.field(default_factory=dict)
+    separated_by: str = ""
+    where: dict[str, Any] = dataclasses.field(default_factory=dict)
+    residual_before: Cube = dataclasses.field(default_factory=_no_cube)
+    residual_after: Cube = dataclasses.field(default_factory=_no_cube)
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether data that took no part in the fit agree better with the effect than without."""
+        return self.heldout_after.mean < self.heldout_before.mean
+
+    @property
+    def negligible(self) -> bool:
+        """Whether the effect hardly matters for calibrated q and u."""
+        return self.change_of_qu < NEGLIGIBLE
+
+
+@dataclasses.dataclass(frozen=True)
+class Limit:
+    """Amplitude of an effect that was not found, one linear step, and the size it stays below with 95 % probability."""
+
+    effect: str
+    parameter: str
+    unit: str
+    value: float
+    sigma: float
+    below: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Unexplained:
+    """What is left and has no name; `term` are the blocks of the free-form term that was added for it.
+
+    `chi2_before` and `chi2_after` are without and with that term, `change_of_qu` is what it changes in calibrated q
+    and u of a star with p ≤ 5 %.
+    """
+
+    p_value: float
+    description: str
+    patterns: tuple[tuple[str, float], ...]
+    term: tuple[str, ...] = ()
+    chi2_before: float = float("nan")
+    chi2_after: float = float("nan")
+    change_of_qu: float = float("nan")
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """What is missing from a model, according to one calibration set.
+
+    `candidates` are (effect, score, corrected p) in the first look; `after` is the fit of the extended model and
+    `problem` what it was fitted to; `remaining_p` is the significance of what is left at the end.
+    """
+
+    verdict: Verdict
+    steps: tuple[Step, ...]
+    candidates: tuple[tuple[str, float, float], ...]
+    limits: tuple[Limit, ...]
+    untestable: tuple[str, ...]
+    unexplained: Unexplained | None
+    p_value: float
+    remaining_p: float
+    before: FitResult
+    after: FitResult
+    problem: Problem
+    seconds: float
+    points: int
+
+    @property
+    def caution(self) -> str:
+        """What to bear in mind with these findings; empty when there is nothing."""
+        parts = []
+        looked_at = len(self.problem.calset.points)
+        if looked_at < self.points:
+            parts.append(
+                f"{looked_at} of {self.points} field points were looked at, and fitted: refit all of them with the "
+                "model found"
+            )
+        if len(self.steps) > MANY:
+            parts.append(
+                f"{len(self.steps)} names were needed: something that is not in the catalogue can look like several "
+                "that are"
+            )
+        far = [
+            f"{s.effect}.{name} ({widths:.0f} widths)" for s in self.steps for name, widths in s.far.items()
+        ]
+        if far:
+            parts.append(f"far beyond its prior, which was widened: {', '.join(far)}")
+        weak = [s.effect for s in self.steps if s.robust_ratio > LARGEST_ROBUST_RATIO]
+        if weak:
+            parts.append(
+                f"errors of {', '.join(weak)} are too small by more than a factor {LARGEST_ROBUST_RATIO} if single "
+                "exposures have disturbances of their own"
+            )
+        return "; ".join(parts)

@@ -1,0 +1,246 @@
+"""The name: refits of the leading candidates, their evidence, and who cannot be told from whom.
+
+Evidence       Laplace: ln B = ½ (O_base − O_g) − ½ (ln det H_g − ln det H_base) − Σ ln w, with O the objective (χ² of
+               data and priors), H half its Hessian and w the prior widths of the added parameters.
+Equivalence    The change D of the residuals that the named effect makes, projected off the other parameters, is fitted
+               by each rival; the length of what the rival cannot follow is the separation in standard deviations
+               (Atkinson & Fedorov 1975, Biometrika 62, 57). Below `SEPARATION` the data cannot tell the two apart, nor
+               when the evidence of their refits differs by less than `EVEN_ODDS`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.data.records import CalibrationSet
+from walop_jax.diagnosis.effect_columns import Probe
+from walop_jax.diagnosis.score import Score, ScoreTable
+from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
+from walop_jax.likelihood.problem import Problem
+from walop_jax.model.effects import Context, Effect
+from walop_jax.model.parameters import leaves
+from walop_jax.model.specification import Model, full_values, with_effects
+
+SEPARATION = 3.0
+MOST_LEADERS = 5
+MOST_SHAPES = 4  # of one effect from which it is refitted
+CLOSE = 8.0  # ln B below the best within which a rival is refitted
+LARGE = 150.0  # ln B above which the linear ranking is not trusted
+EVEN_ODDS = 3.0  # difference in ln B that is no preference
+
+
+@dataclasses.dataclass(frozen=True)
+class Ranked:
+    """An effect with its best probe: evidence averaged over its alternative shapes; `others` may be as good."""
+
+    effect: type[Effect]
+    probe: Probe
+    score: Score
+    log_bayes: float
+    others: tuple[tuple[Probe, Score], ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """An effect that was added and refitted; `alternatives` are other shapes of it that do as well, in words."""
+
+    effect: type[Effect]
+    problem: Problem
+    fit: FitResult
+    log_bayes: float
+    alternatives: tuple[str, ...] = ()
+
+    @property
+    def instance(self) -> Effect:
+        """The effect at its fitted values, in standard form."""
+        return self.fit.model.instrument(self.fit.values).effect(self.effect.name).standard_form()
+
+
+def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
+    """Effects by evidence, best first; alternative shapes share the prior of their effect."""
+    by_effect: dict[type[Effect], list[tuple[Probe, Score]]] = {}
+    for probe in probes:
+        by_effect.setdefault(probe.effect, []).append((probe, table[probe.name]))
+    ranked = []
+    for effect, shapes in by_effect.items():
+        alive = [(p, s) for p, s in shapes if s.testable and follow_physics(p, s)]
+        if not alive:
+            continue
+        alive.sort(key=lambda item: -item[1].log_bayes)
+        (probe, score), best = alive[0], alive[0][1].log_bayes
+        bayes = np.array([s.log_bayes for _, s in alive])
+        mean = float(np.logaddexp.reduce(bayes) - np.log(len(shapes)))
+        others = [item for item in alive[1:MOST_SHAPES] if item[1].log_bayes > best - max(CLOSE, 0.2 * best)]
+        ranked.append(Ranked(effect, probe, score, mean, tuple(others)))
+    return sorted(ranked, key=lambda item: -item.log_bayes)
+
+
+def leaders(ranked: Sequence[Ranked]) -> list[Ranked]:
+    """Candidates whose linear evidence is too close to the best to decide without a refit."""
+    best = ranked[0].log_bayes
+    reach = max(CLOSE, 0.6 * best) if best > LARGE else CLOSE
+    return [item for item in ranked[:MOST_LEADERS] if item.log_bayes > best - reach]
+
+
+def _log_determinant(result: FitResult) -> float:
+    return float(np.linalg.slogdet(result.posterior.matrix)[1])
+
+
+def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
+    """Laplace evidence of an extended fit against the base (parameters without a prior carry no Occam factor)."""
+    known = set(base.model.names)
+    widths = [
+        p.prior[1] if p.prior is not None else (p.loose or p.scale)
+        for p in extended.model.parameters
+        if p.name not in known and p.free and p.tie is None
+    ]
+    gain = 0.5 * (base.posterior.objective - extended.posterior.objective)
+    occam = 0.5 * (_log_determinant(extended) - _log_determinant(base))
+    return gain - occam - float(np.sum(np.log(widths)))
+
+
+def try_effect(
+    calset: CalibrationSet, base: FitResult, instance: Effect, context: Context, prior_shapes: int = 1
+) -> Trial:
+    """Add an effect at the given values to the fitted model and fit everything again."""
+    model = with_effects(base.model, [instance], context)
+    start = dict(zip(base.model.names, base.values, strict=True))
+    values = np.array([start.get(p.name, p.start) for p in model.parameters])
+    problem = Problem(calset, model)
+    result = fit(problem, start=values, noise_scale=base.noise_scale, worth=base.posterior.objective)
+    bayes = log_evidence_ratio(base, result) - (float(np.log(prior_shapes)) if prior_shapes > 1 else 0.0)
+    return Trial(type(instance), problem, result, bayes)
+
+
+def try_shapes(calset: CalibrationSet, base: FitResult, item: Ranked, context: Context, shapes: int) -> Trial:
+    """Refit an effect from the amplitudes of its linear steps at the shapes that may be best, and keep the best."""
+    places = ((item.probe, item.score), *item.others)
+    trials = [
+        try_effect(calset, base, item.effect.combine(probe.group, score.amplitudes), context, shapes)
+        for probe, score in places
+    ]
+    best = max(trials, key=lambda t: t.log_bayes if t.fit.converged else -np.inf)
+    alike = [t for t in trials if t.fit.converged and t.log_bayes > best.log_bayes - EVEN_ODDS]
+    told = dict.fromkeys(in_words(t.instance) for t in alike if _differ(t, best))
+    return dataclasses.replace(best, alternatives=tuple(told))
+
+
+def _differ(one: Trial, other: Trial) -> bool:
+    if one.instance.choices() != other.instance.choices():
+        return True
+    at = one.fit.model.positions(one.effect.name)
+    sigma = np.maximum(one.fit.sigma[at], other.fit.sigma[at])
+    away = full_values(one.instance) - full_values(other.instance)
+    return bool(np.any(np.abs(away) > SEPARATION * np.where(sigma > 0, sigma, np.inf)))
+
+
+def in_words(effect: Effect) -> str:
+    """Choices and values of an effect, e.g. "camera = 2, depth = 0.006"."""
+    values = {leaf.name: f"{v:.4g}" for leaf, v in zip(leaves(effect), full_values(effect), strict=True)}
+    return ", ".join(f"{name} = {value}" for name, value in (spoken_choices(effect) | values).items())
+
+
+def spoken_choices(effect: Effect) -> dict[str, Any]:
+    """Discrete choices that mean something to a reader: a camera, a crystal, a star."""
+    return {name: value for name, value in effect.choices().items() if isinstance(value, int | str)}
+
+
+def follow_physics(probe: Probe, score: Score) -> bool:
+    """Whether a linear step leaves one-sided amplitudes on their side, within `SEPARATION` standard deviations."""
+    sigma = np.sqrt(np.clip(np.diag(score.covariance), 0.0, None))
+    return bool(np.all((score.amplitudes >= -SEPARATION * sigma)[probe.one_sided]))
+
+
+def amplitude_positions(model: Model, name: str) -> list[int]:
+    """Positions of the free amplitudes of an active effect that have a prior."""
+    effect = model.template.effect(name)
+    at = [model.index(f"{name}.{label}") for f in effect.amplitudes() for label in effect.labels(f)]
+    return [i for i in at if model.parameters[i].free and model.parameters[i].prior is not None]
+
+
+def with_refuted_priors_widened(model: Model, values: Float[np.ndarray, " n"], name: str) -> Model:
+    """The model in which amplitudes of an effect that lie far outside of their priors lie one width from the mean.
+
+    A prior says how large such an effect usually is. One that the data refute would go on pulling at the value and
+    count the square of its distance as a misfit, of data that are explained to within the noise.
+    """
+    for i in amplitude_positions(model, name):
+        mean, width = model.parameters[i].prior  # type: ignore[misc]
+        away = abs(float(values[i]) - mean)
+        if away > PRIOR_EDGE * width:
+            model = model.change(model.names[i], prior=(mean, away))
+    return model
+
+
+def beyond_prior(result: FitResult, name: str) -> dict[str, float]:
+    """Amplitudes of an effect that lie beyond the prior of their declaration, widened or not, in its widths."""
+    effect = result.model.template.effect(name)
+    declared = {f"{name}.{leaf.name}": leaf.declaration.width for leaf in leaves(effect)}
+    found = {}
+    for i in amplitude_positions(result.model, name):
+        p = result.model.parameters[i]
+        widths = abs(float(result.values[i]) - p.prior[0]) / (declared[p.name] or np.inf)  # type: ignore[index]
+        if widths > PRIOR_EDGE:
+            found[p.name.removeprefix(f"{name}.")] = widths
+    return found
+
+
+def evidence_of_presence(result: FitResult, name: str, context: Context) -> float:
+    """ln B of a fitted model against the one without an effect: the density that prior and posterior have at neutral.
+
+    The Savage–Dickey ratio of nested models, Gaussian (Dickey 1971, Ann. Math. Stat. 42, 204). Infinite for an
+    effect without parameters.
+    """
+    effect = result.model.template.effect(name)
+    at = amplitude_positions(result.model, name)
+    if not at:
+        return float("inf")
+    neutral = dict(
+        zip(
+            (f"{name}.{leaf.name}" for leaf in leaves(effect)),
+            full_values(effect.at_neutral(context)),
+            strict=True,
+        )
+    )
+    away = result.values[at] - np.array([neutral[result.model.parameters[i].name] for i in at])
+    width = np.array([result.model.parameters[i].prior[1] for i in at])  # type: ignore[index]
+    covariance = result.covariance[np.ix_(at, at)] / np.outer(width, width)
+    away = away / width
+    return float(0.5 * away @ np.linalg.solve(covariance, away) + 0.5 * np.linalg.slogdet(covariance)[1])
+
+
+def without(model: Model, name: str) -> Model:
+    """The model with one effect taken out."""
+    rest = tuple(effect for effect in model.template.effects if effect.name != name)
+    own = model.positions(name)
+    parameters = tuple(p for i, p in enumerate(model.parameters) if i not in own)
+    template = dataclasses.replace(model.template, effects=rest)
+    return dataclasses.replace(model, template=template, parameters=parameters)
+
+
+def refit_without(calset: CalibrationSet, result: FitResult, name: str) -> tuple[Problem, FitResult]:
+    """Take an effect out of a fitted model and fit again, with errors scaled only if what is left needs it."""
+    model = without(result.model, name)
+    start = dict(zip(result.model.names, result.values, strict=True))
+    problem = Problem(calset, model)
+    return problem, fit(problem, start=np.array([start[n] for n in model.names]))
+
+
+def signature(problem: Problem, result: FitResult, name: str, context: Context) -> Float[np.ndarray, " _"]:
+    """What an active effect does to the residuals (data rows): theirs without it, minus theirs with it."""
+    effect = result.model.template.effect(name)
+    if type(effect).is_structural():
+        model = without(result.model, name)
+        kept = [result.model.index(n) for n in model.names]
+        bare = Problem(problem.calset, model).residuals(result.values[kept])[1]
+    else:
+        values = result.values.copy()
+        values[result.model.positions(name)] = full_values(effect.at_neutral(context))
+        bare = problem.residuals(values)[1]
+    change = bare - problem.residuals(result.values)[1]
+    return change[problem.used].reshape(-1) / result.noise_scale

@@ -1,0 +1,287 @@
+"""The workflow: alarm, name, addition, until the data are explained or what is left has no name.
+
+1. Fit the model. 2. Score every effect of the catalogue and every pattern of the free-form basis; global p by Monte
+Carlo. 3. Below `ALARM`: refit the leaders and take the one with the highest evidence that data which took no part in
+the fit confirm, provided that it is significant after correction for all that was tried. 4. It joins the model, and
+everything is fitted again. 5. Repeat. 6. Drop names that are not needed beside the others. 7. What no name explains is
+added as a free-form term, labelled, and the verdict is `unexplained`; names that only stood in for it are dropped as
+well. 8. List for each name what the data cannot tell from it, and give the verdict.
+
+An effect is named whatever its size; `Step.negligible` says when it does not matter for q and u.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from walop_jax.data.records import CalibrationSet
+from walop_jax.diagnosis import location as where
+from walop_jax.diagnosis import naming
+from walop_jax.diagnosis.change_of_stokes import instrument_matrices, largest_change
+from walop_jax.diagnosis.design import Design, held_out
+from walop_jax.diagnosis.effect_columns import Probe
+from walop_jax.diagnosis.effect_columns import probes as all_probes
+from walop_jax.diagnosis.examination import Look
+from walop_jax.diagnosis.findings import Diagnosis, Step, Unexplained, Verdict
+from walop_jax.diagnosis.freeform import block_of
+from walop_jax.diagnosis.score import Score
+from walop_jax.diagnosis.step_summary import comparison, retold
+from walop_jax.fit.refit import FitResult, fit
+from walop_jax.likelihood.chunks import thinned
+from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.model.effects import EFFECTS, Context, Effect, FreeForm
+from walop_jax.model.specification import Model, effect_context, full_values
+
+LARGEST_ROWS = 100_000  # 800 columns of four cameras each take 2.5 GB
+MOST_STEPS = 6
+NEEDED = 1.0  # ln B that an effect must be worth to the final model to stay in it
+MISFIT = 1.5  # χ²/dof above which effects that cannot be differentiated are tried
+Progress = Callable[[str], None]
+
+
+def diagnose(
+    calset: CalibrationSet,
+    model: Model | None = None,
+    *,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Find what `model` (default: the base model) lacks to explain a calibration set.
+
+    `catalogue` are the effects that may be named. Of a set with more than `LARGEST_ROWS` (exposure, point) pairs,
+    points spread over the field are looked at. Raises what `fit` raises.
+    """
+    began = time.perf_counter()
+    tell = progress or (lambda text: None)
+    some = thinned(calset, max(1, LARGEST_ROWS // len(calset.exposures)), run=1)
+    found = _Diagnosing(some, model or base_model(calset), catalogue, seed, tell).run(began)
+    return dataclasses.replace(found, points=len(calset.points))
+
+
+class _Diagnosing:
+    """The state of one diagnosis: the current problem, its fit, the last look at it, the steps so far."""
+
+    def __init__(
+        self,
+        calset: CalibrationSet,
+        model: Model,
+        catalogue: Sequence[type[Effect]],
+        seed: int,
+        tell: Progress,
+    ) -> None:
+        self.calset, self.catalogue, self.tell = calset, catalogue, tell
+        self.rng = np.random.default_rng(seed)
+        self.context: Context = effect_context(model.template, calset.exposures)
+        self.wanted: list[Probe] = list(all_probes(catalogue, self.context))
+        self.problem = Problem(calset, model)
+        self.steps: list[Step] = []
+        tell("fitting the model")
+        self.fit: FitResult = fit(self.problem)
+
+    def run(self, began: float) -> Diagnosis:
+        before = self.fit
+        self.tell("scoring every effect and pattern")
+        first = self._look()
+        look, unexplained = self._conclude(first, self._add_names(first))
+        steps = tuple(self._finished(step, look) for step in self.steps)
+        verdict: Verdict = "unexplained" if unexplained else "effect_found" if steps else "consistent"
+        return Diagnosis(
+            verdict=verdict,
+            steps=steps,
+            candidates=first.summary(),
+            limits=tuple(look.limits()),
+            untestable=first.untestable(self.catalogue),
+            unexplained=unexplained,
+            p_value=first.table.p_global,
+            remaining_p=look.table.p_global,
+            before=before,
+            after=self.fit,
+            problem=self.problem,
+            seconds=time.perf_counter() - began,
+            points=len(self.calset.points),
+        )
+
+    def _look(self, earlier: Look | None = None) -> Look:
+        return Look(self.problem, self.fit, self.wanted, self.rng, earlier)
+
+    # ------------------------------------------------------------------------------------------------ a name
+
+    def _add_names(self, look: Look) -> Look:
+        """Add names until nothing is missing or none is found; the look at what they leave."""
+        while look.alarm and len(self.steps) < MOST_STEPS:
+            self.tell(f"p = {look.table.p_global:.2g}: something is missing; trying names")
+            added = self._add_best(look)
+            if added is None:
+                break
+            self.tell(f"added {added}; scoring what is left")
+            look = self._look(look)
+        return look
+
+    def _trials(self, look: Look) -> Iterator[naming.Trial]:
+        for item in naming.leaders(look.significant) if look.significant else ():
+            shapes = sum(probe.effect is item.effect for probe in look.probes)
+            yield naming.try_shapes(self.calset, self.fit, item, self.context, shapes)
+        if self.fit.chi2 > MISFIT * self.fit.dof:
+            for effect in self.catalogue:
+                if effect.is_structural() and effect.name not in self.problem.model.effect_names:
+                    yield naming.try_effect(self.calset, self.fit, effect.neutral(self.context), self.context)
+
+    def _add_best(self, look: Look) -> str | None:
+        """Add the name with the highest evidence that held-out data confirm; None when there is none."""
+        trials = [t for t in self._trials(look) if t.fit.converged and t.log_bayes > look.least_evidence]
+        trials.sort(key=lambda t: -t.log_bayes)
+        for trial in trials:
+            close = tuple(
+                t.effect.name
+                for t in trials
+                if t is not trial and abs(t.log_bayes - trial.log_bayes) < naming.EVEN_ODDS
+            )
+            step = self._step(look, trial, close)
+            if step.confirmed:
+                self.steps.append(step)
+                self._adopt(trial.problem, trial.fit)
+                if self.fit is not trial.fit:
+                    after = Design.of(self.problem, self.fit)
+                    self.steps[-1] = dataclasses.replace(step, **comparison(step.effect, look.design, after))
+                return step.effect
+        return None
+
+    def _adopt(self, problem: Problem, result: FitResult) -> None:
+        """Go on with a fit: errors as given where they need not be scaled any more, refuted priors widened."""
+        if result.noise_scale > 1.0:
+            result = fit(problem, start=result.values)
+        model = problem.model
+        for step in self.steps:
+            model = naming.with_refuted_priors_widened(model, result.values, step.effect)
+        if model is not problem.model:
+            problem = Problem(self.calset, model)
+            result = fit(problem, start=result.values)
+        self.problem, self.fit = problem, result
+
+    def _step(self, look: Look, trial: naming.Trial, close: tuple[str, ...]) -> Step:
+        name = trial.effect.name
+        score: Score | None = next((r.score for r in look.ranked if r.effect is trial.effect), None)
+        return Step(
+            effect=name,
+            parameters={},
+            score=score.statistic if score else look.result.chi2 - trial.fit.chi2,
+            p_value=look.table.corrected(score) if score else look.table.p_global,
+            log_bayes=trial.log_bayes,
+            equivalent=close,
+            alternatives=trial.alternatives,
+            **comparison(name, look.design, Design.of(trial.problem, trial.fit)),
+        )
+
+    # --------------------------------------------------------------------------------------- what has no name
+
+    def _unexplained(self, look: Look) -> Unexplained:
+        patterns = tuple(look.patterns_needed())
+        if not look.alarm:
+            text = (
+                f"residuals scatter more than N_ERR says (χ²/dof = {look.result.chi2 / look.result.dof:.3g}) "
+                "without any pattern that was looked for"
+            )
+        elif patterns:
+            listed = "; ".join(f"{name} (p = {p:.1g})" for name, p in patterns)
+            text = f"patterns without a name: {listed}"
+        else:
+            text = "something is missing, no single pattern is significant by itself"
+        place = where.describe(look.design, look.design.residual)
+        text += (
+            f". Residuals sit in: cameras {place['camera']}; kinds {place['kind']}; field {place['field']}"
+        )
+        found = Unexplained(look.table.p_global, text, patterns)
+        blocks = tuple(dict.fromkeys(b for name, _ in patterns if (b := block_of(name)) is not None))
+        there = FreeForm.name in self.fit.model.effect_names
+        return self._with_free_form(look, found, blocks) if blocks and not there else found
+
+    def _with_free_form(self, look: Look, found: Unexplained, blocks: tuple[str, ...]) -> Unexplained:
+        """Add a free-form term for patterns without a name, so that the calibration improves all the same.
+
+        It need not be probable, only useful: it stays when it predicts parts of the field that it has not seen.
+        """
+        term = FreeForm.of(self.context, blocks=blocks)
+        trial = naming.try_effect(self.calset, self.fit, term, self.context)
+        if not trial.fit.converged:
+            return found
+        without, with_term = (
+            held_out(design, "field blocks").mean
+            for design in (look.design, Design.of(trial.problem, trial.fit))
+        )
+        if with_term >= without:
+            return found
+        before = self.fit
+        self._adopt(trial.problem, trial.fit)
+        change = largest_change(
+            instrument_matrices(before, self.calset), instrument_matrices(self.fit, self.calset)
+        )
+        return dataclasses.replace(
+            found, term=blocks, chi2_before=before.chi2, chi2_after=self.fit.chi2, change_of_qu=change
+        )
+
+    # ---------------------------------------------------------------------------------------------- the end
+
+    def _conclude(self, first: Look, look: Look) -> tuple[Look, Unexplained | None]:
+        """Drop what is not needed, then ask what is left without a name: the look at the final model, and that."""
+        dropped = self._drop_what_is_not_needed()
+        while True:
+            if dropped:
+                look = self._look(first)
+                self.steps = retold(self.steps, first.design, look.design)
+            if not look.alarm and self.fit.explains_data:
+                return look, None
+            self.tell("something without a name is left")
+            unexplained = self._unexplained(look)
+            if not unexplained.term:
+                return look, unexplained
+            dropped = self._drop_what_is_not_needed()
+            if not dropped:
+                return self._look(look), unexplained
+            # Those names only stood in for what has none: what is it without them?
+            self._adopt(*naming.refit_without(self.calset, self.fit, FreeForm.name))
+
+    def _drop_what_is_not_needed(self) -> bool:
+        """Take out, one by one, names that the final model does not need; whether there were any."""
+        dropped = False
+        while self.steps and len(self.fit.model.template.effects) > 1:
+            worth = {
+                s.effect: naming.evidence_of_presence(self.fit, s.effect, self.context) for s in self.steps
+            }
+            least = min(worth, key=lambda name: worth[name])
+            if worth[least] >= NEEDED:
+                break
+            self.tell(f"{least} is no longer needed")
+            self.steps = [s for s in self.steps if s.effect != least]
+            self._adopt(*naming.refit_without(self.calset, self.fit, least))
+            dropped = True
+        return dropped
+
+    def _finished(self, step: Step, look: Look) -> Step:
+        """The step with final parameters, what cannot be told from it, and where it sits."""
+        change = naming.signature(self.problem, self.fit, step.effect, self.context)
+        separation = look.separation(step.effect, change)
+        close = {name for name, s in separation.items() if s < naming.SEPARATION} | set(step.equivalent)
+        close -= {other.effect for other in self.steps}
+        effect = self.fit.model.instrument(self.fit.values).effect(step.effect)
+        standard = full_values(effect.standard_form()) if not type(effect).is_structural() else ()
+        parameters = {}
+        for i, value in zip(self.fit.model.positions(step.effect), standard, strict=True):
+            p = self.fit.model.parameters[i]
+            label = p.name.removeprefix(f"{step.effect}.")
+            parameters[label] = (float(value), float(self.fit.sigma[i]), p.unit)
+        return dataclasses.replace(
+            step,
+            parameters=parameters,
+            far=naming.beyond_prior(self.fit, step.effect),
+            choices=naming.spoken_choices(effect),
+            robust_ratio=look.design.robust_ratio(step.effect),
+            equivalent=tuple(sorted(close, key=lambda name: separation.get(name, np.inf))),
+            separation=separation,
+            separated_by=effect.separated_by if close else "",
+            where=where.describe(look.design, change),
+        )

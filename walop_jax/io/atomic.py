@@ -1,0 +1,98 @@
+"""Files that appear whole or not at all: written beside their place, flushed to disk, then renamed."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from walop_jax.io.errors import fail
+
+
+def check_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+    """Return the file that `path` leads to, or say why nothing can be written there.
+
+    Meant to be called before hours of work as well as before the writing itself. A symbolic link is
+    followed, so that the link stays one and the file behind it changes.
+
+    Raises `DataError` for a missing or read-only folder, a folder in place of the file, a link that leads
+    to itself, and a file that exists while `overwrite` is False.
+    """
+    try:
+        target = Path(os.path.realpath(path, strict=Path(path).exists()))
+        folder = target.parent
+        if not folder.is_dir():
+            raise fail(f"the folder {folder} does not exist", file=path, advice="create it first")
+        if target.is_dir():
+            raise fail("is a folder", file=path, advice="give the name of a file in it")
+        if target.is_symlink():
+            raise fail("is a symbolic link that leads back to itself", file=path, advice="remove the link")
+        if target.exists() and not overwrite:
+            raise fail("exists already", file=path, advice="choose another name, or ask for overwriting")
+    except OSError as error:
+        raise fail(f"cannot be written: {error}", file=path, advice="choose another place") from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise fail(f"the folder {folder} is read-only", file=path, advice="choose another folder")
+    return target
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
+    """Give a temporary file to write; put it in the place of `path` only if the block ends well.
+
+    The temporary file lies in the same folder (a rename across file systems is a copy, hence not atomic)
+    and has the same suffix, because many writers choose the format by it. It is removed when the block
+    raises, so an old file survives a full disk, an interrupt and a bug untouched.
+
+    Raises `DataError` as `check_output` does, and for what the operating system refuses (a full disk).
+    """
+    target = check_output(path, overwrite=overwrite)
+    try:
+        descriptor, name = tempfile.mkstemp(prefix=".walop-", suffix=target.suffix, dir=target.parent)
+    except OSError as error:
+        raise fail(f"cannot be written: {error}", file=path, advice="choose another folder") from error
+    os.close(descriptor)
+    temporary = Path(name)
+    try:
+        yield temporary
+        publish(temporary, target, overwrite=overwrite)
+    except OSError as error:
+        raise fail(
+            f"writing failed: {error}",
+            file=path,
+            advice="free some space; what stood there before is untouched",
+        ) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
+    """Flush `temporary` to disk and move it to `target`, with the permissions of an ordinary new file."""
+    umask = os.umask(0)
+    os.umask(umask)
+    temporary.chmod(target.stat().st_mode & 0o777 if target.exists() else 0o666 & ~umask)
+    with temporary.open("rb+") as stream:
+        os.fsync(stream.fileno())
+    if overwrite:
+        os.replace(temporary, target)
+    else:
+        try:
+            # A link, unlike a rename, refuses a file that another program has put there meanwhile.
+            os.link(temporary, target)
+        except FileExistsError:
+            raise fail("has been written by another program meanwhile", file=target) from None
+        except OSError:
+            os.replace(temporary, target)  # a file system without hard links
+    _flush_folder(target.parent)
+
+
+def _flush_folder(folder: Path) -> None:
+    """Flush the folder's entry, without which a power cut may undo the rename."""
+    with contextlib.suppress(OSError):  # some network file systems cannot
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,194 @@
+"""Opening a FITS file so that what comes out of it is what was written, or an error.
+
+A file is read once from end to end: for its SHA-256, for the FITS checksums (Seaman, Pence & Rots 2012, an
+appendix of the FITS standard: the 32-bit words of an HDU, summed in ones' complement, are all ones), and
+for its length. astropy would check the sums too, but in small blocks, and would only warn. The sums find
+every damaged byte, but not two changes that cancel each other; the SHA-256 is what tells two files apart.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import gzip
+import hashlib
+import io
+import os
+import warnings
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+
+from walop_jax.io.errors import DataError, fail
+
+_CHUNK = 1 << 23  # a multiple of four, so that words never straddle two chunks
+_LARGEST_GZIP = 1 << 31
+_BLOCK = 2880
+_BROKEN = "the copy is damaged or incomplete; transfer or write the file again"
+
+UNREADABLE = (
+    OSError,
+    EOFError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    AttributeError,
+    zlib.error,
+    fits.VerifyError,
+)
+"""What astropy raises on a damaged file, some of it only when a header or a column is used."""
+
+
+@dataclasses.dataclass(frozen=True)
+class OpenFile:
+    """A FITS file that has passed its checks: its HDUs, its hash, and what is worth remarking."""
+
+    path: Path
+    sha256: str
+    hdus: list[Any]
+    compressed: bool
+    remarks: tuple[str, ...]
+
+
+@contextlib.contextmanager
+def open_fits(path: str | os.PathLike[str]) -> Iterator[OpenFile]:
+    """Open a FITS file (plain, or compressed with gzip) after checking that it is whole.
+
+    Raises `DataError` if it is missing, not FITS, truncated, longer than its headers say, or if a checksum
+    that it carries does not agree with its bytes.
+    """
+    path = Path(path)
+    with contextlib.ExitStack() as stack:
+        try:
+            raw = stack.enter_context(path.open("rb"))
+            compressed = raw.read(2) == b"\x1f\x8b"
+            content = _decompressed(path) if compressed else raw
+            caught = stack.enter_context(warnings.catch_warnings(record=True))
+            warnings.simplefilter("always")
+            # Opened here because astropy does not close a file that it fails to read.
+            stream = (
+                io.BytesIO(content) if isinstance(content, bytes) else stack.enter_context(path.open("rb"))
+            )
+            hdus = stack.enter_context(
+                fits.open(stream, lazy_load_hdus=False, disable_image_compression=True)
+            )
+            units = list(hdus)
+            raw.seek(0)
+            sha256 = _verify(path, units, io.BytesIO(content) if isinstance(content, bytes) else raw)
+        except DataError:
+            raise
+        except FileNotFoundError:
+            raise fail("there is no such file", file=path, advice="check the name") from None
+        except UNREADABLE as error:
+            raise fail(f"cannot be read as FITS: {one_line(error)}", file=path, advice=_BROKEN) from error
+        if isinstance(content, bytes):
+            raw.seek(0)
+            sha256 = hashlib.file_digest(raw, "sha256").hexdigest()
+        remarks = tuple(f"{path}: {one_line(entry.message)}" for entry in caught)
+        yield OpenFile(path, sha256, units, compressed, remarks)
+
+
+def one_line(message: object) -> str:
+    """Put a message of another library on one line, shortened."""
+    return " ".join(str(message).split())[:300] or type(message).__name__
+
+
+def _decompressed(path: Path) -> bytes:
+    """Unpack a gzip file into memory, with a limit: a small file may unpack to any size."""
+    with gzip.open(path) as stream:
+        content = stream.read(_LARGEST_GZIP + 1)
+    if len(content) > _LARGEST_GZIP:
+        raise fail("unpacks to more than 2 GiB", file=path, advice="unpack it with gunzip")
+    return content
+
+
+def _verify(path: Path, hdus: list[Any], stream: io.BufferedIOBase) -> str:
+    """Read the file once; check length and checksums; return the SHA-256 of the bytes."""
+    stream.seek(0, os.SEEK_END)
+    size = stream.tell()
+    stream.seek(0)
+    digest = hashlib.sha256()
+    for number, hdu in enumerate(hdus):
+        info = hdu.fileinfo() if hasattr(hdu, "fileinfo") else None
+        if info is None:  # astropy's stand-in for an extension whose header it cannot understand
+            raise fail(f"the header of extension {number} is damaged", file=path, advice=_BROKEN)
+        name = hdu.name or f"HDU {number}"
+        start, data, end = info["hdrLoc"], info["datLoc"], info["datLoc"] + info["datSpan"]
+        if end > size:
+            raise fail(
+                f"truncated: {size} bytes where {end} are announced",
+                file=path,
+                extension=name,
+                advice=_BROKEN,
+            )
+        header_sum = _sum(stream, data - start, digest)
+        data_sum = _sum(stream, end - data, digest)
+        declared = hdu.header.get("DATASUM")
+        if declared is not None and str(declared).strip() != str(data_sum):
+            raise fail("the data do not agree with DATASUM", file=path, extension=name, advice=_BROKEN)
+        if "CHECKSUM" in hdu.header and _fold(header_sum + data_sum) not in (0, 0xFFFFFFFF):
+            advice = f"{_BROKEN}, or renew the checksum if the header was edited on purpose"
+            raise fail("the bytes do not agree with CHECKSUM", file=path, extension=name, advice=advice)
+    if stream.tell() != size:
+        raise fail(
+            f"{size - stream.tell()} bytes after the last extension cannot be read", file=path, advice=_BROKEN
+        )
+    return digest.hexdigest()
+
+
+def _sum(stream: io.BufferedIOBase, length: int, digest: Any) -> int:
+    """Add up big-endian 32-bit words in ones' complement (carries come back in at the bottom)."""
+    total = 0
+    while length > 0:
+        chunk = stream.read(min(length, _CHUNK))
+        if not chunk:
+            raise EOFError("unexpected end of file")
+        digest.update(chunk)
+        total += int(np.frombuffer(chunk.ljust(-(-len(chunk) // 4) * 4, b"\0"), ">u4").sum(dtype=np.uint64))
+        length -= len(chunk)
+    return _fold(total)
+
+
+def _fold(total: int) -> int:
+    while total >> 32:
+        total = (total & 0xFFFFFFFF) + (total >> 32)
+    return total
+
+
+def data_sum(path: Path, offset: int, length: int) -> int:
+    """Return the FITS data sum of a stretch of a file, for a writer of data larger than memory."""
+    with path.open("rb") as stream:
+        stream.seek(offset)
+        return _sum(stream, length, hashlib.sha256())
+
+
+def checksum_text(header: bytes, data: int) -> str:
+    """Return the CHECKSUM that completes a header in which it is `'0' * 16`, given the sum of the data.
+
+    FITS standard 4.0, appendix J.1: each byte of the complement is split over four letters, kept clear of
+    punctuation, and the string is turned by one because it starts at the twelfth byte of its card.
+    """
+    value = 0xFFFFFFFF ^ _fold(_sum(io.BytesIO(header), len(header), hashlib.sha256()) + data)
+    letters = [0] * 16
+    for place, byte in enumerate(value.to_bytes(4, "big")):
+        four = [byte // 4 + 48 + (byte % 4 if n == 0 else 0) for n in range(4)]
+        while any(_punctuation(letter) for letter in four):
+            for n in (0, 2):
+                if _punctuation(four[n]) or _punctuation(four[n + 1]):
+                    four[n], four[n + 1] = four[n] + 1, four[n + 1] - 1
+        letters[place::4] = four
+    return bytes(letters[-1:] + letters[:-1]).decode("ascii")
+
+
+def _punctuation(letter: int) -> bool:
+    return 0x3A <= letter <= 0x40 or 0x5B <= letter <= 0x60
+
+
+def padded(length: int) -> int:
+    """Round a number of bytes up to whole FITS blocks."""
+    return -(-length // _BLOCK) * _BLOCK

@@ -1,0 +1,66 @@
+"""Tables of results that did not start as a table of the user.
+
+Columns with unit and description, FITS or ECSV.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from astropy.table import Column as AstropyColumn
+from astropy.table import Table
+
+from walop_jax.io.atomic import atomic_path
+from walop_jax.io.errors import fail
+
+FORMATS = {
+    ".fits": "fits",
+    ".fit": "fits",
+    ".fits.gz": "fits",
+    ".csv": "ascii.csv",
+    ".ecsv": "ascii.ecsv",
+}
+"""Extensions of tables that are read, and what astropy calls the format."""
+
+
+def table_format(path: str | os.PathLike[str]) -> str:
+    """What astropy calls the format of a table with this name.
+
+    Raises `DataError` for an extension that is none of `FORMATS`.
+    """
+    name = Path(path).name.lower()
+    for extension, kind in FORMATS.items():
+        if name.endswith(extension):
+            return kind
+    raise fail("is no table that can be read", file=path, advice=f"use {', '.join(FORMATS)}")
+
+
+def write_columns(
+    path: str | os.PathLike[str],
+    columns: Mapping[str, tuple[np.ndarray, str, str]],
+    notes: Mapping[str, str | int | float | bool] | None = None,
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write columns given as (values, unit, description), with notes in the header; whole or not at all.
+
+    The format follows the name. Raises `DataError` as `atomic_path` does, and for an unknown extension.
+    """
+    kind = table_format(path)
+    table = Table(
+        [
+            AstropyColumn(values, name=name, unit=unit or None, description=about)
+            for name, (values, unit, about) in columns.items()
+        ],
+        meta=dict(notes or {}),
+    )
+    with atomic_path(path, overwrite=overwrite) as temporary, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            table.write(temporary, format=kind, overwrite=True)
+        except ValueError as error:
+            raise fail(f"cannot be written: {error}", file=path, advice="try .ecsv") from error

@@ -1,0 +1,308 @@
+"""Paper II's method beside the joint model: the same data, the same stars, on the grid points and between them.
+
+Stars with p ≤ 5 % are seen through *reference* analysis vectors: those of the joint model, or of the true instrument
+where a truth table comes with the set. Paper II's polynomial gets their (q_m, u_m), the joint model their four
+intensities. Without a truth the error of the joint model is what its covariance promises.
+
+Why there are Δq and Δu. With throughput imbalance α an ideal pair of cameras measures r = (α + q)/(1 + αq), whose
+inverse is q = −α + r + α r² + …: squares are needed. But behind a polariser q² + u² = 1, so (q_m, u_m) runs round an
+ellipse on which 1, q_m² and u_m² are nearly dependent: coefficients may move by λ (1, −1, −1) and the polarised states
+hardly notice, while unpolarised light, near q_m = u_m = 0, is off by λ. Noise and the terms left out (q_m u_m, third
+order) decide λ. Where cross-talk makes u_m follow q_m, two more directions go the same way. One unpolarised exposure
+fixes what noise does not; intensities never have the question.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.data.filters import DEFAULT_FILTER
+from walop_jax.data.records import CalibrationSet
+from walop_jax.io.errors import DataError
+from walop_jax.paper.full_moon import full_moon_scheme, judge_patches
+from walop_jax.paper.polynomial import (
+    PaperCalibration,
+    fit_paper,
+    fit_polynomials,
+    judged,
+    polariser_exposures,
+    polariser_states,
+    ratios,
+    terms,
+)
+from walop_jax.paper.spectral import DEGREE, TEMPERATURES, colour_spread, efficiencies, spread_document
+from walop_jax.science.star_errors import (
+    GOAL,
+    LARGEST_P,
+    QUANTITIES,
+    STARS,
+    WEAK,
+    Place,
+    Truth,
+    Vectors,
+    determinant,
+    joint_errors,
+    promised_errors,
+    sample_stars,
+    star_errors,
+    statistics,
+    transmitted,
+    truth_vectors,
+)
+
+LINES = 81  # wavelengths across the filter
+
+
+@dataclasses.dataclass(frozen=True)
+class Offsets:
+    """Where Δq, Δu come from, point by point.
+
+    `found` as in the paper; `along` what the coefficients' departure along the weakest direction of the design
+    matrix makes of unpolarised light, `along_three` along its three weakest; `noiseless` Δ of a fit to noise-free
+    polarised states; `anchored` Δ when one unpolarised exposure is added to those of the set.
+    """
+
+    found: Float[np.ndarray, "p 2"]
+    along: Float[np.ndarray, "p 2"]
+    along_three: Float[np.ndarray, "p 2"]
+    noiseless: Float[np.ndarray, "p 2"]
+    anchored: Float[np.ndarray, "p 2"]
+    condition: Float[np.ndarray, " p"]
+
+    def document(self) -> dict[str, Any]:
+        """Sizes in per cent, and the share of the variance of Δ that the weakest direction explains."""
+
+        def size(values: Float[np.ndarray, "p 2"]) -> dict[str, float]:
+            rms = np.sqrt(np.mean(values**2, axis=0)).tolist()
+            most = np.abs(values).max(axis=0).tolist()
+            return {
+                "rms_q": 100 * rms[0],
+                "rms_u": 100 * rms[1],
+                "max_q": 100 * most[0],
+                "max_u": 100 * most[1],
+            }
+
+        def explained(values: Float[np.ndarray, "p 2"]) -> dict[str, float]:
+            left = np.sum((self.found - values) ** 2, axis=0) / np.sum(self.found**2, axis=0)
+            return {"q": 1.0 - float(left[0]), "u": 1.0 - float(left[1])}
+
+        return {
+            "found": size(self.found),
+            "noiseless": size(self.noiseless),
+            "with_one_unpolarised_exposure": size(self.anchored),
+            "explained_by_weakest_direction": explained(self.along),
+            "explained_by_three_weakest_directions": explained(self.along_three),
+            "condition_number": {
+                "median": float(np.median(self.condition)),
+                "max": float(self.condition.max()),
+            },
+        }
+
+
+def offsets(
+    paper: PaperCalibration,
+    measured: Float[np.ndarray, "p e 2"],
+    states: Float[np.ndarray, "e 2"],
+    reference: Vectors,
+    stars: Float[np.ndarray, "n 2"],
+) -> Offsets:
+    """The reason for Δ shown on data: `measured` are the polarised states, `reference` the instrument."""
+    centre = ratios(reference[..., 0])  # (q_m, u_m) of unpolarised light
+    small = transmitted(reference, np.concatenate([np.zeros((1, 2)), stars]))
+    exact, _ = fit_polynomials(
+        np.concatenate([ratios(transmitted(reference, states)), ratios(small)], axis=1),
+        np.concatenate([states, np.zeros((1, 2)), stars]),
+    )
+    design = terms(measured)
+    scale = np.linalg.norm(design, axis=1)
+    directions = np.linalg.svd(design / scale[:, None], full_matrices=False)[2]
+    departure = (paper.coefficients - exact) * scale[:, None]
+
+    def along(count: int) -> Float[np.ndarray, "p 2"]:
+        weak = directions[:, -count:]
+        return np.einsum("pct,pnt,pnv,pv->pc", departure, weak, weak, terms(centre) / scale, optimize=True)
+
+    smooth, _ = fit_polynomials(ratios(transmitted(reference, states)), states)
+    anchored, _ = fit_polynomials(
+        np.concatenate([measured, centre[:, None]], axis=1), np.concatenate([states, np.zeros((1, 2))])
+    )
+
+    def delta(coefficients: Float[np.ndarray, "p 2 5"]) -> Float[np.ndarray, "p 2"]:
+        return judged(paper.x, paper.y, coefficients, paper.condition, reference, stars).delta
+
+    return Offsets(
+        delta(paper.coefficients), along(1), along(3), delta(smooth), delta(anchored), paper.condition
+    )
+
+
+# ------------------------------------------------------------------------------------- both methods, one set
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """Paper II's method and the joint model on one calibration set.
+
+    `grid` has the errors at the points that the polynomials were made for, `between` those elsewhere; `truth` says
+    whether the joint model was held against a truth there (its covariance otherwise).
+    """
+
+    paper: PaperCalibration
+    offsets: Offsets
+    grid: Place
+    between: Place
+    truth: bool
+    filter: str
+    teff: float
+    colours: Float[np.ndarray, "p 2"]
+    lines: Float[np.ndarray, "w 7"]
+    moon: dict[str, Any] | None
+
+    def document(self) -> dict[str, Any]:
+        """Everything as numbers in per cent; errors are rms over the stars, statistics over the field."""
+        spread = 100.0 * self.paper.spread
+        return {
+            "filter": self.filter,
+            "teff": self.teff,
+            "stars": STARS,
+            "largest_p": LARGEST_P,
+            "goal_percent": 100.0 * GOAL,
+            "joint_errors_from": "truth" if self.truth else "covariance",
+            "as_published": {
+                "sigma_q": _summary(spread[:, 0]),
+                "sigma_u": _summary(spread[:, 1]),
+                "share_sigma_u_below_goal": float(np.mean(spread[:, 1] < 100.0 * GOAL)),
+                "delta_max": dict(
+                    zip("qu", (100.0 * np.abs(self.paper.delta).max(axis=0)).tolist(), strict=True)
+                ),
+            },
+            "on_grid": self.grid.document(),
+            "between": self.between.document(),
+            "offsets": self.offsets.document(),
+            "colour": {"temperatures": list(TEMPERATURES), "degree": DEGREE} | spread_document(self.colours),
+            "full_moon": self.moon,
+        }
+
+    def columns(self) -> dict[str, tuple[np.ndarray, str]]:
+        """One row per point, the grid first: position, errors of both methods, what the paper gives."""
+        places = (self.grid, self.between)
+        count = len(self.between.x)
+        on_grid = np.arange(len(self.grid.x) + count) < len(self.grid.x)
+        columns = {
+            "X": (np.concatenate([p.x for p in places]), "[deg] field position"),
+            "Y": (np.concatenate([p.y for p in places]), "[deg] field position"),
+            "GRID": (on_grid, "a point with a polynomial of its own"),
+            "ZONE": (np.concatenate([p.zone for p in places]), "one exposure holds hardly any u"),
+        }
+        for k, quantity in enumerate(QUANTITIES):
+            for method in ("paper", "joint"):
+                errors = np.concatenate([getattr(p, method)[:, k] for p in places])
+                columns[f"{quantity}_{method}".upper()] = errors, f"rms error of {quantity}, {method}"
+        for name, values in (("DELTA", self.paper.delta), ("SIGMA", self.paper.spread)):
+            padded = np.concatenate([values, np.full((count, 2), np.nan)])
+            columns[f"{name}_Q"] = padded[:, 0], f"{name.lower()} of q as in Paper II"
+            columns[f"{name}_U"] = padded[:, 1], f"{name.lower()} of u as in Paper II"
+        return columns
+
+
+def _summary(values: Float[np.ndarray, " p"]) -> dict[str, float]:
+    return {"median": float(np.median(values)), "max": float(values.max())}
+
+
+def compare(
+    calset: CalibrationSet,
+    calibration: Calibration,
+    truth: Truth | None = None,
+    filter_name: str = DEFAULT_FILTER,
+    seed: int = 0,
+    count: int = 400,
+) -> Comparison:
+    """Run Paper II's method on a set and judge it beside a calibration of the same set.
+
+    The stars have the colour of the source behind the polariser. Without `truth`, `count` random points lie
+    between the grid points. Raises `DataError` and ValueError as `fit_paper` and `PaperCalibration.between`.
+    """
+    stars = sample_stars(seed=seed)
+    paper = fit_paper(calset, filter_name, stars)
+    exposures = polariser_exposures(calset, filter_name)
+    teff = float(np.median(calset.exposures.teff[exposures]))
+    analysis, setting = AnalysisVectors(calibration), Setting(filter_name)
+
+    def vectors(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Vectors:
+        return analysis.coloured(setting, x, y, np.full(len(x), teff))
+
+    def place(
+        x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], local: PaperCalibration, true: Vectors | None
+    ) -> Place:
+        joint = vectors(x, y)
+        reference = joint if true is None else true
+        promised = promised_errors(analysis, setting, x, y, stars)
+        return Place(
+            x,
+            y,
+            star_errors(local.recover(ratios(transmitted(reference, stars))), stars),
+            promised if true is None else joint_errors(joint, reference, stars),
+            np.abs(determinant(reference)) < WEAK,
+        )
+
+    if truth is None:
+        rng = np.random.default_rng([seed, 1])
+        x, y = (rng.uniform(edge.min(), edge.max(), count) for edge in (paper.x, paper.y))
+        true = None
+    else:
+        x, y = truth.x, truth.y
+        true = truth_vectors(vectors(x, y), truth.matrix)
+    on_grid = vectors(paper.x, paper.y)
+    block = calset.intensities.block(0, len(calset.points))
+    whole = block.used[:, exposures].all(axis=1)
+    measured = ratios(block.counts[whole][:, exposures])
+    states = polariser_states(calset.exposures.clp_angle[exposures])
+    curve = calibration.filter_curve(filter_name)
+    lit = curve.wavelength[curve.throughput > 0.05 * curve.throughput.max()]
+    wavelength = np.linspace(lit[0], lit[-1], LINES)
+    far = int(np.argmax(paper.x + paper.y))
+    matrices = efficiencies(calibration, float(paper.x[far]), float(paper.y[far]), wavelength)
+    return Comparison(
+        paper=paper,
+        offsets=offsets(paper, measured, states, on_grid, stars),
+        grid=place(paper.x, paper.y, paper, None),
+        between=place(x, y, paper.between(x, y), true),
+        truth=truth is not None,
+        filter=filter_name,
+        teff=teff,
+        colours=colour_spread(calibration, paper.x, paper.y, filter_name=filter_name),
+        lines=np.concatenate([wavelength[:, None], matrices.reshape(LINES, 6)], axis=1),
+        moon=_moon(calset, calibration, paper, on_grid, stars),
+    )
+
+
+def _moon(
+    calset: CalibrationSet,
+    calibration: Calibration,
+    paper: PaperCalibration,
+    reference: Vectors,
+    stars: Float[np.ndarray, "n 2"],
+) -> dict[str, Any] | None:
+    """Verdicts on the Moon patches, and the errors that the full-Moon scheme leaves at the grid points."""
+    e = calset.exposures
+    if not np.any((e.kind == "moon") & ~e.clp_in):
+        return None
+    patches = judge_patches(calset, calibration)
+    document = patches.document(e.exposure)
+    weight = patches.weight[~e.chwp_in[patches.exposure]]
+    try:
+        schemes = {
+            "equal_weights": full_moon_scheme(calset, paper),
+            "down_weighted": full_moon_scheme(calset, paper, weight),
+        }
+    except (DataError, ValueError) as error:
+        return document | {"scheme": None, "why_not": str(error)}
+    seen = ratios(transmitted(reference, stars))
+    outside = np.abs(determinant(reference)) >= WEAK
+    found = {name: star_errors(scheme.recover(seen), stars) for name, scheme in schemes.items()}
+    return document | {"scheme_outside_zone": {name: statistics(v, outside) for name, v in found.items()}}

@@ -1,0 +1,292 @@
+"""Figures of a diagnosis: residuals over the field and over the exposures, what explains them, and the ladder of χ².
+
+They are drawn from the plain arrays of `diagnosis.fits` (`read_pictures`, or `diagnose.pictures.pictures` of a
+`Diagnosis` in memory). Residuals are (data − model) in standard deviations throughout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.collections import PatchCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator, NullLocator
+
+from walop_jax.data.records import Points
+from walop_jax.diagnosis.figure_file import Comparison, ExposureLabels, Ladder, PointMap, Shares
+from walop_jax.reports.style import (
+    AFTER,
+    BEFORE,
+    DIVERGING,
+    FONT,
+    QUIET,
+    SMALL,
+    blank,
+    field_axes,
+    largest,
+    outer_labels,
+)
+
+CAMERAS = ("O1", "E1", "O2", "E2")
+MARKED = 3.0  # σ beyond which a tile carries its sign
+MOST_MARKED = 400  # points above which signs would run into each other
+MOST_VECTOR = 2000  # points above which tiles are drawn as pixels
+MOST_BINS = 48  # of polariser angle
+EXPLAINS = 5.0  # standard deviations of χ² within which a model counts as explaining the data
+
+
+def residual_maps(points: Points, maps: Mapping[str, PointMap]) -> Figure:
+    """Residuals of every field point in the four cameras: a row of maps for each entry, one colour scale for all.
+
+    `maps` are (point, camera) by title, NaN where there is nothing. The scale is symmetric about 0; tiles beyond
+    3 σ carry their sign, so that the maps can be read without colours.
+    """
+    far = max(largest(*maps.values()), MARKED)
+    return _maps(
+        points, maps, Normalize(-far, far), DIVERGING, "residual (σ)", signs=len(points) <= MOST_MARKED
+    )
+
+
+def rms_maps(points: Points, maps: Mapping[str, PointMap]) -> Figure:
+    """Rms residual of every field point in the four cameras, rows and scale as in `residual_maps`.
+
+    It shows all that is wrong at once, whatever exposures it sits in; noise alone gives 0.87 (flux free).
+    """
+    far = max(largest(*maps.values()), 1.5)
+    return _maps(points, maps, Normalize(0.5, far), "magma_r", "rms residual (σ)", signs=False)
+
+
+def _maps(
+    points: Points, maps: Mapping[str, PointMap], norm: Normalize, colours: str, label: str, signs: bool
+) -> Figure:
+    shown = np.any([np.isfinite(values).any(axis=1) for values in maps.values()], axis=0)
+    shown = shown if shown.any() else np.ones(len(points), bool)
+    figure = blank(8.6, 0.55 + 1.75 * len(maps))
+    axes = figure.subplots(len(maps), 4, sharex=True, sharey=True, squeeze=False)
+    tiles: Any = None
+    for number, values in enumerate(maps.values()):
+        for k, axis in enumerate(axes[number]):
+            field_axes(axis, f"camera {CAMERAS[k]}" if number == 0 else "")
+            axis.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10], prune="both"))
+            axis.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], prune="both"))
+            tiles = _tiles(axis, points, shown, values[:, k], norm, colours)
+            if signs:
+                _signs(axis, points, values[:, k], norm)
+    outer_labels(axes)
+    for axis, title in zip(axes[:, 0], maps, strict=True):
+        axis.set_ylabel(f"{title}\n\nY (deg)", fontsize=FONT)
+    bar = figure.colorbar(tiles, ax=axes, pad=0.015, aspect=18 * len(maps), fraction=0.03)
+    bar.set_label(label, fontsize=FONT)
+    bar.ax.tick_params(labelsize=SMALL)
+    return figure
+
+
+def _tiles(
+    axis: Axes,
+    points: Points,
+    shown: Bool[np.ndarray, " p"],
+    values: Float[np.ndarray, " p"],
+    norm: Normalize,
+    colours: str,
+) -> Any:
+    size = _spacing(points.x[shown], points.y[shown])
+    known = shown & np.isfinite(values)
+    corners = zip(points.x[known] - 0.5 * size, points.y[known] - 0.5 * size, strict=True)
+    # Edges in the colour of the tile close the seams that viewers leave between neighbours.
+    tiles = PatchCollection(
+        [Rectangle(corner, size, size) for corner in corners],
+        cmap=colours, norm=norm, edgecolor="face", linewidth=0.3,
+    )  # fmt: skip
+    tiles.set_array(values[known])
+    tiles.set_rasterized(bool(known.sum() > MOST_VECTOR))
+    axis.add_collection(tiles)
+    axis.set_facecolor("0.93")
+    axis.set_xlim(points.x[shown].min() - size, points.x[shown].max() + size)
+    axis.set_ylim(points.y[shown].min() - size, points.y[shown].max() + size)
+    return tiles
+
+
+def _signs(axis: Axes, points: Points, values: Float[np.ndarray, " p"], norm: Normalize) -> None:
+    for i in np.flatnonzero(np.abs(np.nan_to_num(values)) > MARKED):
+        ink = "white" if abs(norm(values[i]) - 0.5) > 0.35 else "0.25"
+        sign = "+" if values[i] > 0 else "−"
+        axis.text(points.x[i], points.y[i], sign, color=ink, fontsize=5, ha="center", va="center")
+
+
+def _spacing(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> float:
+    """Side of the tiles: the typical distance to the nearest neighbour."""
+    few = slice(0, MOST_VECTOR)
+    distance = np.hypot(x[few, None] - x[None, few], y[few, None] - y[None, few])
+    distance[distance == 0] = np.inf
+    nearest = distance.min(axis=1)
+    nearest = nearest[np.isfinite(nearest)]
+    return float(np.median(nearest)) if nearest.size else 0.05
+
+
+def signature_figure(comparison: Comparison, exposures: ExposureLabels) -> Figure:
+    """Residuals averaged over the field, camera by camera: data as dots, what the effect explains as a line.
+
+    Against the polariser angle where the comparison shows a harmonic of it, or most of its signal is behind the
+    polariser; against time otherwise. Exposures at one angle are averaged. The lower panels hold what is left.
+    """
+    angular = _against_angle(comparison, exposures)
+    figure = blank(8.6, 3.5)
+    upper, lower = figure.subplots(2, 4, sharex=True, sharey="row", height_ratios=(2.2, 1))
+    position, label = _abscissa(exposures, angular)
+    for k in range(4):
+        known = np.isfinite(position) & np.isfinite(comparison.curve_before[:, k])
+        columns = (
+            comparison.curve_before,
+            comparison.curve_error,
+            comparison.curve_explained,
+            comparison.curve_after,
+        )
+        before, error, explained, after = (column[known, k] for column in columns)
+        x, before, error, explained, after = _binned(position[known], before, error, explained, after)
+        for axis, dots in ((upper[k], before), (lower[k], after)):
+            axis.axhline(0.0, color=QUIET, lw=0.8, zorder=0)
+            axis.errorbar(x, dots, error, fmt="o", ms=3, lw=0.8, color="0.15", label="data", zorder=3)
+            axis.tick_params(labelsize=SMALL)
+        upper[k].plot(x, explained, color=BEFORE, lw=1.4, label="effect", zorder=2)
+        upper[k].set_title(f"camera {CAMERAS[k]}", fontsize=FONT)
+        lower[k].set_xlabel(label, fontsize=FONT)
+        if angular:
+            lower[k].set_xticks(
+                np.arange(0, 361, 90) if np.max(x, initial=0.0) > 180 else np.arange(0, 181, 45)
+            )
+    upper[0].set_ylabel("residual (σ)", fontsize=FONT)
+    lower[0].set_ylabel("rest (σ)", fontsize=FONT)
+    upper[0].legend(frameon=False, fontsize=SMALL, loc="best")
+    return figure
+
+
+def _against_angle(comparison: Comparison, exposures: ExposureLabels) -> bool:
+    behind = np.isfinite(exposures.clp_angle)
+    if comparison.harmonic >= 0 or not behind.any():
+        return comparison.harmonic >= 0
+    power = np.nansum(
+        np.where(comparison.curve_explained != 0, comparison.curve_explained, comparison.curve_before) ** 2,
+        axis=1,
+    )
+    return bool(power[behind].sum() > 0.5 * power.sum())
+
+
+def _abscissa(exposures: ExposureLabels, angular: bool) -> tuple[Float[np.ndarray, " e"], str]:
+    if angular:
+        return exposures.clp_angle, "polariser angle (deg)"
+    hours = (
+        24.0 * (exposures.mjd - np.nanmin(exposures.mjd))
+        if np.isfinite(exposures.mjd).any()
+        else exposures.mjd
+    )
+    if np.isfinite(hours).all() and np.ptp(hours) > 0:
+        return hours, "time since the first exposure (h)"
+    return exposures.exposure.astype(float), "exposure"
+
+
+def _binned(x: Float[np.ndarray, " e"], *columns: Float[np.ndarray, " e"]) -> list[Float[np.ndarray, " b"]]:
+    """Means over exposures at the same place, in at most `MOST_BINS` bins; the second column holds errors."""
+    places, bin_of = np.unique(np.round(x, 3), return_inverse=True)
+    if len(places) > MOST_BINS:
+        edges = np.linspace(x.min(), x.max(), MOST_BINS + 1)
+        _, bin_of = np.unique(np.clip(np.digitize(x, edges) - 1, 0, MOST_BINS - 1), return_inverse=True)
+    count = np.bincount(bin_of)
+    means = [np.bincount(bin_of, weights=values) / count for values in (x, *columns)]
+    means[2] = np.sqrt(np.bincount(bin_of, weights=columns[1] ** 2)) / count
+    return means
+
+
+def ladder_figure(ladder: Ladder, names: Sequence[str] | None = None) -> Figure:
+    """χ² per degree of freedom of the starting model and of every model after it, on a logarithmic scale.
+
+    The band is where χ²/dof lies (5 standard deviations) when the model explains the data. `names` replace those
+    of the rungs.
+    """
+    names = [*ladder.model] if names is None else [*names]
+    names = [names[0], *(name if name == "final fit" else f"+ {name}" for name in names[1:])]
+    ratio = ladder.chi2 / np.maximum(ladder.dof, 1)
+    place = np.arange(len(ratio))
+    width = EXPLAINS * np.sqrt(2.0 / max(int(ladder.dof[-1]), 1))
+    figure = blank(7.0, 0.8 + 0.38 * len(ratio))
+    axis = figure.subplots()
+    axis.axvspan(max(1.0 - width, 1e-3), 1.0 + width, color="0.88", lw=0, zorder=0)
+    axis.axvline(1.0, color="0.5", lw=0.8, zorder=1)
+    axis.plot(ratio, place, color="0.6", lw=1.0, zorder=2)
+    explains = ratio < 1.0 + width
+    for chosen, marker, colour in ((~explains, "o", BEFORE), (explains, "s", AFTER)):
+        axis.plot(ratio[chosen], place[chosen], marker, color=colour, ms=7, lw=0, zorder=3)
+    axis.set_xscale("log")
+    low, high = min(float(ratio.min()), 1.0 - width), max(float(ratio.max()), 1.0 + width)
+    margin = (high / low) ** 0.12
+    axis.set_xlim(low / margin, high * margin**2)
+    for y, value in zip(place, ratio, strict=True):
+        axis.annotate(
+            f"{value:.4g}", (value, y), (9, -8), textcoords="offset points", fontsize=8, va="center"
+        )
+    axis.set_yticks(place, names)
+    axis.set_ylim(len(ratio) - 0.5, -0.5)
+    axis.tick_params(labelsize=SMALL)
+    axis.set_xlabel("χ² per degree of freedom", fontsize=FONT)
+    _plain_ticks(axis.xaxis)
+    for side in ("top", "right", "left"):
+        axis.spines[side].set_visible(False)
+    axis.tick_params(axis="y", length=0, labelsize=FONT)
+    return figure
+
+
+def _plain_ticks(axis: Axis) -> None:
+    """Numbers instead of powers of ten on a short logarithmic axis."""
+    low, high = axis.get_view_interval()
+    decades = np.log10(high / low)
+    steps = (1, 1.2, 1.5, 2, 3, 5, 7) if decades < 0.7 else (1, 2, 5) if decades < 2 else (1,)
+    ticks = [step * 10.0**power for power in range(-4, 9) for step in steps]
+    ticks = [tick for tick in ticks if low <= tick <= high]
+    axis.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+    axis.set_minor_locator(NullLocator())
+
+
+def shares_figure(shares: Shares) -> Figure:
+    """Mean squared residual by camera, kind, filter and exposure, over what noise alone gives: before and after."""
+    groups = [g for g in ("camera", "kind", "filter") if np.count_nonzero(shares.group == g) > 1]
+    widths = [np.count_nonzero(shares.group == g) + 1.0 for g in groups]
+    figure = blank(8.6, 2.7)
+    axes = figure.subplots(1, len(groups) + 1, width_ratios=[*widths, max(12.0, sum(widths))], sharey=True)
+    before, after = (values / np.maximum(shares.expected, 1e-300) for values in (shares.before, shares.after))
+    for axis, group in zip(axes, [*groups, "exposure"], strict=True):
+        rows = np.flatnonzero(shares.group == group)
+        place = np.arange(len(rows))
+        if group == "exposure":
+            # Members are texts; the exposures follow each other by their number.
+            rows = rows[np.argsort(shares.member[rows].astype(int), kind="stable")]
+            place = shares.member[rows].astype(int)
+        else:
+            axis.set_xticks(place, shares.member[rows])
+            axis.set_xlim(-0.6, len(rows) - 0.4)
+        axis.axhline(1.0, color="0.5", lw=0.8, zorder=0)
+        size = 5 if group != "exposure" else 3.5
+        axis.vlines(
+            place,
+            np.minimum(before, after)[rows],
+            np.maximum(before, after)[rows],
+            color=QUIET,
+            lw=1,
+            zorder=1,
+        )
+        axis.plot(place, before[rows], "o", color=BEFORE, ms=size, mfc="white", label="starting model")
+        axis.plot(place, after[rows], "s", color=AFTER, ms=size - 0.5, label="final model")
+        axis.set_xlabel(group, fontsize=FONT)
+        axis.tick_params(labelsize=SMALL)
+    top = float(np.max(before, initial=1.0))
+    if top > 5.0:
+        axes[0].set_yscale("log")
+        _plain_ticks(axes[0].yaxis)
+    axes[0].set_ylabel("mean squared residual /\nwhat noise alone gives", fontsize=FONT)
+    axes[-1].legend(frameon=False, fontsize=SMALL, loc="best")
+    return figure

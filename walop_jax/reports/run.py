@@ -1,0 +1,144 @@
+"""What lies in the folder of a run: read, checked against each other, and what is missing said in words."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from walop_jax.calibration.product import CalibrationProduct, read_product
+from walop_jax.calibration.summary import FAILED, PRODUCT, SUMMARY
+from walop_jax.data.user_tables import read_input_table
+from walop_jax.diagnosis.document import DIAGNOSIS
+from walop_jax.diagnosis.figure_data import UNNAMED
+from walop_jax.diagnosis.figure_file import PICTURES, DiagnosisPictures, read_pictures
+from walop_jax.io.errors import DataError, fail
+
+POSTERIOR, INTERVALS, CORNER, SAMPLE = "posterior.nc", "posterior.ecsv", "posterior_corner.png", "sample.json"
+SUMMARY_KEYS = ("chi2", "dof", "n_data", "parameters", "converged", "message", "versions", "inputs")
+DIAGNOSIS_KEYS = ("verdict", "steps", "candidates", "unexplained")
+DEFAULTS: dict[str, Any] = {"warnings": [], "remarks": [], "misfit": None}  # beyond the contract's keys
+SAME = 1e-6  # relative difference of χ²/dof of one and the same fit, read from two files
+
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """The contents of a run; None for what is not there. `missing` says what that means for a page.
+
+    `summary`, `diagnosis` and `sample` are the contents of the JSON files; `intervals` are rows of the table of
+    posterior intervals; `corner` are the bytes of a PNG.
+    """
+
+    folder: Path
+    summary: dict[str, Any]
+    product: CalibrationProduct | None
+    diagnosis: dict[str, Any] | None
+    pictures: DiagnosisPictures | None
+    sample: dict[str, Any] | None
+    intervals: tuple[dict[str, Any], ...]
+    corner: bytes | None
+    missing: tuple[str, ...]
+
+
+def read_run(folder: Path) -> Run:
+    """Read the folder of a `refit` or `diagnose`, with what `sample` may have added.
+
+    Raises `DataError`, with advice, if it is no such folder or if its summary or diagnosis cannot be read; other
+    files that are absent or damaged are left out and listed in `missing`.
+    """
+    if not folder.is_dir():
+        raise fail(
+            "is not the folder of a run", file=folder, advice="give the RUN of walop-jax refit or diagnose"
+        )
+    if not (folder / SUMMARY).exists():
+        if (folder / FAILED).exists():
+            raise fail(
+                f"the fit of this run did not converge; {FAILED} says how it ended",
+                file=folder,
+                advice="look at the data with walop-jax inspect, then refit",
+            )
+        raise fail(f"holds no {SUMMARY}", file=folder, advice="give the RUN of walop-jax refit or diagnose")
+    missing: list[str] = []
+
+    def optional(name: str, read: Callable[[Path], T], lost: str, wanted: bool = True) -> T | None:
+        path = folder / name
+        if not path.exists():
+            if wanted:
+                missing.append(f"{name} is not there: {lost}.")
+            return None
+        try:
+            return read(path)
+        except (DataError, OSError) as error:
+            missing.append(f"{name} cannot be used ({error}): {lost}.")
+            return None
+
+    summary = DEFAULTS | _document(folder / SUMMARY, SUMMARY_KEYS)
+    product = optional(PRODUCT, read_product, "no maps of the matrix, no pulls from the priors")
+    diagnosis = _document(folder / DIAGNOSIS, DIAGNOSIS_KEYS) if (folder / DIAGNOSIS).exists() else None
+    pictures = None
+    if diagnosis is None:
+        missing.append("This run is a refit: maps of the residuals come with walop-jax diagnose.")
+    else:
+        pictures = optional(PICTURES, read_pictures, "no maps of the residuals, no curves, no ladder of χ²")
+        names = [step["effect"] for step in diagnosis["steps"]]
+        drawn = [] if pictures is None else [one.effect for one in pictures.comparisons[1:]]
+        if pictures is not None and drawn not in (names, [*names, UNNAMED]):
+            missing.append(f"{PICTURES} is of another diagnosis than {DIAGNOSIS}: its pictures are left out.")
+            pictures = None
+        if _another_fit(summary, diagnosis):
+            missing.append(
+                f"{DIAGNOSIS} is of another fit than {SUMMARY}: this folder was written to again since."
+            )
+    sampled = (folder / POSTERIOR).exists()
+    return Run(
+        folder=folder,
+        summary=summary,
+        product=product,
+        diagnosis=diagnosis,
+        pictures=pictures,
+        sample=optional(SAMPLE, lambda path: _document(path, ()), "no verdict on the sampling", sampled),
+        intervals=optional(INTERVALS, _intervals, "no table of the posterior", sampled) or (),
+        corner=optional(CORNER, Path.read_bytes, "no corner plot", sampled),
+        missing=tuple(missing),
+    )
+
+
+def _document(path: Path, keys: tuple[str, ...]) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise fail(
+            f"cannot be read: {error}", file=path, advice="run the command that made it again"
+        ) from error
+    lacking = [key for key in keys if not isinstance(content, dict) or key not in content]
+    if lacking or not isinstance(content, dict):
+        what = f"has no {lacking[0]!r}" if lacking else "is not a summary"
+        raise fail(what, file=path, advice="run the command that made it again")
+    return content
+
+
+def _another_fit(summary: dict[str, Any], diagnosis: dict[str, Any]) -> bool:
+    said = diagnosis.get("chi2_per_dof_after")
+    ratio = summary["chi2"] / max(summary["dof"], 1)
+    return said is not None and abs(said - ratio) > SAME * ratio
+
+
+def _intervals(path: Path) -> tuple[dict[str, Any], ...]:
+    """Rows of the sampled coefficients: those that have an effective sample size."""
+    table = read_input_table(path).table
+    names = ("NAME", "UNIT", "MEDIAN", "LOW68", "HIGH68", "LOW95", "HIGH95", "ESS")
+    lacking = [name for name in names if name not in table.colnames]
+    if lacking:
+        raise fail("the column is missing", file=path, column=lacking[0])
+    # An empty text comes back masked.
+    columns = {
+        name: np.ma.filled(np.ma.asarray(table[name]), "" if name in names[:2] else np.nan) for name in names
+    }
+    rows = [{name: column[i] for name, column in columns.items()} for i in range(len(table))]
+    return tuple(row for row in rows if np.isfinite(float(row["ESS"])))

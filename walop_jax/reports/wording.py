@@ -1,0 +1,140 @@
+"""Numbers and verdicts in words: what a page says is decided here, how it looks is not.
+
+An agreement is "consistent with" a cause, never proof of one.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from walop_jax.diagnosis.figure_data import UNNAMED
+from walop_jax.model.effects import EFFECTS
+
+TINY = 1e-15  # probabilities below are not to be taken at their word
+MOST_PARAMETERS = 6  # of an effect, in a sentence
+_PROPER = ("Wollaston", "Moon", "Stokes")
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def measured(value: float, sigma: float) -> str:
+    """Value and error, two digits of the error: 0.23227 ± 0.00024."""
+    return " ± ".join(digits(value, sigma)) if sigma > 0 else digits(value, sigma)[0]
+
+
+def digits(value: float | str | None, sigma: float | None) -> tuple[str, str]:
+    """Value and error as two texts, both to the second digit of the error; the error is empty where there is none."""
+    if isinstance(value, str):
+        return value, ""
+    if value is None or not math.isfinite(value):
+        return "–", ""
+    if sigma is None or not 0 < sigma < math.inf:
+        return minus(f"{value:.7g}"), ""
+    places = max(0, 1 - math.floor(math.log10(sigma)))
+    if places > 8:
+        more = max(0, places + math.floor(math.log10(abs(value) or sigma)))
+        return minus(f"{value:.{more}e}"), minus(f"{sigma:.1e}")
+    return minus(f"{value:.{places}f}"), f"{sigma:.{places}f}"
+
+
+def minus(text: str) -> str:
+    """A number with a true minus sign."""
+    return text.replace("-", "−")
+
+
+def rounded(value: float | None, form: str = ".4g") -> str:
+    """A number, or a dash where there is none."""
+    return "–" if value is None or not math.isfinite(value) else minus(format(value, form))
+
+
+def probability(p: float | None) -> str:
+    """`= 0.43`, `= 2.1 × 10⁻⁷` or `< 10⁻¹⁵`."""
+    if p is None or not math.isfinite(p):
+        return "unknown"
+    if p < TINY:
+        return f"< {_power(TINY)}"
+    if p >= 1e-3:
+        return f"= {p:.2g}"
+    mantissa, exponent = f"{p:.1e}".split("e")
+    return f"= {mantissa} × 10{str(int(exponent)).translate(_RAISED)}"
+
+
+def _power(value: float) -> str:
+    return "10" + str(round(math.log10(value))).translate(_RAISED)
+
+
+def about(effect: str) -> str:
+    """What an effect is, in a few words that may stand inside a sentence; empty for a name that is not known."""
+    if effect == UNNAMED:
+        return "patterns without a name"
+    known = next((entry for entry in EFFECTS if entry.name == effect), None)
+    if known is None:
+        return ""
+    head = (sys.modules[known.__module__].__doc__ or "").strip().splitlines()[0]
+    head = re.sub(r":\s*`.*", "", head).rstrip(".")  # a file of several effects goes on to list them
+    return head if head.startswith(_PROPER) else head[:1].lower() + head[1:]
+
+
+def listed(items: Sequence[str]) -> str:
+    """`a`, `a and b`, `a, b and c`."""
+    return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)
+
+
+def verdict_of_fit(summary: Mapping[str, Any]) -> tuple[str, str]:
+    """Whether a fit may be used, as a label and a sentence that says why."""
+    ratio = summary["chi2"] / max(summary["dof"], 1)
+    numbers = f"χ²/dof = {ratio:.4g} for {summary['dof']} degrees of freedom"
+    if not summary["converged"]:
+        return "Not trusted", f"The fit did not converge ({summary['message']}); {numbers}."
+    if not summary.get("trusted", True):
+        return "Not trusted", f"The fit converged, but the model does not explain the data: {numbers}."
+    return "Trusted", f"The fit converged, and the data are consistent with the model: {numbers}."
+
+
+def verdict_of_diagnosis(diagnosis: Mapping[str, Any]) -> tuple[str, str]:
+    """What a diagnosis found, as a label and the sentences that a scientist would say."""
+    steps, p = diagnosis["steps"], probability(diagnosis.get("p_value"))
+    before, after = (rounded(diagnosis.get(f"chi2_per_dof_{when}")) for when in ("before", "after"))
+    if diagnosis["verdict"] == "consistent":
+        return "Consistent", (
+            f"These data are consistent with the starting model (χ²/dof = {before}): noise alone gives a pattern at "
+            f"least as strong as the strongest one found with p {p}."
+        )
+    base = f"The starting model does not explain these data (χ²/dof = {before}, p {p})"
+    found = listed([_found(step) for step in steps])
+    if diagnosis["verdict"] == "effect_found":
+        return ("Effects found" if len(steps) > 1 else "Effect found"), " ".join(
+            [f"{base}. They are consistent with {found}, with which χ²/dof is {after}.", *_confusions(steps)]
+        )
+    term = ""
+    if diagnosis["unexplained"] and diagnosis["unexplained"].get("free_form"):
+        term = f"A free-form term stands for it in this calibration, with which χ²/dof is {after}."
+    if not steps:
+        text = f"{base}, and no effect of the catalogue does: something without a name is missing."
+    else:
+        text = f"{base}. They agree better with {found}{'' if term else f': χ²/dof is {after}'}, but something without "
+        text += "a name is left."
+    return "Unexplained", " ".join(part for part in (text, term, *_confusions(steps)) if part)
+
+
+def _found(step: Mapping[str, Any]) -> str:
+    words, values = about(step["effect"]), []
+    for name, entry in step["parameters"].items():
+        value, sigma = digits(entry["value"], entry["sigma"])
+        unit = f" {entry['unit']}" if entry["unit"] else ""
+        values.append(f"{name} = {value}{f' ± {sigma}' if sigma else ''}{unit}")
+    if len(values) > MOST_PARAMETERS:
+        values = [f"{len(values)} parameters"]
+    inside = ": ".join(part for part in (words, ", ".join(values)) if part)
+    return f"{step['effect']} ({inside})" if inside else str(step["effect"])
+
+
+def _confusions(steps: Sequence[Mapping[str, Any]]) -> list[str]:
+    return [
+        f"They cannot tell {step['effect']} from {listed(step['equivalent'])}."
+        for step in steps
+        if step["equivalent"]
+    ]

@@ -1,0 +1,170 @@
+"""How far off stars come out of a calibration: errors of q, u and p over the field, true or promised.
+
+Test stars with p ≤ 5 % are seen, noise-free, through *reference* analysis vectors and recovered with a calibration; the
+error at a field point is the rms over the stars.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.science.estimate import estimate
+
+STARS, LARGEST_P = 100, 0.05
+GOAL = 0.001
+WEAK = 0.1  # |m22 m33 − m23 m32| below which one exposure holds hardly any u
+QUANTITIES = ("q", "u", "p")
+_ELECTRONS = 1e6  # of the stars; their photon noise does not enter
+
+Vectors = Float[np.ndarray, "p 4 3"]
+Stars = Float[np.ndarray, "n 2"]
+
+
+def sample_stars(count: int = STARS, largest: float = LARGEST_P, seed: int = 0) -> Stars:
+    """(q, u) of sources with p evenly up to `largest` and any angle."""
+    rng = np.random.default_rng(seed)
+    p, angle = rng.uniform(0.0, largest, count), rng.uniform(0.0, np.pi, count)
+    return np.stack([p * np.cos(2 * angle), p * np.sin(2 * angle)], axis=1)
+
+
+def transmitted(vectors: Float[np.ndarray, "p 4 3"], stars: Stars) -> Float[np.ndarray, "p n 4"]:
+    """Counts (point, star, camera) of sources of unit flux."""
+    s = np.concatenate([np.ones((len(stars), 1)), stars], axis=1)
+    return np.einsum("pks,ns->pnk", vectors, s)
+
+
+class Truth(NamedTuple):
+    """True instrument matrices (m21 … m33) at field positions (deg), for the colour of the polariser's source."""
+
+    x: Float[np.ndarray, " p"]
+    y: Float[np.ndarray, " p"]
+    matrix: Float[np.ndarray, "p 6"]
+
+
+Errors = Float[np.ndarray, "p 3"]
+
+
+def star_errors(found: Float[np.ndarray, "p n 2"], stars: Float[np.ndarray, "n 2"]) -> Errors:
+    """Errors of q, u and p at every point, rms over the stars."""
+    degree = np.hypot(*np.moveaxis(found, -1, 0)) - np.hypot(*stars.T)
+    return np.sqrt(np.stack([*np.mean((found - stars) ** 2, axis=1).T, np.mean(degree**2, axis=1)], axis=1))
+
+
+def joint_errors(vectors: Vectors, reference: Vectors, stars: Float[np.ndarray, "n 2"]) -> Errors:
+    """Errors of stars seen through `reference` and recovered, noise-free, with the vectors of a calibration."""
+    counts = _ELECTRONS * transmitted(reference, stars)
+    p, n = counts.shape[:2]
+    found = estimate(
+        np.repeat(vectors, n, axis=0), counts.reshape(-1, 4), np.sqrt(counts).reshape(-1, 4), np.arange(p * n)
+    )
+    return star_errors(found.qu.reshape(p, n, 2), stars)
+
+
+def promised_errors(
+    analysis: AnalysisVectors,
+    setting: Setting,
+    x: Float[np.ndarray, " p"],
+    y: Float[np.ndarray, " p"],
+    stars: Float[np.ndarray, "n 2"],
+) -> Errors:
+    """Errors that the covariance of the calibration promises, rms over the stars."""
+    vectors = analysis.coloured(setting, x, y)
+    counts = _ELECTRONS * transmitted(vectors, stars)
+    n = len(stars)
+    repeat = np.repeat(vectors, n, axis=0)
+    found = estimate(repeat, counts.reshape(-1, 4), np.sqrt(counts).reshape(-1, 4), np.arange(len(repeat)))
+    local = analysis.derivatives(setting, x, y, np.full(len(x), np.nan))
+    gain = found.gain.reshape(len(x), n, 2, 4)
+    s = np.concatenate([np.ones((n, 1)), stars], axis=1)
+    total = np.zeros((len(x), 3))
+    for k in range(n):
+        plain, throughput = (gain[:, k] @ np.einsum("s,pksf->pkf", s[k], part) for part in local)
+        root = analysis.to_parameters(plain, throughput, x, y) @ analysis.root
+        radial = np.einsum("c,pck->pk", stars[k] / np.hypot(*stars[k]), root)
+        total += np.stack([*np.sum(root**2, axis=2).T, np.sum(radial**2, axis=1)], axis=1)
+    return np.sqrt(total / n)
+
+
+def plate_errors(
+    analysis: AnalysisVectors,
+    settings: Sequence[Setting],
+    x: Float[np.ndarray, " p"],
+    y: Float[np.ndarray, " p"],
+) -> Float[np.ndarray, " p"]:
+    """Photon error of (q, u) in the worse direction for an unpolarised star seen once through each setting.
+
+    In units of the error of q that an ideal instrument would have with the same light: 1 for a single exposure of
+    an ideal instrument, large where the settings hold hardly any u.
+    """
+    r, n = len(settings), len(x)
+    rows = np.stack([analysis.coloured(s, x, y) for s in settings], axis=1)
+    counts = _ELECTRONS * rows[..., 0]
+    found = estimate(
+        rows.reshape(-1, 4, 3),
+        counts.reshape(-1, 4),
+        np.sqrt(counts).reshape(-1, 4),
+        np.repeat(np.arange(n), r),
+    )
+    worst = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(found.photon, nan=np.inf))[:, 1])
+    # q = (N0 − N1)/(N0 + N1) with half of the electrons in its two cameras: σ² = 2 / all electrons.
+    return worst / np.sqrt(2.0 / counts.sum(axis=(1, 2)))
+
+
+def determinant(vectors: Vectors) -> Float[np.ndarray, " p"]:
+    """m22 m33 − m23 m32 at every point: what one exposure holds of (q, u)."""
+    rows = [(vectors[:, i] - vectors[:, i + 1]) / (vectors[:, i] + vectors[:, i + 1])[:, :1] for i in (0, 2)]
+    return rows[0][:, 1] * rows[1][:, 2] - rows[0][:, 2] * rows[1][:, 1]
+
+
+def statistics(errors: Errors, chosen: Bool[np.ndarray, " p"] | None = None) -> dict[str, dict[str, float]]:
+    """Median, rms, 95 % and maximum over the field of each error in per cent; share of the field under 0.1 %."""
+    errors = errors if chosen is None else errors[chosen]
+    return {
+        name: {
+            "median": 100.0 * float(np.median(values)),
+            "rms": 100.0 * float(np.sqrt(np.mean(values**2))),
+            "p95": 100.0 * float(np.quantile(values, 0.95)),
+            "max": 100.0 * float(np.max(values)),
+            "share_below_goal": float(np.mean(values < GOAL)),
+        }
+        for name, values in zip(QUANTITIES, errors.T, strict=True)
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Errors of both methods at some field points; `zone` marks |m22 m33 − m23 m32| < 0.1."""
+
+    x: Float[np.ndarray, " p"]
+    y: Float[np.ndarray, " p"]
+    paper: Errors
+    joint: Errors
+    zone: Bool[np.ndarray, " p"]
+
+    def document(self) -> dict[str, Any]:
+        """Statistics of both methods over all points and outside the zone without u."""
+        out: dict[str, Any] = {"points": len(self.x), "in_zone": int(self.zone.sum())}
+        for name, errors in (("paper", self.paper), ("joint", self.joint)):
+            out[name] = {"all": statistics(errors), "outside_zone": statistics(errors, ~self.zone)}
+        ratio = np.sqrt(np.mean(self.paper**2, axis=0) / np.mean(self.joint**2, axis=0))
+        out["rms_ratio"] = dict(zip(QUANTITIES, ratio.tolist(), strict=True))
+        return out
+
+
+def truth_vectors(joint: Vectors, matrix: Float[np.ndarray, "p 6"]) -> Vectors:
+    """Analysis vectors with true matrices (m21 … m33) and, what these do not hold, the sums of the joint model.
+
+    a± = ½ (S ± S₀ m) with S the sum of a pair of cameras; an error of S is second order in p.
+    """
+    pairs = []
+    for i, rows in ((0, matrix[:, :3]), (2, matrix[:, 3:])):
+        total = joint[:, i] + joint[:, i + 1]
+        difference = total[:, :1] * rows
+        pairs += [0.5 * (total + difference), 0.5 * (total - difference)]
+    return np.stack(pairs, axis=1)

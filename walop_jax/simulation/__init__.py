@@ -1,0 +1,1 @@
+"""Synthetic calibration sets that carry their truth: what is observed, an as-built instrument, noise."""

@@ -1,0 +1,208 @@
+"""What a calibration run observes: points, exposures, standards and filters, without any light yet."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from walop_jax.data.filters import DEFAULT_FILTER, builtin_filter
+from walop_jax.data.records import Exposures, FilterCurve, Points, Site
+from walop_jax.data.sites import SITES
+from walop_jax.model.effects.base import Context
+from walop_jax.sky.moon import moon_direction
+
+NAN = float("nan")
+FULL_MOON: Mapping[str, float] = {"WALOP-SOUTH": 61220.85, "WALOP-NORTH": 61042.90, "WALOP-LAB": 61042.90}
+"""MJD (UTC) in a night of full Moon in which it stands high: 2026 June 29 (south), 2026 January 2 (north)."""
+
+NARROW_BANDS: Mapping[str, float] = {"NB-580": 0.580, "NB-660": 0.660}  # centre, µm
+_SPACING = 0.004  # d between exposures
+_GOLDEN = 0.5 * (3.0 - np.sqrt(5.0))  # of a turn: spreads any number of angles evenly
+_STANDARD_EDGE = 0.232  # deg: 5 × 5 centres of boxes of 0.116°
+_MOON_ROTATOR, _STAR_ROTATOR = (0.0, 40.0, 90.0, 135.0), (0.0, 30.0, 75.0, 120.0)
+
+
+def polariser_turn(count: int = 15, *, full_turn: bool = False) -> tuple[float, ...]:
+    """Evenly spread angles (deg) of the calibration polariser, over half a turn or a full one."""
+    return tuple(float(a) for a in np.arange(count) * ((360.0 if full_turn else 180.0) / count))
+
+
+@dataclasses.dataclass(frozen=True)
+class ObservingPlan:
+    """A calibration run: where, when, through what.
+
+    Field points are a `grid` × `grid` raster over ±`field` degrees, on which polariser and Moon sky are
+    measured, and `standard_grid` × `standard_grid` places of the standards; on the laboratory bench X is the
+    tilt of the plate and the points are `grid` tilts from 0 to `field`. The polariser goes through
+    `polariser_angles` (deg) for each of `filters` and each setting of the calibration plate in `plate` (deg,
+    None: out); Moon patches and standards take the settings in turn, in the first filter. The Moon is
+    observed from `mjd` (UTC) on, at `separations` (deg), the polariser before and the standards after.
+    `electrons` is the level of a camera in unpolarised light of full transparency, ahead of reflections.
+    """
+
+    instrument: str = "WALOP-SOUTH"
+    grid: int = 12
+    field: float = 0.29
+    standard_grid: int = 5
+    polariser_angles: tuple[float, ...] = polariser_turn()
+    moon_patches: int = 8
+    separations: tuple[float, float] = (8.0, 20.0)
+    standards: int = 8
+    unpolarised: int = 2
+    catalogue_error: float = 2e-4
+    filters: tuple[str, ...] = (DEFAULT_FILTER,)
+    plate: tuple[float | None, ...] = (None,)
+    electrons: float = 1e6
+    read_noise: float = 30.0
+    teff: float = 5772.0
+    temperature: tuple[float, float] = (12.0, 8.0)
+    mjd: float | None = None
+    throughput_degree: int = 4
+
+    def __post_init__(self) -> None:
+        if self.instrument not in SITES:
+            raise ValueError(f"unknown instrument {self.instrument!r}: choose one of {', '.join(SITES)}")
+        for name in ("grid", "standard_grid"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} = {getattr(self, name)} must be at least 1")
+        if min(self.moon_patches, self.standards, self.unpolarised) < 0:
+            raise ValueError("numbers of Moon patches and standards cannot be negative")
+        if not self.electrons > 0:
+            raise ValueError(f"{self.electrons} electrons: a camera needs some light")
+        if not (self.filters and self.plate and self.polariser_angles):
+            raise ValueError(
+                "at least a filter, a setting of the calibration plate, a polariser angle are needed"
+            )
+        for name in self.filters:
+            filter_curve(name)
+
+    @classmethod
+    def bench(cls, tilts: int = 11) -> ObservingPlan:
+        """The laboratory bench: plate tilts from 0 to 20°, no sky."""
+        return cls(
+            "WALOP-LAB", tilts, field=20.0, moon_patches=0, standards=0, unpolarised=0, throughput_degree=0
+        )
+
+    @property
+    def site(self) -> Site:
+        """Where the instrument stands."""
+        return SITES[self.instrument]
+
+    @property
+    def start(self) -> float:
+        """MJD (UTC) of the first Moon exposure."""
+        return FULL_MOON[self.instrument] if self.mjd is None else self.mjd
+
+    @property
+    def star_names(self) -> tuple[str, ...]:
+        """Names of the standards."""
+        return tuple(f"STD{i:02d}" for i in range(self.standards))
+
+    def points(self) -> Points:
+        """Grid points first, then the places of the standards (if there are any)."""
+        if self.instrument == "WALOP-LAB":
+            x = np.linspace(0.0, self.field, self.grid)
+            y = np.zeros_like(x)
+        else:
+            edge = np.linspace(-self.field, self.field, self.grid) if self.grid > 1 else np.zeros(1)
+            y, x = (a.ravel() for a in np.meshgrid(edge, edge, indexing="ij"))
+        if self.standards:
+            n = self.standard_grid
+            edge = np.linspace(-_STANDARD_EDGE, _STANDARD_EDGE, n) if n > 1 else np.zeros(1)
+            star_y, star_x = (a.ravel() for a in np.meshgrid(edge, edge, indexing="ij"))
+            x, y = np.append(x, star_x), np.append(y, star_y)
+        return Points(point=np.arange(len(x)), x=x, y=y)
+
+    def curves(self) -> dict[str, FilterCurve]:
+        """The filters with their curves."""
+        return {name: filter_curve(name) for name in self.filters}
+
+    def exposures(self) -> Exposures:
+        """All exposures in the order in which they are taken."""
+        clp = [(f, p, a) for f in self.filters for p in self.plate for a in self.polariser_angles]
+        n_clp, n_moon, n_star = len(clp), self.moon_patches, self.standards
+        n = n_clp + n_moon + n_star
+        sky_plate = [self.plate[i % len(self.plate)] for i in range(max(n_moon, n_star))]
+        plate = [p for _, p, _ in clp] + sky_plate[:n_moon] + sky_plate[:n_star]
+        mjd = self.start + _SPACING * (np.arange(n) - n_clp)
+        moon, star = slice(n_clp, n_clp + n_moon), slice(n_clp + n_moon, n)
+        ra, dec, rotator = np.full((3, n), NAN)
+        ra[moon], dec[moon] = self._patches(mjd[moon])
+        rotator[moon] = [_MOON_ROTATOR[i % 4] for i in range(n_moon)]
+        rotator[star] = [_STAR_ROTATOR[i % 4] for i in range(n_star)]
+        # Pointings that the plan does not fix are spread over ±3 h, out of step with the polariser.
+        ha = 6.0 * np.mod(np.arange(n) * _GOLDEN, 1.0) - 3.0
+        sidereal = _local_sidereal(mjd, self.site.longitude)
+        ra[star] = np.mod(sidereal[star] - 15.0 * ha[star], 360.0)
+        dec[star] = np.clip(self.site.latitude + 5.0, -85.0, 85.0)
+        ha[moon] = (np.mod(sidereal[moon] - ra[moon] + 180.0, 360.0) - 180.0) / 15.0
+        return Exposures(
+            exposure=np.arange(n),
+            kind=np.array(["clp"] * n_clp + ["moon"] * n_moon + ["standard"] * n_star),
+            mjd=mjd,
+            exptime=np.where(np.arange(n) < n_clp, 30.0, 60.0),
+            filter=np.array([f for f, _, _ in clp] + [self.filters[0]] * (n_moon + n_star)),
+            clp_in=np.arange(n) < n_clp,
+            clp_angle=np.array([a for _, _, a in clp] + [NAN] * (n_moon + n_star), float),
+            chwp_in=np.array([p is not None for p in plate], bool),
+            chwp_angle=np.array([NAN if p is None else p for p in plate], float),
+            temp=np.linspace(*self.temperature, n),
+            ha=ha,
+            ra=ra,
+            dec=dec,
+            rotator=rotator,
+            teff=np.full(n, self.teff),
+        )
+
+    def layout(self) -> tuple[Bool[np.ndarray, "p e"], np.ndarray]:
+        """Which (point, exposure) pairs are measured, and the row of the star in each (−1: none)."""
+        exposures, points = self.exposures(), self.points()
+        on_star = np.arange(len(points)) >= len(points) - (self.standard_grid**2 if self.standards else 0)
+        used = on_star[:, None] == (exposures.kind == "standard")
+        star = np.where(exposures.kind == "standard", np.cumsum(exposures.kind == "standard") - 1, -1)
+        return used, np.where(used, star, -1)
+
+    def context(self) -> Context:
+        """What effects that grow with the data need to know."""
+        exposures = self.exposures()
+        moon = np.flatnonzero(exposures.kind == "moon")
+        return Context(
+            exposures=len(exposures),
+            moon=tuple(int(i) for i in moon),
+            moon_ids=tuple(int(i) for i in exposures.exposure[moon]),
+            sources=self.star_names,
+        )
+
+    def _patches(
+        self, mjd: Float[np.ndarray, " m"]
+    ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """Field centres around the Moon: separations and position angles spread evenly."""
+        if not len(mjd):
+            return mjd, mjd
+        moon_ra, moon_dec = (np.deg2rad(a) for a in moon_direction(mjd, self.site))
+        order = np.arange(len(mjd))
+        near, far = np.deg2rad(self.separations)
+        distance = near + (far - near) * np.mod(0.5 + order * _GOLDEN, 1.0)
+        angle = 2.0 * np.pi * _GOLDEN * order
+        sin_dec = np.sin(moon_dec) * np.cos(distance) + np.cos(moon_dec) * np.sin(distance) * np.cos(angle)
+        east = np.sin(distance) * np.sin(angle)
+        north = np.cos(distance) * np.cos(moon_dec) - np.sin(distance) * np.sin(moon_dec) * np.cos(angle)
+        ra = np.mod(np.rad2deg(moon_ra + np.arctan2(east, north)), 360.0)
+        return ra, np.rad2deg(np.arcsin(sin_dec))
+
+
+def filter_curve(name: str) -> FilterCurve:
+    """A built-in filter, or one of the narrow bands of `NARROW_BANDS` (flat-topped, 15 nm wide)."""
+    if name not in NARROW_BANDS:
+        return builtin_filter(name)
+    offset = np.linspace(-0.015, 0.015, 61)
+    return FilterCurve(name, NARROW_BANDS[name] + offset, np.exp(-np.log(2.0) * (offset / 0.0075) ** 6))
+
+
+def _local_sidereal(mjd: Float[np.ndarray, " e"], longitude: float) -> Float[np.ndarray, " e"]:
+    """Local mean sidereal time (deg) to a few arcsec (Meeus 1998, Astronomical Algorithms, 12.4)."""
+    days = mjd - 51544.5
+    return np.mod(280.46061837 + 360.98564736629 * days + longitude, 360.0)

@@ -1,0 +1,198 @@
+"""Synthetic calibration sets that carry their truth: an as-built instrument, its light path, and noise.
+
+The counts come from the light path of the package (`engine.prediction`), so a set tests everything behind the
+physics; the physics itself is held against outside data and the oracle of the tests.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from walop_jax.data.records import Block, CalibrationSet, Sources
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.likelihood import engine
+from walop_jax.likelihood.noise import PhotonNoise
+from walop_jax.likelihood.problem import Problem
+from walop_jax.model import legendre, light
+from walop_jax.model.compiled import compiled
+from walop_jax.model.effects import in_order
+from walop_jax.model.effects.base import Effect, overridden
+from walop_jax.model.instrument import Instrument, Standards, nominal_instrument
+from walop_jax.model.parameters import leaves
+from walop_jax.model.plan import Plan, with_median
+from walop_jax.model.specification import Model, full_values, make_model, make_template, series_indices
+from walop_jax.simulation.observing_plan import ObservingPlan
+
+Cube = Float[np.ndarray, "p e 4"]
+
+LEVEL_SCATTER = 0.03  # of the cameras' throughput around 0.5
+STRUCTURE = 0.02  # rms over the field, relative
+TRANSPARENCY = (0.7, 1.0)
+_MEDIAN_ROUNDS = 6  # the median that a pedestal refers to has the pedestal in it: each round gains its level
+_POLARISED = (0.01, 0.06)
+_STAR_TEFF = (5000.0, 9500.0)
+
+
+class Simulated(NamedTuple):
+    """A synthetic calibration set and the instrument that made it."""
+
+    calset: CalibrationSet
+    truth: Instrument
+
+
+def truth_values(truth: Instrument) -> dict[str, float]:
+    """The true value of every parameter by name; the names are those of a fit."""
+    names = (leaf.name for leaf in leaves(truth))
+    return {name: float(value) for name, value in zip(names, full_values(truth), strict=True)}
+
+
+def draw_instrument(model: Model, rng: np.random.Generator) -> Instrument:
+    """An instrument as it might have been built.
+
+    Every parameter with a prior is drawn from it (efficiencies stop at 1), tied ones follow; throughputs are
+    drawn as smooth maps: levels 0.5 ± 0.03, structure over the field of 2 % rms. The scale that all cameras
+    share is a gauge, so the constant of camera N0 is 0.5. What else has no prior stays at its start value.
+    """
+    values = model.start
+    for i, p in enumerate(model.parameters):
+        if p.prior is not None:
+            values[i] = rng.normal(*p.prior)
+            if p.name.endswith(".efficiency"):
+                values[i] = min(values[i], 1.0)
+    for i, p in enumerate(model.parameters):
+        if p.tie is not None:
+            values[i] = values[model.index(p.tie)]
+    values[list(series_indices(model.template))] = _throughput(model.template, rng).ravel()
+    return model.instrument(values)
+
+
+def _throughput(template: Instrument, rng: np.random.Generator) -> Float[np.ndarray, "4 t"]:
+    terms = np.array(legendre.terms(template.throughput.degree))
+    degree = terms.sum(axis=1)
+    level = 0.5 + LEVEL_SCATTER * rng.standard_normal(4)
+    shape = rng.standard_normal((4, len(terms)))
+    share = np.where(degree > 0, 1.0 / np.maximum(degree, 1), 0.0)
+    share /= max(float(np.linalg.norm(share)), 1.0)
+    # The mean square of P_i P_j over the field is 1 / ((2i + 1)(2j + 1)).
+    relative = STRUCTURE * shape * share * np.sqrt(np.prod(2 * terms + 1, axis=1))
+    relative[:, 0] = 1.0
+    return 0.5 * level[:, None] / level[0] * relative
+
+
+def _catalogue(plan: ObservingPlan, rng: np.random.Generator) -> tuple[Sources, Standards]:
+    """A catalogue of standards, and what the stars really are."""
+    n = plan.standards
+    degree = np.where(np.arange(n) < plan.unpolarised, 0.0, rng.uniform(*_POLARISED, n))
+    angle = rng.uniform(0.0, 2.0 * np.pi, n)
+    catalogue = np.stack([degree * np.cos(angle), degree * np.sin(angle)])
+    true = catalogue + plan.catalogue_error * rng.standard_normal((2, n))
+    sources = Sources(
+        source=np.arange(n),
+        name=np.array(plan.star_names, dtype="U5"),
+        q=catalogue[0],
+        u=catalogue[1],
+        q_err=np.full(n, plan.catalogue_error),
+        u_err=np.full(n, plan.catalogue_error),
+        teff=rng.uniform(*_STAR_TEFF, n),
+    )
+    return sources, Standards(q=true[0], u=true[1], names=plan.star_names)
+
+
+def simulate(
+    plan: ObservingPlan,
+    seed: int = 0,
+    *,
+    instrument: Instrument | None = None,
+    effects: Sequence[Effect] = (),
+    noiseless: bool = False,
+) -> Simulated:
+    """Simulate a calibration run: the same plan, seed and effects give the same set, bit for bit.
+
+    `instrument` is the true one (default: drawn from the priors of the base model); its standards are
+    replaced by those of the simulated catalogue, `effects` are added to it. `noiseless` leaves the expected
+    counts as they are and states the errors that they would have. Effects that depend on the run are made
+    with `plan.context()`.
+    """
+    build, stars, sky, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
+    sources, standards = _catalogue(plan, stars)
+    if instrument is None:
+        nominal = nominal_instrument(plan.instrument, throughput_degree=plan.throughput_degree)
+        instrument = draw_instrument(make_model(plan.instrument, nominal), build)
+    active = in_order((*instrument.effects, *effects))
+    truth = make_template(dataclasses.replace(instrument, standard=standards, effects=active))
+    blank = _blank(plan, sources, seed)
+    expected = _expected(blank, truth, _fluxes(plan, sky))
+    detector = PhotonNoise(plan.read_noise)
+    if noiseless:
+        counts, sigma = expected, detector.sigma(expected)
+    else:
+        # A generator for each point: a last digit that another machine computes differently stays where it is.
+        drawn = [detector.draw(*pair) for pair in zip(noise.spawn(len(expected)), expected, strict=True)]
+        counts, sigma = (np.stack(part) for part in zip(*drawn, strict=True))
+    return Simulated(_with_counts(plan, blank, counts, sigma), truth)
+
+
+def _blank(plan: ObservingPlan, sources: Sources, seed: int) -> CalibrationSet:
+    """The calibration set that the plan announces, before any light: counts and errors are 1."""
+    points = plan.points()
+    used, source = plan.layout()
+    ones = np.ones((*used.shape, 4))
+    block = Block(x=points.x, y=points.y, counts=ones, sigma=ones, used=used, source=source)
+    return CalibrationSet(
+        instrument=plan.instrument,
+        site=plan.site,
+        origin=f"walop-jax simulate, seed {seed}",
+        exposures=plan.exposures(),
+        points=points,
+        sources=sources,
+        filters=plan.curves(),
+        intensities=TableIntensities.dense(points, block),
+    )
+
+
+def _with_counts(plan: ObservingPlan, blank: CalibrationSet, counts: Cube, sigma: Cube) -> CalibrationSet:
+    points = blank.points
+    used, source = plan.layout()
+    block = Block(x=points.x, y=points.y, counts=counts, sigma=sigma, used=used, source=source)
+    return dataclasses.replace(blank, intensities=TableIntensities.dense(points, block))
+
+
+def _fluxes(plan: ObservingPlan, rng: np.random.Generator) -> Float[np.ndarray, "p e"]:
+    """Flux of every (point, exposure): transparency, illumination of the field, brightness of the stars.
+
+    A camera of throughput 0.5 sees a quarter of unpolarised light.
+    """
+    used, source = plan.layout()
+    transparency = rng.uniform(*TRANSPARENCY, used.shape[1])
+    illumination = rng.uniform(0.9, 1.1, used.shape[0])
+    brightness = np.append(rng.uniform(*TRANSPARENCY, plan.standards), 1.0)  # the last entry: no star
+    return 4.0 * plan.electrons * illumination[:, None] * transparency * brightness[source]
+
+
+def _expected(
+    blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, "p e"]
+) -> Float[np.ndarray, "p e 4"]:
+    """Expected counts (electron) of every (point, exposure), what the detectors do to them included."""
+    problem = Problem(blank, make_model(blank.instrument, truth))
+    unit = np.concatenate([np.asarray(engine.prediction(truth, problem.plan, c)) for c in problem.chunks])
+    light_counts = flux[:, :, None] * unit[: len(flux)]
+    if not overridden(truth.effects, "detector"):
+        return light_counts
+    counts = light_counts
+    for _ in range(_MEDIAN_ROUNDS if any(effect.uses_median for effect in truth.effects) else 1):
+        seen = np.where(problem.used[:, :, None], counts, np.nan)
+        plan = with_median(problem.plan, np.nanmedian(seen, axis=0))
+        counts = np.asarray(_detected(truth, plan, jnp.asarray(light_counts)))
+    return counts
+
+
+@compiled
+def _detected(instrument: Instrument, plan: Plan, counts: Float[Array, "p e 4"]) -> Float[Array, "p e 4"]:
+    return jax.vmap(light.detected, (None, None, 0))(instrument, plan.exposures, counts)

@@ -1,0 +1,170 @@
+"""The full-Moon sky and the turn from the sky to the instrument frame.
+
+Single Rayleigh scattering (Paper II of WALOP-South, section on the Moon sky):
+
+    p = δ sin²γ / (1 + cos²γ),    electric vector perpendicular to the scattering plane,
+
+with γ the angle between the line of sight k and the direction m of the Moon. The vector v = k × m is
+perpendicular to the scattering plane and |v| = sin γ; with a and b its components along north and east,
+tan(position angle) = b / a, so that
+
+    Q = δ (a² − b²) / (1 + cos²γ),    U = δ 2ab / (1 + cos²γ),
+
+which needs no angle and stays smooth at γ = 0. All functions here give δ = 1; δ is a parameter of the fit.
+
+North and east at a field point are those of the field centre, carried there by the smallest rotation
+(the meridian convergence is thereby taken out), in the words of the instrument frame:
+
+    n(k) = n − (k·n) / (1 + k·c) · (k + c).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.data.checks import EPHEMERIS_MJD
+from walop_jax.data.records import Site
+from walop_jax.io.errors import fail
+
+
+def moon_sky(
+    mjd: Float[np.ndarray, " e"],
+    ra: Float[np.ndarray, " e"],
+    dec: Float[np.ndarray, " e"],
+    rotator: Float[np.ndarray, " e"],
+    site: Site,
+    x: Float[np.ndarray, " p"],
+    y: Float[np.ndarray, " p"],
+) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e"]]:
+    """Return q and u of the moonlit sky for δ = 1, in the instrument frame.
+
+    `mjd` UTC days at mid-exposure; `ra`, `dec` the field centre and `rotator` the position angle of +X,
+    degrees; `x`, `y` degrees in the instrument frame. Memory is about ten arrays of points × exposures:
+    for whole frames call it with a slab of the points at a time, after `moon_direction`.
+
+    Raises `DataError` if an input is not finite or the site or time is unusable.
+    """
+    moon_ra, moon_dec = moon_direction(mjd, site)
+    return rayleigh_sky(moon_ra, moon_dec, ra, dec, rotator, x, y)
+
+
+def moon_direction(
+    mjd: Float[np.ndarray, " e"], site: Site
+) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
+    """Return right ascension and declination (degrees, GCRS axes) of the Moon as seen from the site.
+
+    The Moon is 60 Earth radii away: its parallax of up to a degree makes the site matter. `mjd` in UTC days.
+    Astropy's `get_body` with the built-in ephemeris; nothing is ever downloaded, so Earth rotation comes
+    from the tables that are installed and may be a second off in the future (0.3 arcsec of parallax).
+
+    Raises `DataError` for a time outside the ephemeris and for a site that is not finite.
+    """
+    mjd = np.asarray(mjd, dtype=np.float64)
+    low, high = EPHEMERIS_MJD
+    if not np.all((mjd >= low) & (mjd <= high)):
+        raise fail(
+            "times must be Modified Julian Dates in 1900 … 2100",
+            column="MJD",
+            advice="subtract 2400000.5 from a Julian Date",
+        )
+    if not np.all(np.isfinite([site.latitude, site.longitude, site.elevation])):
+        raise fail(
+            "the site is not known", column="SITELAT, SITELONG, SITEELEV", advice="add them to the header"
+        )
+    with _offline():
+        # Imported here: coordinates take half a second, and only Moon exposures need them.
+        from astropy.coordinates import EarthLocation, get_body
+        from astropy.time import Time
+
+        place = EarthLocation.from_geodetic(site.longitude, site.latitude, site.elevation)
+        moon: Any = get_body("moon", Time(mjd, format="mjd", scale="utc"), place, ephemeris="builtin")
+        return np.asarray(moon.ra.deg, dtype=np.float64), np.asarray(moon.dec.deg, dtype=np.float64)
+
+
+@contextlib.contextmanager
+def _offline() -> Iterator[None]:
+    """Keep astropy from the network, and from warning that its Earth-rotation tables end."""
+    from astropy.utils import iers
+
+    with (
+        iers.conf.set_temp("auto_download", False),
+        iers.conf.set_temp("iers_degraded_accuracy", "ignore"),
+        iers.earth_orientation_table.set(iers.IERS_B.open()),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore")
+        yield
+
+
+def rayleigh_sky(
+    moon_ra: Float[np.ndarray, " e"],
+    moon_dec: Float[np.ndarray, " e"],
+    ra: Float[np.ndarray, " e"],
+    dec: Float[np.ndarray, " e"],
+    rotator: Float[np.ndarray, " e"],
+    x: Float[np.ndarray, " p"],
+    y: Float[np.ndarray, " p"],
+) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e"]]:
+    """Return q and u (δ = 1, instrument frame) of a sky lit from a given direction; all angles in degrees.
+
+    Raises `DataError` if an input is not finite. Source: see the head of this file.
+    """
+    inputs = {"MOON": moon_ra, "MOON DEC": moon_dec, "RA": ra, "DEC": dec, "ROTATOR": rotator, "X": x, "Y": y}
+    for name, values in inputs.items():
+        if not np.all(np.isfinite(values)):
+            raise fail("is not finite", column=name, advice="give only exposures of the Moon sky")
+
+    # Components of the Moon's direction along north, east and line of sight of the field centre.
+    alpha, delta, delta_moon = np.deg2rad(np.asarray(moon_ra) - ra), np.deg2rad(dec), np.deg2rad(moon_dec)
+    moon_n = np.cos(delta) * np.sin(delta_moon) - np.sin(delta) * np.cos(delta_moon) * np.cos(alpha)
+    moon_e = np.cos(delta_moon) * np.sin(alpha)
+    moon_c = np.sin(delta) * np.sin(delta_moon) + np.cos(delta) * np.cos(delta_moon) * np.cos(alpha)
+
+    # A field point on the tangent plane, then on the unit sphere.
+    cos_r, sin_r = np.cos(np.deg2rad(rotator)), np.sin(np.deg2rad(rotator))
+    x, y = np.deg2rad(x)[:, None], np.deg2rad(y)[:, None]
+    north, east = x * cos_r - y * sin_r, x * sin_r + y * cos_r
+    k_c = 1.0 / np.sqrt(1.0 + north**2 + east**2)
+    k_n, k_e = north * k_c, east * k_c
+
+    # v = k × m in the axes (north, east, line of sight). This triad is left-handed, which turns the sign of
+    # the whole vector; only its orientation, modulo 180°, matters.
+    v_n = k_e * moon_c - k_c * moon_e
+    v_e = k_c * moon_n - k_n * moon_c
+    v_c = k_n * moon_e - k_e * moon_n
+    # The carried axes are n − k_n / (1 + k_c) · (k + c), and v ⟂ k, so only the part along c is corrected.
+    a = v_n - k_n / (1.0 + k_c) * v_c
+    b = v_e - k_e / (1.0 + k_c) * v_c
+
+    cos_gamma = k_n * moon_n + k_e * moon_e + k_c * moon_c
+    weight = 1.0 / (1.0 + cos_gamma**2)
+    return sky_to_instrument(weight * (a**2 - b**2), weight * (2.0 * a * b), rotator)
+
+
+def standard_rotation(
+    rotator: Float[np.ndarray, "*n"],
+) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
+    """Return cos 2R and sin 2R of the position angle R (degrees) of +X: what turns sky into instrument.
+
+    EVPA in the instrument frame = position angle on the sky − R, hence
+    q = Q cos 2R + U sin 2R and u = U cos 2R − Q sin 2R.
+    """
+    angle = np.deg2rad(2.0 * np.asarray(rotator, dtype=np.float64))
+    return np.cos(angle), np.sin(angle)
+
+
+def sky_to_instrument(
+    q: Float[np.ndarray, ...], u: Float[np.ndarray, ...], rotator: Float[np.ndarray, ...]
+) -> tuple[Float[np.ndarray, ...], Float[np.ndarray, ...]]:
+    """Turn equatorial Stokes parameters (position angle north through east) into the instrument frame.
+
+    `rotator` in degrees, broadcast against q and u. The inverse is the same with −`rotator`.
+    """
+    cos_2r, sin_2r = standard_rotation(rotator)
+    return q * cos_2r + u * sin_2r, u * cos_2r - q * sin_2r
