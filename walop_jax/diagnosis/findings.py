@@ -12,7 +12,7 @@ from walop_jax.diagnosis.design import HeldOut
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.problem import Problem
 
-Verdict = Literal["consistent", "effect_found", "unexplained"]
+Outcome = Literal["consistent", "effect_found", "unexplained"]
 Cube = Float[np.ndarray, "p e 4"]
 
 NEGLIGIBLE = (
@@ -108,11 +108,11 @@ class Unexplained:
 class Diagnosis:
     """What is missing from a model, according to one calibration set.
 
-    `candidates` are (effect, score, corrected p) in the first look; `after` is the fit of the extended model and
+    `candidates` are (effect, score, corrected p) in the first examination; `after` is the fit of the extended model and
     `problem` what it was fitted to; `remaining_p` is the significance of what is left at the end.
     """
 
-    verdict: Verdict
+    verdict: Outcome
     steps: tuple[Step, ...]
     candidates: tuple[tuple[str, float, float], ...]
     limits: tuple[Limit, ...]

@@ -196,7 +196,9 @@ def _figures(run: Run) -> dict[str, str]:
 def embedded(figure: Figure) -> str:
     """A figure as a data URI (SVG, letters as outlines): for an image inside a page."""
     stream = io.BytesIO()
-    with matplotlib.rc_context({"svg.hashsalt": "walop-jax"}):  # without it no two pages of a run are the same
+    with matplotlib.rc_context(
+        {"svg.hashsalt": "walop-jax"}
+    ):  # without it no two pages of a run are the same
         figure.savefig(stream, format="svg", metadata={"Date": None})
     return "data:image/svg+xml;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
 
