@@ -12,7 +12,7 @@ from walop_jax.diagnosis.change_of_stokes import largest_change
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import upper_limit
 from walop_jax.diagnosis.findings import Diagnosis
-from walop_jax.diagnosis.freeform import Measured, block_of, strata
+from walop_jax.diagnosis.freeform import Measured, strata
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.problem import Problem, base_model
@@ -123,7 +123,7 @@ def test_limits_against_integrals(value, sigma):
     assert inside / whole == pytest.approx(0.95, abs=1e-6)
 
 
-def test_consequences_by_hand():
+def test_change_of_stokes_by_hand():
     """An ideal instrument; a constant of 0.001 in q moves q by that, 1 % less efficiency moves 5 % by 0.05 %."""
     ideal = np.array([[[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]])
     assert largest_change(ideal, ideal) == 0.0
@@ -138,8 +138,12 @@ def test_consequences_by_hand():
 
 def test_every_block_of_the_free_form_term_answers_to_a_stratum(leaking):
     _, _, _, problem, extended = leaking
-    names = [candidate.name for candidate in strata(Measured(problem, extended.values))]
-    assert {block_of(name) for name in names} == {*BLOCKS, None}
+    blocks = {stratum.name: stratum.block for stratum in strata(Measured(problem, extended.values))}
+    assert set(blocks.values()) == {*BLOCKS, None}
+    assert blocks["4θ of O1"] == "harmonics"
+    assert blocks["rings of E2"] == "fine"
+    assert blocks["kind"] == "exposures"
+    assert blocks["flux"] is None
 
 
 def test_many_names_and_weak_errors_call_for_caution():

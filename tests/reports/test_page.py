@@ -167,7 +167,7 @@ def test_missing_pieces_are_named(tmp_path):
 
 def test_files_of_different_diagnoses_are_not_mixed(tmp_path):
     run = handmade_run.make_diagnosis(tmp_path / "run", steps=[], verdict="consistent")
-    handmade_run.write_pictures(run / "diagnosis.fits", handmade_run.pictures(), overwrite=True)
+    handmade_run.write_figure_data(run / "diagnosis.fits", handmade_run.figure_data(), overwrite=True)
     assert "diagnosis.fits is of another diagnosis" in read_run(run).missing[0]
     handmade_run.make_refit(run, chi2=1300.0)
     assert "diagnosis.json is of another fit" in read_run(run).missing[1]
@@ -261,7 +261,9 @@ def test_a_free_form_term_is_shown_as_what_it_is(tmp_path):
     run = handmade_run.make_diagnosis(
         tmp_path / "run", verdict="unexplained", steps=[], unexplained=unexplained
     )
-    handmade_run.write_pictures(run / "diagnosis.fits", handmade_run.pictures(("free_form",)), overwrite=True)
+    handmade_run.write_figure_data(
+        run / "diagnosis.fits", handmade_run.figure_data(("free_form",)), overwrite=True
+    )
     found = read_run(run)
     assert found.missing == ()
     page = Page(render(found))

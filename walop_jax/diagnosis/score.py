@@ -42,12 +42,14 @@ AT_ONCE = 128  # columns that are projected together
 class Candidate:
     """A named set of columns: the derivative of the residuals with respect to its amplitudes.
 
-    `widths` are the prior standard deviations of the amplitudes, in their own units.
+    `widths` are the prior standard deviations of the amplitudes, in their own units; `block` is the block of the
+    free-form term that can take the columns up, if there is one.
     """
 
     name: str
     columns: Matrix
     widths: Vector
+    block: str | None = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,7 +26,6 @@ from walop_jax.diagnosis.effect_columns import Probe
 from walop_jax.diagnosis.effect_columns import probes as all_probes
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.findings import Diagnosis, Outcome, Step, Unexplained
-from walop_jax.diagnosis.freeform import block_of
 from walop_jax.diagnosis.score import Score
 from walop_jax.diagnosis.step_summary import before_and_after, refitted_in_order
 from walop_jax.fit.refit import FitResult, fit
@@ -201,7 +200,8 @@ class _Diagnosing:
             f". Residuals sit in: cameras {where['camera']}; kinds {where['kind']}; field {where['field']}"
         )
         found = Unexplained(examination.table.p_global, text, patterns)
-        blocks = tuple(dict.fromkeys(b for name, _ in patterns if (b := block_of(name)) is not None))
+        able = (examination.blocks[name] for name, _ in patterns)
+        blocks = tuple(dict.fromkeys(block for block in able if block is not None))
         there = FreeForm.name in self.fit.model.effect_names
         return self._with_free_form(examination, found, blocks) if blocks and not there else found
 

@@ -1,7 +1,7 @@
 """Figures of a diagnosis: residuals over the field and over the exposures, what explains them, and the ladder of χ².
 
-They are drawn from the plain arrays of `diagnosis.fits` (`read_pictures`, or `diagnose.pictures.pictures` of a
-`Diagnosis` in memory). Residuals are (data − model) in standard deviations throughout.
+They are drawn from the plain arrays of `diagnosis.fits` (`read_figure_data`, or `figure_data` of a `Diagnosis`
+in memory). Residuals are (data − model) in standard deviations throughout.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator, NullLocator
 
 from walop_jax.data.records import Points
-from walop_jax.diagnosis.figure_file import Comparison, ExposureLabels, Ladder, PointMap, Shares
+from walop_jax.diagnosis.figure_file import ExposureLabels, Ladder, PointMap, ResidualComparison, Shares
 from walop_jax.reports.style import (
     AFTER,
     BEFORE,
@@ -130,7 +130,7 @@ def _spacing(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> float:
     return float(np.median(nearest)) if nearest.size else 0.05
 
 
-def signature_figure(comparison: Comparison, exposures: ExposureLabels) -> Figure:
+def signature_figure(comparison: ResidualComparison, exposures: ExposureLabels) -> Figure:
     """Residuals averaged over the field, camera by camera: data as dots, what the effect explains as a line.
 
     Against the polariser angle where the comparison shows a harmonic of it, or most of its signal is behind the
@@ -167,7 +167,7 @@ def signature_figure(comparison: Comparison, exposures: ExposureLabels) -> Figur
     return figure
 
 
-def _against_angle(comparison: Comparison, exposures: ExposureLabels) -> bool:
+def _against_angle(comparison: ResidualComparison, exposures: ExposureLabels) -> bool:
     behind = np.isfinite(exposures.clp_angle)
     if comparison.harmonic >= 0 or not behind.any():
         return comparison.harmonic >= 0

@@ -74,8 +74,8 @@ def _context(run: Run) -> dict[str, Any]:
         "shown_candidates": SHOWN_CANDIDATES,
         "ladder": _ladder(run),
         "whole_combination": ""
-        if run.pictures is None
-        else in_greek(run.pictures.comparisons[0].combination),
+        if run.figure_data is None
+        else in_greek(run.figure_data.comparisons[0].combination),
         "pulls": _pulls(run),
         "parameters": main,
         "other_parameters": rest,
@@ -93,22 +93,22 @@ def _steps(run: Run) -> list[dict[str, Any]]:
 
 def _drawn(run: Run, number: int) -> dict[str, str]:
     """The figures of one comparison of `diagnosis.fits` and its combination in words; empty without that."""
-    if run.pictures is None or number >= len(run.pictures.comparisons):
+    if run.figure_data is None or number >= len(run.figure_data.comparisons):
         return {"maps": "", "signature": "", "combination": ""}
-    one, points = run.pictures.comparisons[number], run.pictures.points
+    one, points = run.figure_data.comparisons[number], run.figure_data.points
     rows = {f"without\n{one.effect}": one.before, one.effect: one.explained, f"with\n{one.effect}": one.after}
     return {
         "maps": embedded(diagnosis_figures.residual_maps(points, rows)),
-        "signature": embedded(diagnosis_figures.signature_figure(one, run.pictures.exposures)),
+        "signature": embedded(diagnosis_figures.signature_figure(one, run.figure_data.exposures)),
         "combination": in_greek(one.combination),
     }
 
 
 def _ladder(run: Run) -> list[dict[str, Any]]:
     """Rungs as rows: model, χ², degrees of freedom and what each has gained."""
-    if run.pictures is None:
+    if run.figure_data is None:
         return []
-    ladder, rows, before = run.pictures.ladder, [], math.nan
+    ladder, rows, before = run.figure_data.ladder, [], math.nan
     for model, chi2, dof in zip(ladder.model, ladder.chi2, ladder.dof, strict=True):
         rows.append({"model": str(model), "chi2": float(chi2), "dof": int(dof), "gain": before - float(chi2)})
         before = float(chi2)
@@ -170,15 +170,15 @@ def _figures(run: Run) -> dict[str, str]:
         made["errors"] = product_figures.matrix_errors_figure(run.product.maps)
         if run.product.residuals is not None:
             made["remainder"] = product_figures.residual_map_figure(run.product.residuals)
-    if run.pictures is not None:
-        pictures = run.pictures
-        whole = pictures.comparisons[0]
-        made["shares"] = diagnosis_figures.shares_figure(pictures.shares)
-        if len(pictures.comparisons) == 1:
-            made["residuals"] = diagnosis_figures.residual_maps(pictures.points, {"residuals": whole.before})
+    if run.figure_data is not None:
+        data = run.figure_data
+        whole = data.comparisons[0]
+        made["shares"] = diagnosis_figures.shares_figure(data.shares)
+        if len(data.comparisons) == 1:
+            made["residuals"] = diagnosis_figures.residual_maps(data.points, {"residuals": whole.before})
         else:
-            made["ladder"] = diagnosis_figures.ladder_figure(pictures.ladder)
-        if len(pictures.comparisons) > 2:
+            made["ladder"] = diagnosis_figures.ladder_figure(data.ladder)
+        if len(data.comparisons) > 2:
             # Several effects need not show in one combination of the exposures: rms over all of them.
             # Standards lie between the other points and are measured in other exposures: left out, if need be.
             there = np.isfinite(whole.before)
@@ -186,7 +186,7 @@ def _figures(run: Run) -> dict[str, str]:
                 "starting\nmodel": np.where(there, whole.rms_before, np.nan),
                 "final\nmodel": np.where(there, whole.rms_after, np.nan),
             }
-            made["rms"] = diagnosis_figures.rms_maps(pictures.points, rows)
+            made["rms"] = diagnosis_figures.rms_maps(data.points, rows)
     uris = {name: embedded(figure) for name, figure in made.items()}
     if run.corner is not None:
         uris["corner"] = "data:image/png;base64," + base64.b64encode(run.corner).decode("ascii")
