@@ -14,7 +14,7 @@ from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import write_columns
 from walop_jax.reports.page import render
 from walop_jax.reports.run import read_run
-from walop_jax.reports.wording import digits, probability, verdict_of_diagnosis
+from walop_jax.reports.wording import probability, value_and_error, verdict_of_diagnosis
 
 VOID = {"meta", "img", "br", "link", "hr", "input"}
 
@@ -237,7 +237,7 @@ def test_what_is_no_run_is_refused(tmp_path, spoil, said):
     ],
 )
 def test_two_digits_of_the_error(value, sigma, shown):
-    assert digits(value, sigma) == shown
+    assert value_and_error(value, sigma) == shown
 
 
 def test_probabilities_in_words():

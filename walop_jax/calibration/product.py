@@ -36,7 +36,7 @@ from walop_jax.calibration.records import (
     MatrixMaps,
     ParameterTable,
     Verdict,
-    spelt,
+    in_ascii,
 )
 from walop_jax.calibration.residual_map_file import read_residual_map, residual_hdus
 from walop_jax.data import schema
@@ -58,8 +58,8 @@ __all__ = [
     "MatrixMaps",
     "ParameterTable",
     "Verdict",
+    "in_ascii",
     "read_product",
-    "spelt",
     "write_product",
 ]
 
@@ -112,7 +112,7 @@ def _hdus(product: CalibrationProduct, path: object) -> list[Any]:
     if len(product.sources):
         tables["SOURCES"] = {name: getattr(product.sources, name.lower()) for name in schema.SOURCES}
     if product.inputs:
-        paths = _strings(spelt(str(entry.path)) for entry in product.inputs)
+        paths = _strings(in_ascii(str(entry.path)) for entry in product.inputs)
         tables["INPUTS"] = {"PATH": paths, "SHA256": _strings(entry.sha256 for entry in product.inputs)}
     if product.verdict.warnings:
         tables["WARNINGS"] = {"TEXT": _strings(product.verdict.warnings)}
@@ -163,9 +163,9 @@ def _primary(product: CalibrationProduct) -> fits.PrimaryHDU:
     for name, (value, comment) in cards.items():
         if isinstance(value, float) and not np.isfinite(value):
             continue  # FITS headers know no NaN; a missing card is read as one
-        primary.header[name] = (spelt(value) if isinstance(value, str) else value, comment)
+        primary.header[name] = (in_ascii(value) if isinstance(value, str) else value, comment)
     for number, (name, version) in enumerate(product.versions.items(), start=1):
-        primary.header[f"SOFT{number}"] = spelt(f"{name} {version}")
+        primary.header[f"SOFT{number}"] = in_ascii(f"{name} {version}")
     return primary
 
 

@@ -16,6 +16,9 @@ MATRIX_NAMES = ("M21", "M22", "M23", "M31", "M32", "M33")
 RESIDUAL_NAMES = (*MATRIX_NAMES, "RATIO")
 """Quantities of a residual map: corrections of the matrix, and of the throughput of cameras N2, N3."""
 
+SMALLEST_DETERMINANT = 0.1
+"""|m22 m33 − m23 m32| below which a single exposure holds hardly any u."""
+
 QUALITY_BITS = {
     1: "not converged",
     2: "ill-conditioned",
@@ -43,7 +46,7 @@ _SPELT = {
 }  # fmt: skip
 
 
-def spelt(text: str) -> str:
+def in_ascii(text: str) -> str:
     """The text on one line in ASCII: signs spelt out where that is usual, escaped (\\u00e9) otherwise."""
     for sign, word in _SPELT.items():
         text = text.replace(sign, word)

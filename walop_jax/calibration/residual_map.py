@@ -99,7 +99,7 @@ def cell_of(grid: Grid, x: Vector, y: Vector) -> Int[np.ndarray, " p"]:
     return row * grid.width + column
 
 
-def _chosen(problem: Problem) -> tuple[str, float, Bool[np.ndarray, " e"]]:
+def _main_setting(problem: Problem) -> tuple[str, float, Bool[np.ndarray, " e"]]:
     """The setting with the most polariser exposures, plate out preferred, and its exposures."""
     e = problem.calset.exposures
     angle = np.where(e.chwp_in, e.chwp_angle, -np.inf)
@@ -115,7 +115,7 @@ def residual_map(problem: Problem, values: Vector) -> ResidualMap:
     """The map of what a fit (full vector of parameter values) leaves: one more pass over the points."""
     instrument = problem.model.instrument(values)
     nodes = problem.nodes(instrument)
-    filter_name, chwp_angle, chosen = _chosen(problem)
+    filter_name, chwp_angle, chosen = _main_setting(problem)
     grid = cells_for(problem)
     count = grid.width * grid.height
 

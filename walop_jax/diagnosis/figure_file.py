@@ -30,7 +30,7 @@ import numpy as np
 from astropy.io import fits
 from jaxtyping import Float, Int, Shaped
 
-from walop_jax.calibration.records import spelt
+from walop_jax.calibration.records import in_ascii
 from walop_jax.data.records import Points
 from walop_jax.data.schema import Column, Place, read_table
 from walop_jax.data.write import sign_and_write, table_hdu
@@ -208,7 +208,7 @@ def _columns(data: DiagnosisFigureData) -> dict[str, dict[str, np.ndarray]]:
         "COMPARISONS": {
             "COMPARISON": many,
             "EFFECT": np.array([one.effect for one in all_of]),
-            "COMBINATION": np.array([spelt(one.combination) for one in all_of]),
+            "COMBINATION": np.array([in_ascii(one.combination) for one in all_of]),
             "HARMONIC": np.array([one.harmonic for one in all_of]),
         },
         "FIELD": {

@@ -117,7 +117,7 @@ class _Diagnosing:
                 break
             self.tell(f"added {added}; scoring what is left")
             examination = self._examine(examination)
-        return look
+        return examination
 
     def _trials(self, examination: Examination) -> Iterator[naming.Trial]:
         for item in naming.leaders(examination.significant) if examination.significant else ():

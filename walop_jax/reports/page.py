@@ -20,14 +20,14 @@ from walop_jax.reports import diagnosis_figures, product_figures
 from walop_jax.reports.run import Run
 from walop_jax.reports.wording import (
     UNNAMED,
-    about,
-    digits,
-    measured,
-    minus,
+    effect_in_words,
     probability,
     rounded,
+    value_and_error,
     verdict_of_diagnosis,
     verdict_of_fit,
+    with_error,
+    with_minus_sign,
 )
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -46,7 +46,12 @@ def render(run: Run) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals.update(about=about, digits=digits, rounded=rounded, probability=probability)
+    environment.globals.update(
+        effect_in_words=effect_in_words,
+        value_and_error=value_and_error,
+        rounded=rounded,
+        probability=probability,
+    )
     return environment.get_template("report.html").render(_context(run))
 
 
@@ -119,7 +124,7 @@ def _parameters(run: Run) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Rows of the fitted coefficients of the instrument; rows of throughputs and of what was not fitted."""
     main, rest = [], []
     for name, entry in run.summary["parameters"].items():
-        value, sigma = digits(entry["value"], entry["sigma"])
+        value, sigma = value_and_error(entry["value"], entry["sigma"])
         row = {"name": name, "value": value, "sigma": sigma or "fixed", "unit": entry["unit"]}
         (rest if name.startswith("throughput.") or not sigma else main).append(row)
     return main, rest
@@ -136,10 +141,10 @@ def _pulls(run: Run) -> list[dict[str, Any]]:
     return [
         {
             "name": str(table.name[i]),
-            "value": measured(float(table.value[i]), float(table.sigma[i])),
+            "value": with_error(float(table.value[i]), float(table.sigma[i])),
             "unit": str(table.unit[i]),
-            "prior": f"{minus(f'{table.prior_mean[i] + 0.0:.6g}')} ± {table.prior_width[i]:.3g}",
-            "pull": minus(f"{size:+.2f}"),
+            "prior": f"{with_minus_sign(f'{table.prior_mean[i] + 0.0:.6g}')} ± {table.prior_width[i]:.3g}",
+            "pull": with_minus_sign(f"{size:+.2f}"),
             "strong": abs(float(size)) > STRONG_PULL,
         }
         for i, size in zip(known[order], pull[order], strict=True)
@@ -150,12 +155,13 @@ def _interval(row: Mapping[str, Any]) -> dict[str, str]:
     median, low, high = (float(row[name]) for name in ("MEDIAN", "LOW68", "HIGH68"))
     half = 0.5 * (high - low)
     spans = {
-        level: [digits(float(row[f"{end}{level}"]), half)[0] for end in ("LOW", "HIGH")] for level in (68, 95)
+        level: [value_and_error(float(row[f"{end}{level}"]), half)[0] for end in ("LOW", "HIGH")]
+        for level in (68, 95)
     }
     return {
         "name": str(row["NAME"]),
         "unit": str(row["UNIT"]),
-        "median": digits(median, half)[0],
+        "median": value_and_error(median, half)[0],
         "span68": " … ".join(spans[68]),
         "span95": " … ".join(spans[95]),
         "ess": f"{float(row['ESS']):.0f}",

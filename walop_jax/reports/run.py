@@ -22,7 +22,7 @@ POSTERIOR, INTERVALS, CORNER, SAMPLE = "posterior.nc", "posterior.ecsv", "poster
 SUMMARY_KEYS = ("chi2", "dof", "n_data", "parameters", "converged", "message", "versions", "inputs")
 DIAGNOSIS_KEYS = ("verdict", "steps", "candidates", "unexplained")
 DEFAULTS: dict[str, Any] = {"warnings": [], "remarks": [], "misfit": None}  # beyond the contract's keys
-SAME = 1e-6  # relative difference of χ²/dof of one and the same fit, read from two files
+SAME_CHI2 = 1e-6  # relative difference of χ²/dof of one and the same fit, read from two files
 
 T = TypeVar("T")
 
@@ -130,7 +130,7 @@ def _document(path: Path, keys: tuple[str, ...]) -> dict[str, Any]:
 def _another_fit(summary: dict[str, Any], diagnosis: dict[str, Any]) -> bool:
     said = diagnosis.get("chi2_per_dof_after")
     ratio = summary["chi2"] / max(summary["dof"], 1)
-    return said is not None and abs(said - ratio) > SAME * ratio
+    return said is not None and abs(said - ratio) > SAME_CHI2 * ratio
 
 
 def _intervals(path: Path) -> tuple[dict[str, Any], ...]:
