@@ -13,7 +13,8 @@ from oracle import forward
 from walop_jax.data.records import Exposures, FilterCurve
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
-from walop_jax.model.instrument import Instrument, nominal_instrument
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.build import nominal_instrument
 from walop_jax.model.parameters import leaves
 from walop_jax.model.plan import Plan, build_plan
 from walop_jax.model.specification import full_values, unravel

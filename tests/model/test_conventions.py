@@ -8,7 +8,7 @@ import pytest
 from oracle import forward
 
 from walop_jax.model import conventions, light, mueller
-from walop_jax.model.instrument import HalfWavePlate, Polariser, nominal_instrument
+from walop_jax.model.build import nominal_instrument
 from walop_jax.model.plan import build_plan
 
 LAM = 0.62

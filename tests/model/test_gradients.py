@@ -12,7 +12,7 @@ from oracle import forward
 from walop_jax.data.records import Sources
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
-from walop_jax.model.instrument import HalfWavePlate, nominal_instrument
+from walop_jax.model.build import nominal_instrument
 from walop_jax.model.parameters import leaves
 from walop_jax.model.plan import build_plan
 

@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 
 from walop_jax.data import builtin_filter
 from walop_jax.model import light
-from walop_jax.model.instrument import HalfWavePlate, nominal_instrument, zero_order_quartz
+from walop_jax.model.build import nominal_instrument
 
 # Paper II, table of the laboratory results: tilt (deg), cross-talk from q into u_m
 TILT = np.array([12.0, 14.0, 16.0, 18.0, 20.0])

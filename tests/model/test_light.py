@@ -8,7 +8,7 @@ import pytest
 from oracle import forward
 
 from walop_jax.model import light
-from walop_jax.model.instrument import nominal_instrument
+from walop_jax.model.build import nominal_instrument
 from walop_jax.model.plan import build_plan
 
 SETTINGS = (None, 0.0, 45.0)

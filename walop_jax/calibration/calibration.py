@@ -25,7 +25,8 @@ from walop_jax.fit.model_file import render
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.likelihood.problem import Problem, standard_names
-from walop_jax.model.instrument import nominal_instrument
+from walop_jax.model.build import nominal_instrument
+from walop_jax.model.dependence import needs
 from walop_jax.model.specification import Model, effect_context
 
 Vector = Float[np.ndarray, " n"]
@@ -148,7 +149,7 @@ class Calibration:
         high_x, high_y = self.field[1] + margin, self.field[3] + margin
         flags[(x < low_x) | (x > high_x) | (y < low_y) | (y > high_y)] |= 32
         flags[~np.isin(settings.filter, np.unique(self.exposures.filter))] |= 64
-        if any("temperature" in effect.optics_depend_on for effect in self.model.template.effects):
+        if "temperature" in needs(self.model.template).conditions:
             low, high = np.nanmin(self.exposures.temp), np.nanmax(self.exposures.temp)
             beyond = (settings.temp < low - TEMPERATURE_MARGIN) | (settings.temp > high + TEMPERATURE_MARGIN)
             flags[beyond] |= 64

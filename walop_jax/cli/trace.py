@@ -58,11 +58,11 @@ def trace(
     """
     nan = float("nan")
     switch_on_jax()
-    from walop_jax.model.trace import Ray
+    from walop_jax.model.trace import Sightline
     from walop_jax.model.trace import trace as follow
 
     try:
-        ray = Ray(
+        ray = Sightline(
             x=x,
             y=y,
             q=q,
@@ -98,7 +98,7 @@ def _instrument(product: Path | None, name: str, filter_name: str) -> tuple[Inst
     from walop_jax.data.filters import builtin_filter
 
     if product is None:
-        from walop_jax.model.instrument import nominal_instrument
+        from walop_jax.model.build import nominal_instrument
 
         try:
             return nominal_instrument(name.upper()), builtin_filter(filter_name)

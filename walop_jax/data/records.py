@@ -37,6 +37,14 @@ class FilterCurve:
 
 
 @dataclasses.dataclass(frozen=True)
+class Position:
+    """Where a moving element stands in every exposure."""
+
+    inside: Bool[np.ndarray, " e"]
+    angle: Float[np.ndarray, " e"]
+
+
+@dataclasses.dataclass(frozen=True)
 class Exposures:
     """One entry per exposure; angles in degrees, NaN where a quantity has no meaning.
 
@@ -62,6 +70,12 @@ class Exposures:
 
     def __len__(self) -> int:
         return len(self.exposure)
+
+    def position(self, prefix: str) -> Position:
+        """The moving element of a column prefix."""
+        if prefix == "CLP":
+            return Position(self.clp_in, self.clp_angle)
+        return Position(self.chwp_in, self.chwp_angle)
 
 
 @dataclasses.dataclass(frozen=True)

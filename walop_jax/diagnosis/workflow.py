@@ -34,7 +34,8 @@ from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.chunks import thinned
 from walop_jax.likelihood.problem import Problem, base_model
 from walop_jax.model.effects import EFFECTS, Context, Effect, FreeForm
-from walop_jax.model.specification import Model, effect_context, full_values
+from walop_jax.model.parameters import values_of
+from walop_jax.model.specification import Model, effect_context
 
 LARGEST_ROWS = 100_000  # 800 columns of four cameras each take 2.5 GB
 MOST_STEPS = 6
@@ -268,7 +269,7 @@ class _Diagnosing:
         close = {name for name, s in separation.items() if s < naming.SEPARATION} | set(step.equivalent)
         close -= {other.effect for other in self.steps}
         effect = self.fit.model.instrument(self.fit.values).effect(step.effect)
-        standard = full_values(effect.standard_form()) if not type(effect).is_structural() else ()
+        standard = np.asarray(values_of(effect.standard_form())) if not type(effect).is_structural() else ()
         parameters = {}
         for i, value in zip(self.fit.model.positions(step.effect), standard, strict=True):
             p = self.fit.model.parameters[i]

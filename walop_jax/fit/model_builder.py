@@ -9,8 +9,8 @@ from typing import Any
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_file import Header, parse
 from walop_jax.likelihood.problem import base_model
+from walop_jax.model.build import nominal_instrument
 from walop_jax.model.effects import Context, effect_by_name
-from walop_jax.model.instrument import INSTRUMENTS, nominal_instrument
 from walop_jax.model.parameters import unknown_name
 from walop_jax.model.specification import Model, effect_context, make_model, with_effects
 
@@ -45,8 +45,8 @@ def model_without_data(
     `standards` are (name, q, u); `context` says what effects that grow with the data need to know of them.
     Raises ValueError for an unknown instrument and as `model_for` does.
     """
-    if instrument not in INSTRUMENTS:
-        raise unknown_name("instrument", instrument, INSTRUMENTS)
+    if instrument not in shipped():
+        raise unknown_name("instrument", instrument, shipped())
 
     def build(header: Header) -> Model:
         nominal = nominal_instrument(

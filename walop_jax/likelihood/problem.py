@@ -19,12 +19,16 @@ from walop_jax.likelihood.chunks import Chunks, median_counts
 from walop_jax.likelihood.nodes import Nodes, accurate_nodes
 from walop_jax.likelihood.passes import Part, Passes, threads_at_work
 from walop_jax.likelihood.processes import Processes
+from walop_jax.model import light
+from walop_jax.model.build import nominal_instrument
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import require_double_precision
-from walop_jax.model.effects.base import Effect, overridden
-from walop_jax.model.instrument import Instrument, nominal_instrument
-from walop_jax.model.plan import Plan, plan_for, with_median
-from walop_jax.model.specification import Model, make_model, optical_indices
+from walop_jax.model.dependence import needs, optical_indices
+from walop_jax.model.effects.base import Effect
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.plan import Plan, with_median
+from walop_jax.model.planning import plan_for
+from walop_jax.model.specification import Model, make_model
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
@@ -97,11 +101,11 @@ class Problem:
         require_double_precision()
         self.calset = calset
         self.model = model
-        effects = (*model.template.effects, *probes)
-        self.plan: Plan = plan_for(effects, calset.exposures, calset.filters, calset.sources)
-        if any(effect.uses_median for effect in effects):
+        whole = dataclasses.replace(model.template, effects=(*model.template.effects, *probes))
+        self.plan: Plan = plan_for(whole, calset.exposures, calset.filters, calset.sources)
+        if needs(whole).median:
             self.plan = with_median(self.plan, median_counts(calset))
-        self._mirrored = overridden(effects, "mirrored")
+        self._mirrored = light.has_ghosts(whole)
         n_points = len(calset.points)
         local = len(model.parameters) - len(model.template.throughput.coefficients.ravel()) + 4
         fits = max(1, LARGEST_CHUNK // (4 * len(calset.exposures) * local) * 4)

@@ -19,7 +19,8 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.fit.refit import refit
 from walop_jax.likelihood.problem import Problem, base_model
-from walop_jax.model.instrument import HalfWavePlate, Instrument, nominal_instrument
+from walop_jax.model.build import nominal_instrument
+from walop_jax.model.instrument import Instrument
 from walop_jax.paper.polynomial import fit_paper, judged, ratios, sample_stars, transmitted
 from walop_jax.science.star_errors import joint_errors, star_errors
 from walop_jax.simulation.observing_plan import ObservingPlan

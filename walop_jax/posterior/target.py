@@ -19,8 +19,7 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.problem import Problem
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import leaves, unknown_name
-from walop_jax.model.specification import unravel
+from walop_jax.model.parameters import leaves, unknown_name, with_values
 
 Vector = Float[np.ndarray, " f"]
 LARGEST_SAMPLED = 20
@@ -29,7 +28,7 @@ NEAR_LINEAR = ("Throughput", "Standards")
 
 @jax.jit  # a vector unravelled step by step costs more than the optics of a small set
 def _instrument(template: Instrument, values: Float[Array, " n"]) -> Instrument:
-    return unravel(template)(values)
+    return with_values(template)(values)
 
 
 class Target:

@@ -21,13 +21,16 @@ from walop_jax.likelihood import engine
 from walop_jax.likelihood.noise import PhotonNoise
 from walop_jax.likelihood.problem import Problem
 from walop_jax.model import legendre, light
+from walop_jax.model.build import nominal_instrument
 from walop_jax.model.compiled import compiled
+from walop_jax.model.dependence import needs
 from walop_jax.model.effects import in_order
-from walop_jax.model.effects.base import Effect, overridden
-from walop_jax.model.instrument import Instrument, Standards, nominal_instrument
-from walop_jax.model.parameters import leaves
+from walop_jax.model.effects.base import Effect
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.plan import Plan, with_median
-from walop_jax.model.specification import Model, full_values, make_model, make_template, series_indices
+from walop_jax.model.sources import Standards
+from walop_jax.model.specification import Model, make_model, make_template, series_indices
 from walop_jax.simulation.observing_plan import ObservingPlan
 
 Cube = Float[np.ndarray, "p e 4"]
@@ -50,7 +53,7 @@ class Simulated(NamedTuple):
 def truth_values(truth: Instrument) -> dict[str, float]:
     """The true value of every parameter by name; the names are those of a fit."""
     names = (leaf.name for leaf in leaves(truth))
-    return {name: float(value) for name, value in zip(names, full_values(truth), strict=True)}
+    return {name: float(value) for name, value in zip(names, np.asarray(values_of(truth)), strict=True)}
 
 
 def draw_instrument(model: Model, rng: np.random.Generator) -> Instrument:
@@ -126,7 +129,7 @@ def simulate(
         nominal = nominal_instrument(plan.instrument, throughput_degree=plan.throughput_degree)
         instrument = draw_instrument(make_model(plan.instrument, nominal), build)
     active = in_order((*instrument.effects, *effects))
-    truth = make_template(dataclasses.replace(instrument, standard=standards, effects=active))
+    truth = make_template(dataclasses.replace(instrument.with_source(standards), effects=active))
     blank = _blank(plan, sources, seed)
     expected = _expected(blank, truth, _fluxes(plan, sky))
     detector = PhotonNoise(plan.read_noise)
@@ -183,10 +186,10 @@ def _expected(
     problem = Problem(blank, make_model(blank.instrument, truth))
     unit = np.concatenate([np.asarray(engine.prediction(truth, problem.plan, c)) for c in problem.chunks])
     light_counts = flux[:, :, None] * unit[: len(flux)]
-    if not overridden(truth.effects, "detector"):
+    if light.is_linear(truth):
         return light_counts
     counts = light_counts
-    for _ in range(_MEDIAN_ROUNDS if any(effect.uses_median for effect in truth.effects) else 1):
+    for _ in range(_MEDIAN_ROUNDS if needs(truth).median else 1):
         seen = np.where(problem.used[:, :, None], counts, np.nan)
         plan = with_median(problem.plan, np.nanmedian(seen, axis=0))
         counts = np.asarray(_detected(truth, plan, jnp.asarray(light_counts)))
