@@ -15,9 +15,9 @@ from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.build import nominal_instrument
-from walop_jax.model.parameters import leaves
-from walop_jax.model.plan import Plan, build_plan
-from walop_jax.model.specification import full_values, unravel
+from walop_jax.model.parameters import leaves, values_of, with_values
+from walop_jax.model.plan import Plan
+from walop_jax.model.planning import plan_for
 
 NAN = float("nan")
 _BLANK: dict[str, Any] = {
@@ -76,16 +76,16 @@ def setting_plan(
 ) -> Plan:
     """A plan with one band per setting (deg, or None: out) of the calibration plate, in the order given."""
     rows = [{"teff": teff} | ({} if s is None else {"chwp_angle": s}) for s in settings]
-    plan = build_plan(exposures(*rows), {"band": filter_curve})
-    assert [s for s, _, _ in plan.settings] == list(settings)
+    plan = plan_for(nominal_instrument(), exposures(*rows), {"band": filter_curve})
+    assert [state[0] for state, _, _ in plan.settings] == list(settings)
     return plan
 
 
 def as_built(instrument: Instrument, rng: np.random.Generator, sigmas: float = 1.0) -> Instrument:
     """An instrument whose numbers scatter around the given ones by prior widths (or solver scales)."""
-    values = full_values(instrument)
+    values = np.asarray(values_of(instrument))
     width = [leaf.declaration.width or leaf.declaration.scale for leaf in leaves(instrument)]
-    return unravel(instrument)(
+    return with_values(instrument)(
         jnp.asarray(values + sigmas * np.array(width) * rng.standard_normal(values.size))
     )
 
@@ -101,7 +101,7 @@ def field(rng: np.random.Generator, count: int, edge: float = 0.29) -> tuple[np.
 
 def oracle_params(instrument: Instrument) -> dict[str, Any]:
     """The same instrument in the words of the oracle."""
-    values = dict(zip((leaf.name for leaf in leaves(instrument)), full_values(instrument), strict=True))
+    values = dict(zip((leaf.name for leaf in leaves(instrument)), np.asarray(values_of(instrument)), strict=True))
     params = {theirs: float(values[ours]) for ours, theirs in ORACLE_NAMES.items()}
     params["throughput"] = np.array(
         [[values[f"throughput.n{k}.p{i}{j}"] for i, j in forward.TERMS] for k in range(4)]
