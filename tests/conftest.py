@@ -52,3 +52,9 @@ def shared_data() -> Path:
 def handmade(tmp_path: Path) -> Handmade:
     """A calibration set made with astropy alone, to be spoilt."""
     return Handmade(tmp_path)
+
+
+@pytest.fixture
+def two_cameras(tmp_path: Path) -> Handmade:
+    """A set of an instrument with two cameras and two moving elements of its own, made in the same way."""
+    return Handmade(tmp_path, two_cameras=True)

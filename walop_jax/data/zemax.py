@@ -27,7 +27,7 @@ from jaxtyping import Float
 from walop_jax.data import schema
 from walop_jax.data.calset import empty_sources
 from walop_jax.data.checks import INSTRUMENTS, make_exposures, make_filters, make_points
-from walop_jax.data.records import CalibrationSet
+from walop_jax.data.records import CalibrationSet, DataFlag
 from walop_jax.data.schema import Place
 from walop_jax.data.sites import SITES
 from walop_jax.data.table_intensities import table_intensities
@@ -42,7 +42,6 @@ RELATIVE_ERROR = 1e-3
 
 _UNIT = 1e6  # electrons for light of unit intensity
 _CAMERA_NAMES = ("O1", "E1", "O2", "E2")
-_VIGNETTED = 4  # bit of FLAG
 
 
 def import_transmissions(
@@ -104,7 +103,7 @@ def import_transmissions(
         "N": counts,
         # A number that was rounded to a step is off by step / √12.
         "N_ERR": np.maximum(error * counts, _UNIT * step[row] / math.sqrt(12.0)),
-        "FLAG": np.where(dark, _VIGNETTED, 0),
+        "FLAG": np.where(dark, DataFlag.EDGE_OR_VIGNETTED, 0),
     }
     filters, states = np.nonzero(taken)
     return _calibration_set(

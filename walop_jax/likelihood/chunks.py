@@ -32,9 +32,9 @@ SLABS = 16
 """A set is cut into so many slabs at least, if it has as many chunks: work for several threads and processes."""
 
 
-def bytes_per_point(exposures: int, *, mirrored: bool = False) -> int:
-    """Size of the point data of one field point: per exposure four counts and weights, sky, source and band."""
-    return 8 * (2 + exposures * (4 + 4 + (4 if mirrored else 2) + 1 + 1))
+def bytes_per_point(exposures: int, *, cameras: int = 4, mirrored: bool = False) -> int:
+    """Size of the point data of one field point: per exposure counts and weights, sky, source and band."""
+    return 8 * (2 + exposures * (2 * cameras + (4 if mirrored else 2) + 1 + 1))
 
 
 class Chunks:
@@ -57,7 +57,7 @@ class Chunks:
         """`memory` in bytes, None for `MEMORY`; `threads` is the number of slabs that are in use at a time."""
         self.calset, self.plan, self.size, self.mirrored = calset, plan, size, mirrored
         self._points = len(calset.points)
-        each = bytes_per_point(len(calset.exposures), mirrored=mirrored)
+        each = bytes_per_point(len(calset.exposures), cameras=calset.cameras, mirrored=mirrored)
         memory = MEMORY if memory is None else memory
         self.kept = 2 * each * self._points <= memory
         # Whole chunks; and many of them, as pixels are read in whole rows of the frames.
@@ -175,6 +175,11 @@ class Runs(Intensities):
         )
 
     @property
+    def cameras(self) -> int:
+        """Number of cameras."""
+        return self.whole.cameras
+
+    @property
     def rows(self) -> int:
         """Number of used (exposure, point) pairs; reads all of them."""
         return sum(int(self.whole.block(n, n + self.run).used.sum()) for n in self.starts.tolist())
@@ -198,7 +203,7 @@ def thinned(calset: CalibrationSet, most: int, run: int = 256) -> CalibrationSet
     return dataclasses.replace(calset, points=points, intensities=Runs(calset.intensities, starts, run))
 
 
-def median_counts(calset: CalibrationSet, slab: int = 4096, most: int = 65536) -> Float[np.ndarray, "e 4"]:
+def median_counts(calset: CalibrationSet, slab: int = 4096, most: int = 65536) -> Float[np.ndarray, "e k"]:
     """Median over the field of the measured counts of each camera in each exposure; 0 where nothing is used.
 
     Of a set with more than `most` points, slabs spread evenly over it are enough.

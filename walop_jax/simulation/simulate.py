@@ -33,7 +33,7 @@ from walop_jax.model.sources import Standards
 from walop_jax.model.specification import Model, make_model, make_template, series_indices
 from walop_jax.simulation.observing_plan import ObservingPlan
 
-Cube = Float[np.ndarray, "p e 4"]
+Cube = Float[np.ndarray, "p e k"]
 
 LEVEL_SCATTER = 0.03  # of the cameras' throughput around 0.5
 STRUCTURE = 0.02  # rms over the field, relative
@@ -76,11 +76,12 @@ def draw_instrument(model: Model, rng: np.random.Generator) -> Instrument:
     return model.instrument(values)
 
 
-def _throughput(template: Instrument, rng: np.random.Generator) -> Float[np.ndarray, "4 t"]:
+def _throughput(template: Instrument, rng: np.random.Generator) -> Float[np.ndarray, "k t"]:
     terms = np.array(legendre.terms(template.throughput.degree))
     degree = terms.sum(axis=1)
-    level = 0.5 + LEVEL_SCATTER * rng.standard_normal(4)
-    shape = rng.standard_normal((4, len(terms)))
+    cameras = len(template.throughput.coefficients)
+    level = 0.5 + LEVEL_SCATTER * rng.standard_normal(cameras)
+    shape = rng.standard_normal((cameras, len(terms)))
     share = np.where(degree > 0, 1.0 / np.maximum(degree, 1), 0.0)
     share /= max(float(np.linalg.norm(share)), 1.0)
     # The mean square of P_i P_j over the field is 1 / ((2i + 1)(2j + 1)).
@@ -130,7 +131,7 @@ def simulate(
         instrument = draw_instrument(make_model(plan.instrument, nominal), build)
     active = in_order((*instrument.effects, *effects))
     truth = make_template(dataclasses.replace(instrument.with_source(standards), effects=active))
-    blank = _blank(plan, sources, seed)
+    blank = _blank(plan, sources, seed, len(truth.cameras))
     expected = _expected(blank, truth, _fluxes(plan, sky))
     detector = PhotonNoise(plan.read_noise)
     if noiseless:
@@ -142,11 +143,11 @@ def simulate(
     return Simulated(_with_counts(plan, blank, counts, sigma), truth)
 
 
-def _blank(plan: ObservingPlan, sources: Sources, seed: int) -> CalibrationSet:
+def _blank(plan: ObservingPlan, sources: Sources, seed: int, cameras: int) -> CalibrationSet:
     """The calibration set that the plan announces, before any light: counts and errors are 1."""
     points = plan.points()
     used, source = plan.layout()
-    ones = np.ones((*used.shape, 4))
+    ones = np.ones((*used.shape, cameras))
     block = Block(x=points.x, y=points.y, counts=ones, sigma=ones, used=used, source=source)
     return CalibrationSet(
         instrument=plan.instrument,
@@ -179,9 +180,7 @@ def _fluxes(plan: ObservingPlan, rng: np.random.Generator) -> Float[np.ndarray, 
     return 4.0 * plan.electrons * illumination[:, None] * transparency * brightness[source]
 
 
-def _expected(
-    blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, "p e"]
-) -> Float[np.ndarray, "p e 4"]:
+def _expected(blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, "p e"]) -> Cube:
     """Expected counts (electron) of every (point, exposure), what the detectors do to them included."""
     problem = Problem(blank, make_model(blank.instrument, truth))
     unit = np.concatenate([np.asarray(engine.prediction(truth, problem.plan, c)) for c in problem.chunks])
@@ -197,5 +196,5 @@ def _expected(
 
 
 @compiled
-def _detected(instrument: Instrument, plan: Plan, counts: Float[Array, "p e 4"]) -> Float[Array, "p e 4"]:
+def _detected(instrument: Instrument, plan: Plan, counts: Float[Array, "p e k"]) -> Float[Array, "p e k"]:
     return jax.vmap(light.detected, (None, None, 0))(instrument, plan.exposures, counts)
