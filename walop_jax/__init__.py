@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from walop_jax.calibration.calibration import Calibration
     from walop_jax.calibration.matrix import Settings
+    from walop_jax.calibration.residual_map import residual_map
     from walop_jax.data.calset import read_calibration_set
     from walop_jax.data.write import write_calibration_set
     from walop_jax.diagnosis.workflow import diagnose as find_effects
-    from walop_jax.calibration.residual_map import residual_map
     from walop_jax.fit.misfit import describe as describe_misfit
     from walop_jax.fit.model_builder import base_model
     from walop_jax.fit.refit import FitResult, refit

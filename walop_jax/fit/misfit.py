@@ -100,9 +100,7 @@ def misfit_at(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Misfit
     )
 
 
-def _matrix_elements(
-    likelihood: Likelihood, residual: Float[np.ndarray, "p e 4"]
-) -> dict[str, float]:
+def _matrix_elements(likelihood: Likelihood, residual: Float[np.ndarray, "p e 4"]) -> dict[str, float]:
     e, used = likelihood.calset.exposures, likelihood.used
     weight, counts = likelihood.points.gathered("weight"), likelihood.points.gathered("counts")
     delta = residual / np.where(weight > 0, weight, np.inf)  # electrons, data − model

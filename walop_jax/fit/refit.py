@@ -146,10 +146,10 @@ def fit(
     """Maximise a likelihood with its priors, from the start values of the model or `start` (a full vector).
 
     A model whose χ²/dof stays above `search.FAR_OFF` would be bent out of all physical shape: priors mean nothing
-    beside such residuals. The errors of the data are then scaled until χ²/dof is 1, the minimum is sought again, from plates
-    one order of retardance away as well, and the result says so (`noise_scale`, `warnings`). A `noise_scale` that
-    is given is kept, with no other start: so that fits can be compared; `worth` is the objective of the other fit,
-    and a search that has not come below it when it should have converged is given up.
+    beside such residuals. The errors of the data are then scaled until χ²/dof is 1, the minimum is sought again, from
+    plates one order of retardance away as well, and the result says so (`noise_scale`, `warnings`). A `noise_scale`
+    that is given is kept, with no other start: so that fits can be compared; `worth` is the objective of the other
+    fit, and a search that has not come below it when it should have converged is given up.
     The minimum of a large set (`Layout.large`) is sought on a sample of its points; a pass over all of them gives
     the step from there to its own, and another one shows that nothing is left to do.
     Raises ValueError when the exposures cannot determine the instrument.

@@ -240,7 +240,15 @@ class NormalEquationsSolver(optx.AbstractMinimiser[Vector, Expansion, _State]):
         return jnp.asarray(state.terminate), state.result
 
     def postprocess(
-        self, fn: Any, y: Vector, aux: Expansion, args: Any, options: Any, state: _State, tags: Any, result: Any
+        self,
+        fn: Any,
+        y: Vector,
+        aux: Expansion,
+        args: Any,
+        options: Any,
+        state: _State,
+        tags: Any,
+        result: Any,
     ) -> tuple[Vector, Expansion, dict[str, Any]]:
         """The place, its expansion, and the gates."""
         return y, aux, {"distance": state.distance, "condition": state.condition}

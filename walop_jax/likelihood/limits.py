@@ -14,7 +14,7 @@ LARGEST_CHUNK = 2_000_000
 LARGE_CHUNK = 1024
 """Field points of a chunk whose optics are interpolated: each of them costs less, and the engine divides it further."""
 MEMORY = 2e9
-"""Bytes that point data may take unless told otherwise: half of them for a set that is kept, all for one that is not."""
+"""Bytes that point data may take unless told otherwise: half of them for a set that is kept, all for one read anew."""
 READING = 5
 """Bytes that reading takes for a moment, times those of the slab: the file, its float64, masks and a copy or two."""
 LARGEST_SLAB = 1 << 26

@@ -118,7 +118,9 @@ class Runner:
 
     def _tell_how_far(self, label: str, done: int, points: int, rate: float) -> None:
         left = (points - done) / rate
-        self.tell(f"{label}: {done:,} of {points:,} points, {rate:,.0f} points/s, {left:.0f} s left of this pass")
+        self.tell(
+            f"{label}: {done:,} of {points:,} points, {rate:,.0f} points/s, {left:.0f} s left of this pass"
+        )
 
     def _each(self, numbers: list[int], work: Callable[[int], SlabSums]) -> Generator[SlabSums, None, None]:
         devices = jax.local_devices()

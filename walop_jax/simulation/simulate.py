@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 from walop_jax.data.records import Block, CalibrationSet, Sources
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.likelihood import engine
-from walop_jax.likelihood.noise import PhotonNoise
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.noise import PhotonNoise
 from walop_jax.model import legendre, light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects import in_order
