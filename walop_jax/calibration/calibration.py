@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import importlib.metadata
-import platform
 from collections.abc import Mapping
 
 import numpy as np
@@ -20,11 +18,11 @@ from walop_jax.calibration.records import ResidualMap
 from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import Exposures, FilterCurve, InputFile, Site, Sources
-from walop_jax.fit.model_builder import model_without_data
+from walop_jax.fit.model_builder import model_without_data, standard_names
 from walop_jax.fit.model_file import render
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult
 from walop_jax.io.errors import DataError, nearest
-from walop_jax.likelihood.problem import Problem, standard_names
+from walop_jax.io.software import software_versions
 from walop_jax.model.build import nominal_instrument
 from walop_jax.model.dependence import needs
 from walop_jax.model.specification import Model, effect_context
@@ -39,18 +37,6 @@ ILL_CONDITIONED = (
 EXCESS_NOISE = 0.5  # sigma
 HIGH_CROSSTALK = 10.0  # condition number of the local 2 × 2 inverse
 TEMPERATURE_MARGIN = 2.0  # K beyond the temperatures of the exposures
-SOFTWARE = ("walop-jax", "jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy", "astropy", "speclite")
-
-
-def software_versions() -> dict[str, str]:
-    """Versions of Python, of this package and of what its results rest on."""
-    versions = {"python": platform.python_version()}
-    for name in SOFTWARE:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions[name] = "unknown"
-    return versions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,9 +60,12 @@ class Calibration:
     residuals: ResidualMap | None = None
 
     @classmethod
-    def from_fit(cls, result: FitResult, problem: Problem) -> Calibration:
-        """The calibration that a fit gives, with the verdict on it (see `quality`)."""
-        calset = problem.calset
+    def from_fit(cls, result: FitResult, residuals: ResidualMap | None = None) -> Calibration:
+        """The calibration that a fit gives, with the verdict on it (see `quality`).
+
+        `residuals` is what the model leaves over the field (`residual_map`), worth its pass for large sets.
+        """
+        calset = result.calset
         verdict = Verdict(
             chi2=result.chi2,
             dof=result.dof,
@@ -97,8 +86,9 @@ class Calibration:
             sources=calset.sources,
             site=calset.site,
             origin=calset.origin,
-            field=problem.field,
+            field=result.posterior.census.field,
             inputs=calset.inputs,
+            residuals=residuals,
         )
 
     @property

@@ -33,13 +33,13 @@ def cite(
     held = None if run is None else read_product(product_path(run))
     switch_on_jax()
     from walop_jax.calibration.calibration import rebuild
-    from walop_jax.fit import levenberg
+    from walop_jax.fit import solver
     from walop_jax.fit.model_builder import model_without_data
     from walop_jax.model.references import Reference, references, stated_source
 
     with named(run):
         model = model_without_data("WALOP-SOUTH") if held is None else rebuild(held)
-    found = [*references(model), Reference("fit", stated_source(levenberg.__doc__))]
+    found = [*references(model), Reference("fit", stated_source(solver.__doc__))]
     if json:
         print_json([{"what": entry.what, "source": entry.source} for entry in found])
         return

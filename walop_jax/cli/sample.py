@@ -81,7 +81,7 @@ def sample(
     from walop_jax.posterior import Options
     from walop_jax.posterior import sample as sample_posterior
     from walop_jax.posterior.checkpoint import Checkpoints
-    from walop_jax.posterior.from_run import problem_of_run
+    from walop_jax.posterior.from_run import fit_of_run
 
     options = Options(
         seed=seed,
@@ -92,10 +92,10 @@ def sample(
         inflate=inflate,
     )
     with _bar(quiet or json) as tell:
-        problem, result = problem_of_run(product, run, text)
+        result = fit_of_run(product, run, text)
         if overwrite and not resume:
             Checkpoints(run / CHAINS, {}).clear()
-        found = sample_posterior(problem, result, options, folder=run / CHAINS, resume=resume, report=tell)
+        found = sample_posterior(result, options, folder=run / CHAINS, resume=resume, report=tell)
     summary = _write(run, product, found)
     if json:
         print_json(summary)

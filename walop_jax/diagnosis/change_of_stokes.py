@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_plan
-from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.refit import FitResult
 from walop_jax.model import light
 
@@ -19,9 +18,9 @@ LARGEST_P = 0.05
 SMALLEST_DETERMINANT = 0.1  # below, one exposure holds hardly any u
 
 
-def instrument_matrices(result: FitResult, calset: CalibrationSet) -> Float[np.ndarray, "p 2 3"]:
-    """Instrument matrix at the field points of a set, in the filter and plate setting of its first exposure."""
-    instrument = result.model.instrument(result.values)
+def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p 2 3"]:
+    """Instrument matrix at the field points of a fit, in the filter and plate setting of its first exposure."""
+    instrument, calset = result.model.instrument(result.values), result.calset
     e = calset.exposures
     setting = Settings.default(1, str(e.filter[0]))
     setting.chwp_angle[0] = e.chwp_angle[0] if e.chwp_in[0] else np.nan

@@ -17,7 +17,6 @@ from walop_jax.diagnosis.findings import Limit
 from walop_jax.diagnosis.freeform import SINGLE, strata
 from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable, separations
 from walop_jax.fit.refit import FitResult
-from walop_jax.likelihood.problem import Problem
 from walop_jax.model.effects import Effect
 from walop_jax.model.parameters import field_declarations
 
@@ -45,30 +44,30 @@ class Look:
 
     `named` are the columns of the effects ahead of any projection, `space` and `columns` those of all candidates,
     effects first, behind it. `ranked` are the effects in order of linear evidence, `patterns` the scores of the
-    free-form strata.
+    free-form strata, `blocks` the blocks of the free-form term that can take candidates up.
     """
 
     def __init__(
         self,
-        problem: Problem,
         result: FitResult,
         wanted: Sequence[Probe],
         rng: np.random.Generator,
         earlier: Look | None = None,
     ) -> None:
         """`earlier` is a look at a smaller model, whose columns serve again where the light has hardly changed."""
-        self.problem, self.result = problem, result
-        active = problem.model.effect_names
-        self.design = Design.of(problem, result)
+        self.result = result
+        active = result.model.effect_names
+        self.design = Design.of(result)
         inactive = [probe for probe in wanted if probe.effect.name not in active]
         self.named = (
-            effect_candidates(problem.calset, problem.model, result.values, inactive)
+            effect_candidates(result.calset, result.model, result.values, inactive)
             if earlier is None or not self._is_like(earlier)
             else earlier.named
         )
         self.probes = [probe for probe in inactive if probe.name in self.named]
         candidates = [*(self.named[probe.name] for probe in self.probes), *strata(self.design.measured)]
         names, widths = [c.name for c in candidates], [c.widths for c in candidates]
+        self.blocks = {c.name: c.block for c in candidates}
         self.columns = self.design.stacked([candidates.pop(0).columns for _ in names])
         self._own = {}
         for name in active:
@@ -140,7 +139,7 @@ class Look:
     def untestable(self, catalogue: Sequence[type[Effect]]) -> tuple[str, ...]:
         """Effects that these data cannot show at any plausible size."""
         seen = {probe.effect.name for probe in self.probes if self.table[probe.name].testable}
-        seen.update(self.problem.model.effect_names)
+        seen.update(self.result.model.effect_names)
         return tuple(
             effect.name for effect in catalogue if effect.name not in seen and not effect.is_structural()
         )

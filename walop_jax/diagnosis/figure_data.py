@@ -20,7 +20,7 @@ from walop_jax.data.records import Exposures
 from walop_jax.diagnosis.figure_file import Comparison, DiagnosisPictures, ExposureLabels, Ladder, Shares
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.location import HARMONICS
-from walop_jax.likelihood.problem import Problem
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.conventions import CAMERA_NAMES
 from walop_jax.model.effects import FreeForm
 
@@ -54,20 +54,20 @@ def pictures(diagnosis: Diagnosis) -> DiagnosisPictures:
 
     A free-form term that is in the final model without being a step comes as a last comparison of its own.
     """
-    problem, start, final = diagnosis.problem, diagnosis.before, diagnosis.after
-    exposures, used = problem.calset.exposures, problem.used
-    after = problem.residuals(final.values)[1]
-    before = after if start is final else Problem(problem.calset, start.model).residuals(start.values)[1]
+    start, final = diagnosis.before, diagnosis.after
+    exposures, used = final.calset.exposures, final.likelihood.used
+    after = final.likelihood.residuals(final.values)[1]
+    before = after if start is final else start.likelihood.residuals(start.values)[1]
     pairs = [("", before, after)]
     pairs += [(step.effect, step.residual_before, step.residual_after) for step in diagnosis.steps]
     if _unnamed_term(diagnosis):
         pairs.append((UNNAMED, pairs[-1][2] if diagnosis.steps else before, after))
     angle = np.where(exposures.clp_in, exposures.clp_angle, np.nan)
     return DiagnosisPictures(
-        points=problem.calset.points,
+        points=final.calset.points,
         exposures=ExposureLabels(exposures.exposure, exposures.kind, exposures.mjd, angle),
         ladder=_ladder(diagnosis),
-        shares=_shares(problem, before, after),
+        shares=_shares(final.likelihood, before, after),
         comparisons=tuple(compare(name, first, second, used, exposures) for name, first, second in pairs),
     )
 
@@ -163,11 +163,10 @@ def _ladder(diagnosis: Diagnosis) -> Ladder:
     return Ladder(np.array(model), np.array(chi2, float), np.array(freedom, int))
 
 
-def _shares(problem: Problem, before: Cube, after: Cube) -> Shares:
+def _shares(likelihood: Likelihood, before: Cube, after: Cube) -> Shares:
     """Sums of squared residuals by camera, kind, filter and exposure."""
-    e = problem.calset.exposures
-    known = np.asarray(problem.plan.exposures.flux_known)
-    expected = problem.used.sum(axis=0)[:, None] * np.where(known, 1.0, 0.75)[:, None] * np.ones(4)
+    e, known = likelihood.calset.exposures, likelihood.flux_known
+    expected = likelihood.used.sum(axis=0)[:, None] * np.where(known, 1.0, 0.75)[:, None] * np.ones(4)
     squares = [expected, (before**2).sum(axis=0), (after**2).sum(axis=0)]  # (exposure, camera)
     members: list[tuple[str, str]] = []
     sums: list[list[float]] = []

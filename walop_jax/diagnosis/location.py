@@ -32,7 +32,7 @@ def _harmonics(
     design: Design, pattern: Float[np.ndarray, "p e 4"]
 ) -> tuple[dict[str, float], Float[np.ndarray, " p"]]:
     """Power of each harmonic of the polariser angle, and the field map of the strongest one."""
-    e = design.problem.calset.exposures
+    e = design.fit.calset.exposures
     use = np.flatnonzero(e.clp_in & design.measured.used.any(axis=0))
     if len(use) < 3:
         return {}, pattern.sum(axis=(1, 2))
@@ -53,7 +53,7 @@ def _harmonics(
 
 
 def _field_words(design: Design, field: Float[np.ndarray, " p"]) -> str:
-    points = design.problem.calset.points
+    points = design.fit.calset.points
     basis = np.asarray(legendre.basis(jnp.asarray(points.x), jnp.asarray(points.y), 4))
     degree = np.array([i + j for i, j in legendre.terms(4)])
     if len(field) <= len(degree):
@@ -74,7 +74,7 @@ def describe(design: Design, rows: Float[np.ndarray, " _"]) -> dict[str, Any]:
     """Where a change of the residuals (data rows of `design`) sits, as the contract's `where`."""
     cube = design.cube(rows)
     square = cube**2
-    e = design.problem.calset.exposures
+    e = design.fit.calset.exposures
     by_exposure = square.sum(axis=(0, 2))
 
     def grouped(labels: np.ndarray) -> dict[str, float]:

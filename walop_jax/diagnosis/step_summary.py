@@ -20,7 +20,7 @@ def comparison(name: str, before: Design, after: Design) -> dict[str, Any]:
     # An effect with a number for every exposure cannot predict exposures that it has not seen.
     many = any(np.size(getattr(effect, f)) > 4 for f in effect.amplitudes())
     scheme = "field blocks" if many else "exposures"
-    old, new = (instrument_matrices(design.fit, design.problem.calset) for design in (before, after))
+    old, new = (instrument_matrices(design.fit) for design in (before, after))
     return {
         "chi2_before": before.fit.chi2,
         "chi2_after": after.fit.chi2,
@@ -37,12 +37,12 @@ def retold(steps: Sequence[Step], start: Design, end: Design) -> list[Step]:
 
     The models between the two are fitted again; what tells of the discovery of an effect stays.
     """
-    fits = [(end.problem, end.fit)] if steps else []
+    fits = [end.fit] if steps else []
     for step in reversed(steps[1:]):
-        fits.append(naming.refit_without(end.problem.calset, fits[-1][1], step.effect))
+        fits.append(naming.refit_without(fits[-1], step.effect))
     told, before = [], start
-    for step, (problem, result) in zip(steps, reversed(fits), strict=True):
-        after = end if result is end.fit else Design.of(problem, result)
+    for step, result in zip(steps, reversed(fits), strict=True):
+        after = end if result is end.fit else Design.of(result)
         told.append(dataclasses.replace(step, **comparison(step.effect, before, after)))
         before = after
     return told

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -27,21 +27,21 @@ from walop_jax.diagnosis.effect_columns import Probe
 from walop_jax.diagnosis.effect_columns import probes as all_probes
 from walop_jax.diagnosis.examination import Look
 from walop_jax.diagnosis.findings import Diagnosis, Step, Unexplained, Verdict
-from walop_jax.diagnosis.freeform import block_of
 from walop_jax.diagnosis.score import Score
 from walop_jax.diagnosis.step_summary import comparison, retold
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit
-from walop_jax.likelihood.chunks import thinned
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.runner import Progress
+from walop_jax.likelihood.thinning import thinned
 from walop_jax.model.effects import EFFECTS, Context, Effect, FreeForm
 from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import Model, effect_context
 
-LARGEST_ROWS = 100_000  # 800 columns of four cameras each take 2.5 GB
 MOST_STEPS = 6
 NEEDED = 1.0  # ln B that an effect must be worth to the final model to stay in it
 MISFIT = 1.5  # χ²/dof above which effects that cannot be differentiated are tried
-Progress = Callable[[str], None]
 
 
 def diagnose(
@@ -54,18 +54,19 @@ def diagnose(
 ) -> Diagnosis:
     """Find what `model` (default: the base model) lacks to explain a calibration set.
 
-    `catalogue` are the effects that may be named. Of a set with more than `LARGEST_ROWS` (exposure, point) pairs,
+    `catalogue` are the effects that may be named. Of a set with more than `limits.DIAGNOSED_ROWS` (exposure, point)
+    pairs,
     points spread over the field are looked at. Raises what `fit` raises.
     """
     began = time.perf_counter()
     tell = progress or (lambda text: None)
-    some = thinned(calset, max(1, LARGEST_ROWS // len(calset.exposures)), run=1)
+    some = thinned(calset, max(1, limits.DIAGNOSED_ROWS // len(calset.exposures)), neighbours=1)
     found = _Diagnosing(some, model or base_model(calset), catalogue, seed, tell).run(began)
     return dataclasses.replace(found, points=len(calset.points))
 
 
 class _Diagnosing:
-    """The state of one diagnosis: the current problem, its fit, the last look at it, the steps so far."""
+    """The state of one diagnosis: the current fit and the steps so far."""
 
     def __init__(
         self,
@@ -79,10 +80,9 @@ class _Diagnosing:
         self.rng = np.random.default_rng(seed)
         self.context: Context = effect_context(model.template, calset.exposures)
         self.wanted: list[Probe] = list(all_probes(catalogue, self.context))
-        self.problem = Problem(calset, model)
         self.steps: list[Step] = []
         tell("fitting the model")
-        self.fit: FitResult = fit(self.problem)
+        self.fit: FitResult = fit(Likelihood.of(calset, model))
 
     def run(self, began: float) -> Diagnosis:
         before = self.fit
@@ -102,13 +102,12 @@ class _Diagnosing:
             remaining_p=look.table.p_global,
             before=before,
             after=self.fit,
-            problem=self.problem,
             seconds=time.perf_counter() - began,
             points=len(self.calset.points),
         )
 
     def _look(self, earlier: Look | None = None) -> Look:
-        return Look(self.problem, self.fit, self.wanted, self.rng, earlier)
+        return Look(self.fit, self.wanted, self.rng, earlier)
 
     # ------------------------------------------------------------------------------------------------ a name
 
@@ -126,11 +125,11 @@ class _Diagnosing:
     def _trials(self, look: Look) -> Iterator[naming.Trial]:
         for item in naming.leaders(look.significant) if look.significant else ():
             shapes = sum(probe.effect is item.effect for probe in look.probes)
-            yield naming.try_shapes(self.calset, self.fit, item, self.context, shapes)
+            yield naming.try_shapes(self.fit, item, self.context, shapes)
         if self.fit.chi2 > MISFIT * self.fit.dof:
             for effect in self.catalogue:
-                if effect.is_structural() and effect.name not in self.problem.model.effect_names:
-                    yield naming.try_effect(self.calset, self.fit, effect.neutral(self.context), self.context)
+                if effect.is_structural() and effect.name not in self.fit.model.effect_names:
+                    yield naming.try_effect(self.fit, effect.neutral(self.context), self.context)
 
     def _add_best(self, look: Look) -> str | None:
         """Add the name with the highest evidence that held-out data confirm; None when there is none."""
@@ -145,24 +144,23 @@ class _Diagnosing:
             step = self._step(look, trial, close)
             if step.confirmed:
                 self.steps.append(step)
-                self._adopt(trial.problem, trial.fit)
+                self._adopt(trial.fit)
                 if self.fit is not trial.fit:
-                    after = Design.of(self.problem, self.fit)
+                    after = Design.of(self.fit)
                     self.steps[-1] = dataclasses.replace(step, **comparison(step.effect, look.design, after))
                 return step.effect
         return None
 
-    def _adopt(self, problem: Problem, result: FitResult) -> None:
+    def _adopt(self, result: FitResult) -> None:
         """Go on with a fit: errors as given where they need not be scaled any more, refuted priors widened."""
         if result.noise_scale > 1.0:
-            result = fit(problem, start=result.values)
-        model = problem.model
+            result = fit(result.likelihood, start=result.values)
+        model = result.model
         for step in self.steps:
             model = naming.with_refuted_priors_widened(model, result.values, step.effect)
-        if model is not problem.model:
-            problem = Problem(self.calset, model)
-            result = fit(problem, start=result.values)
-        self.problem, self.fit = problem, result
+        if model is not result.model:
+            result = fit(Likelihood.of(self.calset, model), start=result.values)
+        self.fit = result
 
     def _step(self, look: Look, trial: naming.Trial, close: tuple[str, ...]) -> Step:
         name = trial.effect.name
@@ -175,7 +173,7 @@ class _Diagnosing:
             log_bayes=trial.log_bayes,
             equivalent=close,
             alternatives=trial.alternatives,
-            **comparison(name, look.design, Design.of(trial.problem, trial.fit)),
+            **comparison(name, look.design, Design.of(trial.fit)),
         )
 
     # --------------------------------------------------------------------------------------- what has no name
@@ -197,7 +195,7 @@ class _Diagnosing:
             f". Residuals sit in: cameras {place['camera']}; kinds {place['kind']}; field {place['field']}"
         )
         found = Unexplained(look.table.p_global, text, patterns)
-        blocks = tuple(dict.fromkeys(b for name, _ in patterns if (b := block_of(name)) is not None))
+        blocks = tuple(dict.fromkeys(b for name, _ in patterns if (b := look.blocks[name]) is not None))
         there = FreeForm.name in self.fit.model.effect_names
         return self._with_free_form(look, found, blocks) if blocks and not there else found
 
@@ -207,20 +205,17 @@ class _Diagnosing:
         It need not be probable, only useful: it stays when it predicts parts of the field that it has not seen.
         """
         term = FreeForm.of(self.context, blocks=blocks)
-        trial = naming.try_effect(self.calset, self.fit, term, self.context)
+        trial = naming.try_effect(self.fit, term, self.context)
         if not trial.fit.converged:
             return found
         without, with_term = (
-            held_out(design, "field blocks").mean
-            for design in (look.design, Design.of(trial.problem, trial.fit))
+            held_out(design, "field blocks").mean for design in (look.design, Design.of(trial.fit))
         )
         if with_term >= without:
             return found
         before = self.fit
-        self._adopt(trial.problem, trial.fit)
-        change = largest_change(
-            instrument_matrices(before, self.calset), instrument_matrices(self.fit, self.calset)
-        )
+        self._adopt(trial.fit)
+        change = largest_change(instrument_matrices(before), instrument_matrices(self.fit))
         return dataclasses.replace(
             found, term=blocks, chi2_before=before.chi2, chi2_after=self.fit.chi2, change_of_qu=change
         )
@@ -244,7 +239,7 @@ class _Diagnosing:
             if not dropped:
                 return self._look(look), unexplained
             # Those names only stood in for what has none: what is it without them?
-            self._adopt(*naming.refit_without(self.calset, self.fit, FreeForm.name))
+            self._adopt(naming.refit_without(self.fit, FreeForm.name))
 
     def _drop_what_is_not_needed(self) -> bool:
         """Take out, one by one, names that the final model does not need; whether there were any."""
@@ -258,13 +253,13 @@ class _Diagnosing:
                 break
             self.tell(f"{least} is no longer needed")
             self.steps = [s for s in self.steps if s.effect != least]
-            self._adopt(*naming.refit_without(self.calset, self.fit, least))
+            self._adopt(naming.refit_without(self.fit, least))
             dropped = True
         return dropped
 
     def _finished(self, step: Step, look: Look) -> Step:
         """The step with final parameters, what cannot be told from it, and where it sits."""
-        change = naming.signature(self.problem, self.fit, step.effect, self.context)
+        change = naming.signature(self.fit, step.effect, self.context)
         separation = look.separation(step.effect, change)
         close = {name for name, s in separation.items() if s < naming.SEPARATION} | set(step.equivalent)
         close -= {other.effect for other in self.steps}

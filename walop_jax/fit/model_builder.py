@@ -1,4 +1,7 @@
-"""Models from data, from a model file, or from neither: the one place where the three come together."""
+"""Models from data, from a model file, or from neither: the one place where the three come together.
+
+The scale of the throughput is a gauge unless a flux is known: the constant of camera N0 is held then.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,9 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from walop_jax.data.records import CalibrationSet
+from walop_jax.data.records import CalibrationSet, Sources
 from walop_jax.fit.model_file import Header, parse
-from walop_jax.likelihood.problem import base_model
+from walop_jax.likelihood import limits
 from walop_jax.model.build import nominal_instrument
 from walop_jax.model.effects import Context, effect_by_name
 from walop_jax.model.parameters import unknown_name
@@ -17,6 +20,57 @@ from walop_jax.model.specification import Model, effect_context, make_model, wit
 DEFAULT_PLATES = "waves"
 DEFAULT_DEGREE = 4
 GAUGE = "throughput.n0.p00"
+LEVEL = 0.5  # of a throughput whose scale is a gauge
+
+
+def base_model(
+    calset: CalibrationSet, *, plates: str = DEFAULT_PLATES, throughput_degree: int = DEFAULT_DEGREE
+) -> Model:
+    """The base model (contract, section 3) for the instrument and standards of a calibration set."""
+    names = standard_names(calset.sources)
+    sources = calset.sources
+    level = _throughput_level(calset) if has_known_flux(calset) else LEVEL
+    instrument = nominal_instrument(
+        calset.instrument,
+        standards=list(zip(names, sources.q, sources.u, strict=True)),
+        plates=plates,
+        throughput_degree=throughput_degree,
+        throughput=level,
+    )
+    priors = {}
+    for i, name in enumerate(names):
+        priors[f"standard.{name}.q"] = (float(sources.q[i]), float(sources.q_err[i]))
+        priors[f"standard.{name}.u"] = (float(sources.u[i]), float(sources.u_err[i]))
+    model = make_model(calset.instrument, instrument, priors=priors)
+    for i in model.positions("throughput"):
+        p = model.parameters[i]
+        model = model.change(p.name, scale=p.scale * level / LEVEL, loose=level)
+    if not has_known_flux(calset):
+        model = model.change(GAUGE, free=False)
+    if not ((calset.exposures.kind == "moon") & ~calset.exposures.clp_in).any():
+        model = model.change("sky.depolarisation", free=False)
+    return model
+
+
+def standard_names(sources: Sources) -> tuple[str, ...]:
+    """Unique names of the standards, usable in parameter names."""
+    names: list[str] = []
+    for number, name in zip(sources.source, sources.name, strict=True):
+        clean = "".join(c if c.isalnum() else "_" for c in str(name).strip()) or f"source{number}"
+        names.append(clean if clean not in names else f"{clean}_{number}")
+    return tuple(names)
+
+
+def has_known_flux(calset: CalibrationSet) -> bool:
+    """Whether any exposure is of KIND `flux`, so that the overall scale of the throughput is measured."""
+    return bool((calset.exposures.kind == "flux").any())
+
+
+def _throughput_level(calset: CalibrationSet) -> float:
+    # A camera gets half of the unpolarised light: N = T/2.
+    block = calset.intensities.block(0, min(limits.LEVEL_POINTS, len(calset.points)))
+    rows = block.used & (calset.exposures.kind == "flux")
+    return float(2.0 * block.counts[rows].mean())
 
 
 def model_for(calset: CalibrationSet, text: str = "") -> Model:

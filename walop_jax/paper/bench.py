@@ -17,8 +17,8 @@ from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import refit
-from walop_jax.likelihood.problem import Problem, base_model
 from walop_jax.model.build import nominal_instrument
 from walop_jax.model.instrument import Instrument
 from walop_jax.paper.polynomial import fit_paper, judged, ratios, sample_stars, transmitted
@@ -63,7 +63,7 @@ def bench_table(seed: int = 0, electrons: float = 1e6) -> list[BenchRow]:
     for name in model.names:
         if name.startswith(_ABSENT):
             model = model.change(name, free=False)
-    fitted = Calibration.from_fit(refit(run.calset, model), Problem(run.calset, model))
+    fitted = Calibration.from_fit(refit(run.calset, model))
     true = dataclasses.replace(fitted, values=np.array([truth_values(run.truth)[n] for n in model.names]))
     made, stars = fit_paper(run.calset), sample_stars(seed=seed)
     at = [int(np.flatnonzero(np.isclose(made.x, tilt))[0]) for tilt in TILTS]

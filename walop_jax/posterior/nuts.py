@@ -56,20 +56,20 @@ def _kernel() -> Any:
 
 def whitened(target: Target) -> tuple[Callable[..., Float[Array, ""]], tuple[Any, ...]]:
     """ln p of whitened coordinates, and the arrays that it takes after them: none is compiled in."""
-    problem = target.problem
-    if len(problem.chunks) != 1:
+    likelihood = target.likelihood
+    if len(likelihood.points) != 1:
         raise ValueError(
             "NUTS is a cross-check for sets that fit into one chunk: choose larger points_per_chunk"
         )
-    template, scale = problem.model.template, target.scale
+    template, scale = target.model.template, target.scale
     root = scale[:, None] * np.linalg.cholesky(target.covariance / np.outer(scale, scale))
-    first, select = target.values(target.centre), problem.model.selection()
+    first, select = target.values(target.centre), target.model.selection()
     offset = target.prior_rows(target.centre)
     slope = np.stack([target.prior_rows(target.centre + column) - offset for column in root.T], axis=1)
     arrays = (
         template,
-        problem.plan,
-        problem.chunks[0],
+        likelihood.plan,
+        likelihood.points.chunk(0),
         *(jnp.asarray(a) for a in (first, select @ root, offset, slope)),
     )
 

@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 from walop_jax.data.records import Block, CalibrationSet, Sources
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.likelihood import engine
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.noise import PhotonNoise
-from walop_jax.likelihood.problem import Problem
 from walop_jax.model import legendre, light
 from walop_jax.model.build import nominal_instrument
 from walop_jax.model.compiled import compiled
@@ -182,15 +182,17 @@ def _fluxes(plan: ObservingPlan, rng: np.random.Generator) -> Float[np.ndarray, 
 
 def _expected(blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, "p e"]) -> Cube:
     """Expected counts (electron) of every (point, exposure), what the detectors do to them included."""
-    problem = Problem(blank, make_model(blank.instrument, truth))
-    unit = np.concatenate([np.asarray(engine.prediction(truth, problem.plan, c)) for c in problem.chunks])
+    likelihood = Likelihood.of(blank, make_model(blank.instrument, truth))
+    unit = np.concatenate(
+        [np.asarray(engine.prediction(truth, likelihood.plan, c)) for c in likelihood.points]
+    )
     light_counts = flux[:, :, None] * unit[: len(flux)]
     if light.is_linear(truth):
         return light_counts
     counts = light_counts
     for _ in range(_MEDIAN_ROUNDS if needs(truth).median else 1):
-        seen = np.where(problem.used[:, :, None], counts, np.nan)
-        plan = with_median(problem.plan, np.nanmedian(seen, axis=0))
+        seen = np.where(likelihood.used[:, :, None], counts, np.nan)
+        plan = with_median(likelihood.plan, np.nanmedian(seen, axis=0))
         counts = np.asarray(_detected(truth, plan, jnp.asarray(light_counts)))
     return counts
 
