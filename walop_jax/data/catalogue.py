@@ -1,4 +1,4 @@
-"""Science catalogues: one row per star and exposure, four intensities each (contract, section 4, `apply`).
+"""Science catalogues: one row per star and exposure, four intensities each (docs: files).
 
 | column | unit | meaning |
 | --- | --- | --- |

@@ -359,7 +359,7 @@ def has_known_flux(calset: CalibrationSet) -> bool:
 
 
 def base_model(calset: CalibrationSet, *, plates: str = "waves", throughput_degree: int = 4) -> Model:
-    """The base model (contract, section 3) for the instrument and standards of a calibration set.
+    """The base model (docs: model) for the instrument and standards of a calibration set.
 
     The scale of the throughput is a gauge unless a flux is known, and the constant of camera N0 is held then.
     """
