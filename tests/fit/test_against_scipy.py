@@ -1,4 +1,4 @@
-"""The joint fit against another program: scipy's least squares on a numpy residual written from the contract alone."""
+"""The joint fit against another program: scipy's least squares on a numpy residual written from `docs: model`."""
 
 import time
 

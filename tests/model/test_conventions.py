@@ -153,7 +153,7 @@ def test_moon_sky_is_scaled_by_its_depolarisation():
 
 
 def test_tables_of_the_conventions():
-    """Cameras O1 (0°), E1 (90°), O2 (45°), E2 (135°) in the contract's order, field unit 0.3°."""
+    """Cameras O1 (0°), E1 (90°), O2 (45°), E2 (135°) in the order of docs: conventions, field unit 0.3°."""
     assert conventions.CAMERA_NAMES == ("O1", "E1", "O2", "E2")
     assert conventions.FAST_AXES == (0.0, 22.5)
     assert conventions.FIELD_SCALE == 0.3

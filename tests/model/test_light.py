@@ -163,7 +163,7 @@ def test_fixed_axis_plates_are_the_papers():
 
 
 def test_fixed_axes_miss_about_a_hundredth_of_cross_talk():
-    """Contract: up to 1–2 % at the edge of the field; nothing of the kind on the axis of the plates."""
+    """Up to 1–2 % at the edge of the field; nothing of the kind on the axis of the plates."""
     edge = np.linspace(-0.29, 0.29, 15)
     x, y = (v.ravel() for v in np.meshgrid(edge, edge))
     plan = builders.setting_plan(builders.monochromatic(0.62))

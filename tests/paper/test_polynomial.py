@@ -289,7 +289,7 @@ def test_apply_on_light_of_the_true_instrument(shared_data, fitted, tmp_path):
     for electrons, low, high in ((1e6, 0.9, 1.1), (1e13, 0.3, 2.0)):
         rows = []
         for rotator in rotators:
-            seen = (stars @ [1, 1j]) * np.exp(-2j * np.deg2rad(rotator))  # contract, section 1
+            seen = (stars @ [1, 1j]) * np.exp(-2j * np.deg2rad(rotator))  # docs: conventions
             light = np.stack([np.ones(len(x)), seen.real, seen.imag], axis=1)
             counts = 4 * electrons * np.einsum("pks,ps->pk", truth.vectors(x, y), light)
             error = np.sqrt(counts)

@@ -37,7 +37,9 @@ def stars(vectors, count, rng=None, plate=(None,), rotator=None, flux=4e6, teff=
     rows = []
     for k, setting in enumerate(plate):
         turn = 0.0 if rotator is None else 2 * np.deg2rad(rotator[k])
-        seen = (qu[:, 0] + 1j * qu[:, 1]) * np.exp(-1j * turn)  # contract: EVPA in the ICS = sky − ROTATOR
+        seen = (qu[:, 0] + 1j * qu[:, 1]) * np.exp(
+            -1j * turn
+        )  # docs: conventions, EVPA in the ICS = sky − ROTATOR
         a = vectors.exact(Setting("SDSS-r", setting), x, y, [teff])[:, 0]
         n = flux * np.einsum("pks,ps->pk", a, np.stack([np.ones(count), seen.real, seen.imag], axis=1))
         error = np.sqrt(n + 900.0)

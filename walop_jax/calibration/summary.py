@@ -25,7 +25,7 @@ def summary(
     misfit: Misfit | None = None,
     residuals: ResidualMap | None = None,
 ) -> dict[str, Any]:
-    """What a fit found: the contract's keys first, then how far it can be trusted.
+    """What a fit found and how far it can be trusted, key by key as in docs: files.
 
     Frozen parameters have sigma 0.
     """

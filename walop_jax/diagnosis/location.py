@@ -71,7 +71,7 @@ def _field_words(design: Design, field: Float[np.ndarray, " p"]) -> str:
 
 
 def describe(design: Design, rows: Float[np.ndarray, " _"]) -> dict[str, Any]:
-    """Where a change of the residuals (data rows of `design`) sits, as the contract's `where`."""
+    """Where a change of the residuals (data rows of `design`) sits, as `where` of diagnosis.json (docs: files)."""
     cube = design.cube(rows)
     square = cube**2
     e = design.fit.calset.exposures
