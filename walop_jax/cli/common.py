@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import json as json_format
-import math
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -13,6 +11,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+
+from walop_jax.io.errors import errors_naming as named  # noqa: F401  (for refit)
+from walop_jax.io.text import json_text
+from walop_jax.io.text import read_text as read_text  # (for refit)
 
 CACHE_VARIABLE = "WALOP_JAX_CACHE"
 DEBUG_VARIABLE = "WALOP_JAX_DEBUG"
@@ -108,43 +110,6 @@ def print_json(value: Any) -> None:
     typer.echo(json_text(value), nl=False)
 
 
-def json_text(value: Any) -> str:
-    """The JSON text of a value, indented, with a final newline; null for what is not finite."""
-    return json_format.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def plain(value: Any) -> Any:
-    """The value with mappings as dicts, sequences as lists and numbers that are not finite as None."""
-    if isinstance(value, dict):
-        return {str(key): plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(entry) for entry in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value
-
-
-def read_text(path: Path) -> str:
-    """The text of a file; ValueError, with the name, if it is missing or not text in UTF-8."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: is not text in UTF-8") from None
-
-
-@contextlib.contextmanager
-def named(path: Path | None) -> Iterator[None]:
-    """Say in errors which file they are about."""
-    try:
-        yield
-    except ValueError as error:
-        if path is None or str(path) in str(error):
-            raise
-        raise ValueError(f"{path}: {error}") from error
-
-
 @contextlib.contextmanager
 def progress(quiet: bool) -> Iterator[Callable[[str], None]]:
     """Give a function that shows what is being done: on a terminal only, on stderr, gone at the end."""
@@ -220,8 +185,3 @@ def shared(place: str | None) -> Iterator[bool]:
         complain(f"process {crew.index} of {crew.count}: {error or type(error).__name__}")
         sys.stderr.flush()
         leave_at_once(1)
-
-
-def product_path(run: Path) -> Path:
-    """The calibration product that RUN, a folder or the file itself, stands for."""
-    return run / "calibration.fits" if run.is_dir() else run
