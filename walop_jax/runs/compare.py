@@ -15,7 +15,7 @@ from walop_jax.fit.refit import fit
 from walop_jax.io.errors import errors_naming
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
-from walop_jax.likelihood.problem import Problem
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.paper.comparison import Comparison, compare
 from walop_jax.reports import comparison_figures
 from walop_jax.science.star_errors import Truth
@@ -68,12 +68,11 @@ def compare_methods(
     with errors_naming(model):
         chosen = model_for(calset, text)
     tell("fitting the joint model")
-    problem = Problem(calset, chosen)
-    result = fit(problem)
+    result = fit(Likelihood.of(calset, chosen))
     if not result.converged:
         raise ValueError(f"the joint fit did not converge ({result.minimum.message})")
     tell("fitting and judging the polynomials")
-    found = compare(calset, Calibration.from_fit(result, problem), known, filter_name, seed or 0)
+    found = compare(calset, Calibration.from_fit(result), known, filter_name, seed or 0)
     document = found.document()
     with atomic_folder(output, OUTPUTS, overwrite=overwrite) as folder:
         (folder / DOCUMENT).write_text(json_text(document), encoding="utf-8")

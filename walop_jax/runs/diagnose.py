@@ -63,8 +63,8 @@ def diagnose_sets(
         chosen = model_for(calset, text)
     found = diagnose(calset, chosen, seed=seed or 0, progress=tell)
     tell("mapping the field")
-    product = Calibration.from_fit(found.after, found.problem).to_product()
-    misfit = None if found.after.explains_data else describe(found.problem, found.after.values)
+    product = Calibration.from_fit(found.after).to_product()
+    misfit = None if found.after.explains_data else describe(found.after)
     content = document(found)
     fitted = summary(found.after, calset, seconds=time.perf_counter() - began, misfit=misfit) | {"seed": seed}
     drawn_from = pictures(found)
