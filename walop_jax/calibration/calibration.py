@@ -38,7 +38,7 @@ ILL_CONDITIONED = (
 EXCESS_NOISE = 0.5  # sigma
 HIGH_CROSSTALK = 10.0  # condition number of the local 2 × 2 inverse
 TEMPERATURE_MARGIN = 2.0  # K beyond the temperatures of the exposures
-SOFTWARE = ("walop-jax", "jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy", "astropy", "speclite")
+SOFTWARE = ("walop-jax", "jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy", "astropy")
 
 
 def software_versions() -> dict[str, str]:
