@@ -57,7 +57,7 @@ def product(handmade) -> CalibrationProduct:
         sources=calset.sources,
         model=("[model]", 'instrument = "WALOP-SOUTH"', "# a comment"),
         inputs=calset.inputs,
-        versions={"python": "3.11.7", "walop-jax": "0.1.0"},
+        versions={"python": "3.11.7", "walop-jax": "0.1.0", "speclite": "0.20"},  # of a library long gone
     )
 
 
