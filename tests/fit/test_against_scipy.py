@@ -13,12 +13,12 @@ from walop_jax.likelihood.problem import Problem, base_model
 
 
 @pytest.mark.long
-def test_scipy_finds_the_same_minimum(shared_data):
+def test_scipy_finds_the_same_minimum(either_south_set):
     """χ² at the minimum to 1e-6, every well determined parameter to a hundredth of its error.
 
     Printed (-s): seconds of both, scipy from nominal values by finite differences, ours the second time.
     """
-    path = shared_data / "walop_south_a.fits"
+    path = either_south_set("a").path
     calset = read_calibration_set(path)
     problem = Problem(calset, base_model(calset))
     fit(problem)
