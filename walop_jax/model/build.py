@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from walop_jax.instruments.description import ArmText, Description, ElementText, Given, described
+from walop_jax.instruments.description import ArmText, Description, ElementText, Given, described, shipped
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.model import legendre, materials
 from walop_jax.model.cameras import Cameras, Throughput
@@ -21,41 +21,69 @@ from walop_jax.model.sources import SOURCES, Source, Standards
 
 PLATE_MODELS = tuple(MODELS)
 STAR = tuple[str, float, float]
+SERIES = "Legendre coefficient P_i(x/h) P_j(y/h)"
+FREE = "smooth vignetting and coatings: free"
 
 
-def build(
-    description: Description,
-    *,
-    standards: Sequence[STAR] = (),
-    plates: str = "waves",
-    throughput_degree: int | None = None,
-    throughput: float | None = None,
-    elements: Sequence[type[Element]] = (),
-) -> Instrument:
-    """The instrument that a description describes, at the values that it gives.
+def build(description: Description, *, elements: Sequence[type[Element]] = (), **options: Any) -> Instrument:
+    """The instrument that a description describes, at the values that it gives; options as for `adapted`.
 
-    `standards` are (name, q, u) in the equatorial frame; `throughput` the level of all cameras; `elements` further kinds of
-    elements that the description may name. Raises ValueError for an unknown plate model, and `DataError` for a kind of
-    element or a number of one that does not exist.
+    `elements` are further kinds of elements that the description may name. Raises `DataError` for a kind of element, or a
+    number of one, that does not exist.
     """
-    if plates not in PLATE_MODELS:
-        raise ValueError(f"unknown plate model {plates!r}: choose one of {', '.join(PLATE_MODELS)}")
-    make = _Maker(description, {kind.kind: kind for kind in (*ELEMENTS, *elements)}, plates)
-    degree = description.throughput_degree if throughput_degree is None else throughput_degree
-    level = description.throughput.value if throughput is None else throughput
-    coefficients = np.zeros((len(description.cameras), len(legendre.terms(degree))))
-    coefficients[:, 0] = level
+    make = _Maker(description, {kind.kind: kind for kind in (*ELEMENTS, *elements)})
     arms = tuple(make.arm(arm) for arm in description.arms)
-    return Instrument(
+    given = description.throughput
+    series = Declaration(unit="", about=SERIES, source=FREE, scale=given.scale, loose=given.loose)
+    coefficients = np.zeros((len(description.cameras), len(legendre.terms(description.throughput_degree))))
+    coefficients[:, 0] = given.value
+    instrument = Instrument(
         name=description.name,
-        sources=sources(standards),
+        sources=sources(),
         elements=tuple(make.element(text) for text in description.elements),
         arms=arms,
         throughput=Throughput(
-            degree=degree, coefficients=jnp.asarray(coefficients), scale=description.field_scale
+            degree=description.throughput_degree,
+            coefficients=jnp.asarray(coefficients),
+            scale=description.field_scale,
+            declared=series,
         ),
         cameras=_cameras(description, arms),
         path=description.path,
+        field_limit=description.field_limit,
+        description="" if description.name in shipped() else description.text,
+    )
+    return adapted(instrument, **options)
+
+
+def adapted(
+    instrument: Instrument,
+    *,
+    standards: Sequence[STAR] = (),
+    plates: str | None = None,
+    throughput_degree: int | None = None,
+    throughput: float | None = None,
+) -> Instrument:
+    """An instrument for the data at hand.
+
+    `standards` are (name, q, u) in the equatorial frame; `plates` is the model of the wave plates, `throughput_degree` that
+    of the series, `throughput` the level of all cameras; None leaves what the instrument says. Raises ValueError for an
+    unknown plate model.
+    """
+    instrument = instrument.with_source(_standards(standards))
+    if plates is not None:
+        if plates not in PLATE_MODELS:
+            raise ValueError(f"unknown plate model {plates!r}: choose one of {', '.join(PLATE_MODELS)}")
+        for place in instrument.places(WavePlate):
+            instrument = instrument.changed(place, model=plates)
+    series = instrument.throughput
+    degree = series.degree if throughput_degree is None else throughput_degree
+    level = np.asarray(series.coefficients)[:, 0] if throughput is None else throughput
+    coefficients = np.zeros((len(instrument.cameras), len(legendre.terms(degree))))
+    coefficients[:, 0] = level
+    return dataclasses.replace(
+        instrument,
+        throughput=dataclasses.replace(series, degree=degree, coefficients=jnp.asarray(coefficients)),
     )
 
 
@@ -64,13 +92,14 @@ def nominal_instrument(name: str = "WALOP-SOUTH", **options: Any) -> Instrument:
     return build(described(name), **options)
 
 
-def sources(standards: Sequence[STAR] = ()) -> tuple[Source, ...]:
+def sources() -> tuple[Source, ...]:
     """The sources that every instrument can look at."""
-    names, q, u = zip(*standards, strict=True) if standards else ((), (), ())
-    stars = Standards(
-        names=tuple(names), q=jnp.asarray(np.array(q, float)), u=jnp.asarray(np.array(u, float))
-    )
-    return tuple(stars if kind is Standards else kind() for kind in SOURCES)
+    return tuple(_standards(()) if kind is Standards else kind() for kind in SOURCES)
+
+
+def _standards(stars: Sequence[STAR]) -> Standards:
+    names, q, u = zip(*stars, strict=True) if stars else ((), (), ())
+    return Standards(names=tuple(names), q=jnp.asarray(np.array(q, float)), u=jnp.asarray(np.array(u, float)))
 
 
 def _cameras(description: Description, arms: Sequence[Arm]) -> Cameras:
@@ -92,7 +121,6 @@ def _cameras(description: Description, arms: Sequence[Arm]) -> Cameras:
 class _Maker:
     description: Description
     kinds: Mapping[str, type[Element]]
-    plates: str
 
     def arm(self, text: ArmText) -> Arm:
         elements = tuple(self.element(entry, f"{text.name}.") for entry in text.elements)
@@ -111,7 +139,7 @@ class _Maker:
         fields, declared = self.numbers(kind, text.values, place)
         if kind is WavePlate:
             layers = tuple(self.layer(layer, place) for layer in text.layers)
-            fields |= {"layers": layers, "model": self.plates}
+            fields |= {"layers": layers}
         elif text.layers:
             raise DataError(f"[{place}] an element of kind {text.kind!r} has no layers")
         made = kind(name=text.name, moves=text.moves, declared=declared, **fields)
@@ -119,6 +147,8 @@ class _Maker:
             raise DataError(
                 f"[{place}] moves, but an element of kind {text.kind!r} has no axis that could turn"
             )
+        if text.moves and kind.ray is not Element.ray:
+            raise DataError(f"[{place}] an element of kind {text.kind!r} changes the ray and cannot move")
         if isinstance(made, Analyser) and text.moves:
             raise DataError(f"[{place}] an analyser does not move")
         return made

@@ -15,7 +15,7 @@ What of this can be carried over to other exposures, `carried_over` says; see `I
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 
 from walop_jax.model import legendre
 from walop_jax.model.conventions import FIELD_SCALE
-from walop_jax.model.parameters import Component, param
+from walop_jax.model.parameters import Component, Declaration
 from walop_jax.model.sources import ExposureArrays
 
 Scalar = Float[Array, ""]
@@ -33,14 +33,13 @@ class Throughput(Component):
     """Throughput of each camera as a Legendre series over the field (total degree `degree`)."""
 
     degree: int = eqx.field(static=True)
-    coefficients: Float[Array, "k t"] = param(
-        unit="",
-        about="Legendre coefficient P_i(x/h) P_j(y/h)",
-        source="smooth vignetting and coatings; free",
-        scale=0.02,
-        loose=0.5,
-    )
+    coefficients: Float[Array, "k t"]
+    declared: Declaration = eqx.field(static=True)
     scale: float = eqx.field(static=True, default=FIELD_SCALE)  # h, degrees
+
+    def declarations(self) -> Mapping[str, Declaration]:
+        """The series is a parameter of every instrument."""
+        return {"coefficients": self.declared}
 
     def labels(self, field: str) -> Sequence[str]:
         """Camera and exponents: n0.p21 is camera N0, second degree in X, first in Y."""

@@ -65,7 +65,9 @@ class Arm(Component):
 class Instrument(Component):
     """Everything that is fitted. `path` names the elements ahead of the arms in the order light meets them.
 
-    `rotator_zero` (deg) is added to ROTATOR, `filter_shift` (µm) displaces broad bands; None: there is none.
+    `rotator_zero` (deg) is added to ROTATOR, `filter_shift` (µm) displaces broad bands; None: there is none. Field
+    coordinates reach to ±`field_limit` (deg). `description` is the text it was described in, empty for an instrument that
+    comes with the package.
     """
 
     name: str = eqx.field(static=True)
@@ -78,6 +80,8 @@ class Instrument(Component):
     effects: tuple[Effect, ...] = ()
     rotator_zero: Scalar | None = number(unit="deg", about="true ROTATOR minus the header's", default=None)
     filter_shift: Scalar | None = number(unit="um", about="displacement of broad bands", default=None)
+    field_limit: float = eqx.field(static=True, default=90.0)
+    description: str = eqx.field(static=True, default="", repr=False)
 
     @classmethod
     def read(cls, source: str | os.PathLike[str], **options: Any) -> Instrument:
