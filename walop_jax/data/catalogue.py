@@ -1,4 +1,4 @@
-"""Science catalogues: one row per star and exposure, an intensity of every camera (contract, section 4, `apply`).
+"""Science catalogues: one row per star and exposure, an intensity of every camera (`walop-jax apply`).
 
 | column | unit | meaning |
 | --- | --- | --- |

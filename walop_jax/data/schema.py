@@ -1,7 +1,7 @@
 """The columns of the calibration tables, and the one way that a column becomes an array.
 
 Columns go by name (FITS names know no upper and lower case). A unit that can be converted is converted;
-a missing unit is the contract's; anything else is refused. What comes out is native-endian.
+a missing unit is that of the file format; anything else is refused. What comes out is native-endian.
 """
 
 from __future__ import annotations
