@@ -12,7 +12,7 @@ from between_points import between_points
 from walop_jax.calibration.calibration import Calibration, at_prior_edge, quality
 from walop_jax.calibration.matrix import Settings
 from walop_jax.calibration.matrix_table import matrix_columns
-from walop_jax.calibration.product import read_product, write_product
+from walop_jax.calibration.product import ParameterTable, read_product, write_product
 from walop_jax.data import DataError, read_calibration_set
 from walop_jax.fit.model_builder import model_for, model_without_data
 from walop_jax.fit.model_file import render
@@ -138,6 +138,16 @@ def test_flags_say_what_is_special(calibration):
     assert calibration.flags(x, y, settings, values)[0] == 16
 
 
+def test_cross_talk_of_other_numbers_of_arms(calibration):
+    """Three arms measure q, u and their sum; take one away and the others still tell q from u."""
+    x, settings = np.zeros(3), Settings.default(3)
+    three = np.tile([0.0, 1, 0, 0, 0, 1, 0, 1, 1], (3, 1))
+    three[1, [1, 7]] = 0.0  # q is seen by none
+    three[2, 8] = 0.0
+    assert calibration.flags(x, x, settings, three).tolist() == [0, 16, 0]
+    assert calibration.flags(x, x, settings, three[:, :3]).tolist() == [0, 0, 0]
+
+
 def test_temperature_counts_where_the_model_depends_on_it(problem, result):
     plain = starting(problem, result, "")
     warm = starting(problem, result, '[model]\neffects = ["hwp_temperature"]\n')
@@ -153,6 +163,9 @@ def test_points_outside_have_no_value(calibration):
     assert np.isnan(columns["M22"][0]).tolist() == [False, True, False]
     assert columns["FLAG"][0][1] == 32
     np.testing.assert_array_equal(columns["M33"][0][[0, 2]], calibration.matrix(X, Y)[0][[0, 2], 5])
+    nowhere = matrix_columns(calibration, X, Y, Settings.default(3), np.ones(3, bool))
+    assert list(nowhere) == list(columns)
+    assert np.isnan(nowhere["M33_ERR"][0]).all()
 
 
 def test_unknown_filter_names_the_nearest(calibration):
@@ -191,6 +204,24 @@ def test_effects_and_their_choices_survive_the_product(problem, result, tmp_path
     cited = {entry.what: entry.source for entry in references(back.model)}
     assert "Blinov et al. 2023" in cited["effect standard_outlier"]
     assert not any("contract" in source for source in cited.values())
+
+
+def test_parameters_of_a_product_go_by_name(calibration, tmp_path):
+    """A product whose parameters stand in another order, as another version may have written it."""
+    product = calibration.to_product()
+    order = np.random.default_rng(2).permutation(len(product.parameters))
+    table = product.parameters
+    shuffled = dataclasses.replace(
+        product,
+        parameters=ParameterTable(*(getattr(table, f.name)[order] for f in dataclasses.fields(table))),
+        covariance=product.covariance[order][:, order],
+    )
+    write_product(tmp_path / "c.fits", shuffled)
+    back = Calibration.from_product(read_product(tmp_path / "c.fits"))
+    assert back.model.names == calibration.model.names
+    np.testing.assert_array_equal(back.values, calibration.values)
+    np.testing.assert_array_equal(back.covariance, calibration.covariance)
+    np.testing.assert_array_equal(back.sigma, calibration.sigma)
 
 
 @pytest.mark.parametrize(
@@ -244,6 +275,11 @@ def test_a_product_of_other_physics_is_refused(calibration):
     changed = dataclasses.replace(product, parameters=dataclasses.replace(table, name=names))
     with pytest.raises(DataError, match=r"sky\.colour"):
         Calibration.from_product(changed)
+    names = table.name.copy()
+    names[0] = names[1]
+    twice = dataclasses.replace(product, parameters=dataclasses.replace(table, name=names))
+    with pytest.raises(DataError, match=str(table.name[0])):
+        Calibration.from_product(twice)
 
 
 # ---------------------------------------------------------------------- against sets made outside the project
