@@ -25,8 +25,8 @@ ROOMS = (
     "science",
     "diagnosis",
     "paper",
-    "runs",
     "reports",
+    "runs",
     "cli",
 )
 OWNERS = {

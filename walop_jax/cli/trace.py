@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from walop_jax.cli.common import JsonOption, named, print_json, product_path, switch_on_jax
+from walop_jax.cli.common import JsonOption, print_json, switch_on_jax
 
 if TYPE_CHECKING:
-    from walop_jax.data.records import FilterCurve
-    from walop_jax.model.instrument import Instrument
     from walop_jax.model.trace import Stage
 
 ProductArgument = Annotated[
@@ -59,7 +57,7 @@ def trace(
     nan = float("nan")
     switch_on_jax()
     from walop_jax.model.trace import Ray
-    from walop_jax.model.trace import trace as follow
+    from walop_jax.runs.trace import trace_source
 
     try:
         ray = Ray(
@@ -73,8 +71,12 @@ def trace(
         )
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
-    built, curve = _instrument(product, instrument, filter)
-    stages = follow(built, curve, ray)
+    try:
+        stages = trace_source(ray, product, instrument=instrument, filter_name=filter)
+    except ValueError as error:
+        if product is not None:
+            raise
+        raise typer.BadParameter(str(error)) from None  # the options say all there is
     if json:
         print_json(
             [
@@ -91,26 +93,6 @@ def trace(
         return
     for line in table(stages):
         typer.echo(line)
-
-
-def _instrument(product: Path | None, name: str, filter_name: str) -> tuple[Instrument, FilterCurve]:
-    """The instrument of a calibration product, or one as designed, and the curve of the filter."""
-    from walop_jax.data.filters import builtin_filter
-
-    if product is None:
-        from walop_jax.model.instrument import nominal_instrument
-
-        try:
-            return nominal_instrument(name.upper()), builtin_filter(filter_name)
-        except ValueError as error:
-            raise typer.BadParameter(str(error)) from None
-    from walop_jax.calibration.calibration import Calibration
-    from walop_jax.calibration.product import read_product
-
-    path = product_path(product)
-    with named(path):
-        calibration = Calibration.from_product(read_product(path))
-    return calibration.model.instrument(calibration.values), calibration.filter_curve(filter_name)
 
 
 def table(stages: tuple[Stage, ...]) -> list[str]:
