@@ -11,11 +11,10 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data import DEFAULT_FILTER, read_calibration_set
 from walop_jax.data.user_tables import new_table, true_matrices, write_output_table
 from walop_jax.fit.model_builder import model_for
-from walop_jax.fit.refit import fit
+from walop_jax.fit.refit import refit
 from walop_jax.io.errors import errors_naming
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
-from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.paper.comparison import Comparison, compare
 from walop_jax.reports import comparison_figures
 from walop_jax.science.star_errors import Truth
@@ -68,7 +67,7 @@ def compare_methods(
     with errors_naming(model):
         chosen = model_for(calset, text)
     tell("fitting the joint model")
-    result = fit(Likelihood.of(calset, chosen))
+    result = refit(calset, chosen, progress=tell)
     if not result.converged:
         raise ValueError(f"the joint fit did not converge ({result.minimum.message})")
     tell("fitting and judging the polynomials")

@@ -66,7 +66,7 @@ def diagnose_sets(
     product = Calibration.from_fit(found.after).to_product()
     misfit = None if found.after.explains_data else describe(found.after)
     content = document(found)
-    fitted = summary(found.after, calset, seconds=time.perf_counter() - began, misfit=misfit) | {"seed": seed}
+    fitted = summary(found.after, seconds=time.perf_counter() - began, misfit=misfit) | {"seed": seed}
     drawn_from = pictures(found)
     with atomic_folder(Path(output), OUTPUTS, overwrite=overwrite) as folder:
         write_product(folder / PRODUCT, product)
