@@ -12,8 +12,9 @@ import pytest
 from emcee.autocorr import integrated_time
 
 from walop_jax.data import read_calibration_set
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.posterior import Options, sample
 from walop_jax.posterior.target import Target
 
@@ -31,11 +32,11 @@ def test_emcee_agrees_with_nuts(shared_data: Path) -> None:
     from walop_jax.posterior.nuts import sample_nuts
 
     calset = read_calibration_set(shared_data / "walop_south_a.fits")
-    problem = Problem(calset, base_model(calset))
-    result = fit(problem)
-    ours = sample(problem, result, Options(seed=1, interval=2000))
+    likelihood = Likelihood.of(calset, base_model(calset))
+    result = fit(likelihood)
+    ours = sample(result, Options(seed=1, interval=2000))
     assert ours.trusted, ours.warnings
-    nuts = sample_nuts(Target(problem, result), DRAWS)
+    nuts = sample_nuts(Target(result), DRAWS)
     assert nuts.divergences == 0
     for i, name in enumerate(nuts.names):
         mean, sigma = ours.value(name)
