@@ -23,7 +23,8 @@ from walop_jax.data.frames import Grid
 from walop_jax.data.records import Exposures
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import engine, limits
-from walop_jax.likelihood.expansion import Census
+from walop_jax.likelihood.expansion import Census, Posterior
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.nodes import Nodes
 from walop_jax.likelihood.runner import SlabSums
 from walop_jax.model import light
@@ -113,10 +114,15 @@ def _chosen(e: Exposures) -> tuple[str, float, Bool[np.ndarray, " e"]]:
 
 def residual_map(result: FitResult) -> ResidualMap:
     """The map of what a fit leaves: one more pass over the points."""
-    likelihood, instrument = result.likelihood, result.model.instrument(result.values)
-    nodes, _ = likelihood.nodes(instrument, result.posterior)
-    filter_name, chwp_angle, chosen = _chosen(result.calset.exposures)
-    grid = cells_for(likelihood.layout.points, result.posterior.census)
+    return residual_map_at(result.likelihood, result.values, result.posterior)
+
+
+def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | None = None) -> ResidualMap:
+    """As `residual_map`, at any full vector of parameter values; `near` is an expansion at similar ones."""
+    instrument = likelihood.model.instrument(values)
+    nodes, _ = likelihood.nodes(instrument, near)
+    filter_name, chwp_angle, chosen = _chosen(likelihood.calset.exposures)
+    grid = cells_for(likelihood.layout.points, likelihood.census if near is None else near.census)
     count = grid.width * grid.height
 
     def work(number: int) -> SlabSums:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from walop_jax.cli.common import JsonOption, print_json, switch_on_jax
+from walop_jax.cli.common import InstrumentOption, JsonOption, print_json, switch_on_jax
 
 if TYPE_CHECKING:
     from walop_jax.model.trace import Stage
