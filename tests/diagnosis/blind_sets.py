@@ -21,7 +21,7 @@ import numpy as np
 
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.effect_columns import Probe, effect_candidates, probes
-from walop_jax.diagnosis.examination import ALARM, Look
+from walop_jax.diagnosis.examination import ALARM, Examination
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_builder import base_model
@@ -49,8 +49,8 @@ class Hiding:
         self.design = Design.of(self.fit)
         self.context = effect_context(self.fit.model.template, calset.exposures)
         every = list(probes(EFFECTS, self.context))
-        look = Look(self.fit, every, np.random.default_rng(0))
-        self.probes = [p for p in look.probes if look.table[p.name].testable]
+        examination = Examination(self.fit, every, np.random.default_rng(0))
+        self.probes = [p for p in examination.probes if examination.table[p.name].testable]
         self.names = sorted({p.effect.name for p in self.probes})
 
     def draw(self, name: str, ratio: float, rng: np.random.Generator) -> Effect | None:
