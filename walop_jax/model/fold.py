@@ -19,7 +19,7 @@ from walop_jax.model.ray import Ray
 
 Station = tuple[Element, Ray]
 State = tuple[float | None, ...]
-Mueller = Float[Array, "*n 4 4"]
+Mueller = Float[Array, "... 4 4"]
 Solved = dict[tuple[int, float | None], Mueller | None]
 """Mueller matrices by number of the station and angle at which its element stands (None for one that does not move)."""
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from walop_jax.model.parameters import Component, Declaration
 from walop_jax.model.ray import Ray
 
-Mueller = Float[Array, "*n 4 4"]
+Mueller = Float[Array, "... 4 4"]
 
 
 class Element(Component):
