@@ -32,7 +32,6 @@ from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.runner import Progress
 from walop_jax.likelihood.thinning import thinned
 from walop_jax.model.effects import EFFECTS, Context, Effect, FreeForm
 from walop_jax.model.parameters import values_of

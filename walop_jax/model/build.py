@@ -36,8 +36,8 @@ FREE = "smooth vignetting and coatings: free"
 def build(description: Description, *, elements: Sequence[type[Element]] = (), **options: Any) -> Instrument:
     """The instrument that a description describes, at the values that it gives; options as for `adapted`.
 
-    `elements` are further kinds of elements that the description may name. Raises `DataError` for a kind of element, or a
-    number of one, that does not exist.
+    `elements` are further kinds of elements that the description may name. Raises `DataError` for a kind of
+    element, or a number of one, that does not exist.
     """
     make = _Maker(description, {kind.kind: kind for kind in (*ELEMENTS, *elements)})
     arms = tuple(make.arm(arm) for arm in description.arms)
@@ -76,9 +76,9 @@ def adapted(
 ) -> Instrument:
     """An instrument for the data at hand.
 
-    `standards` are (name, q, u) in the equatorial frame; `plates` is the model of the wave plates, `throughput_degree` that
-    of the series, `throughput` the level of all cameras; None leaves what the instrument says. Raises ValueError for an
-    unknown plate model.
+    `standards` are (name, q, u) in the equatorial frame; `plates` is the model of the wave plates,
+    `throughput_degree` that of the series, `throughput` the level of all cameras; None leaves what the instrument
+    says. Raises ValueError for an unknown plate model.
     """
     instrument = instrument.with_source(_standards(standards))
     if plates is not None:

@@ -1,8 +1,8 @@
 """What of an instrument holds for other exposures than those it was fitted to, and what stays behind.
 
-The instrument matrix and the analysis of a catalogue know the optics and the cameras. Light of the opposite field point,
-shares of single exposures and detectors that need to know of their exposure do not go with them; a detector that asks for
-nothing but its own counts is undone. Which effects that concerns is found by patching, not declared.
+The instrument matrix and the analysis of a catalogue know the optics and the cameras. Light of the opposite field
+point, shares of single exposures and detectors that need to know of their exposure do not go with them; a detector
+that asks for nothing but its own counts is undone. Which effects that concerns is found by patching, not declared.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ Shapes = tuple[tuple[tuple[int, ...], str], ...]
 
 
 class Needs(NamedTuple):
-    """What the light path of an instrument asks for: conditions of the optics, median counts, fringes to be followed."""
+    """What a light path asks for: conditions of the optics, median counts, fringes that nodes must follow."""
 
     conditions: frozenset[str]
     median: bool
@@ -102,7 +102,7 @@ def _optical(structure: Any, shapes: Shapes) -> tuple[int, ...]:
 
 
 def _reaching(program: Any) -> Sequence[bool]:
-    """Which inputs of a traced program its outputs depend on; inner programs count as depending on all they are given."""
+    """Which inputs of a traced program reach its outputs; an inner program counts as using all it is given."""
     needed = {id(v) for v in program.jaxpr.outvars}
     for equation in reversed(program.jaxpr.eqns):
         if any(id(v) in needed for v in equation.outvars):

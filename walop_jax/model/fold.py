@@ -1,9 +1,9 @@
 """The fold of the train: Mueller matrices of all elements at all their positions, multiplied into the analysers' rows.
 
-A *station* is an element with the ray that meets it; a *state* holds the positions of the moving elements in one optical
-setting (an angle in degrees, None when out), in the order of their columns. Settings that agree in the elements nearest to
-the analysers share the products of these, so every product is made once. `solved` hands all elements of one class over
-together: the half-wave plates are one computation, compiled once.
+A *station* is an element with the ray that meets it; a *state* holds the positions of the moving elements in one
+optical setting (an angle in degrees, None when out), in the order of their columns. Settings that agree in the
+elements nearest to the analysers share the products of these, so every product is made once. `solved` hands all
+elements of one class over together: the half-wave plates are one computation, compiled once.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from walop_jax.model.ray import Ray
 
 Station = tuple[Element, Ray]
 State = tuple[float | None, ...]
-Mueller = Float[Array, "*n 4 4"]
+Mueller = Float[Array, "... 4 4"]
 Solved = dict[tuple[int, float | None], Mueller | None]
 """Mueller matrices by number of the station and angle at which its element stands (None for one that does not move)."""
 

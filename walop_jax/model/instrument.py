@@ -70,9 +70,9 @@ class Instrument(Component):
     """Everything that is fitted. `path` names the elements ahead of the arms in the order light meets them.
 
     `rotator_zero` (deg) is added to ROTATOR, `filter_shift` (µm) displaces broad bands; None: there is none. Field
-    coordinates reach to ±`field_limit` (deg); `site` is telescope, latitude and longitude (deg, east positive), elevation (m)
-    and MJD of a full Moon, `raster` how the points of a simulated run lie, and how far out (deg). `description` is the text it was described in, empty for an instrument that
-    comes with the package.
+    coordinates reach to ±`field_limit` (deg); `site` is telescope, latitude and longitude (deg, east positive),
+    elevation (m) and MJD of a full Moon, `raster` how the points of a simulated run lie, and how far out (deg).
+    `description` is the text it was described in, empty for an instrument that comes with the package.
     """
 
     name: str = eqx.field(static=True)
@@ -168,9 +168,9 @@ class Instrument(Component):
     def changed(self, place: str, **fields: Any) -> Instrument:
         """The instrument with fields of one part replaced.
 
-        `place` is a name with dots: an element, an arm's element ("half1.plate"), a layer of it ("half1.plate.mgf2"), a
-        source, or "" for the instrument itself. A function is applied to what was there. Raises `NoSuchPlaceError` where
-        the instrument has no such part.
+        `place` is a name with dots: an element, an arm's element ("half1.plate"), a layer of it
+        ("half1.plate.mgf2"), a source, or "" for the instrument itself. A function is applied to what was there.
+        Raises `NoSuchPlaceError` where the instrument has no such part.
         """
         return _changed(self, place.split(".") if place else [], fields, place)
 
@@ -190,7 +190,10 @@ class Instrument(Component):
         return _inserted(self, element, neighbour, bool(after))
 
     def with_part(self, slot: str, part: Component) -> Instrument:
-        """The instrument with one more part of its cameras: "transmission", "mixing", "ghosts", "exposures", "detectors"."""
+        """The instrument with one more part of its cameras.
+
+        `slot` is "transmission", "mixing", "ghosts", "exposures" or "detectors".
+        """
         cameras = dataclasses.replace(self.cameras, **{slot: (*getattr(self.cameras, slot), part)})
         return dataclasses.replace(self, cameras=cameras)
 

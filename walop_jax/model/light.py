@@ -2,12 +2,12 @@
 
     source → telescope → polariser → train of elements → arms → analysers → cameras → detectors
 
-Everything up to the detectors is linear, so the train is folded backwards, from the analysers to the polariser: each
-element multiplies the rows that the analysers see by its Mueller matrix. What stands directly behind the polariser and
-asks neither for wavelength nor for the exposure leaves the band integral by itself (`leading`) and is multiplied
-afterwards. `band_rows` is all the optics there is, once per field point; `camera_vectors` adds analysers and throughput,
-`counts` is a dot product per exposure. `trace.py` folds the same elements forwards. No effect is named here: effects
-patch the instrument, and the patched instrument is folded.
+Everything up to the detectors is linear, so the train is folded backwards, from the analysers to the polariser:
+each element multiplies the rows that the analysers see by its Mueller matrix. What stands directly behind the
+polariser and asks neither for wavelength nor for the exposure leaves the band integral by itself (`leading`) and is
+multiplied afterwards. `band_rows` is all the optics there is, once per field point; `camera_vectors` adds analysers
+and throughput, `counts` is a dot product per exposure. `trace.py` folds the same elements forwards. No effect is
+named here: effects patch the instrument, and the patched instrument is folded.
 
 Units       counts per unit of unpolarised light at unit throughput; angles rad; wavelengths µm; field deg.
 """

@@ -25,10 +25,10 @@ State = tuple[float | None, ...]
 class Plan(eqx.Module):
     """Static layout of a computation.
 
-    Nodes: `wavelength` (µm) and the `conditions` at which the optics are solved. Bands: rows of `node_weight`, sorted by
-    positions of the moving elements; `moving` holds the prefixes of their columns and `settings` (positions, first band,
-    one past the last), a position being an angle in degrees or None when out. `band_of[e, s + 1]` is the band of exposure e
-    for light of source s (s = −1: no source).
+    Nodes: `wavelength` (µm) and the `conditions` at which the optics are solved. Bands: rows of `node_weight`,
+    sorted by positions of the moving elements; `moving` holds the prefixes of their columns and `settings`
+    (positions, first band, one past the last), a position being an angle in degrees or None when out.
+    `band_of[e, s + 1]` is the band of exposure e for light of source s (s = −1: no source).
     """
 
     wavelength: Float[Array, " n"]

@@ -23,8 +23,8 @@ Scalar = Float[Array, ""]
 class Analyser(Element):
     """A polarising beam splitter: two beams, one for each of its cameras.
 
-    What depends on the light ahead of it (`seen`) and what does not (`shares`) are kept apart: only the first enters the
-    band integral.
+    What depends on the light ahead of it (`seen`) and what does not (`shares`) are kept apart: only the first
+    enters the band integral.
     """
 
     efficiency: Scalar = number(unit="", about="η of the analysers ½(1, ±η, 0, 0)", default=1.0)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from walop_jax.model.parameters import Component, Declaration
 from walop_jax.model.ray import Ray
 
-Mueller = Float[Array, "*n 4 4"]
+Mueller = Float[Array, "... 4 4"]
 
 
 class Element(Component):
@@ -43,7 +43,10 @@ class Element(Component):
         return ray
 
     def mueller(self, ray: Ray) -> Mueller | None:
-        """Mueller matrix for a ray that enters, with a leading axis where it depends on wavelength; None: the identity."""
+        """Mueller matrix for a ray that enters; None: the identity.
+
+        It has a leading axis where it depends on wavelength.
+        """
         del ray
         return None
 

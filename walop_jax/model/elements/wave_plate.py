@@ -2,8 +2,8 @@
 
 Layers      optic axis of a layer at fast axis + axis, out of its surface by cut.
 Thermal     n_e − n_o → (n_e − n_o) (1 − thermal · b · (T − 10 °C)), b the published change per kelvin.
-Air gap     diattenuator D = contrast · cos(4π gap cos ϑ / λ) along the fast axis, directly ahead of the plate; ϑ angle of
-            the ray in air.
+Air gap     diattenuator D = contrast · cos(4π gap cos ϑ / λ) along the fast axis, directly ahead of the plate;
+            ϑ angle of the ray in air.
 Sources     Etzel, Rose & Wang 2000, Appl. Opt. 39, 5796 (thermal); Clarke 2005, A&A 434, 377 (fringes).
 Limits      a plate without layers does nothing.
 """

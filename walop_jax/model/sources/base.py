@@ -17,8 +17,8 @@ Scalar = Float[Array, ""]
 class ExposureArrays(eqx.Module):
     """What the light path needs to know of the exposures, one element each; `median` only where it is asked for.
 
-    `kind` counts the kinds of `kinds`. Angles in radians; `clp_angle` is 0 when the polariser is out, `rotator` where it
-    has no meaning. `hours` since the first exposure, temperature in Celsius, hour angle in h.
+    `kind` counts the kinds of `kinds`. Angles in radians; `clp_angle` is 0 when the polariser is out, `rotator`
+    where it has no meaning. `hours` since the first exposure, temperature in Celsius, hour angle in h.
     """
 
     kind: Int[Array, " e"]
@@ -53,8 +53,8 @@ class ExposureArrays(eqx.Module):
 class Sight(NamedTuple):
     """What is looked at from one field point, exposure by exposure.
 
-    `sky` is (q, u) in the instrument frame of singly scattered moonlight for δ = 1, `source` the row of the standard star
-    or −1; field coordinates in degrees.
+    `sky` is (q, u) in the instrument frame of singly scattered moonlight for δ = 1, `source` the row of the
+    standard star or −1; field coordinates in degrees.
     """
 
     exposures: ExposureArrays
