@@ -79,6 +79,7 @@ Evaluate = Callable[[Vector, Request], Expansion]
 # ------------------------------------------------------------------------------- when the matrix is computed
 
 
+@runtime_checkable
 class MatrixPolicy(Protocol):
     """When the matrix is computed anew."""
 
