@@ -10,13 +10,8 @@ import numpy as np
 from walop_jax.data.filters import BUILTIN_FILTERS
 from walop_jax.data.records import KINDS, Exposures, FilterCurve, Points, Site, Sources
 from walop_jax.data.schema import Place
+from walop_jax.instruments.description import described, shipped
 from walop_jax.io.errors import nearest, rows_text
-
-INSTRUMENTS = ("WALOP-SOUTH", "WALOP-NORTH", "WALOP-LAB")
-"""Values of INSTRUME that a calibration set of version 1 may have; from version 2 on any name will do."""
-
-FIELD_LIMITS = {"WALOP-SOUTH": 0.35, "WALOP-NORTH": 0.35, "WALOP-LAB": 45.0}
-"""Largest |X|, |Y| in degrees; on the laboratory bench X is the tilt of the plate."""
 
 _ANY_FIELD = 90.0  # deg
 _LONGEST_NAME = 32
@@ -42,31 +37,31 @@ def unique(ids: np.ndarray, column: str, place: Place) -> None:
 
 def field_limit(instrument: str) -> float:
     """Largest |X|, |Y| in degrees that a field point of an instrument may have."""
-    return FIELD_LIMITS.get(instrument, _ANY_FIELD)
+    return described(instrument).field_limit if instrument in shipped() else _ANY_FIELD
 
 
 def instrument_name(value: object, version: int, place: Place) -> str:
-    """Check INSTRUME, in which the names of `INSTRUMENTS` know no upper and lower case, and return it.
+    """Check INSTRUME, in which the names of shipped instruments know no upper and lower case, and return it.
 
     Raises `DataError` for another name in version 1; from version 2 on for one that is empty, longer than 32
     letters, begins or ends with a blank, or is not printable ASCII.
     """
     if version == 1:
         name = str(value).strip().upper()
-        if name not in INSTRUMENTS:
-            raise place.fail(f"is {name!r}", "INSTRUME", nearest(name, INSTRUMENTS))
+        if name not in shipped():
+            raise place.fail(f"is {name!r}", "INSTRUME", nearest(name, shipped()))
         return name
     name = value if isinstance(value, str) else ""
     good = 0 < len(name) <= _LONGEST_NAME and name == name.strip() and name.isascii() and name.isprintable()
     if not good:
         advice = f"1 to {_LONGEST_NAME} printable ASCII letters, no blank at either end"
         raise place.fail(f"is {value!r}, not a name", "INSTRUME", advice)
-    return name.upper() if name.upper() in INSTRUMENTS else name
+    return name.upper() if name.upper() in shipped() else name
 
 
 def oldest_version(instrument: str, exposures: Exposures, cameras: int) -> int:
     """The oldest version of the calibration set format (CALVERS) that can hold a set."""
-    newer = instrument not in INSTRUMENTS or cameras != 4 or exposures.moving
+    newer = instrument not in shipped() or cameras != 4 or exposures.moving
     return 1 if not newer and np.isin(exposures.kind, _FIRST_KINDS).all() else 2
 
 

@@ -5,7 +5,6 @@ The scale of the throughput is a gauge unless a flux is known: the constant of c
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,7 +13,7 @@ from walop_jax.data.records import CalibrationSet, Sources
 from walop_jax.fit.model_file import Header, parse
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood import limits
-from walop_jax.model.build import adapted, nominal_instrument
+from walop_jax.model.build import adapted, as_designed, nominal_instrument
 from walop_jax.model.effects import Context, effect_by_name
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import Model, effect_context, make_model, with_effects
@@ -78,11 +77,6 @@ def instrument_of(calset: CalibrationSet) -> Instrument:
             "description, --instrument FILE or instrument=Instrument.read(FILE)"
         )
     return nominal_instrument(calset.instrument)
-
-
-def as_designed(instrument: Instrument) -> Instrument:
-    """The instrument without effects: they are added by name."""
-    return dataclasses.replace(instrument, effects=())
 
 
 def standard_names(sources: Sources) -> tuple[str, ...]:
