@@ -11,6 +11,7 @@ from typing import Any
 
 from walop_jax.data.records import CalibrationSet, Sources
 from walop_jax.fit.model_file import Header, parse
+from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood import limits
 from walop_jax.model.build import adapted, as_designed, nominal_instrument
