@@ -11,9 +11,9 @@ import pytest
 
 from walop_jax.data import builtin_filter
 from walop_jax.model import light
+from walop_jax.model.build import nominal_instrument
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.effects.base import Context
-from walop_jax.model.build import nominal_instrument
 from walop_jax.model.plan import plan_for
 from walop_jax.model.trace import Ray, Stage, trace
 

@@ -28,8 +28,8 @@ def instrument(
 ) -> None:
     """Print and check an instrument: its elements, cameras and parameters, from its description file.
 
-    The description is read, every element is made, and light is sent through it on the axis and at the edge of the field.
-    Without a name the instruments that come with the package are listed.
+    The description is read, every element is made, and light is sent through it on the axis and at the edge of the
+    field. Without a name the instruments that come with the package are listed.
     """
     from walop_jax.instruments.description import described, read_description, shipped
 

@@ -54,7 +54,7 @@ class Examination:
         rng: np.random.Generator,
         earlier: Examination | None = None,
     ) -> None:
-        """`earlier` is a examination at a smaller model, whose columns serve again where the light has hardly changed."""
+        """`earlier` is of a smaller model; its columns serve again where the light has hardly changed."""
         self.result = result
         active = result.model.effect_names
         self.design = Design.of(result)

@@ -107,8 +107,8 @@ class Unexplained:
 class Diagnosis:
     """What is missing from a model, according to one calibration set.
 
-    `candidates` are (effect, score, corrected p) in the first examination; `before` is the fit of the model given, `after`
-    that of the extended one; `remaining_p` is the significance of what is left at the end.
+    `candidates` are (effect, score, corrected p) in the first examination; `before` is the fit of the model given,
+    `after` that of the extended one; `remaining_p` is the significance of what is left at the end.
     """
 
     verdict: Outcome

@@ -148,8 +148,8 @@ class _Diagnosing:
                 self.steps.append(step)
                 self._adopt(trial.fit)
                 if self.fit is not trial.fit:
-                    after = Design.of(self.fit)
-                    self.steps[-1] = dataclasses.replace(step, **before_and_after(step.effect, examination.design, after))
+                    after = Design.of(self.fit) self.steps[-1] = dataclasses.replace(step,
+                    **before_and_after(step.effect, examination.design, after))
                 return step.effect
         return None
 

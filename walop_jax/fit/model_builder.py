@@ -33,8 +33,8 @@ def base_model(
     """The base model (docs: model) for the instrument and standards of a calibration set.
 
     `instrument` is the one as designed, needed where its name is not one that comes with the package; `plates` and
-    `throughput_degree` replace what it says. Raises `DataError` for an instrument that nobody knows, and ValueError for one
-    of another name than the set's.
+    `throughput_degree` replace what it says. Raises `DataError` for an instrument that nobody knows, and ValueError
+    for one of another name than the set's.
     """
     names = standard_names(calset.sources)
     sources = calset.sources
@@ -74,8 +74,8 @@ def instrument_of(calset: CalibrationSet) -> Instrument:
     """The instrument of a set as designed, if it comes with the package; `DataError` with advice if not."""
     if calset.instrument not in shipped():
         raise DataError(
-            f"INSTRUME is {calset.instrument!r}, which does not come with the package ({', '.join(shipped())}): give its "
-            "description, --instrument FILE or instrument=Instrument.read(FILE)"
+            f"INSTRUME is {calset.instrument!r}, which does not come with the package ({', '.join(shipped())}): give
+            its " "description, --instrument FILE or instrument=Instrument.read(FILE)"
         )
     return nominal_instrument(calset.instrument)
 
@@ -126,9 +126,9 @@ def model_without_data(
 ) -> Model:
     """The model of an instrument as designed, for no data in particular.
 
-    `instrument` is one that comes with the package, by name, or any other; `standards` are (name, q, u); `context` says
-    what effects that grow with the data need to know of them. Raises `DataError` for an unknown instrument and ValueError as
-    `model_for` does.
+    `instrument` is one that comes with the package, by name, or any other; `standards` are (name, q, u); `context`
+    says what effects that grow with the data need to know of them. Raises `DataError` for an unknown instrument and
+    ValueError as `model_for` does.
     """
     design = nominal_instrument(instrument) if isinstance(instrument, str) else as_designed(instrument)
 

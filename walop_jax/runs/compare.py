@@ -54,8 +54,9 @@ def compare_methods(
 ) -> ComparedRun:
     """Calibrate with a polynomial per point and with the joint model, judge both, and write the folder `output`.
 
-    `truth` is a table of true X, Y, M21 … M33; without it the reference is the joint model. `instrument` is a shipped one by name or a description file (default: what the sets say), `model` a TOML file
-    (default: the base model); `seed` (None: 0) is that of the stars. `progress` is told what is being done.
+    `truth` is a table of true X, Y, M21 … M33; without it the reference is the joint model. `instrument` is a shipped
+    one by name or a description file (default: what the sets say), `model` a TOML file (default: the base model);
+    `seed` (None: 0) is that of the stars. `progress` is told what is being done.
 
     Raises `DataError` for files that cannot be read or written, ValueError for a model file that does not fit, if
     the joint fit does not converge, and as `compare` does.

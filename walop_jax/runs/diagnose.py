@@ -49,8 +49,9 @@ def diagnose_sets(
     """Find what is missing from the model of calibration sets, add it, fit again, and write the folder `output`.
 
     `calibration.fits` and `summary.json` are of the extended model, `diagnosis.json` is what was found and
-    `diagnosis.fits` what figures of it need: all four appear, or none. `instrument` is a shipped one by name or a description file (default: what the sets say), `model` a TOML file (default: the base
-    model); `seed` (None: 0) is that of the Monte Carlo. `progress` is told what is being done.
+    `diagnosis.fits` what figures of it need: all four appear, or none. `instrument` is a shipped one by name or a
+    description file (default: what the sets say), `model` a TOML file (default: the base model); `seed` (None: 0) is
+    that of the Monte Carlo. `progress` is told what is being done.
 
     Raises `DataError` for files that cannot be read or written, ValueError for a model file that does not fit, and
     what `diagnose` raises.

@@ -64,7 +64,8 @@ class CheckedInstrument:
 def check_instrument(source: str | os.PathLike[str] | None = None) -> CheckedInstrument:
     """Read an instrument (a shipped one by name, or a description file) and send light through it.
 
-    Raises `DataError` for a description that is wrong, and for optics that are not finite or give more light than came in.
+    Raises `DataError` for a description that is wrong, and for optics that are not finite or give more light than
+    came in.
     """
     instrument = nominal_instrument() if source is None else Instrument.read(source)
     asked = needs(instrument)

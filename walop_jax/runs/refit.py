@@ -64,10 +64,11 @@ def refit_sets(
     """Fit all field points of calibration sets jointly, and write the folder `output`.
 
     A fit that has converged leaves `calibration.fits` and `summary.json` there, one that has not
-    `summary.failed.json` alone. `instrument` is a shipped one by name or a description file (default: what the sets say), `model` a TOML file (default: the base model); `seed` is recorded, nothing is drawn.
-    `progress` is told in a line what is being done. Of large sets: `memory` (bytes) is what their data may take;
-    finished parts are kept in `output`/partial until the end, and the same call goes on from them; `processes` share
-    the work (`likelihood.processes.join`), each making this call, and the first one writes.
+    `summary.failed.json` alone. `instrument` is a shipped one by name or a description file (default: what the sets
+    say), `model` a TOML file (default: the base model); `seed` is recorded, nothing is drawn. `progress` is told in a
+    line what is being done. Of large sets: `memory` (bytes) is what their data may take; finished parts are kept in
+    `output`/partial until the end, and the same call goes on from them; `processes` share the work
+    (`likelihood.processes.join`), each making this call, and the first one writes.
 
     Raises `DataError` for files that cannot be read or written, ValueError for a model file that does not fit, and
     what `refit` raises.

@@ -38,17 +38,18 @@ def polariser_turn(count: int = 15, *, full_turn: bool = False) -> tuple[float, 
 class ObservingPlan:
     """A calibration run: where, when, through what.
 
-    Field points are a `grid` × `grid` raster over ±`field` degrees, on which polariser and Moon sky are
-    measured, and `standard_grid` × `standard_grid` places of the standards; where the instrument's raster is a line the points
-    are `grid` steps of X from 0 to `field` (the tilts of a plate on a bench). NaN: as far out as its description says. The polariser goes through
-    `polariser_angles` (deg) for each of `filters` and each setting of the calibration plate in `plate` (deg,
-    None: out); Moon patches and standards take the settings in turn, in the first filter. The Moon is
-    observed from `mjd` (UTC) on, at `separations` (deg), the polariser before and the standards after.
+    Field points are a `grid` × `grid` raster over ±`field` degrees, on which polariser and Moon sky are measured, and
+    `standard_grid` × `standard_grid` places of the standards; where the instrument's raster is a line the points are
+    `grid` steps of X from 0 to `field` (the tilts of a plate on a bench). NaN: as far out as its description says.
+    The polariser goes through `polariser_angles` (deg) for each of `filters` and each setting of the calibration
+    plate in `plate` (deg, None: out); Moon patches and standards take the settings in turn, in the first filter. The
+    Moon is observed from `mjd` (UTC) on, at `separations` (deg), the polariser before and the standards after.
     `electrons` is the level of a camera in unpolarised light of full transparency, ahead of reflections.
 
-    `instrument` is one that comes with the package, by name, or any other; None: the first of the family. `moving` holds the positions (deg, None: out)
-    of further moving elements by the prefix of their columns: the polariser goes through its angles for every
-    combination of them, and `lamps` exposures of KIND `lamp` without it follow each time.
+    `instrument` is one that comes with the package, by name, or any other; None: the first of the family. `moving`
+    holds the positions (deg, None: out) of further moving elements by the prefix of their columns: the polariser goes
+    through its angles for every combination of them, and `lamps` exposures of KIND `lamp` without it follow each
+    time.
     """
 
     instrument: str | Instrument | None = None
@@ -153,7 +154,7 @@ class ObservingPlan:
         return {name: filter_curve(name) for name in self.filters}
 
     def _indoors(self) -> list[tuple[str, float | None, tuple[float | None, ...], float]]:
-        """Filter, calibration plate, further positions and polariser angle (NaN: out) of the exposures ahead of the sky."""
+        """Filter, calibration plate, further positions, polariser angle (NaN: out) of exposures indoors."""
         further = list(itertools.product(*self.moving.values()))
         angles = (*self.polariser_angles, *(NAN for _ in range(self.lamps)))
         return [(f, p, m, a) for f in self.filters for p in self.plate for m in further for a in angles]
