@@ -140,7 +140,7 @@ def rewrite(path, change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda h: h[0].header.set("PRODVERS", 2), "newer walop-jax"),
+        (lambda h: h[0].header.set("PRODVERS", 3), "newer walop-jax"),
         (lambda h: h[0].header.set("PRODVERS", "one"), "not a version"),
         (lambda h: h[0].header.remove("PRODVERS"), "is missing"),
         (lambda h: h[0].header.set("INSTRUME", "WALOP-SUOTH"), "WALOP-SOUTH"),

@@ -107,6 +107,18 @@ def test_polariser_and_plate_beside_further_elements(two_cameras):
     assert calset.remarks == ()
 
 
+def test_a_kind_of_the_users_own(two_cameras):
+    two_cameras.values(E, "KIND")[:2] = "DOME"
+    path = two_cameras.write()
+    with pytest.raises(DataError, match=r"\[EXPOSURES\] KIND: 'dome' is not a kind, in rows 0, 1"):
+        read_calibration_set(path)
+    calset = read_calibration_set(path, kinds=["dome"])
+    assert calset.exposures.kind[:3].tolist() == ["dome", "dome", "lamp"]
+    write_calibration_set(two_cameras.folder / "again.fits", calset)
+    equal(calset, read_calibration_set(two_cameras.folder / "again.fits", kinds=["dome"]))
+    assert inspect(calset).kinds == {"dome": 2, "lamp": 4, "standard": 2}
+
+
 def test_any_field_of_another_instrument(two_cameras):
     two_cameras.values(P, "X")[:] = [-90.0, 0.0, 90.0]
     assert read_calibration_set(two_cameras.write()).points.x.tolist() == [-90.0, 0.0, 90.0]

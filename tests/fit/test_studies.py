@@ -19,9 +19,10 @@ import pytest
 from walop_jax.calibration.matrix import Settings, matrices
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.levenberg import minimise
+from walop_jax.fit.minimise import minimise
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit, refit
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import full_values
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
@@ -120,8 +121,8 @@ def test_three_small_runs():
 # ----------------------------------------------------------------------------------------- exact properties
 
 
-def at_truth(calset: CalibrationSet, truth: Instrument) -> Problem:
-    """A problem whose priors are centred on the truth, so that the truth is its exact minimum."""
+def at_truth(calset: CalibrationSet, truth: Instrument) -> Likelihood:
+    """A likelihood whose priors are centred on the truth, so that the truth is its exact minimum."""
     model = base_model(calset)
     values = full_values(truth)
     for name, value in zip(model.names, values, strict=True):
@@ -129,21 +130,21 @@ def at_truth(calset: CalibrationSet, truth: Instrument) -> Problem:
         if prior is not None:
             model = model.change(name, prior=(float(value), prior[1]))
         model = model.change(name, loose=None)
-    return Problem(calset, model)
+    return Likelihood.of(calset, model)
 
 
 def test_noiseless_data_return_the_truth():
     calset, truth = simulate(SMALL, 4, noiseless=True)
-    problem = at_truth(calset, truth)
-    model, true = problem.model, full_values(truth)
+    likelihood = at_truth(calset, truth)
+    model, true = likelihood.model, full_values(truth)
     scale = np.array([p.scale for p in model.parameters])
     # A fit stops when what is left is far below the errors; followed to the end, nothing is left.
-    result = fit(problem)
+    result = fit(likelihood)
     assert result.converged
     np.testing.assert_allclose((result.values - true) / scale, 0.0, atol=1e-5)
     free = model.free
     to_the_end = minimise(
-        lambda x: problem.expand(model.full(x)), result.values[free], scale[free], tolerance=1e-10
+        lambda x, _: likelihood.expand(model.full(x)), result.values[free], scale[free], tolerance=1e-10
     )
     np.testing.assert_allclose((model.full(to_the_end.x) - true) / scale, 0.0, atol=1e-8)
 
@@ -170,7 +171,7 @@ def test_twice_the_data_halve_the_covariance():
         model = base_model(data)
         for name in model.names:
             model = model.change(name, prior=None, loose=None)
-        information.append(Problem(data, model).expand(full_values(truth)).matrix)
+        information.append(Likelihood.of(data, model).expand(full_values(truth)).matrix)
     np.testing.assert_allclose(
         information[1], 2.0 * information[0], rtol=1e-9, atol=1e-9 * information[0].max()
     )

@@ -14,8 +14,8 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data import DataError, read_calibration_set
 from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.user_tables import read_input_table
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import refit
-from walop_jax.likelihood.problem import Problem, base_model
 from walop_jax.paper import comparison
 from walop_jax.paper import polynomial as paper
 from walop_jax.science import star_errors as accuracy
@@ -184,7 +184,7 @@ def fitted():
         if path not in done:
             calset = read_calibration_set(path)
             model = base_model(calset)
-            done[path] = calset, Calibration.from_fit(refit(calset, model), Problem(calset, model))
+            done[path] = calset, Calibration.from_fit(refit(calset, model))
         return done[path]
 
     return fit

@@ -14,8 +14,8 @@ from walop_jax.calibration.matrix import Settings
 from walop_jax.data import DataError
 from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.user_tables import read_input_table
-from walop_jax.model.effects import effect_by_name
 from walop_jax.model.build import nominal_instrument
+from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, make_model, with_effects
 from walop_jax.science.apply import apply, linearised, not_carried_over
 from walop_jax.simulation.simulate import simulate

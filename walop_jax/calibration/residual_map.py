@@ -18,12 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from walop_jax.calibration.records import RESIDUAL_NAMES, ResidualMap
+from walop_jax.calibration.records import ResidualMap, residual_names
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import Exposures
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import engine, limits
-from walop_jax.likelihood.expansion import Census
+from walop_jax.likelihood.expansion import Census, Posterior
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.nodes import Nodes
 from walop_jax.likelihood.runner import SlabSums
 from walop_jax.model import light
@@ -33,8 +34,9 @@ from walop_jax.model.plan import Plan
 
 Vector = Float[np.ndarray, " n"]
 
-_UPPER = np.triu_indices(len(RESIDUAL_NAMES))
-_NUMBERS = 2 + len(RESIDUAL_NAMES) + len(_UPPER[0])  # χ², degrees of freedom, Σ A r, upper half of Σ A P Aᵀ
+_QUANTITIES = residual_names(2)
+_UPPER = np.triu_indices(len(_QUANTITIES))
+_NUMBERS = 2 + len(_QUANTITIES) + len(_UPPER[0])  # χ², degrees of freedom, Σ A r, upper half of Σ A P Aᵀ
 
 
 def _point_sums(
@@ -112,10 +114,15 @@ def _chosen(e: Exposures) -> tuple[str, float, Bool[np.ndarray, " e"]]:
 
 def residual_map(result: FitResult) -> ResidualMap:
     """The map of what a fit leaves: one more pass over the points."""
-    likelihood, instrument = result.likelihood, result.model.instrument(result.values)
-    nodes, _ = likelihood.nodes(instrument, result.posterior)
-    filter_name, chwp_angle, chosen = _chosen(result.calset.exposures)
-    grid = cells_for(likelihood.layout.points, result.posterior.census)
+    return residual_map_at(result.likelihood, result.values, result.posterior)
+
+
+def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | None = None) -> ResidualMap:
+    """As `residual_map`, at any full vector of parameter values; `near` is an expansion at similar ones."""
+    instrument = likelihood.model.instrument(values)
+    nodes, _ = likelihood.nodes(instrument, near)
+    filter_name, chwp_angle, chosen = _chosen(likelihood.calset.exposures)
+    grid = cells_for(likelihood.layout.points, likelihood.census if near is None else near.census)
     count = grid.width * grid.height
 
     def work(number: int) -> SlabSums:
@@ -130,7 +137,7 @@ def residual_map(result: FitResult) -> ResidualMap:
 
     total = likelihood.runner.total("residual map", None, work, likelihood.layout)
     total = total.sums.reshape(_NUMBERS, count)
-    n = len(RESIDUAL_NAMES)
+    n = len(_QUANTITIES)
     matrix = np.zeros((count, n, n))
     matrix[:, _UPPER[0], _UPPER[1]] = matrix[:, _UPPER[1], _UPPER[0]] = total[2 + n :].T
     size = np.sqrt(np.diagonal(matrix, axis1=1, axis2=2))

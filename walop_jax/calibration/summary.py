@@ -44,7 +44,7 @@ def summary(
         "versions": software_versions(),
         "inputs": [{"path": str(entry.path), "sha256": entry.sha256} for entry in result.calset.inputs],
         "trusted": result.trusted,
-        "quality": quality(result),
+        "quality": int(quality(result)),
         "warnings": list(result.warnings),
         "instrument": result.model.name,
         "effects": list(result.model.effect_names),

@@ -24,6 +24,7 @@ COMMANDS = (
     "epoch",
     "report",
     "model",
+    "instrument",
     "import-zemax",
     "trace",
     "cite",

@@ -5,7 +5,6 @@ gone afterwards: inside the package a number has the unit that the record's docs
 """
 
 from walop_jax.data.calset import empty_sources, read_calibration_set, with_builtins
-from walop_jax.data.checks import INSTRUMENTS
 from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter
 from walop_jax.data.frames import FrameIntensities, Grid
 from walop_jax.data.merge import JoinedIntensities, merge_calibration_sets
@@ -34,7 +33,6 @@ __all__ = [
     "BUILTIN_FILTERS",
     "CALVERS",
     "DEFAULT_FILTER",
-    "INSTRUMENTS",
     "KINDS",
     "Block",
     "CalibrationSet",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from walop_jax.data.filters import builtin_filter
 from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
 from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.records import (
+    KINDS,
     CalibrationSet,
     Exposures,
     FilterCurve,
@@ -39,11 +41,12 @@ _IMAGE = re.compile(r"[NE](0|[1-9][0-9]{0,2})")  # of one camera: counts or erro
 _SAMPLE = 8  # image rows looked at when frames are opened; every block is checked again as it is read
 
 
-def read_calibration_set(*paths: str | os.PathLike[str]) -> CalibrationSet:
+def read_calibration_set(*paths: str | os.PathLike[str], kinds: Collection[str] = ()) -> CalibrationSet:
     """Read and check one calibration set, merging several files into one.
 
     Whole frames are not read, only described; their blocks are checked as they are read. What was odd but
-    harmless (unknown columns, masked rows, …) stands in `remarks`.
+    harmless (unknown columns, masked rows, …) stands in `remarks`. `kinds` are kinds of exposures beyond `KINDS`
+    that sets of version 2 may have, for sources of the caller's own.
 
     Raises `DataError` that names file, extension, column and row for anything that cannot be trusted.
     """
@@ -51,7 +54,7 @@ def read_calibration_set(*paths: str | os.PathLike[str]) -> CalibrationSet:
         raise fail("no file was given", advice="name at least one calibration set")
     sets: list[CalibrationSet] = []
     for path in paths:
-        one = _read_one(Path(path))
+        one = _read_one(Path(path), (*KINDS, *kinds))
         known = {entry.inputs[0].sha256: entry.inputs[0].path for entry in sets}
         if one.inputs[0].sha256 in known:
             raise fail(
@@ -63,10 +66,10 @@ def read_calibration_set(*paths: str | os.PathLike[str]) -> CalibrationSet:
     return sets[0] if len(sets) == 1 else merge_calibration_sets(*sets)
 
 
-def _read_one(path: Path) -> CalibrationSet:
+def _read_one(path: Path, kinds: Collection[str]) -> CalibrationSet:
     with open_fits(path) as opened:
         try:
-            return _from_hdus(opened)
+            return _from_hdus(opened, kinds)
         except DataError:
             raise
         except UNREADABLE as error:
@@ -75,7 +78,7 @@ def _read_one(path: Path) -> CalibrationSet:
             ) from error
 
 
-def _from_hdus(opened: OpenFile) -> CalibrationSet:
+def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
     path, remarks = opened.path, list(opened.remarks)
     primary = opened.hdus[0].header
     version, instrument, site = _header(primary, path)
@@ -91,7 +94,8 @@ def _from_hdus(opened: OpenFile) -> CalibrationSet:
         return columns
 
     filters = make_filters(table("FILTERS"), Place(path, "FILTERS")) if "FILTERS" in tables else {}
-    exposures = make_exposures(table("EXPOSURES"), filters, site, Place(path, "EXPOSURES"), version)
+    place = Place(path, "EXPOSURES")
+    exposures = make_exposures(table("EXPOSURES"), filters, site, place, version=version, kinds=kinds)
     sources = (
         make_sources(table("SOURCES"), Place(path, "SOURCES")) if "SOURCES" in tables else empty_sources()
     )

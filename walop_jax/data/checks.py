@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,17 +10,12 @@ import numpy as np
 from walop_jax.data.filters import BUILTIN_FILTERS
 from walop_jax.data.records import KINDS, Exposures, FilterCurve, Points, Site, Sources
 from walop_jax.data.schema import Place
+from walop_jax.instruments.description import described, shipped
 from walop_jax.io.errors import nearest, rows_text
-
-INSTRUMENTS = ("WALOP-SOUTH", "WALOP-NORTH", "WALOP-LAB")
-"""Values of INSTRUME that a calibration set of version 1 may have; from version 2 on any name will do."""
-
-FIELD_LIMITS = {"WALOP-SOUTH": 0.35, "WALOP-NORTH": 0.35, "WALOP-LAB": 45.0}
-"""Largest |X|, |Y| in degrees; on the laboratory bench X is the tilt of the plate."""
 
 _ANY_FIELD = 90.0  # deg
 _LONGEST_NAME = 32
-_SECOND_VERSION_KINDS = ("lamp",)
+_FIRST_KINDS = ("clp", "moon", "standard", "flux")  # of version 1
 
 EPHEMERIS_MJD = (15020.0, 88069.0)
 """Where astropy's built-in ephemeris (ERFA `moon98`, the years 1900 to 2100) is meant to be used."""
@@ -42,37 +37,32 @@ def unique(ids: np.ndarray, column: str, place: Place) -> None:
 
 def field_limit(instrument: str) -> float:
     """Largest |X|, |Y| in degrees that a field point of an instrument may have."""
-    return FIELD_LIMITS.get(instrument, _ANY_FIELD)
+    return described(instrument).field_limit if instrument in shipped() else _ANY_FIELD
 
 
 def instrument_name(value: object, version: int, place: Place) -> str:
-    """Check INSTRUME, in which the names of `INSTRUMENTS` know no upper and lower case.
+    """Check INSTRUME, in which the names of shipped instruments know no upper and lower case, and return it.
 
     Raises `DataError` for another name in version 1; from version 2 on for one that is empty, longer than 32
     letters, begins or ends with a blank, or is not printable ASCII.
     """
     if version == 1:
         name = str(value).strip().upper()
-        if name not in INSTRUMENTS:
-            raise place.fail(f"is {name!r}", "INSTRUME", nearest(name, INSTRUMENTS))
+        if name not in shipped():
+            raise place.fail(f"is {name!r}", "INSTRUME", nearest(name, shipped()))
         return name
     name = value if isinstance(value, str) else ""
-    if not is_instrument_name(name):
+    good = 0 < len(name) <= _LONGEST_NAME and name == name.strip() and name.isascii() and name.isprintable()
+    if not good:
         advice = f"1 to {_LONGEST_NAME} printable ASCII letters, no blank at either end"
         raise place.fail(f"is {value!r}, not a name", "INSTRUME", advice)
-    return name.upper() if name.upper() in INSTRUMENTS else name
-
-
-def is_instrument_name(name: str) -> bool:
-    """Whether a calibration set may have this INSTRUME (from version 2 on)."""
-    short = 0 < len(name) <= _LONGEST_NAME
-    return short and name == name.strip() and name.isascii() and name.isprintable()
+    return name.upper() if name.upper() in shipped() else name
 
 
 def oldest_version(instrument: str, exposures: Exposures, cameras: int) -> int:
     """The oldest version of the calibration set format (CALVERS) that can hold a set."""
-    newer = instrument not in INSTRUMENTS or cameras != 4 or exposures.moving
-    return 2 if newer or np.isin(exposures.kind, _SECOND_VERSION_KINDS).any() else 1
+    newer = instrument not in shipped() or cameras != 4 or exposures.moving
+    return 1 if not newer and np.isin(exposures.kind, _FIRST_KINDS).all() else 2
 
 
 def make_points(table: dict[str, Any], instrument: str, place: Place) -> Points:
@@ -152,12 +142,22 @@ def make_sources(table: dict[str, Any], place: Place) -> Sources:
 
 
 def make_exposures(
-    table: dict[str, Any], filters: Mapping[str, FilterCurve], site: Site, place: Place, version: int = 1
+    table: dict[str, Any],
+    filters: Mapping[str, FilterCurve],
+    site: Site,
+    place: Place,
+    *,
+    version: int = 1,
+    kinds: Collection[str] | None = KINDS,
 ) -> Exposures:
-    """Check the EXPOSURES table (degrees, days, kelvin, …) of a CALVERS `version` for what every KIND needs."""
+    """Check the EXPOSURES table (degrees, days, kelvin, …) of a CALVERS `version` for what every KIND needs.
+
+    `kinds` are those that KIND may have, None: any.
+    """
     unique(table["EXPOSURE"], "EXPOSURE", place)
     table["KIND"] = kind = np.char.lower(table["KIND"])
-    _kinds(kind, version, place)
+    if kinds is not None:
+        _kinds(kind, kinds, version, place)
     known = {*filters, *BUILTIN_FILTERS}
     for name in np.unique(table["FILTER"]).tolist():
         if name not in known:
@@ -199,10 +199,10 @@ def make_exposures(
     return Exposures.from_columns(table)
 
 
-def _kinds(kind: np.ndarray, version: int, place: Place) -> None:
-    known = [name for name in KINDS if version > 1 or name not in _SECOND_VERSION_KINDS]
+def _kinds(kind: np.ndarray, kinds: Collection[str], version: int, place: Place) -> None:
+    known = [name for name in kinds if version > 1 or name in _FIRST_KINDS]
     for name in np.unique(kind).tolist():
-        if name not in KINDS:
+        if name not in kinds:
             refuse(kind == name, f"{name!r} is not a kind,", "KIND", nearest(name, known), place)
         if name not in known:
             what = f"{name!r} is a kind of CALVERS 2, this is {version},"

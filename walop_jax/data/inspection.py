@@ -9,9 +9,10 @@ from typing import Literal
 
 import numpy as np
 
-from walop_jax.data.checks import INSTRUMENTS, like_radians
+from walop_jax.data.checks import like_radians
 from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, CalibrationSet, DataFlag, Exposures
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.instruments.description import shipped
 
 Severity = Literal["fault", "doubt", "note"]
 
@@ -201,7 +202,7 @@ def _findings(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
         yield from _about_angles(calset, made)
     if made.points < 2:
         # What another instrument needs its own description says.
-        severity = "fault" if calset.instrument in INSTRUMENTS else "note"
+        severity = "fault" if calset.instrument in shipped() else "note"
         yield Finding(severity, "a single field point", "a joint fit over the field needs several")
     elif made.points < _FEW_POINTS:
         yield Finding(

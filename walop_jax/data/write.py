@@ -11,7 +11,7 @@ import numpy as np
 from astropy.io import fits
 
 from walop_jax.data import schema
-from walop_jax.data.checks import is_instrument_name, oldest_version
+from walop_jax.data.checks import instrument_name, oldest_version
 from walop_jax.data.frames import Grid, count_names, error_names
 from walop_jax.data.records import CalibrationSet, DataFlag, Exposures, FilterCurve
 from walop_jax.data.table_intensities import TableIntensities
@@ -54,14 +54,7 @@ def _head(calset: CalibrationSet, path: object) -> list[Any]:
     primary = fits.PrimaryHDU()
     site = calset.site
     version = oldest_version(calset.instrument, calset.exposures, calset.cameras)
-    if not is_instrument_name(calset.instrument):
-        raise fail(
-            f"{calset.instrument!r} is not 1 to 32 printable ASCII letters without blanks at the ends",
-            file=path,
-            extension="PRIMARY",
-            column="INSTRUME",
-            advice="give the instrument another name",
-        )
+    instrument_name(calset.instrument, version, schema.Place(path, "PRIMARY"))
     if calset.cameras < 2:
         raise fail(f"{calset.cameras} camera", file=path, advice="a calibration set needs two at least")
     cards = {

@@ -26,12 +26,12 @@ from jaxtyping import Float
 
 from walop_jax.data import schema
 from walop_jax.data.calset import empty_sources
-from walop_jax.data.checks import INSTRUMENTS, make_exposures, make_filters, make_points
-from walop_jax.data.records import CalibrationSet, DataFlag
+from walop_jax.data.checks import make_exposures, make_filters, make_points
+from walop_jax.data.records import CalibrationSet, DataFlag, Site
 from walop_jax.data.schema import Place
-from walop_jax.data.sites import SITES
 from walop_jax.data.table_intensities import table_intensities
 from walop_jax.data.zemax_text import HEADING, TransmissionExport, read_export
+from walop_jax.instruments.description import described, shipped
 from walop_jax.io.errors import fail, nearest
 
 CAMERA_CONFIGURATIONS = (1, 3, 2, 4)
@@ -142,14 +142,14 @@ def _instrument(
 ) -> str:
     """The instrument that was asked for, or the one that all titles name."""
     titles = sorted({export.title for export in exports})
-    named = {name for title in titles for name in INSTRUMENTS if name in title.upper()}
+    named = {name for title in titles for name in shipped() if name in title.upper()}
     if wanted is None and len(named) == 1:
         return named.pop()
     if wanted is None:
         raise fail(f"the titles name {len(named)} instruments ({', '.join(titles)})", file=folder,
-                   advice=f"say which it is: --instrument {' or '.join(INSTRUMENTS)}")  # fmt: skip
-    if wanted.upper() not in INSTRUMENTS:
-        raise fail(f"there is no instrument {wanted!r}", advice=nearest(wanted, INSTRUMENTS))
+                   advice=f"say which it is: --instrument {' or '.join(shipped())}")  # fmt: skip
+    if wanted.upper() not in shipped():
+        raise fail(f"there is no instrument {wanted!r}", advice=nearest(wanted, shipped()))
     if named - {wanted.upper()}:
         remarks.append(
             f"{folder}: the titles name {', '.join(sorted(named))}, {wanted.upper()} was asked for"
@@ -201,7 +201,7 @@ def _calibration_set(
 ) -> CalibrationSet:
     """Put the tables through the checks of any calibration set."""
     names = np.array([f"MONO-{1e4 * value:.0f}" for value in wavelength])
-    n, site = len(names), SITES[instrument]
+    n, site = len(names), Site(*described(instrument).place[:4])
     nothing = np.full(n, np.nan)
     clp_in = np.isfinite(angle)
     curve, first = np.unique(names, return_index=True)

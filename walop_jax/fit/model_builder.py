@@ -5,16 +5,16 @@ The scale of the throughput is a gauge unless a flux is known: the constant of c
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from walop_jax.data.records import CalibrationSet, Sources
 from walop_jax.fit.model_file import Header, parse
+from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood import limits
-from walop_jax.model.build import adapted, nominal_instrument
+from walop_jax.model.build import adapted, as_designed, nominal_instrument
 from walop_jax.model.effects import Context, effect_by_name
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import Model, effect_context, make_model, with_effects
@@ -33,8 +33,8 @@ def base_model(
     """The base model (docs: model) for the instrument and standards of a calibration set.
 
     `instrument` is the one as designed, needed where its name is not one that comes with the package; `plates` and
-    `throughput_degree` replace what it says. Raises `DataError` for an instrument that nobody knows, and ValueError for one
-    of another name than the set's.
+    `throughput_degree` replace what it says. Raises `DataError` for an instrument that nobody knows, and ValueError
+    for one of another name than the set's.
     """
     names = standard_names(calset.sources)
     sources = calset.sources
@@ -74,15 +74,10 @@ def instrument_of(calset: CalibrationSet) -> Instrument:
     """The instrument of a set as designed, if it comes with the package; `DataError` with advice if not."""
     if calset.instrument not in shipped():
         raise DataError(
-            f"INSTRUME is {calset.instrument!r}, which does not come with the package ({', '.join(shipped())}): give its "
-            "description, --instrument FILE or instrument=Instrument.read(FILE)"
+            f"INSTRUME is {calset.instrument!r}, which does not come with the package ({', '.join(shipped())}): give "
+            "its description, --instrument FILE or instrument=Instrument.read(FILE)"
         )
     return nominal_instrument(calset.instrument)
-
-
-def as_designed(instrument: Instrument) -> Instrument:
-    """The instrument without effects: they are added by name."""
-    return dataclasses.replace(instrument, effects=())
 
 
 def standard_names(sources: Sources) -> tuple[str, ...]:
@@ -131,9 +126,9 @@ def model_without_data(
 ) -> Model:
     """The model of an instrument as designed, for no data in particular.
 
-    `instrument` is one that comes with the package, by name, or any other; `standards` are (name, q, u); `context` says
-    what effects that grow with the data need to know of them. Raises `DataError` for an unknown instrument and ValueError as
-    `model_for` does.
+    `instrument` is one that comes with the package, by name, or any other; `standards` are (name, q, u); `context`
+    says what effects that grow with the data need to know of them. Raises `DataError` for an unknown instrument and
+    ValueError as `model_for` does.
     """
     design = nominal_instrument(instrument) if isinstance(instrument, str) else as_designed(instrument)
 

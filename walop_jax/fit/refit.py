@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.data.records import CalibrationSet
+from walop_jax.fit.minimise import Minimum
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.model_file import render
 from walop_jax.fit.search import find_minimum, free_scales
-from walop_jax.fit.solver import Minimum
 from walop_jax.io.software import software_versions
 from walop_jax.likelihood.expansion import Posterior
 from walop_jax.likelihood.journal import Journal, fingerprint
@@ -211,7 +211,9 @@ def refit(
     model, crew = model or base_model(calset), processes or Processes()
     journal = None if folder is None else _journal(Path(folder), calset, model, crew)
     runner = Runner(processes=crew, progress=progress, journal=journal)
-    return fit(Likelihood.of(calset, model, memory=memory, runner=runner))
+    likelihood = Likelihood.of(calset, model, memory=memory, runner=runner)
+    runner.tell(f"preparing the fit; data will take {likelihood.layout.memory / 1e9:.2g} GB")
+    return fit(likelihood)
 
 
 def _journal(folder: Path, calset: CalibrationSet, model: Model, processes: Processes) -> Journal | None:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.fit.solver import Minimum, Request, WhenStale, minimise
+from walop_jax.fit.minimise import Minimum, minimise
+from walop_jax.fit.solver import Request, WhenStale
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.expansion import Posterior
 from walop_jax.likelihood.likelihood import Likelihood

@@ -23,6 +23,7 @@ Table = Mapping[str, Any]
 
 KEYS = (
     "name",
+    "default",
     "like",
     "about",
     "source",
@@ -37,7 +38,8 @@ KEYS = (
 REQUIRED = ("name", "path", "field", "cameras", "throughput", "elements", "arms")
 NUMBER_KEYS = ("value", "sigma", "unit", "source", "name", "scale", "loose")
 SITE_KEYS = ("telescope", "latitude", "longitude", "elevation", "full_moon")
-FIELD_KEYS = ("limit", "scale")
+FIELD_KEYS = ("limit", "scale", "raster", "edge")
+RASTERS = ("square", "line")
 THROUGHPUT_KEYS = ("degree", "level", "scale", "loose")
 
 
@@ -81,7 +83,10 @@ class ArmText:
 
 @dataclasses.dataclass(frozen=True)
 class Description:
-    """An instrument as described; `path` names the elements ahead of the arms in the order light meets them."""
+    """An instrument as described; `path` names the elements ahead of the arms in the order light meets them.
+
+    `field_limit`, `field_scale` and `edge` in degrees; `raster` is how the field points of a simulated run lie.
+    """
 
     name: str
     about: str
@@ -95,7 +100,16 @@ class Description:
     throughput_degree: int
     throughput: Given
     site: Mapping[str, Any]
+    raster: str = "square"
+    edge: float = 0.0
+    default: bool = False
     text: str = ""
+
+    @property
+    def place(self) -> tuple[str, float, float, float, float]:
+        """Telescope, latitude and longitude (deg, east positive), elevation (m), MJD of a full Moon; NaN: not said."""
+        latitude, longitude, elevation, moon = (float(self.site.get(key, math.nan)) for key in SITE_KEYS[1:])
+        return str(self.site.get("telescope", "")), latitude, longitude, elevation, moon
 
 
 # ------------------------------------------------------------------------------------------------ shipped ones
@@ -106,6 +120,12 @@ def shipped() -> tuple[str, ...]:
     """Names of the instruments that come with the package."""
     folder = resources.files("walop_jax.instruments")
     return tuple(sorted(file.name[:-5] for file in folder.iterdir() if file.name.endswith(".toml")))
+
+
+@functools.cache
+def default_name() -> str:
+    """The shipped instrument that is meant where none is named."""
+    return next(name for name in shipped() if described(name).default)
 
 
 @functools.cache
@@ -312,6 +332,9 @@ class _Reader:
             raise self.fault("throughput", f"degree = {degree!r} must be a whole number from 0 to 12")
         level = self.float(series.get("level", 0.5), "level", "throughput")
         path = tuple(self.words(table["path"], "path", "")) if table["path"] else ()
+        raster = field.get("raster", RASTERS[0])
+        if raster not in RASTERS:
+            raise self.fault("field", f"raster = {raster!r} must be {' or '.join(RASTERS)}")
         arms = tuple(self.arm(name, entry) for name, entry in self.table(table, "arms").items())
         if not arms:
             raise self.fault("arms", "needs one arm at least")
@@ -333,5 +356,8 @@ class _Reader:
                 loose=self.float(series.get("loose", 0.5), "loose", "throughput"),
             ),
             site=dict(site),
+            raster=raster,
+            edge=self.float(field.get("edge", 0.0), "edge", "field"),
+            default=table.get("default") is True and "default" in text,
             text=text,
         )

@@ -217,7 +217,7 @@ class Likelihood:
 
     @property
     def dof(self) -> int:
-        """Per used row one less than cameras (all of them when the flux is known), one per prior, minus the free parameters."""
+        """Per used row one less than cameras (all where the flux is known), one per prior, less the free parameters."""
         return self._degrees_of_freedom(self.census)
 
     @cached_property

@@ -9,7 +9,15 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from walop_jax.instruments.description import ArmText, Description, ElementText, Given, described, shipped
+from walop_jax.instruments.description import (
+    ArmText,
+    Description,
+    ElementText,
+    Given,
+    default_name,
+    described,
+    shipped,
+)
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.model import legendre, materials
 from walop_jax.model.cameras import Cameras, Throughput
@@ -51,6 +59,8 @@ def build(description: Description, *, elements: Sequence[type[Element]] = (), *
         cameras=_cameras(description, arms),
         path=description.path,
         field_limit=description.field_limit,
+        site=description.place,
+        raster=(description.raster, description.edge),
         description="" if description.name in shipped() else description.text,
     )
     return adapted(instrument, **options)
@@ -87,9 +97,14 @@ def adapted(
     )
 
 
-def nominal_instrument(name: str = "WALOP-SOUTH", **options: Any) -> Instrument:
-    """A shipped instrument as designed; options as for `build`."""
-    return build(described(name), **options)
+def as_designed(instrument: Instrument) -> Instrument:
+    """The instrument without effects: they are added by name."""
+    return dataclasses.replace(instrument, effects=())
+
+
+def nominal_instrument(name: str | None = None, **options: Any) -> Instrument:
+    """A shipped instrument as designed (default: the first of the family); options as for `build`."""
+    return build(described(name or default_name()), **options)
 
 
 def sources() -> tuple[Source, ...]:

@@ -28,6 +28,10 @@ Scalar = Float[Array, ""]
 Any_ = TypeVar("Any_", bound=Component)
 
 
+NAN = float("nan")
+NO_SITE = ("", NAN, NAN, NAN, NAN)
+
+
 class NoSuchPlaceError(ValueError):
     """An effect asks for an element that this instrument does not have."""
 
@@ -66,8 +70,9 @@ class Instrument(Component):
     """Everything that is fitted. `path` names the elements ahead of the arms in the order light meets them.
 
     `rotator_zero` (deg) is added to ROTATOR, `filter_shift` (µm) displaces broad bands; None: there is none. Field
-    coordinates reach to ±`field_limit` (deg). `description` is the text it was described in, empty for an
-    instrument that comes with the package.
+    coordinates reach to ±`field_limit` (deg); `site` is telescope, latitude and longitude (deg, east positive),
+    elevation (m) and MJD of a full Moon, `raster` how the points of a simulated run lie, and how far out (deg).
+    `description` is the text it was described in, empty for an instrument that comes with the package.
     """
 
     name: str = eqx.field(static=True)
@@ -81,6 +86,8 @@ class Instrument(Component):
     rotator_zero: Scalar | None = number(unit="deg", about="true ROTATOR minus the header's", default=None)
     filter_shift: Scalar | None = number(unit="um", about="displacement of broad bands", default=None)
     field_limit: float = eqx.field(static=True, default=90.0)
+    site: tuple[str, float, float, float, float] = eqx.field(static=True, default=NO_SITE)
+    raster: tuple[str, float] = eqx.field(static=True, default=("square", 0.0))
     description: str = eqx.field(static=True, default="", repr=False)
 
     @classmethod

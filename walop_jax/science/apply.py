@@ -18,6 +18,7 @@ from walop_jax.calibration.analysis_vectors import COLOURS, AnalysisVectors, Set
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.field_series import COOLEST, colour_weights
 from walop_jax.calibration.matrix import Settings
+from walop_jax.calibration.records import Quality
 from walop_jax.data.catalogue import Catalogue
 from walop_jax.io.errors import DataError
 from walop_jax.model import carried, light
@@ -41,7 +42,7 @@ class Stars:
     On the sky (equatorial frame) where the catalogue has a ROTATOR, in the instrument frame elsewhere;
     `covariance` is `photon` plus `calibration`. `colour` is the error of (q, u) if the colour of the star were
     ignored; where TEFF is not known, half the difference between stars of 3500 K and 10 000 K, which is not
-    in the covariance. `flag` holds `QUALITY_BITS`; `rows` counts the rows of a star.
+    in the covariance. `flag` holds bits of `Quality`; `rows` counts the rows of a star.
     """
 
     qu: Float[np.ndarray, "s 2"]
@@ -233,13 +234,13 @@ def _flags(
     settings = Settings(*(getattr(points, f.name)[rows] for f in dataclasses.fields(Settings)))
     square = np.tile([0.0, 1.0, 0.0, 0.0, 0.0, 1.0], (len(rows), 1))  # 16 is decided below, for all rows
     bits = vectors.calibration.flags(points.x[rows], points.y[rows], settings, square)
-    bits[_outside(vectors, catalogue, rows)] |= 32
-    bits[settings.teff < COOLEST] |= 64
-    bits[~np.isfinite(counts * catalogue.sigma[rows]).all(axis=1)] |= 128
-    bits[catalogue.spoilt[rows]] |= 256
+    bits[_outside(vectors, catalogue, rows)] |= Quality.BEYOND_FIELD
+    bits[settings.teff < COOLEST] |= Quality.BEYOND_SETTINGS
+    bits[~np.isfinite(counts * catalogue.sigma[rows]).all(axis=1)] |= Quality.CAMERA_MISSING
+    bits[catalogue.spoilt[rows]] |= Quality.SATURATED
     flag = np.bitwise_or.reduceat(bits, first) | vectors.calibration.verdict.quality
-    flag[~(condition < ILL_POSED)] |= 16
-    flag[~np.isfinite(qu).all(axis=1)] |= 16384
+    flag[~(condition < ILL_POSED)] |= Quality.HIGH_CROSSTALK
+    flag[~np.isfinite(qu).all(axis=1)] |= Quality.NO_STOKES
     return flag
 
 

@@ -21,7 +21,7 @@ from walop_jax.likelihood import engine
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.noise import PhotonNoise
 from walop_jax.model import legendre, light
-from walop_jax.model.build import nominal_instrument
+from walop_jax.model.build import adapted
 from walop_jax.model.compiled import compiled
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects import in_order
@@ -35,6 +35,7 @@ from walop_jax.simulation.observing_plan import ObservingPlan
 
 Cube = Float[np.ndarray, "p e k"]
 
+LEVEL = 0.5
 LEVEL_SCATTER = 0.03  # of the cameras' throughput around 0.5
 STRUCTURE = 0.02  # rms over the field, relative
 TRANSPARENCY = (0.7, 1.0)
@@ -127,8 +128,8 @@ def simulate(
     build, stars, sky, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
     sources, standards = _catalogue(plan, stars)
     if instrument is None:
-        nominal = nominal_instrument(plan.instrument, throughput_degree=plan.throughput_degree)
-        instrument = draw_instrument(make_model(plan.instrument, nominal), build)
+        nominal = adapted(plan.design, throughput_degree=plan.throughput_degree, throughput=LEVEL)
+        instrument = draw_instrument(make_model(plan.name, nominal), build)
     active = in_order((*instrument.effects, *effects))
     truth = make_template(dataclasses.replace(instrument.with_source(standards), effects=active))
     blank = _blank(plan, sources, seed, len(truth.cameras))
@@ -150,7 +151,7 @@ def _blank(plan: ObservingPlan, sources: Sources, seed: int, cameras: int) -> Ca
     ones = np.ones((*used.shape, cameras))
     block = Block(x=points.x, y=points.y, counts=ones, sigma=ones, used=used, source=source)
     return CalibrationSet(
-        instrument=plan.instrument,
+        instrument=plan.name,
         site=plan.site,
         origin=f"walop-jax simulate, seed {seed}",
         exposures=plan.exposures(),
