@@ -10,7 +10,6 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data import read_calibration_set
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.refit import FitResult, refit
-from walop_jax.likelihood.problem import Problem, base_model
 
 
 class SouthFit(NamedTuple):
@@ -24,6 +23,5 @@ class SouthFit(NamedTuple):
     def of(cls, south: SouthSet) -> SouthFit:
         """Fit the base model, which is complete for the sets a and b."""
         calset = read_calibration_set(south.path)
-        model = base_model(calset)
-        result = refit(calset, model)
-        return cls(calset, result, Calibration.from_fit(result, Problem(calset, model)))
+        result = refit(calset)
+        return cls(calset, result, Calibration.from_fit(result))
