@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import refit
-from walop_jax.likelihood.problem import Problem, base_model
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -28,4 +28,4 @@ def calset():
 @pytest.fixture(scope="session")
 def calibration(calset) -> Calibration:
     model = base_model(calset)
-    return Calibration.from_fit(refit(calset, model), Problem(calset, model))
+    return Calibration.from_fit(refit(calset, model))

@@ -27,8 +27,9 @@ from walop_jax.diagnosis.examination import ALARM, Examination
 from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, Measured
 from walop_jax.diagnosis.score import Candidate, Scorer, ScoreSpace, separations, whitening
 from walop_jax.diagnosis.workflow import MOST_STEPS
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS
 from walop_jax.model.specification import effect_context
 
@@ -71,7 +72,7 @@ class Verdict:
 
 def outside(measured: Measured) -> Iterator[Candidate]:
     """Shapes that are in no catalogue."""
-    e, points = measured.problem.calset.exposures, measured.problem.calset.points
+    e, points = measured.likelihood.calset.exposures, measured.likelihood.calset.points
     shape = (len(points), len(e), 4)
     r = np.hypot(points.x, points.y)
     through = e.clp_in
@@ -94,11 +95,10 @@ class Blind:
 
     def __init__(self, calset: CalibrationSet, seed: int = 1) -> None:
         model = base_model(calset)
-        problem = Problem(calset, model)
-        result = fit(problem)
+        result = fit(Likelihood.of(calset, model))
         self.rng = np.random.default_rng(seed)
         wanted = list(probes(EFFECTS, effect_context(model.template, calset.exposures)))
-        examination = Examination(problem, result, wanted, self.rng)
+        examination = Examination(result, wanted, self.rng)
         self.probes: list[Probe] = examination.probes
         self.effect_of = {p.name: p.effect.name for p in self.probes}
         self.space, self.nuisance = examination.space, examination.common_mode

@@ -15,7 +15,7 @@ from walop_jax.diagnosis.figure_data import figure_data
 from walop_jax.diagnosis.findings import Unexplained
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.refit import FitResult, fit
-from walop_jax.likelihood.problem import Problem
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import FreeForm, effect_by_name
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
@@ -84,7 +84,7 @@ class Rehearsal(workflow._Diagnosing):
     """A diagnosis with parts played by dummies: something is missing as long as a name stands that is not needed."""
 
     def __init__(self):
-        self.calset, self.catalogue, self.problem = SimpleNamespace(points=()), (), Mock(spec=Problem)
+        self.calset, self.catalogue = SimpleNamespace(points=()), ()
         self.fit = Mock(spec=FitResult, explains_data=True)
         self.steps = ["name"]
         self.tell = lambda text: None
@@ -121,7 +121,7 @@ def test_after_a_drop_several_steps_follow_one_another():
     assert [step.effect for step in found.steps] == ["clp_wobble", "camera_leakage"]
     assert lead_from_the_first_fit_to_the_last(found)
     model = naming.without(found.after.model, "camera_leakage")
-    alone = fit(Problem(found.problem.calset, model))
+    alone = fit(Likelihood.of(found.after.calset, model))
     assert found.steps[0].chi2_after == pytest.approx(alone.chi2, rel=1e-6)
     assert [list(step.far) for step in found.steps] == [["amplitude"], []]
 

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood import engine, nodes
-from walop_jax.likelihood.problem import INTERPOLATE_ABOVE, Problem, base_model
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.parameters import leaves
@@ -48,12 +49,12 @@ def simulated():
 
 @pytest.fixture(scope="module")
 def exact(simulated):
-    return Problem(simulated.calset, base_model(simulated.calset))
+    return Likelihood.of(simulated.calset, base_model(simulated.calset))
 
 
 @pytest.fixture(scope="module")
 def quick(simulated):
-    return Problem(simulated.calset, base_model(simulated.calset), interpolate=True)
+    return Likelihood.of(simulated.calset, base_model(simulated.calset), interpolate=True)
 
 
 def test_expansion_agrees(simulated, exact, quick):
@@ -61,7 +62,7 @@ def test_expansion_agrees(simulated, exact, quick):
     for values in (exact.model.start, full_values(simulated.truth)):
         one, other = quick.expand(values), exact.expand(values)
         same((one.data, one.gradient, one.matrix), (other.data, other.gradient, other.matrix))
-    assert 0.0 < quick.optics_error <= nodes.TOLERANCE
+        assert 0.0 < one.optics.error <= nodes.TOLERANCE
     for one, other in zip(quick.residuals(values), exact.residuals(values), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-6)
 
@@ -111,13 +112,32 @@ def test_error_is_measured(exact, simulated):
 
 def test_what_cannot_be_interpolated_is_solved_point_by_point(simulated, exact, monkeypatch):
     monkeypatch.setattr(nodes, "COUNTS", (6, 8))
-    problem = Problem(simulated.calset, base_model(simulated.calset), interpolate=True)
-    values = problem.model.start
-    assert problem.expand(values).data == exact.expand(values).data
-    assert not problem.interpolates
+    likelihood = Likelihood.of(simulated.calset, base_model(simulated.calset), interpolate=True)
+    values = likelihood.model.start
+    found = likelihood.expand(values)
+    assert found.data == exact.expand(values).data
+    assert found.optics.nodes_per_side is None
+    # Having failed there, nobody tries again nearby.
+    monkeypatch.setattr("walop_jax.likelihood.likelihood.accurate_nodes", None)
+    assert likelihood.expand(values, near=found).data == found.data
+
+
+def test_as_many_nodes_as_nearby_are_tried_first(quick, monkeypatch):
+    here = quick.expand(quick.model.start)
+    tried, tabulate = [], nodes.tabulate
+
+    def noted(*arguments):
+        tried.append(arguments[-2])
+        return tabulate(*arguments)
+
+    monkeypatch.setattr(nodes, "tabulate", noted)
+    again = quick.expand(quick.model.start, near=here)
+    assert tried == [here.optics.nodes_per_side]
+    assert again.optics == here.optics
+    assert again.data == here.data
 
 
 def test_tables_of_a_few_hundred_points_are_exact(exact):
-    assert len(exact.calset.points) < INTERPOLATE_ABOVE
-    assert not exact.interpolates
-    assert exact.optics_error == 0.0
+    assert exact.layout.points < limits.INTERPOLATE_ABOVE
+    assert not exact.layout.interpolated
+    assert exact.expand(exact.model.start).optics == (None, 0.0)

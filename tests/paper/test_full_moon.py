@@ -9,8 +9,8 @@ import pytest
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data import DataError
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import refit
-from walop_jax.likelihood.problem import Problem, base_model
 from walop_jax.model.effects import effect_by_name
 from walop_jax.paper import full_moon as moon
 from walop_jax.paper import polynomial as paper
@@ -24,7 +24,7 @@ SPOILT = 2
 
 def calibrate(calset):
     model = base_model(calset)
-    return Calibration.from_fit(refit(calset, model), Problem(calset, model))
+    return Calibration.from_fit(refit(calset, model))
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ import pytest
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import refit
-from walop_jax.likelihood.problem import Problem, base_model
 from walop_jax.paper.comparison import compare
 from walop_jax.reports import comparison_figures as figures
 from walop_jax.science.star_errors import plate_errors
@@ -27,7 +27,7 @@ def calibration_and_set():
         4,
     ).calset
     model = base_model(calset)
-    return Calibration.from_fit(refit(calset, model), Problem(calset, model)), calset
+    return Calibration.from_fit(refit(calset, model)), calset
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import write_product
 from walop_jax.calibration.summary import summary
 from walop_jax.data import read_calibration_set, write_calibration_set
-from walop_jax.fit.refit import fit
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.fit.refit import refit
 from walop_jax.model.effects import effect_by_name
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
@@ -45,12 +44,11 @@ def fitted(tmp_path_factory) -> FittedSet:
     path, run = folder / "small.fits", folder / "RUN"
     write_calibration_set(path, simulate(PLAN, seed=4).calset)
     calset = read_calibration_set(path)
-    problem = Problem(calset, base_model(calset))
-    result = fit(problem)
-    calibration = Calibration.from_fit(result, problem)
+    result = refit(calset)
+    calibration = Calibration.from_fit(result)
     run.mkdir()
     write_product(run / "calibration.fits", calibration.to_product())
-    (run / "summary.json").write_text(json.dumps(summary(result, calset, seconds=1.0)))
+    (run / "summary.json").write_text(json.dumps(summary(result, seconds=1.0)))
     return FittedSet(path, calibration, run)
 
 

@@ -13,7 +13,7 @@ import walop_jax.runs.report
 from walop_jax.calibration.product import read_product, write_product
 from walop_jax.data import builtin_filter
 from walop_jax.io.errors import DataError
-from walop_jax.model.trace import Ray, trace
+from walop_jax.model.trace import Sightline, trace
 from walop_jax.runs.certify import certify_product
 from walop_jax.runs.cite import cite_run
 from walop_jax.runs.epoch import compare_epochs
@@ -82,7 +82,7 @@ def test_a_report_that_fails_leaves_the_old_one(fitted: FittedSet, tmp_path: Pat
 
 
 def test_light_is_traced_through_what_was_fitted(fitted: FittedSet):
-    ray = Ray(x=0.2, y=-0.1, q=0.03, u=0.01, teff=5772.0)
+    ray = Sightline(x=0.2, y=-0.1, q=0.03, u=0.01, teff=5772.0)
     curve = builtin_filter("SDSS-r")
     expected = trace(fitted.calibration.model.instrument(fitted.calibration.values), curve, ray)
     np.testing.assert_allclose(trace_source(ray, fitted.run)[-1].value, expected[-1].value, rtol=1e-12)

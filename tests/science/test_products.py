@@ -17,8 +17,8 @@ from walop_jax.calibration.certify import certify, validity
 from walop_jax.calibration.product import write_product
 from walop_jax.cli import app
 from walop_jax.data import write_calibration_set
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import refit
-from walop_jax.likelihood.problem import Problem, base_model
 from walop_jax.science.epoch import chi2_of_change, chi2_tail, epoch
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
@@ -28,7 +28,7 @@ PLAN = ObservingPlan(grid=5, standard_grid=2, polariser_angles=polariser_turn(8)
 
 def calibrate(calset):
     model = base_model(calset)
-    return Calibration.from_fit(refit(calset, model), Problem(calset, model))
+    return Calibration.from_fit(refit(calset, model))
 
 
 @pytest.fixture(scope="module")

@@ -8,13 +8,14 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from walop_jax.io.errors import errors_naming as named  # noqa: F401  (for refit)
 from walop_jax.io.text import json_text
-from walop_jax.io.text import read_text as read_text  # (for refit)
+
+if TYPE_CHECKING:
+    from walop_jax.likelihood.processes import Processes
 
 CACHE_VARIABLE = "WALOP_JAX_CACHE"
 DEBUG_VARIABLE = "WALOP_JAX_DEBUG"
@@ -31,6 +32,14 @@ SeedOption = Annotated[
 ModelOption = Annotated[
     Path | None,
     typer.Option("--model", metavar="MODEL.toml", help="Model file: what is free, tied, known, added."),
+]
+InstrumentOption = Annotated[
+    str | None,
+    typer.Option(
+        "--instrument",
+        metavar="NAME|FILE.toml",
+        help="An instrument that comes with the package, or a description file; see walop-jax instrument.",
+    ),
 ]
 ProcessesOption = Annotated[
     str | None,
@@ -167,20 +176,21 @@ def _standard_output_to_error() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def shared(place: str | None) -> Iterator[bool]:
-    """Join the other processes of a computation, if `place` says where they are; gives whether this is the first one.
+def shared(place: str | None) -> Iterator[Processes]:
+    """Join the other processes of a computation, if `place` says where they are; gives which one this is.
 
     When one fails it ends at once, with its line of error: the others notice that it has gone.
     """
+    from walop_jax.likelihood.processes import Processes, join, leave_at_once
+
     if place is None:
-        yield True
+        yield Processes()
         return
-    from walop_jax.likelihood.processes import join, leave_at_once
 
     with _standard_output_to_error():
         crew = join(place)
     try:
-        yield crew.index == 0
+        yield crew
     except BaseException as error:
         complain(f"process {crew.index} of {crew.count}: {error or type(error).__name__}")
         sys.stderr.flush()

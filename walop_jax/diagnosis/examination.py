@@ -17,7 +17,6 @@ from walop_jax.diagnosis.findings import Limit
 from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, strata
 from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable, separations
 from walop_jax.fit.refit import FitResult
-from walop_jax.likelihood.problem import Problem
 from walop_jax.model.effects import Effect
 from walop_jax.model.parameters import field_declarations
 
@@ -45,24 +44,23 @@ class Examination:
 
     `named` are the columns of the effects ahead of any projection, `space` and `columns` those of all candidates,
     effects first, behind it. `ranked` are the effects in order of linear evidence, `patterns` the scores of the
-    free-form strata, `blocks` the blocks of the free-form term that can take these up.
+    free-form strata, `blocks` the blocks of the free-form term that can take candidates up.
     """
 
     def __init__(
         self,
-        problem: Problem,
         result: FitResult,
         wanted: Sequence[Probe],
         rng: np.random.Generator,
         earlier: Examination | None = None,
     ) -> None:
-        """`earlier` is of a smaller model, whose columns serve again where the light has hardly changed."""
-        self.problem, self.result = problem, result
-        active = problem.model.effect_names
-        self.design = Design.of(problem, result)
+        """`earlier` is of a smaller model; its columns serve again where the light has hardly changed."""
+        self.result = result
+        active = result.model.effect_names
+        self.design = Design.of(result)
         inactive = [probe for probe in wanted if probe.effect.name not in active]
         self.named = (
-            effect_candidates(problem.calset, problem.model, result.values, inactive)
+            effect_candidates(result.calset, result.model, result.values, inactive)
             if earlier is None or not self._is_like(earlier)
             else earlier.named
         )
@@ -95,7 +93,7 @@ class Examination:
     def _common_mode(self) -> Vector:
         """Prior widths of the gains of single exposures that amount to `COMMON_MODE` per intensity."""
         at = self.space.places()[SINGLE_EXPOSURES]
-        points = np.repeat(self.design.measured.used.sum(axis=0), 3)
+        points = np.repeat(self.design.measured.used.sum(axis=0), self.design.measured.cameras - 1)
         square = np.where(self.space.before[at] > 0, self.space.before[at], np.inf)
         return np.maximum(COMMON_MODE * np.sqrt(points / square), 1e-30)
 
@@ -141,7 +139,7 @@ class Examination:
     def untestable(self, catalogue: Sequence[type[Effect]]) -> tuple[str, ...]:
         """Effects that these data cannot show at any plausible size."""
         seen = {probe.effect.name for probe in self.probes if self.table[probe.name].testable}
-        seen.update(self.problem.model.effect_names)
+        seen.update(self.result.model.effect_names)
         return tuple(
             effect.name for effect in catalogue if effect.name not in seen and not effect.is_structural()
         )

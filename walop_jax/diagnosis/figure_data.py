@@ -26,12 +26,11 @@ from walop_jax.diagnosis.figure_file import (
 )
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.location import HARMONICS
-from walop_jax.likelihood.problem import Problem
-from walop_jax.model.conventions import CAMERA_NAMES
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import FreeForm
 
-Cube = Float[np.ndarray, "p e 4"]
-PointMap = Float[np.ndarray, "p 4"]
+Cube = Float[np.ndarray, "p e k"]
+PointMap = Float[np.ndarray, "p k"]
 Weight = Float[np.ndarray, " e"]
 Used = Bool[np.ndarray, "p e"]
 
@@ -60,20 +59,20 @@ def figure_data(diagnosis: Diagnosis) -> DiagnosisFigureData:
 
     A free-form term that is in the final model without being a step comes as a last comparison of its own.
     """
-    problem, start, final = diagnosis.problem, diagnosis.before, diagnosis.after
-    exposures, used = problem.calset.exposures, problem.used
-    after = problem.residuals(final.values)[1]
-    before = after if start is final else Problem(problem.calset, start.model).residuals(start.values)[1]
+    start, final = diagnosis.before, diagnosis.after
+    exposures, used = final.calset.exposures, final.likelihood.used
+    after = final.likelihood.residuals(final.values)[1]
+    before = after if start is final else start.likelihood.residuals(start.values)[1]
     pairs = [("", before, after)]
     pairs += [(step.effect, step.residual_before, step.residual_after) for step in diagnosis.steps]
     if _unnamed_term(diagnosis):
         pairs.append((UNNAMED, pairs[-1][2] if diagnosis.steps else before, after))
     angle = np.where(exposures.clp_in, exposures.clp_angle, np.nan)
     return DiagnosisFigureData(
-        points=problem.calset.points,
+        points=final.calset.points,
         exposures=ExposureLabels(exposures.exposure, exposures.kind, exposures.mjd, angle),
         ladder=_ladder(diagnosis),
-        shares=_shares(problem, before, after),
+        shares=_shares(final.likelihood, before, after),
         comparisons=tuple(
             compare_residuals(name, first, second, used, exposures) for name, first, second in pairs
         ),
@@ -173,15 +172,16 @@ def _ladder(diagnosis: Diagnosis) -> Ladder:
     return Ladder(np.array(model), np.array(chi2, float), np.array(freedom, int))
 
 
-def _shares(problem: Problem, before: Cube, after: Cube) -> Shares:
+def _shares(likelihood: Likelihood, before: Cube, after: Cube) -> Shares:
     """Sums of squared residuals by camera, kind, filter and exposure."""
-    e = problem.calset.exposures
-    known = np.asarray(problem.plan.exposures.flux_known)
-    expected = problem.used.sum(axis=0)[:, None] * np.where(known, 1.0, 0.75)[:, None] * np.ones(4)
+    e, known = likelihood.calset.exposures, likelihood.flux_known
+    names = likelihood.model.template.cameras.names
+    share = np.where(known, 1.0, 1.0 - 1.0 / len(names))
+    expected = (likelihood.used.sum(axis=0) * share)[:, None] * np.ones(len(names))
     squares = [expected, (before**2).sum(axis=0), (after**2).sum(axis=0)]  # (exposure, camera)
     members: list[tuple[str, str]] = []
     sums: list[list[float]] = []
-    for k, camera in enumerate(CAMERA_NAMES):
+    for k, camera in enumerate(names):
         members.append(("camera", camera))
         sums.append([float(square[:, k].sum()) for square in squares])
     for group, label in (("kind", e.kind), ("filter", e.filter), ("exposure", e.exposure)):

@@ -20,7 +20,7 @@ def before_and_after(name: str, before: Design, after: Design) -> dict[str, Any]
     # An effect with a number for every exposure cannot predict exposures that it has not seen.
     many = any(np.size(getattr(effect, f)) > 4 for f in effect.amplitudes())
     scheme = "field blocks" if many else "exposures"
-    old, new = (instrument_matrices(design.fit, design.problem.calset) for design in (before, after))
+    old, new = (instrument_matrices(design.fit) for design in (before, after))
     return {
         "chi2_before": before.fit.chi2,
         "chi2_after": after.fit.chi2,
@@ -37,12 +37,12 @@ def refitted_in_order(steps: Sequence[Step], start: Design, end: Design) -> list
 
     The models between the two are fitted again; what belongs to the discovery of an effect stays.
     """
-    fits = [(end.problem, end.fit)] if steps else []
+    fits = [end.fit] if steps else []
     for step in reversed(steps[1:]):
-        fits.append(naming.refit_without(end.problem.calset, fits[-1][1], step.effect))
+        fits.append(naming.refit_without(fits[-1], step.effect))
     compared, before = [], start
-    for step, (problem, result) in zip(steps, reversed(fits), strict=True):
-        after = end if result is end.fit else Design.of(problem, result)
+    for step, result in zip(steps, reversed(fits), strict=True):
+        after = end if result is end.fit else Design.of(result)
         compared.append(dataclasses.replace(step, **before_and_after(step.effect, before, after)))
         before = after
     return compared

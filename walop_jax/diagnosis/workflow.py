@@ -28,13 +28,15 @@ from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.findings import Diagnosis, Outcome, Step, Unexplained
 from walop_jax.diagnosis.score import Score
 from walop_jax.diagnosis.step_summary import before_and_after, refitted_in_order
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit
-from walop_jax.likelihood.chunks import thinned
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.thinning import thinned
 from walop_jax.model.effects import EFFECTS, Context, Effect, FreeForm
-from walop_jax.model.specification import Model, effect_context, full_values
+from walop_jax.model.parameters import values_of
+from walop_jax.model.specification import Model, effect_context
 
-LARGEST_ROWS = 100_000  # 800 columns of four cameras each take 2.5 GB
 MOST_STEPS = 6
 NEEDED = 1.0  # ln B that an effect must be worth to the final model to stay in it
 MISFIT = 1.5  # χ²/dof above which effects that cannot be differentiated are tried
@@ -50,18 +52,19 @@ def diagnose(
 ) -> Diagnosis:
     """Find what `model` (default: the base model) lacks to explain a calibration set.
 
-    `catalogue` are the effects that may be named. Of a set with more than `LARGEST_ROWS` (exposure, point) pairs,
+    `catalogue` are the effects that may be named. Of a set with more than `limits.DIAGNOSED_ROWS` (exposure, point)
+    pairs,
     points spread over the field are looked at. Raises what `fit` raises.
     """
     began = time.perf_counter()
     tell = progress or (lambda text: None)
-    some = thinned(calset, max(1, LARGEST_ROWS // len(calset.exposures)), run=1)
+    some = thinned(calset, max(1, limits.DIAGNOSED_ROWS // len(calset.exposures)), neighbours=1)
     found = _Diagnosing(some, model or base_model(calset), catalogue, seed, tell).run(began)
     return dataclasses.replace(found, points=len(calset.points))
 
 
 class _Diagnosing:
-    """The state of one diagnosis: the current problem, its fit, the last examination of it, the steps so far."""
+    """The state of one diagnosis: the current fit and the steps so far."""
 
     def __init__(
         self,
@@ -71,14 +74,15 @@ class _Diagnosing:
         seed: int,
         tell: Callable[[str], None],
     ) -> None:
-        self.calset, self.catalogue, self.tell = calset, catalogue, tell
+        self.calset, self.tell = calset, tell
         self.rng = np.random.default_rng(seed)
         self.context: Context = effect_context(model.template, calset.exposures)
-        self.wanted: list[Probe] = list(all_probes(catalogue, self.context))
-        self.problem = Problem(calset, model)
+        fitting = [kind for kind in catalogue if kind.neutral(self.context).fits(model.template)]
+        self.catalogue = tuple(fitting)
+        self.wanted: list[Probe] = list(all_probes(self.catalogue, self.context))
         self.steps: list[Step] = []
         tell("fitting the model")
-        self.fit: FitResult = fit(self.problem)
+        self.fit: FitResult = fit(Likelihood.of(calset, model))
 
     def run(self, began: float) -> Diagnosis:
         before = self.fit
@@ -98,13 +102,12 @@ class _Diagnosing:
             remaining_p=examination.table.p_global,
             before=before,
             after=self.fit,
-            problem=self.problem,
             seconds=time.perf_counter() - began,
             points=len(self.calset.points),
         )
 
     def _examine(self, earlier: Examination | None = None) -> Examination:
-        return Examination(self.problem, self.fit, self.wanted, self.rng, earlier)
+        return Examination(self.fit, self.wanted, self.rng, earlier)
 
     # ------------------------------------------------------------------------------------------------ a name
 
@@ -122,11 +125,11 @@ class _Diagnosing:
     def _trials(self, examination: Examination) -> Iterator[naming.Trial]:
         for item in naming.leaders(examination.significant) if examination.significant else ():
             shapes = sum(probe.effect is item.effect for probe in examination.probes)
-            yield naming.try_shapes(self.calset, self.fit, item, self.context, shapes)
+            yield naming.try_shapes(self.fit, item, self.context, shapes)
         if self.fit.chi2 > MISFIT * self.fit.dof:
             for effect in self.catalogue:
-                if effect.is_structural() and effect.name not in self.problem.model.effect_names:
-                    yield naming.try_effect(self.calset, self.fit, effect.neutral(self.context), self.context)
+                if effect.is_structural() and effect.name not in self.fit.model.effect_names:
+                    yield naming.try_effect(self.fit, effect.neutral(self.context), self.context)
 
     def _add_best(self, examination: Examination) -> str | None:
         """Add the name with the highest evidence that held-out data confirm; None when there is none."""
@@ -145,26 +148,24 @@ class _Diagnosing:
             step = self._step(examination, trial, close)
             if step.confirmed:
                 self.steps.append(step)
-                self._adopt(trial.problem, trial.fit)
+                self._adopt(trial.fit)
                 if self.fit is not trial.fit:
-                    after = Design.of(self.problem, self.fit)
-                    self.steps[-1] = dataclasses.replace(
-                        step, **before_and_after(step.effect, examination.design, after)
-                    )
+                    after = Design.of(self.fit)
+                    compared = before_and_after(step.effect, examination.design, after)
+                    self.steps[-1] = dataclasses.replace(step, **compared)
                 return step.effect
         return None
 
-    def _adopt(self, problem: Problem, result: FitResult) -> None:
+    def _adopt(self, result: FitResult) -> None:
         """Go on with a fit: errors as given where they need not be scaled any more, refuted priors widened."""
         if result.noise_scale > 1.0:
-            result = fit(problem, start=result.values)
-        model = problem.model
+            result = fit(result.likelihood, start=result.values)
+        model = result.model
         for step in self.steps:
             model = naming.with_refuted_priors_widened(model, result.values, step.effect)
-        if model is not problem.model:
-            problem = Problem(self.calset, model)
-            result = fit(problem, start=result.values)
-        self.problem, self.fit = problem, result
+        if model is not result.model:
+            result = fit(Likelihood.of(self.calset, model), start=result.values)
+        self.fit = result
 
     def _step(self, examination: Examination, trial: naming.Trial, close: tuple[str, ...]) -> Step:
         name = trial.effect.name
@@ -177,7 +178,7 @@ class _Diagnosing:
             log_bayes=trial.log_bayes,
             equivalent=close,
             alternatives=trial.alternatives,
-            **before_and_after(name, examination.design, Design.of(trial.problem, trial.fit)),
+            **before_and_after(name, examination.design, Design.of(trial.fit)),
         )
 
     # --------------------------------------------------------------------------------------- what has no name
@@ -200,8 +201,9 @@ class _Diagnosing:
             f". Residuals sit in: cameras {where['camera']}; kinds {where['kind']}; field {where['field']}"
         )
         found = Unexplained(examination.table.p_global, text, patterns)
-        able = (examination.blocks[name] for name, _ in patterns)
-        blocks = tuple(dict.fromkeys(block for block in able if block is not None))
+        blocks = tuple(
+            dict.fromkeys(b for name, _ in patterns if (b := examination.blocks[name]) is not None)
+        )
         there = FreeForm.name in self.fit.model.effect_names
         return self._with_free_form(examination, found, blocks) if blocks and not there else found
 
@@ -213,20 +215,17 @@ class _Diagnosing:
         It need not be probable, only useful: it stays when it predicts parts of the field that it has not seen.
         """
         term = FreeForm.of(self.context, blocks=blocks)
-        trial = naming.try_effect(self.calset, self.fit, term, self.context)
+        trial = naming.try_effect(self.fit, term, self.context)
         if not trial.fit.converged:
             return found
         without, with_term = (
-            held_out(design, "field blocks").mean
-            for design in (examination.design, Design.of(trial.problem, trial.fit))
+            held_out(design, "field blocks").mean for design in (examination.design, Design.of(trial.fit))
         )
         if with_term >= without:
             return found
         before = self.fit
-        self._adopt(trial.problem, trial.fit)
-        change = largest_change(
-            instrument_matrices(before, self.calset), instrument_matrices(self.fit, self.calset)
-        )
+        self._adopt(trial.fit)
+        change = largest_change(instrument_matrices(before), instrument_matrices(self.fit))
         return dataclasses.replace(
             found, term=blocks, chi2_before=before.chi2, chi2_after=self.fit.chi2, change_of_qu=change
         )
@@ -252,7 +251,7 @@ class _Diagnosing:
             if not dropped:
                 return self._examine(examination), unexplained
             # Those names only stood in for what has none: what is it without them?
-            self._adopt(*naming.refit_without(self.calset, self.fit, FreeForm.name))
+            self._adopt(naming.refit_without(self.fit, FreeForm.name))
 
     def _drop_what_is_not_needed(self) -> bool:
         """Take out, one by one, names that the final model does not need; whether there were any."""
@@ -266,18 +265,18 @@ class _Diagnosing:
                 break
             self.tell(f"{least} is no longer needed")
             self.steps = [s for s in self.steps if s.effect != least]
-            self._adopt(*naming.refit_without(self.calset, self.fit, least))
+            self._adopt(naming.refit_without(self.fit, least))
             dropped = True
         return dropped
 
     def _finished(self, step: Step, examination: Examination) -> Step:
         """The step with final parameters, what cannot be told from it, and where it sits."""
-        change = naming.signature(self.problem, self.fit, step.effect, self.context)
+        change = naming.signature(self.fit, step.effect, self.context)
         separation = examination.separation(step.effect, change)
         close = {name for name, s in separation.items() if s < naming.SEPARATION} | set(step.equivalent)
         close -= {other.effect for other in self.steps}
         effect = self.fit.model.instrument(self.fit.values).effect(step.effect)
-        standard = full_values(effect.standard_form()) if not type(effect).is_structural() else ()
+        standard = np.asarray(values_of(effect.standard_form())) if not type(effect).is_structural() else ()
         parameters = {}
         for i, value in zip(self.fit.model.positions(step.effect), standard, strict=True):
             p = self.fit.model.parameters[i]

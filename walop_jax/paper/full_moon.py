@@ -27,7 +27,6 @@ from walop_jax.data.records import Block, CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
-from walop_jax.likelihood.problem import Problem
 from walop_jax.model.specification import Model
 from walop_jax.paper.polynomial import PaperCalibration, measured_qu, polynomial_terms
 from walop_jax.science.estimate import estimate
@@ -153,7 +152,7 @@ def reweighted_calibration(
     """
     current, weight = calset, np.ones(0)
     while True:
-        calibration = Calibration.from_fit(refit(current, model), Problem(current, model))
+        calibration = Calibration.from_fit(refit(current, model))
         patches = judge_patches(calset, calibration)
         rounds -= 1
         if rounds < 1 or (weight.size and np.allclose(patches.weight, weight, rtol=0.05)):

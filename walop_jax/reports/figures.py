@@ -20,7 +20,8 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import Settings
 from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
-from walop_jax.likelihood.problem import Problem
+from walop_jax.fit.refit import FitResult
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.reports.style import (
     FONT,
     FROM_MINUS_ONE_TO_ONE,
@@ -48,50 +49,54 @@ def matrix_figure(calibration: Calibration, settings: Settings | None = None) ->
     return figure
 
 
-def residual_figure(
-    problem: Problem, before: Float[np.ndarray, " n"], after: Float[np.ndarray, " n"]
-) -> Figure:
-    """Residuals of every field point at two full vectors of parameter values; a histogram of the second."""
+def residual_figure(result: FitResult, before: Float[np.ndarray, " n"] | None = None) -> Figure:
+    """Residuals of every field point before and after a fit; a histogram of the latter.
+
+    `before` is a full vector of parameter values (default: the start values of the model).
+    """
+    likelihood = result.likelihood
+    start = result.model.start if before is None else before
     figure = empty_figure(9.6, 3.2)
     left, middle, right = figure.subplots(1, 3)
-    maps = [point_residuals(problem, values) for values in (before, after)]
+    maps = [point_residuals(likelihood, values) for values in (start, result.values)]
     norm = LogNorm(0.7, max(2.0, float(np.nanmax(maps[0]))))
     field_axes(left, "before the fit")
     field_axes(middle, "after the fit")
-    _tiles(left, problem, maps[0], norm)
-    bar = figure.colorbar(_tiles(middle, problem, maps[1], norm), ax=[left, middle], pad=0.02)
+    _tiles(left, likelihood, maps[0], norm)
+    bar = figure.colorbar(_tiles(middle, likelihood, maps[1], norm), ax=[left, middle], pad=0.02)
     bar.set_label("rms residual (σ)", fontsize=8)
     bar.ax.tick_params(labelsize=7)
     middle.set_ylabel("")
-    _histogram(right, problem, after)
+    _histogram(right, likelihood, result.values)
     return figure
 
 
 def calibration_figure(
-    problem: Problem,
-    calibration: Calibration,
+    result: FitResult,
     before: Float[np.ndarray, " n"] | None = None,
     settings: Settings | None = None,
 ) -> Figure:
-    """A calibration on one page: maps of the matrix, and what a fit has left of the residuals.
+    """A calibration on one page: maps of the matrix, and what the fit has left of the residuals.
 
-    `before` is a full vector of parameter values to compare with (default: the start of the fit).
+    `before` is a full vector of parameter values to compare with (default: the start values of the model).
     """
     figure = empty_figure(10.2, 4.7)
     grid = figure.subplots(2, 4)
-    _matrix_maps(figure, grid[:, :3], calibration, settings)
-    start = calibration.model.start if before is None else before
+    _matrix_maps(figure, grid[:, :3], Calibration.from_fit(result), settings)
+    start = result.model.start if before is None else before
     for axis, values, title in zip(
         grid[:, 3],
-        (start, calibration.values),
+        (start, result.values),
         ("residuals, as designed", "residuals, as fitted"),
         strict=True,
     ):
-        residual = point_residuals(problem, values)
+        residual = point_residuals(result.likelihood, values)
         far = float(np.nanmax(residual)) > 3.0
         low, high = (float(edge(residual)) for edge in (np.nanmin, np.nanmax))
         field_axes(axis, title)
-        shown = _tiles(axis, problem, residual, Normalize(low, high) if far else Normalize(0.7, 1.3))
+        shown = _tiles(
+            axis, result.likelihood, residual, Normalize(low, high) if far else Normalize(0.7, 1.3)
+        )
         bar = figure.colorbar(shown, ax=axis, pad=0.03, extend="neither" if far else "both")
         bar.set_label("rms residual (σ)", fontsize=8)
         bar.ax.tick_params(labelsize=7)
@@ -99,14 +104,13 @@ def calibration_figure(
     return figure
 
 
-def point_residuals(problem: Problem, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " p"]:
+def point_residuals(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " p"]:
     """Rms normalised residual of each field point; 1 is what noise alone gives (the flux took one in four).
 
     NaN where a point has no data.
     """
-    _, residual = problem.residuals(values)
-    known = np.asarray(problem.plan.exposures.flux_known)
-    freedom = (problem.used * np.where(known, 4.0, 3.0)).sum(axis=1)
+    _, residual = likelihood.residuals(values)
+    freedom = (likelihood.used * np.where(likelihood.flux_known, 4.0, 3.0)).sum(axis=1)
     square = (residual**2).sum(axis=(1, 2))
     return np.sqrt(np.where(freedom > 0, square / np.maximum(freedom, 1.0), np.nan))
 
@@ -147,10 +151,10 @@ def _image(axis: Axes, values: Map, field: tuple[float, float, float, float], el
     )
 
 
-def _tiles(axis: Axes, problem: Problem, values: Float[np.ndarray, " p"], norm: Normalize) -> Any:
+def _tiles(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " p"], norm: Normalize) -> Any:
     """Field points as tiles; the places of the standards, which lie between the others, are left out."""
-    points, extended = problem.calset.points, problem.calset.exposures.kind != "standard"
-    tiles = problem.used[:, extended].any(axis=1)
+    points, extended = likelihood.calset.points, likelihood.calset.exposures.kind != "standard"
+    tiles = likelihood.used[:, extended].any(axis=1)
     tiles = tiles if tiles.any() else np.ones(len(points), bool)
     x, y = points.x[tiles], points.y[tiles]
     tile = max(float(np.ptp(x)), float(np.ptp(y)), 1e-3) / max(np.sqrt(tiles.sum()) - 1.0, 1.0)
@@ -163,12 +167,11 @@ def _tiles(axis: Axes, problem: Problem, values: Float[np.ndarray, " p"], norm: 
     return shown
 
 
-def _histogram(axis: Axes, problem: Problem, values: Float[np.ndarray, " n"]) -> None:
+def _histogram(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> None:
     """All residuals of a fit beside what noise alone would give."""
-    _, residual = problem.residuals(values)
-    used = residual[problem.used].ravel()
-    known = np.asarray(problem.plan.exposures.flux_known)
-    width = np.sqrt(np.mean(np.where(known, 1.0, 0.75)[np.nonzero(problem.used)[1]]))
+    _, residual = likelihood.residuals(values)
+    used = residual[likelihood.used].ravel()
+    width = np.sqrt(np.mean(np.where(likelihood.flux_known, 1.0, 0.75)[np.nonzero(likelihood.used)[1]]))
     edges = np.linspace(-4.0, 4.0, 41)
     axis.hist(
         np.clip(used / width, -4.0, 4.0), bins=edges.tolist(), density=True, color="0.75", label="residuals"

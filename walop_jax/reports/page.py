@@ -15,7 +15,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from walop_jax.calibration.records import QUALITY_BITS
+from walop_jax.calibration.records import Quality
 from walop_jax.reports import diagnosis_figures, product_figures
 from walop_jax.reports.run import Run
 from walop_jax.reports.wording import (
@@ -60,7 +60,7 @@ def _context(run: Run) -> dict[str, Any]:
     label, sentence = verdict_of_fit(summary) if diagnosis is None else verdict_of_diagnosis(diagnosis)
     good = diagnosis is None or diagnosis["verdict"] != "unexplained"
     main, rest = _parameters(run)
-    quality = int(summary.get("quality", 0))
+    quality = Quality(int(summary.get("quality", 0)))
     return {
         "run": run,
         "name": run.folder.resolve().name,
@@ -72,7 +72,7 @@ def _context(run: Run) -> dict[str, Any]:
         "sentence": sentence,
         "fit_sentence": ": ".join(verdict_of_fit(summary)),
         "good": good and bool(summary.get("trusted", summary["converged"])),
-        "quality": [text for bit, text in QUALITY_BITS.items() if quality & bit],
+        "quality": quality.meanings,
         "steps": [] if diagnosis is None else _steps(run),
         "unnamed": None if diagnosis is None else _drawn(run, len(diagnosis["steps"]) + 1),
         "unnamed_term": UNNAMED,

@@ -18,7 +18,7 @@ from walop_jax.io.plain_tables import write_columns
 from walop_jax.io.text import json_text, read_text
 from walop_jax.posterior import Options, PosteriorSample, sample
 from walop_jax.posterior.checkpoint import Checkpoints
-from walop_jax.posterior.from_run import problem_of_run
+from walop_jax.posterior.from_run import fit_of_run
 from walop_jax.posterior.output import intervals, report, write_posterior
 from walop_jax.posterior.result import Report
 from walop_jax.reports.posterior_figures import corner_figure, save_figure, trace_figure
@@ -66,10 +66,10 @@ def sample_run(
     found = [name for name in OUTPUTS if (folder / name).exists()]
     if found and not (overwrite or resume):
         raise fail(f"holds {found[0]} already", file=folder, advice="go on with --resume, or --overwrite it")
-    problem, result = problem_of_run(product, folder, text)
+    result = fit_of_run(product, folder, text)
     if overwrite and not resume:
         Checkpoints(folder / CHAINS, {}).clear()
-    posterior = sample(problem, result, options, folder=folder / CHAINS, resume=resume, report=progress)
+    posterior = sample(result, options, folder=folder / CHAINS, resume=resume, report=progress)
     summary = report(posterior)
     _write(folder, product, posterior, summary)
     return SampledRun(posterior, summary)

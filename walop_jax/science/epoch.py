@@ -26,7 +26,7 @@ from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_builder import effects_text, model_for
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood.problem import Problem
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import Model
 from walop_jax.science.star_errors import determinant, joint_errors, sample_stars, statistics
 
@@ -79,11 +79,10 @@ def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]
     if calset.instrument != old.model.name:
         raise ValueError(f"the new set is of {calset.instrument}, the calibration of {old.model.name}")
     model = model_for(calset, effects_text(old.model.effect_names))
-    problem = Problem(calset, model)
-    result = fit(problem)
+    result = fit(Likelihood.of(calset, model))
     if not result.converged:
         raise RuntimeError(f"the fit of the new set did not converge: {result.minimum.message}")
-    new = Calibration.from_fit(result, problem)
+    new = Calibration.from_fit(result)
     names = shared_parameters(old.model, model)
     a = np.array([old.model.index(name) for name in names])
     b = np.array([model.index(name) for name in names])
@@ -107,7 +106,7 @@ def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]
         p_value=p_value,
         test=test,
         directions=directions,
-        chi2_old=problem.expand(values).chi2,
+        chi2_old=result.likelihood.expand(values, near=result.posterior).chi2,
         chi2_new=result.chi2,
         dof=result.dof,
         moved=tuple(sorted(moved, key=lambda entry: -abs(entry.z))),

@@ -11,10 +11,13 @@ import pytest
 
 from walop_jax.data import Grid, read_calibration_set, write_frames
 from walop_jax.data.records import Intensities
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import refit
-from walop_jax.likelihood import chunks
-from walop_jax.likelihood.chunks import Chunks, bytes_per_point, thinned
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.layout import bytes_per_point
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.points import PointReader, PointsInMemory, StreamedPoints
+from walop_jax.likelihood.thinning import thinned
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 from walop_jax.sky.moon import moon_sky
@@ -33,6 +36,10 @@ class Counted(Intensities):
 
     def __init__(self, inner):
         self.inner, self.asked = inner, []
+
+    @property
+    def cameras(self):
+        return self.inner.cameras
 
     def block(self, start, stop):
         self.asked.append((start, stop))
@@ -68,10 +75,10 @@ def calset(tmp_path_factory):
 def streaming(calset, monkeypatch):
     """The same set when there is hardly any memory: three slabs of two chunks of 16 points."""
     each = bytes_per_point(len(calset.exposures))
-    monkeypatch.setattr(chunks, "MEMORY", 81 * each)
-    monkeypatch.setattr(chunks, "READING", 1)
-    monkeypatch.setattr(chunks, "SLABS", 2)
-    monkeypatch.setattr(chunks, "LARGEST_SLAB", 32 * each)
+    monkeypatch.setattr(limits, "MEMORY", 81 * each)
+    monkeypatch.setattr(limits, "READING", 1)
+    monkeypatch.setattr(limits, "SLABS", 2)
+    monkeypatch.setattr(limits, "LARGEST_SLAB", 32 * each)
     return dataclasses.replace(calset, intensities=Counted(calset.intensities))
 
 
@@ -81,45 +88,47 @@ def equal(one, other):
 
 
 def test_what_is_read_is_what_is_kept(calset, streaming):
-    plan = Problem(calset, base_model(calset, throughput_degree=2)).plan
-    kept, read = (Chunks(one, plan, 16) for one in (calset, dataclasses.replace(calset)))
-    read.kept = False
-    assert len(kept) == len(read) == 6
+    layout = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16).layout
+    reader = PointReader(calset, layout.plan)
+    kept, read = PointsInMemory(reader, layout), StreamedPoints(reader, layout)
+    assert (len(kept), len(read), layout.slabs) == (6, 6, 3)
     for i, (one, other) in enumerate(zip(read, kept, strict=True)):
         equal(one, other)
-        equal(read[i], other)
-    equal(read[-1], kept[-1])
+        equal(read.chunk(i), other)
+        equal(kept.chunk(i), other)
+    for points in (kept, read):
+        assert [len(points.slab(n)) for n in range(3)] == [2, 2, 2]
+        np.testing.assert_array_equal(points.gathered("x"), calset.points.x)
 
 
 def test_every_pass_reads_every_slab_once(calset, streaming):
-    problem = Problem(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
+    likelihood = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
     asked = streaming.intensities.asked
     for _ in range(2):
         asked.clear()
         assert (
-            sum(int((np.asarray(c.weight[..., 0]) > 0).sum()) for c in problem.chunks)
+            sum(int((np.asarray(c.weight[..., 0]) > 0).sum()) for c in likelihood.points)
             == calset.intensities.rows
         )
         assert asked == [(0, 32), (32, 64), (64, 81)]
 
 
 def test_expansion_and_counts_agree(calset, streaming):
-    one = Problem(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
-    other = Problem(calset, base_model(calset, throughput_degree=2), points_per_chunk=16)
-    assert not one.chunks.kept
-    other.chunks.kept = True
-    told = []
-    one.passes.watch = lambda label, done, rate: told.append((done, rate))
+    one = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
+    other = Likelihood.of(calset, base_model(calset, throughput_degree=2), points_per_chunk=16)
+    assert isinstance(one.points, StreamedPoints)
+    other = dataclasses.replace(other, points=PointsInMemory(other.points.reader, other.layout))
     a, b = one.expand(one.model.start), other.expand(other.model.start)
     assert a.data == b.data
     np.testing.assert_array_equal(a.matrix, b.matrix)
-    assert told[-1][0] == SIDE**2
-    assert told[-1][1] > 0
-    assert (one.n_data, one.dof) == (other.n_data, other.dof)
-    assert one.n_data == 4 * other.used.sum() == 4 * calset.intensities.rows
+    # What an expansion has counted on its way is what a pass of its own counts.
+    for found in (a, b):
+        np.testing.assert_array_equal(found.census.rows, one.census.rows)
+        assert (found.n_data, found.dof) == (other.census.n_data, other.dof)
+    assert a.n_data == 4 * other.used.sum() == 4 * calset.intensities.rows
     used = np.arange(81) % 17 != 3
     x, y = calset.points.x[used], calset.points.y[used]
-    assert one.field == other.field == (x.min(), x.max(), y.min(), y.max())
+    assert a.census.field == one.census.field == (x.min(), x.max(), y.min(), y.max())
 
 
 def test_refit_of_frames_that_do_not_fit_into_memory(calset, streaming):
@@ -132,7 +141,7 @@ def test_refit_of_frames_that_do_not_fit_into_memory(calset, streaming):
 def test_moon_sky_is_that_of_the_ephemeris(calset):
     e = calset.exposures
     moon = np.flatnonzero(e.kind == "moon")
-    read = Chunks(calset, Problem(calset, base_model(calset, throughput_degree=2)).plan, 81)
+    read = PointReader(calset, Likelihood.of(calset, base_model(calset, throughput_degree=2)).plan)
     x, y = GRID.xy(0, 5)
     sky = read.sky_polarisation(x, y)
     expected = moon_sky(e.mjd[moon], e.ra[moon], e.dec[moon], e.rotator[moon], calset.site, x, y)
@@ -146,18 +155,18 @@ def test_a_fault_in_the_file_stops_the_pass(calset, streaming):
             raise OSError("the disk has gone")
         return calset.intensities.block(start, stop)
 
-    problem = Problem(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
+    likelihood = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
     streaming.intensities.block = broken
     with pytest.raises(OSError, match="the disk has gone"):
-        problem.expand(problem.model.start)
+        likelihood.expand(likelihood.model.start)
 
 
 def test_a_pass_may_be_left_half_way(calset, streaming):
-    problem = Problem(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
-    first = next(iter(problem.chunks))
+    likelihood = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
+    first = next(iter(likelihood.points))
     assert first.x.shape == (16,)
     with ThreadPoolExecutor(1) as pool:
-        assert pool.submit(lambda: len(list(problem.chunks))).result(timeout=60) == 6
+        assert pool.submit(lambda: len(list(likelihood.points))).result(timeout=60) == 6
 
 
 def test_a_sample_is_part_of_the_set(calset):

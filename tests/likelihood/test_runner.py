@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
@@ -14,13 +15,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from walop_jax.fit import refit
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood import passes, processes
-from walop_jax.likelihood import problem as likelihood
+from walop_jax.likelihood import limits, processes
 from walop_jax.likelihood.journal import Journal
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.processes import LostProcessError, Processes
+from walop_jax.likelihood.runner import Runner
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -33,18 +34,18 @@ import jax
 jax.config.update("jax_enable_x64", True)
 import json, os, sys, time
 import numpy as np
-from test_passes import made
+from test_runner import made
 """
 
 
 def made(**options):
     calset = simulate(RUN, seed=5).calset
     model = base_model(calset, throughput_degree=2)
-    return Problem(calset, model, points_per_chunk=64, interpolate=True, memory=1e6, **options)
+    return Likelihood.of(calset, model, points_per_chunk=64, interpolate=True, memory=1e6, **options)
 
 
 @pytest.fixture
-def problem():
+def likelihood():
     return made()
 
 
@@ -57,12 +58,12 @@ def _compiled_once(tmp_path_factory):
         yield
 
 
-def test_the_number_of_threads_changes_nothing(problem, monkeypatch):
+def test_the_number_of_threads_changes_nothing(likelihood):
     found = []
     for threads in (1, 2, 5):
-        monkeypatch.setattr(passes, "threads_at_work", lambda threads=threads: threads)
-        found.append(problem.expand(problem.model.start))
-    assert problem.passes.slab == 64
+        there = dataclasses.replace(likelihood, runner=Runner(threads=threads))
+        found.append(there.expand(likelihood.model.start))
+    assert likelihood.layout.slab == 64
     for other in found[1:]:
         assert other.data == found[0].data
         np.testing.assert_array_equal(other.gradient, found[0].gradient)
@@ -87,15 +88,15 @@ def result_of(process: subprocess.Popen) -> dict:
 EXPAND = """
 p = made()
 found = p.expand(p.model.start)
-print(json.dumps({"devices": jax.local_device_count(), "data": found.data, "rows": p.rows_used.tolist(),
+print(json.dumps({"devices": jax.local_device_count(), "data": found.data, "rows": found.census.rows.tolist(),
                   "gradient": found.gradient.tolist(), "matrix": found.matrix.tolist()}))
 """
 
 
-def test_two_devices_give_the_same(problem):
+def test_two_devices_give_the_same(likelihood):
     code = PLAN.replace("import json", 'jax.config.update("jax_num_cpu_devices", 2)\nimport json', 1) + EXPAND
     found = result_of(run(code))
-    here = problem.expand(problem.model.start)
+    here = likelihood.expand(likelihood.model.start)
     assert found["devices"] == 2
     assert found["data"] == here.data
     np.testing.assert_array_equal(found["gradient"], here.gradient)
@@ -108,16 +109,16 @@ def free_port() -> int:
 
 
 SHARED = """
-from walop_jax.likelihood import processes, problem
-from walop_jax.fit import refit
-problem.LARGE_ABOVE, refit.SAMPLE = 0, 400
+from walop_jax.likelihood import limits, processes
+from walop_jax.likelihood.runner import Runner
+limits.LARGE_ABOVE, limits.SAMPLE = 0, 400
 here = processes.join(sys.argv[1])
-p = made()
-assert p.is_large
+p = made(runner=Runner(processes=here))
+assert p.layout.large
 """
 
 
-def test_two_processes_fit_as_one_does(problem, monkeypatch):
+def test_two_processes_fit_as_one_does(likelihood, monkeypatch):
     """To 1e-10 in every parameter, in units of its scale; each has done half of the work."""
     code = (
         PLAN
@@ -130,24 +131,24 @@ block = p.calset.intensities.block
 p.calset.intensities.block = lambda a, b: (seen.append(a), block(a, b))[1]
 p.expand(found.values)
 print(json.dumps({"values": found.values.tolist(), "sigma": found.sigma.tolist(), "chi2": found.chi2,
-                  "dof": found.dof, "field": p.field, "converged": found.converged, "seen": len(set(seen))}))
+                  "dof": found.dof, "field": found.posterior.census.field, "converged": found.converged,
+                  "seen": len(set(seen))}))
 """
     )
     port = free_port()
     both = [run(code, f"{n}/2@localhost:{port}") for n in range(2)]
     one, other = (result_of(process) for process in both)
-    monkeypatch.setattr(likelihood, "LARGE_ABOVE", 0)
-    monkeypatch.setattr(refit, "SAMPLE", 400)
-    alone_problem = made()
-    alone = fit(alone_problem)
-    scale = np.array([p.scale for p in problem.model.parameters])
+    monkeypatch.setattr(limits, "LARGE_ABOVE", 0)
+    monkeypatch.setattr(limits, "SAMPLE", 400)
+    alone = fit(made())
+    scale = np.array([p.scale for p in likelihood.model.parameters])
     assert one["converged"]
     assert one["values"] == other["values"]
     assert one["sigma"] == other["sigma"]
     np.testing.assert_allclose(np.array(one["values"]) / scale, alone.values / scale, rtol=0, atol=1e-10)
     np.testing.assert_allclose(one["sigma"], alone.sigma, rtol=1e-8)
     assert one["chi2"] == pytest.approx(alone.chi2, rel=1e-12)
-    assert (one["dof"], tuple(one["field"])) == (alone.dof, alone_problem.field)
+    assert (one["dof"], tuple(one["field"])) == (alone.dof, alone.posterior.census.field)
     assert (one["seen"], other["seen"]) == (13, 12)
 
 
@@ -202,10 +203,9 @@ def test_a_place_that_is_none_is_refused(place):
         processes.join(place)
 
 
-def test_more_processes_than_slabs_are_refused(problem):
-    problem.passes.processes = Processes(99, 100)
+def test_more_processes_than_slabs_are_refused(likelihood):
     with pytest.raises(ValueError, match="use fewer"):
-        problem.passes.total("", None, lambda _: None)
+        Runner(processes=Processes(99, 100)).total("", None, lambda _: None, likelihood.layout)
 
 
 # ------------------------------------------------------------------------------------------------- resuming
@@ -215,9 +215,9 @@ class StopError(Exception):
     pass
 
 
-def interrupted(problem, after):
-    """The problem with a disk that fails after so many slabs."""
-    block, count = problem.calset.intensities.block, 0
+def interrupted(likelihood, after):
+    """The likelihood with a disk that fails after so many slabs."""
+    block, count = likelihood.calset.intensities.block, 0
 
     def failing(start, stop):
         nonlocal count
@@ -226,29 +226,26 @@ def interrupted(problem, after):
             raise StopError
         return block(start, stop)
 
-    problem.calset.intensities.block = failing
-    return problem
+    likelihood.calset.intensities.block = failing
+    return likelihood
 
 
 def test_a_resumed_pass_is_the_same_to_the_last_bit(tmp_path):
-    whole = made()
+    whole, kept = made(), Runner(journal=Journal(tmp_path / "partial", "one fit"))
     expected = whole.expand(whole.model.start)
-    first = interrupted(made(), 9)
-    first.passes.journal = Journal(tmp_path / "partial", "one fit")
+    first = interrupted(dataclasses.replace(made(), runner=kept), 9)
     with pytest.raises(StopError):
         first.expand(first.model.start)
-    again = made()
-    again.passes.journal = Journal(tmp_path / "partial", "one fit")
+    again = dataclasses.replace(made(), runner=kept)
     asked = []
     block = again.calset.intensities.block
     again.calset.intensities.block = lambda a, b: (asked.append(a), block(a, b))[1]
     found = again.expand(again.model.start)
-    assert again.passes.journal.recovered >= 7
-    assert len(asked) == 25 - again.passes.journal.recovered
+    assert 25 - 9 <= len(asked) <= 25 - 7
     assert found.data == expected.data
     np.testing.assert_array_equal(found.matrix, expected.matrix)
-    np.testing.assert_array_equal(again.rows_used, whole.rows_used)
-    assert again.field == whole.field
+    np.testing.assert_array_equal(found.census.rows, whole.census.rows)
+    assert found.census.field == whole.census.field
     # A third time nothing is read at all; other values, another set or model are other work.
     asked.clear()
     again.expand(again.model.start)
@@ -256,8 +253,8 @@ def test_a_resumed_pass_is_the_same_to_the_last_bit(tmp_path):
     again.expand(again.model.start * 1.001)
     assert len(asked) == 25
     asked.clear()
-    again.passes.journal = Journal(tmp_path / "partial", "another fit")
-    again.expand(again.model.start)
+    other = Runner(journal=Journal(tmp_path / "partial", "another fit"))
+    dataclasses.replace(again, runner=other).expand(again.model.start)
     assert len(asked) == 25
 
 
@@ -297,13 +294,27 @@ def test_what_was_made_once_is_remembered(tmp_path):
     assert len(calls) == 1
 
 
-def test_progress_counts_every_point_once(problem, monkeypatch):
+def test_progress_counts_every_point_once(likelihood, monkeypatch):
+    """On a clock that ticks every two seconds: 64 points a tick."""
     told = []
-    problem.passes.watch = lambda label, done, rate: told.append((label, done, rate))
     monkeypatch.setattr(time, "perf_counter", iter(np.arange(0.0, 1e6, 2.0)).__next__)
-    problem.expand(problem.model.start)
-    done = [entry[1] for entry in told]
-    assert done == sorted(done)
-    assert done[-1] == 1600
-    assert len(done) == 25
-    assert all(rate > 0 for _, _, rate in told)
+    dataclasses.replace(likelihood, runner=Runner(progress=told.append)).expand(likelihood.model.start)
+    assert len(told) == 25
+    label = "χ², gradient and matrix"
+    assert told[0] == f"{label}: 64 of 1,600 points, 32 points/s, 48 s left of this pass"
+    assert told[12] == f"{label}: 832 of 1,600 points, 32 points/s, 24 s left of this pass"
+    assert told[-1] == f"{label}: 1,600 of 1,600 points, 32 points/s, 0 s left of this pass"
+
+
+def test_short_passes_are_not_told_of(likelihood):
+    told = []
+    assert dataclasses.replace(likelihood, runner=Runner(progress=told.append)).census.n_data
+    assert told == []
+
+
+def test_small_sets_are_neither_shared_nor_kept(tmp_path):
+    """Every process would wait for the others longer than it computes."""
+    runner = Runner(processes=Processes(1, 2), journal=Journal(tmp_path, "fit"), progress=print)
+    small = made(runner=runner)
+    assert not small.layout.large
+    assert small.runner == Runner(runner.threads, progress=print)
