@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -15,6 +15,7 @@ from south_sets import ABSENT, CUTS, SHARED, SouthSet
 jax.config.update("jax_enable_x64", True)  # the package itself never switches it on
 # Every annotated shape and type of the package is checked, under pytest only. Must precede its import.
 jaxtyping.install_import_hook("walop_jax", "shapes.checked")
+from south_fits import SouthFit  # noqa: E402
 
 OPTIONS = {"long": "studies that take minutes", "benchmark": "timings"}
 
@@ -60,19 +61,25 @@ def shared_data() -> Path:
 @pytest.fixture(scope="session")
 def south_set() -> Callable[[str], SouthSet]:
     """Cuts of 5 × 5 points of the sets a, b, c, d with known truth, by name."""
-    return partial(SouthSet.of, CUTS)
+    return functools.partial(SouthSet.of, CUTS)
 
 
 @pytest.fixture(scope="session")
 def whole_south_set(shared_data: Path) -> Callable[[str], SouthSet]:
     """The sets of 12 × 12 points with known truth, by name; skips where they are not."""
-    return partial(SouthSet.of, shared_data)
+    return functools.partial(SouthSet.of, shared_data)
 
 
 @pytest.fixture(params=["cut", "whole"])
 def either_south_set(request: pytest.FixtureRequest) -> Callable[[str], SouthSet]:
     """Cut and whole sets in turn: for what holds on both alike."""
     return request.getfixturevalue({"cut": "south_set", "whole": "whole_south_set"}[request.param])
+
+
+@pytest.fixture(scope="session")
+def south_fit() -> Callable[[SouthSet], SouthFit]:
+    """Fits of the base model to sets with known truth, each made once."""
+    return functools.cache(SouthFit.of)
 
 
 @pytest.fixture

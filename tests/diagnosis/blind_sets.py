@@ -28,8 +28,8 @@ from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Effect
-from walop_jax.model.parameters import field_declarations, leaves
-from walop_jax.model.specification import effect_context, full_values
+from walop_jax.model.parameters import field_declarations, leaves, values_of
+from walop_jax.model.specification import effect_context
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate
 
@@ -105,7 +105,7 @@ def scene(hiding: Hiding, number: int) -> dict[str, Any]:
     entry["truth"] = None if null else name
     entry["ratio"] = 0.0 if null else ratio
     entry["values"] = {
-        leaf.name: float(v) for e in hidden for leaf, v in zip(leaves(e), full_values(e), strict=True)
+        leaf.name: float(v) for e in hidden for leaf, v in zip(leaves(e), values_of(e), strict=True)
     }
     return entry
 

@@ -131,10 +131,10 @@ class Calibration:
     ) -> Int[np.ndarray, " p"]:
         """Bits of `Quality` of matrices at field positions: high cross-talk, beyond the field or the settings.
 
-        A single arm holds one combination of q and u only: no inverse, and no bit for its cross-talk.
+        A single arm sees one combination of q and u, which has no inverse: it is marked only where it sees neither.
         """
         flags = np.zeros(len(x), np.int64)
-        blocks = values.reshape(len(x), -1, 3)[:, :, 1:]
+        blocks = values.reshape(len(x), values.shape[1] // 3, 3)[:, :, 1:]
         known = np.all(np.isfinite(values), axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             condition = np.linalg.cond(np.where(known[:, None, None], blocks, np.eye(*blocks.shape[1:])))

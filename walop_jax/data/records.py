@@ -257,7 +257,7 @@ class Intensities:
 
     @property
     def cameras(self) -> int:
-        """Number of cameras. Here one point is read for it; who knows better says so without reading."""
+        """Number of cameras. This default reads one point; the classes of the package know it without reading."""
         return self.block(0, 1).counts.shape[-1]
 
     @property

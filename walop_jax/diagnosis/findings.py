@@ -12,7 +12,7 @@ from walop_jax.diagnosis.design import HeldOut
 from walop_jax.fit.refit import FitResult
 
 Outcome = Literal["consistent", "effect_found", "unexplained"]
-Cube = Float[np.ndarray, "p e 4"]
+Cube = Float[np.ndarray, "p e k"]
 
 NEGLIGIBLE = (
     1e-4  # change of calibrated q and u (0.01 %) that does not matter for an instrument good to 0.1 %

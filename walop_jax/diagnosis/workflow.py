@@ -74,10 +74,12 @@ class _Diagnosing:
         seed: int,
         tell: Callable[[str], None],
     ) -> None:
-        self.calset, self.catalogue, self.tell = calset, catalogue, tell
+        self.calset, self.tell = calset, tell
         self.rng = np.random.default_rng(seed)
         self.context: Context = effect_context(model.template, calset.exposures)
-        self.wanted: list[Probe] = list(all_probes(catalogue, self.context))
+        fitting = [kind for kind in catalogue if kind.neutral(self.context).fits(model.template)]
+        self.catalogue = tuple(fitting)
+        self.wanted: list[Probe] = list(all_probes(self.catalogue, self.context))
         self.steps: list[Step] = []
         tell("fitting the model")
         self.fit: FitResult = fit(Likelihood.of(calset, model))
@@ -148,8 +150,9 @@ class _Diagnosing:
                 self.steps.append(step)
                 self._adopt(trial.fit)
                 if self.fit is not trial.fit:
-                    after = Design.of(self.fit) self.steps[-1] = dataclasses.replace(step,
-                    **before_and_after(step.effect, examination.design, after))
+                    after = Design.of(self.fit)
+                    compared = before_and_after(step.effect, examination.design, after)
+                    self.steps[-1] = dataclasses.replace(step, **compared)
                 return step.effect
         return None
 
@@ -198,7 +201,9 @@ class _Diagnosing:
             f". Residuals sit in: cameras {where['camera']}; kinds {where['kind']}; field {where['field']}"
         )
         found = Unexplained(examination.table.p_global, text, patterns)
-        blocks = tuple(dict.fromkeys(b for name, _ in patterns if (b := examination.blocks[name]) is not None))
+        blocks = tuple(
+            dict.fromkeys(b for name, _ in patterns if (b := examination.blocks[name]) is not None)
+        )
         there = FreeForm.name in self.fit.model.effect_names
         return self._with_free_form(examination, found, blocks) if blocks and not there else found
 

@@ -83,6 +83,11 @@ class Likelihood:
         return self.points.reader.calset
 
     @property
+    def cameras(self) -> int:
+        """Number of cameras."""
+        return len(self.model.template.cameras)
+
+    @property
     def plan(self) -> Plan:
         """What is computed for the exposures."""
         return self.layout.plan
@@ -179,8 +184,7 @@ class Likelihood:
         )
 
     def _degrees_of_freedom(self, census: Census) -> int:
-        cameras = len(self.model.template.cameras)
-        per_row = np.where(self.flux_known, cameras, cameras - 1)
+        per_row = np.where(self.flux_known, self.cameras, self.cameras - 1)
         return int(census.rows @ per_row) + int(self.priors.known.sum()) - len(self.model.free)
 
     # ----------------------------------------------------------------------------------- a pass over the points
@@ -207,7 +211,7 @@ class Likelihood:
         total = self.runner.total(label, key, work, self.layout)
         *arrays, rows = np.split(total.sums, np.cumsum([math.prod(shape) for shape in shapes]))
         low_x, high_x, low_y, high_y = (total.extent * np.array([-1.0, 1.0, -1.0, 1.0])).tolist()
-        census = Census(rows.astype(int), (low_x, high_x, low_y, high_y))
+        census = Census(rows.astype(int), (low_x, high_x, low_y, high_y), self.cameras)
         return [array.reshape(shape) for array, shape in zip(arrays, shapes, strict=True)], census
 
     @cached_property

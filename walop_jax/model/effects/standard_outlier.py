@@ -49,9 +49,11 @@ class StandardOutlier(Effect):
 
     def patch(self, instrument: Instrument) -> Instrument:
         """Move the values of the star."""
+        from walop_jax.model.instrument import NoSuchPlaceError
+
         names = instrument.standard.names
         if self.source not in names:
-            raise unknown_name("standard star", self.source, names)
+            raise NoSuchPlaceError(str(unknown_name("standard star", self.source, names)))
         row = names.index(self.source)
         return instrument.changed(
             "standard", q=lambda q: q.at[row].add(self.q), u=lambda u: u.at[row].add(self.u)
