@@ -31,7 +31,6 @@ ROOMS = (
 )
 OWNERS = {
     "astropy": {"io", "data", "sky", "calibration", "diagnosis"},
-    "speclite": {"data"},
     "optimistix": {"fit"},
     "scipy": {"calibration", "diagnosis"},
     "emcee": {"posterior"},

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from walop_jax.fit.refit import FitResult, refit
     from walop_jax.io.errors import DataError
     from walop_jax.likelihood.likelihood import Likelihood
+    from walop_jax.model.build import nominal_instrument
     from walop_jax.model.effects import effect_by_name
-    from walop_jax.model.instrument import nominal_instrument
     from walop_jax.model.specification import with_effects
-    from walop_jax.model.trace import Ray, trace
+    from walop_jax.model.trace import Sightline, trace
     from walop_jax.science.apply import apply
     from walop_jax.simulation.observing_plan import ObservingPlan
     from walop_jax.simulation.simulate import simulate
@@ -41,8 +41,8 @@ __all__ = [
     "FitResult",
     "Likelihood",
     "ObservingPlan",
-    "Ray",
     "Settings",
+    "Sightline",
     "apply",
     "base_model",
     "describe_misfit",
@@ -64,14 +64,14 @@ _HOME = {
     "FitResult": ("fit.refit", "FitResult"),
     "Likelihood": ("likelihood.likelihood", "Likelihood"),
     "ObservingPlan": ("simulation.observing_plan", "ObservingPlan"),
-    "Ray": ("model.trace", "Ray"),
+    "Sightline": ("model.trace", "Sightline"),
     "Settings": ("calibration.matrix", "Settings"),
     "apply": ("science.apply", "apply"),
     "base_model": ("fit.model_builder", "base_model"),
     "describe_misfit": ("fit.misfit", "describe"),
     "effect_by_name": ("model.effects", "effect_by_name"),
     "find_effects": ("diagnosis.workflow", "diagnose"),
-    "nominal_instrument": ("model.instrument", "nominal_instrument"),
+    "nominal_instrument": ("model.build", "nominal_instrument"),
     "read_calibration_set": ("data.calset", "read_calibration_set"),
     "refit": ("fit.refit", "refit"),
     "residual_map": ("calibration.residual_map", "residual_map"),

@@ -57,7 +57,7 @@ def product(handmade) -> CalibrationProduct:
         sources=calset.sources,
         model=("[model]", 'instrument = "WALOP-SOUTH"', "# a comment"),
         inputs=calset.inputs,
-        versions={"python": "3.11.7", "walop-jax": "0.1.0"},
+        versions={"python": "3.11.7", "walop-jax": "0.1.0", "speclite": "0.20"},  # of a library long gone
     )
 
 
@@ -140,7 +140,7 @@ def rewrite(path, change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda h: h[0].header.set("PRODVERS", 2), "newer walop-jax"),
+        (lambda h: h[0].header.set("PRODVERS", 3), "newer walop-jax"),
         (lambda h: h[0].header.set("PRODVERS", "one"), "not a version"),
         (lambda h: h[0].header.remove("PRODVERS"), "is missing"),
         (lambda h: h[0].header.set("INSTRUME", "WALOP-SUOTH"), "WALOP-SOUTH"),

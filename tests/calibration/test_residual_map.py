@@ -10,7 +10,7 @@ import pytest
 
 from walop_jax.calibration import residual_map as remainder
 from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_plan
-from walop_jax.calibration.records import RESIDUAL_NAMES
+from walop_jax.calibration.records import residual_names
 from walop_jax.calibration.residual_map import cell_of, cells_for, residual_map_at
 from walop_jax.data.records import Block
 from walop_jax.data.table_intensities import TableIntensities
@@ -105,7 +105,7 @@ def test_noise_alone_makes_corrections_of_the_size_of_their_errors(cells):
     assert abs(found.significance()) < 5
     assert found.chi2.mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / (576 * 11 * 3)))
     excess = found.excess()
-    for name, error in zip(RESIDUAL_NAMES, found.errors, strict=True):
+    for name, error in zip(residual_names(2), found.errors, strict=True):
         # The scatter of a mean of 36 squares.
         assert abs(excess[name]) ** 2 < 5 * np.sqrt(2 / 36) * np.mean(error**2)
 

@@ -2,43 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
-from typer.testing import CliRunner
+from command import call, no_cache
 
-from walop_jax.cli import app
 from walop_jax.data import write_calibration_set
 from walop_jax.model.effects import effect_by_name
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
+__all__ = ["call", "no_cache"]
+
 PLAN = ObservingPlan(grid=5, standard_grid=2, polariser_angles=polariser_turn(8), moon_patches=3, standards=3)
-
-Call = Callable[..., Any]  # a `Result`: typer brings its own click, or uses an installed one
-
-
-@pytest.fixture(autouse=True, scope="session")
-def _no_cache():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("WALOP_JAX_CACHE", "off")
-        patch.setenv("COLUMNS", "200")
-        yield
-
-
-@pytest.fixture(scope="session")
-def call() -> Call:
-    """Run a command in this process; exceptions that are no exit code count as test failures."""
-
-    def run(*args: object) -> Any:
-        result = CliRunner().invoke(app, [str(arg) for arg in args])
-        if result.exception is not None and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        return result
-
-    return run
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ from astropy.io import fits
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import read_product, write_product
-from walop_jax.calibration.records import RESIDUAL_NAMES
+from walop_jax.calibration.records import residual_names
 from walop_jax.data import Grid, write_frames
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood import limits
@@ -80,14 +80,14 @@ def test_the_calibration_carries_a_residual_map(finished):
     assert summary["steps"] <= 3
     residuals = read_product(folder / "calibration.fits").residuals
     assert summary["residual_map"]["cells"] == [9, 9]
-    assert residuals.values.shape == (len(RESIDUAL_NAMES), 9, 9)
+    assert residuals.values.shape == (len(residual_names(2)), 9, 9)
     # Nothing is hidden in this set.
     assert abs(summary["residual_map"]["significance"]) < 5
     assert summary["residual_map"]["significance"] == pytest.approx(residuals.significance())
     np.testing.assert_allclose(residuals.chi2, 1.0, atol=6 * np.sqrt(2 / (64 * 9 * 3)))
     with fits.open(folder / "calibration.fits") as hdus:
         header = hdus["RESIDUAL"].header
-        assert [header[f"PLANE{n}"] for n in range(1, 8)] == list(RESIDUAL_NAMES)
+        assert [header[f"PLANE{n}"] for n in range(1, 8)] == list(residual_names(2))
         assert header["CTYPE1"] == "X"
         # The centre of the first cell, by the coordinates of the header.
         first = header["CRVAL1"] + (1 - header["CRPIX1"]) * header["CD1_1"]

@@ -10,11 +10,11 @@ import pytest
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import read_product
 from walop_jax.data import builtin_filter
-from walop_jax.model.instrument import nominal_instrument
-from walop_jax.model.trace import Ray, trace
+from walop_jax.model.build import nominal_instrument
+from walop_jax.model.trace import Sightline, trace
 
 STAR = ("--x", 0.2, "--y", -0.1, "--q", 0.03, "--u", 0.01, "--teff", 5772)
-RAY = Ray(x=0.2, y=-0.1, q=0.03, u=0.01, teff=5772.0)
+RAY = Sightline(x=0.2, y=-0.1, q=0.03, u=0.01, teff=5772.0)
 
 
 def test_as_designed(call):

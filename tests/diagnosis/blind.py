@@ -23,7 +23,7 @@ import numpy as np
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import naming
 from walop_jax.diagnosis.effect_columns import Probe, probes
-from walop_jax.diagnosis.examination import ALARM, Look
+from walop_jax.diagnosis.examination import ALARM, Examination
 from walop_jax.diagnosis.freeform import SINGLE, Measured
 from walop_jax.diagnosis.score import Candidate, Scorer, ScoreSpace, separations, whitening
 from walop_jax.diagnosis.workflow import MOST_STEPS
@@ -98,23 +98,23 @@ class Blind:
         result = fit(Likelihood.of(calset, model))
         self.rng = np.random.default_rng(seed)
         wanted = list(probes(EFFECTS, effect_context(model.template, calset.exposures)))
-        look = Look(result, wanted, self.rng)
-        self.probes: list[Probe] = look.probes
+        examination = Examination(result, wanted, self.rng)
+        self.probes: list[Probe] = examination.probes
         self.effect_of = {p.name: p.effect.name for p in self.probes}
-        self.space, self.nuisance = look.space, look.common_mode
+        self.space, self.nuisance = examination.space, examination.common_mode
         self.places = self.space.places()
         self._whitening = whitening(self.space.gram)
         self._root = self.space.gram @ self._whitening
         self.dimension = self._root.shape[1]
         self.outside = {}
-        for shape in outside(look.design.measured):
-            column = look.design.projector(look.design.stacked([shape.columns])[:, 0])
-            along = self._whitening.T @ (look.columns.T @ column)
+        for shape in outside(examination.design.measured):
+            column = examination.design.projector(examination.design.stacked([shape.columns])[:, 0])
+            along = self._whitening.T @ (examination.columns.T @ column)
             self.outside[shape.name] = along, float(column @ column - along @ along)
         self._scorers: dict[tuple[tuple[str, ...], tuple[str, ...]], tuple[Scorer, list[Probe]]] = {}
-        self.free = look.space.free
-        self.visible = sorted({p.effect.name for p in self.probes if look.table[p.name].testable})
-        self._testable = {p.name for p in self.probes if look.table[p.name].testable}
+        self.free = examination.space.free
+        self.visible = sorted({p.effect.name for p in self.probes if examination.table[p.name].testable})
+        self._testable = {p.name for p in self.probes if examination.table[p.name].testable}
 
     # ------------------------------------------------------------------------------------------ drawing scenes
 

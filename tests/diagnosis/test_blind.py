@@ -1,4 +1,4 @@
-"""A small part of the blind suite; the whole is `tests/diagnosis/blind.py` (scores) and `blind_sets.py` (whole sets)."""
+"""A small part of the blind suite; the whole is `blind.py` (scores) and `blind_sets.py` (whole sets)."""
 
 import blind as suite
 import pytest

@@ -10,7 +10,7 @@ import pytest
 
 from walop_jax.diagnosis import naming, workflow
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.examination import Look
+from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.figure_data import pictures
 from walop_jax.diagnosis.findings import Unexplained
 from walop_jax.diagnosis.workflow import diagnose
@@ -89,21 +89,23 @@ class Rehearsal(workflow._Diagnosing):
         self.steps = ["name"]
         self.tell = lambda text: None
 
-    def _look(self, earlier=None):
-        look = Mock(spec=Look, alarm=bool(self.steps), design=Mock(spec=Design))
-        look.table = SimpleNamespace(p_global=float(not self.steps))
-        look.summary.return_value = look.limits.return_value = look.untestable.return_value = ()
+    def _examine(self, earlier=None):
+        examination = Mock(spec=Examination, alarm=bool(self.steps), design=Mock(spec=Design))
+        examination.table = SimpleNamespace(p_global=float(not self.steps))
+        examination.summary.return_value = examination.limits.return_value = (
+            examination.untestable.return_value
+        ) = ()
         return look
 
-    def _add_best(self, look):
+    def _add_best(self, examination):
         return None
 
     def _drop_what_is_not_needed(self):
         dropped, self.steps = bool(self.steps), []
         return dropped
 
-    def _unexplained(self, look):
-        return Unexplained(look.table.p_global, "", ())
+    def _unexplained(self, examination):
+        return Unexplained(examination.table.p_global, "", ())
 
 
 def test_what_has_no_name_is_asked_of_the_model_without_needless_names():

@@ -1,4 +1,4 @@
-"""The joint fit against another program: scipy's least squares on a numpy residual written from the contract alone."""
+"""The joint fit against another program: scipy's least squares on a numpy residual written from `docs: model`."""
 
 import time
 
@@ -14,12 +14,12 @@ from walop_jax.likelihood.likelihood import Likelihood
 
 
 @pytest.mark.long
-def test_scipy_finds_the_same_minimum(shared_data):
+def test_scipy_finds_the_same_minimum(either_south_set):
     """χ² at the minimum to 1e-6, every well determined parameter to a hundredth of its error.
 
     Printed (-s): seconds of both, scipy from nominal values by finite differences, ours the second time.
     """
-    path = shared_data / "walop_south_a.fits"
+    path = either_south_set("a").path
     calset = read_calibration_set(path)
     likelihood = Likelihood.of(calset, base_model(calset))
     fit(likelihood)

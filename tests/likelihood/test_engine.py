@@ -329,13 +329,13 @@ def test_eliminated_flux_is_the_least_squares_one():
 
 
 @pytest.mark.parametrize("start", ["true", "nominal"])
-def test_set_a_has_the_oracles_residuals(shared_data, start):
+def test_set_a_has_the_oracles_residuals(either_south_set, start):
     """χ² of a set made elsewhere, residual by residual, at the as-built values and at the nominal ones."""
-    path = shared_data / "walop_south_a.fits"
-    calset = read_calibration_set(path)
+    south = either_south_set("a")
+    calset = read_calibration_set(south.path)
     likelihood = Likelihood.of(calset, base_model(calset))
-    data = forward.load(path)
-    params = forward.nominal() if start == "nominal" else validate.read_truth(shared_data, "a")[0]
+    data = forward.load(south.path)
+    params = forward.nominal() if start == "nominal" else validate.read_truth(south)[0]
     params["q"], params["u"] = data["sources"]["Q"] + 1e-4, data["sources"]["U"] - 2e-4
     values = dict(zip(likelihood.model.names, likelihood.model.start, strict=True))
     values |= {ours: params[theirs] for ours, theirs in builders.ORACLE_NAMES.items()}

@@ -37,6 +37,10 @@ class Counted(Intensities):
     def __init__(self, inner):
         self.inner, self.asked = inner, []
 
+    @property
+    def cameras(self):
+        return self.inner.cameras
+
     def block(self, start, stop):
         self.asked.append((start, stop))
         return self.inner.block(start, stop)

@@ -1,13 +1,13 @@
-"""Hold the oracle against sets with known truth: `python -m oracle.validate FOLDER SET` in tests/."""
+"""Hold the oracle against sets with known truth: `python -m oracle.validate [FOLDER [SET]]` in tests/."""
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
+from south_sets import CUTS, SouthSet
 
 from . import forward
 
@@ -23,17 +23,17 @@ AS_BUILT = {
 }
 
 
-def read_truth(folder, name):
-    """As-built parameters (constant throughputs) and the table of true matrices of a set."""
+def read_truth(south):
+    """As-built parameters (constant throughputs) and the table of true matrices of a `SouthSet`."""
     from astropy.io import fits
 
-    built = json.loads((Path(folder) / f"walop_south_{name}_truth.json").read_text())
+    built = south.as_built()
     params = forward.nominal()
     params.update({ours: built[theirs] for ours, theirs in AS_BUILT.items()})
     params["eta_1"], params["eta_2"] = built["efficiency"]
     params["coll_q"], params["coll_u"] = built["collimator_bias"]
     params["throughput"][:, 0] = built["throughput"]
-    with fits.open(Path(folder) / f"walop_south_{name}_truth.fits") as hdus:
+    with fits.open(south.matrix) as hdus:
         table = {column: np.array(hdus[1].data[column], float) for column in hdus[1].columns.names}
     return params, table
 
@@ -70,12 +70,13 @@ def compare(params, table, wavelengths, weights):
     return out
 
 
-def main(folder, name="a"):
+def main(folder=CUTS, name="a"):
     """Print the comparison with the truth, then the fit and its calibration error."""
     from . import fit
 
-    params, table = read_truth(folder, name)
-    data = forward.load(Path(folder) / f"walop_south_{name}.fits")
+    south = SouthSet.of(Path(folder), name)
+    params, table = read_truth(south)
+    data = forward.load(south.path)
     band = forward.band(*data["filters"]["SDSS-r"], 5772.0)
     for k, error in compare(params, table, *band).items():
         print(f"{k:8s} rms {np.sqrt(np.mean(error**2)):.1e}  max {np.max(np.abs(error)):.1e}")

@@ -23,7 +23,7 @@ from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_pl
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
-from walop_jax.model.specification import unravel
+from walop_jax.model.parameters import with_values
 from walop_jax.posterior import Options, sample
 from walop_jax.posterior.target import Target
 
@@ -53,7 +53,7 @@ class Study:
         axis = np.linspace(-0.25, 0.25, 4)
         self.x, self.y = (v.ravel() for v in np.meshgrid(axis, axis))
         self.plan = settings_plan(Settings.default(1), self.worlds.blank.filters, model.template)
-        to_instrument = unravel(model.template)
+        to_instrument = with_values(model.template)
 
         def matrix(values: jax.Array, plan: object, x: jax.Array, y: jax.Array) -> jax.Array:
             instrument = to_instrument(values)

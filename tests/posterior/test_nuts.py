@@ -5,11 +5,12 @@ python -m pytest tests/posterior/test_nuts.py --long -s
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from emcee.autocorr import integrated_time
+from south_sets import SouthSet
 
 from walop_jax.data import read_calibration_set
 from walop_jax.fit.model_builder import base_model
@@ -26,14 +27,13 @@ def effective(x: np.ndarray) -> float:
 
 
 @pytest.mark.long
-def test_emcee_agrees_with_nuts(shared_data: Path) -> None:
+def test_emcee_agrees_with_nuts(either_south_set: Callable[[str], SouthSet]) -> None:
     """Means to 0.1 σ, widths to 5 % beyond twice the sampling error of NUTS (ours is far smaller)."""
     pytest.importorskip("blackjax")
     from walop_jax.posterior.nuts import sample_nuts
 
-    calset = read_calibration_set(shared_data / "walop_south_a.fits")
-    likelihood = Likelihood.of(calset, base_model(calset))
-    result = fit(likelihood)
+    calset = read_calibration_set(either_south_set("a").path)
+    result = fit(Likelihood.of(calset, base_model(calset)))
     ours = sample(result, Options(seed=1, interval=2000))
     assert ours.trusted, ours.warnings
     nuts = sample_nuts(Target(result), DRAWS)

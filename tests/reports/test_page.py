@@ -173,7 +173,7 @@ def test_files_of_different_diagnoses_are_not_mixed(tmp_path):
     assert "diagnosis.json is of another fit" in read_run(run).missing[1]
 
 
-def test_a_summary_with_the_contract_alone_is_enough(tmp_path):
+def test_a_summary_with_the_necessary_keys_alone_is_enough(tmp_path):
     run = handmade_run.make_refit(tmp_path / "run")
     keys = ("chi2", "dof", "n_data", "parameters", "converged", "message", "seconds", "versions", "inputs")
     (run / "summary.json").write_text(json.dumps({key: handmade_run.SUMMARY[key] for key in keys}))

@@ -23,8 +23,8 @@ from walop_jax.data import (
 from walop_jax.fit.model_builder import base_model
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
+from walop_jax.model.build import nominal_instrument
 from walop_jax.model.effects import effect_by_name
-from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.specification import full_values, make_model, with_effects
 from walop_jax.simulation.observing_plan import (
     NARROW_BANDS,
@@ -322,9 +322,13 @@ def test_the_documented_command_makes_the_set_in_fits_data(tmp_path: Path, name:
     stored = read_calibration_set(FITS_DATA / f"{name}.fits")
     made = read_calibration_set(tmp_path / f"{name}.fits")
     for part in ("exposures", "points", "sources"):
-        ours, theirs = getattr(made, part), getattr(stored, part)
-        for field in dataclasses.fields(ours):
-            values, reference = getattr(ours, field.name), getattr(theirs, field.name)
+        ours, theirs = (
+            entry.exposures.columns() if part == "exposures" else dataclasses.asdict(getattr(entry, part))
+            for entry in (made, stored)
+        )
+        assert ours.keys() == theirs.keys()
+        for column, values in ours.items():
+            reference = theirs[column]
             if values.dtype.kind == "f":
                 np.testing.assert_allclose(values, reference, rtol=1e-13, atol=1e-13)
             else:

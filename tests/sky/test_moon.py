@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from astropy import units as u
 from astropy.coordinates import SkyCoord
-from astropy.io import fits
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from science.truth import TrueInstrument
 
 from walop_jax.data import DataError, Site, read_calibration_set
 from walop_jax.sky.moon import moon_direction, moon_sky, rayleigh_sky, sky_to_instrument, standard_rotation
@@ -158,25 +158,17 @@ def test_bad_skies_are_refused():
         moon_sky(good, good, np.array([np.nan]), good, SITE, *CENTRE)
 
 
-def test_moon_exposures_of_an_outside_simulator(shared_data):
+def test_moon_exposures_of_an_outside_simulator(either_south_set):
     """Set a: camera ratios of the Moon patches through the true matrix, to the photon noise."""
-    calset = read_calibration_set(shared_data / "walop_south_a.fits")
-    with fits.open(shared_data / "walop_south_a_truth.fits") as hdus:
-        truth = {name: np.asarray(hdus[1].data[name], dtype=float) for name in hdus[1].data.names}
+    calset = read_calibration_set(either_south_set("a").path)
+    truth = TrueInstrument(either_south_set("a"))
     exposures = calset.exposures
     moon = np.flatnonzero(exposures.kind == "moon")
     block = calset.intensities.block(0, len(calset.points))
     rows = np.flatnonzero(block.used[:, moon].all(axis=1))
     x, y = block.x[rows], block.y[rows]
 
-    def basis(a, b, degree=12):  # the true matrix is smooth: this interpolates it to 1e-6
-        terms = np.polynomial.chebyshev.chebvander2d(a / 0.3, b / 0.3, [degree, degree])
-        i, j = np.indices((degree + 1, degree + 1))
-        return terms[:, (i + j <= degree).ravel()]
-
-    def at_points(name):
-        fit = np.linalg.lstsq(basis(truth["X"], truth["Y"]), truth[name], rcond=None)[0]
-        return (basis(x, y) @ fit)[:, None]
+    matrix = {name: values[:, None] for name, values in truth.matrix(x, y).items()}
 
     def chi2(site):
         settings = (getattr(exposures, name)[moon] for name in ("mjd", "ra", "dec", "rotator"))
@@ -187,7 +179,7 @@ def test_moon_exposures_of_an_outside_simulator(shared_data):
             both = n.sum(axis=-1)
             ratio = (n[..., 0] - n[..., 1]) / both
             sigma = 2 * np.hypot(n[..., 1] * s[..., 0], n[..., 0] * s[..., 1]) / both**2
-            model = at_points(f"M{row}1") + at_points(f"M{row}2") * q + at_points(f"M{row}3") * u_
+            model = matrix[f"m{row}1"] + matrix[f"m{row}2"] * q + matrix[f"m{row}3"] * u_
             total += np.mean(((ratio - model) / sigma) ** 2)
         return total / 2
 

@@ -18,19 +18,20 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.field_series import FieldSeries, colour_nodes, colour_weights, field_nodes
 from walop_jax.calibration.matrix import Settings, settings_plan
-from walop_jax.data.checks import FIELD_LIMITS
+from walop_jax.data.checks import field_limit
 from walop_jax.likelihood.nodes import rows_and_slopes
-from walop_jax.model import legendre, light
+from walop_jax.model import light
 from walop_jax.model.compiled import compiled
+from walop_jax.model.dependence import optical_indices
 from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import values_of, with_values
 from walop_jax.model.plan import Plan
-from walop_jax.model.specification import optical_indices, series_indices
+from walop_jax.model.specification import series_indices
 
 COLOURS = 12  # colour temperatures of the vectors
 DERIVATIVE_COLOURS = 3
@@ -64,7 +65,7 @@ class Local(NamedTuple):
 
 def _vectors(
     instrument: Instrument, plan: Plan, x: Float[Array, ""], y: Float[Array, ""]
-) -> Float[Array, "b 4 3"]:
+) -> Float[Array, "b k 3"]:
     rows = light.band_rows(instrument, plan, x, y)
     vectors = light.camera_vectors(instrument, rows, light.throughput_at(instrument, x, y), x, y)
     return (vectors @ light.telescope(instrument))[..., :3]
@@ -72,24 +73,28 @@ def _vectors(
 
 def _derivatives(
     instrument: Instrument, plan: Plan, x: Float[Array, ""], y: Float[Array, ""]
-) -> Float[Array, "n4 b 4 3"]:
+) -> Float[Array, "n2 b k 3"]:
     """Derivatives to all parameters (zero for the throughput series), then to the four local throughputs."""
-    values, to_instrument = ravel_pytree(instrument)
+    values, to_instrument = values_of(instrument), with_values(instrument)
     optical = np.asarray(optical_indices(instrument), int)
     plain = np.setdiff1d(np.arange(values.size), np.asarray(series_indices(instrument), int))
 
     def vectors(
-        rows: Float[Array, "b 2 2 4"], all_values: Float[Array, " n"], local: Float[Array, 4]
-    ) -> Float[Array, "b 4 3"]:
+        rows: Float[Array, "b r 4"], all_values: Float[Array, " n"], local: Float[Array, " k"]
+    ) -> Float[Array, "b k 3"]:
         there = to_instrument(all_values)
         return (light.camera_vectors(there, rows, local, x, y) @ light.telescope(there))[..., :3]
 
     rows, slopes = rows_and_slopes(instrument, plan, x, y)
     out, push = jax.linearize(vectors, rows, values, light.throughput_at(instrument, x, y))
-    no_rows, no_values, no_local = jnp.zeros_like(rows), jnp.zeros_like(values), jnp.zeros(4)
+    no_rows, no_values, no_local = (
+        jnp.zeros_like(rows),
+        jnp.zeros_like(values),
+        jnp.zeros(len(instrument.cameras)),
+    )
     d_rows = jnp.zeros((values.size, *rows.shape)).at[optical].set(slopes)
     d_plain = jax.vmap(lambda dr, dv: push(dr, dv, no_local))(d_rows[plain], jnp.eye(values.size)[plain])
-    d_local = jax.vmap(lambda dt: push(no_rows, no_values, dt))(jnp.eye(4))
+    d_local = jax.vmap(lambda dt: push(no_rows, no_values, dt))(jnp.eye(no_local.size))
     return jnp.concatenate([jnp.zeros((values.size, *out.shape)).at[plain].set(d_plain), d_local])
 
 
@@ -116,7 +121,7 @@ class AnalysisVectors:
         self.calibration = calibration
         self.instrument = calibration.model.instrument(calibration.values)
         reach = REACH * float(np.abs(calibration.field).max())
-        self.half_width = min(FIELD_LIMITS[calibration.model.name], reach)
+        self.half_width = min(field_limit(calibration.model.name), reach)
         self._tables: dict[Setting, _Table] = {}
         series = np.asarray(series_indices(self.instrument), int)
         uncertain = np.diag(calibration.covariance) > 0
@@ -168,10 +173,7 @@ class AnalysisVectors:
         y: Float[np.ndarray, " p"],
     ) -> Float[np.ndarray, "p 2 k"]:
         """Derivatives to `parameters`: those to the local throughputs are spread over the series."""
-        degree = self.instrument.throughput.degree
-        basis = np.asarray(
-            jax.vmap(lambda a, b: legendre.basis(a, b, degree))(jnp.asarray(x), jnp.asarray(y))
-        )
+        basis = np.asarray(self.instrument.throughput.basis(jnp.asarray(x), jnp.asarray(y)))
         spread = throughput[..., None] * basis[:, None, None, :]
         return np.concatenate([plain, spread.reshape(*plain.shape[:2], -1)], axis=-1)
 

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
+import operator
 from collections.abc import Mapping
 
 import numpy as np
@@ -14,7 +16,7 @@ from jaxtyping import Float, Int
 
 from walop_jax.calibration.matrix import Settings, matrices
 from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, ParameterTable, Verdict, spelt
-from walop_jax.calibration.records import ResidualMap
+from walop_jax.calibration.records import Quality, ResidualMap
 from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import Exposures, FilterCurve, InputFile, Site, Sources
@@ -23,7 +25,8 @@ from walop_jax.fit.model_file import render
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.software import software_versions
-from walop_jax.model.instrument import nominal_instrument
+from walop_jax.model.build import nominal_instrument
+from walop_jax.model.dependence import needs
 from walop_jax.model.specification import Model, effect_context
 
 Vector = Float[np.ndarray, " n"]
@@ -99,8 +102,8 @@ class Calibration:
 
     def matrix(
         self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings | None = None
-    ) -> tuple[Float[np.ndarray, "p 6"], Float[np.ndarray, "p 6 6"]]:
-        """m21, m22, m23, m31, m32, m33 and their covariance at field positions (deg), a setting for each.
+    ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
+        """m21, m22, m23, m31, … and their covariance at field positions (deg), a setting for each.
 
         Without `settings`: SDSS-r, a flat photon spectrum, calibration plate out. Raises `DataError` for a
         filter that neither the calibration nor the package knows.
@@ -124,24 +127,27 @@ class Calibration:
         x: Float[np.ndarray, " p"],
         y: Float[np.ndarray, " p"],
         settings: Settings,
-        values: Float[np.ndarray, "p 6"],
+        values: Float[np.ndarray, "p m"],
     ) -> Int[np.ndarray, " p"]:
-        """Quality bits (`QUALITY_BITS`) of matrices at field positions: 16, 32 and 64."""
+        """Bits of `Quality` of matrices at field positions: high cross-talk, beyond the field or the settings.
+
+        A single arm sees one combination of q and u, which has no inverse: it is marked only where it sees neither.
+        """
         flags = np.zeros(len(x), np.int64)
-        blocks = values[:, [[1, 2], [4, 5]]]
+        blocks = values.reshape(len(x), values.shape[1] // 3, 3)[:, :, 1:]
         known = np.all(np.isfinite(values), axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            condition = np.linalg.cond(np.where(known[:, None, None], blocks, np.eye(2)))
-        flags[~(condition <= HIGH_CROSSTALK)] |= 16
+            condition = np.linalg.cond(np.where(known[:, None, None], blocks, np.eye(*blocks.shape[1:])))
+        flags[~(condition <= HIGH_CROSSTALK)] |= Quality.HIGH_CROSSTALK
         margin = 0.5 / MAP_SIZE * (self.field[1] - self.field[0])
         low_x, low_y = self.field[0] - margin, self.field[2] - margin
         high_x, high_y = self.field[1] + margin, self.field[3] + margin
-        flags[(x < low_x) | (x > high_x) | (y < low_y) | (y > high_y)] |= 32
-        flags[~np.isin(settings.filter, np.unique(self.exposures.filter))] |= 64
-        if any("temperature" in effect.optics_depend_on for effect in self.model.template.effects):
+        flags[(x < low_x) | (x > high_x) | (y < low_y) | (y > high_y)] |= Quality.BEYOND_FIELD
+        flags[~np.isin(settings.filter, np.unique(self.exposures.filter))] |= Quality.BEYOND_SETTINGS
+        if "temperature" in needs(self.model.template).conditions:
             low, high = np.nanmin(self.exposures.temp), np.nanmax(self.exposures.temp)
             beyond = (settings.temp < low - TEMPERATURE_MARGIN) | (settings.temp > high + TEMPERATURE_MARGIN)
-            flags[beyond] |= 64
+            flags[beyond] |= Quality.BEYOND_SETTINGS
         return flags
 
     def maps(self, size: int = MAP_SIZE) -> MatrixMaps:
@@ -158,7 +164,7 @@ class Calibration:
         points = grid.points
         values, covariance = self.matrix(points.x, points.y, Settings.default(size * size, name))
         errors = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
-        planes = (6, size, size)
+        planes = (-1, size, size)
         return MatrixMaps(grid, name, values.T.reshape(planes), errors.T.reshape(planes))
 
     # ------------------------------------------------------------------------------- into a file and back
@@ -198,23 +204,25 @@ class Calibration:
 
     @classmethod
     def from_product(cls, product: CalibrationProduct) -> Calibration:
-        """The calibration that a product holds.
+        """The calibration that a product holds; parameters go by name, whatever their order there.
 
         Raises ValueError if the model of the product cannot be rebuilt, or has other parameters than it
         lists.
         """
         model = rebuild(product)
-        names = tuple(str(name) for name in product.parameters.name)
-        if model.names != names:
-            odd = sorted(set(model.names) ^ set(names))
+        names = [str(name) for name in product.parameters.name]
+        if sorted(model.names) != sorted(names):
+            odd = sorted(set(model.names) ^ set(names)) or ["one of them twice"]
             raise DataError(
                 f"the model of the product has other parameters than it lists ({', '.join(odd[:3])}): it was "
                 "made by a version with other physics; fit again"
             )
+        place = {name: n for n, name in enumerate(names)}
+        order = np.array([place[name] for name in model.names])
         return cls(
             model=model,
-            values=product.parameters.value,
-            covariance=product.covariance,
+            values=product.parameters.value[order],
+            covariance=product.covariance[np.ix_(order, order)],
             verdict=product.verdict,
             filters=product.filters,
             exposures=product.exposures,
@@ -238,14 +246,17 @@ def rebuild(product: CalibrationProduct) -> Model:
     )
 
 
-def quality(result: FitResult) -> int:
-    """Quality bits of a fit as a whole (`QUALITY_BITS`): 1, 2, 4, 8 and 8192."""
-    bits = 0 if result.converged else 1
-    bits |= 2 if result.minimum.condition > ILL_CONDITIONED * result.n_data else 0
-    bits |= 4 if len(at_prior_edge(result)) else 0
+def quality(result: FitResult) -> Quality:
+    """What is to be said against a fit as a whole."""
     ratio = result.chi2 / max(result.dof, 1)
-    bits |= 8 if max(ratio, result.noise_scale**2) > 1.0 + EXCESS_NOISE**2 else 0
-    return bits | (0 if result.explains_data else 8192)
+    held_against = {
+        Quality.NOT_CONVERGED: not result.converged,
+        Quality.ILL_CONDITIONED: result.minimum.condition > ILL_CONDITIONED * result.n_data,
+        Quality.AT_PRIOR_EDGE: len(at_prior_edge(result)) > 0,
+        Quality.EXCESS_NOISE: max(ratio, result.noise_scale**2) > 1.0 + EXCESS_NOISE**2,
+        Quality.UNEXPLAINED: not result.explains_data,
+    }
+    return functools.reduce(operator.or_, (bit for bit, holds in held_against.items() if holds), Quality(0))
 
 
 def at_prior_edge(result: FitResult) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from walop_jax.calibration.records import RESIDUAL_NAMES, ResidualMap
+from walop_jax.calibration.records import ResidualMap, residual_names
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import Exposures
 from walop_jax.fit.refit import FitResult
@@ -34,8 +34,9 @@ from walop_jax.model.plan import Plan
 
 Vector = Float[np.ndarray, " n"]
 
-_UPPER = np.triu_indices(len(RESIDUAL_NAMES))
-_NUMBERS = 2 + len(RESIDUAL_NAMES) + len(_UPPER[0])  # χ², degrees of freedom, Σ A r, upper half of Σ A P Aᵀ
+_QUANTITIES = residual_names(2)
+_UPPER = np.triu_indices(len(_QUANTITIES))
+_NUMBERS = 2 + len(_QUANTITIES) + len(_UPPER[0])  # χ², degrees of freedom, Σ A r, upper half of Σ A P Aᵀ
 
 
 def _point_sums(
@@ -136,7 +137,7 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
 
     total = likelihood.runner.total("residual map", None, work, likelihood.layout)
     total = total.sums.reshape(_NUMBERS, count)
-    n = len(RESIDUAL_NAMES)
+    n = len(_QUANTITIES)
     matrix = np.zeros((count, n, n))
     matrix[:, _UPPER[0], _UPPER[1]] = matrix[:, _UPPER[1], _UPPER[0]] = total[2 + n :].T
     size = np.sqrt(np.diagonal(matrix, axis1=1, axis2=2))

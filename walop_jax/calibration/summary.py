@@ -25,7 +25,7 @@ def summary(
     misfit: Misfit | None = None,
     residuals: ResidualMap | None = None,
 ) -> dict[str, Any]:
-    """What a fit found: the contract's keys first, then how far it can be trusted.
+    """What a fit found and how far it can be trusted, key by key as in docs: files.
 
     Frozen parameters have sigma 0.
     """
@@ -44,7 +44,7 @@ def summary(
         "versions": software_versions(),
         "inputs": [{"path": str(entry.path), "sha256": entry.sha256} for entry in result.calset.inputs],
         "trusted": result.trusted,
-        "quality": quality(result),
+        "quality": int(quality(result)),
         "warnings": list(result.warnings),
         "instrument": result.model.name,
         "effects": list(result.model.effect_names),

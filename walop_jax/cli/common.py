@@ -33,6 +33,14 @@ ModelOption = Annotated[
     Path | None,
     typer.Option("--model", metavar="MODEL.toml", help="Model file: what is free, tied, known, added."),
 ]
+InstrumentOption = Annotated[
+    str | None,
+    typer.Option(
+        "--instrument",
+        metavar="NAME|FILE.toml",
+        help="An instrument that comes with the package, or a description file; see walop-jax instrument.",
+    ),
+]
 ProcessesOption = Annotated[
     str | None,
     typer.Option(

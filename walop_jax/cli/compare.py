@@ -9,6 +9,7 @@ import typer
 
 from walop_jax.cli.common import (
     CalsetFiles,
+    InstrumentOption,
     JsonOption,
     ModelOption,
     OverwriteOption,
@@ -34,6 +35,7 @@ def compare(
     truth: TruthOption = None,
     filter_name: FilterOption = "SDSS-r",
     model: ModelOption = None,
+    instrument: InstrumentOption = None,
     overwrite: OverwriteOption = False,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -56,6 +58,7 @@ def compare(
             truth=truth,
             filter_name=filter_name,
             model=model,
+            instrument=instrument,
             seed=seed,
             overwrite=overwrite,
             progress=tell,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from walop_jax.cli.common import (
     CalsetFiles,
+    InstrumentOption,
     JsonOption,
     ModelOption,
     OverwriteOption,
@@ -29,6 +30,7 @@ def diagnose(
     calsets: CalsetFiles,
     output: RunFolder,
     model: ModelOption = None,
+    instrument: InstrumentOption = None,
     overwrite: OverwriteOption = False,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -44,7 +46,9 @@ def diagnose(
     from walop_jax.runs.diagnose import diagnose_sets
 
     with progress(quiet or json) as tell:
-        found = diagnose_sets(calsets, output, model=model, seed=seed, overwrite=overwrite, progress=tell)
+        found = diagnose_sets(
+            calsets, output, model=model, instrument=instrument, seed=seed, overwrite=overwrite, progress=tell
+        )
     if json:
         print_json(found.document)
     for sentence in found.diagnosis.after.warnings:

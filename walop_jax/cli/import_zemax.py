@@ -25,7 +25,7 @@ OutputOption = Annotated[
 ]
 InstrumentOption = Annotated[
     str | None,
-    typer.Option("--instrument", help="WALOP-SOUTH, WALOP-NORTH or WALOP-LAB; default: what the titles say."),
+    typer.Option("--instrument", help="Which instrument; default: what the titles say."),
 ]
 CamerasOption = Annotated[
     str,
@@ -68,13 +68,13 @@ def import_zemax(
         )
     if not 0.0 <= error < 1.0:
         raise typer.BadParameter(f"{error} is not a share, as in 0.001", param_hint="--error")
-    from walop_jax.data.checks import INSTRUMENTS
+    from walop_jax.instruments.description import shipped
     from walop_jax.io.errors import nearest
     from walop_jax.runs.import_zemax import import_folder
 
-    if instrument is not None and instrument.upper() not in INSTRUMENTS:
+    if instrument is not None and instrument.upper() not in shipped():
         raise typer.BadParameter(
-            f"there is no {instrument!r}: {nearest(instrument, INSTRUMENTS)}", param_hint="--instrument"
+            f"there is no {instrument!r}: {nearest(instrument, shipped())}", param_hint="--instrument"
         )
     with progress(quiet or json) as tell:
         made = import_folder(

@@ -44,7 +44,12 @@ def _show(report: Inspection) -> None:
     lines = {
         "instrument": f"{report.instrument}, {report.telescope} ({report.origin or 'origin not stated'})",
         "field points": f"{report.points}, X {low_x:+.3f} … {high_x:+.3f}°, Y {low_y:+.3f} … {high_y:+.3f}°",
+        "cameras": str(report.cameras),
         "polariser angles": f"{len(report.angles)} modulo 180°, widest gap {report.widest_gap:.3g}°",
+        **{
+            f"element {use.prefix}": f"in {use.exposures} exposures, {len(use.angles)} angles"
+            for use in report.elements
+        },
         "used": f"{report.rows} of {report.possible} (exposure, point) pairs"
         + (f" at {report.looked_at} points looked at" if report.looked_at < report.points else ""),
         "flagged": ", ".join(f"{count} {name}" for name, count in report.flags.items()) or "none",

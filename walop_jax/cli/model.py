@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from walop_jax.cli.common import (
+    InstrumentOption,
     JsonOption,
     OverwriteOption,
     QuietOption,
@@ -22,9 +23,6 @@ Sets = Annotated[
 ]
 OutputOption = Annotated[
     Path | None, typer.Option("--output", "-o", metavar="MODEL.toml", help="File to write; default: stdout.")
-]
-InstrumentOption = Annotated[
-    str | None, typer.Option("--instrument", help="WALOP-SOUTH (default), WALOP-NORTH or WALOP-LAB.")
 ]
 EffectOption = Annotated[
     list[str] | None, typer.Option("--effect", metavar="NAME", help="Add an effect; may be repeated.")
@@ -47,8 +45,6 @@ def model(
     `refit --model`.
     """
     del seed  # nothing is random here
-    if calsets and instrument:
-        raise typer.BadParameter("the calibration sets say which instrument it is", param_hint="--instrument")
     switch_on_jax()
     from walop_jax.runs.model import write_model
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from walop_jax.cli.common import (
     CalsetFiles,
     CommandError,
+    InstrumentOption,
     JsonOption,
     MemoryOption,
     ModelOption,
@@ -31,6 +32,7 @@ def refit(
     calsets: CalsetFiles,
     output: RunFolder,
     model: ModelOption = None,
+    instrument: InstrumentOption = None,
     overwrite: OverwriteOption = False,
     memory: MemoryOption = 2.0,
     processes: ProcessesOption = None,
@@ -58,6 +60,7 @@ def refit(
             calsets,
             output,
             model=model,
+            instrument=instrument,
             seed=seed,
             overwrite=overwrite,
             memory=memory * 1e9,

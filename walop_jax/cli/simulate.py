@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from walop_jax.cli.common import (
+    InstrumentOption,
     JsonOption,
     OverwriteOption,
     QuietOption,
@@ -19,9 +20,6 @@ from walop_jax.cli.common import (
 
 OutputOption = Annotated[
     Path, typer.Option("--output", "-o", metavar="CALSET", help="Calibration set to write (FITS).")
-]
-InstrumentOption = Annotated[
-    str, typer.Option("--instrument", help="WALOP-SOUTH, WALOP-NORTH, or WALOP-LAB (the bench).")
 ]
 EffectOption = Annotated[
     list[str] | None,
@@ -40,7 +38,7 @@ SeedOption = Annotated[int, typer.Option("--seed", min=0, help="The same seed gi
 
 def simulate(
     output: OutputOption,
-    instrument: InstrumentOption = "WALOP-SOUTH",
+    instrument: InstrumentOption = None,
     effect: EffectOption = None,
     seed: SeedOption = 0,
     grid: Annotated[int, typer.Option(min=1, help="Field points along each axis.")] = 12,
@@ -68,17 +66,22 @@ def simulate(
     The light path is the one that a fit uses; noise is that of photons and of the detectors (30 electrons).
     """
     switch_on_jax()
+    from walop_jax.model.build import nominal_instrument
+    from walop_jax.model.instrument import Instrument
     from walop_jax.runs.simulate import simulate_set
     from walop_jax.simulation.effect_text import effect_from_text
     from walop_jax.simulation.observing_plan import NARROW_BANDS, ObservingPlan, polariser_turn
 
     turn = polariser_turn(angles, full_turn=full_turn)
     try:
-        if instrument.upper() == "WALOP-LAB":
-            plan = dataclasses.replace(ObservingPlan.bench(grid), polariser_angles=turn, electrons=electrons)
+        design = Instrument.read(instrument) if instrument else nominal_instrument()
+        if design.raster[0] == "line":
+            plan = dataclasses.replace(
+                ObservingPlan.bench(grid), instrument=design, polariser_angles=turn, electrons=electrons
+            )
         else:
             plan = ObservingPlan(
-                instrument.upper(),
+                design,
                 grid=grid,
                 standard_grid=standard_grid,
                 polariser_angles=turn,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from walop_jax.cli.common import JsonOption, print_json, switch_on_jax
+from walop_jax.cli.common import InstrumentOption, JsonOption, print_json, switch_on_jax
 
 if TYPE_CHECKING:
     from walop_jax.model.trace import Stage
@@ -19,9 +19,6 @@ ProductArgument = Annotated[
         help="An instrument as fitted; without it, as designed.",
         show_default=False,
     ),
-]
-InstrumentOption = Annotated[
-    str, typer.Option("--instrument", help="WALOP-SOUTH, WALOP-NORTH or WALOP-LAB, as designed.")
 ]
 AngleOption = Annotated[
     float | None, typer.Option("--angle", help="Polariser in, with its axis here (deg).", show_default=False)
@@ -38,7 +35,7 @@ TeffOption = Annotated[
 
 def trace(
     product: ProductArgument = None,
-    instrument: InstrumentOption = "WALOP-SOUTH",
+    instrument: InstrumentOption = None,
     x: Annotated[float, typer.Option("--x", help="Field position X (deg).")] = 0.0,
     y: Annotated[float, typer.Option("--y", help="Field position Y (deg).")] = 0.0,
     q: Annotated[float, typer.Option("--q", help="Stokes q of the source, a fraction.")] = 0.0,
@@ -56,11 +53,11 @@ def trace(
     """
     nan = float("nan")
     switch_on_jax()
-    from walop_jax.model.trace import Ray
+    from walop_jax.model.trace import Sightline
     from walop_jax.runs.trace import trace_source
 
     try:
-        ray = Ray(
+        ray = Sightline(
             x=x,
             y=y,
             q=q,

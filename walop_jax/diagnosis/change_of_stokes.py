@@ -18,7 +18,7 @@ LARGEST_P = 0.05
 SMALLEST_DETERMINANT = 0.1  # below, one exposure holds hardly any u
 
 
-def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p 2 3"]:
+def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p a 3"]:
     """Instrument matrix at the field points of a fit, in the filter and plate setting of its first exposure."""
     instrument, calset = result.model.instrument(result.values), result.calset
     e = calset.exposures
@@ -26,13 +26,17 @@ def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p 2 3"]:
     setting.chwp_angle[0] = e.chwp_angle[0] if e.chwp_in[0] else np.nan
     plan = settings_plan(setting, calset.filters, instrument)
     vectors = analysis_vectors(instrument, plan, calset.points.x, calset.points.y)[:, 0]
-    return np.asarray(light.instrument_matrix(jnp.asarray(vectors) @ light.telescope(instrument)))
+    return np.asarray(
+        light.instrument_matrix(jnp.asarray(vectors) @ light.telescope(instrument), instrument.cameras.pairs)
+    )
 
 
 def largest_change(
-    assumed: Float[np.ndarray, "p 2 3"], true: Float[np.ndarray, "p 2 3"], p: float = LARGEST_P
+    assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
 ) -> float:
     """Largest error of q and u over the field for stars polarised by up to `p`; NaN when no point holds both."""
+    if assumed.shape[1] != 2:  # one exposure of one arm, or of three, does not give q and u and nothing else
+        return float("nan")
     good = np.abs(np.linalg.det(assumed[:, :, 1:])) > SMALLEST_DETERMINANT
     if not good.any():
         return float("nan")

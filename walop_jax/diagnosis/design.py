@@ -43,17 +43,17 @@ class Design:
     @property
     def rows(self) -> int:
         """Number of rows that are data."""
-        return 4 * int(self.measured.used.sum())
+        return self.measured.cameras * int(self.measured.used.sum())
 
     @cached_property
     def exposure(self) -> Int[np.ndarray, " d"]:
         """Exposure (position) of every data row."""
-        return np.repeat(np.nonzero(self.measured.used)[1], 4)
+        return np.repeat(np.nonzero(self.measured.used)[1], self.measured.cameras)
 
     @cached_property
     def point(self) -> Int[np.ndarray, " d"]:
         """Field point (position) of every data row."""
-        return np.repeat(np.nonzero(self.measured.used)[0], 4)
+        return np.repeat(np.nonzero(self.measured.used)[0], self.measured.cameras)
 
     @cached_property
     def projector(self) -> Projector:
@@ -91,11 +91,11 @@ class Design:
             first += piece.shape[1]
         return whole
 
-    def cube(self, rows: Vector) -> Float[np.ndarray, "p e 4"]:
+    def cube(self, rows: Vector) -> Float[np.ndarray, "p e k"]:
         """Data rows put back into (point, exposure, camera); 0 where unused."""
         used = self.measured.used
-        cube = np.zeros((*used.shape, 4))
-        cube[used] = rows[: self.rows].reshape(-1, 4)
+        cube = np.zeros((*used.shape, self.measured.cameras))
+        cube[used] = rows[: self.rows].reshape(-1, self.measured.cameras)
         return cube
 
     def subset_step(self, keep: Bool[np.ndarray, " _"]) -> Float[np.ndarray, " _"]:
@@ -143,7 +143,7 @@ class HeldOut:
 
     @property
     def mean(self) -> float:
-        """Mean squared normalised residual (noise alone gives 3/4 when the flux is free)."""
+        """Mean squared normalised residual (noise alone gives 1 − 1/K with K cameras when the flux is free)."""
         return float(self.squares.sum() / self.counts.sum())
 
 

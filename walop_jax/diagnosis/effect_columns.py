@@ -19,9 +19,9 @@ from walop_jax.diagnosis.score import Candidate
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import light
+from walop_jax.model.dependence import needs, optical_indices
 from walop_jax.model.effects import Context, Effect
-from walop_jax.model.effects.base import overridden
-from walop_jax.model.parameters import field_declarations
+from walop_jax.model.parameters import field_declarations, leaves
 from walop_jax.model.specification import Model
 
 LEAST_SURVIVING = 1e-3  # a contrast of 1 % that the band reduces by this factor is 0.001 %: of no consequence
@@ -68,15 +68,11 @@ def probes(catalogue: Sequence[type[Effect]], context: Context) -> Iterator[Prob
                 yield probe
 
 
-def _kind_of_computation(effect: type[Effect], instance: Effect) -> tuple[object, ...]:
-    """What makes a computation costly: optics for every exposure, many nodes, derivatives of the plates."""
-    return (
-        effect.optics_depend_on,
-        effect.fringes,
-        effect.uses_median,
-        overridden((instance,), "mirrored"),
-        overridden((instance,), "plates") or overridden((instance,), "field"),
-    )
+def _kind_of_computation(model: Model, instance: Effect) -> tuple[object, ...]:
+    """What makes a computation costly: optics for every exposure, many nodes, derivatives of the optics."""
+    alone = dataclasses.replace(model.template, effects=(instance,))
+    first = len(leaves(dataclasses.replace(alone, effects=())))
+    return needs(alone), light.has_ghosts(alone), any(i >= first for i in optical_indices(alone))
 
 
 def effect_candidates(
@@ -89,7 +85,7 @@ def effect_candidates(
     together: dict[tuple[object, ...], list[Probe]] = {}
     for probe in wanted:
         if probe.effect not in several:
-            together.setdefault(_kind_of_computation(probe.effect, probe.group[0]), []).append(probe)
+            together.setdefault(_kind_of_computation(model, probe.group[0]), []).append(probe)
     for batch in together.values():
         members = tuple(member for probe in batch for member in probe.group)
         columns = Likelihood.of(calset, model, members).effect_columns(values, members)

@@ -1,4 +1,4 @@
-"""One look at a fit: its design, the scores of every effect and pattern, and the names in order of evidence."""
+"""One examination of a fit: its design, the scores of every effect and pattern, and the names in order of evidence."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ALIKE = 0.01  # relative change of the counts up to which columns are kept
 
 
 @dataclasses.dataclass(frozen=True)
-class _Own:
+class _Absorbed:
     """What the parameters of an active effect absorb: the projection without them, and the columns' share of it."""
 
     rest: Projector
@@ -39,7 +39,7 @@ class _Own:
     columns: Matrix  # basisᵀ C
 
 
-class Look:
+class Examination:
     """The scores of everything against one fit.
 
     `named` are the columns of the effects ahead of any projection, `space` and `columns` those of all candidates,
@@ -52,9 +52,9 @@ class Look:
         result: FitResult,
         wanted: Sequence[Probe],
         rng: np.random.Generator,
-        earlier: Look | None = None,
+        earlier: Examination | None = None,
     ) -> None:
-        """`earlier` is a look at a smaller model, whose columns serve again where the light has hardly changed."""
+        """`earlier` is of a smaller model; its columns serve again where the light has hardly changed."""
         self.result = result
         active = result.model.effect_names
         self.design = Design.of(result)
@@ -69,10 +69,10 @@ class Look:
         names, widths = [c.name for c in candidates], [c.widths for c in candidates]
         self.blocks = {c.name: c.block for c in candidates}
         self.columns = self.design.stacked([candidates.pop(0).columns for _ in names])
-        self._own = {}
+        self._absorbed = {}
         for name in active:
             rest, basis = self.design.without(name)
-            self._own[name] = _Own(rest, basis, basis.T @ self.columns)
+            self._absorbed[name] = _Absorbed(rest, basis, basis.T @ self.columns)
         self.space = ScoreSpace.projected(self.design.projector, names, widths, self.columns)
         self.common_mode = self._common_mode()
         space, reduce = self.space.with_base([SINGLE], self.common_mode)
@@ -85,7 +85,7 @@ class Look:
         # Where the base is excluded, a name competes with patterns that have none, not with the base.
         self.least_evidence = min(0.0, max(s.log_bayes for s in self.patterns if s.testable))
 
-    def _is_like(self, earlier: Look) -> bool:
+    def _is_like(self, earlier: Examination) -> bool:
         """Whether the expected counts differ so little that derivatives with respect to anything else do as well."""
         ours, theirs = self.design.measured.model, earlier.design.measured.model
         return bool(np.linalg.norm(ours - theirs) < ALIKE * np.linalg.norm(theirs))
@@ -93,7 +93,7 @@ class Look:
     def _common_mode(self) -> Vector:
         """Prior widths of the gains of single exposures that amount to `COMMON_MODE` per intensity."""
         at = self.space.places()[SINGLE]
-        points = np.repeat(self.design.measured.used.sum(axis=0), 3)
+        points = np.repeat(self.design.measured.used.sum(axis=0), self.design.measured.cameras - 1)
         square = np.where(self.space.before[at] > 0, self.space.before[at], np.inf)
         return np.maximum(COMMON_MODE * np.sqrt(points / square), 1e-30)
 
@@ -146,7 +146,7 @@ class Look:
 
     def separation(self, name: str, change: Vector) -> dict[str, float]:
         """How far (σ) each rival stays from an active effect that changes the residuals (data rows) by `change`."""
-        own = self._own[name]
+        own = self._absorbed[name]
         whole = np.pad(change, (0, len(self.design.residual) - len(change)))
         projected = own.rest(whole)
         space = dataclasses.replace(self.space, gram=self.space.gram + own.columns.T @ own.columns)

@@ -21,11 +21,10 @@ from walop_jax.diagnosis.figure_file import Comparison, DiagnosisPictures, Expos
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.location import HARMONICS
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.conventions import CAMERA_NAMES
 from walop_jax.model.effects import FreeForm
 
-Cube = Float[np.ndarray, "p e 4"]
-PointMap = Float[np.ndarray, "p 4"]
+Cube = Float[np.ndarray, "p e k"]
+PointMap = Float[np.ndarray, "p k"]
 Weight = Float[np.ndarray, " e"]
 Used = Bool[np.ndarray, "p e"]
 
@@ -166,11 +165,13 @@ def _ladder(diagnosis: Diagnosis) -> Ladder:
 def _shares(likelihood: Likelihood, before: Cube, after: Cube) -> Shares:
     """Sums of squared residuals by camera, kind, filter and exposure."""
     e, known = likelihood.calset.exposures, likelihood.flux_known
-    expected = likelihood.used.sum(axis=0)[:, None] * np.where(known, 1.0, 0.75)[:, None] * np.ones(4)
+    names = likelihood.model.template.cameras.names
+    share = np.where(known, 1.0, 1.0 - 1.0 / len(names))
+    expected = (likelihood.used.sum(axis=0) * share)[:, None] * np.ones(len(names))
     squares = [expected, (before**2).sum(axis=0), (after**2).sum(axis=0)]  # (exposure, camera)
     members: list[tuple[str, str]] = []
     sums: list[list[float]] = []
-    for k, camera in enumerate(CAMERA_NAMES):
+    for k, camera in enumerate(names):
         members.append(("camera", camera))
         sums.append([float(square[:, k].sum()) for square in squares])
     for group, label in (("kind", e.kind), ("filter", e.filter), ("exposure", e.exposure)):

@@ -44,11 +44,11 @@ DIAGVERS = 1
 
 Names = Shaped[np.ndarray, " _"]
 Vector = Float[np.ndarray, " _"]
-PointMap = Float[np.ndarray, "p 4"]
-Curve = Float[np.ndarray, "e 4"]
+PointMap = Float[np.ndarray, "p k"]
+Curve = Float[np.ndarray, "e k"]
 
 _SIGMA = "(data - model) in standard deviations, cameras O1 E1 O2 E2"
-_FOUR = Column("float", width=4)
+_CAMERAS = Column("float", width=None)
 _TABLES: Mapping[str, Mapping[str, tuple[Column, str]]] = {
     "LADDER": {
         "MODEL": (Column("str"), "the starting model, or what was added to it"),
@@ -73,13 +73,13 @@ _TABLES: Mapping[str, Mapping[str, tuple[Column, str]]] = {
         "POINT": (Column("int"), "field point"),
         "X": (Column("float", "deg"), "field coordinate"),
         "Y": (Column("float", "deg"), "field coordinate"),
-        "BEFORE": (_FOUR, f"combined residual: {_SIGMA}"),
-        "AFTER": (_FOUR, "the same with the effect"),
-        "EXPLAINED": (_FOUR, "BEFORE - AFTER: the effect"),
-        "MEAN_BEFORE": (_FOUR, "mean over exposures"),
-        "MEAN_AFTER": (_FOUR, "mean over exposures"),
-        "RMS_BEFORE": (_FOUR, "rms over exposures"),
-        "RMS_AFTER": (_FOUR, "rms over exposures"),
+        "BEFORE": (_CAMERAS, f"combined residual: {_SIGMA}"),
+        "AFTER": (_CAMERAS, "the same with the effect"),
+        "EXPLAINED": (_CAMERAS, "BEFORE - AFTER: the effect"),
+        "MEAN_BEFORE": (_CAMERAS, "mean over exposures"),
+        "MEAN_AFTER": (_CAMERAS, "mean over exposures"),
+        "RMS_BEFORE": (_CAMERAS, "rms over exposures"),
+        "RMS_AFTER": (_CAMERAS, "rms over exposures"),
     },
     "CURVES": {
         "COMPARISON": (Column("int"), "row of COMPARISONS"),
@@ -87,10 +87,10 @@ _TABLES: Mapping[str, Mapping[str, tuple[Column, str]]] = {
         "KIND": (Column("str"), "clp, moon, standard or flux"),
         "MJD": (Column("float", "d"), "UTC mid-exposure"),
         "CLP_ANGLE": (Column("float", "deg"), "polariser angle; NaN: out"),
-        "BEFORE": (_FOUR, f"weighted mean over the field: {_SIGMA}"),
-        "ERROR": (_FOUR, "standard error of BEFORE and AFTER"),
-        "AFTER": (_FOUR, "the same with the effect"),
-        "EXPLAINED": (_FOUR, "BEFORE - AFTER: the effect"),
+        "BEFORE": (_CAMERAS, f"weighted mean over the field: {_SIGMA}"),
+        "ERROR": (_CAMERAS, "standard error of BEFORE and AFTER"),
+        "AFTER": (_CAMERAS, "the same with the effect"),
+        "EXPLAINED": (_CAMERAS, "BEFORE - AFTER: the effect"),
     },
 }  # fmt: skip
 

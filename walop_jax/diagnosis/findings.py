@@ -11,8 +11,8 @@ from jaxtyping import Float
 from walop_jax.diagnosis.design import HeldOut
 from walop_jax.fit.refit import FitResult
 
-Verdict = Literal["consistent", "effect_found", "unexplained"]
-Cube = Float[np.ndarray, "p e 4"]
+Outcome = Literal["consistent", "effect_found", "unexplained"]
+Cube = Float[np.ndarray, "p e k"]
 
 NEGLIGIBLE = (
     1e-4  # change of calibrated q and u (0.01 %) that does not matter for an instrument good to 0.1 %
@@ -107,11 +107,11 @@ class Unexplained:
 class Diagnosis:
     """What is missing from a model, according to one calibration set.
 
-    `candidates` are (effect, score, corrected p) in the first look; `before` is the fit of the model given, `after`
-    that of the extended one; `remaining_p` is the significance of what is left at the end.
+    `candidates` are (effect, score, corrected p) in the first examination; `before` is the fit of the model given,
+    `after` that of the extended one; `remaining_p` is the significance of what is left at the end.
     """
 
-    verdict: Verdict
+    verdict: Outcome
     steps: tuple[Step, ...]
     candidates: tuple[tuple[str, float, float], ...]
     limits: tuple[Limit, ...]

@@ -22,8 +22,8 @@ from walop_jax.diagnosis.score import Score, ScoreTable
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Context, Effect
-from walop_jax.model.parameters import leaves
-from walop_jax.model.specification import Model, full_values, with_effects
+from walop_jax.model.parameters import leaves, values_of
+from walop_jax.model.specification import Model, with_effects
 
 SEPARATION = 3.0
 MOST_LEADERS = 5
@@ -131,13 +131,15 @@ def _differ(one: Trial, other: Trial) -> bool:
         return True
     at = one.fit.model.positions(one.effect.name)
     sigma = np.maximum(one.fit.sigma[at], other.fit.sigma[at])
-    away = full_values(one.instance) - full_values(other.instance)
+    away = np.asarray(values_of(one.instance)) - np.asarray(values_of(other.instance))
     return bool(np.any(np.abs(away) > SEPARATION * np.where(sigma > 0, sigma, np.inf)))
 
 
 def in_words(effect: Effect) -> str:
     """Choices and values of an effect, e.g. "camera = 2, depth = 0.006"."""
-    values = {leaf.name: f"{v:.4g}" for leaf, v in zip(leaves(effect), full_values(effect), strict=True)}
+    values = {
+        leaf.name: f"{v:.4g}" for leaf, v in zip(leaves(effect), np.asarray(values_of(effect)), strict=True)
+    }
     return ", ".join(f"{name} = {value}" for name, value in (spoken_choices(effect) | values).items())
 
 
@@ -199,7 +201,7 @@ def evidence_of_presence(result: FitResult, name: str, context: Context) -> floa
     neutral = dict(
         zip(
             (f"{name}.{leaf.name}" for leaf in leaves(effect)),
-            full_values(effect.at_neutral(context)),
+            np.asarray(values_of(effect.at_neutral(context))),
             strict=True,
         )
     )
@@ -235,7 +237,7 @@ def signature(result: FitResult, name: str, context: Context) -> Float[np.ndarra
         bare = Likelihood.of(result.calset, model).residuals(result.values[kept])[1]
     else:
         values = result.values.copy()
-        values[result.model.positions(name)] = full_values(effect.at_neutral(context))
+        values[result.model.positions(name)] = np.asarray(values_of(effect.at_neutral(context)))
         bare = result.likelihood.residuals(values)[1]
     change = bare - result.likelihood.residuals(result.values)[1]
     return change[result.likelihood.used].reshape(-1) / result.noise_scale

@@ -13,15 +13,16 @@ Matrix = Float[np.ndarray, "n n"]
 
 
 class Census(NamedTuple):
-    """Number of points used in each exposure; smallest and largest x, then y (deg), of those used in any."""
+    """Number of points used in each exposure; smallest and largest x, then y (deg), of those used in any; cameras."""
 
     rows: Int[np.ndarray, " e"]
     field: tuple[float, float, float, float]
+    cameras: int
 
     @property
     def n_data(self) -> int:
         """Number of intensities used."""
-        return 4 * int(self.rows.sum())
+        return self.cameras * int(self.rows.sum())
 
 
 class OpticsUsed(NamedTuple):

@@ -9,9 +9,12 @@ import numpy as np
 from walop_jax.data.records import CalibrationSet
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.thinning import median_counts
+from walop_jax.model import light
 from walop_jax.model.chebyshev import Rectangle
-from walop_jax.model.effects.base import Effect, overridden
-from walop_jax.model.plan import Plan, plan_for, with_median
+from walop_jax.model.dependence import needs
+from walop_jax.model.effects.base import Effect
+from walop_jax.model.plan import Plan, with_median
+from walop_jax.model.planning import plan_for
 from walop_jax.model.specification import Model
 
 THINNEST = 1e-3  # deg: shortest side of a rectangle with nodes
@@ -57,18 +60,18 @@ class Layout:
         `memory` (bytes) is what point data may take, None for the usual 2 GB; `threads` is the number of slabs in use
         at a time. `points_per_chunk` and `interpolate` are decided by the size of the set where they are None.
         """
-        effects = (*model.template.effects, *probes)
-        plan = plan_for(effects, calset.exposures, calset.filters, calset.sources)
-        if any(effect.uses_median for effect in effects):
+        whole = dataclasses.replace(model.template, effects=(*model.template.effects, *probes))
+        plan = plan_for(whole, calset.exposures, calset.filters, calset.sources)
+        if needs(whole).median:
             plan = with_median(plan, median_counts(calset))
-        mirrored = overridden(effects, "mirrored")
+        mirrored = light.has_ghosts(whole)
         points, exposures = len(calset.points), len(calset.exposures)
         many = points > limits.INTERPOLATE_ABOVE
         interpolated = many if interpolate is None else interpolate
         usual = limits.LARGE_CHUNK if many else min(limits.POINTS_PER_CHUNK, _largest_chunk(model, exposures))
         chunk = min(points_per_chunk or usual, points)
         allowed = limits.MEMORY if memory is None else memory
-        each = bytes_per_point(exposures, mirrored=mirrored)
+        each = bytes_per_point(exposures, calset.cameras, mirrored=mirrored)
         kept = 2 * each * points <= allowed
         # Whole chunks; and many of them, as pixels are read in whole rows of the frames.
         most = min(
@@ -100,15 +103,16 @@ class Layout:
         return -(-self.points // self.slab)
 
 
-def bytes_per_point(exposures: int, *, mirrored: bool = False) -> int:
-    """Size of the point data of one field point: per exposure four counts and weights, sky, source and band."""
-    return 8 * (2 + exposures * (4 + 4 + (4 if mirrored else 2) + 1 + 1))
+def bytes_per_point(exposures: int, cameras: int = 4, *, mirrored: bool = False) -> int:
+    """Size of the point data of one field point: per exposure counts and weights, sky, source and band."""
+    return 8 * (2 + exposures * (2 * cameras + (4 if mirrored else 2) + 1 + 1))
 
 
 def _largest_chunk(model: Model, exposures: int) -> int:
     """The largest multiple of four points whose Jacobian in local quantities stays small."""
-    local = len(model.parameters) - len(model.template.throughput.coefficients.ravel()) + 4
-    return max(1, limits.LARGEST_CHUNK // (4 * exposures * local) * 4)
+    cameras = len(model.template.cameras)
+    local = len(model.parameters) - len(model.template.throughput.coefficients.ravel()) + cameras
+    return max(1, limits.LARGEST_CHUNK // (cameras * exposures * local) * 4)
 
 
 def _rectangle(calset: CalibrationSet, *, mirrored: bool) -> Rectangle:

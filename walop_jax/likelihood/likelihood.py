@@ -21,10 +21,11 @@ from walop_jax.likelihood.points import MeasuredPoints, measured_points
 from walop_jax.likelihood.priors import PriorRows, prior_rows
 from walop_jax.likelihood.runner import Runner, SlabSums
 from walop_jax.model.compiled import require_double_precision
+from walop_jax.model.dependence import optical_indices
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
-from walop_jax.model.specification import Model, optical_indices
+from walop_jax.model.specification import Model
 
 Vector = Float[np.ndarray, " n"]
 
@@ -80,6 +81,11 @@ class Likelihood:
     def calset(self) -> CalibrationSet:
         """The set that the points are from."""
         return self.points.reader.calset
+
+    @property
+    def cameras(self) -> int:
+        """Number of cameras."""
+        return len(self.model.template.cameras)
 
     @property
     def plan(self) -> Plan:
@@ -178,7 +184,7 @@ class Likelihood:
         )
 
     def _degrees_of_freedom(self, census: Census) -> int:
-        per_row = np.where(self.flux_known, 4, 3)
+        per_row = np.where(self.flux_known, self.cameras, self.cameras - 1)
         return int(census.rows @ per_row) + int(self.priors.known.sum()) - len(self.model.free)
 
     # ----------------------------------------------------------------------------------- a pass over the points
@@ -205,7 +211,7 @@ class Likelihood:
         total = self.runner.total(label, key, work, self.layout)
         *arrays, rows = np.split(total.sums, np.cumsum([math.prod(shape) for shape in shapes]))
         low_x, high_x, low_y, high_y = (total.extent * np.array([-1.0, 1.0, -1.0, 1.0])).tolist()
-        census = Census(rows.astype(int), (low_x, high_x, low_y, high_y))
+        census = Census(rows.astype(int), (low_x, high_x, low_y, high_y), self.cameras)
         return [array.reshape(shape) for array, shape in zip(arrays, shapes, strict=True)], census
 
     @cached_property
@@ -215,19 +221,19 @@ class Likelihood:
 
     @property
     def dof(self) -> int:
-        """Three per used row (four when the flux is known), one per prior, minus the free parameters."""
+        """Per used row one less than cameras (all where the flux is known), one per prior, less the free parameters."""
         return self._degrees_of_freedom(self.census)
 
     @cached_property
     def used(self) -> Bool[np.ndarray, "p e"]:
-        """True where the four intensities of a (point, exposure) are used."""
+        """True where the intensities of a (point, exposure) are used."""
         return np.concatenate([np.asarray(chunk.weight[..., 0]) > 0 for chunk in self.points])[
             : self.layout.points
         ]
 
     # ----------------------------------------------------------------------------------------- row by row
 
-    def residuals(self, values: Vector) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e 4"]]:
+    def residuals(self, values: Vector) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e k"]]:
         """Best flux and normalised residuals (data − model)/σ of every (point, exposure); 0 where unused.
 
         All of them at once: for whole frames take a sample (`thinning.thinned`).
@@ -275,5 +281,5 @@ class Likelihood:
 def _rows(columns: Array | np.ndarray, chunk: engine.PointData) -> Float[np.ndarray, "d n"]:
     """The rows of a chunk that are used."""
     used = np.asarray(chunk.weight[..., 0] > 0)
-    cube = np.asarray(columns).reshape(*used.shape, 4, -1)
+    cube = np.asarray(columns).reshape(*used.shape, chunk.weight.shape[-1], -1)
     return cube[used].reshape(-1, cube.shape[-1])

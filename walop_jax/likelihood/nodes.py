@@ -16,15 +16,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from walop_jax.model import chebyshev, light
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import compiled
+from walop_jax.model.dependence import optical_indices
 from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import values_of, with_values
 from walop_jax.model.plan import Plan
-from walop_jax.model.specification import optical_indices
 
 Vector = Float[np.ndarray, " n"]
 
@@ -40,8 +40,8 @@ class Nodes(NamedTuple):
     """Band rows at the nodes t of a rectangle, and their derivatives with respect to the optical parameters o."""
 
     rectangle: Rectangle
-    rows: Float[Array, "t b 2 2 4"]
-    slopes: Float[Array, "t o b 2 2 4"]
+    rows: Float[Array, "t b r 4"]
+    slopes: Float[Array, "t o b r 4"]
 
     @property
     def per_side(self) -> int:
@@ -51,12 +51,12 @@ class Nodes(NamedTuple):
 
 def rows_and_slopes(
     instrument: Instrument, plan: Plan, x: Float[Array, ""], y: Float[Array, ""]
-) -> tuple[Float[Array, "b 2 2 4"], Float[Array, "o b 2 2 4"]]:
+) -> tuple[Float[Array, "b r 4"], Float[Array, "o b r 4"]]:
     """Band rows at a field position and their derivatives with respect to the optical parameters: exact."""
-    values, to_instrument = ravel_pytree(instrument)
+    values, to_instrument = values_of(instrument), with_values(instrument)
     optical = np.asarray(optical_indices(instrument), int)
 
-    def optics(optical_values: Float[Array, " o"]) -> Float[Array, "b 2 2 4"]:
+    def optics(optical_values: Float[Array, " o"]) -> Float[Array, "b r 4"]:
         return light.band_rows(to_instrument(values.at[optical].set(optical_values)), plan, x, y)
 
     rows, push = jax.linearize(optics, values[optical])
@@ -65,7 +65,7 @@ def rows_and_slopes(
 
 def interpolated(
     nodes: Nodes, x: Float[Array, " m"], y: Float[Array, " m"]
-) -> tuple[Float[Array, "m b 2 2 4"], Float[Array, "m o b 2 2 4"]]:
+) -> tuple[Float[Array, "m b r 4"], Float[Array, "m o b r 4"]]:
     """Band rows and their derivatives between the nodes."""
     weights = chebyshev.weights(x, y, nodes.rectangle, nodes.per_side)
     return jnp.tensordot(weights, nodes.rows, 1), jnp.tensordot(weights, nodes.slopes, 1)
@@ -77,7 +77,7 @@ _interpolate = compiled(interpolated)
 
 def _solve_all(
     instrument: Instrument, plan: Plan, x: Vector, y: Vector
-) -> tuple[Float[np.ndarray, "p b 2 2 4"], Float[np.ndarray, "p o b 2 2 4"]]:
+) -> tuple[Float[np.ndarray, "p b r 4"], Float[np.ndarray, "p o b r 4"]]:
     parts = []
     for start in range(0, len(x), AT_ONCE):
         # The last batch is filled up with its first place.
@@ -116,7 +116,7 @@ def tabulate(
     nodes = Nodes(rectangle, jnp.asarray(rows[:n]), jnp.asarray(slopes[:n]))
     near, slope = _interpolate(nodes, jnp.asarray(other_x), jnp.asarray(other_y))
     off = np.abs(np.asarray(near) - rows[n:]).max(initial=0.0)
-    tilt = np.abs(np.asarray(slope) - slopes[n:]) * scale[:, None, None, None, None]
+    tilt = np.abs(np.asarray(slope) - slopes[n:]) * scale[:, None, None, None]
     return nodes, float(max(off, tilt.max(initial=0.0)))
 
 

@@ -30,6 +30,11 @@ class RunsOfPoints(Intensities):
         )
 
     @property
+    def cameras(self) -> int:
+        """Number of cameras."""
+        return self.whole.cameras
+
+    @property
     def rows(self) -> int:
         """Number of used (exposure, point) pairs; reads all of them."""
         return sum(int(self.whole.block(n, n + self.length).used.sum()) for n in self.starts.tolist())
@@ -56,7 +61,7 @@ def thinned(calset: CalibrationSet, most: int, neighbours: int = limits.NEIGHBOU
     )
 
 
-def median_counts(calset: CalibrationSet) -> Float[np.ndarray, "e 4"]:
+def median_counts(calset: CalibrationSet) -> Float[np.ndarray, "e k"]:
     """Median over the field of the measured counts of each camera in each exposure; 0 where nothing is used.
 
     Of a set with more than `limits.MEDIAN_POINTS` points, slabs spread evenly over it are enough.

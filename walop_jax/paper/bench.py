@@ -19,7 +19,8 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import refit
-from walop_jax.model.instrument import HalfWavePlate, Instrument, nominal_instrument
+from walop_jax.model.build import adapted
+from walop_jax.model.instrument import Instrument
 from walop_jax.paper.polynomial import fit_paper, judged, ratios, sample_stars, transmitted
 from walop_jax.science.star_errors import joint_errors, star_errors
 from walop_jax.simulation.observing_plan import ObservingPlan
@@ -81,7 +82,7 @@ def _as_built(rng: np.random.Generator) -> Instrument:
 
     (A plate of zero order that is off by 1 µm has 7° of retardance too much.)
     """
-    nominal = nominal_instrument("WALOP-LAB", throughput_degree=0)
+    nominal = adapted(ObservingPlan.bench().design, throughput_degree=0)
     throughput = 0.5 + 0.03 * rng.standard_normal((4, 1))
     plates = [nominal.half1.plate, nominal.half2.plate]
     off = [eqx.tree_at(lambda p: p.mgf2, plate, plate.mgf2 + 0.1 * rng.standard_normal()) for plate in plates]

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 from walop_jax.likelihood import engine
 from walop_jax.model.compiled import compiled
-from walop_jax.model.specification import unravel
+from walop_jax.model.parameters import with_values
 from walop_jax.posterior.target import Target
 
 TARGET_ACCEPTANCE = 0.8
@@ -77,7 +77,7 @@ def whitened(target: Target) -> tuple[Callable[..., Float[Array, ""]], tuple[Any
 
     def log_density(w: Array, template: Any, plan: Any, data: Any, *linear: Array) -> Float[Array, ""]:
         first, along, offset, slope = linear
-        _, r = residuals(unravel(template)(first + along @ w), plan, data)
+        _, r = residuals(with_values(template)(first + along @ w), plan, data)
         return -0.5 * (jnp.sum(r**2) / target.noise_scale**2 + jnp.sum((offset + slope @ w) ** 2))
 
     return log_density, arrays

@@ -18,8 +18,7 @@ from jaxtyping import Array, Float, Int
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import engine
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import leaves, unknown_name
-from walop_jax.model.specification import unravel
+from walop_jax.model.parameters import leaves, unknown_name, with_values
 
 Vector = Float[np.ndarray, " f"]
 LARGEST_SAMPLED = 20
@@ -28,7 +27,7 @@ NEAR_LINEAR = ("Throughput", "Standards")
 
 @jax.jit  # a vector unravelled step by step costs more than the optics of a small set
 def _instrument(template: Instrument, values: Float[Array, " n"]) -> Instrument:
-    return unravel(template)(values)
+    return with_values(template)(values)
 
 
 class Target:

@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from walop_jax.calibration.records import QUALITY_BITS
+from walop_jax.calibration.records import Quality
 from walop_jax.reports import diagnosis_figures, product_figures
 from walop_jax.reports.run import Run
 from walop_jax.reports.wording import (
@@ -54,7 +55,7 @@ def _context(run: Run) -> dict[str, Any]:
     label, sentence = verdict_of_fit(summary) if diagnosis is None else verdict_of_diagnosis(diagnosis)
     good = diagnosis is None or diagnosis["verdict"] != "unexplained"
     main, rest = _parameters(run)
-    quality = int(summary.get("quality", 0))
+    quality = Quality(int(summary.get("quality", 0)))
     return {
         "run": run,
         "name": run.folder.resolve().name,
@@ -66,7 +67,7 @@ def _context(run: Run) -> dict[str, Any]:
         "sentence": sentence,
         "fit_sentence": ": ".join(verdict_of_fit(summary)),
         "good": good and bool(summary.get("trusted", summary["converged"])),
-        "quality": [text for bit, text in QUALITY_BITS.items() if quality & bit],
+        "quality": quality.meanings,
         "steps": [] if diagnosis is None else _steps(run),
         "unnamed": None if diagnosis is None else _drawn(run, len(diagnosis["steps"]) + 1),
         "unnamed_term": UNNAMED,
@@ -195,7 +196,10 @@ def _figures(run: Run) -> dict[str, str]:
 def embedded(figure: Figure) -> str:
     """A figure as a data URI (SVG, letters as outlines): for an image inside a page."""
     stream = io.BytesIO()
-    figure.savefig(stream, format="svg", metadata={"Date": None})
+    with matplotlib.rc_context(
+        {"svg.hashsalt": "walop-jax"}
+    ):  # without it no two pages of a run are the same
+        figure.savefig(stream, format="svg", metadata={"Date": None})
     return "data:image/svg+xml;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
 
 

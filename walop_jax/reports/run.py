@@ -21,7 +21,7 @@ from walop_jax.io.errors import DataError, fail
 POSTERIOR, INTERVALS, CORNER, SAMPLE = "posterior.nc", "posterior.ecsv", "posterior_corner.png", "sample.json"
 SUMMARY_KEYS = ("chi2", "dof", "n_data", "parameters", "converged", "message", "versions", "inputs")
 DIAGNOSIS_KEYS = ("verdict", "steps", "candidates", "unexplained")
-DEFAULTS: dict[str, Any] = {"warnings": [], "remarks": [], "misfit": None}  # beyond the contract's keys
+DEFAULTS: dict[str, Any] = {"warnings": [], "remarks": [], "misfit": None}  # what a summary may lack
 SAME = 1e-6  # relative difference of χ²/dof of one and the same fit, read from two files
 
 T = TypeVar("T")

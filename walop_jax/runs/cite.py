@@ -10,6 +10,7 @@ from walop_jax.calibration.product import read_product
 from walop_jax.fit import solver
 from walop_jax.fit.model_builder import model_without_data
 from walop_jax.io.errors import errors_naming
+from walop_jax.model.build import nominal_instrument
 from walop_jax.model.references import Reference, references, stated_source
 
 
@@ -19,7 +20,7 @@ def cite_run(run: str | os.PathLike[str] | None = None) -> tuple[Reference, ...]
     `run` is a calibration product or the folder of a run. Raises `DataError` for a file that cannot be read.
     """
     if run is None:
-        model = model_without_data("WALOP-SOUTH")
+        model = model_without_data(nominal_instrument())
     else:
         path = product_path(run)
         with errors_naming(path):

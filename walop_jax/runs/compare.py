@@ -15,6 +15,7 @@ from walop_jax.fit.refit import refit
 from walop_jax.io.errors import errors_naming
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
+from walop_jax.model.instrument import Instrument
 from walop_jax.paper.comparison import Comparison, compare
 from walop_jax.reports import comparison_figures
 from walop_jax.science.star_errors import Truth
@@ -46,14 +47,16 @@ def compare_methods(
     truth: str | os.PathLike[str] | None = None,
     filter_name: str = DEFAULT_FILTER,
     model: str | os.PathLike[str] | None = None,
+    instrument: str | os.PathLike[str] | None = None,
     seed: int | None = None,
     overwrite: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> ComparedRun:
     """Calibrate with a polynomial per point and with the joint model, judge both, and write the folder `output`.
 
-    `truth` is a table of true X, Y, M21 … M33; without it the reference is the joint model. `model` is a TOML file
-    (default: the base model); `seed` (None: 0) is that of the stars. `progress` is told what is being done.
+    `truth` is a table of true X, Y, M21 … M33; without it the reference is the joint model. `instrument` is a shipped
+    one by name or a description file (default: what the sets say), `model` a TOML file (default: the base model);
+    `seed` (None: 0) is that of the stars. `progress` is told what is being done.
 
     Raises `DataError` for files that cannot be read or written, ValueError for a model file that does not fit, if
     the joint fit does not converge, and as `compare` does.
@@ -64,8 +67,9 @@ def compare_methods(
     tell("reading")
     calset = read_calibration_set(*calsets)
     known = None if truth is None else Truth(*true_matrices(truth, calset.instrument))
+    design = None if instrument is None else Instrument.read(instrument)
     with errors_naming(model):
-        chosen = model_for(calset, text)
+        chosen = model_for(calset, text, design)
     tell("fitting the joint model")
     result = refit(calset, chosen, progress=tell)
     if not result.converged:

@@ -23,6 +23,7 @@ from walop_jax.fit.model_builder import model_for
 from walop_jax.io.errors import errors_naming
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
+from walop_jax.model.instrument import Instrument
 
 OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, PICTURES)
 
@@ -40,6 +41,7 @@ def diagnose_sets(
     output: str | os.PathLike[str],
     *,
     model: str | os.PathLike[str] | None = None,
+    instrument: str | os.PathLike[str] | None = None,
     seed: int | None = None,
     overwrite: bool = False,
     progress: Callable[[str], None] | None = None,
@@ -47,8 +49,9 @@ def diagnose_sets(
     """Find what is missing from the model of calibration sets, add it, fit again, and write the folder `output`.
 
     `calibration.fits` and `summary.json` are of the extended model, `diagnosis.json` is what was found and
-    `diagnosis.fits` what figures of it need: all four appear, or none. `model` is a TOML file (default: the base
-    model); `seed` (None: 0) is that of the Monte Carlo. `progress` is told what is being done.
+    `diagnosis.fits` what figures of it need: all four appear, or none. `instrument` is a shipped one by name or a
+    description file (default: what the sets say), `model` a TOML file (default: the base model); `seed` (None: 0) is
+    that of the Monte Carlo. `progress` is told what is being done.
 
     Raises `DataError` for files that cannot be read or written, ValueError for a model file that does not fit, and
     what `diagnose` raises.
@@ -59,8 +62,9 @@ def diagnose_sets(
     check_folder(output, OUTPUTS, overwrite=overwrite)
     tell("reading")
     calset = read_calibration_set(*calsets)
+    design = None if instrument is None else Instrument.read(instrument)
     with errors_naming(model):
-        chosen = model_for(calset, text)
+        chosen = model_for(calset, text, design)
     found = diagnose(calset, chosen, seed=seed or 0, progress=tell)
     tell("mapping the field")
     product = Calibration.from_fit(found.after).to_product()

@@ -12,9 +12,9 @@ from walop_jax.data import read_calibration_set
 from walop_jax.fit.model_builder import effects_text, model_for, model_without_data
 from walop_jax.fit.model_file import render
 from walop_jax.io.atomic import atomic_path, check_output
+from walop_jax.model.build import nominal_instrument
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import Model
-
-DEFAULT_INSTRUMENT = "WALOP-SOUTH"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,25 +49,25 @@ def write_model(
     output: str | os.PathLike[str] | None = None,
     calsets: Sequence[str | os.PathLike[str]] = (),
     *,
-    instrument: str | None = None,
+    instrument: str | os.PathLike[str] | None = None,
     effects: Sequence[str] = (),
     overwrite: bool = False,
 ) -> ModelFile:
-    """The base model with `effects` added by name, for `calsets` or else for `instrument` (default: WALOP-SOUTH).
+    """The base model with `effects` added by name, for `calsets` or else for `instrument` (a shipped one by name or a
+    description file; None: the first of the family).
 
     It is written as `output`, if that is given. Raises `DataError` for files that cannot be read or written, and
-    ValueError, with the nearest names, for an unknown instrument or effect, and if both `calsets` and `instrument`
-    are given.
+    ValueError, with the nearest names, for an unknown instrument or effect, and for an instrument that is not the
+    sets'.
     """
-    if calsets and instrument:
-        raise ValueError("the calibration sets say which instrument it is: give them or the instrument")
     if output is not None:
         check_output(output, overwrite=overwrite)
     changes = effects_text(effects)
+    design = Instrument.read(instrument) if instrument is not None else None
     if calsets:
-        model = model_for(read_calibration_set(*calsets), changes)
+        model = model_for(read_calibration_set(*calsets), changes, design)
     else:
-        model = model_without_data(instrument or DEFAULT_INSTRUMENT, changes)
+        model = model_without_data(design or nominal_instrument(), changes)
     text = render(model)
     if output is not None:
         with atomic_path(output, overwrite=overwrite) as temporary:

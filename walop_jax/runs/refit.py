@@ -24,6 +24,7 @@ from walop_jax.io.errors import errors_naming
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
 from walop_jax.likelihood.processes import Processes
+from walop_jax.model.instrument import Instrument
 
 OUTPUTS = (PRODUCT, SUMMARY)
 
@@ -53,6 +54,7 @@ def refit_sets(
     output: str | os.PathLike[str],
     *,
     model: str | os.PathLike[str] | None = None,
+    instrument: str | os.PathLike[str] | None = None,
     seed: int | None = None,
     overwrite: bool = False,
     memory: float | None = None,
@@ -62,10 +64,11 @@ def refit_sets(
     """Fit all field points of calibration sets jointly, and write the folder `output`.
 
     A fit that has converged leaves `calibration.fits` and `summary.json` there, one that has not
-    `summary.failed.json` alone. `model` is a TOML file (default: the base model); `seed` is recorded, nothing is drawn.
-    `progress` is told in a line what is being done. Of large sets: `memory` (bytes) is what their data may take;
-    finished parts are kept in `output`/partial until the end, and the same call goes on from them; `processes` share
-    the work (`likelihood.processes.join`), each making this call, and the first one writes.
+    `summary.failed.json` alone. `instrument` is a shipped one by name or a description file (default: what the sets
+    say), `model` a TOML file (default: the base model); `seed` is recorded, nothing is drawn. `progress` is told in a
+    line what is being done. Of large sets: `memory` (bytes) is what their data may take; finished parts are kept in
+    `output`/partial until the end, and the same call goes on from them; `processes` share the work
+    (`likelihood.processes.join`), each making this call, and the first one writes.
 
     Raises `DataError` for files that cannot be read or written, ValueError for a model file that does not fit, and
     what `refit` raises.
@@ -79,8 +82,9 @@ def refit_sets(
     folder = Path(output)
     tell("reading")
     calset = read_calibration_set(*calsets)
+    design = None if instrument is None else Instrument.read(instrument)
     with errors_naming(model):
-        chosen = model_for(calset, text)
+        chosen = model_for(calset, text, design)
     result = refit(calset, chosen, folder=folder / PARTIAL, progress=tell, memory=memory, processes=processes)
     residuals = residual_map(result) if result.likelihood.layout.large and result.converged else None
     misfit = None

@@ -75,7 +75,7 @@ def simulate_set(
         write_calibration_set(output, calset, overwrite=overwrite)
     return SimulatedSet(
         path=Path(output),
-        instrument=plan.instrument,
+        instrument=plan.name,
         seed=seed,
         exposures=len(calset.exposures),
         points=len(calset.points),
@@ -89,9 +89,9 @@ def truth_document(plan: ObservingPlan, seed: int, instrument: Instrument) -> di
     """What a simulated set was made of, as plain data: the plan, the effects, the true value of every parameter."""
     units = {leaf.name: leaf.declaration.unit for leaf in leaves(instrument)}
     return {
-        "instrument": plan.instrument,
+        "instrument": plan.name,
         "seed": seed,
-        "plan": dataclasses.asdict(plan),
+        "plan": plan.document(),
         "effects": {effect.name: effect.choices() for effect in instrument.effects},
         "parameters": {
             name: {"value": value, "unit": units[name]} for name, value in truth_values(instrument).items()

@@ -18,11 +18,12 @@ from walop_jax.calibration.analysis_vectors import COLOURS, AnalysisVectors, Set
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.field_series import COOLEST, colour_weights
 from walop_jax.calibration.matrix import Settings
+from walop_jax.calibration.records import Quality
 from walop_jax.data.catalogue import Catalogue
 from walop_jax.io.errors import DataError
-from walop_jax.model.effects.base import overridden
-from walop_jax.model.plan import exposure_arrays
-from walop_jax.model.specification import unravel
+from walop_jax.model import carried, light
+from walop_jax.model.dependence import needs
+from walop_jax.model.parameters import with_values
 from walop_jax.science.estimate import calibration_shift, estimate
 
 BLOCK = 16384  # rows that are worked on together
@@ -31,7 +32,6 @@ ILL_POSED = 10.0  # ratio of the errors of the two principal directions from whi
 COOL, HOT = 3500.0, 10000.0
 """Colour temperatures (K) between which stars without TEFF are taken to lie."""
 _NEUTRAL = Setting("")
-_CORRECTED = ("nonlinearity",)  # effects of the detectors that need to know nothing of the exposure
 _ROUNDS = 16
 
 
@@ -42,7 +42,7 @@ class Stars:
     On the sky (equatorial frame) where the catalogue has a ROTATOR, in the instrument frame elsewhere;
     `covariance` is `photon` plus `calibration`. `colour` is the error of (q, u) if the colour of the star were
     ignored; where TEFF is not known, half the difference between stars of 3500 K and 10 000 K, which is not
-    in the covariance. `flag` holds `QUALITY_BITS`; `rows` counts the rows of a star.
+    in the covariance. `flag` holds bits of `Quality`; `rows` counts the rows of a star.
     """
 
     qu: Float[np.ndarray, "s 2"]
@@ -196,7 +196,7 @@ def _settings(calibration: Calibration, catalogue: Catalogue) -> tuple[list[Sett
     Temperature and hour angle count only where an effect of the model makes the optics depend on them.
     """
     points = catalogue.points
-    depends = {name for effect in calibration.model.template.effects for name in effect.optics_depend_on}
+    depends = needs(calibration.model.template).conditions
     temperature = points.temp if "temperature" in depends else np.full(len(catalogue), _NEUTRAL.temperature)
     hours = points.ha if "hour_angle" in depends else np.zeros(len(catalogue))
     plate = np.where(np.isnan(points.chwp_angle), np.inf, np.mod(points.chwp_angle, 180.0))
@@ -234,13 +234,13 @@ def _flags(
     settings = Settings(*(getattr(points, f.name)[rows] for f in dataclasses.fields(Settings)))
     square = np.tile([0.0, 1.0, 0.0, 0.0, 0.0, 1.0], (len(rows), 1))  # 16 is decided below, for all rows
     bits = vectors.calibration.flags(points.x[rows], points.y[rows], settings, square)
-    bits[_outside(vectors, catalogue, rows)] |= 32
-    bits[settings.teff < COOLEST] |= 64
-    bits[~np.isfinite(counts * catalogue.sigma[rows]).all(axis=1)] |= 128
-    bits[catalogue.spoilt[rows]] |= 256
+    bits[_outside(vectors, catalogue, rows)] |= Quality.BEYOND_FIELD
+    bits[settings.teff < COOLEST] |= Quality.BEYOND_SETTINGS
+    bits[~np.isfinite(counts * catalogue.sigma[rows]).all(axis=1)] |= Quality.CAMERA_MISSING
+    bits[catalogue.spoilt[rows]] |= Quality.SATURATED
     flag = np.bitwise_or.reduceat(bits, first) | vectors.calibration.verdict.quality
-    flag[~(condition < ILL_POSED)] |= 16
-    flag[~np.isfinite(qu).all(axis=1)] |= 16384
+    flag[~(condition < ILL_POSED)] |= Quality.HIGH_CROSSTALK
+    flag[~np.isfinite(qu).all(axis=1)] |= Quality.NO_STOKES
     return flag
 
 
@@ -248,33 +248,28 @@ def _flags(
 
 
 def linearised(calibration: Calibration, counts: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
-    """Counts as linear detectors would report them, by the non-linearity that the calibration has found."""
-    effects = [e for e in calibration.model.instrument(calibration.values).effects if e.name in _CORRECTED]
-    exposures = exposure_arrays(calibration.exposures)
+    """Counts as linear detectors would report them, where the calibration has found out what they do to counts."""
+    instrument = calibration.model.instrument(calibration.values)
+    if light.is_linear(instrument):
+        return counts
     true = counts
-    for _ in range(_ROUNDS if effects else 0):
-        seen = jnp.asarray(true)
-        for effect in effects:
-            seen = effect.detector(seen, exposures)
-        true = true + (counts - np.asarray(seen))
+    for _ in range(_ROUNDS):
+        true = true + (counts - np.asarray(carried.reported(instrument, jnp.asarray(true))))
     return true
 
 
 def not_carried_over(calibration: Calibration) -> tuple[str, ...]:
-    """Effects of the fitted model that belong to an exposure's detectors and cannot be undone in a catalogue."""
-    effects = calibration.model.template.effects
-    return tuple(e.name for e in effects if overridden((e,), "detector") and e.name not in _CORRECTED)
+    """Effects of the fitted model that belong to its exposures and cannot be undone in a catalogue."""
+    return carried.left_behind(calibration.model.template)
 
 
 def _rotator_zero(vectors: AnalysisVectors) -> tuple[float, Float[np.ndarray, " k"]]:
     """What the model adds to ROTATOR (rad), and its derivatives to `vectors.parameters`."""
-    to_instrument = unravel(vectors.calibration.model.template)
+    to_instrument = with_values(vectors.calibration.model.template)
 
     def zero(values: jax.Array) -> jax.Array:
-        angle = jnp.zeros(())
-        for effect in to_instrument(values).effects:
-            angle = effect.rotator(angle)
-        return jnp.asarray(angle)
+        angle = to_instrument(values).patched().rotator_zero
+        return jnp.zeros(()) if angle is None else jnp.deg2rad(angle)
 
     values = jnp.asarray(vectors.calibration.values)
     return float(zero(values)), np.asarray(jax.grad(zero)(values))[vectors.parameters]
