@@ -9,7 +9,7 @@ import pytest
 
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood import engine, nodes
+from walop_jax.likelihood import engine, limits, nodes
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.effects import effect_by_name
