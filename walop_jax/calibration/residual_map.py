@@ -76,7 +76,9 @@ def _chunk_sums(
     instrument: Instrument, plan: Plan, chosen: Bool[Array, " e"], data: engine.PointData, nodes: Nodes | None
 ) -> Float[Array, "p n"]:
     return jax.lax.map(
-        lambda point: _point_sums(instrument, plan, chosen, point, nodes), data, batch_size=engine.BLOCK
+        lambda point: _point_sums(instrument, plan, chosen, point, nodes),
+        data,
+        batch_size=limits.JACOBIAN_BLOCK,
     )
 
 

@@ -21,12 +21,12 @@ from walop_jax.calibration.matrix import Settings
 from walop_jax.calibration.records import Quality
 from walop_jax.data.catalogue import Catalogue
 from walop_jax.io.errors import DataError
+from walop_jax.likelihood import limits
 from walop_jax.model import carried, light
 from walop_jax.model.dependence import needs
 from walop_jax.model.parameters import with_values
 from walop_jax.science.estimate import calibration_shift, estimate
 
-ROWS_AT_ONCE = 16384  # rows that are worked on together
 MOST_SETTINGS = 200
 ILL_POSED = 10.0  # ratio of the errors of the two principal directions from which FLAG 16 is set
 COOL, HOT = 3500.0, 10000.0
@@ -85,12 +85,12 @@ def apply(
 
 
 def _slices_of_stars(star: Int[np.ndarray, " n"]) -> Iterator[tuple[int, slice]]:
-    """Slices of about `ROWS_AT_ONCE` rows that do not divide stars, each with the number of rows done after it."""
+    """Slices of about `limits.STAR_ROWS` rows that do not divide stars, each with the number of rows done after it."""
     first = np.flatnonzero(np.diff(star, prepend=-1))
     start = 0
     while start < len(star):
-        at = np.searchsorted(first, start + ROWS_AT_ONCE, side="right") - 1
-        end = len(star) if start + ROWS_AT_ONCE >= len(star) else int(first[at])
+        at = np.searchsorted(first, start + limits.STAR_ROWS, side="right") - 1
+        end = len(star) if start + limits.STAR_ROWS >= len(star) else int(first[at])
         if end <= start:  # a single star with more rows than a block
             end = int(first[at + 1]) if at + 1 < len(first) else len(star)
         yield end, slice(start, end)
