@@ -206,9 +206,9 @@ class Verdict:
 class CalibrationProduct:
     """Everything that `calibration.fits` holds, free of FITS.
 
-    `field` is (smallest x, largest x, smallest y, largest y) of the field points that were used, in degrees;
-    `model` are the lines of the model's TOML text, `description` those of the instrument's description file where it does
-    not come with the package; `versions` name the software; `date` is UTC, ISO 8601.
+    `field` is (smallest x, largest x, smallest y, largest y) of the field points that were used, in degrees; `model`
+    are the lines of the model's TOML text, `description` those of the instrument's description file where it does not
+    come with the package; `versions` name the software; `date` is UTC, ISO 8601.
     """
 
     instrument: str
