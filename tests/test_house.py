@@ -14,6 +14,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "walop_jax"
 ROOMS = (
     "io",
+    "instruments",
     "data",
     "sky",
     "model",
