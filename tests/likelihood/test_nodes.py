@@ -9,7 +9,7 @@ import pytest
 
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood import engine, nodes
+from walop_jax.likelihood import engine, limits, nodes
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.effects import effect_by_name
@@ -104,14 +104,14 @@ def test_error_is_measured(exact, simulated):
     plan, scale = exact.plan, scales(simulated.truth)
     table, stated = nodes.tabulate(simulated.truth, plan, FIELD, 8, scale)
     assert nodes.TOLERANCE < stated < 0.01
-    x, y = np.random.default_rng(3).uniform(-0.3, 0.3, (2, nodes.AT_ONCE))
+    x, y = np.random.default_rng(3).uniform(-0.3, 0.3, (2, limits.SOLVED_TOGETHER))
     rows, _ = nodes._solve(simulated.truth, plan, jnp.asarray(x), jnp.asarray(y))
     between, _ = nodes._interpolate(table, jnp.asarray(x), jnp.asarray(y))
     assert 0.1 * stated < np.abs(np.asarray(between - rows)).max() < 3.0 * stated
 
 
 def test_what_cannot_be_interpolated_is_solved_point_by_point(simulated, exact, monkeypatch):
-    monkeypatch.setattr(nodes, "COUNTS", (6, 8))
+    monkeypatch.setattr(limits, "NODES_PER_SIDE", (6, 8))
     likelihood = Likelihood.of(simulated.calset, base_model(simulated.calset), interpolate=True)
     values = likelihood.model.start
     found = likelihood.expand(values)

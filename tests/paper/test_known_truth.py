@@ -11,6 +11,7 @@ from science.truth import TrueInstrument
 from scipy import stats
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.paper import polynomial as paper
@@ -35,8 +36,8 @@ def errors_of_both(fitted, truth):
     ):
         true = truth.vectors(x, y)
         joint = analysis.exact(Setting("SDSS-r"), x, y, [TEFF])[:, 0]
-        outside = np.abs(accuracy.determinant(true)) >= accuracy.WEAK
-        seen = paper.ratios(paper.transmitted(true, stars))
+        outside = np.abs(accuracy.determinant(true)) >= SMALLEST_DETERMINANT
+        seen = paper.measured_qu(paper.transmitted(true, stars))
         for method, errors in (
             ("paper", accuracy.star_errors(local.recover(seen), stars)),
             ("joint", accuracy.joint_errors(joint, true, stars)),

@@ -36,7 +36,7 @@ def test_a_diagnosis(call, spoilt: Path, tmp_path: Path, monkeypatch):
     assert_same_files(tmp_path / "command", tmp_path / "caller")
 
     monkeypatch.setattr(diagnose, "diagnose", lambda *args, **more: found.diagnosis)
-    monkeypatch.setattr(diagnose, "write_pictures", fail)
+    monkeypatch.setattr(diagnose, "write_figure_data", fail)
     with pytest.raises(DataError, match="what was there is untouched"):
         diagnose.diagnose_sets([spoilt], tmp_path / "other")
     assert not (tmp_path / "other").exists()

@@ -24,6 +24,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.field_series import FieldSeries, colour_nodes, colour_weights, field_nodes
 from walop_jax.calibration.matrix import Settings, settings_plan
 from walop_jax.data.checks import field_limit
+from walop_jax.likelihood import limits
 from walop_jax.likelihood.nodes import rows_and_slopes
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
@@ -40,8 +41,6 @@ DERIVATIVE_TERMS = (14, 20, 28, 40)
 TOLERANCE = 1e-7  # of a vector's largest element
 DERIVATIVE_TOLERANCE = 1e-3  # of a derivative's largest value: errors of errors
 REACH = 1.25  # of the calibrated field: beyond, no polynomial of the throughput means anything
-_CHUNK = 100  # field points that are computed together
-_CHECKS = 24  # field points at which a series is checked
 
 
 class Setting(NamedTuple):
@@ -207,7 +206,7 @@ class AnalysisVectors:
 
     def _vector_series(self, setting: Setting) -> FieldSeries:
         teff = [np.nan, *colour_nodes(COLOURS).tolist()]
-        x, y = np.random.default_rng(1).uniform(-self.half_width, self.half_width, (2, _CHECKS))
+        x, y = np.random.default_rng(1).uniform(-self.half_width, self.half_width, (2, limits.VECTOR_CHECKS))
         between = [2300.0, 3500.0, 5772.0, 12000.0]
         truth = self.exact(setting, x, y, [*between, np.nan])
         weights = colour_weights(np.array([*between, np.nan]), COLOURS)
@@ -216,7 +215,7 @@ class AnalysisVectors:
             at = field_nodes(count, self.half_width)
             values = self.exact(setting, *at, teff)
             series = FieldSeries.through(self.half_width, values.reshape(len(values), -1))
-            found = series(x, y).reshape(_CHECKS, COLOURS + 1, 4, 3)
+            found = series(x, y).reshape(limits.VECTOR_CHECKS, COLOURS + 1, 4, 3)
             error = float(np.abs(np.einsum("tc,pcks->ptks", weights, found) - truth).max() / truth.max())
             if error < TOLERANCE:
                 return series
@@ -232,7 +231,7 @@ class AnalysisVectors:
             values = _in_chunks(lambda a, b: _derivatives_at(self.instrument, plan, a, b), x, y)
             return np.moveaxis(values[:, wanted][:, :, bands], 1, -1).reshape(len(x), -1)
 
-        x, y = np.random.default_rng(2).uniform(-self.half_width, self.half_width, (2, _CHECKS))
+        x, y = np.random.default_rng(2).uniform(-self.half_width, self.half_width, (2, limits.VECTOR_CHECKS))
         truth = exact(x, y).reshape(-1, len(wanted))
         size = np.abs(truth).max(axis=0)
         error = np.inf
@@ -255,9 +254,9 @@ def _too_fast(error: float, tolerance: float) -> str:
 def _in_chunks(function, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> np.ndarray:  # type: ignore[no-untyped-def]
     """Apply a compiled function to slices of equal size: one compilation."""
     parts = []
-    for start in range(0, len(x), _CHUNK):
-        px, py = x[start : start + _CHUNK], y[start : start + _CHUNK]
-        pad = (0, _CHUNK - len(px))
+    for start in range(0, len(x), limits.VECTOR_POINTS):
+        px, py = x[start : start + limits.VECTOR_POINTS], y[start : start + limits.VECTOR_POINTS]
+        pad = (0, limits.VECTOR_POINTS - len(px))
         out = function(jnp.asarray(np.pad(px, pad, mode="edge")), jnp.asarray(np.pad(py, pad, mode="edge")))
         parts.append(np.asarray(out)[: len(px)])
     return np.concatenate(parts)

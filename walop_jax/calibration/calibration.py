@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from walop_jax.calibration.matrix import Settings, matrices
-from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, ParameterTable, Verdict, spelt
+from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, ParameterTable, Verdict, in_ascii
 from walop_jax.calibration.records import Quality, ResidualMap
 from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter
 from walop_jax.data.frames import Grid
@@ -174,11 +174,11 @@ class Calibration:
         parameters = self.model.parameters
         priors = np.array([p.prior or (np.nan, np.nan) for p in parameters]).reshape(-1, 2)
         maps = self.maps()
-        texts = tuple(spelt(text) for text in self.verdict.warnings)
+        texts = tuple(in_ascii(text) for text in self.verdict.warnings)
         return CalibrationProduct(
             instrument=self.model.name,
             site=self.site,
-            origin=spelt(self.origin),
+            origin=in_ascii(self.origin),
             date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds").replace("+00:00", ""),
             verdict=dataclasses.replace(self.verdict, warnings=texts),
             parameters=ParameterTable(
@@ -196,7 +196,7 @@ class Calibration:
             exposures=self.exposures,
             filters=self.filters,
             sources=self.sources,
-            model=tuple(spelt(line) for line in render(self.model).splitlines() if line.strip()),
+            model=tuple(in_ascii(line) for line in render(self.model).splitlines() if line.strip()),
             inputs=self.inputs,
             versions=software_versions(),
             residuals=self.residuals,

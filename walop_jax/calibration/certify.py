@@ -19,8 +19,8 @@ from walop_jax.calibration.records import Quality
 from walop_jax.data.checks import field_limit
 from walop_jax.data.filters import BUILTIN_FILTERS
 
-SAME = 1e-7  # between maps in the file and maps of its parameters, on another machine
-NEGATIVE = 1e-4  # of the response to unpolarised light: what "less than no light" may be
+MAP_TOLERANCE = 1e-7  # between maps in the file and maps of its parameters, on another machine
+DARKEST = 1e-4  # of the response to unpolarised light: what "less than no light" may be
 _POINTS = 64
 
 
@@ -119,7 +119,9 @@ def _maps(product: CalibrationProduct, calibration: Calibration) -> Check:
         return Check("maps", False, "do not lie on the grid that this program makes")
     off = float(np.abs(again.values - product.maps.values).max())
     errors = float(np.abs(again.errors / np.maximum(product.maps.errors, 1e-30) - 1.0).max())
-    return Check("maps", off < SAME and errors < 1e-4, f"differ from those of the parameters by {off:.1e}")
+    return Check(
+        "maps", off < MAP_TOLERANCE and errors < 1e-4, f"differ from those of the parameters by {off:.1e}"
+    )
 
 
 def _physics(calibration: Calibration) -> Check:
@@ -129,5 +131,5 @@ def _physics(calibration: Calibration) -> Check:
     name = str(np.unique(calibration.exposures.filter)[0])
     vectors = AnalysisVectors(calibration).exact(Setting(name), x, y, [np.nan])[:, 0]
     darkest = float(np.min(1.0 - np.hypot(vectors[..., 1], vectors[..., 2]) / vectors[..., 0]))
-    good = bool(np.all(vectors[..., 0] > 0)) and darkest > -NEGATIVE
+    good = bool(np.all(vectors[..., 0] > 0)) and darkest > -DARKEST
     return Check("physics", good, f"least light a camera sees: {darkest:.1e} of unpolarised")

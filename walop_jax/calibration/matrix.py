@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.data.records import Exposures, FilterCurve
+from walop_jax.likelihood import limits
 from walop_jax.likelihood.nodes import rows_and_slopes
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
@@ -27,9 +28,6 @@ from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for
 from walop_jax.model.ray import Conditions
 from walop_jax.model.specification import series_indices
-
-CHUNK = 256  # field points that are computed together
-SMALL_CHUNK = 16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,7 +188,8 @@ def matrices(
 def _in_chunks(function: Callable[..., Any], *columns: Float[np.ndarray, " p"]) -> tuple[np.ndarray, ...]:
     """Apply a compiled function to slices of the columns, padded to one of two sizes: two compilations."""
     count = len(columns[0])
-    size = SMALL_CHUNK if count <= SMALL_CHUNK else CHUNK
+    few, many = limits.MATRIX_POINTS
+    size = few if count <= few else many
     parts = []
     for start in range(0, count, size):
         slices = [column[start : start + size] for column in columns]

@@ -44,8 +44,8 @@ from walop_jax.calibration.records import (
     MatrixMaps,
     ParameterTable,
     Verdict,
+    in_ascii,
     matrix_names,
-    spelt,
 )
 from walop_jax.calibration.residual_map_file import read_residual_map, residual_hdus
 from walop_jax.data import schema
@@ -65,8 +65,8 @@ __all__ = [
     "MatrixMaps",
     "ParameterTable",
     "Verdict",
+    "in_ascii",
     "read_product",
-    "spelt",
     "write_product",
 ]
 
@@ -113,7 +113,7 @@ def _hdus(product: CalibrationProduct, path: object) -> list[Any]:
     if len(product.sources):
         tables["SOURCES"] = {name: getattr(product.sources, name.lower()) for name in schema.SOURCES}
     if product.inputs:
-        paths = _strings(spelt(str(entry.path)) for entry in product.inputs)
+        paths = _strings(in_ascii(str(entry.path)) for entry in product.inputs)
         tables["INPUTS"] = {"PATH": paths, "SHA256": _strings(entry.sha256 for entry in product.inputs)}
     if product.verdict.warnings:
         tables["WARNINGS"] = {"TEXT": _strings(product.verdict.warnings)}

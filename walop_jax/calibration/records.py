@@ -13,6 +13,9 @@ from jaxtyping import Bool, Float, Shaped
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import Exposures, FilterCurve, InputFile, Site, Sources
 
+SMALLEST_DETERMINANT = 0.1
+"""|m22 m33 − m23 m32| below which a single exposure holds hardly any u."""
+
 
 def matrix_names(arms: int) -> tuple[str, ...]:
     """Names of the matrix elements of an instrument, three for each arm: M21, M22, M23, M31, … (two arms: to M33)."""
@@ -79,7 +82,7 @@ _SPELT = {
 }  # fmt: skip
 
 
-def spelt(text: str) -> str:
+def in_ascii(text: str) -> str:
     """The text on one line in ASCII: signs spelt out where that is usual, escaped (\\u00e9) otherwise."""
     for sign, word in _SPELT.items():
         text = text.replace(sign, word)

@@ -76,7 +76,9 @@ def _chunk_sums(
     instrument: Instrument, plan: Plan, chosen: Bool[Array, " e"], data: engine.PointData, nodes: Nodes | None
 ) -> Float[Array, "p n"]:
     return jax.lax.map(
-        lambda point: _point_sums(instrument, plan, chosen, point, nodes), data, batch_size=engine.BLOCK
+        lambda point: _point_sums(instrument, plan, chosen, point, nodes),
+        data,
+        batch_size=limits.JACOBIAN_BLOCK,
     )
 
 
@@ -101,7 +103,7 @@ def cell_of(grid: Grid, x: Vector, y: Vector) -> Int[np.ndarray, " p"]:
     return row * grid.width + column
 
 
-def _chosen(e: Exposures) -> tuple[str, float, Bool[np.ndarray, " e"]]:
+def _main_setting(e: Exposures) -> tuple[str, float, Bool[np.ndarray, " e"]]:
     """The setting with the most polariser exposures, plate out preferred, and its exposures."""
     angle = np.where(e.chwp_in, e.chwp_angle, -np.inf)
     settings = sorted(
@@ -121,7 +123,7 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
     """As `residual_map`, at any full vector of parameter values; `near` is an expansion at similar ones."""
     instrument = likelihood.model.instrument(values)
     nodes, _ = likelihood.nodes(instrument, near)
-    filter_name, chwp_angle, chosen = _chosen(likelihood.calset.exposures)
+    filter_name, chwp_angle, chosen = _main_setting(likelihood.calset.exposures)
     grid = cells_for(likelihood.layout.points, likelihood.census if near is None else near.census)
     count = grid.width * grid.height
 

@@ -34,6 +34,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
+from walop_jax.likelihood import limits
 from walop_jax.likelihood.nodes import Nodes, interpolated, rows_and_slopes
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
@@ -46,8 +47,6 @@ from walop_jax.model.specification import series_indices
 
 Vector = Float[Array, " n"]
 Result = TypeVar("Result")
-BLOCK = 64  # field points whose Jacobians are worked on together
-LARGEST_BLOCK = 256  # up to so many points are one block
 NEWTON_STEPS = 3  # each squares the share of the detectors' distortion that is missing from the flux
 
 
@@ -245,7 +244,7 @@ def _over_blocks(function: Callable[[PointData], Result], data: PointData, block
     Points that make no whole number of blocks, and few points, are one block.
     """
     points = data.x.shape[0]
-    if points <= LARGEST_BLOCK or points % block:
+    if points <= limits.GRADIENT_BLOCK or points % block:
         return function(data)
     parts = jax.tree.map(lambda v: v.reshape(-1, block, *v.shape[1:]), data)
     blank = jax.tree.map(
@@ -259,7 +258,9 @@ def _over_blocks(function: Callable[[PointData], Result], data: PointData, block
 def _normal_equations(
     instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes | None = None
 ) -> Normal:
-    return _over_blocks(lambda part: _block_equations(instrument, plan, part, nodes), data, BLOCK)
+    return _over_blocks(
+        lambda part: _block_equations(instrument, plan, part, nodes), data, limits.JACOBIAN_BLOCK
+    )
 
 
 def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes | None) -> Normal:
@@ -313,7 +314,7 @@ def _slope_equations(
         by_optics = jnp.einsum("tbrs,tobrs->o", by_rows, nodes.slopes)
         return value, 0.5 * direct.at[optical].set(by_optics)
 
-    return _over_blocks(slope, data, LARGEST_BLOCK)
+    return _over_blocks(slope, data, limits.GRADIENT_BLOCK)
 
 
 def _residuals(
@@ -393,15 +394,15 @@ def _incoming(instrument: Instrument, plan: Plan, data: PointData) -> Float[Arra
 
 incoming = compiled(_incoming)
 
-PROBES_AT_ONCE = 6  # shapes of one effect that are worked on together: bounds the memory
-
 
 def _effect_columns_over_shapes(
     instrument: Instrument, plan: Plan, probes: Effect, data: PointData
 ) -> Float[Array, "g p d a"]:
     """As `effect_columns`, for one effect at many shapes: its parameters carry a leading axis g."""
     return jax.lax.map(
-        lambda probe: _effect_columns(instrument, plan, (probe,), data), probes, batch_size=PROBES_AT_ONCE
+        lambda probe: _effect_columns(instrument, plan, (probe,), data),
+        probes,
+        batch_size=limits.PROBES_AT_ONCE,
     )
 
 

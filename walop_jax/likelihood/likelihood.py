@@ -30,7 +30,7 @@ from walop_jax.model.specification import Model
 Vector = Float[np.ndarray, " n"]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Likelihood:
     """The joint likelihood of one calibration set under one model.
 

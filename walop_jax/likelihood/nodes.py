@@ -1,7 +1,7 @@
 """The optics of a large set on Chebyshev nodes of the field, with an error that is measured every time.
 
 Band rows and their derivatives with respect to the optical parameters are smooth over the field, and they are all
-the optics there is. They are solved exactly on n × n nodes and at `HELD_OUT` other places; the largest difference
+the optics there is. They are solved exactly on n × n nodes and at other places; the largest difference
 between interpolated and exact values there, derivatives in units of the solver's scales, is the error.
 
 Tolerance   A relative error ε of all n counts, each known to σ/N, moves a parameter by up to √n ε / (σ/N) of its
@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from walop_jax.likelihood import limits
 from walop_jax.model import chebyshev, light
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import compiled
@@ -29,11 +30,6 @@ from walop_jax.model.plan import Plan
 Vector = Float[np.ndarray, " n"]
 
 TOLERANCE = 2e-10
-COUNTS = (12, 16, 18, 20, 24, 28, 32)
-"""Numbers of nodes per side that are tried, one after the other."""
-HELD_OUT = 48
-AT_ONCE = 64
-"""Places that are solved together, so that the optics are compiled for one size only."""
 
 
 class Nodes(NamedTuple):
@@ -79,9 +75,9 @@ def _solve_all(
     instrument: Instrument, plan: Plan, x: Vector, y: Vector
 ) -> tuple[Float[np.ndarray, "p b r 4"], Float[np.ndarray, "p o b r 4"]]:
     parts = []
-    for start in range(0, len(x), AT_ONCE):
+    for start in range(0, len(x), limits.SOLVED_TOGETHER):
         # The last batch is filled up with its first place.
-        inside = np.minimum(np.arange(start, start + AT_ONCE), len(x) - 1)
+        inside = np.minimum(np.arange(start, start + limits.SOLVED_TOGETHER), len(x) - 1)
         parts.append(_solve(instrument, plan, jnp.asarray(x[inside]), jnp.asarray(y[inside])))
     rows, slopes = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
     return rows[: len(x)], slopes[: len(x)]
@@ -94,7 +90,7 @@ def held_out(rectangle: Rectangle) -> tuple[Vector, Vector]:
     """
     corners = [(a, b) for a in (0.0, 0.5, 1.0) for b in (0.0, 0.5, 1.0)]
     plastic = 1.324717957244746
-    number = np.arange(1, HELD_OUT - len(corners) + 1)[:, None]
+    number = np.arange(1, limits.CHECKED_PLACES - len(corners) + 1)[:, None]
     unit = np.concatenate([corners, np.mod(number * np.array([1 / plastic, 1 / plastic**2]), 1.0)])
     low, high = np.asarray(rectangle.low), np.asarray(rectangle.high)
     x, y = (low + unit * (high - low)).T
@@ -129,7 +125,7 @@ def accurate_nodes(
     Optics that are not finite somewhere make the table not finite, and with it all that is computed from it.
     """
     error = np.inf
-    for count in COUNTS:
+    for count in limits.NODES_PER_SIDE:
         if first is not None and count < first:
             continue
         nodes, error = tabulate(instrument, plan, rectangle, count, scale)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 import os
 import time
 
@@ -13,6 +12,7 @@ from jaxtyping import Float, Int
 
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import fail
+from walop_jax.io.software import versions_of
 from walop_jax.posterior.checkpoint import Checkpoints, digest
 from walop_jax.posterior.convergence import Chains, Convergence, assess
 from walop_jax.posterior.ensemble import Block, Walkers, advance, start
@@ -38,7 +38,7 @@ def fingerprint(target: Target, options: Options) -> dict[str, str]:
     chain = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
     for name in ("maximum_steps", "draws", "checks"):  # how long, and what is made of it: free to change
         del chain[name]
-    versions = {name: _version(name) for name in SOFTWARE}
+    versions = versions_of(SOFTWARE)
     return {
         "data": digest(*data, *plan, *exposures, laid_out.settings), "model": digest(model.name,
         parameters, [type(e).__name__ for e in model.template.effects], model.template.plates), "priors":
@@ -46,13 +46,6 @@ def fingerprint(target: Target, options: Options) -> dict[str, str]:
         digest(sorted(chain.items(), key=lambda item: item[0])), "versions": ", ".join(f"{name} {version}"
         for name, version in versions.items()),
     }  # fmt: skip
-
-
-def _version(name: str) -> str:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "unknown"
 
 
 def sample(
