@@ -49,7 +49,7 @@ def _point_sums(
     flux, residual = engine.point_residuals(instrument, plan, point, nodes)
     unit = engine.point_prediction(instrument, plan, point, nodes)
     vectors = engine.vectors_at(instrument, plan, point, nodes)[point.band]
-    stokes = light.stokes(instrument, plan.exposures, point.sky, point.source)[:, :3]
+    stokes = light.stokes(instrument, plan.exposures, point.sky, point.source, point.x, point.y)[:, :3]
     first, second = (vectors[:, k, 0] + vectors[:, k + 1, 0] for k in (0, 2))
     signs = jnp.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
     pairs = [

@@ -77,22 +77,25 @@ def exposure_arrays(
 
 
 def blank_plan(instrument: Instrument, asked: Collection[str] = (), median: bool = False) -> Plan:
-    """A plan of one exposure with every moving element in the beam, one node, one band: for shapes and derivatives."""
-    one = jnp.ones(1)
-    moving = instrument.patched().moving()
-    kinds = instrument.kinds
+    """A plan with every moving element in the beam, one node, one band: for shapes and derivatives."""
+    patched = instrument.patched()
+    count = max((part.exposures_known or 1 for part in patched.cameras.exposures), default=1)
+    one, each = jnp.ones(1), jnp.ones(count)
+    none = jnp.zeros(count, bool)
     exposures = ExposureArrays(
-        kind=jnp.zeros(1, int), clp_in=jnp.zeros(1, bool), clp_angle=0.0 * one, flux_known=jnp.zeros(1, bool),
-        rotator=0.0 * one, hours=one, temperature=one, hour_angle=one,
-        median_counts=jnp.ones((1, len(instrument.cameras))) if median else None, kinds=kinds,
+        kind=jnp.zeros(count, int), clp_in=none, clp_angle=0.0 * each, flux_known=none, rotator=0.0 * each,
+        hours=each, temperature=each, hour_angle=each,
+        median_counts=jnp.ones((count, len(instrument.cameras))) if median else None,
+        kinds=instrument.kinds,
     )  # fmt: skip
+    moving = patched.moving()
     return Plan(
         wavelength=0.62 * one,
         conditions=Conditions(band_width=0.1 * one, planned=dict.fromkeys(asked, one)),
         node_weight=jnp.ones((1, 1)),
         teff=5000.0 * one,
         exposures=exposures,
-        band_of=np.zeros((1, 1 + len(instrument.standard.names)), int),
+        band_of=np.zeros((count, 1 + len(instrument.standard.names)), int),
         settings=((tuple(30.0 for _ in moving), 0, 1),),
         moving=moving,
     )

@@ -6,6 +6,7 @@ import dataclasses
 import os
 import time
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -31,7 +32,7 @@ def fingerprint(target: Target, options: Options) -> dict[str, str]:
     model, laid_out = target.model, target.likelihood.plan
     data = [np.asarray(part) for chunk in target.likelihood.points for part in chunk if part is not None]
     plan = [np.asarray(part) for part in (laid_out.wavelength, laid_out.node_weight, laid_out.teff)]
-    exposures = [np.asarray(part) for part in laid_out.exposures if part is not None]
+    exposures = [np.asarray(part) for part in jax.tree.leaves(laid_out.exposures)]
     parameters = [(p.name, p.start, p.free, p.tie, p.scale) for p in model.parameters]
     priors = [(p.name, p.prior, p.loose) for p in model.parameters]
     chain = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}

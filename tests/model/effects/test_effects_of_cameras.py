@@ -61,8 +61,14 @@ def test_gain_drift_by_hand():
     assert hours[[0, 1, 4]] == pytest.approx([0.0, 2.4, 3.6])
     found = detected(make("camera_gain_drift", camera=2, rate=0.01))
     assert found[4] == pytest.approx([1e5, 2e5, 3e5 * 1.036, 4e5], rel=1e-12)
-    with pytest.raises(ValueError, match="camera 4 does not exist"):
-        make("camera_gain_drift", camera=4)
+
+
+@pytest.mark.parametrize("name", ["camera_gain_drift", "blemish"])
+@pytest.mark.parametrize("camera", [4, -1])
+def test_a_camera_that_does_not_exist_is_refused(name, camera):
+    """An index out of range would otherwise change nothing, and a negative one another camera."""
+    with pytest.raises(ValueError, match=rf"camera {camera} does not exist; cameras are 0 \(O1\), 1 \(E1\)"):
+        scenes.instrument(make(name, camera=camera)).patched()
 
 
 def test_blemish_by_hand():
