@@ -77,20 +77,16 @@ def tabulate_matrix(
 
     flag = columns["FLAG"][0]
     counts = {bit: int((flag & bit > 0).sum()) for bit in BITS}
-    warnings = list(held.warnings)
-    if counts[Quality.BEYOND_FIELD]:
-        warnings.append(
-            f"{points}: {counts[Quality.BEYOND_FIELD]} point(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)"
-        )
-    if counts[Quality.BEYOND_SETTINGS]:
-        warnings.append(
-            f"{points}: {counts[Quality.BEYOND_SETTINGS]} row(s) with a filter or temperature not in the calibration (FLAG 64)"
-        )
+    said = (
+        (Quality.BEYOND_FIELD, "point(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)"),
+        (Quality.BEYOND_SETTINGS, "row(s) with a filter or temperature not in the calibration (FLAG 64)"),
+    )
+    flagged = [f"{points}: {counts[bit]} {text}" for bit, text in said if counts[bit]]
     return MatrixTable(
         path=Path(output),
         rows=table.rows,
         trusted=held.product.verdict.trusted,
         flags=counts,
         product=held.product.content_hash(),
-        warnings=tuple(warnings),
+        warnings=(*held.warnings, *flagged),
     )
