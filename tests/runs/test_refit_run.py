@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 from pathlib import Path
 
@@ -79,8 +80,10 @@ def test_a_run_that_is_interrupted_goes_on_where_it_was(frames, large, tmp_path)
     again = refit_sets([frames], tmp_path / "cut", seed=5, progress=told.append)
     # The sample is not fitted a second time, and the slabs that were done are not done again.
     assert not any(line.startswith("fit: ") for line in told)
-    fresh = [line for line in told if line.startswith(MATRIX)]
-    assert len(fresh) == SIDE**2 // 64 - 12
+    passes = [line for line in told if "points/s" in line]
+    first = list(itertools.takewhile(lambda line: line.startswith(MATRIX), passes))
+    assert len(first) == SIDE**2 // 64 - 12
+    assert first[0].startswith(f"{MATRIX}: 832 of 1,600 points")
     assert told[-1] == "mapping the field"
     np.testing.assert_array_equal(again.result.values, whole.result.values)
     assert_same_files(tmp_path / "cut", tmp_path / "whole")

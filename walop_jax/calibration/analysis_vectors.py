@@ -23,7 +23,6 @@ from jaxtyping import Array, Float, Int
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.field_series import FieldSeries, colour_nodes, colour_weights, field_nodes
 from walop_jax.calibration.matrix import Settings, settings_plan
-from walop_jax.data.checks import field_limit
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.nodes import rows_and_slopes
 from walop_jax.model import light
@@ -120,7 +119,7 @@ class AnalysisVectors:
         self.calibration = calibration
         self.instrument = calibration.model.instrument(calibration.values)
         reach = REACH * float(np.abs(calibration.field).max())
-        self.half_width = min(field_limit(calibration.model.name), reach)
+        self.half_width = min(calibration.model.template.field_limit, reach)
         self._tables: dict[Setting, _Table] = {}
         series = np.asarray(series_indices(self.instrument), int)
         uncertain = np.diag(calibration.covariance) > 0

@@ -9,7 +9,7 @@ import dataclasses
 import datetime
 import functools
 import operator
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,10 +23,12 @@ from walop_jax.data.records import Exposures, FilterCurve, InputFile, Site, Sour
 from walop_jax.fit.model_builder import model_without_data, standard_names
 from walop_jax.fit.model_file import render
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult
+from walop_jax.instruments.description import parsed
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.software import software_versions
-from walop_jax.model.build import nominal_instrument
+from walop_jax.model.build import adapted, build, nominal_instrument
 from walop_jax.model.dependence import needs
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import Model, effect_context
 
 Vector = Float[np.ndarray, " n"]
@@ -196,10 +198,11 @@ class Calibration:
             exposures=self.exposures,
             filters=self.filters,
             sources=self.sources,
-            model=tuple(in_ascii(line) for line in render(self.model).splitlines() if line.strip()),
+            model=tuple(_lines(render(self.model))),
             inputs=self.inputs,
             versions=software_versions(),
             residuals=self.residuals,
+            description=tuple(_lines(self.model.template.description)),
         )
 
     @classmethod
@@ -235,15 +238,30 @@ class Calibration:
         )
 
 
+def _lines(text: str) -> Iterator[str]:
+    return (in_ascii(line) for line in text.splitlines() if line.strip())
+
+
+def instrument_as_designed(product: CalibrationProduct) -> Instrument:
+    """The instrument of a product as designed, from the description that it holds or that comes with the package.
+
+    Raises `DataError` for elements that only the fit has known: such a product is rebuilt where they are known.
+    """
+    if not product.description:
+        return nominal_instrument(product.instrument)
+    return build(
+        parsed("\n".join(product.description), f"the description of {product.instrument} in the product")
+    )
+
+
 def rebuild(product: CalibrationProduct) -> Model:
     """The model of a product from its lines of TOML, its standards and its exposures."""
     sources = product.sources
     names = standard_names(sources)
     standards = list(zip(names, sources.q.tolist(), sources.u.tolist(), strict=True))
-    context = effect_context(nominal_instrument(product.instrument, standards=standards), product.exposures)
-    return model_without_data(
-        product.instrument, "\n".join(product.model), standards=standards, context=context
-    )
+    design = instrument_as_designed(product)
+    context = effect_context(adapted(design, standards=standards), product.exposures)
+    return model_without_data(design, "\n".join(product.model), standards=standards, context=context)
 
 
 def quality(result: FitResult) -> Quality:

@@ -16,7 +16,6 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import CalibrationProduct
 from walop_jax.calibration.records import Quality
-from walop_jax.data.checks import field_limit
 from walop_jax.data.filters import BUILTIN_FILTERS
 
 MAP_TOLERANCE = 1e-7  # between maps in the file and maps of its parameters, on another machine
@@ -126,7 +125,7 @@ def _maps(product: CalibrationProduct, calibration: Calibration) -> Check:
 
 def _physics(calibration: Calibration) -> Check:
     """No camera sees less than no light, whatever the polarisation: a₀ ≥ √(a₁² + a₂²)."""
-    limit = min(field_limit(calibration.model.name), float(np.abs(calibration.field).max()))
+    limit = min(calibration.model.template.field_limit, float(np.abs(calibration.field).max()))
     x, y = np.random.default_rng(0).uniform(-limit, limit, (2, _POINTS))
     name = str(np.unique(calibration.exposures.filter)[0])
     vectors = AnalysisVectors(calibration).exact(Setting(name), x, y, [np.nan])[:, 0]

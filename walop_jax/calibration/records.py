@@ -206,8 +206,9 @@ class Verdict:
 class CalibrationProduct:
     """Everything that `calibration.fits` holds, free of FITS.
 
-    `field` is (smallest x, largest x, smallest y, largest y) of the field points that were used, in degrees;
-    `model` are the lines of the model's TOML text; `versions` name the software; `date` is UTC, ISO 8601.
+    `field` is (smallest x, largest x, smallest y, largest y) of the field points that were used, in degrees; `model`
+    are the lines of the model's TOML text, `description` those of the instrument's description file where it does not
+    come with the package; `versions` name the software; `date` is UTC, ISO 8601.
     """
 
     instrument: str
@@ -226,6 +227,7 @@ class CalibrationProduct:
     inputs: tuple[InputFile, ...] = ()
     versions: Mapping[str, str] = dataclasses.field(default_factory=dict)
     residuals: ResidualMap | None = None
+    description: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.parameters)
@@ -241,7 +243,7 @@ class CalibrationProduct:
         # Twelve digits: a number in a FITS header may lose its last bit.
         numbers = (verdict.chi2, verdict.noise_scale, *self.field)
         texts = [
-            *(self.instrument, *self.model, *verdict.warnings, verdict.covariance_from),
+            *(self.instrument, *self.model, *self.description, *verdict.warnings, verdict.covariance_from),
             *(str(value) for value in (verdict.dof, verdict.n_data, verdict.converged, verdict.trusted)),
             *(str(int(verdict.quality)), *(f"{value:.11e}" for value in numbers)),
             *(entry.sha256 for entry in self.inputs),
