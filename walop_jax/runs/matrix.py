@@ -11,12 +11,13 @@ from typing import Any
 from walop_jax.calibration.from_file import read_calibration
 from walop_jax.calibration.matrix import Settings
 from walop_jax.calibration.matrix_table import matrix_columns
+from walop_jax.calibration.records import Quality
 from walop_jax.data.user_tables import field_points, read_input_table, table_format, write_output_table
 from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import errors_naming
 from walop_jax.posterior.propagate import with_draws
 
-BITS = (16, 32, 64)
+BITS = (Quality.HIGH_CROSSTALK, Quality.BEYOND_FIELD, Quality.BEYOND_SETTINGS)
 """Bits of FLAG that a row of a table of matrices can have."""
 
 
@@ -31,7 +32,7 @@ class MatrixTable:
     path: Path
     rows: int
     trusted: bool
-    flags: Mapping[int, int]
+    flags: Mapping[Quality, int]
     product: str
     warnings: tuple[str, ...]
 
@@ -41,7 +42,7 @@ class MatrixTable:
             "output": str(self.path),
             "rows": self.rows,
             "trusted": self.trusted,
-            "flags": {str(bit): count for bit, count in self.flags.items()},
+            "flags": {str(int(bit)): count for bit, count in self.flags.items()},
             "product": self.product,
         }
 
@@ -77,13 +78,13 @@ def tabulate_matrix(
     flag = columns["FLAG"][0]
     counts = {bit: int((flag & bit > 0).sum()) for bit in BITS}
     warnings = list(held.warnings)
-    if counts[32]:
+    if counts[Quality.BEYOND_FIELD]:
         warnings.append(
-            f"{points}: {counts[32]} point(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)"
+            f"{points}: {counts[Quality.BEYOND_FIELD]} point(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)"
         )
-    if counts[64]:
+    if counts[Quality.BEYOND_SETTINGS]:
         warnings.append(
-            f"{points}: {counts[64]} row(s) with a filter or temperature not in the calibration (FLAG 64)"
+            f"{points}: {counts[Quality.BEYOND_SETTINGS]} row(s) with a filter or temperature not in the calibration (FLAG 64)"
         )
     return MatrixTable(
         path=Path(output),
