@@ -12,9 +12,9 @@ from walop_jax.fit.refit import fit
 from walop_jax.likelihood import engine, limits, nodes
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.chebyshev import Rectangle
+from walop_jax.model.dependence import optical_indices
 from walop_jax.model.effects import effect_by_name
-from walop_jax.model.parameters import leaves
-from walop_jax.model.specification import full_values, optical_indices
+from walop_jax.model.parameters import leaves, values_of
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -59,7 +59,7 @@ def quick(simulated):
 
 def test_expansion_agrees(simulated, exact, quick):
     """Calibration plate in and out, Moon sky, standards of several temperatures; at the truth and away from it."""
-    for values in (exact.model.start, full_values(simulated.truth)):
+    for values in (exact.model.start, values_of(simulated.truth)):
         one, other = quick.expand(values), exact.expand(values)
         same((one.data, one.gradient, one.matrix), (other.data, other.gradient, other.matrix))
         assert 0.0 < one.optics.error <= nodes.TOLERANCE

@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 from oracle import forward
 
-from walop_jax.model.build import nominal_instrument
+from walop_jax.instruments.description import parsed
+from walop_jax.io.errors import DataError
+from walop_jax.model import light
+from walop_jax.model.build import build, nominal_instrument
 from walop_jax.model.planning import plan_for
 
 SETTINGS = (None, 0.0, 45.0)
@@ -168,3 +171,43 @@ def test_fixed_axes_miss_about_a_hundredth_of_cross_talk():
     )
     missed = np.abs(exact - fixed)[:, :, 1:].max(axis=(0, 1))
     assert 0.008 < missed.max() < 0.06
+
+
+# ------------------------------------------------------------------------------ what stands ahead of the polariser
+
+AHEAD = """
+name = "SOUTH-TURNED-ROUND"
+like = "WALOP-SOUTH"
+path = ["collimator", "polariser", "pupil", "chwp"]
+[elements.collimator]
+diattenuation = 0.8
+"""
+
+
+def test_lenses_ahead_of_the_polariser_act_on_the_sky_alone():
+    """Diattenuation 0.8 r² along the radius: of an unpolarised star at (0.2, 0.1) it makes q = 0.024, u = 0.032.
+
+    Light through the polariser has forgotten it, and lamps stand behind it.
+    """
+    instrument = build(parsed(AHEAD, "a test"))
+    rows = builders.exposures(
+        {"kind": "standard", "rotator": 0.0}, {"clp_angle": 0.0}, {"kind": "flux"}, {"kind": "moon"}
+    )
+    arrays = plan_for(instrument, rows, {"band": builders.monochromatic(0.62)}).exposures
+    found = light.stokes(
+        instrument, arrays, jnp.zeros((4, 2)), jnp.full(4, -1), jnp.asarray(0.2), jnp.asarray(0.1)
+    )
+    c = (1 - 2e-5) / (1 + 2e-5)
+    expected = [[1, 0.024, 0.032, 0], [1, c, 0, 0], [1, 0, 0, 0], [1, 0.024, 0.032, 0]]
+    np.testing.assert_allclose(found, expected, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "element", ["chwp", "pupil", "late"], ids=["moves", "bends the ray", "depends on wavelength"]
+)
+def test_what_cannot_stand_ahead_of_the_polariser_is_refused(element):
+    path = ["polariser", "collimator", "pupil", "chwp", "late"]
+    path.insert(0, path.pop(path.index(element)))
+    text = f'name = "X"\nlike = "WALOP-SOUTH"\npath = {path}\n[elements.late]\nkind = "retarder"\nwavelength = 0.6\n'
+    with pytest.raises(DataError, match=f"element '{element}' stands ahead of the polariser.*put it behind"):
+        build(parsed(text, "a test"))

@@ -66,7 +66,7 @@ def _vectors(
 ) -> Float[Array, "b k 3"]:
     rows = light.band_rows(instrument, plan, x, y)
     vectors = light.camera_vectors(instrument, rows, light.throughput_at(instrument, x, y), x, y)
-    return (vectors @ light.telescope(instrument))[..., :3]
+    return (vectors @ light.telescope(instrument, x, y))[..., :3]
 
 
 def _derivatives(
@@ -81,7 +81,7 @@ def _derivatives(
         rows: Float[Array, "b r 4"], all_values: Float[Array, " n"], local: Float[Array, " k"]
     ) -> Float[Array, "b k 3"]:
         there = to_instrument(all_values)
-        return (light.camera_vectors(there, rows, local, x, y) @ light.telescope(there))[..., :3]
+        return (light.camera_vectors(there, rows, local, x, y) @ light.telescope(there, x, y))[..., :3]
 
     rows, slopes = rows_and_slopes(instrument, plan, x, y)
     out, push = jax.linearize(vectors, rows, values, light.throughput_at(instrument, x, y))

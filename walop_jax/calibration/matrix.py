@@ -102,7 +102,7 @@ def _point_matrix(
     ) -> Float[Array, "b a 3"]:
         there = to_instrument(all_values)
         vectors = light.camera_vectors(there, rows, local, x, y)
-        return light.instrument_matrix(vectors @ light.telescope(there), there.cameras.pairs)
+        return light.instrument_matrix(vectors @ light.telescope(there, x, y), there.cameras.pairs)
 
     rows, slopes = rows_and_slopes(instrument, plan, x, y)
     m, push = jax.linearize(matrix, rows, values, throughput)

@@ -6,6 +6,7 @@ comes out wrong by A⁻¹ (δm₀ + δA s), at most |A⁻¹ δm₀| + p ‖A⁻�
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -26,9 +27,9 @@ def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p a 3"]:
     setting.chwp_angle[0] = e.chwp_angle[0] if e.chwp_in[0] else np.nan
     plan = settings_plan(setting, calset.filters, instrument)
     vectors = analysis_vectors(instrument, plan, calset.points.x, calset.points.y)[:, 0]
-    return np.asarray(
-        light.instrument_matrix(jnp.asarray(vectors) @ light.telescope(instrument), instrument.cameras.pairs)
-    )
+    at = jnp.asarray(calset.points.x), jnp.asarray(calset.points.y)
+    sky = jax.vmap(light.telescope, (None, 0, 0))(instrument, *at)
+    return np.asarray(light.instrument_matrix(jnp.asarray(vectors) @ sky, instrument.cameras.pairs))
 
 
 def largest_change(

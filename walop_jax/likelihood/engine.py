@@ -24,14 +24,12 @@ Exposures      are not compressed beforehand, although light is linear in them. 
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.likelihood import limits
@@ -39,7 +37,6 @@ from walop_jax.likelihood.nodes import Nodes, interpolated, rows_and_slopes
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.dependence import optical_indices
-from walop_jax.model.effects.base import Effect
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import values_of, with_values
 from walop_jax.model.plan import Plan
@@ -148,7 +145,7 @@ def vectors_at(
     return light.camera_vectors(instrument, rows, throughput, point.x, point.y)
 
 
-def _best_flux(
+def best_flux(
     instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], point: PointData
 ) -> Float[Array, " e"]:
     """Flux that fits best: in closed form, refined by Newton steps where detectors are not linear in it."""
@@ -157,7 +154,7 @@ def _best_flux(
     if not light.is_linear(instrument):
         for _ in range(NEWTON_STEPS):
             counts, slope = jax.jvp(
-                lambda f: _real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),)
+                lambda f: real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),)
             )
             missing = (point.counts - counts) * point.weight
             step, _ = eliminate_flux(missing, slope * point.weight, known)
@@ -165,9 +162,10 @@ def _best_flux(
     return flux
 
 
-def _real_counts(
+def real_counts(
     instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], flux: Float[Array, " e"]
 ) -> Float[Array, "e k"]:
+    """What the detectors report for light of a flux, `unit` being the counts for light of unit flux."""
     return light.detected(instrument, plan.exposures, flux[:, None] * unit)
 
 
@@ -176,8 +174,8 @@ def point_residuals(
 ) -> tuple[Float[Array, " e"], Float[Array, "e k"]]:
     """Best flux of every exposure of one point and the normalised residuals data − model."""
     unit = point_prediction(instrument, plan, point, nodes)
-    flux = _best_flux(instrument, plan, unit, point)
-    return flux, (point.counts - _real_counts(instrument, plan, unit, flux)) * point.weight
+    flux = best_flux(instrument, plan, unit, point)
+    return flux, (point.counts - real_counts(instrument, plan, unit, flux)) * point.weight
 
 
 def _point_jacobian(
@@ -210,7 +208,7 @@ def _point_jacobian(
     d_local = jax.vmap(lambda dt: push(no_rows, no_values, dt))(each_local)
 
     # From unit flux to counts: `along` is the derivative with respect to the flux itself.
-    flux = _best_flux(instrument, plan, unit, point)
+    flux = best_flux(instrument, plan, unit, point)
     known = plan.exposures.flux_known
     counts, along = flux[:, None] * unit, unit
     d_counts = flux[:, None] * jnp.concatenate([d_plain, d_local])
@@ -305,8 +303,8 @@ def _slope_equations(
 
             def of_point(point: PointData) -> Float[Array, ""]:
                 unit = point_prediction(here, plan, point, between)
-                flux = jax.lax.stop_gradient(_best_flux(here, plan, unit, point))
-                return jnp.sum(((point.counts - _real_counts(here, plan, unit, flux)) * point.weight) ** 2)
+                flux = jax.lax.stop_gradient(best_flux(here, plan, unit, point))
+                return jnp.sum(((point.counts - real_counts(here, plan, unit, flux)) * point.weight) ** 2)
 
             return jnp.sum(jax.vmap(of_point)(part))
 
@@ -343,48 +341,6 @@ def _dense_jacobian(instrument: Instrument, plan: Plan, data: PointData) -> Floa
     return full.at[:, :, plain].set(jnp.swapaxes(local[:, : plain.size], 1, 2))
 
 
-def _point_effect_columns(
-    instrument: Instrument, plan: Plan, probes: tuple[Effect, ...], point: PointData
-) -> Float[Array, "a d"]:
-    names = [(i, name) for i, probe in enumerate(probes) for name in probe.amplitudes()]
-    neutral = [getattr(probes[i], name) for i, name in names]
-
-    def with_amplitudes(amplitudes: list[Float[Array, ...]]) -> Instrument:
-        changed = list(probes)
-        for (i, name), value in zip(names, amplitudes, strict=True):
-            changed[i] = dataclasses.replace(changed[i], **{name: value})
-        return dataclasses.replace(instrument, effects=(*instrument.effects, *changed))
-
-    at_neutral = with_amplitudes(neutral)
-    unit = point_prediction(at_neutral, plan, point)
-    flux = _best_flux(at_neutral, plan, unit, point)
-
-    def counts(amplitudes: list[Float[Array, ...]]) -> Float[Array, "e k"]:
-        active = with_amplitudes(amplitudes)
-        return _real_counts(active, plan, point_prediction(active, plan, point), flux)
-
-    _, push = jax.linearize(counts, neutral)
-    flat, to_tree = ravel_pytree(neutral)
-    change = jax.vmap(lambda one: push(to_tree(one)))(jnp.eye(flat.size)) * point.weight
-    _, along = jax.jvp(lambda f: _real_counts(at_neutral, plan, unit, f), (flux,), (jnp.ones_like(flux),))
-    along = along * point.weight
-    power = jnp.sum(along**2, axis=-1)
-    share = jnp.sum(change * along, axis=-1) / jnp.where(power > 0, power, 1.0)
-    projected = change - jnp.where(plan.exposures.flux_known, 0.0, share)[..., None] * along
-    return -projected.reshape(flat.size, -1)
-
-
-def _effect_columns(
-    instrument: Instrument, plan: Plan, probes: tuple[Effect, ...], data: PointData
-) -> Float[Array, "p d a"]:
-    """Derivatives of the residuals with respect to the amplitudes of effects that are not active, at neutral.
-
-    Only what an effect changes is differentiated: one at the detectors costs a dot product, not the optics.
-    """
-    columns = jax.vmap(_point_effect_columns, in_axes=(None, None, None, 0))(instrument, plan, probes, data)
-    return jnp.swapaxes(columns, 1, 2)
-
-
 def _incoming(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p e 4"]:
     """Stokes vectors that enter the collimator."""
     return jax.vmap(light.stokes, (None, None, 0, 0, 0, 0))(
@@ -395,22 +351,9 @@ def _incoming(instrument: Instrument, plan: Plan, data: PointData) -> Float[Arra
 incoming = compiled(_incoming)
 
 
-def _effect_columns_over_shapes(
-    instrument: Instrument, plan: Plan, probes: Effect, data: PointData
-) -> Float[Array, "g p d a"]:
-    """As `effect_columns`, for one effect at many shapes: its parameters carry a leading axis g."""
-    return jax.lax.map(
-        lambda probe: _effect_columns(instrument, plan, (probe,), data),
-        probes,
-        batch_size=limits.PROBES_AT_ONCE,
-    )
-
-
 normal_equations = compiled(_normal_equations)
 slope_equations = compiled(_slope_equations)
-effect_columns_over_shapes = compiled(_effect_columns_over_shapes)
 dense_jacobian = compiled(_dense_jacobian)
-effect_columns = compiled(_effect_columns)
 residuals = compiled(_residuals)
 prediction = compiled(_prediction)
 

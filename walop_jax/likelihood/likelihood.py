@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.likelihood import engine
+from walop_jax.likelihood import effect_columns, engine
 from walop_jax.likelihood.expansion import Census, OpticsUsed, Posterior
 from walop_jax.likelihood.layout import Layout
 from walop_jax.likelihood.nodes import Nodes, accurate_nodes
@@ -256,7 +256,9 @@ class Likelihood:
     def effect_columns(self, values: Vector, probes: tuple[Effect, ...]) -> Float[np.ndarray, "d a"]:
         """Derivatives of the used residuals with respect to the amplitudes of neutral effects added to the model."""
         instrument = self.model.instrument(values)
-        parts = [_rows(engine.effect_columns(instrument, self.plan, probes, c), c) for c in self.points]
+        parts = [
+            _rows(effect_columns.effect_columns(instrument, self.plan, probes, c), c) for c in self.points
+        ]
         return np.concatenate(parts)
 
     def effect_columns_over_shapes(
@@ -267,7 +269,9 @@ class Likelihood:
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *probes)
         parts = []
         for chunk in self.points:
-            cube = np.asarray(engine.effect_columns_over_shapes(instrument, self.plan, stacked, chunk))
+            cube = np.asarray(
+                effect_columns.effect_columns_over_shapes(instrument, self.plan, stacked, chunk)
+            )
             parts.append(np.stack([_rows(one, chunk) for one in cube]))
         return np.concatenate(parts, axis=1)
 

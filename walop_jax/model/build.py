@@ -63,6 +63,10 @@ def build(description: Description, *, elements: Sequence[type[Element]] = (), *
         raster=(description.raster, description.edge),
         description="" if description.name in shipped() else description.text,
     )
+    try:
+        instrument.telescope()
+    except ValueError as error:
+        raise DataError(f"[elements] {error}") from None
     return adapted(instrument, **options)
 
 

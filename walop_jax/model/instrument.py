@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import os
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.instruments.description import read_description
 from walop_jax.model.cameras import Cameras, Throughput
 from walop_jax.model.elements import Analyser, Element, Polariser, WavePlate
 from walop_jax.model.parameters import Component, number, unknown_name
+from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import MoonSky, Source, Standards
 
 if TYPE_CHECKING:
@@ -111,6 +115,22 @@ class Instrument(Component):
     def polariser(self) -> Polariser | None:
         """The calibration polariser, if the train has one."""
         return next((element for element in self.train() if isinstance(element, Polariser)), None)
+
+    def telescope(self) -> tuple[Element, ...]:
+        """The elements ahead of the polariser, which only light from the sky meets; none where there is no polariser.
+
+        Raises ValueError for one that moves, bends the ray or depends on the wavelength: that is not computed there.
+        """
+        if self.polariser is None:
+            return ()
+        elements = tuple(itertools.takewhile(lambda e: not isinstance(e, Polariser), self.train()))
+        for element in elements:
+            if element.moves or type(element).ray is not Element.ray or not _is_achromatic(element):
+                raise ValueError(
+                    f"element {element.name!r} stands ahead of the polariser, where nothing may move, bend the ray "
+                    "or depend on wavelength or exposure; put it behind the polariser"
+                )
+        return elements
 
     def source(self, name: str) -> Source:
         """A source by name; ValueError with the nearest names when there is none."""
@@ -218,6 +238,15 @@ def _member(members: tuple[Any_, ...], name: str, what: str) -> Any_:
         if _name(member) == name:
             return member
     raise NoSuchPlaceError(str(unknown_name(what, name, [_name(member) for member in members])))
+
+
+def _is_achromatic(element: Element) -> bool:
+    zero = jnp.zeros(())
+    try:
+        jax.eval_shape(lambda e: e.mueller(Ray.entering(zero, zero)), element)
+    except NotPlannedError:
+        return False
+    return True
 
 
 def _name(member: Any) -> str:

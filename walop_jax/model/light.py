@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.model import fold
-from walop_jax.model.elements import Element, Polariser
+from walop_jax.model.elements import Element
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 from walop_jax.model.ray import NotPlannedError, Ray
@@ -50,8 +50,8 @@ def divided(instrument: Instrument) -> Train:
     Leading are the elements behind the polariser up to the first that moves, or that asks for the wavelength or for
     anything else that differs between exposures; which those are is found by asking them.
     """
-    elements = tuple(instrument.train())
-    start = next((i + 1 for i, element in enumerate(elements) if isinstance(element, Polariser)), 0)
+    elements, telescope = tuple(instrument.train()), instrument.telescope()
+    start = len(telescope) + (instrument.polariser is not None)
     ray, stop = Ray.entering(jnp.zeros(()), jnp.zeros(())), start
     for element in elements[start:]:
         if element.moves:
@@ -62,7 +62,7 @@ def divided(instrument: Instrument) -> Train:
         except NotPlannedError:
             break
         stop += 1
-    return Train(elements[: max(start - 1, 0)], elements[start:stop], elements[stop:])
+    return Train(telescope, elements[start:stop], elements[stop:])
 
 
 def _product(elements: tuple[Element, ...], ray: Ray) -> Float[Array, "4 4"] | None:
@@ -76,9 +76,9 @@ def _product(elements: tuple[Element, ...], ray: Ray) -> Float[Array, "4 4"] | N
     return matrix
 
 
-def telescope(instrument: Instrument) -> Float[Array, "4 4"]:
+def telescope(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
     """Mueller matrix of what light from the sky, and no other, meets ahead of the polariser."""
-    matrix = _product(divided(instrument.patched()).telescope, Ray.entering(jnp.zeros(()), jnp.zeros(())))
+    matrix = _product(instrument.patched().telescope(), Ray.entering(x, y))
     return jnp.eye(4) if matrix is None else matrix
 
 
@@ -206,8 +206,8 @@ def stokes(
             qu, taken = jnp.where(seen[:, None], one.polarisation(sight), qu), taken | seen
     one, zero = jnp.ones_like(exposures.clp_angle), jnp.zeros_like(exposures.clp_angle)
     light = jnp.stack([one, qu[:, 0], qu[:, 1], zero], axis=-1)
-    if divided(instrument).telescope:
-        light = jnp.where(indoors[:, None], light, light @ telescope(instrument).T)
+    if instrument.telescope():
+        light = jnp.where(indoors[:, None], light, light @ telescope(instrument, x, y).T)
     polariser = instrument.polariser
     if polariser is None:
         return light
@@ -291,7 +291,7 @@ def instrument_matrix(
     """Rows (m21, m22, m23), (m31, m32, m33), … of the instrument matrix from analysis vectors, one for each arm.
 
     Difference of the response of the two cameras of an arm (`pairs`) to 1, q, u, each over the sum of their response to
-    unpolarised light. For light from the sky pass `vectors @ telescope(instrument)`.
+    unpolarised light. For light from the sky pass `vectors @ telescope(instrument, x, y)`.
     """
     first, second = (vectors[..., np.array([pair[i] for pair in pairs]), :] for i in (0, 1))
     return (first[..., :3] - second[..., :3]) / (first[..., :1] + second[..., :1])

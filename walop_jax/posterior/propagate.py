@@ -6,6 +6,7 @@ import dataclasses
 import os
 from collections.abc import Mapping
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -43,7 +44,10 @@ def matrix_draws(
         for i, values in enumerate(draws):
             instrument = model.instrument(values)
             vectors = analysis_vectors(instrument, plan, x[rows], y[rows])[:, 0]
-            matrix = light.instrument_matrix(jnp.asarray(vectors) @ light.telescope(instrument), pairs)
+            sky = jax.vmap(light.telescope, (None, 0, 0))(
+                instrument, jnp.asarray(x[rows]), jnp.asarray(y[rows])
+            )
+            matrix = light.instrument_matrix(jnp.asarray(vectors) @ sky, pairs)
             result[i, rows] = np.asarray(matrix).reshape(len(rows), -1)
     return result
 

@@ -94,7 +94,8 @@ def test_telescope_polarisation_in_the_instrument_matrix():
     """Its part of m21 is m22 q + m23 u: what an unpolarised star shows."""
     device = scenes.instrument(make("telescope_polarisation", q=0.02, u=-0.01))
     vectors = builders.vectors(device, scenes.plan(), 0.1, 0.05)[0, 0]
-    plain, seen = builders.matrix(vectors), builders.matrix(vectors @ light.telescope(device))
+    telescope = light.telescope(device, jnp.asarray(0.1), jnp.asarray(0.05))
+    plain, seen = builders.matrix(vectors), builders.matrix(vectors @ telescope)
     signal = vectors @ np.array([1.0, 0.02, -0.01, 0.0])
     assert seen[0, 0] == pytest.approx((signal[0] - signal[1]) / (signal[0] + signal[1]), abs=3e-4)
     assert seen[0, 0] - plain[0, 0] == pytest.approx(plain[0, 1:] @ [0.02, -0.01], rel=0.02)
