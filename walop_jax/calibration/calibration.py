@@ -212,7 +212,7 @@ class Calibration:
         Raises ValueError if the model of the product cannot be rebuilt, or has other parameters than it
         lists.
         """
-        model = rebuild(product)
+        model = model_of_product(product)
         names = [str(name) for name in product.parameters.name]
         if sorted(model.names) != sorted(names):
             odd = sorted(set(model.names) ^ set(names)) or ["one of them twice"]
@@ -254,7 +254,7 @@ def instrument_as_designed(product: CalibrationProduct) -> Instrument:
     )
 
 
-def rebuild(product: CalibrationProduct) -> Model:
+def model_of_product(product: CalibrationProduct) -> Model:
     """The model of a product from its lines of TOML, its standards and its exposures."""
     sources = product.sources
     names = standard_names(sources)

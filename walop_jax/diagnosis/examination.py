@@ -27,7 +27,7 @@ ALARM = 0.0027  # three standard deviations
 COMMON_MODE = 0.05  # rms (σ of one intensity) of disturbances that one camera in one exposure may have
 PROBABILITY = 0.95
 MOST_PATTERNS = 8
-ALIKE = 0.01  # relative change of the counts up to which columns are kept
+SAME_COUNTS = 0.01  # relative change of the counts up to which columns are kept
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Examination:
     def _is_like(self, earlier: Examination) -> bool:
         """Whether the expected counts differ so little that derivatives with respect to anything else do as well."""
         ours, theirs = self.design.measured.model, earlier.design.measured.model
-        return bool(np.linalg.norm(ours - theirs) < ALIKE * np.linalg.norm(theirs))
+        return bool(np.linalg.norm(ours - theirs) < SAME_COUNTS * np.linalg.norm(theirs))
 
     def _common_mode(self) -> Vector:
         """Prior widths of the gains of single exposures that amount to `COMMON_MODE` per intensity."""

@@ -3,7 +3,7 @@
 Combination  r_pk = Σ_e w_e r_pek / (Σ_e w_e² over the used ones)^½ keeps unit noise. The weights w are those of what
              can be said in words (a harmonic of the polariser angle at its best phase, the mean of a kind of
              exposures, a trend with time) that holds most of the power of the disagreement; if all of them hold less
-             than `ENOUGH` of what the best weights do (principal component over the exposures), the latter.
+             than `WORDS_FROM` of what the best weights do (principal component over the exposures), the latter.
 Curve        c_ek = Σ_p v_pk r_pek / Σ_p v_pk², with v the field pattern of the difference in that camera, rms 1: a
              pattern that changes sign over the field does not average out.
 """
@@ -34,8 +34,8 @@ PointMap = Float[np.ndarray, "p k"]
 Weight = Float[np.ndarray, " e"]
 Used = Bool[np.ndarray, "p e"]
 
-ENOUGH = 0.3  # share of the best weights' power with which a combination in words is preferred
-PRESENT = 0.5  # share of Σ w² that the exposures of a point must hold for the point to be shown
+WORDS_FROM = 0.3  # share of the best weights' power with which a combination in words is preferred
+LEAST_COVERAGE = 0.5  # share of Σ w² that the exposures of a point must hold for the point to be shown
 UNNAMED = FreeForm.name  # the effect that stands for patterns without a name
 
 
@@ -50,7 +50,7 @@ class Combination:
     def of(self, cube: Cube, used: Used) -> PointMap:
         """The combined residuals of every point and camera; NaN where too few of the exposures are used."""
         present = used @ self.weight**2
-        norm = np.where(present > PRESENT, np.sqrt(present), np.nan)
+        norm = np.where(present > LEAST_COVERAGE, np.sqrt(present), np.nan)
         return np.einsum("pek,e->pk", cube, self.weight) / norm[:, None]
 
 
@@ -130,7 +130,7 @@ def best_combination(cube: Cube, used: Used, exposures: Exposures) -> Combinatio
     principal = principal * (np.sign(principal[np.abs(principal).argmax()]) or 1.0)
     free = Combination("the combination of all exposures that shows it best", principal)
     named = max(_in_words(cube, used, exposures), key=power, default=free)
-    return named if power(named) >= ENOUGH * power(free) else free
+    return named if power(named) >= WORDS_FROM * power(free) else free
 
 
 def _in_words(cube: Cube, used: Used, exposures: Exposures) -> Iterator[Combination]:

@@ -17,7 +17,7 @@ Cube = Float[np.ndarray, "p e k"]
 NEGLIGIBLE = (
     1e-4  # change of calibrated q and u (0.01 %) that does not matter for an instrument good to 0.1 %
 )
-MANY = 2  # names above which a single effect that nobody thought of is as likely
+MOST_NAMES = 2  # names above which a single effect that nobody thought of is as likely
 LARGEST_ROBUST_RATIO = (
     1.5  # of errors that allow for common disturbances of an exposure, to errors that do not
 )
@@ -134,7 +134,7 @@ class Diagnosis:
                 f"{looked_at} of {self.points} field points were looked at, and fitted: refit all of them with the "
                 "model found"
             )
-        if len(self.steps) > MANY:
+        if len(self.steps) > MOST_NAMES:
             parts.append(
                 f"{len(self.steps)} names were needed: something that is not in the catalogue can look like several "
                 "that are"

@@ -28,8 +28,8 @@ from walop_jax.model.specification import Model, with_effects
 SEPARATION = 3.0
 MOST_LEADERS = 5
 MOST_SHAPES = 4  # of one effect from which it is refitted
-CLOSE = 8.0  # ln B below the best within which a rival is refitted
-LARGE = 150.0  # ln B above which the linear ranking is not trusted
+REFIT_WITHIN = 8.0  # ln B below the best within which a rival is refitted
+LINEAR_BELOW = 150.0  # ln B above which the linear ranking is not trusted
 EVEN_ODDS = 3.0  # difference in ln B that is no preference
 
 
@@ -73,7 +73,9 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
         (probe, score), best = alive[0], alive[0][1].log_bayes
         bayes = np.array([s.log_bayes for _, s in alive])
         mean = float(np.logaddexp.reduce(bayes) - np.log(len(shapes)))
-        others = [item for item in alive[1:MOST_SHAPES] if item[1].log_bayes > best - max(CLOSE, 0.2 * best)]
+        others = [
+            item for item in alive[1:MOST_SHAPES] if item[1].log_bayes > best - max(REFIT_WITHIN, 0.2 * best)
+        ]
         ranked.append(Ranked(effect, probe, score, mean, tuple(others)))
     return sorted(ranked, key=lambda item: -item.log_bayes)
 
@@ -81,7 +83,7 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
 def leaders(ranked: Sequence[Ranked]) -> list[Ranked]:
     """Candidates whose linear evidence is too close to the best to decide without a refit."""
     best = ranked[0].log_bayes
-    reach = max(CLOSE, 0.6 * best) if best > LARGE else CLOSE
+    reach = max(REFIT_WITHIN, 0.6 * best) if best > LINEAR_BELOW else REFIT_WITHIN
     return [item for item in ranked[:MOST_LEADERS] if item.log_bayes > best - reach]
 
 
@@ -212,7 +214,7 @@ def evidence_of_presence(result: FitResult, name: str, context: Context) -> floa
     return float(0.5 * away @ np.linalg.solve(covariance, away) + 0.5 * np.linalg.slogdet(covariance)[1])
 
 
-def without(model: Model, name: str) -> Model:
+def model_without(model: Model, name: str) -> Model:
     """The model with one effect taken out."""
     rest = tuple(effect for effect in model.template.effects if effect.name != name)
     own = model.positions(name)
@@ -223,7 +225,7 @@ def without(model: Model, name: str) -> Model:
 
 def refit_without(result: FitResult, name: str) -> FitResult:
     """Take an effect out of a fitted model and fit again, with errors scaled only if what is left needs it."""
-    model = without(result.model, name)
+    model = model_without(result.model, name)
     start = dict(zip(result.model.names, result.values, strict=True))
     return fit(Likelihood.of(result.calset, model), start=np.array([start[n] for n in model.names]))
 
@@ -232,7 +234,7 @@ def signature(result: FitResult, name: str, context: Context) -> Float[np.ndarra
     """What an active effect does to the residuals (data rows): theirs without it, minus theirs with it."""
     effect = result.model.template.effect(name)
     if type(effect).is_structural():
-        model = without(result.model, name)
+        model = model_without(result.model, name)
         kept = [result.model.index(n) for n in model.names]
         bare = Likelihood.of(result.calset, model).residuals(result.values[kept])[1]
     else:

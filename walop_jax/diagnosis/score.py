@@ -35,7 +35,7 @@ Reduction = Callable[[Vector, float], tuple[Vector, float]]
 ABSORBED = 1e-6  # surviving share of a column's square below which the base has swallowed it
 FAINTEST = 0.05  # standard deviations that a plausible amplitude must reach to be testable
 RANK_TOLERANCE = 1e-8
-COUNTED = 20  # draws below the smallest p found that make counting them precise enough
+LEAST_COUNT = 20  # draws below the smallest p found that make counting them precise enough
 
 
 @dataclasses.dataclass(frozen=True)
@@ -254,7 +254,7 @@ class Scorer:
         reference = float(np.quantile(self._smallest, 0.01))
         trials = max(1.0, float(np.log1p(-0.01) / np.log1p(-np.exp(reference))))
         below = int(np.sum(self._smallest <= found))
-        if below >= COUNTED:
+        if below >= LEAST_COUNT:
             return (1 + below) / (1 + len(self._smallest)), trials
         return corrected_p(found, trials), trials
 

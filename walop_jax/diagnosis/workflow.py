@@ -38,8 +38,8 @@ from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import Model, effect_context
 
 MOST_STEPS = 6
-NEEDED = 1.0  # ln B that an effect must be worth to the final model to stay in it
-MISFIT = 1.5  # χ²/dof above which effects that cannot be differentiated are tried
+LEAST_EVIDENCE = 1.0  # ln B that an effect must be worth to the final model to stay in it
+POOR_FIT = 1.5  # χ²/dof above which effects that cannot be differentiated are tried
 
 
 def diagnose(
@@ -126,7 +126,7 @@ class _Diagnosing:
         for item in naming.leaders(examination.significant) if examination.significant else ():
             shapes = sum(probe.effect is item.effect for probe in examination.probes)
             yield naming.try_shapes(self.fit, item, self.context, shapes)
-        if self.fit.chi2 > MISFIT * self.fit.dof:
+        if self.fit.chi2 > POOR_FIT * self.fit.dof:
             for effect in self.catalogue:
                 if effect.is_structural() and effect.name not in self.fit.model.effect_names:
                     yield naming.try_effect(self.fit, effect.neutral(self.context), self.context)
@@ -261,7 +261,7 @@ class _Diagnosing:
                 s.effect: naming.evidence_of_presence(self.fit, s.effect, self.context) for s in self.steps
             }
             least = min(worth, key=lambda name: worth[name])
-            if worth[least] >= NEEDED:
+            if worth[least] >= LEAST_EVIDENCE:
                 break
             self.tell(f"{least} is no longer needed")
             self.steps = [s for s in self.steps if s.effect != least]

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from walop_jax.calibration.records import Quality
 from walop_jax.reports import diagnosis_figures, product_figures
-from walop_jax.reports.run import Run
+from walop_jax.reports.run import RunContents
 from walop_jax.reports.wording import (
     UNNAMED,
     effect_in_words,
@@ -37,7 +37,7 @@ SHOWN_CANDIDATES = 10
 MANY = 24  # parameters of an effect above which its table is folded
 
 
-def render(run: Run) -> str:
+def render(run: RunContents) -> str:
     """The HTML text of the page about a run."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
@@ -55,7 +55,7 @@ def render(run: Run) -> str:
     return environment.get_template("report.html").render(_context(run))
 
 
-def _context(run: Run) -> dict[str, Any]:
+def _context(run: RunContents) -> dict[str, Any]:
     summary, diagnosis = run.summary, run.diagnosis
     label, sentence = verdict_of_fit(summary) if diagnosis is None else verdict_of_diagnosis(diagnosis)
     good = diagnosis is None or diagnosis["verdict"] != "unexplained"
@@ -90,13 +90,13 @@ def _context(run: Run) -> dict[str, Any]:
     }
 
 
-def _steps(run: Run) -> list[dict[str, Any]]:
+def _steps(run: RunContents) -> list[dict[str, Any]]:
     """The steps of a diagnosis, each with its figures and its combination in words."""
     assert run.diagnosis is not None
     return [dict(step) | _drawn(run, number) for number, step in enumerate(run.diagnosis["steps"], start=1)]
 
 
-def _drawn(run: Run, number: int) -> dict[str, str]:
+def _drawn(run: RunContents, number: int) -> dict[str, str]:
     """The figures of one comparison of `diagnosis.fits` and its combination in words; empty without that."""
     if run.figure_data is None or number >= len(run.figure_data.comparisons):
         return {"maps": "", "signature": "", "combination": ""}
@@ -109,7 +109,7 @@ def _drawn(run: Run, number: int) -> dict[str, str]:
     }
 
 
-def _ladder(run: Run) -> list[dict[str, Any]]:
+def _ladder(run: RunContents) -> list[dict[str, Any]]:
     """Rungs as rows: model, χ², degrees of freedom and what each has gained."""
     if run.figure_data is None:
         return []
@@ -120,7 +120,7 @@ def _ladder(run: Run) -> list[dict[str, Any]]:
     return rows
 
 
-def _parameters(run: Run) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+def _parameters(run: RunContents) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Rows of the fitted coefficients of the instrument; rows of throughputs and of what was not fitted."""
     main, rest = [], []
     for name, entry in run.summary["parameters"].items():
@@ -130,7 +130,7 @@ def _parameters(run: Run) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     return main, rest
 
 
-def _pulls(run: Run) -> list[dict[str, Any]]:
+def _pulls(run: RunContents) -> list[dict[str, Any]]:
     """The coefficients farthest from their priors, in prior widths, farthest first."""
     if run.product is None:
         return []
@@ -168,14 +168,14 @@ def _interval(row: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _figures(run: Run) -> dict[str, str]:
+def _figures(run: RunContents) -> dict[str, str]:
     """The figures of the run as a whole, as data URIs."""
     made: dict[str, Figure] = {}
     if run.product is not None:
         made["matrix"] = product_figures.matrix_maps_figure(run.product.maps)
         made["errors"] = product_figures.matrix_errors_figure(run.product.maps)
         if run.product.residuals is not None:
-            made["remainder"] = product_figures.residual_map_figure(run.product.residuals)
+            made["residual_map"] = product_figures.residual_map_figure(run.product.residuals)
     if run.figure_data is not None:
         data = run.figure_data
         whole = data.comparisons[0]

@@ -28,7 +28,7 @@ T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
-class Run:
+class RunContents:
     """The contents of a run; None for what is not there. `missing` says what that means for a page.
 
     `summary`, `diagnosis` and `sample` are the contents of the JSON files; `intervals` are rows of the table of
@@ -46,7 +46,7 @@ class Run:
     missing: tuple[str, ...]
 
 
-def read_run(folder: Path) -> Run:
+def read_run(folder: Path) -> RunContents:
     """Read the folder of a `refit` or `diagnose`, with what `sample` may have added.
 
     Raises `DataError`, with advice, if it is no such folder or if its summary or diagnosis cannot be read; other
@@ -100,7 +100,7 @@ def read_run(folder: Path) -> Run:
                 f"{DIAGNOSIS} is of another fit than {SUMMARY}: this folder was written to again since."
             )
     sampled = (folder / POSTERIOR).exists()
-    return Run(
+    return RunContents(
         folder=folder,
         summary=summary,
         product=product,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from walop_jax.calibration.calibration import rebuild
+from walop_jax.calibration.calibration import model_of_product
 from walop_jax.calibration.from_file import product_path
 from walop_jax.calibration.product import read_product
 from walop_jax.fit import solver
@@ -24,5 +24,5 @@ def cite_run(run: str | os.PathLike[str] | None = None) -> tuple[Reference, ...]
     else:
         path = product_path(run)
         with errors_naming(path):
-            model = rebuild(read_product(path))
+            model = model_of_product(read_product(path))
     return (*references(model), Reference("fit", stated_source(solver.__doc__)))

@@ -132,7 +132,7 @@ def simulate(
         instrument = draw_instrument(make_model(plan.name, nominal), build)
     active = in_order((*instrument.effects, *effects))
     truth = make_template(dataclasses.replace(instrument.with_source(standards), effects=active))
-    blank = _blank(plan, sources, seed, len(truth.cameras))
+    blank = _without_light(plan, sources, seed, len(truth.cameras))
     expected = _expected(blank, truth, _fluxes(plan, sky))
     detector = PhotonNoise(plan.read_noise)
     if noiseless:
@@ -144,7 +144,7 @@ def simulate(
     return Simulated(_with_counts(plan, blank, counts, sigma), truth)
 
 
-def _blank(plan: ObservingPlan, sources: Sources, seed: int, cameras: int) -> CalibrationSet:
+def _without_light(plan: ObservingPlan, sources: Sources, seed: int, cameras: int) -> CalibrationSet:
     """The calibration set that the plan announces, before any light: counts and errors are 1."""
     points = plan.points()
     used, source = plan.layout()
