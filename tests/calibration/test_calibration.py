@@ -18,6 +18,7 @@ from walop_jax.data import DataError
 from walop_jax.fit.model_builder import model_for, model_without_data
 from walop_jax.fit.model_file import render
 from walop_jax.fit.refit import FitResult, refit
+from walop_jax.fit.solver import RESULTS
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.references import references
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
@@ -254,7 +255,8 @@ def test_models_without_data():
 def test_quality_bits_follow_the_fit(result):
     good = quality(result)
     assert good == 0
-    minimum = dataclasses.replace(result.minimum, converged=False, condition=1e11)
+    stopped = RESULTS.nonlinear_max_steps_reached
+    minimum = dataclasses.replace(result.minimum, result=stopped, condition=1e11)
     posterior = dataclasses.replace(result.posterior, data=10.0 * result.dof)
     values = result.values.copy()
     index = result.model.index("pupil.magnification")

@@ -15,6 +15,7 @@ from walop_jax.calibration.residual_map import cell_of, cells_for, residual_map_
 from walop_jax.data.records import Block
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.model_builder import base_model
+from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
@@ -80,7 +81,7 @@ def likelihood_of(calset):
 
 
 def test_structure_is_found_where_it_is(noiseless, cells, monkeypatch):
-    monkeypatch.setattr(remainder, "_chosen", polariser_only)
+    monkeypatch.setattr(remainder, "_main_setting", polariser_only)
     west = noiseless.calset.points.x < 0
     likelihood = likelihood_of(with_structure(noiseless, west))
     found = residual_map_at(likelihood, as_values(noiseless.truth))
@@ -112,7 +113,7 @@ def test_noise_alone_makes_corrections_of_the_size_of_their_errors(cells):
 
 def test_structure_below_the_noise_of_a_point_stands_out_of_many(cells, monkeypatch):
     """5·10⁻⁴ in m23: half of the error of a single point, ten times that of the whole map."""
-    monkeypatch.setattr(remainder, "_chosen", polariser_only)
+    monkeypatch.setattr(remainder, "_main_setting", polariser_only)
     simulated = simulate(RUN, seed=8)
     noise = simulated.calset.intensities.block(0, 576)
     clean = simulate(RUN, seed=8, noiseless=True)
@@ -131,13 +132,13 @@ def test_structure_below_the_noise_of_a_point_stands_out_of_many(cells, monkeypa
 def test_the_map_is_of_the_setting_with_the_most_exposures():
     plan = dataclasses.replace(RUN, plate=(None, 45.0), moon_patches=0, grid=4)
     calset = simulate(plan, seed=1).calset
-    name, angle, chosen = remainder._chosen(calset.exposures)
+    name, angle, chosen = remainder._main_setting(calset.exposures)
     assert name == "SDSS-r"
     assert np.isnan(angle)
     np.testing.assert_array_equal(chosen, ~calset.exposures.chwp_in)
     only = dataclasses.replace(plan, plate=(45.0,))
     calset = simulate(only, seed=1).calset
-    assert remainder._chosen(calset.exposures)[1] == 45.0
+    assert remainder._main_setting(calset.exposures)[1] == 45.0
 
 
 def test_cells_without_enough_light_hold_no_number(cells):

@@ -95,7 +95,7 @@ class Rehearsal(workflow._Diagnosing):
         examination.summary.return_value = examination.limits.return_value = (
             examination.untestable.return_value
         ) = ()
-        return look
+        return examination
 
     def _add_best(self, examination):
         return None

@@ -44,6 +44,7 @@ from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.points import StreamedPoints
 from walop_jax.model.light import instrument_matrix
+from walop_jax.model.parameters import values_of
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -132,7 +133,7 @@ def test_counts_made_in_slabs_are_those_of_the_instrument():
     """What the table is made with: the truth explains it."""
     calset = made(20)
     likelihood = Likelihood.of(calset, base_model(calset), points_per_chunk=100)
-    truth = np.concatenate([np.ravel(v) for v in jax.tree.leaves(simulate(RUN, seed=3).truth)])
+    truth = np.asarray(values_of(simulate(RUN, seed=3).truth))
     chi2, dof = likelihood.expand(truth).data, 3 * 400 * EXPOSURES
     assert abs(chi2 - dof) < 5 * np.sqrt(2 * dof)
     again = calset.intensities.block(130, 150)
@@ -175,7 +176,7 @@ def test_whole_frames():
     fitted = time.perf_counter() - began
     residuals = residual_map(result)
     whole = time.perf_counter() - began
-    truth = np.concatenate([np.ravel(v) for v in jax.tree.leaves(simulate(RUN, seed=3).truth)])
+    truth = np.asarray(values_of(simulate(RUN, seed=3).truth))
     known = result.sigma > 0
     pulls = (result.values - truth)[known] / result.sigma[known]
     print(

@@ -139,5 +139,5 @@ def test_a_model_file(call, fitted: FittedSet, tmp_path: Path):
     assert write_model(calsets=[fitted.calset], effects=["clp_zero"]).text == found.text
     with pytest.raises(DataError, match="exists already"):
         write_model(caller / "m.toml")
-    with pytest.raises(ValueError, match="give them or the instrument"):
+    with pytest.raises(ValueError, match="come from WALOP-SOUTH"):
         write_model(calsets=[fitted.calset], instrument="WALOP-NORTH")

@@ -29,7 +29,6 @@ from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import make_model, with_effects
 from walop_jax.simulation.observing_plan import (
     NARROW_BANDS,
-    SITES,
     ObservingPlan,
     filter_curve,
     polariser_turn,
@@ -116,7 +115,7 @@ def test_default_nights_are_full_moon_and_the_moon_is_up(instrument: str):
     plan = ObservingPlan(instrument)
     e = plan.exposures()
     moon = e.kind == "moon"
-    site = SITES[instrument]
+    site = ObservingPlan(instrument).site
     with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("iers_degraded_accuracy", "ignore"):
         time = Time(e.mjd[moon], format="mjd")
         place = EarthLocation.from_geodetic(site.longitude, site.latitude, site.elevation)

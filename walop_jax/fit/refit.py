@@ -216,7 +216,7 @@ def refit(
     return fit(likelihood)
 
 
-def _journal(folder: Path, calset: CalibrationSet, model: Model, processes: Processes) -> Journal | None:
+def _journal(folder: Path, calset: CalibrationSet, model: Model, processes: Processes) -> Journal:
     """Where the work of one fit is kept, by all that it depends on: data, model, software, and who does it."""
     texts = [fingerprint(calset), render(model), f"{processes.index}/{processes.count}"]
     texts += [f"{name} {version}" for name, version in software_versions().items()]

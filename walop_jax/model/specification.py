@@ -209,6 +209,7 @@ def with_effects(model: Model, effects: Sequence[str | Effect], context: Context
         values = zip(np.asarray(values_of(effect)), np.asarray(values_of(neutral)), strict=True)
         starts |= dict(zip(names, values, strict=True))
     instrument = dataclasses.replace(model.template, effects=in_order(active))
+    jax.eval_shape(lambda i: i.patched(), instrument)  # whatever does not fit the instrument is an error here
     known = {p.name: p for p in model.parameters}
     parameters = []
     for p in make_model(model.name, instrument).parameters:

@@ -86,14 +86,10 @@ def _as_built(rng: np.random.Generator) -> Instrument:
     """
     nominal = adapted(ObservingPlan.bench().design, throughput_degree=0)
     throughput = 0.5 + 0.03 * rng.standard_normal((4, 1))
-    plates = [nominal.half1.plate, nominal.half2.plate]
-    off = [eqx.tree_at(lambda p: p.mgf2, plate, plate.mgf2 + 0.1 * rng.standard_normal()) for plate in plates]
-    return eqx.tree_at(
-        lambda i: (i.half1.plate, i.half2.plate, i.throughput.coefficients),
-        nominal,
-        (*off, jnp.asarray(throughput)),
-        is_leaf=lambda v: isinstance(v, HalfWavePlate),
-    )
+    for arm in nominal.arms:
+        off = 0.1 * rng.standard_normal()
+        nominal = nominal.changed(f"{arm.name}.plate.mgf2", thickness=lambda d, off=off: d + off)
+    return eqx.tree_at(lambda i: i.throughput.coefficients, nominal, jnp.asarray(throughput))
 
 
 def _vectors(

@@ -80,11 +80,13 @@ def tabulate_matrix(
     warnings = list(held.warnings)
     if counts[Quality.BEYOND_FIELD]:
         warnings.append(
-            f"{points}: {counts[Quality.BEYOND_FIELD]} point(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)"
+            f"{points}: {counts[Quality.BEYOND_FIELD]} point(s) beyond the calibrated field: extrapolated, or NaN "
+            "(FLAG 32)"
         )
     if counts[Quality.BEYOND_SETTINGS]:
         warnings.append(
-            f"{points}: {counts[Quality.BEYOND_SETTINGS]} row(s) with a filter or temperature not in the calibration (FLAG 64)"
+            f"{points}: {counts[Quality.BEYOND_SETTINGS]} row(s) with a filter or temperature not in the "
+            "calibration (FLAG 64)"
         )
     return MatrixTable(
         path=Path(output),

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from walop_jax.data.filters import DEFAULT_FILTER, builtin_filter
 from walop_jax.data.records import Exposures, FilterCurve, Points, Position, Site
-from walop_jax.instruments.description import described, shipped
+from walop_jax.instruments.description import default_name, described, shipped
 from walop_jax.model.build import as_designed, nominal_instrument
 from walop_jax.model.effects.base import Context
 from walop_jax.model.instrument import Instrument
@@ -75,7 +75,7 @@ class ObservingPlan:
 
     def __post_init__(self) -> None:
         if np.isnan(self.field):
-            object.__setattr__(self, "field", self.design.raster[1])
+            object.__setattr__(self, "field", self._raster[1])
         for prefix in self.moving:
             if prefix not in self.design.moving():
                 raise unknown_name("moving element", prefix, self.design.moving())
@@ -107,6 +107,14 @@ class ObservingPlan:
         return nominal_instrument(self.instrument)
 
     @property
+    def _raster(self) -> tuple[str, float]:
+        """How the field points lie, and how far out (deg); found without making the instrument."""
+        if isinstance(self.instrument, Instrument):
+            return self.instrument.raster
+        described_as = described(self.instrument or default_name())
+        return described_as.raster, described_as.edge
+
+    @property
     def name(self) -> str:
         """Name of the instrument."""
         return self.design.name
@@ -136,7 +144,7 @@ class ObservingPlan:
 
     def points(self) -> Points:
         """Grid points first, then the places of the standards (if there are any)."""
-        if self.design.raster[0] == "line":
+        if self._raster[0] == "line":
             x = np.linspace(0.0, self.field, self.grid)
             y = np.zeros_like(x)
         else:

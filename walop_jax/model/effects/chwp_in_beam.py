@@ -1,6 +1,7 @@
 """The calibration half-wave plate is in the beam although the header says out.
 
 Equation    CHWP out → the plate stands at 0°; settings that the header says are in stay as they are
+Source      a plate left in the beam, or a header that is wrong.
 Neutral     none: the effect is there or it is not; without it the header is right
 Revealed by everything that has u: the plate reverses its sign ahead of the wedges. Two models are compared.
 """

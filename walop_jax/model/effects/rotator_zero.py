@@ -2,6 +2,7 @@
 
 Equation    true ROTATOR = header + angle, hence (q + iu) of the sky in the ICS → (q + iu) exp(−2i angle)
 Symbols     angle [deg], north through east
+Source      EVPA in the instrument frame = position angle on the sky − ROTATOR (docs: conventions).
 Neutral     angle = 0
 Revealed by Moon and standards turned together against the polariser.
 

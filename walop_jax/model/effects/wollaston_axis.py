@@ -2,6 +2,7 @@
 
 Equation    analysers ½ (1, ±η cos 2 angle, ±η sin 2 angle, 0)
 Symbols     angle of the analysers from +X toward +Y [deg]; η their efficiency
+Source      mounting of the prisms.
 Neutral     angle = 0
 Revealed by an analysed direction that is turned the same way in both halves.
 """
