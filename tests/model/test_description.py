@@ -235,7 +235,6 @@ def test_like_names_a_shipped_one(own, like):
         Instrument.read(own(('name = "OWN"', f'name = "OWN"\nlike = {like}')))
 
 
-def test_every_key_of_a_shipped_file_is_needed_once():
-    """A description stands for itself: as text it gives the same instrument again."""
+def test_the_text_of_a_description_gives_its_instrument_again():
     for name in shipped():
         assert table(build(parsed(described(name).text, name))) == table(nominal_instrument(name))

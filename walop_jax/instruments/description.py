@@ -281,7 +281,8 @@ class _Reader:
                     )
         for name in ("unit", "source", "name"):
             if name in value:
-                given[name] = self.text(value[name], name, here)
+                pure = name == "unit" and value[name] == ""
+                given[name] = "" if pure else self.text(value[name], name, here)
         return Given(**given)
 
     def element(self, name: str, table: Any, place: str) -> ElementText:
