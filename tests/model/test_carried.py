@@ -15,6 +15,7 @@ from walop_jax.calibration.matrix import Settings, matrices
 from walop_jax.data.records import Sources
 from walop_jax.likelihood import engine
 from walop_jax.model import carried, mueller
+from walop_jax.model.build import nominal_instrument
 from walop_jax.model.cameras import DetectorPart
 from walop_jax.model.effects import EFFECTS, FreeForm, effect_by_name
 from walop_jax.model.effects.base import Context, Effect, Scalar
@@ -28,7 +29,8 @@ from walop_jax.model.ray import Ray
 # Stars of known (q, u), from which the linear coefficients of each camera follow exactly.
 STARS = (("none", 0.0, 0.0), ("q", 0.5, 0.0), ("u", 0.0, 0.5))
 CONTEXT = Context(exposures=6, moon=(0,), moon_ids=(0,), sources=tuple(s[0] for s in STARS))
-BASE = builders.south(np.random.default_rng(5), standards=STARS)
+BUILT = builders.south(np.random.default_rng(5))
+BASE = BUILT.with_source(nominal_instrument(standards=STARS).standard)
 CURVE = builders.curve([0.59, 0.62, 0.65], [1.0, 1.0, 1.0])
 TEMP, HA = 4.0, -2.0
 X, Y = np.array([0.21, -0.13]), np.array([-0.17, 0.08])
