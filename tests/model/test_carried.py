@@ -15,6 +15,7 @@ from walop_jax.calibration.matrix import Settings, matrices
 from walop_jax.data.records import Sources
 from walop_jax.likelihood import engine
 from walop_jax.model import carried, mueller
+from walop_jax.model.build import nominal_instrument
 from walop_jax.model.cameras import DetectorPart
 from walop_jax.model.effects import EFFECTS, FreeForm, effect_by_name
 from walop_jax.model.effects.base import Context, Effect, Scalar
@@ -28,7 +29,8 @@ from walop_jax.model.ray import Ray
 # Stars of known (q, u), from which the linear coefficients of each camera follow exactly.
 STARS = (("none", 0.0, 0.0), ("q", 0.5, 0.0), ("u", 0.0, 0.5))
 CONTEXT = Context(exposures=6, moon=(0,), moon_ids=(0,), sources=tuple(s[0] for s in STARS))
-BASE = builders.south(np.random.default_rng(5), standards=STARS)
+BUILT = builders.south(np.random.default_rng(5))
+BASE = BUILT.with_source(nominal_instrument(standards=STARS).standard)
 CURVE = builders.curve([0.59, 0.62, 0.65], [1.0, 1.0, 1.0])
 TEMP, HA = 4.0, -2.0
 X, Y = np.array([0.21, -0.13]), np.array([-0.17, 0.08])
@@ -94,27 +96,34 @@ def make(name: str, **values) -> Effect:
 
 # ----------------------------------------------------------------------------------------- every effect once
 
-IN_THE_PRODUCT = {
-    "telescope_polarisation": {"q": 0.004, "u": -0.003},
-    "lens_birefringence": {"delta": 0.02},
-    "upstream_retarder": {"delta": 0.05, "axis": 20.0},
-    "chwp_in_beam": {},
-    "chwp_axis": {"angle": 0.5},
-    "chwp_thickness": {"mgf2": 3.0, "quartz": -2.0},
-    "flexure": {"rate_x": 0.01, "rate_y": -0.005},
-    "filter_shift": {"wavelength": 0.004},
-    "etalon": {"contrast": 0.01, "gap": 8.0},
-    "hwp_temperature": {"coefficient": 1.0},
-    "hwp1_axis": {"angle": 0.5},
-    "hwp2_axis": {"angle": 0.5},
-    "hwp1_crossing": {"angle": 0.5},
-    "hwp2_crossing": {"angle": 0.5},
-    "hwp1_axis_cut": {"angle": 0.5},
-    "hwp2_axis_cut": {"angle": 0.5},
-    "wollaston_axis": {"angle": 0.5},
-    "blemish": {"camera": 2, "x": 0.2, "y": -0.15, "size": 0.06, "depth": 0.03},
-    "camera_leakage": {"share": 0.01},
-}
+# Effects in company: the others of a group are there at neutral, so that one compilation serves all of it.
+IN_THE_PRODUCT = (
+    {
+        "telescope_polarisation": {"q": 0.004, "u": -0.003},
+        "lens_birefringence": {"delta": 0.02},
+        "upstream_retarder": {"delta": 0.05, "axis": 20.0},
+        "chwp_axis": {"angle": 0.5},
+        "chwp_thickness": {"mgf2": 3.0, "quartz": -2.0},
+        "flexure": {"rate_x": 0.01, "rate_y": -0.005},
+        "filter_shift": {"wavelength": 0.004},
+    },
+    {
+        "etalon": {"contrast": 0.01, "gap": 8.0},
+        "hwp_temperature": {"coefficient": 1.0},
+        "hwp1_axis": {"angle": 0.5},
+        "hwp2_axis": {"angle": 0.5},
+        "hwp1_crossing": {"angle": 0.5},
+        "hwp2_crossing": {"angle": 0.5},
+        "hwp1_axis_cut": {"angle": 0.5},
+        "hwp2_axis_cut": {"angle": 0.5},
+    },
+    {
+        "wollaston_axis": {"angle": 0.5},
+        "blemish": {"camera": 2, "x": 0.2, "y": -0.15, "size": 0.06, "depth": 0.03},
+        "camera_leakage": {"share": 0.01},
+    },
+    {"chwp_in_beam": {}},
+)
 OF_THE_SOURCE = {  # and of the polariser: no part of what is said of the instrument
     "moon_multiple_scattering": {"p": 0.02},
     "moon_patch": {"q": 0.01, "u": 0.01},
@@ -125,58 +134,73 @@ OF_THE_SOURCE = {  # and of the polariser: no part of what is said of the instru
     "clp_extinction": {"ratio": 0.01},
     "clp_ellipticity": {"v": 0.05},
 }
-UNDONE = {"nonlinearity": {"coefficient": [0.03, -0.02, 0.01, 0.05]}}
-LEFT_BEHIND = {
+DETECTORS = {
+    "nonlinearity": {"coefficient": [0.03, -0.02, 0.01, 0.05]},
     "ghost": {"share": 0.02},
     "pedestal": {"level": [0.01, 0.02, -0.005, 0.0]},
     "camera_gain_drift": {"camera": 1, "rate": 0.01},
 }
+UNDONE, LEFT_BEHIND = ("nonlinearity",), ("ghost", "pedestal", "camera_gain_drift")
+GROUP = {name: group for group in (*IN_THE_PRODUCT, OF_THE_SOURCE, DETECTORS) for name in group}
+
+
+def among(name: str, *, neutral: bool = False) -> tuple[Effect, ...]:
+    """The effects of a group, all at neutral but one (or all)."""
+    effects = []
+    for other, values in GROUP[name].items():
+        effect = make(other, **values)
+        effects.append(effect if other == name and not neutral else effect.at_neutral(CONTEXT))
+    return tuple(effects)
+
+
+def alone(name: str) -> Instrument:
+    return instrument(make(name, **GROUP[name][name]))
 
 
 def test_every_effect_is_one_of_these():
-    listed = [*IN_THE_PRODUCT, *OF_THE_SOURCE, *UNDONE, *LEFT_BEHIND]
-    assert sorted(listed) == sorted(kind.name for kind in EFFECTS)
+    assert sorted(GROUP) == sorted(kind.name for kind in EFFECTS)
+    assert set(DETECTORS) == {*UNDONE, *LEFT_BEHIND}
 
 
 def test_without_effects():
     assert product() == pytest.approx(matrix_of_counts(star_counts()), abs=1e-12)
 
 
-@pytest.mark.parametrize("name", IN_THE_PRODUCT)
+@pytest.mark.parametrize("name", [name for group in IN_THE_PRODUCT for name in group])
 def test_what_the_counts_show_the_product_says(name):
-    effect = make(name, **IN_THE_PRODUCT[name])
-    assert carried.left_behind(instrument(effect)) == ()
-    shown, said = matrix_of_counts(star_counts(effect)), product(effect)
+    assert carried.left_behind(alone(name)) == ()
+    shown, said = matrix_of_counts(star_counts(*among(name))), product(*among(name))
     assert np.abs(shown - matrix_of_counts(star_counts())).max() > 1e-4
     np.testing.assert_allclose(said, shown, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", OF_THE_SOURCE)
 def test_what_belongs_to_the_source_stays_with_it(name):
-    effect = make(name, **OF_THE_SOURCE[name])
-    assert carried.left_behind(instrument(effect)) == ()
-    np.testing.assert_array_equal(product(effect), product())
+    assert carried.left_behind(alone(name)) == ()
+    np.testing.assert_array_equal(product(*among(name)), product(*among(name, neutral=True)))
+    np.testing.assert_allclose(product(*among(name)), product(), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", DETECTORS)
+def test_what_acts_on_counts_is_no_part_of_the_product(name):
+    np.testing.assert_array_equal(product(*among(name)), product(*among(name, neutral=True)))
+    np.testing.assert_allclose(product(*among(name)), product(), rtol=0, atol=1e-14)
+    if name != "ghost":  # which stars do not have
+        assert np.abs(star_counts(*among(name)) / star_counts() - 1).max() > 1e-3
 
 
 @pytest.mark.parametrize("name", UNDONE)
 def test_what_a_detector_does_to_its_own_counts_is_undone(name):
-    effect = make(name, **UNDONE[name])
-    assert carried.left_behind(instrument(effect)) == ()
-    np.testing.assert_array_equal(product(effect), product())
-    shown, linear = star_counts(effect), star_counts()
-    assert np.abs(shown / linear - 1).max() > 1e-3
-    again = np.asarray(carried.reported(instrument(effect), jnp.asarray(linear.reshape(-1, 4))))
+    assert carried.left_behind(alone(name)) == ()
+    shown, linear = star_counts(*among(name)), star_counts()
+    again = np.asarray(carried.reported(alone(name), jnp.asarray(linear.reshape(-1, 4))))
     np.testing.assert_allclose(again.reshape(linear.shape), shown, rtol=1e-13)
 
 
 @pytest.mark.parametrize("name", LEFT_BEHIND)
 def test_what_is_left_behind_is_named(name):
-    effect = make(name, **LEFT_BEHIND[name])
-    both = instrument(make("hwp1_axis", angle=0.5), effect)
+    both = instrument(make("hwp1_axis", angle=0.5), make(name, **DETECTORS[name]))
     assert carried.left_behind(both) == (name,)
-    np.testing.assert_array_equal(product(effect), product())
-    if name != "ghost":  # which stars do not have
-        assert np.abs(star_counts(effect) / star_counts() - 1).max() > 1e-3
 
 
 # ------------------------------------------------------------------------------------------- the free form

@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import math
 import os
+import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from importlib import resources
@@ -40,6 +41,8 @@ NUMBER_KEYS = ("value", "sigma", "unit", "source", "name", "scale", "loose")
 SITE_KEYS = ("telescope", "latitude", "longitude", "elevation", "full_moon")
 FIELD_KEYS = ("limit", "scale", "raster", "edge")
 RASTERS = ("square", "line")
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+LARGEST = 1e300
 THROUGHPUT_KEYS = ("degree", "level", "scale", "loose")
 
 
@@ -176,6 +179,8 @@ def _whole(text: str, where: str, seen: tuple[str, ...]) -> Table:
         raise DataError(f"{where}: not valid TOML: {error}") from None
     except RecursionError:
         raise DataError(f"{where}: tables nested too deep") from None
+    except ValueError as error:  # numbers too long to be read
+        raise DataError(f"{where}: {error}") from None
     like = table.get("like")
     if like is None:
         return table
@@ -230,6 +235,11 @@ class _Reader:
             raise self.fault(place, f"{key} = {value!r} must be a table")
         return value
 
+    def name(self, value: str, place: str) -> str:
+        if not NAME.fullmatch(value):
+            raise self.fault(place, f"{value!r} cannot be a name: letters, digits and _, a letter first")
+        return value
+
     def words(self, value: Any, key: str, place: str) -> tuple[str, ...]:
         if not (isinstance(value, list) and value and all(isinstance(word, str) for word in value)):
             raise self.fault(place, f"{key} = {value!r} must be a list of names")
@@ -238,14 +248,21 @@ class _Reader:
         return tuple(value)
 
     def text(self, value: Any, key: str, place: str) -> str:
-        if not isinstance(value, str) or not value.isprintable():
-            raise self.fault(place, f"{key} = {value!r} must be a text")
+        if not isinstance(value, str) or not value.isprintable() or not value.strip():
+            raise self.fault(place, f"{key} = {value!r} must be a text on one line")
         return value
 
     def float(self, value: Any, key: str, place: str) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise self.fault(place, f"{key} = {value!r} must be a finite number")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+            shown = repr(value) if len(repr(value)) < 80 else "that"
+            raise self.fault(place, f"{key} = {shown} must be a finite number")
         return float(value)
+
+    def positive(self, value: Any, key: str, place: str) -> float:
+        number = self.float(value, key, place)
+        if number <= 0:
+            raise self.fault(place, f"{key} = {number:g} must be above 0")
+        return number
 
     def number(self, value: Any, key: str, place: str) -> Given:
         if not isinstance(value, Mapping):
@@ -264,7 +281,8 @@ class _Reader:
                     )
         for name in ("unit", "source", "name"):
             if name in value:
-                given[name] = self.text(value[name], name, here)
+                pure = name == "unit" and value[name] == ""
+                given[name] = "" if pure else self.text(value[name], name, here)
         return Given(**given)
 
     def element(self, name: str, table: Any, place: str) -> ElementText:
@@ -281,6 +299,9 @@ class _Reader:
         layers = table.get("layers", [])
         if not _named(layers):
             raise self.fault(place, "layers must be a list of tables with a name each")
+        for layer in layers:
+            self.name(self.text(layer["name"], "name", f"{place}.layers"), f"{place}.layers")
+        self.words([layer["name"] for layer in layers], "layers", place) if layers else None
         made = tuple(
             {k: self.value(v, k, f"{place}.layers.{layer['name']}") for k, v in layer.items()}
             for layer in layers
@@ -304,10 +325,10 @@ class _Reader:
         for name, entry in table.items():
             if name not in path:
                 raise self.fault(f"{place}.{name}".lstrip("."), "is described but does not stand in the path")
-            yield self.element(name, entry, f"{place}.{name}".lstrip("."))
+            yield self.element(self.name(name, place), entry, f"{place}.{name}".lstrip("."))
 
     def arm(self, name: str, table: Any) -> ArmText:
-        place = f"arms.{name}"
+        place = f"arms.{self.name(name, 'arms')}"
         if not isinstance(table, Mapping):
             raise self.fault(place, f"{table!r} must be a table")
         self.known(table, ("path", "elements"), place)
@@ -325,12 +346,16 @@ class _Reader:
         self.known(field, FIELD_KEYS, "field")
         for key, value in site.items():
             self.text(value, key, "site") if key == "telescope" else self.float(value, key, "site")
+        if not abs(site.get("latitude", 0.0)) <= 90.0:
+            raise self.fault("site", f"latitude = {site['latitude']:g} must be between -90 and 90 deg")
         series = self.table(table, "throughput")
         self.known(series, THROUGHPUT_KEYS, "throughput")
         degree = series.get("degree", 4)
         if isinstance(degree, bool) or not isinstance(degree, int) or not 0 <= degree <= 12:
             raise self.fault("throughput", f"degree = {degree!r} must be a whole number from 0 to 12")
-        level = self.float(series.get("level", 0.5), "level", "throughput")
+        level = self.positive(series.get("level", 0.5), "level", "throughput")
+        cameras = self.table(table, "cameras")
+        self.known(cameras, ("names",), "cameras")
         path = tuple(self.words(table["path"], "path", "")) if table["path"] else ()
         raster = field.get("raster", RASTERS[0])
         if raster not in RASTERS:
@@ -340,20 +365,20 @@ class _Reader:
             raise self.fault("arms", "needs one arm at least")
         return Description(
             name=self.text(table["name"], "name", ""),
-            about=self.text(table.get("about", ""), "about", ""),
+            about=self.text(table["about"], "about", "") if "about" in table else "",
             source=self.text(table.get("source", "description file"), "source", ""),
             path=path,
             elements=tuple(self.elements(self.table(table, "elements"), path, "elements")),
             arms=arms,
-            cameras=self.words(self.table(table, "cameras").get("names"), "names", "cameras"),
-            field_limit=self.float(field.get("limit", 90.0), "limit", "field"),
-            field_scale=self.float(field.get("scale", 0.3), "scale", "field"),
+            cameras=self.words(cameras.get("names"), "names", "cameras"),
+            field_limit=self.positive(field.get("limit", 90.0), "limit", "field"),
+            field_scale=self.positive(field.get("scale", 0.3), "scale", "field"),
             throughput_degree=degree,
             throughput=Given(
                 level,
                 parameter=True,
-                scale=self.float(series.get("scale", 0.02), "scale", "throughput"),
-                loose=self.float(series.get("loose", 0.5), "loose", "throughput"),
+                scale=self.positive(series.get("scale", 0.02), "scale", "throughput"),
+                loose=self.positive(series.get("loose", 0.5), "loose", "throughput"),
             ),
             site=dict(site),
             raster=raster,

@@ -9,6 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from walop_jax.data.records import POLARISER, PREFIX
 from walop_jax.instruments.description import (
     ArmText,
     Description,
@@ -21,14 +22,16 @@ from walop_jax.instruments.description import (
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.model import legendre, materials
 from walop_jax.model.cameras import Cameras, Throughput
-from walop_jax.model.elements import ELEMENTS, Analyser, Element, Layer, Polariser, WavePlate
+from walop_jax.model.elements import ELEMENTS, Analyser, Element, Layer, Polariser, WavePlate, Wedge
 from walop_jax.model.elements.wave_plate import MODELS
 from walop_jax.model.instrument import Arm, Instrument
 from walop_jax.model.parameters import Component, Declaration, numbers_of, unknown_name
 from walop_jax.model.sources import SOURCES, Source, Standards
+from walop_jax.model.well_formed import check
 
 PLATE_MODELS = tuple(MODELS)
 STAR = tuple[str, float, float]
+OWN = ("name", "moves", "declared", "model", "always_in")  # what a file says otherwise, or not at all
 SERIES = "Legendre coefficient P_i(x/h) P_j(y/h)"
 FREE = "smooth vignetting and coatings: free"
 
@@ -63,10 +66,7 @@ def build(description: Description, *, elements: Sequence[type[Element]] = (), *
         raster=(description.raster, description.edge),
         description="" if description.name in shipped() else description.text,
     )
-    try:
-        instrument.telescope()
-    except ValueError as error:
-        raise DataError(f"[elements] {error}") from None
+    check(instrument)
     return adapted(instrument, **options)
 
 
@@ -142,13 +142,16 @@ class _Maker:
     kinds: Mapping[str, type[Element]]
 
     def arm(self, text: ArmText) -> Arm:
-        elements = tuple(self.element(entry, f"{text.name}.") for entry in text.elements)
+        place = f"arms.{text.name}"
+        elements = tuple(self.element(entry, f"{place}.elements.") for entry in text.elements)
         arm = Arm(name=text.name, elements=elements, path=text.path)
+        if not isinstance(elements[[e.name for e in elements].index(text.path[-1])], Analyser):
+            raise DataError(f"[{place}] its path must end with an analyser, not with {text.path[-1]!r}")
         if len(arm.analyser.cameras) != 2:
             raise DataError(f"[arms.{text.name}] its analyser needs the names of two cameras")
         return arm
 
-    def element(self, text: ElementText, prefix: str = "") -> Element:
+    def element(self, text: ElementText, prefix: str = "elements.") -> Element:
         place = f"{prefix}{text.name}"
         if text.kind not in self.kinds:
             raise DataError(
@@ -157,29 +160,48 @@ class _Maker:
         kind = self.kinds[text.kind]
         fields, declared = self.numbers(kind, text.values, place)
         if kind is WavePlate:
-            layers = tuple(self.layer(layer, place) for layer in text.layers)
-            fields |= {"layers": layers}
+            if not text.layers:
+                raise DataError(f"[{place}] a wave plate needs layers")
+            fields |= {"layers": tuple(self.layer(layer, place) for layer in text.layers)}
         elif text.layers:
             raise DataError(f"[{place}] an element of kind {text.kind!r} has no layers")
+        if kind is Wedge and fields.get("material", Wedge.material) not in materials.GLASSES:
+            glass = str(fields["material"])
+            raise DataError(f"[{place}] unknown glass {glass!r}; {nearest(glass, materials.GLASSES)}")
         made = kind(name=text.name, moves=text.moves, declared=declared, **fields)
-        if text.moves and not isinstance(made, Polariser) and not hasattr(made, "axis"):
-            raise DataError(
-                f"[{place}] moves, but an element of kind {text.kind!r} has no axis that could turn"
-            )
-        if text.moves and kind.ray is not Element.ray:
-            raise DataError(f"[{place}] an element of kind {text.kind!r} changes the ray and cannot move")
-        if isinstance(made, Analyser) and text.moves:
-            raise DataError(f"[{place}] an analyser does not move")
+        self.check_moves(made, place)
         return made
+
+    def check_moves(self, made: Element, place: str) -> None:
+        moves, what = made.moves, f"an element of kind {made.kind!r}"
+        if isinstance(made, Polariser):
+            if moves not in (None, POLARISER):
+                raise DataError(f"[{place}] moves = {moves!r}: the columns of a polariser are {POLARISER}")
+        elif moves is None:
+            return
+        elif not PREFIX.fullmatch(moves):
+            raise DataError(
+                f"[{place}] moves = {moves!r} cannot begin the names of columns: capital letters, digits and _, a "
+                "letter first"
+            )
+        elif isinstance(made, Analyser):
+            raise DataError(f"[{place}] an analyser does not move")
+        elif not hasattr(made, "axis"):
+            raise DataError(f"[{place}] moves, but {what} has no axis that could turn")
+        elif type(made).ray is not Element.ray:
+            raise DataError(f"[{place}] {what} changes the ray and cannot move")
 
     def layer(self, values: Mapping[str, Any], place: str) -> Layer:
         name = values["name"]
         rest = {key: value for key, value in values.items() if key != "name"}
-        fields, declared = self.numbers(Layer, rest, f"{place}.{name}")
+        place = f"{place}.layers.{name}"
+        fields, declared = self.numbers(Layer, rest, place)
+        if not fields.get("thickness", 0.0) >= 0.0 or "thickness" not in fields:
+            raise DataError(f"[{place}] needs a thickness (um) that is not below 0")
         material = fields.get("material", "")
         if material not in materials.CRYSTALS:
             raise DataError(
-                f"[{place}.{name}] unknown crystal {material!r}; {nearest(str(material), materials.CRYSTALS)}"
+                f"[{place}] unknown crystal {material!r}; {nearest(str(material), materials.CRYSTALS)}"
             )
         return Layer(name=name, declared=declared, **fields)
 
@@ -188,15 +210,15 @@ class _Maker:
     ) -> tuple[dict[str, Any], tuple[tuple[str, Declaration], ...]]:
         """Fields of a component from what a file says of it, and which of them are parameters."""
         known = numbers_of(kind)
-        plain = [f.name for f in dataclasses.fields(kind) if f.metadata.get("static", False)]
-        plain = [name for name in plain if name not in ("name", "moves", "declared", "model", "always_in")]
+        static = {f.name: f.default for f in dataclasses.fields(kind) if f.metadata.get("static", False)}
+        plain = {name: default for name, default in static.items() if name not in OWN}
         fields: dict[str, Any] = {}
         declared: list[tuple[str, Declaration]] = []
         for key, value in values.items():
             if key not in known and key not in plain:
                 raise DataError(f"[{place}] {unknown_name('key', key, [*known, *plain])}")
             if key in plain:
-                fields[key] = value
+                fields[key] = self.fixed(value, plain[key], f"[{place}] {key}")
                 continue
             if not isinstance(value, Given):
                 raise DataError(f"[{place}] {key} = {value!r} must be a number")
@@ -210,6 +232,18 @@ class _Maker:
         # In the order of the class, as the tree is flattened.
         order = list(known)
         return fields, tuple(sorted(declared, key=lambda entry: order.index(entry[0])))
+
+    def fixed(self, value: Any, default: Any, what: str) -> Any:
+        """A choice that is no parameter, of the type of its default."""
+        if isinstance(value, Given):
+            if value.parameter:
+                raise DataError(f"{what} cannot be a parameter")
+            value = type(default)(value.value) if isinstance(default, int | float) else value.value
+        if isinstance(default, str | tuple) and not isinstance(value, type(default)):
+            raise DataError(
+                f"{what} = {value!r} must be a {'name' if isinstance(default, str) else 'list of names'}"
+            )
+        return value
 
     def declaration(self, given: Given, unit: str, about: str) -> Declaration:
         return Declaration(

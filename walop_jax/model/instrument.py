@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.instruments.description import read_description
+from walop_jax.io.errors import errors_naming
 from walop_jax.model.cameras import Cameras, Throughput
 from walop_jax.model.elements import Analyser, Element, Polariser, WavePlate
 from walop_jax.model.parameters import Component, number, unknown_name
@@ -98,11 +99,13 @@ class Instrument(Component):
     def read(cls, source: str | os.PathLike[str], **options: Any) -> Instrument:
         """The instrument of a description file, or a shipped one by name; options as for `build.build`.
 
-        Raises `DataError` for a file that is wrong and ValueError for an element that does not exist.
+        Raises `DataError`, naming file, table and key, for a file that is wrong.
         """
         from walop_jax.model.build import build
 
-        return build(read_description(source), **options)
+        description = read_description(source)
+        with errors_naming(source):
+            return build(description, **options)
 
     # ------------------------------------------------------------------------------- asking for parts
 
