@@ -1,5 +1,19 @@
 """The small simulated run and its calibration (`small_run.py`) for the tests of this room."""
 
-from small_run import calibration, calset
+from __future__ import annotations
 
-__all__ = ["calibration", "calset"]
+import pytest
+from small_run import WITH_PLATE, fitted_run
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.data.records import CalibrationSet
+
+
+@pytest.fixture(scope="session")
+def calset() -> CalibrationSet:
+    return fitted_run(WITH_PLATE).calset
+
+
+@pytest.fixture(scope="session")
+def calibration() -> Calibration:
+    return fitted_run(WITH_PLATE).calibration
