@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,11 +13,13 @@ from oracle import forward
 
 from walop_jax.data.records import Exposures, FilterCurve
 from walop_jax.model import light
+from walop_jax.model.build import nominal_instrument
 from walop_jax.model.compiled import compiled
-from walop_jax.model.instrument import Instrument, nominal_instrument
-from walop_jax.model.parameters import leaves
-from walop_jax.model.plan import Plan, build_plan
-from walop_jax.model.specification import full_values, unravel
+from walop_jax.model.effects.base import Effect
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import leaves, values_of, with_values
+from walop_jax.model.plan import Plan
+from walop_jax.model.planning import plan_for
 
 NAN = float("nan")
 _BLANK: dict[str, Any] = {
@@ -75,23 +78,57 @@ def setting_plan(
 ) -> Plan:
     """A plan with one band per setting (deg, or None: out) of the calibration plate, in the order given."""
     rows = [{"teff": teff} | ({} if s is None else {"chwp_angle": s}) for s in settings]
-    plan = build_plan(exposures(*rows), {"band": filter_curve})
-    assert [s for s, _, _ in plan.settings] == list(settings)
+    plan = plan_for(nominal_instrument(), exposures(*rows), {"band": filter_curve})
+    assert [state[0] for state, _, _ in plan.settings] == list(settings)
     return plan
 
 
 def as_built(instrument: Instrument, rng: np.random.Generator, sigmas: float = 1.0) -> Instrument:
     """An instrument whose numbers scatter around the given ones by prior widths (or solver scales)."""
-    values = full_values(instrument)
+    values = np.asarray(values_of(instrument))
     width = [leaf.declaration.width or leaf.declaration.scale for leaf in leaves(instrument)]
-    return unravel(instrument)(
+    return with_values(instrument)(
         jnp.asarray(values + sigmas * np.array(width) * rng.standard_normal(values.size))
     )
 
 
-def south(rng: np.random.Generator | None = None, **options: Any) -> Instrument:
+def south(
+    rng: np.random.Generator | None = None, effects: Sequence[Effect] = (), **options: Any
+) -> Instrument:
     instrument = nominal_instrument("WALOP-SOUTH", **options)
-    return instrument if rng is None else as_built(instrument, rng)
+    built = instrument if rng is None else as_built(instrument, rng)
+    return dataclasses.replace(built, effects=tuple(effects))
+
+
+def without_wedges(instrument: Instrument) -> Instrument:
+    """The middle of the field is then at normal incidence in both halves."""
+    for half in ("half1", "half2"):
+        instrument = instrument.changed(f"{half}.wedge", angle=jnp.asarray(0.0))
+    return instrument
+
+
+def with_plates(
+    instrument: Instrument,
+    quartz: float,
+    mgf2: float,
+    places: Sequence[str] = ("chwp", "half1.plate", "half2.plate"),
+) -> Instrument:
+    """The instrument with crystals of that thickness (µm)."""
+    for place in places:
+        instrument = instrument.changed(f"{place}.quartz", thickness=jnp.asarray(quartz))
+        instrument = instrument.changed(f"{place}.mgf2", thickness=jnp.asarray(mgf2))
+    return instrument
+
+
+def value(instrument: Instrument, name: str) -> float:
+    """A parameter by its name, such as "half2.plate.mgf2"."""
+    names = [leaf.name for leaf in leaves(instrument)]
+    return float(values_of(instrument)[names.index(name)])
+
+
+def matrix(vectors: Any) -> np.ndarray:
+    """Rows (m21, m22, m23), (m31, m32, m33): O1 − E1 and O2 − E2."""
+    return np.asarray(light.instrument_matrix(jnp.asarray(vectors), ((0, 1), (2, 3))))
 
 
 def field(rng: np.random.Generator, count: int, edge: float = 0.29) -> tuple[np.ndarray, np.ndarray]:
@@ -100,7 +137,9 @@ def field(rng: np.random.Generator, count: int, edge: float = 0.29) -> tuple[np.
 
 def oracle_params(instrument: Instrument) -> dict[str, Any]:
     """The same instrument in the words of the oracle."""
-    values = dict(zip((leaf.name for leaf in leaves(instrument)), full_values(instrument), strict=True))
+    values = dict(
+        zip((leaf.name for leaf in leaves(instrument)), np.asarray(values_of(instrument)), strict=True)
+    )
     params = {theirs: float(values[ours]) for ours, theirs in ORACLE_NAMES.items()}
     params["throughput"] = np.array(
         [[values[f"throughput.n{k}.p{i}{j}"] for i, j in forward.TERMS] for k in range(4)]

@@ -17,9 +17,8 @@ from south_sets import ABSENT, CUTS, SHARED, SouthSet
 jax.config.update("jax_enable_x64", True)  # the package itself never switches it on
 # Every annotated shape and type of the package is checked, under pytest only. Must precede its import.
 jaxtyping.install_import_hook("walop_jax", "shapes.checked")
-from fitted import Fitted  # noqa: E402
-
 from walop_jax.data import read_calibration_set  # noqa: E402
+from walop_jax.fit.refit import FitResult, refit  # noqa: E402
 
 LEAST_COMPILED = 0.1  # seconds: what compiles faster is not worth a file
 OPTIONS = {"long": "studies that take minutes", "benchmark": "timings"}
@@ -94,12 +93,18 @@ def either_south_set(request: pytest.FixtureRequest) -> Callable[[str], SouthSet
 
 
 @pytest.fixture(scope="session")
-def south_fit() -> Callable[[SouthSet], Fitted]:
+def south_fit() -> Callable[[SouthSet], FitResult]:
     """Fits of the base model to sets with known truth, each made once."""
-    return functools.cache(lambda south: Fitted.to(read_calibration_set(south.path)))
+    return functools.cache(lambda south: refit(read_calibration_set(south.path)))
 
 
 @pytest.fixture
 def handmade(tmp_path: Path) -> Handmade:
     """A calibration set made with astropy alone, to be spoilt."""
     return Handmade(tmp_path)
+
+
+@pytest.fixture
+def two_cameras(tmp_path: Path) -> Handmade:
+    """A set of an instrument with two cameras and two moving elements of its own, made in the same way."""
+    return Handmade(tmp_path, two_cameras=True)

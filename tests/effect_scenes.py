@@ -14,7 +14,8 @@ from walop_jax.data.records import FilterCurve, Sources
 from walop_jax.likelihood import engine
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.plan import Plan, plan_for, with_median
+from walop_jax.model.plan import Plan, with_median
+from walop_jax.model.planning import plan_for
 
 FLUX = 4e5
 X, Y = np.array([0.21, -0.13]), np.array([-0.17, -0.08])
@@ -43,7 +44,7 @@ SKY = np.array([[0.10, 0.02], [-0.05, 0.08]])
 def plan(effects: Sequence[Effect] = (), exposures=EXPOSURES, filters=FILTERS) -> Plan:
     nan = np.full(2, np.nan)
     stars = Sources(np.arange(2), np.array([s[0] for s in STARS]), nan, nan, nan, nan, nan)
-    return with_median(plan_for(effects, exposures, filters, stars), MEDIAN)
+    return with_median(plan_for(instrument(*effects), exposures, filters, stars), MEDIAN)
 
 
 def points(plan: Plan, x=X, y=Y) -> engine.PointData:

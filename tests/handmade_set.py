@@ -74,13 +74,35 @@ def _tables() -> dict[str, dict[str, list]]:
     }
 
 
+def _two_cameras() -> dict[str, dict[str, list]]:
+    """The same points and sources for another instrument: 6 exposures of a lamp and 2 of a standard.
+
+    A retarder RET_1 that may be taken out, a rotating plate HWP that is always in, neither CLP nor CHWP.
+    """
+    tables = _tables()
+    exposures, intensities = tables["EXPOSURES"], tables["INTENSITIES"]
+    for name in ("CLP_IN", "CLP_ANGLE", "CHWP_IN", "CHWP_ANGLE"):
+        del exposures[name]
+    exposures["KIND"][2] = np.array(["lamp"] * 6 + ["standard"] * 2)
+    exposures["RET_1_IN"] = ["L", None, np.array([True] * 4 + [False] * 2 + [True, False])]
+    exposures["RET_1_ANGLE"] = ["D", "deg", np.array([0.0, 0.0, 30.0, 30.0, NAN, NAN, 60.0, NAN])]
+    exposures["HWP_ANGLE"] = ["D", "deg", np.array([0.0, 22.5, 45.0, 67.5, 0.0, 22.5, 45.0, 360.0])]
+    exposures["ROTATOR"][2] = np.array([NAN] * 6 + [40.0, 75.0])
+    intensities["SOURCE"][2] = np.where(intensities["EXPOSURE"][2] >= 16, 3, -1)
+    for name in ("N", "N_ERR"):
+        intensities[name] = ["2D", "electron", intensities[name][2][:, :2]]
+    return tables
+
+
 class Handmade:
     """The set as plain columns: change what you like, then `write` it."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, two_cameras: bool = False) -> None:
         self.folder = folder
         self.header = dict(HEADER)
-        self.tables = _tables()
+        self.tables = _two_cameras() if two_cameras else _tables()
+        if two_cameras:
+            self.header |= {"CALVERS": 2, "INSTRUME": "Bench of two"}
 
     def __getitem__(self, table: str) -> dict[str, list]:
         return self.tables[table]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 
-from fitted import Fitted
-
+from walop_jax.fit.refit import FitResult, refit
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -18,6 +17,6 @@ SEED = 4
 
 
 @functools.cache
-def fitted_run(plan: ObservingPlan) -> Fitted:
-    """A run of seed `SEED` and its fit, made once."""
-    return Fitted.to(simulate(plan, seed=SEED).calset)
+def fitted_run(plan: ObservingPlan) -> FitResult:
+    """The fit of a run of seed `SEED`, made once."""
+    return refit(simulate(plan, seed=SEED).calset)

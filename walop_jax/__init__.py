@@ -16,17 +16,20 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from walop_jax.calibration.calibration import Calibration
     from walop_jax.calibration.matrix import Settings
+    from walop_jax.calibration.residual_map import residual_map
     from walop_jax.data.calset import read_calibration_set
     from walop_jax.data.write import write_calibration_set
     from walop_jax.diagnosis.workflow import diagnose as find_effects
     from walop_jax.fit.misfit import describe as describe_misfit
+    from walop_jax.fit.model_builder import base_model
     from walop_jax.fit.refit import FitResult, refit
     from walop_jax.io.errors import DataError
-    from walop_jax.likelihood.problem import Problem, base_model
+    from walop_jax.likelihood.likelihood import Likelihood
+    from walop_jax.model.build import nominal_instrument
     from walop_jax.model.effects import effect_by_name
-    from walop_jax.model.instrument import nominal_instrument
+    from walop_jax.model.instrument import Instrument
     from walop_jax.model.specification import with_effects
-    from walop_jax.model.trace import Ray, trace
+    from walop_jax.model.trace import Sightline, trace
     from walop_jax.science.apply import apply
     from walop_jax.simulation.observing_plan import ObservingPlan
     from walop_jax.simulation.simulate import simulate
@@ -37,10 +40,11 @@ __all__ = [
     "Calibration",
     "DataError",
     "FitResult",
+    "Instrument",
+    "Likelihood",
     "ObservingPlan",
-    "Problem",
-    "Ray",
     "Settings",
+    "Sightline",
     "apply",
     "base_model",
     "describe_misfit",
@@ -49,6 +53,7 @@ __all__ = [
     "nominal_instrument",
     "read_calibration_set",
     "refit",
+    "residual_map",
     "simulate",
     "trace",
     "with_effects",
@@ -59,18 +64,20 @@ _HOME = {
     "Calibration": ("calibration.calibration", "Calibration"),
     "DataError": ("io.errors", "DataError"),
     "FitResult": ("fit.refit", "FitResult"),
+    "Instrument": ("model.instrument", "Instrument"),
+    "Likelihood": ("likelihood.likelihood", "Likelihood"),
     "ObservingPlan": ("simulation.observing_plan", "ObservingPlan"),
-    "Problem": ("likelihood.problem", "Problem"),
-    "Ray": ("model.trace", "Ray"),
+    "Sightline": ("model.trace", "Sightline"),
     "Settings": ("calibration.matrix", "Settings"),
     "apply": ("science.apply", "apply"),
-    "base_model": ("likelihood.problem", "base_model"),
+    "base_model": ("fit.model_builder", "base_model"),
     "describe_misfit": ("fit.misfit", "describe"),
     "effect_by_name": ("model.effects", "effect_by_name"),
     "find_effects": ("diagnosis.workflow", "diagnose"),
-    "nominal_instrument": ("model.instrument", "nominal_instrument"),
+    "nominal_instrument": ("model.build", "nominal_instrument"),
     "read_calibration_set": ("data.calset", "read_calibration_set"),
     "refit": ("fit.refit", "refit"),
+    "residual_map": ("calibration.residual_map", "residual_map"),
     "simulate": ("simulation.simulate", "simulate"),
     "trace": ("model.trace", "trace"),
     "with_effects": ("model.specification", "with_effects"),

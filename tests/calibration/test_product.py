@@ -15,8 +15,8 @@ from walop_jax.calibration.product import (
     MatrixMaps,
     ParameterTable,
     Verdict,
+    in_ascii,
     read_product,
-    spelt,
     write_product,
 )
 from walop_jax.data import DataError, read_calibration_set
@@ -57,7 +57,7 @@ def product(handmade) -> CalibrationProduct:
         sources=calset.sources,
         model=("[model]", 'instrument = "WALOP-SOUTH"', "# a comment"),
         inputs=calset.inputs,
-        versions={"python": "3.11.7", "walop-jax": "0.1.0"},
+        versions={"python": "3.11.7", "walop-jax": "0.1.0", "speclite": "0.20"},  # of a library long gone
     )
 
 
@@ -125,8 +125,8 @@ def test_the_hash_is_of_the_content(product):
 
 
 def test_signs_are_spelt_out():
-    assert spelt("χ²/dof = 1.2 × 3\n at  40°") == "chi2/dof = 1.2 x 3 at 40 deg"
-    assert spelt("Gál") == "G\\xe1l"
+    assert in_ascii("χ²/dof = 1.2 × 3\n at  40°") == "chi2/dof = 1.2 x 3 at 40 deg"
+    assert in_ascii("Gál") == "G\\xe1l"
 
 
 def rewrite(path, change):
@@ -140,7 +140,7 @@ def rewrite(path, change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda h: h[0].header.set("PRODVERS", 2), "newer walop-jax"),
+        (lambda h: h[0].header.set("PRODVERS", 3), "newer walop-jax"),
         (lambda h: h[0].header.set("PRODVERS", "one"), "not a version"),
         (lambda h: h[0].header.remove("PRODVERS"), "is missing"),
         (lambda h: h[0].header.set("INSTRUME", "WALOP-SUOTH"), "WALOP-SOUTH"),

@@ -10,11 +10,13 @@ import pytest
 
 from walop_jax.calibration import residual_map as remainder
 from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_plan
-from walop_jax.calibration.records import RESIDUAL_NAMES
-from walop_jax.calibration.residual_map import cell_of, cells_for, residual_map
+from walop_jax.calibration.records import residual_names
+from walop_jax.calibration.residual_map import cell_of, cells_for, residual_map_at
 from walop_jax.data.records import Block
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.fit.model_builder import base_model
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -71,18 +73,18 @@ def noiseless():
 @pytest.fixture
 def cells(monkeypatch):
     """Six by six cells of sixteen points."""
-    monkeypatch.setattr(remainder, "POINTS_PER_CELL", 16)
+    monkeypatch.setattr(limits, "POINTS_PER_CELL", 16)
 
 
-def problem_of(calset):
-    return Problem(calset, base_model(calset, throughput_degree=2), interpolate=True)
+def likelihood_of(calset):
+    return Likelihood.of(calset, base_model(calset, throughput_degree=2), interpolate=True)
 
 
 def test_structure_is_found_where_it_is(noiseless, cells, monkeypatch):
-    monkeypatch.setattr(remainder, "_chosen", polariser_only)
+    monkeypatch.setattr(remainder, "_main_setting", polariser_only)
     west = noiseless.calset.points.x < 0
-    problem = problem_of(with_structure(noiseless, west))
-    found = residual_map(problem, as_values(noiseless.truth))
+    likelihood = likelihood_of(with_structure(noiseless, west))
+    found = residual_map_at(likelihood, as_values(noiseless.truth))
     assert found.values.shape == (7, 6, 6)
     for plane, expected in zip(found.values, BROKEN, strict=True):
         # First order in the structure: what is left is of second order.
@@ -91,34 +93,34 @@ def test_structure_is_found_where_it_is(noiseless, cells, monkeypatch):
     assert (found.chi2[:, :3] > 1e3 * found.chi2[:, 3:]).all()
 
 
-def polariser_only(problem):
+def polariser_only(exposures):
     """The Moon sky is in the same setting, and its counts were left alone."""
-    return "SDSS-r", np.nan, problem.calset.exposures.clp_in
+    return "SDSS-r", np.nan, exposures.clp_in
 
 
 def test_noise_alone_makes_corrections_of_the_size_of_their_errors(cells):
     simulated = simulate(RUN, seed=8)
-    found = residual_map(problem_of(simulated.calset), as_values(simulated.truth))
+    found = residual_map_at(likelihood_of(simulated.calset), as_values(simulated.truth))
     pulls = found.values / found.errors
     assert np.mean(pulls**2) == pytest.approx(1.0, abs=5 * np.sqrt(2 / pulls.size))
     assert abs(found.significance()) < 5
     assert found.chi2.mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / (576 * 11 * 3)))
     excess = found.excess()
-    for name, error in zip(RESIDUAL_NAMES, found.errors, strict=True):
+    for name, error in zip(residual_names(2), found.errors, strict=True):
         # The scatter of a mean of 36 squares.
         assert abs(excess[name]) ** 2 < 5 * np.sqrt(2 / 36) * np.mean(error**2)
 
 
 def test_structure_below_the_noise_of_a_point_stands_out_of_many(cells, monkeypatch):
     """5·10⁻⁴ in m23: half of the error of a single point, ten times that of the whole map."""
-    monkeypatch.setattr(remainder, "_chosen", polariser_only)
+    monkeypatch.setattr(remainder, "_main_setting", polariser_only)
     simulated = simulate(RUN, seed=8)
     noise = simulated.calset.intensities.block(0, 576)
     clean = simulate(RUN, seed=8, noiseless=True)
     structure = with_structure(clean, np.ones(576, bool)).intensities.block(0, 576)
     added = structure.counts - clean.calset.intensities.block(0, 576).counts
     calset = changed(simulated.calset, noise.counts + added, noise.sigma)
-    found = residual_map(problem_of(calset), as_values(simulated.truth))
+    found = residual_map_at(likelihood_of(calset), as_values(simulated.truth))
     assert found.significance() > 5
     weight = found.errors**-2
     mean = np.sum(found.values * weight, axis=(1, 2)) / np.sum(weight, axis=(1, 2))
@@ -130,15 +132,13 @@ def test_structure_below_the_noise_of_a_point_stands_out_of_many(cells, monkeypa
 def test_the_map_is_of_the_setting_with_the_most_exposures():
     plan = dataclasses.replace(RUN, plate=(None, 45.0), moon_patches=0, grid=4)
     calset = simulate(plan, seed=1).calset
-    problem = Problem(calset, base_model(calset, throughput_degree=2))
-    name, angle, chosen = remainder._chosen(problem)
+    name, angle, chosen = remainder._main_setting(calset.exposures)
     assert name == "SDSS-r"
     assert np.isnan(angle)
     np.testing.assert_array_equal(chosen, ~calset.exposures.chwp_in)
     only = dataclasses.replace(plan, plate=(45.0,))
     calset = simulate(only, seed=1).calset
-    problem = Problem(calset, base_model(calset, throughput_degree=2))
-    assert remainder._chosen(problem)[1] == 45.0
+    assert remainder._main_setting(calset.exposures)[1] == 45.0
 
 
 def test_cells_without_enough_light_hold_no_number(cells):
@@ -147,16 +147,16 @@ def test_cells_without_enough_light_hold_no_number(cells):
     table = calset.intensities
     corner = (calset.points.x > 0.15) & (calset.points.y > 0.15)
     used = ~(corner[table.point] & (table.exposure > 1))
-    problem = problem_of(dataclasses.replace(calset, intensities=table.using(used)))
-    found = residual_map(problem, problem.model.start)
+    likelihood = likelihood_of(dataclasses.replace(calset, intensities=table.using(used)))
+    found = residual_map_at(likelihood, likelihood.model.start)
     assert np.isnan(found.values[:, -1, -1]).all()
     assert np.isfinite(found.values[:, :3, :3]).all()
 
 
 def test_every_point_has_a_cell(noiseless, cells):
-    problem = problem_of(noiseless.calset)
-    grid = cells_for(problem)
-    x, y = problem.calset.points.x, problem.calset.points.y
+    likelihood = likelihood_of(noiseless.calset)
+    grid = cells_for(likelihood.layout.points, likelihood.census)
+    x, y = likelihood.calset.points.x, likelihood.calset.points.y
     cell = cell_of(grid, x, y)
     np.testing.assert_array_equal(np.bincount(cell), np.full(36, 16))
     centre_x, centre_y = grid.xy(0, 36)

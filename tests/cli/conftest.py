@@ -2,41 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
+from command import call, no_cache
 from small_run import SEED, SMALL
-from typer.testing import CliRunner
 
-from walop_jax.cli import app
 from walop_jax.data import write_calibration_set
 from walop_jax.model.effects import effect_by_name
 from walop_jax.simulation.simulate import simulate
 
-Call = Callable[..., Any]  # a `Result`: typer brings its own click, or uses an installed one
-
-
-@pytest.fixture(autouse=True, scope="session")
-def _no_cache():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("WALOP_JAX_CACHE", "off")
-        patch.setenv("COLUMNS", "200")
-        yield
-
-
-@pytest.fixture(scope="session")
-def call() -> Call:
-    """Run a command in this process; exceptions that are no exit code count as test failures."""
-
-    def run(*args: object) -> Any:
-        result = CliRunner().invoke(app, [str(arg) for arg in args])
-        if result.exception is not None and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        return result
-
-    return run
+__all__ = ["call", "no_cache"]
 
 
 @pytest.fixture(scope="session")

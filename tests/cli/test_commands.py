@@ -102,7 +102,7 @@ def test_a_misfit_is_written_but_not_trusted(call, spoilt_file, tmp_path):
 
 
 def test_no_convergence_no_product(call, calset_file, tmp_path, monkeypatch):
-    monkeypatch.setattr(walop_jax.fit.refit, "FIRST_STEPS", 1)
+    monkeypatch.setattr(walop_jax.fit.search, "FIRST_STEPS", 1)
     monkeypatch.setattr(walop_jax.fit.refit, "MAXIMUM_STEPS", 1)
     search = walop_jax.fit.refit._search
     monkeypatch.setattr(walop_jax.fit.refit, "_search", lambda *args, **more: search(*args[:5], 1))
@@ -303,7 +303,7 @@ def test_model_is_a_file_that_refit_takes(call, calset_file, tmp_path):
 def test_model_errors(call, calset_file, tmp_path):
     assert "WALOP-SOUTH" in one_line(call("model", "--instrument", "WALOP-SUOTH"))
     assert "clp_wobble" in one_line(call("model", "--effect", "clp_woble"))
-    assert call("model", calset_file, "--instrument", "WALOP-NORTH").exit_code == 2
+    assert "come from WALOP-SOUTH" in one_line(call("model", calset_file, "--instrument", "WALOP-NORTH"))
 
 
 def test_cite_lists_sources(call, run):

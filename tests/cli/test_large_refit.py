@@ -16,11 +16,10 @@ from astropy.io import fits
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import read_product, write_product
-from walop_jax.calibration.records import RESIDUAL_NAMES
+from walop_jax.calibration.records import residual_names
 from walop_jax.data import Grid, write_frames
-from walop_jax.fit import refit
 from walop_jax.io.errors import DataError
-from walop_jax.likelihood import problem as likelihood
+from walop_jax.likelihood import limits
 from walop_jax.reports import product_figures
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
@@ -32,9 +31,8 @@ RUN = ObservingPlan(
 # The commands in another process, with sets large from the first point on and slabs of 256 points.
 LARGE = """
 import sys
-from walop_jax.likelihood import chunks, problem
-from walop_jax.fit import refit
-problem.LARGE_ABOVE, problem.LARGE_CHUNK, refit.SAMPLE, chunks.MEMORY = 0, 256, 1024, 1e6
+from walop_jax.likelihood import limits
+limits.LARGE_ABOVE, limits.LARGE_CHUNK, limits.SAMPLE = 0, 256, 1024
 from walop_jax.cli import main
 main()
 """
@@ -82,14 +80,14 @@ def test_the_calibration_carries_a_residual_map(finished):
     assert summary["steps"] <= 3
     residuals = read_product(folder / "calibration.fits").residuals
     assert summary["residual_map"]["cells"] == [9, 9]
-    assert residuals.values.shape == (len(RESIDUAL_NAMES), 9, 9)
+    assert residuals.values.shape == (len(residual_names(2)), 9, 9)
     # Nothing is hidden in this set.
     assert abs(summary["residual_map"]["significance"]) < 5
     assert summary["residual_map"]["significance"] == pytest.approx(residuals.significance())
     np.testing.assert_allclose(residuals.chi2, 1.0, atol=6 * np.sqrt(2 / (64 * 9 * 3)))
     with fits.open(folder / "calibration.fits") as hdus:
         header = hdus["RESIDUAL"].header
-        assert [header[f"PLANE{n}"] for n in range(1, 8)] == list(RESIDUAL_NAMES)
+        assert [header[f"PLANE{n}"] for n in range(1, 8)] == list(residual_names(2))
         assert header["CTYPE1"] == "X"
         # The centre of the first cell, by the coordinates of the header.
         first = header["CRVAL1"] + (1 - header["CRPIX1"]) * header["CD1_1"]
@@ -179,8 +177,8 @@ def test_a_wrong_place_is_one_line(call, frames, tmp_path):
 
 @pytest.mark.long
 def test_small_memory_changes_nothing(call, frames, tmp_path, monkeypatch):
-    monkeypatch.setattr(likelihood, "LARGE_ABOVE", 0)
-    monkeypatch.setattr(refit, "SAMPLE", 1024)
+    monkeypatch.setattr(limits, "LARGE_ABOVE", 0)
+    monkeypatch.setattr(limits, "SAMPLE", 1024)
     found = [
         json.loads(call("refit", frames, "-o", tmp_path / memory, "--memory", memory, "--json").stdout)
         for memory in ("4", "0.1")
@@ -189,8 +187,8 @@ def test_small_memory_changes_nothing(call, frames, tmp_path, monkeypatch):
 
 
 def test_sampling_so_many_points_is_refused_with_advice(call, finished, monkeypatch):
-    monkeypatch.setattr(likelihood, "LARGE_ABOVE", 0)
-    monkeypatch.setattr(likelihood, "INTERPOLATE_ABOVE", 0)
+    monkeypatch.setattr(limits, "LARGE_ABOVE", 0)
+    monkeypatch.setattr(limits, "INTERPOLATE_ABOVE", 0)
     result = call("sample", finished[0])
     assert result.exit_code == 1
     assert "calibration.fits holds its covariance" in result.stderr

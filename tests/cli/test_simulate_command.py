@@ -6,13 +6,9 @@ import json
 
 import pytest
 
-from walop_jax.cli.simulate import parsed_effect
 from walop_jax.data import read_calibration_set
-from walop_jax.model.effects import EFFECTS
-from walop_jax.simulation.observing_plan import ObservingPlan
 
 SMALL = ("--grid", 3, "--standard-grid", 1, "--angles", 4, "--moon-patches", 2, "--standards", 3)
-CONTEXT = ObservingPlan().context()
 
 
 def test_a_set_and_its_truth(call, tmp_path):
@@ -60,35 +56,6 @@ def test_existing_files_are_kept(call, tmp_path):
     assert result.exit_code == 1
     assert "exists already" in result.stderr
     assert output.read_text() == "mine"
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("clp_wobbel=1", "clp_wobble"),
-        ("clp_wobble=1", "2 parameters"),
-        ("clp_wobble=amplitud:1,phase:0", "nearest: amplitude|without a value of amplitude"),
-        ("clp_zero", "without a value of angle"),
-        ("clp_zero=fast", "does not fit"),
-        ("clp_zero=1%", "not a number"),
-        ("clp_zero=angle:1,angle:2", "each once"),
-        ("chwp_in_beam=1", "give chwp_in_beam alone"),
-        ("pedestal=0.1/0.2/0.3", "does not fit"),
-        ("blemish=camera:7,depth:0.1", "does not fit|camera"),
-    ],
-)
-def test_effects_that_make_no_sense(text: str, message: str):
-    with pytest.raises(ValueError, match=message):
-        parsed_effect(text, CONTEXT)
-
-
-def test_every_effect_can_be_asked_for():
-    for kind in EFFECTS:
-        names = kind.amplitudes()
-        text = f"{kind.name}={','.join(f'{name}:0.01' for name in names)}" if names else kind.name
-        assert parsed_effect(text, CONTEXT).name == kind.name
-        if len(names) == 1 and not kind.shape:
-            assert parsed_effect(f"{kind.name}=0.01", CONTEXT).name == kind.name
 
 
 @pytest.mark.parametrize(

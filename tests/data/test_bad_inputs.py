@@ -90,7 +90,7 @@ BAD = {
     # headers
     "no INSTRUME": (header("INSTRUME", None), "[PRIMARY] INSTRUME: is ''", "WALOP-SOUTH"),
     "misspelt INSTRUME": (header("INSTRUME", "WALOP-SUOTH"), "INSTRUME", "did you mean 'WALOP-SOUTH'"),
-    "newer CALVERS": (header("CALVERS", 2), "[PRIMARY] CALVERS: is 2", "newer walop-jax"),
+    "newer CALVERS": (header("CALVERS", 3), "[PRIMARY] CALVERS: is 3", "newer walop-jax"),
     "no CALVERS": (header("CALVERS", None), "CALVERS: is missing", "is this a calibration set?"),
     "site text": (header("SITELAT", "south"), "[PRIMARY] SITELAT: is 'south'", "degrees"),
     "Moon, no site": (header("SITELONG", None), "[PRIMARY] SITELONG: is nan", "site"),

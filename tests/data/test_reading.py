@@ -34,11 +34,12 @@ def test_good_set(handmade):
 
 def test_everything_is_native(handmade):
     calset = read_calibration_set(handmade.write())
-    for record in (calset.exposures, calset.points, calset.sources, calset.intensities.block(0, 3)):
-        for name in record.__dataclass_fields__:
-            array = getattr(record, name)
-            assert array.dtype.isnative
-            assert array.dtype.kind in "iUb" or array.dtype == np.float64
+    arrays = list(calset.exposures.columns().values())
+    for record in (calset.points, calset.sources, calset.intensities.block(0, 3)):
+        arrays += [getattr(record, name) for name in record.__dataclass_fields__]
+    for array in arrays:
+        assert array.dtype.isnative
+        assert array.dtype.kind in "iUb" or array.dtype == np.float64
 
 
 def test_units_are_converted(handmade):

@@ -22,11 +22,20 @@ from walop_jax.data import (
 )
 
 
+def columns(calset):
+    """All columns of the three small tables."""
+    named = {f"EXPOSURES.{name}": values for name, values in calset.exposures.columns().items()}
+    for part in ("points", "sources"):
+        record = getattr(calset, part)
+        named |= {f"{part}.{field.name}": getattr(record, field.name) for field in dataclasses.fields(record)}
+    return named
+
+
 def equal(one, other):
-    for part in ("exposures", "points", "sources"):
-        for field in dataclasses.fields(getattr(one, part)):
-            a, b = (getattr(getattr(entry, part), field.name) for entry in (one, other))
-            np.testing.assert_array_equal(a, b, strict=a.dtype.kind != "U")
+    tables = [columns(one), columns(other)]
+    assert tables[0].keys() == tables[1].keys()
+    for name, a in tables[0].items():
+        np.testing.assert_array_equal(a, tables[1][name], strict=a.dtype.kind != "U")
     assert one.filters.keys() == other.filters.keys()
     for name, curve in one.filters.items():
         np.testing.assert_array_equal(curve.wavelength, other.filters[name].wavelength)

@@ -334,7 +334,7 @@ def test_which_instrument(folder):
         path.write_text(
             path.read_text(encoding="latin-1").replace("WALOP-North", "polarimeter"), encoding="latin-1"
         )
-    with pytest.raises(DataError, match=r"name 0 instruments \(polarimeter\); .*--instrument WALOP-SOUTH or"):
+    with pytest.raises(DataError, match=r"name 0 instruments \(polarimeter\); .*--instrument WALOP-LAB or"):
         import_transmissions(folder)
     assert import_transmissions(folder, instrument="walop-south").instrument == "WALOP-SOUTH"
     with pytest.raises(DataError, match="WALOP-NORTH"):

@@ -23,12 +23,13 @@ import numpy as np
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import naming
 from walop_jax.diagnosis.effect_columns import Probe, probes
-from walop_jax.diagnosis.examination import ALARM, Look
-from walop_jax.diagnosis.freeform import SINGLE, Measured
+from walop_jax.diagnosis.examination import ALARM, Examination
+from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, Measured
 from walop_jax.diagnosis.score import Candidate, Scorer, ScoreSpace, separations, whitening
 from walop_jax.diagnosis.workflow import MOST_STEPS
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS
 from walop_jax.model.specification import effect_context
 
@@ -71,7 +72,7 @@ class Verdict:
 
 def outside(measured: Measured) -> Iterator[Candidate]:
     """Shapes that are in no catalogue."""
-    e, points = measured.problem.calset.exposures, measured.problem.calset.points
+    e, points = measured.likelihood.calset.exposures, measured.likelihood.calset.points
     shape = (len(points), len(e), 4)
     r = np.hypot(points.x, points.y)
     through = e.clp_in
@@ -94,27 +95,26 @@ class Blind:
 
     def __init__(self, calset: CalibrationSet, seed: int = 1) -> None:
         model = base_model(calset)
-        problem = Problem(calset, model)
-        result = fit(problem)
+        result = fit(Likelihood.of(calset, model))
         self.rng = np.random.default_rng(seed)
         wanted = list(probes(EFFECTS, effect_context(model.template, calset.exposures)))
-        look = Look(problem, result, wanted, self.rng)
-        self.probes: list[Probe] = look.probes
+        examination = Examination(result, wanted, self.rng)
+        self.probes: list[Probe] = examination.probes
         self.effect_of = {p.name: p.effect.name for p in self.probes}
-        self.space, self.nuisance = look.space, look.common_mode
+        self.space, self.nuisance = examination.space, examination.common_mode
         self.places = self.space.places()
         self._whitening = whitening(self.space.gram)
         self._root = self.space.gram @ self._whitening
         self.dimension = self._root.shape[1]
         self.outside = {}
-        for shape in outside(look.design.measured):
-            column = look.design.projector(look.design.stacked([shape.columns])[:, 0])
-            along = self._whitening.T @ (look.columns.T @ column)
+        for shape in outside(examination.design.measured):
+            column = examination.design.projector(examination.design.stacked([shape.columns])[:, 0])
+            along = self._whitening.T @ (examination.columns.T @ column)
             self.outside[shape.name] = along, float(column @ column - along @ along)
         self._scorers: dict[tuple[tuple[str, ...], tuple[str, ...]], tuple[Scorer, list[Probe]]] = {}
-        self.free = look.space.free
-        self.visible = sorted({p.effect.name for p in self.probes if look.table[p.name].testable})
-        self._testable = {p.name for p in self.probes if look.table[p.name].testable}
+        self.free = examination.space.free
+        self.visible = sorted({p.effect.name for p in self.probes if examination.table[p.name].testable})
+        self._testable = {p.name for p in self.probes if examination.table[p.name].testable}
 
     # ------------------------------------------------------------------------------------------ drawing scenes
 
@@ -193,11 +193,11 @@ class Blind:
         return self._scorers[added, removed]
 
     def _space(self, added: tuple[str, ...]) -> ScoreSpace:
-        space = self.space.with_base([SINGLE], self.nuisance)[0]
+        space = self.space.with_base([SINGLE_EXPOSURES], self.nuisance)[0]
         return space.with_base(list(added))[0] if added else space
 
     def _reduced(self, s: np.ndarray, square: float, added: tuple[str, ...]) -> tuple[np.ndarray, float]:
-        space, reduce = self.space.with_base([SINGLE], self.nuisance)
+        space, reduce = self.space.with_base([SINGLE_EXPOSURES], self.nuisance)
         s, square = reduce(s, square)
         return space.with_base(list(added))[1](s, square) if added else (s, square)
 

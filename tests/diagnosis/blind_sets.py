@@ -21,14 +21,15 @@ import numpy as np
 
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.effect_columns import Probe, effect_candidates, probes
-from walop_jax.diagnosis.examination import ALARM, Look
+from walop_jax.diagnosis.examination import ALARM, Examination
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.workflow import diagnose
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Effect
-from walop_jax.model.parameters import field_declarations, leaves
-from walop_jax.model.specification import effect_context, full_values
+from walop_jax.model.parameters import field_declarations, leaves, values_of
+from walop_jax.model.specification import effect_context
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate
 
@@ -44,13 +45,12 @@ class Hiding:
     def __init__(self, plan: ObservingPlan) -> None:
         self.plan = plan
         calset, _ = simulate(plan, seed=SEED)
-        self.problem = Problem(calset, base_model(calset))
-        self.fit = fit(self.problem)
-        self.design = Design.of(self.problem, self.fit)
-        self.context = effect_context(self.problem.model.template, calset.exposures)
+        self.fit = fit(Likelihood.of(calset, base_model(calset)))
+        self.design = Design.of(self.fit)
+        self.context = effect_context(self.fit.model.template, calset.exposures)
         every = list(probes(EFFECTS, self.context))
-        look = Look(self.problem, self.fit, every, np.random.default_rng(0))
-        self.probes = [p for p in look.probes if look.table[p.name].testable]
+        examination = Examination(self.fit, every, np.random.default_rng(0))
+        self.probes = [p for p in examination.probes if examination.table[p.name].testable]
         self.names = sorted({p.effect.name for p in self.probes})
 
     def draw(self, name: str, ratio: float, rng: np.random.Generator) -> Effect | None:
@@ -68,8 +68,7 @@ class Hiding:
             tuple(_jittered(member, rng) for member in probe.group) if len(probe.group) == 1 else probe.group
         )
         probe = Probe(probe.name, probe.effect, group)
-        problem, values = self.problem, self.fit.values
-        candidate = effect_candidates(problem.calset, problem.model, values, [probe])[probe.name]
+        candidate = effect_candidates(self.fit.calset, self.fit.model, self.fit.values, [probe])[probe.name]
         columns = self.design.stacked([candidate.columns])
         step = rng.standard_normal(len(probe.widths)) * probe.widths
         step = np.where(probe.one_sided, np.abs(step), step)
@@ -106,7 +105,7 @@ def scene(hiding: Hiding, number: int) -> dict[str, Any]:
     entry["truth"] = None if null else name
     entry["ratio"] = 0.0 if null else ratio
     entry["values"] = {
-        leaf.name: float(v) for e in hidden for leaf, v in zip(leaves(e), full_values(e), strict=True)
+        leaf.name: float(v) for e in hidden for leaf, v in zip(leaves(e), values_of(e), strict=True)
     }
     return entry
 

@@ -11,12 +11,12 @@ from scenes import PLAN
 
 from walop_jax.diagnosis import naming, workflow
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.examination import Look
-from walop_jax.diagnosis.figure_data import pictures
+from walop_jax.diagnosis.examination import Examination
+from walop_jax.diagnosis.figure_data import figure_data
 from walop_jax.diagnosis.findings import Unexplained
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.refit import FitResult, fit
-from walop_jax.likelihood.problem import Problem
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import FreeForm, effect_by_name
 from walop_jax.simulation.simulate import simulate
 
@@ -40,7 +40,7 @@ def lead_from_the_first_fit_to_the_last(found):
     for one, next_one in itertools.pairwise(found.steps):
         assert one.heldout_after.mean == next_one.heldout_before.mean
         np.testing.assert_array_equal(one.residual_after, next_one.residual_before)
-    ladder = pictures(found).ladder
+    ladder = figure_data(found).ladder
     assert list(ladder.model) == ["starting model", *(step.effect for step in found.steps)]
     assert (ladder.dof[0], ladder.dof[-1]) == (found.before.dof, found.after.dof)
     return True
@@ -80,26 +80,28 @@ class Rehearsal(workflow._Diagnosing):
     """A diagnosis with parts played by dummies: something is missing as long as a name stands that is not needed."""
 
     def __init__(self):
-        self.calset, self.catalogue, self.problem = SimpleNamespace(points=()), (), Mock(spec=Problem)
+        self.calset, self.catalogue = SimpleNamespace(points=()), ()
         self.fit = Mock(spec=FitResult, explains_data=True)
         self.steps = ["name"]
         self.tell = lambda text: None
 
-    def _look(self, earlier=None):
-        look = Mock(spec=Look, alarm=bool(self.steps), design=Mock(spec=Design))
-        look.table = SimpleNamespace(p_global=float(not self.steps))
-        look.summary.return_value = look.limits.return_value = look.untestable.return_value = ()
-        return look
+    def _examine(self, earlier=None):
+        examination = Mock(spec=Examination, alarm=bool(self.steps), design=Mock(spec=Design))
+        examination.table = SimpleNamespace(p_global=float(not self.steps))
+        examination.summary.return_value = examination.limits.return_value = (
+            examination.untestable.return_value
+        ) = ()
+        return examination
 
-    def _add_best(self, look):
+    def _add_best(self, examination):
         return None
 
     def _drop_what_is_not_needed(self):
         dropped, self.steps = bool(self.steps), []
         return dropped
 
-    def _unexplained(self, look):
-        return Unexplained(look.table.p_global, "", ())
+    def _unexplained(self, examination):
+        return Unexplained(examination.table.p_global, "", ())
 
 
 def test_what_has_no_name_is_asked_of_the_model_without_needless_names():
@@ -115,7 +117,7 @@ def test_after_a_drop_several_steps_follow_one_another():
     assert [step.effect for step in found.steps] == ["clp_wobble", "camera_leakage"]
     assert lead_from_the_first_fit_to_the_last(found)
     model = naming.without(found.after.model, "camera_leakage")
-    alone = fit(Problem(found.problem.calset, model))
+    alone = fit(Likelihood.of(found.after.calset, model))
     assert found.steps[0].chi2_after == pytest.approx(alone.chi2, rel=1e-6)
     assert [list(step.far) for step in found.steps] == [["amplitude"], []]
 
@@ -133,4 +135,4 @@ def test_what_has_no_name_is_told_without_the_name_that_stood_in_for_it():
     assert found.unexplained.chi2_before == pytest.approx(found.before.chi2, rel=1e-9)
     assert found.unexplained.chi2_after == found.after.chi2
     assert found.unexplained.p_value == pytest.approx(found.p_value, rel=0.5)
-    assert list(pictures(found).ladder.model) == ["starting model", "free_form"]
+    assert list(figure_data(found).ladder.model) == ["starting model", "free_form"]

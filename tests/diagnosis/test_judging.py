@@ -13,10 +13,11 @@ from walop_jax.diagnosis.change_of_stokes import largest_change
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import upper_limit
 from walop_jax.diagnosis.findings import Diagnosis
-from walop_jax.diagnosis.freeform import Measured, block_of, strata
+from walop_jax.diagnosis.freeform import Measured, strata
 from walop_jax.diagnosis.workflow import diagnose
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import FreeForm, effect_by_name
 from walop_jax.model.effects.free_form import BLOCKS
 from walop_jax.model.specification import effect_context, with_effects
@@ -30,14 +31,13 @@ def leaking():
     calset, _ = simulate(PLAN, seed=8, effects=[effect])
     model = base_model(calset)
     context = effect_context(model.template, calset.exposures)
-    base = fit(Problem(calset, model))
-    problem = Problem(calset, with_effects(model, ["camera_leakage"], context))
-    return calset, context, base, problem, fit(problem)
+    base = fit(Likelihood.of(calset, model))
+    return calset, context, base, fit(Likelihood.of(calset, with_effects(model, ["camera_leakage"], context)))
 
 
 def test_density_at_neutral_is_the_evidence_of_two_fits(leaking):
     """Savage–Dickey against Laplace evidence of the models with and without: both Gaussian, so alike."""
-    _, context, base, _, extended = leaking
+    _, context, base, extended = leaking
     by_fits = naming.log_evidence_ratio(base, extended)
     assert by_fits > 5.0
     assert naming.evidence_of_presence(extended, "camera_leakage", context) == pytest.approx(by_fits, abs=0.5)
@@ -45,19 +45,19 @@ def test_density_at_neutral_is_the_evidence_of_two_fits(leaking):
 
 def test_signature_is_what_taking_the_effect_away_does(leaking):
     """To first order, the effect's column times its amplitude."""
-    calset, context, base, problem, extended = leaking
+    calset, context, base, extended = leaking
     probe = effect_by_name("camera_leakage").probes(context)[0]
-    bare = Problem(calset, base.model, probes=probe)
+    bare = Likelihood.of(calset, base.model, probes=probe)
     kept = [extended.model.index(name) for name in base.model.names]
     column = bare.effect_columns(extended.values[kept], probe)[:, 0]
     share, _ = extended.value("camera_leakage.share")
-    found = naming.signature(problem, extended, "camera_leakage", context)
+    found = naming.signature(extended, "camera_leakage", context)
     np.testing.assert_allclose(found, -column * share, atol=2e-2 * np.abs(found).max())
 
 
 def test_taking_it_out_again_gives_the_fit_without(leaking):
-    calset, _, base, _, extended = leaking
-    _, again = naming.refit_without(calset, extended, "camera_leakage")
+    _, _, base, extended = leaking
+    again = naming.refit_without(extended, "camera_leakage")
     assert again.model.names == base.model.names
     assert again.chi2 == pytest.approx(base.chi2, abs=1e-3)
 
@@ -72,21 +72,22 @@ def test_a_prior_is_widened_only_where_the_data_refute_it(leaking):
         wide = naming.with_refuted_priors_widened(model, values, "camera_leakage")
         assert wide["camera_leakage.share"].prior == (mean, pytest.approx(expected))
         assert wide.change("camera_leakage.share", prior=(mean, width)) == model
+        widened = dataclasses.replace(extended.likelihood, model=wide)
         beyond = naming.beyond_prior(
-            dataclasses.replace(extended, model=wide, values=values), "camera_leakage"
+            dataclasses.replace(extended, likelihood=widened, values=values), "camera_leakage"
         )
         assert beyond == ({"share": pytest.approx(12.0)} if abs(away) > 4.0 else {})
 
 
 def test_robust_errors_are_the_stated_ones_when_noise_is_as_stated(leaking):
-    design = Design.of(*leaking[3:])
+    design = Design.of(leaking[-1])
     assert 0.6 < design.robust_ratio("camera_leakage") < 1.5
     assert np.isnan(design.robust_ratio("ghost"))
 
 
 def test_robust_errors_see_disturbances_of_whole_exposures(leaking):
     """Each exposure pulls the magnification by five times what noise lets it."""
-    design = Design.of(*leaking[3:])
+    design = Design.of(leaking[-1])
     column = design.without("pupil")[1][: design.rows, 0]
     length = np.sqrt(np.bincount(design.exposure, column**2))
     pull = 5.0 * np.random.default_rng(4).choice([-1.0, 1.0], length.size) / length
@@ -97,14 +98,14 @@ def test_robust_errors_see_disturbances_of_whole_exposures(leaking):
 
 def test_patterns_do_not_know_the_noise(leaking):
     """Columns of two sets that differ by nothing but their noise differ by no more than their fits do."""
-    calset, _, base, _, _ = leaking
+    calset, base, *_ = leaking
     other, _ = simulate(
         PLAN,
         seed=8,
         effects=[dataclasses.replace(effect_by_name("camera_leakage")(), share=4e-4)],
         noiseless=True,
     )
-    ours, exact = (Measured(Problem(s, base.model), base.values).level for s in (calset, other))
+    ours, exact = (Measured(Likelihood.of(s, base.model), base.values).level for s in (calset, other))
     np.testing.assert_allclose(ours, exact, rtol=1e-12)
 
 
@@ -119,7 +120,7 @@ def test_limits_against_integrals(value, sigma):
     assert inside / whole == pytest.approx(0.95, abs=1e-6)
 
 
-def test_consequences_by_hand():
+def test_change_of_stokes_by_hand():
     """An ideal instrument; a constant of 0.001 in q moves q by that, 1 % less efficiency moves 5 % by 0.05 %."""
     ideal = np.array([[[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]])
     assert largest_change(ideal, ideal) == 0.0
@@ -133,16 +134,21 @@ def test_consequences_by_hand():
 
 
 def test_every_block_of_the_free_form_term_answers_to_a_stratum(leaking):
-    _, _, _, problem, extended = leaking
-    names = [candidate.name for candidate in strata(Measured(problem, extended.values))]
-    assert {block_of(name) for name in names} == {*BLOCKS, None}
+    *_, extended = leaking
+    measured = Measured(extended.likelihood, extended.values)
+    blocks = {stratum.name: stratum.block for stratum in strata(measured)}
+    assert set(blocks.values()) == {*BLOCKS, None}
+    assert blocks["4θ of O1"] == "harmonics"
+    assert blocks["rings of E2"] == "fine"
+    assert blocks["kind"] == "exposures"
+    assert blocks["flux"] is None
 
 
 def test_many_names_and_weak_errors_call_for_caution():
     def caution(*steps, far=None):
         named = [SimpleNamespace(effect=name, robust_ratio=ratio, far=far or {}) for name, ratio in steps]
-        problem = SimpleNamespace(calset=SimpleNamespace(points=range(9)))
-        return Diagnosis.caution.fget(SimpleNamespace(steps=named, problem=problem, points=9))
+        after = SimpleNamespace(calset=SimpleNamespace(points=range(9)))
+        return Diagnosis.caution.fget(SimpleNamespace(steps=named, after=after, points=9))
 
     assert caution() == caution(("a", 1.1), ("b", float("nan"))) == ""
     assert "3 names" in caution(*((name, 1.0) for name in "abc"))

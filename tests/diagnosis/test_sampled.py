@@ -6,6 +6,7 @@ import pytest
 
 from walop_jax.diagnosis import workflow
 from walop_jax.diagnosis.workflow import diagnose
+from walop_jax.likelihood import limits
 from walop_jax.model.effects import effect_by_name
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
@@ -21,7 +22,7 @@ class SeenError(Exception):
 
 def test_a_sample_of_a_large_set_is_looked_at(monkeypatch):
     calset = simulate(PLAN, seed=4).calset
-    monkeypatch.setattr(workflow, "LARGEST_ROWS", 40 * len(calset.exposures))
+    monkeypatch.setattr(limits, "DIAGNOSED_ROWS", 40 * len(calset.exposures))
 
     def looked_at(some, *_):
         assert len(some.points) == 40
@@ -37,9 +38,9 @@ def test_a_sample_of_a_large_set_is_looked_at(monkeypatch):
 def test_findings_of_a_sample_say_so(monkeypatch):
     effect = effect_by_name("clp_wobble").of(PLAN.context(), amplitude=0.3, phase=1.0)
     calset = simulate(PLAN, seed=4, effects=(effect,)).calset
-    monkeypatch.setattr(workflow, "LARGEST_ROWS", 40 * len(calset.exposures))
+    monkeypatch.setattr(limits, "DIAGNOSED_ROWS", 40 * len(calset.exposures))
     found = diagnose(calset)
-    assert len(found.problem.calset.points) == 40
+    assert len(found.after.calset.points) == 40
     assert found.points == 81
     assert "40 of 81 field points" in found.caution
     assert [step.effect for step in found.steps] == ["clp_wobble"]

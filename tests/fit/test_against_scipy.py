@@ -1,4 +1,4 @@
-"""The joint fit against another program: scipy's least squares on a numpy residual written from the contract alone."""
+"""The joint fit against another program: scipy's least squares on a numpy residual written from `docs: model`."""
 
 import time
 
@@ -8,8 +8,9 @@ from oracle import fit as oracle_fit
 from oracle import forward
 
 from walop_jax.data import read_calibration_set
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood.likelihood import Likelihood
 
 
 @pytest.mark.long
@@ -20,10 +21,10 @@ def test_scipy_finds_the_same_minimum(either_south_set):
     """
     path = either_south_set("a").path
     calset = read_calibration_set(path)
-    problem = Problem(calset, base_model(calset))
-    fit(problem)
+    likelihood = Likelihood.of(calset, base_model(calset))
+    fit(likelihood)
     start = time.perf_counter()
-    ours = fit(problem)
+    ours = fit(likelihood)
     ours_seconds = time.perf_counter() - start
     data = forward.load(path)
     start = time.perf_counter()

@@ -23,8 +23,9 @@ from scipy.optimize import least_squares
 from scipy.sparse import lil_matrix
 
 from walop_jax.data import read_calibration_set, write_calibration_set
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate
 
@@ -106,9 +107,9 @@ def test_against_scipy(tmp_path):
     cold = min(process(refit, "refit", path, "-o", tmp_path / f"run{n}") for n in range(2))
     calset = read_calibration_set(path)
     model = base_model(calset)
-    fit(Problem(calset, model))
+    fit(Likelihood.of(calset, model))
     warm, ours = min(
-        (seconds(lambda: fit(Problem(calset, model))) for _ in range(3)), key=lambda pair: pair[0]
+        (seconds(lambda: fit(Likelihood.of(calset, model))) for _ in range(3)), key=lambda pair: pair[0]
     )
     theirs, (found, calls) = seconds(lambda: scipy_fit(path))
     scipy_cold = process("import sys; from test_speed import scipy_fit; scipy_fit(sys.argv[1])", path)

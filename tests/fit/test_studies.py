@@ -19,11 +19,12 @@ import pytest
 from walop_jax.calibration.matrix import Settings, matrices
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.levenberg import minimise
+from walop_jax.fit.minimise import minimise
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit, refit
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.specification import full_values
+from walop_jax.model.parameters import values_of
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -86,7 +87,7 @@ def study(plan: ObservingPlan, seeds: Sequence[int]) -> Study:
         assert result.trusted, result.warnings
         free = result.model.free
         names = tuple(result.model.names[i] for i in free)
-        pulls.append((result.values - full_values(truth))[free] / result.sigma[free])
+        pulls.append((result.values - np.asarray(values_of(truth)))[free] / result.sigma[free])
         fitted, variance = matrix_at(result.model.instrument(result.values), calset, plan, result.covariance)
         true, _ = matrix_at(truth, calset, plan, result.covariance)
         squared.append((fitted - true) ** 2)
@@ -120,39 +121,37 @@ def test_three_small_runs():
 # ----------------------------------------------------------------------------------------- exact properties
 
 
-def at_truth(calset: CalibrationSet, truth: Instrument) -> Problem:
-    """A problem whose priors are centred on the truth, so that the truth is its exact minimum."""
+def at_truth(calset: CalibrationSet, truth: Instrument) -> Likelihood:
+    """A likelihood whose priors are centred on the truth, so that the truth is its exact minimum."""
     model = base_model(calset)
-    values = full_values(truth)
+    values = np.asarray(values_of(truth))
     for name, value in zip(model.names, values, strict=True):
         prior = model[name].prior
         if prior is not None:
             model = model.change(name, prior=(float(value), prior[1]))
         model = model.change(name, loose=None)
-    return Problem(calset, model)
+    return Likelihood.of(calset, model)
 
 
 def test_noiseless_data_return_the_truth():
     calset, truth = simulate(SMALL, 4, noiseless=True)
-    problem = at_truth(calset, truth)
-    model, true = problem.model, full_values(truth)
+    likelihood = at_truth(calset, truth)
+    model, true = likelihood.model, np.asarray(values_of(truth))
     scale = np.array([p.scale for p in model.parameters])
     # A fit stops when what is left is far below the errors; followed to the end, nothing is left.
-    result = fit(problem)
+    result = fit(likelihood)
     assert result.converged
     np.testing.assert_allclose((result.values - true) / scale, 0.0, atol=1e-5)
     free = model.free
     to_the_end = minimise(
-        lambda x: problem.expand(model.full(x)), result.values[free], scale[free], tolerance=1e-10
+        lambda x, _: likelihood.expand(model.full(x)), result.values[free], scale[free], tolerance=1e-10
     )
     np.testing.assert_allclose((model.full(to_the_end.x) - true) / scale, 0.0, atol=1e-8)
 
 
 def twice(calset: CalibrationSet) -> CalibrationSet:
     """Every exposure twice."""
-    exposures = calset.exposures
-    doubled = {f.name: np.tile(getattr(exposures, f.name), 2) for f in dataclasses.fields(exposures)}
-    doubled["exposure"] = np.arange(2 * len(exposures))
+    exposures = calset.exposures[np.tile(np.arange(len(calset.exposures)), 2)]
     block = calset.intensities.block(0, len(calset.points))
     again = {
         name: np.concatenate([getattr(block, name)] * 2, axis=1)
@@ -160,7 +159,7 @@ def twice(calset: CalibrationSet) -> CalibrationSet:
     }
     return dataclasses.replace(
         calset,
-        exposures=dataclasses.replace(exposures, **doubled),
+        exposures=dataclasses.replace(exposures, exposure=np.arange(len(exposures))),
         intensities=TableIntensities.dense(calset.points, dataclasses.replace(block, **again)),
     )
 
@@ -172,7 +171,7 @@ def test_twice_the_data_halve_the_covariance():
         model = base_model(data)
         for name in model.names:
             model = model.change(name, prior=None, loose=None)
-        information.append(Problem(data, model).expand(full_values(truth)).matrix)
+        information.append(Likelihood.of(data, model).expand(np.asarray(values_of(truth))).matrix)
     np.testing.assert_allclose(
         information[1], 2.0 * information[0], rtol=1e-9, atol=1e-9 * information[0].max()
     )

@@ -9,15 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
 from oracle import forward, validate
 
 from walop_jax.data import read_calibration_set
 from walop_jax.data.records import Block, CalibrationSet, Intensities, Points, Site, Sources
+from walop_jax.fit.model_builder import base_model
 from walop_jax.likelihood import engine
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.compiled import compiled
-from walop_jax.model.specification import full_values
+from walop_jax.model.parameters import values_of, with_values
 
 POINTS = 7
 # flux exposures come last so that they can be left off
@@ -74,11 +74,11 @@ def make_block(seed=3, noise=True, flux_known=True):
     calset = calibration_set(block)
     model = base_model(calset, throughput_degree=2)
     instrument = builders.as_built(model.instrument(model.start), rng)
-    problem = Problem(calset, model)
+    likelihood = Likelihood.of(calset, model)
     flux = rng.uniform(0.5e6, 1.5e6, (POINTS, e, 1))
     if flux_known:
         flux[:, -1] = 1.0
-    counts = flux * np.asarray(engine.prediction(instrument, problem.plan, problem.chunks[0]))
+    counts = flux * np.asarray(engine.prediction(instrument, likelihood.plan, likelihood.points.chunk(0)))
     sigma = sigma * np.where(flux == 1.0, 1e-6, 1.0)
     if noise:
         counts = counts + sigma * rng.standard_normal(counts.shape)
@@ -89,28 +89,28 @@ def make_block(seed=3, noise=True, flux_known=True):
 BLOCK, TRUTH = make_block()
 
 
-def problem_of(block, rows=ROWS, points_per_chunk=None):
+def likelihood_of(block, rows=ROWS, points_per_chunk=None):
     calset = calibration_set(block, rows)
-    return Problem(calset, base_model(calset, throughput_degree=2), points_per_chunk)
+    return Likelihood.of(calset, base_model(calset, throughput_degree=2), points_per_chunk=points_per_chunk)
 
 
 @pytest.fixture(scope="module")
-def problem():
-    return problem_of(BLOCK)
+def likelihood():
+    return likelihood_of(BLOCK)
 
 
 @pytest.fixture(scope="module")
-def values(problem):
+def values(likelihood):
     """A point of parameter space some standard deviations off the truth: residuals far from noise."""
     rng = np.random.default_rng(8)
-    return full_values(builders.as_built(TRUTH, rng, 0.5))
+    return values_of(builders.as_built(TRUTH, rng, 0.5))
 
 
-TEMPLATE = problem_of(BLOCK).model.template
+TEMPLATE = likelihood_of(BLOCK).model.template
 
 
 def _plain(values, plan, data):
-    model = engine._prediction(ravel_pytree(TEMPLATE)[1](values), plan, data) * data.weight
+    model = engine._prediction(with_values(TEMPLATE)(values), plan, data) * data.weight
     eliminate = jax.vmap(engine.eliminate_flux, in_axes=(0, 0, None))
     residual = eliminate(data.counts * data.weight, model, plan.exposures.flux_known)[1]
     return (residual, model), (residual, model)
@@ -119,9 +119,9 @@ def _plain(values, plan, data):
 _derivatives = compiled(jax.jacfwd(_plain, has_aux=True))
 
 
-def jacobians(problem, values, data):
+def jacobians(likelihood, values, data):
     """Residuals, weighted model, and their plain forward derivatives with respect to all parameters."""
-    (dr, da), (r, a) = _derivatives(jnp.asarray(values), problem.plan, data)
+    (dr, da), (r, a) = _derivatives(jnp.asarray(values), likelihood.plan, data)
     return tuple(np.asarray(v) for v in (r, a, dr, da))
 
 
@@ -144,15 +144,17 @@ def kaufman(y, a, da, known):
 
 
 @pytest.fixture(scope="module")
-def plain(problem, values):
-    return jacobians(problem, values, problem.chunks[0])
+def plain(likelihood, values):
+    return jacobians(likelihood, values, likelihood.points.chunk(0))
 
 
-def test_gradient_is_that_of_plain_derivatives(problem, values, plain):
+def test_gradient_is_that_of_plain_derivatives(likelihood, values, plain):
     """Jᵀr of the structured equations = Jᵀr of the residuals differentiated as they stand, flux and all."""
     r, _, dr, _ = plain
-    np.testing.assert_allclose(problem.residuals(values)[1], r, rtol=1e-9, atol=1e-9)
-    normal = engine.normal_equations(problem.model.instrument(values), problem.plan, problem.chunks[0])
+    np.testing.assert_allclose(likelihood.residuals(values)[1], r, rtol=1e-9, atol=1e-9)
+    normal = engine.normal_equations(
+        likelihood.model.instrument(values), likelihood.plan, likelihood.points.chunk(0)
+    )
     assert float(normal.chi2) == pytest.approx(np.sum(r**2), rel=1e-12)
     expected = np.einsum("pek,pekn->n", r, dr)
     scale = np.sqrt(np.einsum("pek,pekn->n", r**2, dr**2))
@@ -160,13 +162,13 @@ def test_gradient_is_that_of_plain_derivatives(problem, values, plain):
     np.testing.assert_array_less(np.abs(np.asarray(normal.gradient) - expected), 1e-8 * scale + 1e-12)
 
 
-def test_matrix_is_kaufmans(problem, values, plain):
+def test_matrix_is_kaufmans(likelihood, values, plain):
     _, a, _, da = plain
-    data = problem.chunks[0]
+    data = likelihood.points.chunk(0)
     y = np.asarray(data.counts * data.weight)
-    jacobian = kaufman(y, a, da, np.asarray(problem.plan.exposures.flux_known)).reshape(-1, len(values))
+    jacobian = kaufman(y, a, da, np.asarray(likelihood.plan.exposures.flux_known)).reshape(-1, len(values))
     expected = jacobian.T @ jacobian
-    normal = engine.normal_equations(problem.model.instrument(values), problem.plan, data)
+    normal = engine.normal_equations(likelihood.model.instrument(values), likelihood.plan, data)
     size = np.sqrt(np.diag(expected))
     assert (size > 0).all()
     np.testing.assert_allclose(
@@ -177,11 +179,11 @@ def test_matrix_is_kaufmans(problem, values, plain):
 def test_matrix_is_the_fisher_information_with_fluxes_marginalised():
     """Without noise and at the truth: Schur complement of the joint information of parameters and fluxes."""
     block, truth = make_block(noise=False)
-    problem, values = problem_of(block), full_values(truth)
-    data = problem.chunks[0]
-    r, a, dr, da = jacobians(problem, values, data)
+    likelihood, values = likelihood_of(block), values_of(truth)
+    data = likelihood.points.chunk(0)
+    r, a, dr, da = jacobians(likelihood, values, data)
     np.testing.assert_allclose(r, 0.0, atol=1e-6)
-    known = np.asarray(problem.plan.exposures.flux_known)
+    known = np.asarray(likelihood.plan.exposures.flux_known)
     information = np.zeros((len(values), len(values)))
     for p, e in np.ndindex(a.shape[:2]):
         row, d = a[p, e], da[p, e]
@@ -193,7 +195,7 @@ def test_matrix_is_the_fisher_information_with_fluxes_marginalised():
         information += joint[:-1, :-1]
         if not known[e]:
             information -= np.outer(joint[:-1, -1], joint[-1, :-1]) / joint[-1, -1]
-    normal = engine.normal_equations(problem.model.instrument(values), problem.plan, data)
+    normal = engine.normal_equations(likelihood.model.instrument(values), likelihood.plan, data)
     size = np.sqrt(np.diag(information))
     np.testing.assert_allclose(
         normal.matrix / np.outer(size, size), information / np.outer(size, size), atol=1e-9
@@ -203,13 +205,15 @@ def test_matrix_is_the_fisher_information_with_fluxes_marginalised():
     np.testing.assert_allclose(plain / np.outer(size, size), information / np.outer(size, size), atol=1e-8)
 
 
-def test_posterior_adds_the_priors(problem, values):
+def test_posterior_adds_the_priors(likelihood, values):
     """χ² of the priors and half its derivative, by hand, on top of the data's."""
-    found = problem.expand(values)
-    normal = engine.normal_equations(problem.model.instrument(values), problem.plan, problem.chunks[0])
+    found = likelihood.expand(values)
+    normal = engine.normal_equations(
+        likelihood.model.instrument(values), likelihood.plan, likelihood.points.chunk(0)
+    )
     gradient, matrix, chi2 = np.array(normal.gradient), np.array(normal.matrix), 0.0
     loose = 0.0
-    for i, p in enumerate(problem.model.parameters):
+    for i, p in enumerate(likelihood.model.parameters):
         if p.prior is not None:
             chi2 += ((values[i] - p.prior[0]) / p.prior[1]) ** 2
             gradient[i] += (values[i] - p.prior[0]) / p.prior[1] ** 2
@@ -218,7 +222,7 @@ def test_posterior_adds_the_priors(problem, values):
             loose += ((values[i] - p.start) / p.loose) ** 2
             gradient[i] += (values[i] - p.start) / p.loose**2
             matrix[i, i] += p.loose**-2
-    free = problem.model.free
+    free = likelihood.model.free
     assert found.priors == pytest.approx(chi2, rel=1e-12)
     assert found.loose == pytest.approx(loose, rel=1e-12)
     assert found.data == pytest.approx(float(normal.chi2), rel=1e-12)
@@ -245,18 +249,18 @@ def changed(block, **changes):
     return dataclasses.replace(block, **changes)
 
 
-def test_chunks_change_nothing(problem, values):
+def test_chunks_change_nothing(likelihood, values):
     """Seven points in chunks of three: the last one is padded."""
-    chunked = problem_of(BLOCK, points_per_chunk=3)
-    assert len(chunked.chunks) == 3
-    same(chunked.expand(values), problem.expand(values))
-    assert (chunked.dof, chunked.n_data) == (problem.dof, problem.n_data)
+    chunked = likelihood_of(BLOCK, points_per_chunk=3)
+    assert len(chunked.points) == 3
+    same(chunked.expand(values), likelihood.expand(values))
+    assert (chunked.dof, chunked.census.n_data) == (likelihood.dof, likelihood.census.n_data)
 
 
-def test_order_of_the_points_changes_nothing(problem, values):
+def test_order_of_the_points_changes_nothing(likelihood, values):
     order = np.random.default_rng(1).permutation(POINTS)
     shuffled = Block(*(getattr(BLOCK, f.name)[order] for f in dataclasses.fields(Block)))
-    same(problem_of(shuffled).expand(values), problem.expand(values))
+    same(likelihood_of(shuffled).expand(values), likelihood.expand(values))
 
 
 def test_row_that_is_not_used_is_as_good_as_removed(values):
@@ -264,14 +268,14 @@ def test_row_that_is_not_used_is_as_good_as_removed(values):
     gone = 4
     used, counts, sigma = BLOCK.used.copy(), BLOCK.counts.copy(), BLOCK.sigma.copy()
     used[:, gone], counts[:, gone], sigma[:, gone] = False, 1e9, 1e-3
-    masked = problem_of(changed(BLOCK, used=used, counts=counts, sigma=sigma))
+    masked = likelihood_of(changed(BLOCK, used=used, counts=counts, sigma=sigma))
     keep = np.delete(np.arange(len(ROWS)), gone)
     names = ("counts", "sigma", "used", "source")
-    removed = problem_of(
+    removed = likelihood_of(
         changed(BLOCK, **{name: getattr(BLOCK, name)[:, keep] for name in names}), [ROWS[i] for i in keep]
     )
     same(masked.expand(values), removed.expand(values))
-    assert (masked.dof, masked.n_data) == (removed.dof, removed.n_data)
+    assert (masked.dof, masked.census.n_data) == (removed.dof, removed.census.n_data)
     flux, residual = masked.residuals(values)
     np.testing.assert_array_equal(residual[:, gone], 0.0)
     assert np.isfinite(flux).all()
@@ -282,28 +286,28 @@ def test_unit_of_the_counts_does_not_matter(values):
     factor = np.random.default_rng(2).uniform(0.01, 100.0, (POINTS, len(ROWS), 1))
     factor[:, -1] = 1.0
     scaled = changed(BLOCK, counts=BLOCK.counts * factor, sigma=BLOCK.sigma * factor)
-    plain = problem_of(BLOCK)
-    same(problem_of(scaled).expand(values), plain.expand(values), 1e-9)
+    plain = likelihood_of(BLOCK)
+    same(likelihood_of(scaled).expand(values), plain.expand(values), 1e-9)
     flux = plain.residuals(values)[0]
-    np.testing.assert_allclose(problem_of(scaled).residuals(values)[0], flux * factor[..., 0], rtol=1e-9)
+    np.testing.assert_allclose(likelihood_of(scaled).residuals(values)[0], flux * factor[..., 0], rtol=1e-9)
 
 
 def test_known_flux_is_not_eliminated(values):
     used = np.zeros_like(BLOCK.used)
     used[:, -1] = True
     alone = changed(BLOCK, used=used)
-    twice = problem_of(changed(alone, counts=2 * BLOCK.counts)).expand(values).data
-    assert twice > 2 * problem_of(alone).expand(values).data
+    twice = likelihood_of(changed(alone, counts=2 * BLOCK.counts)).expand(values).data
+    assert twice > 2 * likelihood_of(alone).expand(values).data
 
 
-def test_degrees_of_freedom(problem):
+def test_degrees_of_freedom(likelihood):
     """Three per row, four with known flux, one per prior, minus the free parameters; counted by hand."""
     rows = BLOCK.used.sum()
     flux_rows = BLOCK.used[:, -1].sum()
     # priors: collimator 3, calibration plate 2, pupil 2, each half 4, two standards 4; throughput 4 × 6; δ
     priors, free = 3 + 2 + 2 + 8 + 4, 3 + 2 + 2 + 8 + 4 + 24 + 1
-    assert problem.n_data == 4 * rows
-    assert problem.dof == 3 * rows + flux_rows + priors - free
+    assert likelihood.census.n_data == 4 * rows
+    assert likelihood.dof == 3 * rows + flux_rows + priors - free
 
 
 def test_eliminated_flux_is_the_least_squares_one():
@@ -328,11 +332,11 @@ def test_set_a_has_the_oracles_residuals(either_south_set, start):
     """χ² of a set made elsewhere, residual by residual, at the as-built values and at the nominal ones."""
     south = either_south_set("a")
     calset = read_calibration_set(south.path)
-    problem = Problem(calset, base_model(calset))
+    likelihood = Likelihood.of(calset, base_model(calset))
     data = forward.load(south.path)
     params = forward.nominal() if start == "nominal" else validate.read_truth(south)[0]
     params["q"], params["u"] = data["sources"]["Q"] + 1e-4, data["sources"]["U"] - 2e-4
-    values = dict(zip(problem.model.names, problem.model.start, strict=True))
+    values = dict(zip(likelihood.model.names, likelihood.model.start, strict=True))
     values |= {ours: params[theirs] for ours, theirs in builders.ORACLE_NAMES.items()}
     for k in range(4):
         values |= {
@@ -341,14 +345,14 @@ def test_set_a_has_the_oracles_residuals(either_south_set, start):
         }
     for i in range(8):
         values |= {f"standard.STD0{i}.q": params["q"][i], f"standard.STD0{i}.u": params["u"][i]}
-    assert len(values) == len(problem.model.names)
-    vector = np.array([values[name] for name in problem.model.names])
+    assert len(values) == len(likelihood.model.names)
+    vector = np.array([values[name] for name in likelihood.model.names])
 
     expected = forward.residuals(params, data)
     rows = 4 * data["point"].size
-    found = problem.residuals(vector)[1][data["point"], data["exposure"]]
+    found = likelihood.residuals(vector)[1][data["point"], data["exposure"]]
     np.testing.assert_allclose(found.ravel(), expected[:rows], rtol=1e-6, atol=1e-4)
-    posterior = problem.expand(vector)
+    posterior = likelihood.expand(vector)
     assert posterior.data == pytest.approx(np.sum(expected[:rows] ** 2), rel=1e-6)
     assert posterior.priors == pytest.approx(np.sum(expected[rows:] ** 2), rel=1e-10)
-    assert problem.n_data == rows
+    assert likelihood.census.n_data == rows

@@ -6,14 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from jax.flatten_util import ravel_pytree
 
-from walop_jax.fit import misfit, refit
+from walop_jax.fit import misfit, search
+from walop_jax.fit.minimise import minimise
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood import engine
-from walop_jax.likelihood import problem as likelihood
-from walop_jax.likelihood.chunks import thinned
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.fit.solver import WhenStale
+from walop_jax.likelihood import engine, limits
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.thinning import thinned
+from walop_jax.model.parameters import with_values
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -26,7 +28,9 @@ RUN = ObservingPlan(
 @pytest.fixture(scope="module")
 def made():
     calset = simulate(RUN, seed=12).calset
-    return Problem(calset, base_model(calset, throughput_degree=2), points_per_chunk=512, interpolate=True)
+    return Likelihood.of(
+        calset, base_model(calset, throughput_degree=2), points_per_chunk=512, interpolate=True
+    )
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +41,9 @@ def fitted(made):
 @pytest.fixture
 def large(made, monkeypatch):
     """The same set, handled as if it were too large for a matrix at every step."""
-    monkeypatch.setattr(likelihood, "LARGE_ABOVE", 0)
-    monkeypatch.setattr(refit, "SAMPLE", 1024)
-    return Problem(made.calset, made.model, points_per_chunk=512)
+    monkeypatch.setattr(limits, "LARGE_ABOVE", 0)
+    monkeypatch.setattr(limits, "SAMPLE", 1024)
+    return Likelihood.of(made.calset, made.model, points_per_chunk=512)
 
 
 def test_slope_is_that_of_the_expansion(made):
@@ -63,7 +67,7 @@ def test_slope_keeps_the_factor_on_the_errors(made):
 
 def test_blocks_change_nothing(made):
     """Chunks of 512 go in blocks of 64; chunks of 250 are one block each."""
-    other = Problem(made.calset, made.model, points_per_chunk=250, interpolate=True)
+    other = Likelihood.of(made.calset, made.model, points_per_chunk=250, interpolate=True)
     one, two = made.expand(made.model.start), other.expand(made.model.start)
     size = np.sqrt(np.diag(two.matrix))
     assert one.data == pytest.approx(two.data, rel=1e-12)
@@ -73,7 +77,7 @@ def test_blocks_change_nothing(made):
 
 
 def test_the_fit_of_a_large_set_ends_where_the_usual_one_ends(large, fitted):
-    assert large.is_large
+    assert large.layout.large
     found = fit(large)
     assert found.converged
     assert found.minimum.steps <= 3
@@ -83,31 +87,31 @@ def test_the_fit_of_a_large_set_ends_where_the_usual_one_ends(large, fitted):
     # The matrix is that of the sample's minimum, some nine standard errors away.
     np.testing.assert_allclose(found.sigma, fitted.sigma, rtol=5e-3)
     assert (found.dof, found.n_data) == (fitted.dof, fitted.n_data)
-    assert large.field == made_field(large)
+    assert found.posterior.census.field == made_field(large)
 
 
-def made_field(problem):
-    x, y = problem.calset.points.x, problem.calset.points.y
+def made_field(likelihood):
+    x, y = likelihood.calset.points.x, likelihood.calset.points.y
     return (x.min(), x.max(), y.min(), y.max())
 
 
 def test_frames_and_table_path_agree_to_1e_8(made, monkeypatch):
     """144 of the points: interpolated optics, blocks and a fit from a sample, beside the path that tables take."""
-    sample = thinned(made.calset, 144, run=1)
+    sample = thinned(made.calset, 144, neighbours=1)
     assert len(sample.points) == 144
-    plain = Problem(sample, made.model)
-    assert not plain.interpolates
-    monkeypatch.setattr(likelihood, "LARGE_ABOVE", 0)
-    monkeypatch.setattr(refit, "LARGE_TOLERANCE", 1e-6)
-    monkeypatch.setattr(refit, "SAMPLE", 72)
-    frames = Problem(sample, made.model, points_per_chunk=16, interpolate=True)
-    assert frames.is_large
+    plain = Likelihood.of(sample, made.model)
+    assert not plain.layout.interpolated
+    monkeypatch.setattr(limits, "LARGE_ABOVE", 0)
+    monkeypatch.setattr(search, "LARGE_TOLERANCE", 1e-6)
+    monkeypatch.setattr(limits, "SAMPLE", 72)
+    frames = Likelihood.of(sample, made.model, points_per_chunk=16, interpolate=True)
+    assert frames.layout.large
     a, b = plain.expand(made.model.start), frames.expand(made.model.start)
     size = np.sqrt(np.diag(a.matrix))
     assert a.data == pytest.approx(b.data, rel=1e-8)
     np.testing.assert_allclose(b.gradient / size, a.gradient / size, atol=1e-8 * np.sqrt(a.data))
     np.testing.assert_allclose(b.matrix / np.outer(size, size), a.matrix / np.outer(size, size), atol=1e-8)
-    monkeypatch.setattr("walop_jax.fit.refit.minimise", _tight(refit.minimise))
+    monkeypatch.setattr(search, "minimise", _tight(search.minimise))
     one, other = fit(plain), fit(frames)
     assert other.chi2 == pytest.approx(one.chi2, rel=1e-8)
     scale = np.array([p.scale for p in made.model.parameters])
@@ -116,47 +120,53 @@ def test_frames_and_table_path_agree_to_1e_8(made, monkeypatch):
 
 def _tight(minimise):
     def tighter(*args, **options):
-        return minimise(*args, **(options | {"tolerance": 1e-5}))
+        return minimise(*args, **(options | {"tolerance": min(options.get("tolerance", 1.0), 1e-5)}))
 
     return tighter
 
 
 @pytest.mark.long
-def test_optimistix_on_residuals_in_memory_finds_the_same(made, monkeypatch):
+def test_optimistix_on_residuals_in_memory_finds_the_same(made):
     """The reference: `optimistix.LevenbergMarquardt` on the residuals themselves, derivatives by JAX."""
-    sample = thinned(made.calset, 20, run=1)
-    problem = Problem(sample, made.model)
-    model, chunk = problem.model, problem.chunks[0]
+    sample = thinned(made.calset, 20, neighbours=1)
+    likelihood = Likelihood.of(sample, made.model)
+    model, chunk = likelihood.model, likelihood.points.chunk(0)
     scale = np.array([model.parameters[i].scale for i in model.free])
     select = model.selection() * scale
-    index, mean, width = problem._priors
-    _, to_instrument = ravel_pytree(model.instrument())
+    to_instrument = with_values(model.instrument())
 
     def residuals(x, _):
         values = jnp.asarray(model.start) + select @ x
-        _, data = engine._residuals(to_instrument(values), problem.plan, chunk)
-        loose = jnp.sqrt(problem._loose) * (values - model.start)
-        return jnp.concatenate([data.ravel(), (values[index] - mean) / width, loose])
+        _, data = engine._residuals(to_instrument(values), likelihood.plan, chunk)
+        known = [(i, *p.prior) for i, p in enumerate(model.parameters) if p.free and p.prior is not None]
+        pulled = [(i, p.start, p.loose) for i, p in enumerate(model.parameters) if p.free and p.prior is None]
+        index, mean, width = (np.array(column) for column in zip(*known, *pulled, strict=True))
+        return jnp.concatenate([data.ravel(), (values[index] - mean) / width])
 
     x = jnp.zeros(len(scale))
     # The second one takes away the damping that the first still has when it stops.
     for solver in (optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6), optx.GaussNewton(rtol=1e-12, atol=1e-12)):
         x = optx.least_squares(residuals, solver, x, max_steps=60, throw=False).value
-    monkeypatch.setattr(refit, "LARGE_TOLERANCE", 1e-8)
-    ours = refit._polished(problem, fit(problem).values, 1.0, None)
-    assert ours.minimum.converged
+
+    def evaluate(x, request):
+        values = model.full(x)
+        return likelihood.expand(values) if request.matrix else likelihood.slope(values, request.near)
+
+    near = fit(likelihood).values[model.free]
+    ours = minimise(evaluate, near, scale, matrix=WhenStale(), damping=0.0, tolerance=1e-8)
+    assert ours.converged
     reference = model.start + select @ np.asarray(x)
     everything = np.array([p.scale for p in model.parameters])
-    np.testing.assert_allclose(ours.values / everything, reference / everything, atol=1e-8)
+    np.testing.assert_allclose(model.full(ours.x) / everything, reference / everything, atol=1e-8)
     objective = float(jnp.sum(residuals(x, None) ** 2))
-    assert ours.minimum.expansion.objective == pytest.approx(objective, rel=1e-10)
+    assert ours.expansion.objective == pytest.approx(objective, rel=1e-10)
 
 
 def test_misfit_of_a_large_set_is_that_of_points_spread_over_it(made, monkeypatch):
     values = made.model.start
-    full = misfit.describe(made, values)
-    monkeypatch.setattr(misfit, "LOOKED_AT", 2560)
-    some = misfit.describe(made, values)
+    full = misfit.misfit_at(made, values)
+    monkeypatch.setattr(limits, "MISFIT_POINTS", 2560)
+    some = misfit.misfit_at(made, values)
     assert some != full
     assert some.camera == pytest.approx(full.camera, rel=0.1)
     assert some.matrix_element == pytest.approx(full.matrix_element, rel=0.1)
@@ -165,8 +175,10 @@ def test_misfit_of_a_large_set_is_that_of_points_spread_over_it(made, monkeypatc
 def test_memory_is_bounded_by_what_is_allowed(made):
     """Small memory: small slabs, read anew; the estimate stays below what was allowed."""
     for memory in (1e9, 1e8, 5e6):
-        problem = Problem(made.calset, made.model, 64, interpolate=True, memory=memory)
-        assert problem.chunks.memory <= memory
-    assert not problem.chunks.kept
-    again = problem.expand(made.model.start)
+        likelihood = Likelihood.of(
+            made.calset, made.model, points_per_chunk=64, interpolate=True, memory=memory
+        )
+        assert likelihood.layout.memory <= memory
+    assert not likelihood.layout.kept
+    again = likelihood.expand(made.model.start)
     assert again.data == pytest.approx(made.expand(made.model.start).data, rel=1e-12)

@@ -7,13 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood import engine, nodes
-from walop_jax.likelihood.problem import INTERPOLATE_ABOVE, Problem, base_model
+from walop_jax.likelihood import engine, limits, nodes
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.chebyshev import Rectangle
+from walop_jax.model.dependence import optical_indices
 from walop_jax.model.effects import effect_by_name
-from walop_jax.model.parameters import leaves
-from walop_jax.model.specification import full_values, optical_indices
+from walop_jax.model.parameters import leaves, values_of
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -48,20 +49,20 @@ def simulated():
 
 @pytest.fixture(scope="module")
 def exact(simulated):
-    return Problem(simulated.calset, base_model(simulated.calset))
+    return Likelihood.of(simulated.calset, base_model(simulated.calset))
 
 
 @pytest.fixture(scope="module")
 def quick(simulated):
-    return Problem(simulated.calset, base_model(simulated.calset), interpolate=True)
+    return Likelihood.of(simulated.calset, base_model(simulated.calset), interpolate=True)
 
 
 def test_expansion_agrees(simulated, exact, quick):
     """Calibration plate in and out, Moon sky, standards of several temperatures; at the truth and away from it."""
-    for values in (exact.model.start, full_values(simulated.truth)):
+    for values in (exact.model.start, values_of(simulated.truth)):
         one, other = quick.expand(values), exact.expand(values)
         same((one.data, one.gradient, one.matrix), (other.data, other.gradient, other.matrix))
-    assert 0.0 < quick.optics_error <= nodes.TOLERANCE
+        assert 0.0 < one.optics.error <= nodes.TOLERANCE
     for one, other in zip(quick.residuals(values), exact.residuals(values), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-6)
 
@@ -103,21 +104,40 @@ def test_error_is_measured(exact, simulated):
     plan, scale = exact.plan, scales(simulated.truth)
     table, stated = nodes.tabulate(simulated.truth, plan, FIELD, 8, scale)
     assert nodes.TOLERANCE < stated < 0.01
-    x, y = np.random.default_rng(3).uniform(-0.3, 0.3, (2, nodes.AT_ONCE))
+    x, y = np.random.default_rng(3).uniform(-0.3, 0.3, (2, limits.SOLVED_TOGETHER))
     rows, _ = nodes._solve(simulated.truth, plan, jnp.asarray(x), jnp.asarray(y))
     between, _ = nodes._interpolate(table, jnp.asarray(x), jnp.asarray(y))
     assert 0.1 * stated < np.abs(np.asarray(between - rows)).max() < 3.0 * stated
 
 
 def test_what_cannot_be_interpolated_is_solved_point_by_point(simulated, exact, monkeypatch):
-    monkeypatch.setattr(nodes, "COUNTS", (6, 8))
-    problem = Problem(simulated.calset, base_model(simulated.calset), interpolate=True)
-    values = problem.model.start
-    assert problem.expand(values).data == exact.expand(values).data
-    assert not problem.interpolates
+    monkeypatch.setattr(limits, "NODES_PER_SIDE", (6, 8))
+    likelihood = Likelihood.of(simulated.calset, base_model(simulated.calset), interpolate=True)
+    values = likelihood.model.start
+    found = likelihood.expand(values)
+    assert found.data == exact.expand(values).data
+    assert found.optics.nodes_per_side is None
+    # Having failed there, nobody tries again nearby.
+    monkeypatch.setattr("walop_jax.likelihood.likelihood.accurate_nodes", None)
+    assert likelihood.expand(values, near=found).data == found.data
+
+
+def test_as_many_nodes_as_nearby_are_tried_first(quick, monkeypatch):
+    here = quick.expand(quick.model.start)
+    tried, tabulate = [], nodes.tabulate
+
+    def noted(*arguments):
+        tried.append(arguments[-2])
+        return tabulate(*arguments)
+
+    monkeypatch.setattr(nodes, "tabulate", noted)
+    again = quick.expand(quick.model.start, near=here)
+    assert tried == [here.optics.nodes_per_side]
+    assert again.optics == here.optics
+    assert again.data == here.data
 
 
 def test_tables_of_a_few_hundred_points_are_exact(exact):
-    assert len(exact.calset.points) < INTERPOLATE_ABOVE
-    assert not exact.interpolates
-    assert exact.optics_error == 0.0
+    assert exact.layout.points < limits.INTERPOLATE_ABOVE
+    assert not exact.layout.interpolated
+    assert exact.expand(exact.model.start).optics == (None, 0.0)

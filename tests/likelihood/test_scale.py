@@ -38,11 +38,13 @@ from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_pl
 from walop_jax.calibration.residual_map import residual_map
 from walop_jax.data import Grid, read_calibration_set, write_frames
 from walop_jax.data.records import Block, CalibrationSet, Intensities
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood import engine
-from walop_jax.likelihood.chunks import Chunks
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood import engine, limits
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.points import StreamedPoints
 from walop_jax.model.light import instrument_matrix
+from walop_jax.model.parameters import values_of
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -64,14 +66,14 @@ class Made(Intensities):
     def __init__(self, blank: CalibrationSet, truth, electrons=ELECTRONS, *, from_counts=False):
         self.blank, self.truth, self.electrons, self.from_counts = blank, truth, electrons, from_counts
         degree = truth.throughput.degree
-        self.problem = Problem(blank, base_model(blank, throughput_degree=degree), interpolate=True)
-        self.nodes = self.problem.nodes(truth)
+        self.likelihood = Likelihood.of(blank, base_model(blank, throughput_degree=degree), interpolate=True)
+        self.nodes, _ = self.likelihood.nodes(truth)
         shape = (TILE, EXPOSURES)
         first = Block(
             np.zeros(TILE), np.zeros(TILE), np.ones((*shape, 4)), np.ones((*shape, 4)), np.ones(shape, bool),
             np.full(shape, -1),
         )  # fmt: skip
-        self.data = Chunks(blank, self.problem.plan, TILE).point_data(first)
+        self.data = self.likelihood.points.reader.point_data(first)
 
     def block(self, start, stop):
         tiles = range(start // TILE, -(-stop // TILE))
@@ -91,7 +93,7 @@ class Made(Intensities):
     def tile(self, number):
         inside = np.minimum(np.arange(number * TILE, (number + 1) * TILE), len(self.blank.points) - 1)
         data = self.data._replace(x=self.blank.points.x[inside], y=self.blank.points.y[inside])
-        unit = np.asarray(engine.prediction(self.truth, self.problem.plan, data, self.nodes))
+        unit = np.asarray(engine.prediction(self.truth, self.likelihood.plan, data, self.nodes))
         counts = 4.0 * self.electrons * unit
         sigma = np.sqrt(counts + READ_NOISE**2)
         random = np.random.Generator(np.random.SFC64([number, 7]))
@@ -130,9 +132,9 @@ def seconds(work) -> float:
 def test_counts_made_in_slabs_are_those_of_the_instrument():
     """What the table is made with: the truth explains it."""
     calset = made(20)
-    problem = Problem(calset, base_model(calset), points_per_chunk=100)
-    truth = np.concatenate([np.ravel(v) for v in jax.tree.leaves(simulate(RUN, seed=3).truth)])
-    chi2, dof = problem.expand(truth).data, 3 * 400 * EXPOSURES
+    likelihood = Likelihood.of(calset, base_model(calset), points_per_chunk=100)
+    truth = np.asarray(values_of(simulate(RUN, seed=3).truth))
+    chi2, dof = likelihood.expand(truth).data, 3 * 400 * EXPOSURES
     assert abs(chi2 - dof) < 5 * np.sqrt(2 * dof)
     again = calset.intensities.block(130, 150)
     np.testing.assert_allclose(again.counts, calset.intensities.block(0, 400).counts[130:150], rtol=1e-12)
@@ -143,20 +145,22 @@ def test_cost_per_iteration():
     rows = []
     for side in (12, 120, 1000):
         calset = made(side)
-        problem = Problem(calset, base_model(calset))
-        values = problem.model.start
-        near = problem.expand(values)  # compiles; fills the memory where the set is kept
-        problem.slope(values, near)
-        data = seconds(lambda problem=problem: problem._total("data", None, lambda _: (), ()))
-        full = seconds(lambda problem=problem, values=values: problem.expand(values))
-        slope = seconds(lambda problem=problem, values=values, near=near: problem.slope(values, near))
+        likelihood = Likelihood.of(calset, base_model(calset))
+        values = likelihood.model.start
+        near = likelihood.expand(values)  # compiles; fills the memory where the set is kept
+        likelihood.slope(values, near)
+        data = seconds(lambda likelihood=likelihood: likelihood._total("data", None, lambda _: (), ()))
+        full = seconds(lambda likelihood=likelihood, values=values: likelihood.expand(values))
+        slope = seconds(
+            lambda likelihood=likelihood, values=values, near=near: likelihood.slope(values, near)
+        )
         rows.append((side**2, data, full))
         print(
             f"\n{side**2:>9,} points: data {data:8.3f} s, gradient {slope:8.3f} s, with the matrix {full:8.3f} s "
-            f"({side**2 / full:9,.0f} points/s), error of the optics {problem.optics_error:.0e}, peak {peak():.2f} GB",
+            f"({side**2 / full:9,.0f} points/s), error of the optics {near.optics.error:.0e}, peak {peak():.2f} GB",
             end="",
         )
-        assert problem.chunks.memory < 2e9
+        assert likelihood.layout.memory < 2e9
     # Linear in the points, once there are many.
     n, data, full = rows[-1]
     assert (full - data) / n < 2.0 * rows[1][2] / rows[1][0]
@@ -167,16 +171,16 @@ def test_whole_frames():
     """4096 × 4096 pixels: cold, with all that a refit does but reading and writing files."""
     began = time.perf_counter()
     calset = made(4096)
-    problem = Problem(calset, base_model(calset))
-    result = fit(problem)
+    likelihood = Likelihood.of(calset, base_model(calset))
+    result = fit(likelihood)
     fitted = time.perf_counter() - began
-    residuals = residual_map(problem, result.values)
+    residuals = residual_map(result)
     whole = time.perf_counter() - began
-    truth = np.concatenate([np.ravel(v) for v in jax.tree.leaves(simulate(RUN, seed=3).truth)])
+    truth = np.asarray(values_of(simulate(RUN, seed=3).truth))
     known = result.sigma > 0
     pulls = (result.values - truth)[known] / result.sigma[known]
     print(
-        f"\n{len(calset.points):,} points: fit {fitted:.0f} s, {result.minimum.steps + 1} passes; with the residual "
+        f"\n{len(calset.points):,} points: fit {fitted:.0f} s, {result.minimum.steps} passes; with the residual "
         f"map {whole:.0f} s, peak {peak():.2f} GB; χ²/dof {result.chi2 / result.dof:.5f}, {result.minimum.message}; "
         f"residual map {residuals.significance():+.1f} standard deviations above noise; pulls of the parameters: rms "
         f"{np.sqrt(np.mean(pulls**2)):.2f}"
@@ -189,7 +193,7 @@ def test_whole_frames():
 def matrix_error(calset, truth, result) -> tuple[float, float]:
     """Rms error of the elements of the matrix at places between the points, and what the covariance expects."""
     x, y = (part.ravel() for part in np.meshgrid(*[np.linspace(-0.23, 0.23, 11)] * 2))
-    calibration = Calibration.from_fit(result, Problem(calset, result.model))
+    calibration = Calibration.from_fit(result)
     found, covariance = calibration.matrix(x, y)
     plan = settings_plan(Settings.default(1), calset.filters, truth)
     exact = instrument_matrix(jnp.asarray(analysis_vectors(truth, plan, x, y)[:, 0]))
@@ -215,7 +219,7 @@ def test_errors_fall_with_the_points():
         for degree, from_counts in ((4, False), (4, True), (6, False)):
             plan = dataclasses.replace(RUN, throughput_degree=degree, electrons=1e4)
             calset = made(side, plan, from_counts=from_counts)
-            result = fit(Problem(calset, base_model(calset, throughput_degree=4)))
+            result = fit(Likelihood.of(calset, base_model(calset, throughput_degree=4)))
             row.append(
                 (*matrix_error(calset, simulate(plan, seed=3).truth, result), result.chi2 / result.dof)
             )
@@ -238,14 +242,16 @@ def test_errors_fall_with_the_points():
 def test_work_per_point():
     """Floating-point operations and bytes that the compiled code counts, and the rate at which it does them."""
     calset = made(32)
-    problem = Problem(calset, base_model(calset), points_per_chunk=engine.LARGEST_BLOCK, interpolate=True)
-    instrument = problem.model.instrument()
-    arguments = (instrument, problem.plan, problem.chunks[0], problem.nodes(instrument))
+    likelihood = Likelihood.of(
+        calset, base_model(calset), points_per_chunk=limits.GRADIENT_BLOCK, interpolate=True
+    )
+    instrument = likelihood.model.instrument()
+    arguments = (instrument, likelihood.plan, likelihood.points.chunk(0), likelihood.nodes(instrument)[0])
     for label, function in (("matrix", engine.normal_equations), ("gradient", engine.slope_equations)):
         cost = jax.jit(function.__wrapped__).lower(*arguments).compile().cost_analysis()
         jax.block_until_ready(function(*arguments))
         best = min(seconds(lambda f=function: jax.block_until_ready(f(*arguments))) for _ in range(5))
-        n = engine.LARGEST_BLOCK
+        n = limits.GRADIENT_BLOCK
         print(
             f"\n{label}: {cost['flops'] / n / 1e3:.0f} kflop and {cost['bytes accessed'] / n / 1e3:.0f} kB a point; "
             f"{1e6 * best / n:.1f} µs, {cost['flops'] / best / 1e9:.1f} Gflop/s, "
@@ -259,11 +265,11 @@ def test_reading_frames(tmp_path):
     side = 512
     write_frames(tmp_path / "frames.fits", made(side), raster(side))
     calset = read_calibration_set(tmp_path / "frames.fits")
-    problem = Problem(calset, base_model(calset))
-    problem.chunks.kept = False
-    size = problem.chunks.slab
+    likelihood = Likelihood.of(calset, base_model(calset))
+    points = StreamedPoints(likelihood.points.reader, likelihood.layout)
+    size = likelihood.layout.slab
     raw = seconds(lambda: [calset.intensities.block(n, n + size) for n in range(0, side**2, size)] and None)
-    ready = seconds(lambda: [None for _ in problem.chunks])
+    ready = seconds(lambda: [None for _ in points])
     print(
         f"\nframes: {side**2 / raw:,.0f} points/s read, {side**2 / ready:,.0f} points/s ready for the engine"
     )

@@ -1,41 +1,34 @@
 """The conventions, pinned by canonical states: which camera brightens, and the paper's matrices typed."""
 
 import builders
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracle import forward
 
-from walop_jax.model import conventions, light, mueller
-from walop_jax.model.instrument import HalfWavePlate, Polariser, nominal_instrument
-from walop_jax.model.plan import build_plan
+from walop_jax.model import conventions, mueller
+from walop_jax.model.build import nominal_instrument
+from walop_jax.model.planning import plan_for
 
 LAM = 0.62
 
 
-def thin_plate(retardance):
+def thin_plate(instrument, retardance):
     """Crossed plates of that retardance (rad, fast axis the MgF2's) at 0.62 µm, indices of the oracle."""
     (q_o, q_e), (m_o, m_e) = forward.quartz(LAM), forward.mgf2(LAM)
     mgf2 = 300.0
     quartz = (mgf2 * (m_e - m_o) - retardance / (2 * np.pi) * LAM) / (q_e - q_o)
-    return HalfWavePlate(quartz=quartz, mgf2=mgf2)
+    return builders.with_plates(instrument, quartz, mgf2)
 
 
 def ideal(retardance=np.pi, plates="fixed_axis"):
     """No wedges, no collimator, perfect analysers, throughput one."""
-    start = nominal_instrument("WALOP-SOUTH", plates=plates, throughput=1.0)
-    plate = thin_plate(retardance)
     one, zero = jnp.asarray(1.0), jnp.asarray(0.0)
-    return eqx.tree_at(
-        lambda i: (
-            i.chwp, i.half1.plate, i.half2.plate, i.half1.wedge, i.half2.wedge, i.half1.efficiency,
-            i.half2.efficiency, i.collimator.diattenuation, i.polariser,
-        ),
-        start,
-        (plate, plate, plate, zero, zero, one, one, zero, Polariser(extinction=0.0)),
-        is_leaf=lambda v: isinstance(v, Polariser),
-    )  # fmt: skip
+    instrument = nominal_instrument("WALOP-SOUTH", plates=plates, throughput=1.0)
+    for half in ("half1", "half2"):
+        instrument = instrument.changed(f"{half}.analyser", efficiency=one)
+    instrument = instrument.changed("collimator", diattenuation=zero).changed("polariser", extinction=zero)
+    return thin_plate(builders.without_wedges(instrument), retardance)
 
 
 def responses(instrument, settings=(None,)):
@@ -72,7 +65,7 @@ def test_which_camera_brightens(state):
 )
 def test_calibration_plate_exchanges_and_mirrors(setting, matrix):
     """A half-wave plate at α mirrors the plane of polarisation: 0° turns u round, 45° q, 22.5° swaps them."""
-    found = light.instrument_matrix(jnp.asarray(responses(ideal(), (setting,))))[0]
+    found = builders.matrix(responses(ideal(), (setting,)))[0]
     np.testing.assert_allclose(found, matrix, atol=1e-12)
 
 
@@ -124,8 +117,8 @@ def test_retarders_are_the_papers(delta):
 
 
 def counts(rows, sky=None, source=None, standards=()):
-    instrument = eqx.tree_at(lambda i: i.standard, ideal(), nominal_instrument(standards=standards).standard)
-    plan = build_plan(builders.exposures(*rows), {"band": builders.monochromatic(LAM)})
+    instrument = ideal().with_source(nominal_instrument(standards=standards).standard)
+    plan = plan_for(instrument, builders.exposures(*rows), {"band": builders.monochromatic(LAM)})
     return builders.counts(instrument, plan, 0.0, 0.0, sky, source)
 
 
@@ -153,8 +146,13 @@ def test_moon_sky_is_scaled_by_its_depolarisation():
 
 
 def test_tables_of_the_conventions():
-    """Cameras O1 (0°), E1 (90°), O2 (45°), E2 (135°) in the contract's order, field unit 0.3°."""
+    """Cameras O1 (0°), E1 (90°), O2 (45°), E2 (135°) in their order, two to an arm; field unit 0.3°."""
     assert conventions.CAMERA_NAMES == ("O1", "E1", "O2", "E2")
-    assert conventions.FAST_AXES == (0.0, 22.5)
+    south = nominal_instrument()
+    assert south.cameras.names == conventions.CAMERA_NAMES
+    assert south.cameras.pairs == ((0, 1), (2, 3))
+    axes = [next(e for e in arm.elements if e.name == "plate").axis for arm in south.arms]
+    assert [float(axis) for axis in axes] == [0.0, 22.5]
     assert conventions.FIELD_SCALE == 0.3
     assert conventions.MATRIX_ELEMENTS == ("m21", "m22", "m23", "m31", "m32", "m33")
+    assert conventions.matrix_elements(3)[6:] == ("m41", "m42", "m43")

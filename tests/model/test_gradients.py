@@ -1,20 +1,18 @@
 """Derivatives of counts: forward = reverse = central differences, for every parameter of the base model."""
 
 import builders
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
 from oracle import forward
 
 from walop_jax.data.records import Sources
 from walop_jax.model import light
+from walop_jax.model.build import nominal_instrument
 from walop_jax.model.compiled import compiled
-from walop_jax.model.instrument import HalfWavePlate, nominal_instrument
-from walop_jax.model.parameters import leaves
-from walop_jax.model.plan import build_plan
+from walop_jax.model.parameters import leaves, values_of, with_values
+from walop_jax.model.planning import plan_for
 
 STANDARDS = [("STAR", 0.04, -0.02)]
 LAM = 0.63
@@ -34,16 +32,16 @@ def plan():
         np.array([1]), np.array(["STAR"]), one, -0.5 * one, 0.01 * one, 0.01 * one, np.array([np.nan])
     )
     filters = {"band": builders.curve([LAM, LAM + 0.0004], [1.0, 0.6])}
-    return build_plan(builders.exposures(*rows), filters, sources)
+    return plan_for(TEMPLATE, builders.exposures(*rows), filters, sources)
 
 
-PLAN = plan()
 TEMPLATE = nominal_instrument(standards=STANDARDS)
+PLAN = plan()
 NAMES = [leaf.name for leaf in leaves(TEMPLATE)]
 
 
 def model(values, x, y):
-    instrument = ravel_pytree(TEMPLATE)[1](values)
+    instrument = with_values(TEMPLATE)(values)
     rows = light.band_rows(instrument, PLAN, x, y)
     band = jnp.asarray(PLAN.band_of)[jnp.arange(4), SOURCE + 1]
     throughput = light.throughput_at(instrument, x, y)
@@ -53,37 +51,30 @@ def model(values, x, y):
 counts, forward_jacobian, reverse_jacobian = map(compiled, (model, jax.jacfwd(model), jax.jacrev(model)))
 
 
+def without_wedges():
+    return builders.without_wedges(TEMPLATE)
+
+
 def half_wave():
     """Thicknesses that make δ = π, a thin plate and no wedge: cos δ has its extremum there."""
     (q_o, q_e), (m_o, m_e) = forward.quartz(LAM), forward.mgf2(LAM)
-    return HalfWavePlate(quartz=(300.0 * (m_e - m_o) - 0.5 * LAM) / (q_e - q_o), mgf2=300.0)
-
-
-def without_wedges(plate=None):
-    wedges = eqx.tree_at(
-        lambda i: (i.half1.wedge, i.half2.wedge), TEMPLATE, (jnp.asarray(0.0), jnp.asarray(0.0))
-    )
-    if plate is None:
-        return wedges
-    return eqx.tree_at(
-        lambda i: (i.chwp, i.half1.plate, i.half2.plate), wedges, (plate, plate, plate),
-        is_leaf=lambda v: isinstance(v, HalfWavePlate),
-    )  # fmt: skip
+    quartz = (300.0 * (m_e - m_o) - 0.5 * LAM) / (q_e - q_o)
+    return builders.with_plates(without_wedges(), quartz, 300.0)
 
 
 CASES = {
     "field corner": (lambda: TEMPLATE, 0.29, -0.29),
     "as built": (lambda: builders.as_built(TEMPLATE, np.random.default_rng(4)), -0.17, 0.08),
     "normal incidence": (without_wedges, 0.0, 0.0),
-    "half wave, normal incidence": (lambda: without_wedges(half_wave()), 0.0, 0.0),
-    "half wave, off axis": (lambda: without_wedges(half_wave()), 0.2, 0.2),
+    "half wave, normal incidence": (half_wave, 0.0, 0.0),
+    "half wave, off axis": (half_wave, 0.2, 0.2),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_derivatives_agree(case):
     make, x, y = CASES[case]
-    values = np.asarray(ravel_pytree(make())[0])
+    values = np.asarray(values_of(make()))
     point = jnp.asarray(x), jnp.asarray(y)
     ahead = np.asarray(forward_jacobian(jnp.asarray(values), *point))
     assert np.isfinite(ahead).all()
@@ -105,6 +96,6 @@ def test_derivatives_agree(case):
 
 def test_every_parameter_moves_the_counts():
     """A parameter that moves nothing would have an error bar of nothing, and a misspelt one is such."""
-    values = ravel_pytree(TEMPLATE)[0]
+    values = values_of(TEMPLATE)
     moved = np.abs(forward_jacobian(values, jnp.asarray(0.23), jnp.asarray(-0.26))).max(0)
     assert [name for name, size in zip(NAMES, moved, strict=True) if size < 1e-6] == []

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from oracle import forward
 
+from walop_jax.instruments.description import parsed
+from walop_jax.io.errors import DataError
 from walop_jax.model import light
-from walop_jax.model.instrument import nominal_instrument
-from walop_jax.model.plan import build_plan
+from walop_jax.model.build import build, nominal_instrument
+from walop_jax.model.planning import plan_for
 
 SETTINGS = (None, 0.0, 45.0)
 FLIP_V = np.array([1.0, 1.0, 1.0, -1.0])  # the oracle's V is 2 Im Ex* Ey, the package's 2 Im Ex Ey*
@@ -49,7 +51,7 @@ def test_matrix_is_defined_by_band_integrated_intensities():
     """Hand: responses (1, q, u) of O1 (3, 2, 1), E1 (1, −1, 2), O2 (2, 0, 1), E2 (2, 1, −3)."""
     vectors = jnp.asarray([[3.0, 2, 1, 9], [1, -1, 2, 9], [2, 0, 1, 9], [2, 1, -3, 9]])
     expected = [[0.5, 0.75, -0.25], [0.0, -0.25, 1.0]]
-    np.testing.assert_allclose(light.instrument_matrix(vectors), expected, atol=1e-15)
+    np.testing.assert_allclose(builders.matrix(vectors), expected, atol=1e-15)
 
 
 def test_throughput_enters_the_offsets():
@@ -58,10 +60,9 @@ def test_throughput_enters_the_offsets():
     c = instrument.throughput.coefficients.at[:, 0].set(jnp.asarray([0.55, 0.45, 0.5, 0.5]))
     lopsided = eqx.tree_at(lambda i: i.throughput.coefficients, instrument, c)
     plan = builders.setting_plan(builders.monochromatic(0.62))
-    plain = np.asarray(light.instrument_matrix(jnp.asarray(builders.vectors(instrument, plan, 0.2, 0.1))))[
-        0, 0
-    ]
-    found = np.asarray(light.instrument_matrix(jnp.asarray(builders.vectors(lopsided, plan, 0.2, 0.1))))[0, 0]
+    plain, found = (
+        builders.matrix(builders.vectors(device, plan, 0.2, 0.1))[0, 0] for device in (instrument, lopsided)
+    )
     # (a(1+m) − b(1−m)) / (a(1+m) + b(1−m)) with a, b = 0.55, 0.45
     assert found[0, 0] == pytest.approx((0.1 + plain[0, 0]) / (1 + 0.1 * plain[0, 0]), abs=1e-12)
     np.testing.assert_allclose(found[1], plain[1], atol=1e-15)
@@ -72,8 +73,10 @@ def test_counts_are_linear_in_stokes():
     rng = np.random.default_rng(7)
     instrument = builders.south(rng)
     angles = np.array([0.0, 60.0, 120.0, 17.0, 71.0, 155.0])
-    plan = build_plan(
-        builders.exposures(*({"clp_angle": a} for a in angles)), {"band": builders.monochromatic(0.65)}
+    plan = plan_for(
+        instrument,
+        builders.exposures(*({"clp_angle": a} for a in angles)),
+        {"band": builders.monochromatic(0.65)},
     )
     counts = builders.counts(instrument, plan, 0.21, -0.13)
     two = 2 * np.deg2rad(angles)
@@ -89,8 +92,7 @@ def test_no_light_is_made(setting):
     Uncoated faces pass (1 − 4.6 %)(1 − 0.3 %)(1 − 2.5 %) = 92.8 % per stack (Fresnel, normal incidence).
     """
     rng = np.random.default_rng(8)
-    instrument = nominal_instrument()
-    instrument = eqx.tree_at(lambda i: i.collimator.diattenuation, instrument, jnp.asarray(0.0))
+    instrument = nominal_instrument().changed("collimator", diattenuation=jnp.asarray(0.0))
     plan = builders.setting_plan(builders.monochromatic(0.62), (setting,))
     x, y = builders.field(rng, 20)
     direction = rng.standard_normal((50, 3))
@@ -109,10 +111,7 @@ def test_mirror_image_of_the_first_half():
     instrument = nominal_instrument()
     plan = builders.setting_plan(builders.monochromatic(0.63))
     x, y = builders.field(rng, 8)
-    above, below = (
-        light.instrument_matrix(jnp.asarray(builders.vectors(instrument, plan, x, s * y)))[:, 0, 0]
-        for s in (1, -1)
-    )
+    above, below = (builders.matrix(builders.vectors(instrument, plan, x, s * y))[:, 0, 0] for s in (1, -1))
     np.testing.assert_allclose(above * np.array([1, 1, -1]), below, atol=1e-12)
     assert np.abs(above[:, 2]).max() > 1e-4
 
@@ -138,8 +137,7 @@ def papers_rows(delta, alpha):
 
 
 def no_lens(plates):
-    instrument = nominal_instrument(plates=plates)
-    return eqx.tree_at(lambda i: i.collimator.diattenuation, instrument, jnp.asarray(0.0))
+    return nominal_instrument(plates=plates).changed("collimator", diattenuation=jnp.asarray(0.0))
 
 
 def test_fixed_axis_plates_are_the_papers():
@@ -163,13 +161,53 @@ def test_fixed_axis_plates_are_the_papers():
 
 
 def test_fixed_axes_miss_about_a_hundredth_of_cross_talk():
-    """Contract: up to 1–2 % at the edge of the field; nothing of the kind on the axis of the plates."""
+    """Up to 1–2 % at the edge of the field; nothing of the kind on the axis of the plates."""
     edge = np.linspace(-0.29, 0.29, 15)
     x, y = (v.ravel() for v in np.meshgrid(edge, edge))
     plan = builders.setting_plan(builders.monochromatic(0.62))
     exact, fixed = (
-        np.asarray(light.instrument_matrix(jnp.asarray(builders.vectors(no_lens(plates), plan, x, y)))[:, 0])
+        builders.matrix(builders.vectors(no_lens(plates), plan, x, y))[:, 0]
         for plates in ("waves", "fixed_axis")
     )
     missed = np.abs(exact - fixed)[:, :, 1:].max(axis=(0, 1))
     assert 0.008 < missed.max() < 0.06
+
+
+# ------------------------------------------------------------------------------ what stands ahead of the polariser
+
+AHEAD = """
+name = "SOUTH-TURNED-ROUND"
+like = "WALOP-SOUTH"
+path = ["collimator", "polariser", "pupil", "chwp"]
+[elements.collimator]
+diattenuation = 0.8
+"""
+
+
+def test_lenses_ahead_of_the_polariser_act_on_the_sky_alone():
+    """Diattenuation 0.8 r² along the radius: of an unpolarised star at (0.2, 0.1) it makes q = 0.024, u = 0.032.
+
+    Light through the polariser has forgotten it, and lamps stand behind it.
+    """
+    instrument = build(parsed(AHEAD, "a test"))
+    rows = builders.exposures(
+        {"kind": "standard", "rotator": 0.0}, {"clp_angle": 0.0}, {"kind": "flux"}, {"kind": "moon"}
+    )
+    arrays = plan_for(instrument, rows, {"band": builders.monochromatic(0.62)}).exposures
+    found = light.stokes(
+        instrument, arrays, jnp.zeros((4, 2)), jnp.full(4, -1), jnp.asarray(0.2), jnp.asarray(0.1)
+    )
+    c = (1 - 2e-5) / (1 + 2e-5)
+    expected = [[1, 0.024, 0.032, 0], [1, c, 0, 0], [1, 0, 0, 0], [1, 0.024, 0.032, 0]]
+    np.testing.assert_allclose(found, expected, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "element", ["chwp", "pupil", "late"], ids=["moves", "bends the ray", "depends on wavelength"]
+)
+def test_what_cannot_stand_ahead_of_the_polariser_is_refused(element):
+    path = ["polariser", "collimator", "pupil", "chwp", "late"]
+    path.insert(0, path.pop(path.index(element)))
+    text = f'name = "X"\nlike = "WALOP-SOUTH"\npath = {path}\n[elements.late]\nkind = "retarder"\nwavelength = 0.6\n'
+    with pytest.raises(DataError, match=f"element '{element}' stands ahead of the polariser.*put it behind"):
+        build(parsed(text, "a test"))

@@ -7,7 +7,7 @@ Frame       pyElli puts the plane of incidence into its xz plane (k_x ≥ 0, z a
             turned by −φ, and as carrying commutes with a turn about z, the carried ICS axes follow by
             (E_p, E_s) = R(φ)(E_x, E_y), R the turn of axes by φ: J = R(φ)ᵀ J_ps R(φ). No sign is changed.
 Stokes      M = A (J ⊗ J*) A⁻¹ with A typed below, V = 2 Im Ex Ey* as in `conventions.py`.
-Fringes     pyElli keeps the waves reflected to and fro, the contract drops them. Both plates are stepped over
+Fringes     pyElli keeps the waves reflected to and fro, the base model drops them. Both plates are stepped over
             fringes (one is λ / 2k_z of thickness; quarters of it, triangular weights over ± 1), which leaves
             the retardance alone but for some 0.01 rad:
             - the mean of J, phase of one pass taken out, kills every term that has been reflected (they turn

@@ -90,7 +90,7 @@ def with_spectrum(node, weight, teff):
 @pytest.mark.parametrize("name", CURVES)
 @pytest.mark.parametrize("teff", [None, 3500.0], ids=["flat", "3500 K"])
 def test_band_rule_has_converged(name, teff):
-    """To 1e-6 of the intensities (contract), over the field, calibration plate out, at 0° and at 45°.
+    """To 1e-6 of the intensities (docs: model), over the field, calibration plate out, at 0° and at 45°.
 
     Measured: 2e-8 from the sum over the table (refined to 0.5 nm where it is coarser). The integral over
     straight lines between rows of 0.5 nm is another reading of "tabulated curve"; it differs by up to 8e-6

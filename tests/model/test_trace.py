@@ -11,39 +11,38 @@ import pytest
 
 from walop_jax.data import builtin_filter
 from walop_jax.model import light
+from walop_jax.model.build import nominal_instrument
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.effects.base import Context
-from walop_jax.model.instrument import nominal_instrument
-from walop_jax.model.plan import plan_for
-from walop_jax.model.trace import Ray, Stage, trace
+from walop_jax.model.planning import plan_for
+from walop_jax.model.trace import STOKES, Sightline, Stage, trace
 
-RAYS = {
-    "unpolarised star on axis": Ray(),
-    "star": Ray(x=0.2, y=-0.13, q=0.031, u=-0.02, teff=5772.0),
-    "star, plate in": Ray(x=-0.25, y=0.11, q=0.031, u=-0.02, chwp_angle=45.0, teff=9000.0),
-    "polariser": Ray(x=0.1, y=0.28, clp_angle=33.0),
-    "polariser, plate in": Ray(x=0.1, y=0.28, clp_angle=123.0, chwp_angle=0.0, teff=3000.0),
+SIGHTLINES = {
+    "unpolarised star on axis": Sightline(),
+    "star": Sightline(x=0.2, y=-0.13, q=0.031, u=-0.02, teff=5772.0),
+    "star, plate in": Sightline(x=-0.25, y=0.11, q=0.031, u=-0.02, chwp_angle=45.0, teff=9000.0),
+    "polariser": Sightline(x=0.1, y=0.28, clp_angle=33.0),
+    "polariser, plate in": Sightline(x=0.1, y=0.28, clp_angle=123.0, chwp_angle=0.0, teff=3000.0),
 }
 CONTEXT = Context(exposures=1, sources=("STD00",))
 
 
 def built(*effects):
-    rng = np.random.default_rng(5)
-    return builders.south(rng, standards=[("STD00", 0.0, 0.0)], effects=effects)
+    return builders.south(np.random.default_rng(5), effects, standards=[("STD00", 0.0, 0.0)])
 
 
-def counts_of(instrument, ray: Ray) -> np.ndarray:
+def counts_of(instrument, sightline: Sightline) -> np.ndarray:
     """The same counts from the backward path of a fit, the source given as a catalogue star of its own."""
     standard = dataclasses.replace(
         instrument.standard,
-        q=jnp.append(instrument.standard.q, ray.q),
-        u=jnp.append(instrument.standard.u, ray.u),
+        q=jnp.append(instrument.standard.q, sightline.q),
+        u=jnp.append(instrument.standard.u, sightline.u),
         names=(*instrument.standard.names, "it"),
     )
-    instrument = dataclasses.replace(instrument, standard=standard)
+    instrument = instrument.with_source(standard)
     band = builders.broad_band()
-    plan = plan_for(instrument.effects, ray.exposure(band.name), {band.name: band})
-    x, y = jnp.asarray(ray.x), jnp.asarray(ray.y)
+    plan = plan_for(instrument, sightline.exposure(band.name), {band.name: band})
+    x, y = jnp.asarray(sightline.x), jnp.asarray(sightline.y)
     rows = light.band_rows(instrument, plan, x, y)
     source, sky = jnp.asarray([1]), jnp.zeros((1, 2))
     throughput = light.throughput_at(instrument, x, y)
@@ -56,12 +55,12 @@ def named(stages: tuple[Stage, ...], name: str) -> np.ndarray:
     return next(stage.value for stage in stages if stage.name == name)
 
 
-@pytest.mark.parametrize("ray", RAYS.values(), ids=RAYS)
-def test_the_last_stage_is_what_a_fit_computes(ray: Ray):
+@pytest.mark.parametrize("sightline", SIGHTLINES.values(), ids=SIGHTLINES)
+def test_the_last_stage_is_what_a_fit_computes(sightline: Sightline):
     instrument = built()
-    last = trace(instrument, builders.broad_band(), ray)[-1]
+    last = trace(instrument, builders.broad_band(), sightline)[-1]
     assert last.name == "counts"
-    np.testing.assert_allclose(last.value[0], counts_of(instrument, ray), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(last.value[0], counts_of(instrument, sightline), rtol=0, atol=1e-14)
 
 
 # One effect for every stage at which the path can be changed.
@@ -78,17 +77,17 @@ def test_effects_are_followed(name: str):
     names = kind.amplitudes()
     changed = {name: jnp.full(np.shape(getattr(effect, name)), 0.01) for name in names}
     instrument = built(dataclasses.replace(effect, **changed))
-    ray = RAYS["polariser, plate in" if name == "clp_ellipticity" else "star"]
-    last = trace(instrument, builders.broad_band(), ray)[-1]
-    np.testing.assert_allclose(last.value[0], counts_of(instrument, ray), rtol=0, atol=1e-14)
+    sightline = SIGHTLINES["polariser, plate in" if name == "clp_ellipticity" else "star"]
+    last = trace(instrument, builders.broad_band(), sightline)[-1]
+    np.testing.assert_allclose(last.value[0], counts_of(instrument, sightline), rtol=0, atol=1e-14)
 
 
 def test_unpolarised_light_is_shared_equally_by_the_nominal_instrument():
-    stages = trace(nominal_instrument(), builtin_filter("SDSS-r"), Ray())
+    stages = trace(nominal_instrument(), builtin_filter("SDSS-r"), Sightline())
     np.testing.assert_allclose(named(stages, "source"), [[1, 0, 0, 0]])
     # Three faces reflect: ((n − 1) / (n + 1))² at 1.54 and at 1.38, next to nothing between the plates.
     passed = (1 - (0.54 / 2.54) ** 2) * (1 - (0.38 / 2.38) ** 2)
-    np.testing.assert_allclose(named(stages, "Wollaston prisms"), np.full((1, 4), 0.5 * passed), rtol=0.01)
+    np.testing.assert_allclose(named(stages, "analysers"), np.full((1, 4), 0.5 * passed), rtol=0.01)
     # The level of the nominal throughput is 0.5, so the cameras see a quarter of what the plates let through.
     np.testing.assert_allclose(named(stages, "counts"), 0.25 * passed, rtol=0.01)
 
@@ -96,22 +95,26 @@ def test_unpolarised_light_is_shared_equally_by_the_nominal_instrument():
 def test_half_wave_plate_at_45_degrees_turns_x_into_y():
     # On axis the retardance is 2π (2407 µm Δn(quartz) − 1930 µm Δn(MgF2)) / λ, of Q its cosine is left.
     # Δn at 0.62 µm: 0.00906 and 0.01179 (handbook values; the plates are 35 and 37 waves thick).
-    stages = trace(nominal_instrument(), builders.monochromatic(0.62), Ray(clp_angle=0.0, chwp_angle=45.0))
+    stages = trace(
+        nominal_instrument(), builders.monochromatic(0.62), Sightline(clp_angle=0.0, chwp_angle=45.0)
+    )
     np.testing.assert_allclose(named(stages, "source")[0], [1, 1, 0, 0], atol=5e-5)
-    behind = named(stages, "calibration plate")[0]
+    behind = named(stages, "chwp")[0]
     retardance = 2 * np.pi * (2407.0 * 0.00906 - 1930.0 * 0.01179) / 0.62
     assert behind[1] / behind[0] == pytest.approx(np.cos(retardance), abs=0.02)
 
 
 def test_light_never_gains():
-    for ray in RAYS.values():
-        stages = trace(built(), builders.broad_band(), ray)
-        for stage in stages[:4]:
+    for sightline in SIGHTLINES.values():
+        stages = trace(built(), builders.broad_band(), sightline)
+        beams = [stage for stage in stages if stage.columns == STOKES]
+        assert [stage.name for stage in beams] == ["source", "collimator", "chwp", "arms"]
+        for stage in beams:
             intensity, polarised = stage.value[:, 0], np.linalg.norm(stage.value[:, 1:], axis=1)
             assert np.all(polarised <= intensity * (1 + 1e-12)), stage.name
-        assert named(stages, "half-wave plates")[:, 0].max() <= named(stages, "source")[0, 0] * 1.01
+        assert named(stages, "arms")[:, 0].max() <= named(stages, "source")[0, 0] * 1.01
 
 
 def test_impossible_light_is_refused():
     with pytest.raises(ValueError, match="polarised by more than 1"):
-        Ray(q=0.9, u=0.9)
+        Sightline(q=0.9, u=0.9)

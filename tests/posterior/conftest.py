@@ -30,9 +30,9 @@ def worlds() -> Worlds:
 @pytest.fixture(scope="session")
 def scene(worlds: Worlds) -> Scene:
     world = worlds.draw(np.random.default_rng(11))
-    result = fit(world.problem, start=world.truth)
+    result = fit(world.likelihood, start=world.truth)
     assert result.converged
-    target = Target(world.problem, result)
+    target = Target(result)
     return Scene(world, result, target, build_surrogate(target))
 
 

@@ -43,23 +43,24 @@ def measure(path: Path, nuts_draws: int, plain_steps: int) -> dict[str, Any]:
     from oracle import forward
 
     from walop_jax.data import read_calibration_set
+    from walop_jax.fit.model_builder import base_model
     from walop_jax.fit.refit import fit
-    from walop_jax.likelihood.problem import Problem, base_model
+    from walop_jax.likelihood.likelihood import Likelihood
     from walop_jax.posterior import Options, build_surrogate, sample
     from walop_jax.posterior.nuts import sample_nuts
     from walop_jax.posterior.target import Target
 
     calset = read_calibration_set(path)
-    problem = Problem(calset, base_model(calset))
-    result = fit(problem)
-    target = Target(problem, result)
+    likelihood = Likelihood.of(calset, base_model(calset))
+    result = fit(likelihood)
+    target = Target(result)
     found: dict[str, Any] = {"core": CORE, "coefficients": len(target.free)}
 
     began = time.perf_counter()
-    first = sample(problem, result, Options(seed=1))
+    first = sample(result, Options(seed=1))
     found["ours_cold_seconds"] = time.perf_counter() - began
     began = time.perf_counter()
-    second = sample(problem, result, Options(seed=2))
+    second = sample(result, Options(seed=2))
     found["ours_warm_seconds"] = time.perf_counter() - began
     for name, run in (("cold", first), ("warm", second)):
         found[f"ours_{name}_ess"] = float(run.convergence.ess.min())
@@ -71,7 +72,7 @@ def measure(path: Path, nuts_draws: int, plain_steps: int) -> dict[str, Any]:
     start["q"], start["u"] = data["sources"]["Q"].copy(), data["sources"]["U"].copy()
     vector = oracle_fit.Vector(start, data)
     x, rng = vector.pack(start), np.random.default_rng(0)
-    nodes = problem.plan.wavelength.shape[0]
+    nodes = likelihood.plan.wavelength.shape[0]
     times = []
     for _ in range(5):
         began = time.perf_counter()

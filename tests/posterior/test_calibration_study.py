@@ -23,7 +23,7 @@ from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_pl
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
-from walop_jax.model.specification import unravel
+from walop_jax.model.parameters import with_values
 from walop_jax.posterior import Options, sample
 from walop_jax.posterior.target import Target
 
@@ -53,13 +53,14 @@ class Study:
         axis = np.linspace(-0.25, 0.25, 4)
         self.x, self.y = (v.ravel() for v in np.meshgrid(axis, axis))
         self.plan = settings_plan(Settings.default(1), self.worlds.blank.filters, model.template)
-        to_instrument = unravel(model.template)
+        to_instrument = with_values(model.template)
 
         def matrix(values: jax.Array, plan: object, x: jax.Array, y: jax.Array) -> jax.Array:
             instrument = to_instrument(values)
             rows = light.band_rows(instrument, plan, x, y)  # pyright: ignore[reportArgumentType]
             throughput = light.throughput_at(instrument, x, y)
-            return light.instrument_matrix(light.camera_vectors(instrument, rows, throughput, x, y)[0])
+            vectors = light.camera_vectors(instrument, rows, throughput, x, y)[0]
+            return light.instrument_matrix(vectors, instrument.cameras.pairs)
 
         over_points = jax.vmap(matrix, (None, None, 0, 0))
         self._matrices = compiled(
@@ -77,7 +78,7 @@ class Study:
         stokes = 0.05 * np.array([np.cos(0.7), np.sin(0.7)])
         seen = m[..., 0] + m[..., 1:] @ stokes
         error = np.abs(np.hypot(seen[..., 0], seen[..., 1]) - 0.05).mean(axis=1)
-        free = world.problem.model.free
+        free = world.likelihood.model.free
         likelihood = np.array([-0.5 * target.data(one[free]) for one in values])
         return np.stack([crosstalk, error, likelihood], axis=1)
 
@@ -87,7 +88,7 @@ class Study:
         """Whether the 68 and 95 % intervals of corrected q and u of new stars hold the truth."""
         x, y = rng.uniform(-0.28, 0.28, (2, STARS))
         true = 0.02 * rng.standard_normal((STARS, 2))
-        instrument = world.problem.model.instrument(world.truth)
+        instrument = world.likelihood.model.instrument(world.truth)
         vectors = analysis_vectors(instrument, self.plan, x, y)[:, 0]
         light_in = np.concatenate([np.ones((STARS, 1)), true, np.zeros((STARS, 1))], axis=1)
         expected = 4.0 * STAR_ELECTRONS * np.einsum("pks,ps->pk", vectors, light_in)
@@ -109,7 +110,7 @@ class Study:
         self, world: World, result: FitResult, draws: np.ndarray, seed: int, trusted: bool
     ) -> Outcome:
         rng = np.random.default_rng([seed, 3])
-        target, free = Target(world.problem, result), world.problem.model.free
+        target, free = Target(result), world.likelihood.model.free
         some = draws[rng.permutation(len(draws))[:RANKED]]
         values = np.concatenate([world.truth[None], some])
         quantities = np.concatenate([values[:, free], self.functionals(world, target, values)], axis=1)
@@ -119,16 +120,16 @@ class Study:
 
     def emcee(self, seed: int) -> Outcome:
         world = self.worlds.draw(np.random.default_rng([seed, 1]))
-        result = fit(world.problem)
-        posterior = sample(world.problem, result, Options(seed=seed, checks=64))
+        result = fit(world.likelihood)
+        posterior = sample(result, Options(seed=seed, checks=64))
         draws = posterior.draws.reshape(-1, len(posterior.names))
         return self.outcome(world, result, draws, seed, posterior.trusted)
 
     def laplace(self, seed: int) -> Outcome:
         world = self.worlds.draw(np.random.default_rng([seed, 1]))
-        result = fit(world.problem)
+        result = fit(world.likelihood)
         rng = np.random.default_rng([seed, 2])
-        free, model = world.problem.model.free, world.problem.model
+        free, model = world.likelihood.model.free, world.likelihood.model
         root = np.linalg.cholesky(result.covariance[np.ix_(free, free)] / np.outer(*2 * [result.sigma[free]]))
         away = (rng.standard_normal((400, len(free))) @ root.T) * result.sigma[free]
         draws = result.values + away @ model.selection().T

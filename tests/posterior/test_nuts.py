@@ -13,8 +13,9 @@ from emcee.autocorr import integrated_time
 from south_sets import SouthSet
 
 from walop_jax.data import read_calibration_set
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.posterior import Options, sample
 from walop_jax.posterior.target import Target
 
@@ -32,11 +33,10 @@ def test_emcee_agrees_with_nuts(either_south_set: Callable[[str], SouthSet]) -> 
     from walop_jax.posterior.nuts import sample_nuts
 
     calset = read_calibration_set(either_south_set("a").path)
-    problem = Problem(calset, base_model(calset))
-    result = fit(problem)
-    ours = sample(problem, result, Options(seed=1, interval=2000))
+    result = fit(Likelihood.of(calset, base_model(calset)))
+    ours = sample(result, Options(seed=1, interval=2000))
     assert ours.trusted, ours.warnings
-    nuts = sample_nuts(Target(problem, result), DRAWS)
+    nuts = sample_nuts(Target(result), DRAWS)
     assert nuts.divergences == 0
     for i, name in enumerate(nuts.names):
         mean, sigma = ours.value(name)

@@ -37,12 +37,12 @@ def _built_once(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
 def posterior(scene: Scene) -> PosteriorSample:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sampling, "build_surrogate", lambda *a, **k: scene.surrogate)
-        return sample(scene.world.problem, scene.result, OPTIONS)
+        return sample(scene.result, OPTIONS)
 
 
 def test_posterior_agrees_with_laplace_where_that_holds(scene: Scene, posterior: PosteriorSample) -> None:
     assert posterior.trusted, posterior.warnings
-    free = scene.world.problem.model.free
+    free = scene.world.likelihood.model.free
     pull = (posterior.mean - scene.result.values)[free] / scene.result.sigma[free]
     ratio = np.sqrt(np.diag(posterior.covariance))[free] / scene.result.sigma[free]
     assert np.abs(pull).max() < 0.2
@@ -58,9 +58,9 @@ def test_posterior_agrees_with_laplace_where_that_holds(scene: Scene, posterior:
 
 @pytest.mark.parametrize("cut", [1, 2])
 def test_interrupted_is_uninterrupted(scene: Scene, tmp_path: Path, cut: int) -> None:
-    problem, result = scene.world.problem, scene.result
+    result = scene.result
     options = dataclasses.replace(OPTIONS, moves="de", maximum_steps=600)
-    whole = sample(problem, result, options, folder=tmp_path / "whole")
+    whole = sample(result, options, folder=tmp_path / "whole")
     done = 0
 
     def stop(progress: Any) -> None:
@@ -70,32 +70,31 @@ def test_interrupted_is_uninterrupted(scene: Scene, tmp_path: Path, cut: int) ->
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        sample(problem, result, options, folder=tmp_path / "cut", report=stop)
+        sample(result, options, folder=tmp_path / "cut", report=stop)
     assert len(list((tmp_path / "cut").glob("block-*.h5"))) == cut
-    resumed = sample(problem, result, options, folder=tmp_path / "cut", resume=True)
+    resumed = sample(result, options, folder=tmp_path / "cut", resume=True)
     np.testing.assert_array_equal(resumed.chains, whole.chains)
     np.testing.assert_array_equal(resumed.draws, whole.draws)
     np.testing.assert_array_equal(resumed.covariance, whole.covariance)
 
 
 def test_resume_refuses_what_has_changed(scene: Scene, tmp_path: Path) -> None:
-    problem, result = scene.world.problem, scene.result
+    model, result = scene.result.model, scene.result
     options = dataclasses.replace(OPTIONS, maximum_steps=200)
-    sample(problem, result, options, folder=tmp_path / "chain")
+    sample(result, options, folder=tmp_path / "chain")
     with pytest.raises(DataError, match="holds a chain already"):
-        sample(problem, result, options, folder=tmp_path / "chain")
+        sample(result, options, folder=tmp_path / "chain")
     with pytest.raises(DataError, match="other settings"):
-        sample(problem, result, dataclasses.replace(options, seed=4), folder=tmp_path / "chain", resume=True)
-    name = problem.model.names[problem.model.free[0]]
-    changed = problem.model.change(name, prior=(0.81, 0.02))
-    other = type(problem)(problem.calset, changed)
+        sample(result, dataclasses.replace(options, seed=4), folder=tmp_path / "chain", resume=True)
+    changed = model.change(model.names[model.free[0]], prior=(0.81, 0.02))
+    other = dataclasses.replace(result, likelihood=Likelihood.of(result.calset, changed))
     with pytest.raises(DataError, match="other priors"):
-        sample(other, result, options, folder=tmp_path / "chain", resume=True)
+        sample(other, options, folder=tmp_path / "chain", resume=True)
 
 
 def test_a_chain_cut_short_says_so(scene: Scene, tmp_path: Path) -> None:
     options = dataclasses.replace(OPTIONS, moves="stretch", maximum_steps=200)
-    short = sample(scene.world.problem, scene.result, options)
+    short = sample(scene.result, options)
     assert not short.trusted
     assert "Go on for" in short.warnings[0]
     write_posterior(tmp_path / "short.nc", short)
@@ -105,7 +104,7 @@ def test_a_chain_cut_short_says_so(scene: Scene, tmp_path: Path) -> None:
 
 def test_inflation_finds_the_noise_as_stated(scene: Scene) -> None:
     options = dataclasses.replace(OPTIONS, inflate=True, interval=400)
-    inflated = sample(scene.world.problem, scene.result, options)
+    inflated = sample(scene.result, options)
     assert inflated.trusted, inflated.warnings
     assert inflated.ln_f is not None
     measured = scene.target.measured
@@ -143,7 +142,7 @@ def test_matrix_by_draws_agrees_with_the_covariance(
     scene: Scene, posterior: PosteriorSample, tmp_path: Path
 ) -> None:
     x, y = np.array([0.0, 0.2, -0.25]), np.array([0.0, 0.1, 0.2])
-    model, filters = scene.world.problem.model, scene.world.problem.calset.filters
+    model, filters = scene.world.likelihood.model, scene.world.likelihood.calset.filters
     drawn = matrix_draws(model, posterior.draws[0, :100], Settings.default(3), filters, x, y)
     instrument = model.instrument(posterior.mean)
     values, covariance = matrices(instrument, Settings.default(3), filters, x, y, posterior.covariance)
@@ -151,11 +150,9 @@ def test_matrix_by_draws_agrees_with_the_covariance(
     np.testing.assert_allclose(drawn.std(axis=0), sigma, rtol=0.3)
     assert np.max(np.abs(drawn.mean(axis=0) - values) / sigma) < 0.45
     write_posterior(tmp_path / "posterior.nc", posterior)
-    calibration = with_draws(
-        Calibration.from_fit(scene.result, scene.world.problem), tmp_path / "posterior.nc", 50
-    )
+    calibration = with_draws(Calibration.from_fit(scene.result), tmp_path / "posterior.nc", 50)
     assert calibration.matrix(x, y)[1].shape == (3, 6, 6)
-    moments = with_moments(Calibration.from_fit(scene.result, scene.world.problem), tmp_path / "posterior.nc")
+    moments = with_moments(Calibration.from_fit(scene.result), tmp_path / "posterior.nc")
     flat = posterior.draws.reshape(-1, len(posterior.names))
     np.testing.assert_allclose(moments.values, flat.mean(axis=0), rtol=1e-12)
     away = flat - flat.mean(axis=0)

@@ -113,7 +113,7 @@ def test_only_orders_2_and_3(scene: Scene) -> None:
 
 def test_target_is_what_the_fit_minimises(scene: Scene) -> None:
     target = scene.target
-    posterior = scene.world.problem.expand(np.asarray(scene.result.values), scene.result.noise_scale)
+    posterior = scene.world.likelihood.expand(np.asarray(scene.result.values), scene.result.noise_scale)
     assert target.objective(target.centre) == pytest.approx(posterior.objective, rel=1e-12)
     step = (
         0.3

@@ -14,9 +14,10 @@ from scipy import stats
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.fit.model_builder import base_model
 from walop_jax.likelihood import engine
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.noise import PhotonNoise
-from walop_jax.likelihood.problem import Problem, base_model
 from walop_jax.model.specification import Model
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
@@ -35,9 +36,9 @@ NOISE = PhotonNoise()
 
 
 class World(NamedTuple):
-    """A problem and the full vector of true values behind its data."""
+    """A likelihood and the full vector of true values behind its data."""
 
-    problem: Problem
+    likelihood: Likelihood
     truth: np.ndarray
 
 
@@ -56,7 +57,7 @@ class Worlds:
     def __init__(self) -> None:
         self.blank = simulate(PLAN, seed=5).calset
         self.model = prior_model(self.blank)
-        self.problem = Problem(self.blank, self.model)
+        self.likelihood = Likelihood.of(self.blank, self.model)
         points = self.blank.points
         self.block = self.blank.intensities.block(0, len(points))
 
@@ -67,14 +68,14 @@ class Worlds:
             assert prior is not None
             truth[i] = rng.normal(*prior)
         flux = 4.0 * PLAN.electrons * rng.uniform(0.7, 1.0, self.block.used.shape)
-        chunk = self.problem.chunks[0]
-        unit = np.asarray(engine.prediction(self.model.instrument(truth), self.problem.plan, chunk))
+        chunk = self.likelihood.points.chunk(0)
+        unit = np.asarray(engine.prediction(self.model.instrument(truth), self.likelihood.plan, chunk))
         expected = flux[:, :, None] * unit
         sigma = NOISE.sigma(expected)
         counts = expected + sigma * rng.standard_normal(expected.shape)
         block = dataclasses.replace(self.block, counts=counts, sigma=sigma)
         calset = dataclasses.replace(self.blank, intensities=TableIntensities.dense(self.blank.points, block))
-        return World(Problem(calset, self.model), truth)
+        return World(Likelihood.of(calset, self.model), truth)
 
 
 def ecdf_band(count: int, level: float = 0.95, grid: int = 100, draws: int = 4000, seed: int = 1) -> float:

@@ -9,6 +9,7 @@ import pytest
 from small_run import SMALL, fitted_run
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.paper.comparison import compare
 from walop_jax.reports import comparison_figures as figures
 from walop_jax.science.star_errors import plate_errors
@@ -16,8 +17,8 @@ from walop_jax.science.star_errors import plate_errors
 
 @pytest.fixture(scope="module")
 def calibration_and_set():
-    run = fitted_run(SMALL)
-    return run.calibration, run.calset
+    result = fitted_run(SMALL)
+    return Calibration.from_fit(result), result.calset
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Figures show what they say: numbers behind them are checked, pictures are drawn without a screen."""
+"""Figures show what they say: numbers behind them are checked, they are drawn without a screen."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import pytest
 from matplotlib import pyplot
 from small_run import SMALL, fitted_run
 
-from walop_jax.diagnosis.figure_data import pictures
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.diagnosis.figure_data import figure_data
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.reports import figures
 from walop_jax.reports.diagnosis_figures import signature_figure
@@ -19,8 +20,8 @@ from walop_jax.reports.diagnosis_figures import signature_figure
 
 @pytest.fixture(scope="module")
 def fitted():
-    _, problem, result, calibration = fitted_run(SMALL)
-    return problem, result, calibration
+    result = fitted_run(SMALL)
+    return result, Calibration.from_fit(result)
 
 
 def drawn(figure) -> bytes:
@@ -30,20 +31,20 @@ def drawn(figure) -> bytes:
 
 
 def test_residuals_of_points_are_noise_after_a_fit(fitted):
-    problem, result, _ = fitted
-    after = figures.point_residuals(problem, result.values)
+    result, _ = fitted
+    after = figures.point_residuals(result.likelihood, result.values)
     assert after.shape == (25 + 4,)
     assert np.sqrt(np.nanmean(after**2)) == pytest.approx(1.0, abs=0.15)
-    assert figures.point_residuals(problem, problem.model.start).min() > 5.0
+    assert figures.point_residuals(result.likelihood, result.model.start).min() > 5.0
 
 
 def test_every_figure_can_be_drawn(fitted):
-    problem, result, calibration = fitted
+    result, calibration = fitted
     made = {
-        "calibration": figures.calibration_figure(problem, calibration),
+        "calibration": figures.calibration_figure(result),
         "matrix": figures.matrix_figure(calibration),
-        "residual": figures.residual_figure(problem, problem.model.start, result.values),
-        "modulation": figures.modulation_figure(problem.calset, [0, 5]),
+        "residual": figures.residual_figure(result),
+        "modulation": figures.modulation_figure(result.calset, [0, 5]),
     }
     for name, figure in made.items():
         assert drawn(figure).startswith(b"\x89PNG"), name
@@ -51,7 +52,7 @@ def test_every_figure_can_be_drawn(fitted):
 
 
 def test_maps_show_the_matrix(fitted):
-    _, _, calibration = fitted
+    _, calibration = fitted
     figure = figures.matrix_figure(calibration)
     low_x, high_x, low_y, high_y = calibration.field
     corner, _ = calibration.matrix(np.array([low_x, high_x]), np.array([low_y, high_y]))
@@ -62,42 +63,42 @@ def test_maps_show_the_matrix(fitted):
 
 
 def test_modulation_is_that_of_the_data(fitted):
-    problem, _, _ = fitted
-    figure = figures.modulation_figure(problem.calset, [3])
-    block = problem.calset.intensities.block(3, 4)
-    clp = problem.calset.exposures.clp_in
+    calset = fitted[0].calset
+    figure = figures.modulation_figure(calset, [3])
+    block = calset.intensities.block(3, 4)
+    clp = calset.exposures.clp_in
     n = block.counts[0, clp]
     for axis, pair in zip(figure.axes, (0, 2), strict=True):
         shown = axis.lines[1].get_ydata()
         np.testing.assert_allclose(shown, (n[:, pair] - n[:, pair + 1]) / (n[:, pair] + n[:, pair + 1]))
 
 
-def test_pictures_of_a_diagnosis_hold_its_residuals(fitted):
-    problem, result, _ = fitted
-    start = dataclasses.replace(result, values=problem.model.start)
+def test_figures_of_a_diagnosis_hold_its_residuals(fitted):
+    result, _ = fitted
+    likelihood, start = result.likelihood, dataclasses.replace(result, values=result.model.start)
     found = Diagnosis(
         verdict="consistent", steps=(), candidates=(), limits=(), untestable=(), unexplained=None, p_value=0.5,
-        remaining_p=0.5, before=start, after=result, problem=problem, seconds=0.0, points=29,
+        remaining_p=0.5, before=start, after=result, seconds=0.0, points=29,
     )  # fmt: skip
-    made = pictures(found)
-    before, after = (problem.residuals(values)[1] for values in (problem.model.start, result.values))
+    made = figure_data(found)
+    before, after = (likelihood.residuals(values)[1] for values in (likelihood.model.start, result.values))
     for group in ("camera", "kind", "filter", "exposure"):
         rows = made.shares.group == group
         assert made.shares.before[rows].sum() == pytest.approx((before**2).sum())
         assert made.shares.after[rows].sum() == pytest.approx((after**2).sum())
-        assert made.shares.expected[rows].sum() == pytest.approx(3.0 * problem.used.sum())
+        assert made.shares.expected[rows].sum() == pytest.approx(3.0 * likelihood.used.sum())
     assert made.ladder.chi2.tolist() == [result.chi2]
     (whole,) = made.comparisons
-    rows = problem.used.sum(axis=1)[:, None]
+    rows = likelihood.used.sum(axis=1)[:, None]
     np.testing.assert_allclose(whole.rms_after**2 * rows, (after**2).sum(axis=1), rtol=1e-9)
     assert drawn(signature_figure(whole, made.exposures)).startswith(b"\x89PNG")
 
 
 def test_figures_may_be_made_in_threads(fitted):
-    problem, _, _ = fitted
+    calset = fitted[0].calset
     made: list[bytes] = []
     threads = [
-        threading.Thread(target=lambda: made.append(drawn(figures.modulation_figure(problem.calset, [0]))))
+        threading.Thread(target=lambda: made.append(drawn(figures.modulation_figure(calset, [0]))))
         for _ in range(2)
     ]
     for thread in threads:

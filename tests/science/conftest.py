@@ -16,4 +16,4 @@ def calset() -> CalibrationSet:
 
 @pytest.fixture(scope="session")
 def calibration() -> Calibration:
-    return fitted_run(WITH_PLATE).calibration
+    return Calibration.from_fit(fitted_run(WITH_PLATE))

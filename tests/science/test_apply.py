@@ -15,8 +15,8 @@ from walop_jax.calibration.matrix import Settings
 from walop_jax.data import DataError
 from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.user_tables import read_input_table
+from walop_jax.model.build import nominal_instrument
 from walop_jax.model.effects import effect_by_name
-from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.specification import effect_context, make_model, with_effects
 from walop_jax.science import apply as application
 from walop_jax.science.apply import apply, linearised, not_carried_over
@@ -49,7 +49,9 @@ def stars(vectors, count, rng=None, plate=(None,), rotator=None, flux=4e6, teff=
     rows = []
     for k, setting in enumerate(plate):
         turn = 0.0 if rotator is None else 2 * np.deg2rad(rotator[k])
-        seen = (qu[:, 0] + 1j * qu[:, 1]) * np.exp(-1j * turn)  # contract: EVPA in the ICS = sky − ROTATOR
+        seen = (qu[:, 0] + 1j * qu[:, 1]) * np.exp(
+            -1j * turn
+        )  # docs: conventions, EVPA in the ICS = sky − ROTATOR
         a = vectors.exact(Setting("SDSS-r", setting), x, y, [teff])[:, 0]
         n = flux * np.einsum("pks,ps->pk", a, np.stack([np.ones(count), seen.real, seen.imag], axis=1))
         error = np.sqrt(n + 900.0)

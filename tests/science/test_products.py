@@ -9,17 +9,22 @@ import equinox as eqx
 import numpy as np
 import pytest
 from astropy.io import fits
-from fitted import Fitted
 from scipy import stats
 from small_run import SMALL
 from typer.testing import CliRunner
 
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify, validity
 from walop_jax.calibration.product import write_product
 from walop_jax.cli import app
 from walop_jax.data import write_calibration_set
-from walop_jax.science.epoch import chi2_tail, departure, epoch
+from walop_jax.fit.refit import refit
+from walop_jax.science.epoch import chi2_of_change, chi2_tail, epoch
 from walop_jax.simulation.simulate import simulate
+
+
+def calibrate(calset):
+    return Calibration.from_fit(refit(calset))
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +32,7 @@ def first():
     """An instrument, and what a first run has learnt of it."""
     run = simulate(SMALL, seed=5)
     calset = dataclasses.replace(run.calset, inputs=())
-    return run.truth, Fitted.to(calset).calibration
+    return run.truth, calibrate(calset)
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +41,7 @@ def product(first, tmp_path_factory):
 
     path = tmp_path_factory.mktemp("sets") / "first.fits"
     write_calibration_set(path, simulate(SMALL, seed=5).calset)
-    return Fitted.to(read_calibration_set(path)).calibration.to_product()
+    return calibrate(read_calibration_set(path)).to_product()
 
 
 def failed(product):
@@ -117,7 +122,7 @@ def test_tail_of_chi2_by_scipy():
 def test_departure_by_hand():
     """3-4-5: Δ = (3, 4) with unit errors, and a third parameter that nobody measured."""
     change, covariance = np.array([3.0, 4.0, 0.0]), np.diag([1.0, 1.0, 0.0])
-    assert departure(change, covariance, np.array([1.0, 1.0, 1.0])) == (pytest.approx(25.0), 2)
+    assert chi2_of_change(change, covariance, np.array([1.0, 1.0, 1.0])) == (pytest.approx(25.0), 2)
 
 
 def test_an_instrument_that_has_not_changed_still_fits(first):

@@ -18,19 +18,20 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.field_series import FieldSeries, colour_nodes, colour_weights, field_nodes
 from walop_jax.calibration.matrix import Settings, settings_plan
-from walop_jax.data.checks import FIELD_LIMITS
+from walop_jax.likelihood import limits
 from walop_jax.likelihood.nodes import rows_and_slopes
-from walop_jax.model import legendre, light
+from walop_jax.model import light
 from walop_jax.model.compiled import compiled
+from walop_jax.model.dependence import optical_indices
 from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import values_of, with_values
 from walop_jax.model.plan import Plan
-from walop_jax.model.specification import optical_indices, series_indices
+from walop_jax.model.specification import series_indices
 
 COLOURS = 12  # colour temperatures of the vectors
 DERIVATIVE_COLOURS = 3
@@ -39,8 +40,6 @@ DERIVATIVE_TERMS = (14, 20, 28, 40)
 TOLERANCE = 1e-7  # of a vector's largest element
 DERIVATIVE_TOLERANCE = 1e-3  # of a derivative's largest value: errors of errors
 REACH = 1.25  # of the calibrated field: beyond, no polynomial of the throughput means anything
-_CHUNK = 100  # field points that are computed together
-_CHECKS = 24  # field points at which a series is checked
 
 
 class Setting(NamedTuple):
@@ -64,32 +63,36 @@ class Local(NamedTuple):
 
 def _vectors(
     instrument: Instrument, plan: Plan, x: Float[Array, ""], y: Float[Array, ""]
-) -> Float[Array, "b 4 3"]:
+) -> Float[Array, "b k 3"]:
     rows = light.band_rows(instrument, plan, x, y)
     vectors = light.camera_vectors(instrument, rows, light.throughput_at(instrument, x, y), x, y)
-    return (vectors @ light.telescope(instrument))[..., :3]
+    return (vectors @ light.telescope(instrument, x, y))[..., :3]
 
 
 def _derivatives(
     instrument: Instrument, plan: Plan, x: Float[Array, ""], y: Float[Array, ""]
-) -> Float[Array, "n4 b 4 3"]:
+) -> Float[Array, "n2 b k 3"]:
     """Derivatives to all parameters (zero for the throughput series), then to the four local throughputs."""
-    values, to_instrument = ravel_pytree(instrument)
+    values, to_instrument = values_of(instrument), with_values(instrument)
     optical = np.asarray(optical_indices(instrument), int)
     plain = np.setdiff1d(np.arange(values.size), np.asarray(series_indices(instrument), int))
 
     def vectors(
-        rows: Float[Array, "b 2 2 4"], all_values: Float[Array, " n"], local: Float[Array, 4]
-    ) -> Float[Array, "b 4 3"]:
+        rows: Float[Array, "b r 4"], all_values: Float[Array, " n"], local: Float[Array, " k"]
+    ) -> Float[Array, "b k 3"]:
         there = to_instrument(all_values)
-        return (light.camera_vectors(there, rows, local, x, y) @ light.telescope(there))[..., :3]
+        return (light.camera_vectors(there, rows, local, x, y) @ light.telescope(there, x, y))[..., :3]
 
     rows, slopes = rows_and_slopes(instrument, plan, x, y)
     out, push = jax.linearize(vectors, rows, values, light.throughput_at(instrument, x, y))
-    no_rows, no_values, no_local = jnp.zeros_like(rows), jnp.zeros_like(values), jnp.zeros(4)
+    no_rows, no_values, no_local = (
+        jnp.zeros_like(rows),
+        jnp.zeros_like(values),
+        jnp.zeros(len(instrument.cameras)),
+    )
     d_rows = jnp.zeros((values.size, *rows.shape)).at[optical].set(slopes)
     d_plain = jax.vmap(lambda dr, dv: push(dr, dv, no_local))(d_rows[plain], jnp.eye(values.size)[plain])
-    d_local = jax.vmap(lambda dt: push(no_rows, no_values, dt))(jnp.eye(4))
+    d_local = jax.vmap(lambda dt: push(no_rows, no_values, dt))(jnp.eye(no_local.size))
     return jnp.concatenate([jnp.zeros((values.size, *out.shape)).at[plain].set(d_plain), d_local])
 
 
@@ -116,7 +119,7 @@ class AnalysisVectors:
         self.calibration = calibration
         self.instrument = calibration.model.instrument(calibration.values)
         reach = REACH * float(np.abs(calibration.field).max())
-        self.half_width = min(FIELD_LIMITS[calibration.model.name], reach)
+        self.half_width = min(calibration.model.template.field_limit, reach)
         self._tables: dict[Setting, _Table] = {}
         series = np.asarray(series_indices(self.instrument), int)
         uncertain = np.diag(calibration.covariance) > 0
@@ -168,10 +171,7 @@ class AnalysisVectors:
         y: Float[np.ndarray, " p"],
     ) -> Float[np.ndarray, "p 2 k"]:
         """Derivatives to `parameters`: those to the local throughputs are spread over the series."""
-        degree = self.instrument.throughput.degree
-        basis = np.asarray(
-            jax.vmap(lambda a, b: legendre.basis(a, b, degree))(jnp.asarray(x), jnp.asarray(y))
-        )
+        basis = np.asarray(self.instrument.throughput.basis(jnp.asarray(x), jnp.asarray(y)))
         spread = throughput[..., None] * basis[:, None, None, :]
         return np.concatenate([plain, spread.reshape(*plain.shape[:2], -1)], axis=-1)
 
@@ -205,7 +205,7 @@ class AnalysisVectors:
 
     def _vector_series(self, setting: Setting) -> FieldSeries:
         teff = [np.nan, *colour_nodes(COLOURS).tolist()]
-        x, y = np.random.default_rng(1).uniform(-self.half_width, self.half_width, (2, _CHECKS))
+        x, y = np.random.default_rng(1).uniform(-self.half_width, self.half_width, (2, limits.VECTOR_CHECKS))
         between = [2300.0, 3500.0, 5772.0, 12000.0]
         truth = self.exact(setting, x, y, [*between, np.nan])
         weights = colour_weights(np.array([*between, np.nan]), COLOURS)
@@ -214,7 +214,7 @@ class AnalysisVectors:
             at = field_nodes(count, self.half_width)
             values = self.exact(setting, *at, teff)
             series = FieldSeries.through(self.half_width, values.reshape(len(values), -1))
-            found = series(x, y).reshape(_CHECKS, COLOURS + 1, 4, 3)
+            found = series(x, y).reshape(limits.VECTOR_CHECKS, COLOURS + 1, 4, 3)
             error = float(np.abs(np.einsum("tc,pcks->ptks", weights, found) - truth).max() / truth.max())
             if error < TOLERANCE:
                 return series
@@ -230,7 +230,7 @@ class AnalysisVectors:
             values = _in_chunks(lambda a, b: _derivatives_at(self.instrument, plan, a, b), x, y)
             return np.moveaxis(values[:, wanted][:, :, bands], 1, -1).reshape(len(x), -1)
 
-        x, y = np.random.default_rng(2).uniform(-self.half_width, self.half_width, (2, _CHECKS))
+        x, y = np.random.default_rng(2).uniform(-self.half_width, self.half_width, (2, limits.VECTOR_CHECKS))
         truth = exact(x, y).reshape(-1, len(wanted))
         size = np.abs(truth).max(axis=0)
         error = np.inf
@@ -253,9 +253,9 @@ def _too_fast(error: float, tolerance: float) -> str:
 def _in_chunks(function, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> np.ndarray:  # type: ignore[no-untyped-def]
     """Apply a compiled function to slices of equal size: one compilation."""
     parts = []
-    for start in range(0, len(x), _CHUNK):
-        px, py = x[start : start + _CHUNK], y[start : start + _CHUNK]
-        pad = (0, _CHUNK - len(px))
+    for start in range(0, len(x), limits.VECTOR_POINTS):
+        px, py = x[start : start + limits.VECTOR_POINTS], y[start : start + limits.VECTOR_POINTS]
+        pad = (0, limits.VECTOR_POINTS - len(px))
         out = function(jnp.asarray(np.pad(px, pad, mode="edge")), jnp.asarray(np.pad(py, pad, mode="edge")))
         parts.append(np.asarray(out)[: len(px)])
     return np.concatenate(parts)

@@ -7,25 +7,28 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import importlib.metadata
-import platform
-from collections.abc import Mapping
+import functools
+import operator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from walop_jax.calibration.matrix import Settings, matrices
-from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, ParameterTable, Verdict, spelt
-from walop_jax.calibration.records import ResidualMap
+from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, ParameterTable, Verdict, in_ascii
+from walop_jax.calibration.records import Quality, ResidualMap
 from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import Exposures, FilterCurve, InputFile, Site, Sources
-from walop_jax.fit.model_builder import model_without_data
+from walop_jax.fit.model_builder import model_without_data, standard_names
 from walop_jax.fit.model_file import render
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult
+from walop_jax.instruments.description import parsed
 from walop_jax.io.errors import DataError, nearest
-from walop_jax.likelihood.problem import Problem, standard_names
-from walop_jax.model.instrument import nominal_instrument
+from walop_jax.io.software import software_versions
+from walop_jax.model.build import adapted, build, nominal_instrument
+from walop_jax.model.dependence import needs
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import Model, effect_context
 
 Vector = Float[np.ndarray, " n"]
@@ -38,18 +41,6 @@ ILL_CONDITIONED = (
 EXCESS_NOISE = 0.5  # sigma
 HIGH_CROSSTALK = 10.0  # condition number of the local 2 × 2 inverse
 TEMPERATURE_MARGIN = 2.0  # K beyond the temperatures of the exposures
-SOFTWARE = ("walop-jax", "jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy", "astropy", "speclite")
-
-
-def software_versions() -> dict[str, str]:
-    """Versions of Python, of this package and of what its results rest on."""
-    versions = {"python": platform.python_version()}
-    for name in SOFTWARE:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions[name] = "unknown"
-    return versions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,9 +64,12 @@ class Calibration:
     residuals: ResidualMap | None = None
 
     @classmethod
-    def from_fit(cls, result: FitResult, problem: Problem) -> Calibration:
-        """The calibration that a fit gives, with the verdict on it (see `quality`)."""
-        calset = problem.calset
+    def from_fit(cls, result: FitResult, residuals: ResidualMap | None = None) -> Calibration:
+        """The calibration that a fit gives, with the verdict on it (see `quality`).
+
+        `residuals` is what the model leaves over the field (`residual_map`), worth its pass for large sets.
+        """
+        calset = result.calset
         verdict = Verdict(
             chi2=result.chi2,
             dof=result.dof,
@@ -96,8 +90,9 @@ class Calibration:
             sources=calset.sources,
             site=calset.site,
             origin=calset.origin,
-            field=problem.field,
+            field=result.posterior.census.field,
             inputs=calset.inputs,
+            residuals=residuals,
         )
 
     @property
@@ -109,8 +104,8 @@ class Calibration:
 
     def matrix(
         self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings | None = None
-    ) -> tuple[Float[np.ndarray, "p 6"], Float[np.ndarray, "p 6 6"]]:
-        """m21, m22, m23, m31, m32, m33 and their covariance at field positions (deg), a setting for each.
+    ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
+        """m21, m22, m23, m31, … and their covariance at field positions (deg), a setting for each.
 
         Without `settings`: SDSS-r, a flat photon spectrum, calibration plate out. Raises `DataError` for a
         filter that neither the calibration nor the package knows.
@@ -134,24 +129,27 @@ class Calibration:
         x: Float[np.ndarray, " p"],
         y: Float[np.ndarray, " p"],
         settings: Settings,
-        values: Float[np.ndarray, "p 6"],
+        values: Float[np.ndarray, "p m"],
     ) -> Int[np.ndarray, " p"]:
-        """Quality bits (`QUALITY_BITS`) of matrices at field positions: 16, 32 and 64."""
+        """Bits of `Quality` of matrices at field positions: high cross-talk, beyond the field or the settings.
+
+        A single arm sees one combination of q and u, which has no inverse: it is marked only where it sees neither.
+        """
         flags = np.zeros(len(x), np.int64)
-        blocks = values[:, [[1, 2], [4, 5]]]
+        blocks = values.reshape(len(x), values.shape[1] // 3, 3)[:, :, 1:]
         known = np.all(np.isfinite(values), axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            condition = np.linalg.cond(np.where(known[:, None, None], blocks, np.eye(2)))
-        flags[~(condition <= HIGH_CROSSTALK)] |= 16
+            condition = np.linalg.cond(np.where(known[:, None, None], blocks, np.eye(*blocks.shape[1:])))
+        flags[~(condition <= HIGH_CROSSTALK)] |= Quality.HIGH_CROSSTALK
         margin = 0.5 / MAP_SIZE * (self.field[1] - self.field[0])
         low_x, low_y = self.field[0] - margin, self.field[2] - margin
         high_x, high_y = self.field[1] + margin, self.field[3] + margin
-        flags[(x < low_x) | (x > high_x) | (y < low_y) | (y > high_y)] |= 32
-        flags[~np.isin(settings.filter, np.unique(self.exposures.filter))] |= 64
-        if any("temperature" in effect.optics_depend_on for effect in self.model.template.effects):
+        flags[(x < low_x) | (x > high_x) | (y < low_y) | (y > high_y)] |= Quality.BEYOND_FIELD
+        flags[~np.isin(settings.filter, np.unique(self.exposures.filter))] |= Quality.BEYOND_SETTINGS
+        if "temperature" in needs(self.model.template).conditions:
             low, high = np.nanmin(self.exposures.temp), np.nanmax(self.exposures.temp)
             beyond = (settings.temp < low - TEMPERATURE_MARGIN) | (settings.temp > high + TEMPERATURE_MARGIN)
-            flags[beyond] |= 64
+            flags[beyond] |= Quality.BEYOND_SETTINGS
         return flags
 
     def maps(self, size: int = MAP_SIZE) -> MatrixMaps:
@@ -168,7 +166,7 @@ class Calibration:
         points = grid.points
         values, covariance = self.matrix(points.x, points.y, Settings.default(size * size, name))
         errors = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
-        planes = (6, size, size)
+        planes = (-1, size, size)
         return MatrixMaps(grid, name, values.T.reshape(planes), errors.T.reshape(planes))
 
     # ------------------------------------------------------------------------------- into a file and back
@@ -178,11 +176,11 @@ class Calibration:
         parameters = self.model.parameters
         priors = np.array([p.prior or (np.nan, np.nan) for p in parameters]).reshape(-1, 2)
         maps = self.maps()
-        texts = tuple(spelt(text) for text in self.verdict.warnings)
+        texts = tuple(in_ascii(text) for text in self.verdict.warnings)
         return CalibrationProduct(
             instrument=self.model.name,
             site=self.site,
-            origin=spelt(self.origin),
+            origin=in_ascii(self.origin),
             date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds").replace("+00:00", ""),
             verdict=dataclasses.replace(self.verdict, warnings=texts),
             parameters=ParameterTable(
@@ -200,31 +198,34 @@ class Calibration:
             exposures=self.exposures,
             filters=self.filters,
             sources=self.sources,
-            model=tuple(spelt(line) for line in render(self.model).splitlines() if line.strip()),
+            model=tuple(_lines(render(self.model))),
             inputs=self.inputs,
             versions=software_versions(),
             residuals=self.residuals,
+            description=tuple(_lines(self.model.template.description)),
         )
 
     @classmethod
     def from_product(cls, product: CalibrationProduct) -> Calibration:
-        """The calibration that a product holds.
+        """The calibration that a product holds; parameters go by name, whatever their order there.
 
         Raises ValueError if the model of the product cannot be rebuilt, or has other parameters than it
         lists.
         """
         model = rebuild(product)
-        names = tuple(str(name) for name in product.parameters.name)
-        if model.names != names:
-            odd = sorted(set(model.names) ^ set(names))
+        names = [str(name) for name in product.parameters.name]
+        if sorted(model.names) != sorted(names):
+            odd = sorted(set(model.names) ^ set(names)) or ["one of them twice"]
             raise DataError(
                 f"the model of the product has other parameters than it lists ({', '.join(odd[:3])}): it was "
                 "made by a version with other physics; fit again"
             )
+        place = {name: n for n, name in enumerate(names)}
+        order = np.array([place[name] for name in model.names])
         return cls(
             model=model,
-            values=product.parameters.value,
-            covariance=product.covariance,
+            values=product.parameters.value[order],
+            covariance=product.covariance[np.ix_(order, order)],
             verdict=product.verdict,
             filters=product.filters,
             exposures=product.exposures,
@@ -237,25 +238,43 @@ class Calibration:
         )
 
 
+def _lines(text: str) -> Iterator[str]:
+    return (in_ascii(line) for line in text.splitlines() if line.strip())
+
+
+def instrument_as_designed(product: CalibrationProduct) -> Instrument:
+    """The instrument of a product as designed, from the description that it holds or that comes with the package.
+
+    Raises `DataError` for elements that only the fit has known: such a product is rebuilt where they are known.
+    """
+    if not product.description:
+        return nominal_instrument(product.instrument)
+    return build(
+        parsed("\n".join(product.description), f"the description of {product.instrument} in the product")
+    )
+
+
 def rebuild(product: CalibrationProduct) -> Model:
     """The model of a product from its lines of TOML, its standards and its exposures."""
     sources = product.sources
     names = standard_names(sources)
     standards = list(zip(names, sources.q.tolist(), sources.u.tolist(), strict=True))
-    context = effect_context(nominal_instrument(product.instrument, standards=standards), product.exposures)
-    return model_without_data(
-        product.instrument, "\n".join(product.model), standards=standards, context=context
-    )
+    design = instrument_as_designed(product)
+    context = effect_context(adapted(design, standards=standards), product.exposures)
+    return model_without_data(design, "\n".join(product.model), standards=standards, context=context)
 
 
-def quality(result: FitResult) -> int:
-    """Quality bits of a fit as a whole (`QUALITY_BITS`): 1, 2, 4, 8 and 8192."""
-    bits = 0 if result.converged else 1
-    bits |= 2 if result.minimum.condition > ILL_CONDITIONED * result.n_data else 0
-    bits |= 4 if len(at_prior_edge(result)) else 0
+def quality(result: FitResult) -> Quality:
+    """What is to be said against a fit as a whole."""
     ratio = result.chi2 / max(result.dof, 1)
-    bits |= 8 if max(ratio, result.noise_scale**2) > 1.0 + EXCESS_NOISE**2 else 0
-    return bits | (0 if result.explains_data else 8192)
+    held_against = {
+        Quality.NOT_CONVERGED: not result.converged,
+        Quality.ILL_CONDITIONED: result.minimum.condition > ILL_CONDITIONED * result.n_data,
+        Quality.AT_PRIOR_EDGE: len(at_prior_edge(result)) > 0,
+        Quality.EXCESS_NOISE: max(ratio, result.noise_scale**2) > 1.0 + EXCESS_NOISE**2,
+        Quality.UNEXPLAINED: not result.explains_data,
+    }
+    return functools.reduce(operator.or_, (bit for bit, holds in held_against.items() if holds), Quality(0))
 
 
 def at_prior_edge(result: FitResult) -> tuple[str, ...]:

@@ -15,11 +15,11 @@ from jaxtyping import Float
 from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import CalibrationProduct
-from walop_jax.data.checks import FIELD_LIMITS
+from walop_jax.calibration.records import Quality
 from walop_jax.data.filters import BUILTIN_FILTERS
 
-SAME = 1e-7  # between maps in the file and maps of its parameters, on another machine
-NEGATIVE = 1e-4  # of the response to unpolarised light: what "less than no light" may be
+MAP_TOLERANCE = 1e-7  # between maps in the file and maps of its parameters, on another machine
+DARKEST = 1e-4  # of the response to unpolarised light: what "less than no light" may be
 _POINTS = 64
 
 
@@ -65,14 +65,20 @@ def _verdict(product: CalibrationProduct) -> list[Check]:
     v = product.verdict
     return [
         Check(
-            "converged", v.converged and not v.quality & 1, "the minimum was reached" if v.converged else "no"
+            "converged",
+            v.converged and not v.quality & Quality.NOT_CONVERGED,
+            "the minimum was reached" if v.converged else "no",
         ),
         Check(
             "explains the data",
-            v.trusted and not v.quality & 8192,
+            v.trusted and not v.quality & Quality.UNEXPLAINED,
             f"χ²/dof = {v.chi2 / max(v.dof, 1):.4f}" + "".join(f"; {text}" for text in v.warnings),
         ),
-        Check("conditioned", not v.quality & 2, "ill-conditioned" if v.quality & 2 else "well"),
+        Check(
+            "conditioned",
+            not v.quality & Quality.ILL_CONDITIONED,
+            "ill-conditioned" if v.quality & Quality.ILL_CONDITIONED else "well",
+        ),
     ]
 
 
@@ -112,15 +118,17 @@ def _maps(product: CalibrationProduct, calibration: Calibration) -> Check:
         return Check("maps", False, "do not lie on the grid that this program makes")
     off = float(np.abs(again.values - product.maps.values).max())
     errors = float(np.abs(again.errors / np.maximum(product.maps.errors, 1e-30) - 1.0).max())
-    return Check("maps", off < SAME and errors < 1e-4, f"differ from those of the parameters by {off:.1e}")
+    return Check(
+        "maps", off < MAP_TOLERANCE and errors < 1e-4, f"differ from those of the parameters by {off:.1e}"
+    )
 
 
 def _physics(calibration: Calibration) -> Check:
     """No camera sees less than no light, whatever the polarisation: a₀ ≥ √(a₁² + a₂²)."""
-    limit = min(FIELD_LIMITS[calibration.model.name], float(np.abs(calibration.field).max()))
+    limit = min(calibration.model.template.field_limit, float(np.abs(calibration.field).max()))
     x, y = np.random.default_rng(0).uniform(-limit, limit, (2, _POINTS))
     name = str(np.unique(calibration.exposures.filter)[0])
     vectors = AnalysisVectors(calibration).exact(Setting(name), x, y, [np.nan])[:, 0]
     darkest = float(np.min(1.0 - np.hypot(vectors[..., 1], vectors[..., 2]) / vectors[..., 0]))
-    good = bool(np.all(vectors[..., 0] > 0)) and darkest > -NEGATIVE
+    good = bool(np.all(vectors[..., 0] > 0)) and darkest > -DARKEST
     return Check("physics", good, f"least light a camera sees: {darkest:.1e} of unpolarised")

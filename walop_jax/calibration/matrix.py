@@ -14,19 +14,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from walop_jax.data.records import Exposures, FilterCurve
+from walop_jax.likelihood import limits
 from walop_jax.likelihood.nodes import rows_and_slopes
-from walop_jax.model import legendre, light
+from walop_jax.model import light
 from walop_jax.model.compiled import compiled
+from walop_jax.model.dependence import optical_indices
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.plan import Plan, plan_for
-from walop_jax.model.specification import optical_indices, series_indices
-
-CHUNK = 256  # field points that are computed together
-SMALL_CHUNK = 16
+from walop_jax.model.parameters import values_of, with_values
+from walop_jax.model.plan import Plan
+from walop_jax.model.planning import plan_for
+from walop_jax.model.ray import Conditions
+from walop_jax.model.specification import series_indices
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,41 +76,41 @@ def settings_plan(settings: Settings, filters: Mapping[str, FilterCurve], instru
         clp_in=off, clp_angle=nan, chwp_in=chwp_in, chwp_angle=settings.chwp_angle, temp=settings.temp,
         ha=settings.ha, ra=nan, dec=nan, rotator=nan, teff=settings.teff,
     )  # fmt: skip
-    return plan_for(instrument.effects, exposures, filters)
+    return plan_for(instrument, exposures, filters)
 
 
 def _point_vectors(
     instrument: Instrument, plan: Plan, x: Float[Array, ""], y: Float[Array, ""]
-) -> Float[Array, "b 4 4"]:
+) -> Float[Array, "b k 4"]:
     rows = light.band_rows(instrument, plan, x, y)
     return light.camera_vectors(instrument, rows, light.throughput_at(instrument, x, y), x, y)
 
 
 def _point_matrix(
     instrument: Instrument, plan: Plan, x: Float[Array, ""], y: Float[Array, ""]
-) -> tuple[Float[Array, "b 2 3"], Float[Array, "b 2 3 n"]]:
+) -> tuple[Float[Array, "b a 3"], Float[Array, "b a 3 n"]]:
     """Instrument matrices of a field point and their derivatives with respect to all parameters."""
-    values, to_instrument = ravel_pytree(instrument)
+    values, to_instrument = values_of(instrument), with_values(instrument)
     optical = np.asarray(optical_indices(instrument), int)
     series = np.asarray(series_indices(instrument), int)
     plain = np.setdiff1d(np.arange(values.size), series)
-    basis = legendre.basis(x, y, instrument.throughput.degree)
+    basis = instrument.throughput.basis(x, y)
     throughput = light.throughput_at(instrument, x, y)
 
     def matrix(
-        rows: Float[Array, "b 2 2 4"], all_values: Float[Array, " n"], local: Float[Array, 4]
-    ) -> Float[Array, "b 2 3"]:
+        rows: Float[Array, "b r 4"], all_values: Float[Array, " n"], local: Float[Array, " k"]
+    ) -> Float[Array, "b a 3"]:
         there = to_instrument(all_values)
         vectors = light.camera_vectors(there, rows, local, x, y)
-        return light.instrument_matrix(vectors @ light.telescope(there))
+        return light.instrument_matrix(vectors @ light.telescope(there, x, y), there.cameras.pairs)
 
     rows, slopes = rows_and_slopes(instrument, plan, x, y)
     m, push = jax.linearize(matrix, rows, values, throughput)
     d_rows = jnp.zeros((values.size, *rows.shape)).at[optical].set(slopes)
     unit = jnp.eye(values.size)
-    d_plain = jax.vmap(lambda dr, dv: push(dr, dv, jnp.zeros(4)))(d_rows[plain], unit[plain])
+    d_plain = jax.vmap(lambda dr, dv: push(dr, dv, jnp.zeros_like(throughput)))(d_rows[plain], unit[plain])
     zero_rows, zero_values = jnp.zeros_like(rows), jnp.zeros_like(values)
-    d_local = jax.vmap(lambda dt: push(zero_rows, zero_values, dt))(jnp.eye(4))
+    d_local = jax.vmap(lambda dt: push(zero_rows, zero_values, dt))(jnp.eye(throughput.size))
     d_series = (d_local[:, None] * basis[None, :, None, None, None]).reshape(series.size, *m.shape)
     derivative = jnp.zeros((values.size, *m.shape)).at[plain].set(d_plain).at[series].set(d_series)
     return m, jnp.moveaxis(derivative, 0, -1)
@@ -128,23 +129,25 @@ class _Row(NamedTuple):
 def _row_plan(plan: Plan, row: _Row) -> Plan:
     """The plan of a layout (one band) with the numbers of a row."""
     nodes = plan.wavelength.shape
-    conditions = plan.conditions._replace(
-        temperature=jnp.broadcast_to(row.temperature, nodes),
-        hour_angle=jnp.broadcast_to(row.hour_angle, nodes),
-    )
+    own = {"temperature": row.temperature, "hour_angle": row.hour_angle}
+    planned = {
+        name: jnp.broadcast_to(own[name], nodes) if name in own else value
+        for name, value in plan.conditions.planned.items()
+    }
+    conditions = Conditions(plan.conditions.band_width, planned)
     changed = (jnp.broadcast_to(row.teff, plan.teff.shape), conditions)
     return eqx.tree_at(lambda p: (p.teff, p.conditions), plan, changed)
 
 
 def _matrices_with_covariance(
     instrument: Instrument, plan: Plan, rows: _Row, covariance: Float[Array, "n n"]
-) -> tuple[Float[Array, "p 6"], Float[Array, "p 6 6"]]:
-    def one(row: _Row) -> tuple[Float[Array, "b 2 3"], Float[Array, "b 2 3 n"]]:
+) -> tuple[Float[Array, "p m"], Float[Array, "p m m"]]:
+    def one(row: _Row) -> tuple[Float[Array, "b a 3"], Float[Array, "b a 3 n"]]:
         return _point_matrix(instrument, _row_plan(plan, row), row.x, row.y)
 
     m, derivative = jax.vmap(one)(rows)
-    flat = derivative[:, 0].reshape(len(m), 6, -1)
-    return m[:, 0].reshape(len(m), 6), jnp.einsum("pin,nk,pjk->pij", flat, covariance, flat)
+    flat = derivative[:, 0].reshape(len(m), m.shape[2] * 3, -1)
+    return m[:, 0].reshape(len(m), -1), jnp.einsum("pin,nk,pjk->pij", flat, covariance, flat)
 
 
 _matrices = compiled(_matrices_with_covariance)
@@ -153,7 +156,7 @@ _vectors = compiled(jax.vmap(_point_vectors, in_axes=(None, None, 0, 0)))
 
 def analysis_vectors(
     instrument: Instrument, plan: Plan, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]
-) -> Float[np.ndarray, "p b 4 4"]:
+) -> Float[np.ndarray, "p b k 4"]:
     """Analysis vectors (point, band, camera, Stokes) at field positions in degrees."""
     return _in_chunks(lambda a, b: (_vectors(instrument, plan, a, b),), x, y)[0]
 
@@ -165,12 +168,13 @@ def matrices(
     x: Float[np.ndarray, " p"],
     y: Float[np.ndarray, " p"],
     covariance: Float[np.ndarray, "n n"],
-) -> tuple[Float[np.ndarray, "p 6"], Float[np.ndarray, "p 6 6"]]:
+) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
     """Instrument matrix (m21, m22, m23, m31, m32, m33) and its covariance at field positions (deg).
 
     `settings` has one row per position. Raises KeyError for a filter that `filters` does not hold.
     """
-    values, errors = np.empty((len(x), 6)), np.empty((len(x), 6, 6))
+    size = 3 * len(instrument.arms)
+    values, errors = np.empty((len(x), size)), np.empty((len(x), size, size))
     cov = jnp.asarray(covariance)
     columns = (x, y, np.nan_to_num(settings.teff), settings.temp, settings.ha)
     for layout, rows in settings.layouts():
@@ -184,7 +188,8 @@ def matrices(
 def _in_chunks(function: Callable[..., Any], *columns: Float[np.ndarray, " p"]) -> tuple[np.ndarray, ...]:
     """Apply a compiled function to slices of the columns, padded to one of two sizes: two compilations."""
     count = len(columns[0])
-    size = SMALL_CHUNK if count <= SMALL_CHUNK else CHUNK
+    few, many = limits.MATRIX_POINTS
+    size = few if count <= few else many
     parts = []
     for start in range(0, count, size):
         slices = [column[start : start + size] for column in columns]

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import Settings
-from walop_jax.calibration.product import MATRIX_NAMES
+from walop_jax.calibration.records import Quality, matrix_names
 
 
 def matrix_columns(
@@ -17,21 +17,22 @@ def matrix_columns(
     settings: Settings,
     outside: Bool[np.ndarray, " p"],
 ) -> dict[str, tuple[np.ndarray, str]]:
-    """M21 … M33, their standard errors and FLAG, each with its description; NaN and 32 where `outside`.
+    """The matrix elements, their standard errors and FLAG, each with its description; NaN and 32 where `outside`.
 
     Raises `DataError` for a filter that neither the calibration nor the package knows.
     """
-    values, errors = np.full((len(x), 6), np.nan), np.full((len(x), 6), np.nan)
     inside = np.flatnonzero(~outside)
-    if inside.size:
-        values[inside], covariance = calibration.matrix(x[inside], y[inside], settings[inside])
-        errors[inside] = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
-    flag = np.full(len(x), 32, np.int32)
+    there, covariance = calibration.matrix(x[inside], y[inside], settings[inside])
+    values, errors = np.full((2, len(x), there.shape[1]), np.nan)
+    values[inside] = there
+    errors[inside] = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
+    flag = np.full(len(x), Quality.BEYOND_FIELD, np.int32)
     flag[inside] = calibration.flags(x[inside], y[inside], settings[inside], values[inside])
     columns: dict[str, tuple[np.ndarray, str]] = {}
-    for k, name in enumerate(MATRIX_NAMES):
+    names = matrix_names(values.shape[1] // 3)
+    for k, name in enumerate(names):
         columns[name] = values[:, k], f"element {name.lower()} of the instrument matrix"
-    for k, name in enumerate(MATRIX_NAMES):
+    for k, name in enumerate(names):
         columns[f"{name}_ERR"] = errors[:, k], f"standard error of {name}"
     columns["FLAG"] = flag, "16 high cross-talk, 32 beyond the calibrated field, 64 filter or temperature"
     return columns

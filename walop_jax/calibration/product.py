@@ -1,25 +1,28 @@
-"""The calibration product, `calibration.fits` (PRODVERS = 1): what a fit has learnt, complete in one file.
+"""The calibration product, `calibration.fits`: what a fit has learnt, complete in one file.
 
     PRIMARY      instrument, verdict of the fit, validity (dates, temperatures, filters), versions of the software,
                  hash of the content
     PARAMETERS   NAME, VALUE, SIGMA, UNIT, PRIOR_MEAN, PRIOR_WIDTH, FREE
     COVARIANCE   image, in the order of PARAMETERS; tied and frozen parameters included
     M21 … M33    images of the instrument matrix over the field (filter of MAPFILT, flat photon spectrum,
-                 calibration plate out), M21_ERR … M33_ERR their standard errors; linear WCS in degrees
+                 calibration plate out), M21_ERR … M33_ERR their standard errors; linear WCS in degrees; three for
+                 each arm of the instrument, further moving elements at ANGLE1, … of the elements ELEM1, …
     RESIDUAL…    of a large set: what the smooth model leaves, in cells of the field (see residual_map.py)
     FILTERS      the filter curves that were used          } as in a calibration set
     EXPOSURES    the exposures that went in                }
     SOURCES      the standards, if there were any          }
     MODEL        LINE: the model file of the fit, line by line
+    INSTRUMENT   LINE: the description file of an instrument that does not come with the package
     INPUTS       PATH, SHA256 of the calibration sets
     WARNINGS     TEXT: what does not hold
 
-FITS headers and tables hold ASCII only: Greek letters and signs are spelt out when a product is made.
+PRODVERS is 2 for an instrument that is none of the first three or has not two arms, for further moving elements and
+for lamps, otherwise 1. FITS headers and tables hold ASCII only: Greek letters and signs are spelt out when a product
+is made.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import re
 from collections.abc import Iterable, Mapping
@@ -29,42 +32,44 @@ from typing import Any, NoReturn
 import numpy as np
 from astropy.io import fits
 
+from walop_jax.calibration.product_header import (
+    PRODVERS,
+    ProductHeader,
+    position_cards,
+    primary_hdu,
+    product_version,
+    read_positions,
+)
 from walop_jax.calibration.records import (
-    MATRIX_NAMES,
-    QUALITY_BITS,
     CalibrationProduct,
     MatrixMaps,
     ParameterTable,
     Verdict,
-    spelt,
+    in_ascii,
+    matrix_names,
 )
 from walop_jax.calibration.residual_map_file import read_residual_map, residual_hdus
 from walop_jax.data import schema
 from walop_jax.data.calset import empty_sources
-from walop_jax.data.checks import INSTRUMENTS, make_exposures, make_filters, make_sources
+from walop_jax.data.checks import instrument_name, make_exposures, make_filters, make_sources
 from walop_jax.data.frames import read_grid
 from walop_jax.data.records import InputFile, Site
-from walop_jax.data.schema import Column, Place, read_table
-from walop_jax.data.write import filter_columns, grid_cards, sign_and_write, table_hdu
+from walop_jax.data.schema import Column, Place, column_names, read_table, table_rules
+from walop_jax.data.write import exposures_hdu, filter_columns, grid_cards, sign_and_write, table_hdu
 from walop_jax.io.atomic import atomic_path
-from walop_jax.io.errors import DataError, fail, nearest
+from walop_jax.io.errors import DataError, fail
 from walop_jax.io.fits_reading import UNREADABLE, OpenFile, one_line, open_fits
 
 __all__ = [
-    "MATRIX_NAMES",
     "PRODVERS",
-    "QUALITY_BITS",
     "CalibrationProduct",
     "MatrixMaps",
     "ParameterTable",
     "Verdict",
+    "in_ascii",
     "read_product",
-    "spelt",
     "write_product",
 ]
-
-PRODVERS = 1
-"""Version of the file format that is written, and the newest that is read."""
 
 _RULES: Mapping[str, Mapping[str, Column]] = {
     "PARAMETERS": {
@@ -77,14 +82,13 @@ _RULES: Mapping[str, Mapping[str, Column]] = {
         "FREE": Column("bool"),
     },
     "MODEL": {"LINE": Column("str")},
+    "INSTRUMENT": {"LINE": Column("str")},
     "INPUTS": {"PATH": Column("str"), "SHA256": Column("str")},
     "WARNINGS": {"TEXT": Column("str")},
-    "EXPOSURES": schema.EXPOSURES,
     "FILTERS": schema.FILTERS,
     "SOURCES": schema.SOURCES,
 }
-_IMAGES = ("COVARIANCE", *MATRIX_NAMES, *(f"{name}_ERR" for name in MATRIX_NAMES))
-_LONGEST_SOFTWARE_LIST = 30
+_MATRIX_IMAGE = re.compile(r"M([1-9][0-9]{0,2})[123](_ERR)?")
 
 
 # ------------------------------------------------------------------------------------------------- writing
@@ -106,82 +110,35 @@ def _hdus(product: CalibrationProduct, path: object) -> list[Any]:
     tables = {
         "PARAMETERS": {name: getattr(parameters, name.lower()) for name in _RULES["PARAMETERS"]},
         "FILTERS": filter_columns(product.filters),
-        "EXPOSURES": {name: getattr(product.exposures, name.lower()) for name in schema.EXPOSURES},
         "MODEL": {"LINE": _strings(product.model)},
     }
+    if product.description:
+        tables["INSTRUMENT"] = {"LINE": _strings(product.description)}
     if len(product.sources):
         tables["SOURCES"] = {name: getattr(product.sources, name.lower()) for name in schema.SOURCES}
     if product.inputs:
-        paths = _strings(spelt(str(entry.path)) for entry in product.inputs)
+        paths = _strings(in_ascii(str(entry.path)) for entry in product.inputs)
         tables["INPUTS"] = {"PATH": paths, "SHA256": _strings(entry.sha256 for entry in product.inputs)}
     if product.verdict.warnings:
         tables["WARNINGS"] = {"TEXT": _strings(product.verdict.warnings)}
     made = {name: table_hdu(name, columns, path, _RULES[name]) for name, columns in tables.items()}
+    version = product_version(product)
+    instrument_name(product.instrument, version, Place(path, "PRIMARY"))
+    exposures = exposures_hdu(product.exposures, version, path)
     images = [fits.ImageHDU(product.covariance, name="COVARIANCE")]
     for suffix, maps in (("", product.maps.values), ("_ERR", product.maps.errors)):
-        for name, image in zip(MATRIX_NAMES, maps, strict=True):
+        for name, image in zip(product.maps.names, maps, strict=True):
             images.append(fits.ImageHDU(image, name=name + suffix))
-            images[-1].header.update(grid_cards(product.maps.grid))
+            images[-1].header.update(grid_cards(product.maps.grid) | position_cards(product.maps.positions))
     if product.residuals is not None:
         images += residual_hdus(product.residuals)
-    return [_primary(product), made.pop("PARAMETERS"), *images, *made.values()]
+    parameters_hdu, filters = made.pop("PARAMETERS"), made.pop("FILTERS")
+    primary = primary_hdu(product, version)
+    return [primary, parameters_hdu, *images, filters, exposures, *made.values()]
 
 
 def _strings(values: Iterable[str]) -> np.ndarray:
     return np.array(list(values), dtype=np.str_)
-
-
-def _primary(product: CalibrationProduct) -> fits.PrimaryHDU:
-    verdict, site = product.verdict, product.site
-    primary = fits.PrimaryHDU()
-    cards: dict[str, tuple[Any, str]] = {
-        "TELESCOP": (site.telescope, ""),
-        "INSTRUME": (product.instrument, ""),
-        "PRODVERS": (PRODVERS, "version of the calibration product format"),
-        "ORIGIN": (product.origin, ""),
-        "CREATOR": ("walop-jax", ""),
-        "DATE": (product.date, "UTC, when the product was made"),
-        "SITELAT": (site.latitude, "[deg] latitude"),
-        "SITELONG": (site.longitude, "[deg] longitude, east positive"),
-        "SITEELEV": (site.elevation, "[m] elevation"),
-        "TRUSTED": (verdict.trusted, "converged and explains the data"),
-        "CONVERGD": (verdict.converged, "the minimum was reached"),
-        "CHI2": (verdict.chi2, "chi squared of data and priors"),
-        "DOF": (verdict.dof, "degrees of freedom"),
-        "NDATA": (verdict.n_data, "intensities used"),
-        "NOISESCL": (verdict.noise_scale, "factor on the errors of the data"),
-        "QUALITY": (verdict.quality, "bit mask, 0 is good"),
-        "COVFROM": (verdict.covariance_from, "what COVARIANCE is of"),
-        "MAPFILT": (product.maps.filter, "filter of the maps M21...M33"),
-        **{
-            f"FIELD{side}": (value, "[deg] extent of the field points used")
-            for side, value in zip(("XMI", "XMA", "YMI", "YMA"), product.field, strict=True)
-        },
-        **_validity(product),
-        "CONTHASH": (product.content_hash(), ""),
-    }
-    for name, (value, comment) in cards.items():
-        if isinstance(value, float) and not np.isfinite(value):
-            continue  # FITS headers know no NaN; a missing card is read as one
-        primary.header[name] = (spelt(value) if isinstance(value, str) else value, comment)
-    for number, (name, version) in enumerate(product.versions.items(), start=1):
-        primary.header[f"SOFT{number}"] = spelt(f"{name} {version}")
-    return primary
-
-
-def _validity(product: CalibrationProduct) -> dict[str, tuple[Any, str]]:
-    """What the product may be applied to, for a look: EXPOSURES says the same."""
-    cards: dict[str, tuple[Any, str]] = {}
-    for values, names, comment in (
-        (product.exposures.mjd, ("MJD-BEG", "MJD-END"), "[d] UTC of the exposures"),
-        (product.exposures.temp, ("TEMPMIN", "TEMPMAX"), "[Celsius] of the exposures"),
-    ):
-        known = values[np.isfinite(values)]
-        if known.size:
-            cards |= {names[0]: (float(known.min()), comment), names[1]: (float(known.max()), comment)}
-    for number, name in enumerate(np.unique(product.exposures.filter).tolist(), start=1):
-        cards[f"FILTER{number}"] = (name, "")
-    return cards
 
 
 # ------------------------------------------------------------------------------------------------- reading
@@ -206,8 +163,8 @@ def read_product(path: str | os.PathLike[str]) -> CalibrationProduct:
 
 def _from_hdus(opened: OpenFile) -> CalibrationProduct:
     path = opened.path
-    header = _Header(opened.hdus[0].header, Place(path, "PRIMARY"))
-    header.check_version()
+    header = ProductHeader(opened.hdus[0].header, Place(path, "PRIMARY"))
+    version = header.version()
     units: dict[str, Any] = {}
     for hdu in opened.hdus[1:]:
         name = hdu.name.strip().upper()
@@ -217,33 +174,26 @@ def _from_hdus(opened: OpenFile) -> CalibrationProduct:
 
     def table(name: str, *, optional: bool = False) -> dict[str, Any] | None:
         if name in units:
-            return read_table(units[name], _RULES[name], Place(path, name))[0]
+            place = Place(path, name)
+            rules = _RULES.get(name) or table_rules(name, version, column_names(units[name], place), place)
+            return read_table(units[name], rules, place)[0]
         if optional:
             return None
         _missing(path, name)
 
-    images = {name: _image(units, name, path) for name in _IMAGES}
-    grid = read_grid(units[MATRIX_NAMES[0]].header, Place(path, MATRIX_NAMES[0]))
-    shape = (grid.height, grid.width)
-    for name in _IMAGES[1:]:
-        if images[name].shape != shape or read_grid(units[name].header, Place(path, name)) != grid:
-            raise fail(f"does not lie on the grid of {MATRIX_NAMES[0]}", file=path, extension=name)
-    maps = MatrixMaps(
-        grid=grid,
-        filter=header.text("MAPFILT"),
-        values=np.stack([images[name] for name in MATRIX_NAMES]),
-        errors=np.stack([images[f"{name}_ERR"] for name in MATRIX_NAMES]),
-    )
+    covariance = _image(units, "COVARIANCE", path)
+    maps = _maps(units, header.text("MAPFILT"), version, path)
     parameters = _parameters(table("PARAMETERS"), Place(path, "PARAMETERS"))
-    _check_covariance(images["COVARIANCE"], parameters, Place(path, "COVARIANCE"))
+    _check_covariance(covariance, parameters, Place(path, "COVARIANCE"))
     site = Site(
         header.text("TELESCOP"), *(header.number(f"SITE{n}", np.nan) for n in ("LAT", "LONG", "ELEV"))
     )
     filters = make_filters(table("FILTERS") or {}, Place(path, "FILTERS"))
     sources, inputs = table("SOURCES", optional=True), table("INPUTS", optional=True)
     warnings, model = table("WARNINGS", optional=True), table("MODEL") or {}
+    description = table("INSTRUMENT", optional=True)
     product = CalibrationProduct(
-        instrument=header.instrument(),
+        instrument=header.instrument(version),
         site=site,
         origin=header.text("ORIGIN"),
         date=header.text("DATE"),
@@ -259,13 +209,15 @@ def _from_hdus(opened: OpenFile) -> CalibrationProduct:
             covariance_from=header.text("COVFROM") or "fit",
         ),
         parameters=parameters,
-        covariance=images["COVARIANCE"],
+        covariance=covariance,
         maps=maps,
         field=(
             header.number("FIELDXMI"), header.number("FIELDXMA"),
             header.number("FIELDYMI"), header.number("FIELDYMA"),
         ),
-        exposures=make_exposures(table("EXPOSURES") or {}, filters, site, Place(path, "EXPOSURES")),
+        exposures=make_exposures(
+            table("EXPOSURES") or {}, filters, site, Place(path, "EXPOSURES"), version=version, kinds=None
+        ),
         filters=filters,
         sources=empty_sources() if sources is None else make_sources(sources, Place(path, "SOURCES")),
         model=tuple(model["LINE"].tolist()),
@@ -273,7 +225,8 @@ def _from_hdus(opened: OpenFile) -> CalibrationProduct:
         if inputs is None
         else tuple(InputFile(Path(p), s) for p, s in zip(inputs["PATH"], inputs["SHA256"], strict=True)),
         versions=header.versions(),
-        residuals=read_residual_map(units, path),
+        residuals=read_residual_map(units, maps.arms, path),
+        description=() if description is None else tuple(description["LINE"].tolist()),
     )  # fmt: skip
     if header.text("CONTHASH") != product.content_hash():
         raise fail(
@@ -290,60 +243,24 @@ def _missing(path: Path, name: str) -> NoReturn:
     raise fail("the extension is missing", file=path, extension=name, advice="make the product again")
 
 
-@dataclasses.dataclass(frozen=True)
-class _Header:
-    """The primary header, read with types."""
-
-    header: Any
-    place: Place
-
-    def check_version(self) -> None:
-        version = self.header.get("PRODVERS")
-        if version is None and "CALVERS" in self.header:
-            raise self.place.fail(
-                "this is a calibration set, not a calibration product",
-                "PRODVERS",
-                "run walop-jax refit on it",
-            )
-        if version is None:
-            raise self.place.fail("is missing", "PRODVERS", "is this the calibration.fits of a fit?")
-        if isinstance(version, bool) or not isinstance(version, int) or version < 1:
-            raise self.place.fail(f"is {version!r}, not a version", "PRODVERS", "make the product again")
-        if version > PRODVERS:
-            raise self.place.fail(
-                f"is {version}, this program reads up to {PRODVERS}",
-                "PRODVERS",
-                "use a newer walop-jax, or make the product again with this one",
-            )
-
-    def number(self, name: str, missing: float | None = None) -> float:
-        value = self.header.get(name, missing)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.place.fail(f"is {value!r}, not a number", name, "make the product again")
-        return float(value)
-
-    def flag(self, name: str) -> bool:
-        value = self.header.get(name)
-        if not isinstance(value, bool):
-            raise self.place.fail(f"is {value!r}, not T or F", name, "make the product again")
-        return value
-
-    def text(self, name: str) -> str:
-        return str(self.header.get(name, "")).strip()
-
-    def instrument(self) -> str:
-        name = self.text("INSTRUME")
-        if name not in INSTRUMENTS:
-            raise self.place.fail(f"is {name!r}", "INSTRUME", nearest(name, INSTRUMENTS))
-        return name
-
-    def versions(self) -> dict[str, str]:
-        found: dict[str, str] = {}
-        for number in range(1, _LONGEST_SOFTWARE_LIST):
-            name, _, version = self.text(f"SOFT{number}").partition(" ")
-            if name:
-                found[name] = version
-        return found
+def _maps(units: Mapping[str, Any], filter_name: str, version: int, path: Path) -> MatrixMaps:
+    """The maps of the matrix: of two arms in version 1, of as many as there are images later on."""
+    found = [int(match[1]) for name in units if (match := _MATRIX_IMAGE.fullmatch(name))]
+    names = matrix_names(2 if version == 1 else max([1, *(row - 1 for row in found)]))
+    errors = tuple(f"{name}_ERR" for name in names)
+    images = {name: _image(units, name, path) for name in (*names, *errors)}
+    grid = read_grid(units[names[0]].header, Place(path, names[0]))
+    for name, image in images.items():
+        same = image.shape == (grid.height, grid.width)
+        if not same or read_grid(units[name].header, Place(path, name)) != grid:
+            raise fail(f"does not lie on the grid of {names[0]}", file=path, extension=name)
+    return MatrixMaps(
+        grid=grid,
+        filter=filter_name,
+        values=np.stack([images[name] for name in names]),
+        errors=np.stack([images[name] for name in errors]),
+        positions=read_positions(units[names[0]].header, Place(path, names[0])),
+    )
 
 
 def _image(units: Mapping[str, Any], name: str, path: Path) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 import hashlib
 from collections.abc import Iterable, Mapping
 
@@ -12,28 +13,66 @@ from jaxtyping import Bool, Float, Shaped
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import Exposures, FilterCurve, InputFile, Site, Sources
 
-MATRIX_NAMES = ("M21", "M22", "M23", "M31", "M32", "M33")
-RESIDUAL_NAMES = (*MATRIX_NAMES, "RATIO")
-"""Quantities of a residual map: corrections of the matrix, and of the throughput of cameras N2, N3."""
+SMALLEST_DETERMINANT = 0.1
+"""|m22 m33 − m23 m32| below which a single exposure holds hardly any u."""
 
-QUALITY_BITS = {
-    1: "not converged",
-    2: "ill-conditioned",
-    4: "a parameter lies at the edge of its prior",
-    8: "excess noise above 0.5 sigma",
-    16: "zone of high cross-talk (a local inverse has a condition number above 10)",
-    32: "extrapolated in the field",
-    64: "extrapolated in wavelength or temperature",
-    128: "a camera is missing",
-    256: "saturated or non-linear data used",
-    512: "unknown free-form term active",
-    1024: "only a class of causes was named",
-    2048: "validity forced",
-    4096: "non-physical Mueller matrix within tolerance",
-    8192: "the model does not explain the data",
-    16384: "no Stokes parameters: too few cameras, too little light, or no u in the rows there are",
+
+def matrix_names(arms: int) -> tuple[str, ...]:
+    """Names of the matrix elements of an instrument, three for each arm: M21, M22, M23, M31, … (two arms: to M33)."""
+    return tuple(f"M{arm + 2}{column}" for arm in range(arms) for column in (1, 2, 3))
+
+
+def residual_names(arms: int) -> tuple[str, ...]:
+    """Quantities of a residual map: the matrix elements, and the throughput of each arm beside the first.
+
+    The latter are RATIO for two arms (cameras N2, N3 of WALOP), RATIO2, RATIO3, … for more.
+    """
+    ratios = ("RATIO",) if arms == 2 else tuple(f"RATIO{arm}" for arm in range(2, arms + 1))
+    return (*matrix_names(arms), *ratios)
+
+
+class Quality(enum.IntFlag):
+    """Bits of QUALITY (of a product) and FLAG (of a row, star or pixel)."""
+
+    NOT_CONVERGED = 1
+    ILL_CONDITIONED = 2
+    AT_PRIOR_EDGE = 4
+    EXCESS_NOISE = 8
+    HIGH_CROSSTALK = 16
+    BEYOND_FIELD = 32
+    BEYOND_SETTINGS = 64
+    CAMERA_MISSING = 128
+    SATURATED = 256
+    FREE_FORM = 512
+    CLASS_ONLY = 1024
+    VALIDITY_FORCED = 2048
+    NON_PHYSICAL = 4096
+    UNEXPLAINED = 8192
+    NO_STOKES = 16384
+
+    @property
+    def meanings(self) -> tuple[str, ...]:
+        """What the bits that are set say, in words."""
+        return tuple(text for bit, text in _MEANINGS.items() if bit & self)
+
+
+_MEANINGS = {
+    Quality.NOT_CONVERGED: "not converged",
+    Quality.ILL_CONDITIONED: "ill-conditioned",
+    Quality.AT_PRIOR_EDGE: "a parameter lies at the edge of its prior",
+    Quality.EXCESS_NOISE: "excess noise above 0.5 sigma",
+    Quality.HIGH_CROSSTALK: "zone of high cross-talk (a local inverse has a condition number above 10)",
+    Quality.BEYOND_FIELD: "extrapolated in the field",
+    Quality.BEYOND_SETTINGS: "extrapolated in wavelength or temperature",
+    Quality.CAMERA_MISSING: "a camera is missing",
+    Quality.SATURATED: "saturated or non-linear data used",
+    Quality.FREE_FORM: "unknown free-form term active",
+    Quality.CLASS_ONLY: "only a class of causes was named",
+    Quality.VALIDITY_FORCED: "validity forced",
+    Quality.NON_PHYSICAL: "non-physical Mueller matrix within tolerance",
+    Quality.UNEXPLAINED: "the model does not explain the data",
+    Quality.NO_STOKES: "no Stokes parameters: too few cameras, too little light, or no u in the rows there are",
 }
-"""Bits of QUALITY (of a product) and FLAG (of a row or pixel)."""
 
 _SPELT = {
     "χ²": "chi2", "²": "^2", "⁻": "^-", "×": "x", "·": "*", "°": " deg", "±": "+-", "−": "-", "–": "-",
@@ -43,7 +82,7 @@ _SPELT = {
 }  # fmt: skip
 
 
-def spelt(text: str) -> str:
+def in_ascii(text: str) -> str:
     """The text on one line in ASCII: signs spelt out where that is usual, escaped (\\u00e9) otherwise."""
     for sign, word in _SPELT.items():
         text = text.replace(sign, word)
@@ -68,37 +107,71 @@ class ParameterTable:
 
 @dataclasses.dataclass(frozen=True)
 class MatrixMaps:
-    """The six elements of the instrument matrix over the field, for a look: order of `MATRIX_NAMES`.
+    """The elements of the instrument matrix over the field, for a look: order of `matrix_names`, three per arm.
 
-    For the filter named, a flat photon spectrum and the calibration plate out.
+    For the filter named, a flat photon spectrum, the calibration plate out, and the further moving elements at
+    `positions` (deg by column prefix; those not there are out). Raises ValueError for another number of planes.
     """
 
     grid: Grid
     filter: str
-    values: Float[np.ndarray, "6 y x"]
-    errors: Float[np.ndarray, "6 y x"]
+    values: Float[np.ndarray, "m y x"]
+    errors: Float[np.ndarray, "m y x"]
+    positions: Mapping[str, float] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if len(self.values) % 3 or not len(self.values):
+            raise ValueError(f"{len(self.values)} maps of a matrix that has three elements for each arm")
+
+    @property
+    def arms(self) -> int:
+        """Number of arms."""
+        return len(self.values) // 3
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the elements."""
+        return matrix_names(self.arms)
 
 
 @dataclasses.dataclass(frozen=True)
 class ResidualMap:
-    """What the smooth model leaves, in cells of the field: planes in the order of `RESIDUAL_NAMES`.
+    """What the smooth model leaves, in cells of the field: planes in the order of `residual_names`.
 
-    To be added to the matrix (throughput of N2, N3: relative); NaN where a cell has too few data. `chi2` is that of the
-    residuals before the correction, per degree of freedom. Through `filter` and with the calibration plate at
-    `chwp_angle` (deg, NaN out).
+    To be added to the matrix (throughput of an arm: relative); NaN where a cell has too few data. `chi2` is that of the
+    residuals before the correction, per degree of freedom. Through `filter`, with the calibration plate at
+    `chwp_angle` (deg, NaN out) and the further moving elements at `positions` (deg by column prefix; those not there
+    are out). Raises ValueError for another number of planes.
     """
 
     grid: Grid
     filter: str
     chwp_angle: float
-    values: Float[np.ndarray, "7 y x"]
-    errors: Float[np.ndarray, "7 y x"]
+    values: Float[np.ndarray, "m y x"]
+    errors: Float[np.ndarray, "m y x"]
     chi2: Float[np.ndarray, "y x"]
+    positions: Mapping[str, float] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if len(self.values) % 4 != 3:
+            raise ValueError(
+                f"{len(self.values)} planes, for A arms there are 3 A elements and A − 1 throughputs"
+            )
+
+    @property
+    def arms(self) -> int:
+        """Number of arms."""
+        return (len(self.values) + 1) // 4
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the quantities."""
+        return residual_names(self.arms)
 
     def excess(self) -> dict[str, float]:
         """Rms over the field of every quantity beyond its standard errors; negative if below, as chance has it."""
         found = {}
-        for name, value, error in zip(RESIDUAL_NAMES, self.values, self.errors, strict=True):
+        for name, value, error in zip(self.names, self.values, self.errors, strict=True):
             known = np.isfinite(value)
             variance = float(np.mean(value[known] ** 2 - error[known] ** 2)) if known.any() else np.nan
             found[name] = float(np.sign(variance) * np.sqrt(abs(variance)))
@@ -112,7 +185,7 @@ class ResidualMap:
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """How far a product can be trusted; `quality` are bits of `QUALITY_BITS`.
+    """How far a product can be trusted; `quality` are bits of `Quality`.
 
     `noise_scale` multiplied the errors of the data in the fit (1: as given); `covariance_from` says what the
     covariance is of ("fit" or "posterior").
@@ -133,8 +206,9 @@ class Verdict:
 class CalibrationProduct:
     """Everything that `calibration.fits` holds, free of FITS.
 
-    `field` is (smallest x, largest x, smallest y, largest y) of the field points that were used, in degrees;
-    `model` are the lines of the model's TOML text; `versions` name the software; `date` is UTC, ISO 8601.
+    `field` is (smallest x, largest x, smallest y, largest y) of the field points that were used, in degrees; `model`
+    are the lines of the model's TOML text, `description` those of the instrument's description file where it does not
+    come with the package; `versions` name the software; `date` is UTC, ISO 8601.
     """
 
     instrument: str
@@ -153,11 +227,14 @@ class CalibrationProduct:
     inputs: tuple[InputFile, ...] = ()
     versions: Mapping[str, str] = dataclasses.field(default_factory=dict)
     residuals: ResidualMap | None = None
+    description: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.parameters)
         if self.covariance.shape != (n, n):
             raise ValueError(f"covariance has shape {self.covariance.shape}, there are {n} parameters")
+        if self.residuals is not None and self.residuals.arms != self.maps.arms:
+            raise ValueError(f"a residual map of {self.residuals.arms} arms, the matrix has {self.maps.arms}")
 
     def content_hash(self) -> str:
         """SHA-256 of what the product says of the instrument: not of dates, paths and versions."""
@@ -166,10 +243,12 @@ class CalibrationProduct:
         # Twelve digits: a number in a FITS header may lose its last bit.
         numbers = (verdict.chi2, verdict.noise_scale, *self.field)
         texts = [
-            *(self.instrument, *self.model, *verdict.warnings, verdict.covariance_from),
+            *(self.instrument, *self.model, *self.description, *verdict.warnings, verdict.covariance_from),
             *(str(value) for value in (verdict.dof, verdict.n_data, verdict.converged, verdict.trusted)),
-            *(str(verdict.quality), *(f"{value:.11e}" for value in numbers)),
+            *(str(int(verdict.quality)), *(f"{value:.11e}" for value in numbers)),
             *(entry.sha256 for entry in self.inputs),
+            *_texts(self.maps.positions),
+            *(_texts(self.residuals.positions) if self.residuals is not None else ()),
         ]
         for text in texts:
             digest.update(text.encode() + b"\n")
@@ -184,8 +263,14 @@ class CalibrationProduct:
         for record in (self.parameters, self.sources):
             yield from (getattr(record, entry.name) for entry in dataclasses.fields(record))
         yield from (getattr(self.exposures, name) for name in ("exposure", "kind", "mjd", "filter"))
+        for prefix, position in self.exposures.moving.items():
+            yield from (np.array([prefix]), position.inside, position.angle)
         yield from (self.covariance, self.maps.values, self.maps.errors)
         if self.residuals is not None:
             yield from (self.residuals.values, self.residuals.errors, self.residuals.chi2)
         for name, curve in self.filters.items():
             yield from (np.array([name]), curve.wavelength, curve.throughput)
+
+
+def _texts(positions: Mapping[str, float]) -> Iterable[str]:
+    return (f"{prefix} {angle:.11e}" for prefix, angle in positions.items())

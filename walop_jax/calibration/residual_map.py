@@ -18,12 +18,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from walop_jax.calibration.records import RESIDUAL_NAMES, ResidualMap
+from walop_jax.calibration.records import ResidualMap, residual_names
 from walop_jax.data.frames import Grid
-from walop_jax.likelihood import engine
+from walop_jax.data.records import Exposures
+from walop_jax.fit.refit import FitResult
+from walop_jax.likelihood import engine, limits
+from walop_jax.likelihood.expansion import Census, Posterior
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.nodes import Nodes
-from walop_jax.likelihood.passes import Part
-from walop_jax.likelihood.problem import Problem
+from walop_jax.likelihood.runner import SlabSums
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
@@ -31,10 +34,9 @@ from walop_jax.model.plan import Plan
 
 Vector = Float[np.ndarray, " n"]
 
-MOST_CELLS = 128  # per side
-POINTS_PER_CELL = 64
-_UPPER = np.triu_indices(len(RESIDUAL_NAMES))
-_NUMBERS = 2 + len(RESIDUAL_NAMES) + len(_UPPER[0])  # χ², degrees of freedom, Σ A r, upper half of Σ A P Aᵀ
+_QUANTITIES = residual_names(2)
+_UPPER = np.triu_indices(len(_QUANTITIES))
+_NUMBERS = 2 + len(_QUANTITIES) + len(_UPPER[0])  # χ², degrees of freedom, Σ A r, upper half of Σ A P Aᵀ
 
 
 def _point_sums(
@@ -47,7 +49,7 @@ def _point_sums(
     flux, residual = engine.point_residuals(instrument, plan, point, nodes)
     unit = engine.point_prediction(instrument, plan, point, nodes)
     vectors = engine.vectors_at(instrument, plan, point, nodes)[point.band]
-    stokes = light.stokes(instrument, plan.exposures, point.sky, point.source)[:, :3]
+    stokes = light.stokes(instrument, plan.exposures, point.sky, point.source, point.x, point.y)[:, :3]
     first, second = (vectors[:, k, 0] + vectors[:, k + 1, 0] for k in (0, 2))
     signs = jnp.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
     pairs = [
@@ -74,17 +76,19 @@ def _chunk_sums(
     instrument: Instrument, plan: Plan, chosen: Bool[Array, " e"], data: engine.PointData, nodes: Nodes | None
 ) -> Float[Array, "p n"]:
     return jax.lax.map(
-        lambda point: _point_sums(instrument, plan, chosen, point, nodes), data, batch_size=engine.BLOCK
+        lambda point: _point_sums(instrument, plan, chosen, point, nodes),
+        data,
+        batch_size=limits.JACOBIAN_BLOCK,
     )
 
 
 _sums = compiled(_chunk_sums)
 
 
-def cells_for(problem: Problem) -> Grid:
-    """A grid of square-ish cells over the used part of the field: `POINTS_PER_CELL` points in each, or more."""
-    low_x, high_x, low_y, high_y = problem.field
-    side = int(np.clip(np.sqrt(len(problem.calset.points) / POINTS_PER_CELL), 1, MOST_CELLS))
+def cells_for(points: int, census: Census) -> Grid:
+    """A grid of square-ish cells over the used part of the field: `limits.POINTS_PER_CELL` points in each, or more."""
+    low_x, high_x, low_y, high_y = census.field
+    side = int(np.clip(np.sqrt(points / limits.POINTS_PER_CELL), 1, limits.MOST_CELLS))
     width, height = (high_x - low_x) / side, (high_y - low_y) / side
     return Grid(
         side, side, (0.5, 0.5), (low_x, low_y), ((width or 1.0, 0.0), (0.0, height or 1.0))
@@ -99,9 +103,8 @@ def cell_of(grid: Grid, x: Vector, y: Vector) -> Int[np.ndarray, " p"]:
     return row * grid.width + column
 
 
-def _chosen(problem: Problem) -> tuple[str, float, Bool[np.ndarray, " e"]]:
+def _main_setting(e: Exposures) -> tuple[str, float, Bool[np.ndarray, " e"]]:
     """The setting with the most polariser exposures, plate out preferred, and its exposures."""
-    e = problem.calset.exposures
     angle = np.where(e.chwp_in, e.chwp_angle, -np.inf)
     settings = sorted(
         set(zip(e.filter.tolist(), angle.tolist(), strict=True)), key=lambda setting: setting[1]
@@ -111,24 +114,32 @@ def _chosen(problem: Problem) -> tuple[str, float, Bool[np.ndarray, " e"]]:
     return name, at if np.isfinite(at) else np.nan, exposures[name, at]
 
 
-def residual_map(problem: Problem, values: Vector) -> ResidualMap:
-    """The map of what a fit (full vector of parameter values) leaves: one more pass over the points."""
-    instrument = problem.model.instrument(values)
-    nodes = problem.nodes(instrument)
-    filter_name, chwp_angle, chosen = _chosen(problem)
-    grid = cells_for(problem)
+def residual_map(result: FitResult) -> ResidualMap:
+    """The map of what a fit leaves: one more pass over the points."""
+    return residual_map_at(result.likelihood, result.values, result.posterior)
+
+
+def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | None = None) -> ResidualMap:
+    """As `residual_map`, at any full vector of parameter values; `near` is an expansion at similar ones."""
+    instrument = likelihood.model.instrument(values)
+    nodes, _ = likelihood.nodes(instrument, near)
+    filter_name, chwp_angle, chosen = _main_setting(likelihood.calset.exposures)
+    grid = cells_for(likelihood.layout.points, likelihood.census if near is None else near.census)
     count = grid.width * grid.height
 
-    def work(number: int) -> Part:
-        chunks = problem.chunks.of_slab(number)
+    def work(number: int) -> SlabSums:
+        chunks = likelihood.points.slab(number)
         cell = np.concatenate([cell_of(grid, np.asarray(chunk.x), np.asarray(chunk.y)) for chunk in chunks])
         # Padded points carry no weight, hence zeros.
-        columns = [np.asarray(_sums(instrument, problem.plan, jnp.asarray(chosen), c, nodes)) for c in chunks]
+        columns = [
+            np.asarray(_sums(instrument, likelihood.plan, jnp.asarray(chosen), c, nodes)) for c in chunks
+        ]
         sums = [np.bincount(cell, column, count) for column in np.concatenate(columns).T]
-        return Part(np.concatenate(sums), np.zeros(4))
+        return SlabSums(np.concatenate(sums), np.zeros(4))
 
-    total = problem.passes.total("residual map", None, work).sums.reshape(_NUMBERS, count)
-    n = len(RESIDUAL_NAMES)
+    total = likelihood.runner.total("residual map", None, work, likelihood.layout)
+    total = total.sums.reshape(_NUMBERS, count)
+    n = len(_QUANTITIES)
     matrix = np.zeros((count, n, n))
     matrix[:, _UPPER[0], _UPPER[1]] = matrix[:, _UPPER[1], _UPPER[0]] = total[2 + n :].T
     size = np.sqrt(np.diagonal(matrix, axis1=1, axis2=2))

@@ -1,7 +1,8 @@
 """The residual map of a calibration product: three images over cells of the field.
 
 RESIDUAL       (7, ny, nx): dm21 … dm33 to be added to the instrument matrix, and the relative change of the
-               throughput of cameras N2, N3; NaN where a cell has too few data
+               throughput of the second arm (cameras N2, N3); NaN where a cell has too few data. Of an instrument with
+               A arms 4 A − 1 planes, PLANE1, … name them.
 RESIDUAL_ERR   their standard errors
 RESIDUAL_CHI2  (ny, nx): χ² per degree of freedom of the residuals before that correction
 """
@@ -16,7 +17,8 @@ import numpy as np
 from astropy.io import fits
 from jaxtyping import Float
 
-from walop_jax.calibration.records import RESIDUAL_NAMES, ResidualMap
+from walop_jax.calibration.product_header import position_cards, read_positions
+from walop_jax.calibration.records import ResidualMap, residual_names
 from walop_jax.data.frames import read_grid
 from walop_jax.data.schema import Place
 from walop_jax.data.write import grid_cards
@@ -30,19 +32,19 @@ def residual_hdus(residuals: ResidualMap) -> list[Any]:
     hdus = []
     for name, attribute in _IMAGES.items():
         hdu = fits.ImageHDU(getattr(residuals, attribute), name=name)
-        hdu.header.update(grid_cards(residuals.grid))
+        hdu.header.update(grid_cards(residuals.grid) | position_cards(residuals.positions))
         hdu.header["FILTER"] = residuals.filter
         if np.isfinite(residuals.chwp_angle):
             hdu.header["CHWPANG"] = (residuals.chwp_angle, "[deg] calibration plate; absent: out")
         if hdu.header["NAXIS"] == 3:
-            for number, quantity in enumerate(RESIDUAL_NAMES, start=1):
+            for number, quantity in enumerate(residuals.names, start=1):
                 hdu.header[f"PLANE{number}"] = quantity
         hdus.append(hdu)
     return hdus
 
 
-def read_residual_map(units: Mapping[str, Any], path: Path) -> ResidualMap | None:
-    """The residual map among the extensions of a product, None when there is none.
+def read_residual_map(units: Mapping[str, Any], arms: int, path: Path) -> ResidualMap | None:
+    """The residual map among the extensions of a product of an instrument with so many arms, None without one.
 
     Raises `DataError` for images that are missing or do not belong together.
     """
@@ -57,7 +59,7 @@ def read_residual_map(units: Mapping[str, Any], path: Path) -> ResidualMap | Non
     images: dict[str, Float[np.ndarray, ...]] = {}
     for name, attribute in _IMAGES.items():
         shape = (grid.height, grid.width)
-        expected = shape if attribute == "chi2" else (len(RESIDUAL_NAMES), *shape)
+        expected = shape if attribute == "chi2" else (len(residual_names(arms)), *shape)
         data = units[name].data
         if grids[name] != grid or not isinstance(data, np.ndarray) or data.shape != expected:
             raise fail(
@@ -69,5 +71,6 @@ def read_residual_map(units: Mapping[str, Any], path: Path) -> ResidualMap | Non
         grid=grid,
         filter=str(header.get("FILTER", "")).strip(),
         chwp_angle=float(header.get("CHWPANG", np.nan)),
+        positions=read_positions(header, Place(path, "RESIDUAL")),
         **images,
     )

@@ -3,42 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from typing import Any
 
-from walop_jax.calibration.calibration import quality, software_versions
+from walop_jax.calibration.calibration import quality
 from walop_jax.calibration.records import ResidualMap
-from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.misfit import Misfit
-from walop_jax.fit.model_file import render
 from walop_jax.fit.refit import FitResult
-from walop_jax.model.specification import Model
+from walop_jax.io.software import software_versions
 
 PRODUCT = "calibration.fits"
 SUMMARY = "summary.json"
 FAILED = "summary.failed.json"
-
-
 PARTIAL = "partial"
 """Folder of the finished parts of a fit that was interrupted."""
 
 
-def identity(calset: CalibrationSet, model: Model) -> str:
-    """What the sums of a fit depend on besides parameter values: the data, the model and the software."""
-    texts = [*(entry.sha256 for entry in calset.inputs), render(model)]
-    texts += [f"{name} {version}" for name, version in software_versions().items()]
-    return hashlib.sha256("\n".join(texts).encode()).hexdigest()
-
-
 def summary(
     result: FitResult,
-    calset: CalibrationSet,
     *,
     seconds: float,
     misfit: Misfit | None = None,
     residuals: ResidualMap | None = None,
 ) -> dict[str, Any]:
-    """What a fit found: the contract's keys first, then how far it can be trusted.
+    """What a fit found and how far it can be trusted, key by key as in docs: files.
 
     Frozen parameters have sigma 0.
     """
@@ -55,9 +42,9 @@ def summary(
         "message": result.minimum.message,
         "seconds": seconds,
         "versions": software_versions(),
-        "inputs": [{"path": str(entry.path), "sha256": entry.sha256} for entry in calset.inputs],
+        "inputs": [{"path": str(entry.path), "sha256": entry.sha256} for entry in result.calset.inputs],
         "trusted": result.trusted,
-        "quality": quality(result),
+        "quality": int(quality(result)),
         "warnings": list(result.warnings),
         "instrument": result.model.name,
         "effects": list(result.model.effect_names),
@@ -78,5 +65,5 @@ def summary(
             "rms_beyond_noise": residuals.excess(),
             "significance": residuals.significance(),
         },
-        "remarks": list(calset.remarks),
+        "remarks": list(result.calset.remarks),
     }

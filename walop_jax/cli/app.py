@@ -24,9 +24,11 @@ COMMANDS = (
     "epoch",
     "report",
     "model",
+    "instrument",
     "import-zemax",
     "trace",
     "cite",
+    "docs",
 )
 """In the order of the help; `import-zemax` is the function `import_zemax` of `import_zemax.py`, and so on."""
 

@@ -10,9 +10,7 @@ from walop_jax.cli.common import (
     Product,
     QuietOption,
     SeedOption,
-    named,
     print_json,
-    product_path,
     switch_on_jax,
 )
 
@@ -26,33 +24,17 @@ def certify(
     calibration sets it was made from, maps against parameters, and that no camera sees less than no light.
     """
     del seed  # nothing is random
-    from walop_jax.calibration.product import PRODVERS, read_product
-
-    path = product_path(product)
-    held = read_product(path)
     switch_on_jax()
-    from walop_jax.calibration.certify import certify as examine
-    from walop_jax.calibration.certify import validity
+    from walop_jax.runs.certify import certify_product
 
-    with named(path):
-        checks = examine(held)
-    failed = [check for check in checks if not check.passed]
+    found = certify_product(product)
     if json:
-        print_json(
-            {
-                "product": str(path),
-                "valid": not failed,
-                "schema": PRODVERS,
-                "content": held.content_hash(),
-                "parents": [entry.sha256 for entry in held.inputs],
-                "validity": validity(held)._asdict(),
-                "checks": [check._asdict() for check in checks],
-            }
-        )
+        print_json(found.document())
     elif not quiet:
-        for check in checks:
+        for check in found.checks:
             typer.echo(f"{'ok ' if check.passed else 'BAD'} {check.name}: {check.found}")
-    if failed:
+    if found.failed:
         raise CommandError(
-            f"{path}: not valid: " + "; ".join(f"{check.name} ({check.found})" for check in failed)
+            f"{found.path}: not valid: "
+            + "; ".join(f"{check.name} ({check.found})" for check in found.failed)
         )

@@ -11,9 +11,7 @@ from walop_jax.cli.common import (
     JsonOption,
     QuietOption,
     SeedOption,
-    named,
     print_json,
-    product_path,
     switch_on_jax,
 )
 
@@ -28,18 +26,10 @@ def cite(
 ) -> None:
     """List the sources of the physics in a fitted model, effects included."""
     del quiet, seed  # the list is all there is, and nothing is random
-    from walop_jax.calibration.product import read_product
-
-    held = None if run is None else read_product(product_path(run))
     switch_on_jax()
-    from walop_jax.calibration.calibration import rebuild
-    from walop_jax.fit import levenberg
-    from walop_jax.fit.model_builder import model_without_data
-    from walop_jax.model.references import Reference, references, stated_source
+    from walop_jax.runs.cite import cite_run
 
-    with named(run):
-        model = model_without_data("WALOP-SOUTH") if held is None else rebuild(held)
-    found = [*references(model), Reference("fit", stated_source(levenberg.__doc__))]
+    found = cite_run(run)
     if json:
         print_json([{"what": entry.what, "source": entry.source} for entry in found])
         return

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import json as json_format
-import math
 import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from walop_jax.io.text import json_text
+
+if TYPE_CHECKING:
+    from walop_jax.likelihood.processes import Processes
 
 CACHE_VARIABLE = "WALOP_JAX_CACHE"
 DEBUG_VARIABLE = "WALOP_JAX_DEBUG"
@@ -29,6 +32,14 @@ SeedOption = Annotated[
 ModelOption = Annotated[
     Path | None,
     typer.Option("--model", metavar="MODEL.toml", help="Model file: what is free, tied, known, added."),
+]
+InstrumentOption = Annotated[
+    str | None,
+    typer.Option(
+        "--instrument",
+        metavar="NAME|FILE.toml",
+        help="An instrument that comes with the package, or a description file; see walop-jax instrument.",
+    ),
 ]
 ProcessesOption = Annotated[
     str | None,
@@ -108,43 +119,6 @@ def print_json(value: Any) -> None:
     typer.echo(json_text(value), nl=False)
 
 
-def json_text(value: Any) -> str:
-    """The JSON text of a value, indented, with a final newline; null for what is not finite."""
-    return json_format.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def plain(value: Any) -> Any:
-    """The value with mappings as dicts, sequences as lists and numbers that are not finite as None."""
-    if isinstance(value, dict):
-        return {str(key): plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(entry) for entry in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value
-
-
-def read_text(path: Path) -> str:
-    """The text of a file; ValueError, with the name, if it is missing or not text in UTF-8."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: is not text in UTF-8") from None
-
-
-@contextlib.contextmanager
-def named(path: Path | None) -> Iterator[None]:
-    """Say in errors which file they are about."""
-    try:
-        yield
-    except ValueError as error:
-        if path is None or str(path) in str(error):
-            raise
-        raise ValueError(f"{path}: {error}") from error
-
-
 @contextlib.contextmanager
 def progress(quiet: bool) -> Iterator[Callable[[str], None]]:
     """Give a function that shows what is being done: on a terminal only, on stderr, gone at the end."""
@@ -202,26 +176,22 @@ def _standard_output_to_error() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def shared(place: str | None) -> Iterator[bool]:
-    """Join the other processes of a computation, if `place` says where they are; gives whether this is the first one.
+def shared(place: str | None) -> Iterator[Processes]:
+    """Join the other processes of a computation, if `place` says where they are; gives which one this is.
 
     When one fails it ends at once, with its line of error: the others notice that it has gone.
     """
+    from walop_jax.likelihood.processes import Processes, join, leave_at_once
+
     if place is None:
-        yield True
+        yield Processes()
         return
-    from walop_jax.likelihood.processes import join, leave_at_once
 
     with _standard_output_to_error():
         crew = join(place)
     try:
-        yield crew.index == 0
+        yield crew
     except BaseException as error:
         complain(f"process {crew.index} of {crew.count}: {error or type(error).__name__}")
         sys.stderr.flush()
         leave_at_once(1)
-
-
-def product_path(run: Path) -> Path:
-    """The calibration product that RUN, a folder or the file itself, stands for."""
-    return run / "calibration.fits" if run.is_dir() else run

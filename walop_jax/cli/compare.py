@@ -9,30 +9,19 @@ import typer
 
 from walop_jax.cli.common import (
     CalsetFiles,
-    CommandError,
+    InstrumentOption,
     JsonOption,
     ModelOption,
     OverwriteOption,
     QuietOption,
     RunFolder,
     SeedOption,
-    json_text,
-    named,
     print_json,
     progress,
-    read_text,
     switch_on_jax,
     warn,
 )
 
-FILES = (
-    "comparison.json",
-    "comparison.fits",
-    "comparison_histogram.png",
-    "comparison_map.png",
-    "comparison_offset.png",
-    "comparison_spectral.png",
-)
 TruthOption = Annotated[
     Path | None,
     typer.Option("--truth", metavar="TABLE", help="True X, Y, M21 … M33 (FITS, CSV), for simulated sets."),
@@ -46,6 +35,7 @@ def compare(
     truth: TruthOption = None,
     filter_name: FilterOption = "SDSS-r",
     model: ModelOption = None,
+    instrument: InstrumentOption = None,
     overwrite: OverwriteOption = False,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -58,47 +48,27 @@ def compare(
     simulated set. RUN/comparison.json has the statistics, comparison.fits every point, four figures the rest: also
     the spectral appendix and the full-Moon scheme.
     """
-    from walop_jax.io.folder import atomic_folder, check_folder
-
-    text = "" if model is None else read_text(model)
-    check_folder(output, FILES, overwrite=overwrite)
     switch_on_jax()
-    from walop_jax.calibration.calibration import Calibration
-    from walop_jax.data import read_calibration_set
-    from walop_jax.data.user_tables import new_table, true_matrices, write_output_table
-    from walop_jax.fit.model_builder import model_for
-    from walop_jax.fit.refit import fit
-    from walop_jax.likelihood.problem import Problem
-    from walop_jax.paper.comparison import Truth
-    from walop_jax.paper.comparison import compare as both
-    from walop_jax.reports import comparison_figures as figures
+    from walop_jax.runs.compare import compare_methods
 
     with progress(quiet or json) as tell:
-        tell("reading")
-        calset = read_calibration_set(*calsets)
-        known = None if truth is None else Truth(*true_matrices(truth, calset.instrument))
-        with named(model):
-            chosen = model_for(calset, text)
-        tell("fitting the joint model")
-        problem = Problem(calset, chosen)
-        result = fit(problem)
-        if not result.converged:
-            raise CommandError(f"the joint fit did not converge ({result.minimum.message})")
-        tell("fitting and judging the polynomials")
-        found = both(calset, Calibration.from_fit(result, problem), known, filter_name, seed or 0)
-        document = found.document()
-        with atomic_folder(output, FILES, overwrite=overwrite) as folder:
-            (folder / FILES[0]).write_text(json_text(document), encoding="utf-8")
-            write_output_table(folder / FILES[1], new_table(found.columns()), {})
-            for name in FILES[2:]:
-                figure = getattr(figures, f"{name.removeprefix('comparison_').removesuffix('.png')}_figure")
-                figure(found).savefig(folder / name, dpi=130)
-    if not result.trusted:
-        warn("the joint fit is not trusted: see walop-jax refit")
+        found = compare_methods(
+            calsets,
+            output,
+            truth=truth,
+            filter_name=filter_name,
+            model=model,
+            instrument=instrument,
+            seed=seed,
+            overwrite=overwrite,
+            progress=tell,
+        )
+    for sentence in found.warnings:
+        warn(sentence)
     if json:
-        print_json(document)
+        print_json(found.document)
     elif not quiet:
-        _show(document, output)
+        _show(found.document, output)
 
 
 def _show(document: dict, output: Path) -> None:

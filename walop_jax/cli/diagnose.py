@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from walop_jax.cli.common import (
     CalsetFiles,
+    InstrumentOption,
     JsonOption,
     ModelOption,
     OverwriteOption,
     QuietOption,
     RunFolder,
     SeedOption,
-    json_text,
-    named,
     print_json,
     progress,
-    read_text,
     switch_on_jax,
     warn,
 )
@@ -33,6 +30,7 @@ def diagnose(
     calsets: CalsetFiles,
     output: RunFolder,
     model: ModelOption = None,
+    instrument: InstrumentOption = None,
     overwrite: OverwriteOption = False,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -44,47 +42,19 @@ def diagnose(
     together; effects that the data cannot show at all are listed as such. RUN/calibration.fits and
     RUN/summary.json hold the extended model; RUN/diagnosis.fits what the pictures of `walop-jax report` need.
     """
-    began = time.perf_counter()
-    from walop_jax.calibration.product import write_product
-    from walop_jax.calibration.summary import PRODUCT, SUMMARY, summary
-    from walop_jax.diagnosis.figure_file import PICTURES, write_pictures
-    from walop_jax.io.folder import atomic_folder, check_folder
-
-    text = "" if model is None else read_text(model)
-    check_folder(output, (PRODUCT, SUMMARY, PICTURES, "diagnosis.json"), overwrite=overwrite)
     switch_on_jax()
-    from walop_jax.calibration.calibration import Calibration
-    from walop_jax.data import read_calibration_set
-    from walop_jax.diagnosis.document import DIAGNOSIS, document
-    from walop_jax.diagnosis.figure_data import pictures
-    from walop_jax.diagnosis.workflow import diagnose as find
-    from walop_jax.fit.misfit import describe
-    from walop_jax.fit.model_builder import model_for
+    from walop_jax.runs.diagnose import diagnose_sets
 
     with progress(quiet or json) as tell:
-        tell("reading")
-        calset = read_calibration_set(*calsets)
-        with named(model):
-            chosen = model_for(calset, text)
-        found = find(calset, chosen, seed=seed or 0, progress=tell)
-        tell("mapping the field")
-        product = Calibration.from_fit(found.after, found.problem).to_product()
-        misfit = None if found.after.explains_data else describe(found.problem, found.after.values)
-        content = document(found)
-        seconds = time.perf_counter() - began
-        drawn_from = pictures(found)
-        with atomic_folder(output, (PRODUCT, SUMMARY, DIAGNOSIS, PICTURES), overwrite=overwrite) as folder:
-            write_product(folder / PRODUCT, product)
-            fitted = summary(found.after, calset, seconds=seconds, misfit=misfit) | {"seed": seed}
-            (folder / SUMMARY).write_text(json_text(fitted), encoding="utf-8")
-            (folder / DIAGNOSIS).write_text(json_text(content), encoding="utf-8")
-            write_pictures(folder / PICTURES, drawn_from)
+        found = diagnose_sets(
+            calsets, output, model=model, instrument=instrument, seed=seed, overwrite=overwrite, progress=tell
+        )
     if json:
-        print_json(content)
-    for sentence in found.after.warnings:
+        print_json(found.document)
+    for sentence in found.diagnosis.after.warnings:
         warn(sentence)
     if not (json or quiet):
-        _show(found, output)
+        _show(found.diagnosis, output)
 
 
 def _show(found: Diagnosis, output: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,12 +12,13 @@ from walop_jax.cli.common import (
     JsonOption,
     QuietOption,
     SeedOption,
-    named,
     print_json,
-    product_path,
     progress,
     switch_on_jax,
 )
+
+if TYPE_CHECKING:
+    from walop_jax.science.epoch import Epoch
 
 OldProduct = Annotated[
     Path, typer.Argument(metavar="OLD", help="Old calibration product, or folder of a run.")
@@ -38,28 +39,18 @@ def epoch(
     the old calibration were used on. The effects of the old model are those of the new fit.
     """
     del seed  # nothing is random
-    from walop_jax.calibration.product import read_product
-    from walop_jax.data import read_calibration_set
-
-    path = product_path(old)
-    held = read_product(path)
-    calset = read_calibration_set(*calsets)
     switch_on_jax()
-    from walop_jax.calibration.calibration import Calibration
-    from walop_jax.science.epoch import epoch as compare
+    from walop_jax.runs.epoch import compare_epochs
 
     with progress(quiet or json) as tell:
-        tell("fitting the new set")
-        with named(path):
-            before = Calibration.from_product(held)
-            found, _ = compare(before, calset)
+        compared = compare_epochs(old, calsets, progress=tell)
     if json:
-        print_json({"old": held.content_hash(), "new": [e.sha256 for e in calset.inputs]} | found.document())
+        print_json(compared.document())
     elif not quiet:
-        _show(found)
+        _show(compared.found)
 
 
-def _show(found) -> None:  # type: ignore[no-untyped-def]
+def _show(found: Epoch) -> None:
     from rich.console import Console
     from rich.table import Table
 

@@ -25,7 +25,7 @@ OutputOption = Annotated[
 ]
 InstrumentOption = Annotated[
     str | None,
-    typer.Option("--instrument", help="WALOP-SOUTH, WALOP-NORTH or WALOP-LAB; default: what the titles say."),
+    typer.Option("--instrument", help="Which instrument; default: what the titles say."),
 ]
 CamerasOption = Annotated[
     str,
@@ -68,36 +68,30 @@ def import_zemax(
         )
     if not 0.0 <= error < 1.0:
         raise typer.BadParameter(f"{error} is not a share, as in 0.001", param_hint="--error")
-    from walop_jax.data import check_output, import_transmissions, write_calibration_set
-    from walop_jax.data.checks import INSTRUMENTS
+    from walop_jax.instruments.description import shipped
     from walop_jax.io.errors import nearest
+    from walop_jax.runs.import_zemax import import_folder
 
-    if instrument is not None and instrument.upper() not in INSTRUMENTS:
+    if instrument is not None and instrument.upper() not in shipped():
         raise typer.BadParameter(
-            f"there is no {instrument!r}: {nearest(instrument, INSTRUMENTS)}", param_hint="--instrument"
+            f"there is no {instrument!r}: {nearest(instrument, shipped())}", param_hint="--instrument"
         )
-    check_output(output, overwrite=overwrite)
     with progress(quiet or json) as tell:
-        calset = import_transmissions(
-            folder, instrument=instrument, configurations=configurations, error=error, tell=tell
+        made = import_folder(
+            folder,
+            output,
+            instrument=instrument,
+            configurations=configurations,
+            error=error,
+            overwrite=overwrite,
+            progress=tell,
         )
-        tell("writing")
-        write_calibration_set(output, calset, overwrite=overwrite)
-    for remark in calset.remarks:
+    for remark in made.remarks:
         warn(remark)
-    summary = {
-        "output": str(output),
-        "instrument": calset.instrument,
-        "wavelengths": [float(curve.wavelength[0]) for curve in calset.filters.values()],
-        "exposures": len(calset.exposures),
-        "points": len(calset.points),
-        "rows": calset.intensities.rows,
-        "remarks": list(calset.remarks),
-    }
     if json:
-        print_json(summary)
+        print_json(made.document())
     elif not quiet:
         typer.echo(
-            f"{output}: {calset.instrument}, {len(calset.filters)} wavelengths, {len(calset.exposures)} exposures of "
-            f"{len(calset.points)} points, {calset.intensities.rows} rows to use"
+            f"{output}: {made.instrument}, {len(made.wavelengths)} wavelengths, {made.exposures} exposures of "
+            f"{made.points} points, {made.rows} rows to use"
         )

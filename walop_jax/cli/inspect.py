@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -25,30 +24,13 @@ def inspect(
     Each file by itself; then whether they can be fitted as one. Exit code 1 if any cannot be read or fitted.
     """
     del seed  # nothing is random here
-    from walop_jax.data import DataError, read_calibration_set
-    from walop_jax.data.inspection import inspect as look_at
+    from walop_jax.runs.inspect import inspect_sets
 
-    reports, faults = [], []
-    for path in calsets:
-        try:
-            report = look_at(read_calibration_set(path))
-        except DataError as error:
-            faults.append(str(error))
-            reports.append({"files": [str(path)], "error": str(error)})
-            continue
-        faults += [f"{path}: {entry}" for entry in report.findings if entry.severity == "fault"]
-        reports.append(dataclasses.asdict(report))
-        if not (json or quiet):
-            _show(report)
-    joint = None
-    if len(calsets) > 1 and not faults:
-        joint = look_at(read_calibration_set(*calsets))
-        if not (json or quiet):
-            _show(joint)
+    found = inspect_sets(calsets, progress=None if json or quiet else _show)
     if json:
-        print_json({"sets": reports, "joint": None if joint is None else dataclasses.asdict(joint)})
-    if faults:
-        raise CommandError("; ".join(faults))
+        print_json(found.document())
+    if found.faults:
+        raise CommandError("; ".join(found.faults))
 
 
 def _show(report: Inspection) -> None:
@@ -62,7 +44,12 @@ def _show(report: Inspection) -> None:
     lines = {
         "instrument": f"{report.instrument}, {report.telescope} ({report.origin or 'origin not stated'})",
         "field points": f"{report.points}, X {low_x:+.3f} … {high_x:+.3f}°, Y {low_y:+.3f} … {high_y:+.3f}°",
+        "cameras": str(report.cameras),
         "polariser angles": f"{len(report.angles)} modulo 180°, widest gap {report.widest_gap:.3g}°",
+        **{
+            f"element {use.prefix}": f"in {use.exposures} exposures, {len(use.angles)} angles"
+            for use in report.elements
+        },
         "used": f"{report.rows} of {report.possible} (exposure, point) pairs"
         + (f" at {report.looked_at} points looked at" if report.looked_at < report.points else ""),
         "flagged": ", ".join(f"{count} {name}" for name, count in report.flags.items()) or "none",

@@ -15,9 +15,7 @@ from walop_jax.cli.common import (
     Product,
     QuietOption,
     SeedOption,
-    named,
     print_json,
-    product_path,
     progress,
     switch_on_jax,
     warn,
@@ -48,52 +46,18 @@ def matrix(
     of the instrument (0.35 degrees) there is no value: NaN and FLAG 32.
     """
     del seed  # nothing is random here
-    from walop_jax.calibration.product import read_product
-    from walop_jax.data.user_tables import field_points, read_input_table, table_format, write_output_table
-    from walop_jax.io.atomic import check_output
-
-    table_format(output)
-    check_output(output, overwrite=overwrite)
-    path = product_path(product)
-    held = read_product(path)
-    table = read_input_table(points)
-    wanted = field_points(table, held.instrument)
-
     switch_on_jax()
-    from walop_jax.calibration.calibration import Calibration
-    from walop_jax.calibration.matrix import Settings
-    from walop_jax.calibration.matrix_table import matrix_columns
+    from walop_jax.calibration.records import Quality
+    from walop_jax.runs.matrix import tabulate_matrix
 
     with progress(quiet or json) as tell:
-        tell("working out the matrix")
-        with named(path):
-            calibration = Calibration.from_product(held)
-        if posterior is not None:
-            from walop_jax.posterior.propagate import with_draws
-
-            calibration = with_draws(calibration, posterior)
-        settings = Settings(wanted.filter, wanted.teff, wanted.chwp_angle, wanted.temp, wanted.ha)
-        with named(points):
-            columns = matrix_columns(calibration, wanted.x, wanted.y, settings, wanted.outside)
-        write_output_table(output, table, columns, overwrite=overwrite)
-
-    flag = columns["FLAG"][0]
-    counts = {bit: int((flag & bit > 0).sum()) for bit in (16, 32, 64)}
-    if not held.verdict.trusted:
-        warn(f"{path}: this calibration is not trusted: {'; '.join(held.verdict.warnings) or 'see WARNINGS'}")
-    if counts[32]:
-        warn(f"{points}: {counts[32]} point(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)")
-    if counts[64]:
-        warn(f"{points}: {counts[64]} row(s) with a filter or temperature not in the calibration (FLAG 64)")
-    if json:
-        print_json(
-            {
-                "output": str(output),
-                "rows": table.rows,
-                "trusted": held.verdict.trusted,
-                "flags": {str(bit): count for bit, count in counts.items()},
-                "product": held.content_hash(),
-            }
+        found = tabulate_matrix(
+            product, points, output, posterior=posterior, overwrite=overwrite, progress=tell
         )
+    for sentence in found.warnings:
+        warn(sentence)
+    if json:
+        print_json(found.document())
     elif not quiet:
-        typer.echo(f"{output}: {table.rows} rows, {counts[16]} of them in zones of high cross-talk")
+        high = found.flags[Quality.HIGH_CROSSTALK]
+        typer.echo(f"{output}: {found.rows} rows, {high} of them in zones of high cross-talk")

@@ -32,23 +32,13 @@ def report(
     priors, all parameters, warnings, inputs and versions: what of it lies in RUN. The page says what is missing.
     """
     del seed  # nothing is random here
-    from walop_jax.io.atomic import atomic_path, check_output
-    from walop_jax.reports.run import read_run
+    from walop_jax.runs.report import write_report
 
-    target = run / "report.html" if output is None else output
     with progress(quiet or json) as tell:
-        tell("reading")
-        found = read_run(run)
-        check_output(target, overwrite=overwrite)
-        from walop_jax.reports.page import render
-
-        tell("drawing")
-        text = render(found)
-        with atomic_path(target, overwrite=overwrite) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        page = write_report(run, output, overwrite=overwrite, progress=tell)
     if json:
-        print_json({"page": str(target), "bytes": len(text.encode()), "missing": list(found.missing)})
+        print_json(page.document())
     elif not quiet:
-        typer.echo(f"{target}: {len(text.encode()) / 1e6:.1f} MB")
-        for sentence in found.missing:
+        typer.echo(f"{page.path}: {page.length / 1e6:.1f} MB")
+        for sentence in page.missing:
             typer.echo(f"  {sentence}")

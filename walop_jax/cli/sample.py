@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,26 +15,13 @@ from walop_jax.cli.common import (
     ModelOption,
     OverwriteOption,
     QuietOption,
-    json_text,
     print_json,
-    read_text,
     switch_on_jax,
     warn,
 )
 
 if TYPE_CHECKING:
-    from walop_jax.calibration.product import CalibrationProduct
     from walop_jax.posterior import PosteriorSample, Progress
-
-CHAINS = "sampling"
-OUTPUTS = (
-    "posterior.nc",
-    "posterior.fits",
-    "posterior.ecsv",
-    "posterior_corner.png",
-    "posterior_trace.png",
-    "sample.json",
-)
 
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a `walop-jax refit`.")]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on from the checkpoints in RUN/sampling.")]
@@ -67,21 +53,9 @@ def sample(
     data, model, priors, settings or versions have changed. A chain that has not converged is written and
     marked so, with exit code 1; the covariance of the fit then stays in calibration.fits.
     """
-    from walop_jax.calibration.product import read_product
-    from walop_jax.io.errors import fail
-
-    if not run.is_dir():
-        raise CommandError(f"{run}: is not a folder; give the RUN of walop-jax refit")
-    product = read_product(run / "calibration.fits")
-    text = None if model is None else read_text(model)
-    found = [name for name in OUTPUTS if (run / name).exists()]
-    if found and not (overwrite or resume):
-        raise fail(f"holds {found[0]} already", file=run, advice="go on with --resume, or --overwrite it")
     switch_on_jax()
     from walop_jax.posterior import Options
-    from walop_jax.posterior import sample as sample_posterior
-    from walop_jax.posterior.checkpoint import Checkpoints
-    from walop_jax.posterior.from_run import problem_of_run
+    from walop_jax.runs.sample import sample_run
 
     options = Options(
         seed=seed,
@@ -91,56 +65,18 @@ def sample(
         moves=moves,
         inflate=inflate,
     )
-    with _bar(quiet or json) as tell:
-        problem, result = problem_of_run(product, run, text)
-        if overwrite and not resume:
-            Checkpoints(run / CHAINS, {}).clear()
-        found = sample_posterior(problem, result, options, folder=run / CHAINS, resume=resume, report=tell)
-    summary = _write(run, product, found)
+    with _bar(quiet or json) as progress:
+        found = sample_run(run, options, model=model, resume=resume, overwrite=overwrite, progress=progress)
     if json:
-        print_json(summary)
-    for sentence in found.warnings:
+        print_json(found.summary)
+    for sentence in found.posterior.warnings:
         warn(sentence)
     if not (json or quiet):
-        _show(found)
-    if not found.trusted:
+        _show(found.posterior)
+    if not found.posterior.trusted:
         raise CommandError(
             f"{run}: the posterior is not to be believed yet; calibration.fits keeps its covariance"
         )
-
-
-def _write(run: Path, product: CalibrationProduct, found: PosteriorSample) -> dict[str, Any]:
-    import numpy as np
-
-    from walop_jax.calibration.calibration import Calibration
-    from walop_jax.calibration.product import write_product
-    from walop_jax.io.folder import atomic_folder
-    from walop_jax.io.plain_tables import write_columns
-    from walop_jax.posterior.output import intervals, report, write_posterior
-    from walop_jax.reports.posterior_figures import corner_figure, save_figure, trace_figure
-
-    summary = report(found)
-    units = [dict(zip(found.names, found.units, strict=True)).get(name, "") for name in found.sampled]
-    k = [found.names.index(name) for name in found.sampled if name in found.names]
-    flat = found.draws.reshape(-1, len(found.names))[:, k]
-    if found.ln_f is not None:
-        flat = np.concatenate([flat, found.ln_f.reshape(-1, 1)], axis=1)
-    notes = {"TRUSTED": found.trusted, "STEPS": found.convergence.steps}
-    names = OUTPUTS + (("calibration.fits",) if found.trusted else ())
-    with atomic_folder(run, names, overwrite=True) as folder:
-        write_posterior(folder / OUTPUTS[0], found)
-        for name in OUTPUTS[1:3]:
-            write_columns(folder / name, intervals(found), notes)
-        save_figure(folder / OUTPUTS[3], corner_figure(flat, found.sampled, units))
-        trace = trace_figure(found.chains, found.sampled, units, found.thin, found.convergence.tau)
-        save_figure(folder / OUTPUTS[4], trace)
-        (folder / OUTPUTS[5]).write_text(json_text(summary), encoding="utf-8")
-        if found.trusted:
-            calibration = Calibration.from_product(product)
-            verdict = dataclasses.replace(calibration.verdict, covariance_from="posterior")
-            sampled = dataclasses.replace(calibration, covariance=found.covariance, verdict=verdict)
-            write_product(folder / "calibration.fits", sampled.to_product())
-    return summary
 
 
 @contextlib.contextmanager

@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from walop_jax.cli.common import JsonOption, named, print_json, product_path, switch_on_jax
+from walop_jax.cli.common import InstrumentOption, JsonOption, print_json, switch_on_jax
 
 if TYPE_CHECKING:
-    from walop_jax.data.records import FilterCurve
-    from walop_jax.model.instrument import Instrument
     from walop_jax.model.trace import Stage
 
 ProductArgument = Annotated[
@@ -21,9 +19,6 @@ ProductArgument = Annotated[
         help="An instrument as fitted; without it, as designed.",
         show_default=False,
     ),
-]
-InstrumentOption = Annotated[
-    str, typer.Option("--instrument", help="WALOP-SOUTH, WALOP-NORTH or WALOP-LAB, as designed.")
 ]
 AngleOption = Annotated[
     float | None, typer.Option("--angle", help="Polariser in, with its axis here (deg).", show_default=False)
@@ -40,7 +35,7 @@ TeffOption = Annotated[
 
 def trace(
     product: ProductArgument = None,
-    instrument: InstrumentOption = "WALOP-SOUTH",
+    instrument: InstrumentOption = None,
     x: Annotated[float, typer.Option("--x", help="Field position X (deg).")] = 0.0,
     y: Annotated[float, typer.Option("--y", help="Field position Y (deg).")] = 0.0,
     q: Annotated[float, typer.Option("--q", help="Stokes q of the source, a fraction.")] = 0.0,
@@ -58,11 +53,11 @@ def trace(
     """
     nan = float("nan")
     switch_on_jax()
-    from walop_jax.model.trace import Ray
-    from walop_jax.model.trace import trace as follow
+    from walop_jax.model.trace import Sightline
+    from walop_jax.runs.trace import trace_source
 
     try:
-        ray = Ray(
+        ray = Sightline(
             x=x,
             y=y,
             q=q,
@@ -73,8 +68,12 @@ def trace(
         )
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
-    built, curve = _instrument(product, instrument, filter)
-    stages = follow(built, curve, ray)
+    try:
+        stages = trace_source(ray, product, instrument=instrument, filter_name=filter)
+    except ValueError as error:
+        if product is not None:
+            raise
+        raise typer.BadParameter(str(error)) from None  # the options say all there is
     if json:
         print_json(
             [
@@ -91,26 +90,6 @@ def trace(
         return
     for line in table(stages):
         typer.echo(line)
-
-
-def _instrument(product: Path | None, name: str, filter_name: str) -> tuple[Instrument, FilterCurve]:
-    """The instrument of a calibration product, or one as designed, and the curve of the filter."""
-    from walop_jax.data.filters import builtin_filter
-
-    if product is None:
-        from walop_jax.model.instrument import nominal_instrument
-
-        try:
-            return nominal_instrument(name.upper()), builtin_filter(filter_name)
-        except ValueError as error:
-            raise typer.BadParameter(str(error)) from None
-    from walop_jax.calibration.calibration import Calibration
-    from walop_jax.calibration.product import read_product
-
-    path = product_path(product)
-    with named(path):
-        calibration = Calibration.from_product(read_product(path))
-    return calibration.model.instrument(calibration.values), calibration.filter_curve(filter_name)
 
 
 def table(stages: tuple[Stage, ...]) -> list[str]:

@@ -4,25 +4,25 @@ This room turns files into plain immutable records and back. Units are checked a
 gone afterwards: inside the package a number has the unit that the record's docstring gives.
 """
 
-from walop_jax.data.calset import CALVERS, empty_sources, read_calibration_set, with_builtins
-from walop_jax.data.checks import INSTRUMENTS
+from walop_jax.data.calset import empty_sources, read_calibration_set, with_builtins
 from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter
 from walop_jax.data.frames import FrameIntensities, Grid
 from walop_jax.data.merge import JoinedIntensities, merge_calibration_sets
 from walop_jax.data.records import (
-    CAMERAS,
-    FLAG_BITS,
     KINDS,
     Block,
     CalibrationSet,
+    DataFlag,
     Exposures,
     FilterCurve,
     InputFile,
     Intensities,
     Points,
+    Position,
     Site,
     Sources,
 )
+from walop_jax.data.schema import CALVERS
 from walop_jax.data.table_intensities import TableIntensities, empty_block
 from walop_jax.data.write import write_calibration_set, write_frames
 from walop_jax.data.zemax import import_transmissions
@@ -32,14 +32,12 @@ from walop_jax.io.errors import DataError, nearest
 __all__ = [
     "BUILTIN_FILTERS",
     "CALVERS",
-    "CAMERAS",
     "DEFAULT_FILTER",
-    "FLAG_BITS",
-    "INSTRUMENTS",
     "KINDS",
     "Block",
     "CalibrationSet",
     "DataError",
+    "DataFlag",
     "Exposures",
     "FilterCurve",
     "FrameIntensities",
@@ -48,6 +46,7 @@ __all__ = [
     "Intensities",
     "JoinedIntensities",
     "Points",
+    "Position",
     "Site",
     "Sources",
     "TableIntensities",

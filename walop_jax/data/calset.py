@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import os
+import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from walop_jax.data import schema
-from walop_jax.data.checks import INSTRUMENTS, make_exposures, make_filters, make_points, make_sources
+from walop_jax.data.checks import (
+    instrument_name,
+    make_exposures,
+    make_filters,
+    make_points,
+    make_sources,
+)
 from walop_jax.data.filters import builtin_filter
-from walop_jax.data.frames import COUNT_NAMES, ERROR_NAMES, FrameIntensities, frame_stack
+from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
 from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.records import (
+    KINDS,
     CalibrationSet,
     Exposures,
     FilterCurve,
@@ -23,23 +32,21 @@ from walop_jax.data.records import (
     Site,
     Sources,
 )
-from walop_jax.data.schema import Place, read_table
+from walop_jax.data.schema import CALVERS, Place, column_names, read_table, table_rules
 from walop_jax.data.table_intensities import TableIntensities, mask_repeats, table_intensities, usable
 from walop_jax.io.errors import DataError, fail, nearest
 from walop_jax.io.fits_reading import UNREADABLE, OpenFile, one_line, open_fits
 
-CALVERS = 1
-"""Version of the file format that is written, and the newest that is read."""
-
-_IMAGES = (*COUNT_NAMES, *ERROR_NAMES, "FLAG")
+_IMAGE = re.compile(r"[NE](0|[1-9][0-9]{0,2})")  # of one camera: counts or errors
 _SAMPLE = 8  # image rows looked at when frames are opened; every block is checked again as it is read
 
 
-def read_calibration_set(*paths: str | os.PathLike[str]) -> CalibrationSet:
+def read_calibration_set(*paths: str | os.PathLike[str], kinds: Collection[str] = ()) -> CalibrationSet:
     """Read and check one calibration set, merging several files into one.
 
     Whole frames are not read, only described; their blocks are checked as they are read. What was odd but
-    harmless (unknown columns, masked rows, …) stands in `remarks`.
+    harmless (unknown columns, masked rows, …) stands in `remarks`. `kinds` are kinds of exposures beyond `KINDS`
+    that sets of version 2 may have, for sources of the caller's own.
 
     Raises `DataError` that names file, extension, column and row for anything that cannot be trusted.
     """
@@ -47,7 +54,7 @@ def read_calibration_set(*paths: str | os.PathLike[str]) -> CalibrationSet:
         raise fail("no file was given", advice="name at least one calibration set")
     sets: list[CalibrationSet] = []
     for path in paths:
-        one = _read_one(Path(path))
+        one = _read_one(Path(path), (*KINDS, *kinds))
         known = {entry.inputs[0].sha256: entry.inputs[0].path for entry in sets}
         if one.inputs[0].sha256 in known:
             raise fail(
@@ -59,10 +66,10 @@ def read_calibration_set(*paths: str | os.PathLike[str]) -> CalibrationSet:
     return sets[0] if len(sets) == 1 else merge_calibration_sets(*sets)
 
 
-def _read_one(path: Path) -> CalibrationSet:
+def _read_one(path: Path, kinds: Collection[str]) -> CalibrationSet:
     with open_fits(path) as opened:
         try:
-            return _from_hdus(opened)
+            return _from_hdus(opened, kinds)
         except DataError:
             raise
         except UNREADABLE as error:
@@ -71,21 +78,24 @@ def _read_one(path: Path) -> CalibrationSet:
             ) from error
 
 
-def _from_hdus(opened: OpenFile) -> CalibrationSet:
+def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
     path, remarks = opened.path, list(opened.remarks)
     primary = opened.hdus[0].header
-    instrument, site = _header(primary, path)
-    tables, images = _extensions(opened, remarks)
+    version, instrument, site = _header(primary, path)
+    tables, images = _extensions(opened, version, remarks)
 
     def table(name: str) -> dict[str, Any]:
         if name not in tables:
             raise fail("the extension is missing", file=path, extension=name, advice="see the file format")
-        columns, more = read_table(tables[name], schema.TABLES[name], Place(path, name))
+        place = Place(path, name)
+        rules = table_rules(name, version, column_names(tables[name], place), place)
+        columns, more = read_table(tables[name], rules, place)
         remarks.extend(more)
         return columns
 
     filters = make_filters(table("FILTERS"), Place(path, "FILTERS")) if "FILTERS" in tables else {}
-    exposures = make_exposures(table("EXPOSURES"), filters, site, Place(path, "EXPOSURES"))
+    place = Place(path, "EXPOSURES")
+    exposures = make_exposures(table("EXPOSURES"), filters, site, place, version=version, kinds=kinds)
     sources = (
         make_sources(table("SOURCES"), Place(path, "SOURCES")) if "SOURCES" in tables else empty_sources()
     )
@@ -94,7 +104,7 @@ def _from_hdus(opened: OpenFile) -> CalibrationSet:
             raise fail("has frames and a table of intensities", file=path, advice="use one file for each")
         if opened.compressed:
             raise fail("frames are read in slabs", file=path, advice="unpack the file with gunzip")
-        intensities, points = _frames(images, exposures, instrument, path)
+        intensities, points = _frames(images, exposures, instrument, version, path)
     else:
         points = make_points(table("POINTS"), instrument, Place(path, "POINTS"))
         place = Place(path, "INTENSITIES")
@@ -115,16 +125,15 @@ def _from_hdus(opened: OpenFile) -> CalibrationSet:
     )
 
 
-def _header(header: Any, path: Path) -> tuple[str, Site]:
+def _header(header: Any, path: Path) -> tuple[int, str, Site]:
     place = Place(path, "PRIMARY")
     version = header.get("CALVERS")
     if version is None:
         raise place.fail("is missing", "CALVERS", "is this a calibration set?")
     if isinstance(version, bool) or not isinstance(version, int) or not 1 <= version <= CALVERS:
-        raise place.fail(f"is {version!r}, this program reads {CALVERS}", "CALVERS", "use a newer walop-jax")
-    instrument = str(header.get("INSTRUME", "")).strip().upper()
-    if instrument not in INSTRUMENTS:
-        raise place.fail(f"is {instrument!r}", "INSTRUME", nearest(instrument, INSTRUMENTS))
+        what = f"is {version!r}, this program reads up to {CALVERS}"
+        raise place.fail(what, "CALVERS", "use a newer walop-jax")
+    instrument = instrument_name(header.get("INSTRUME", ""), version, place)
     values: dict[str, float] = {}
     for name in ("SITELAT", "SITELONG", "SITEELEV"):
         value = header.get(name, float("nan"))
@@ -132,18 +141,21 @@ def _header(header: Any, path: Path) -> tuple[str, Site]:
             raise place.fail(f"is {value!r}, not a number", name, "degrees (east positive) and metres")
         values[name] = float(value)
     telescope = str(header.get("TELESCOP", "")).strip()
-    return instrument, Site(telescope, values["SITELAT"], values["SITELONG"], values["SITEELEV"])
+    site = Site(telescope, values["SITELAT"], values["SITELONG"], values["SITEELEV"])
+    return version, instrument, site
 
 
-def _extensions(opened: OpenFile, remarks: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+def _extensions(opened: OpenFile, version: int, remarks: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Sort the extensions of a file by name into tables and images."""
+    four = image_names(4)
     tables: dict[str, Any] = {}
     images: dict[str, Any] = {}
     for number, hdu in enumerate(opened.hdus[1:], start=1):
         name = hdu.name.strip().upper()
-        kind = tables if name in schema.TABLES else images if name in _IMAGES else None
+        image = name in four or (version > 1 and _IMAGE.fullmatch(name))
+        kind = tables if name in schema.TABLES else images if image else None
         if kind is None:
-            known = (*schema.TABLES, *_IMAGES)
+            known = (*schema.TABLES, *four)
             remarks.append(f"{opened.path} [{name or number}]: unknown extension ({nearest(name, known)})")
         elif name in kind:
             raise fail("is there twice", file=opened.path, extension=name, advice="remove one")
@@ -171,7 +183,7 @@ def _idle(intensities: TableIntensities, exposures: Exposures, path: Path) -> li
 
 
 def _frames(
-    images: dict[str, Any], exposures: Exposures, instrument: str, path: Path
+    images: dict[str, Any], exposures: Exposures, instrument: str, version: int, path: Path
 ) -> tuple[Intensities, Points]:
     """Describe frames, and look at a few rows of pixels for what is wrong everywhere."""
     if np.any(bad := (exposures.kind == "standard") & ~exposures.clp_in):
@@ -182,13 +194,13 @@ def _frames(
             column="KIND",
             advice="give standards in a table, in another file",
         )
-    grid, stack = frame_stack(images, len(exposures), path)
+    grid, stack = frame_stack(images, len(exposures), path, 4 if version == 1 else None)
     width, total = grid.width, grid.width * grid.height
     corners = (0, width - 1, total - width, total - 1)
     x, y = (np.concatenate(parts) for parts in zip(*(grid.xy(n, n + 1) for n in corners), strict=True))
     make_points({"POINT": np.arange(4), "X": x, "Y": y}, instrument, Place(path, "N0"))
     intensities = FrameIntensities(grid, (stack,))
-    place = Place(path, "N0")
+    place, last = Place(path, "N0"), intensities.cameras - 1
     sampled = [int(row) for row in np.unique(np.linspace(0, grid.height - 1, _SAMPLE).astype(int))]
     spoilt = number = 0
     lowest, highest = np.inf, -np.inf
@@ -203,9 +215,9 @@ def _frames(
     if spoilt > 0.2 * number:
         raise place.fail(
             f"{100 * spoilt / number:.0f} % of the pixels looked at are not finite or far below zero",
-            "N0…N3, E0…E3",
+            f"N0…N{last}, E0…E{last}",
             "repair the reduction, or set the FLAG image",
         )
     if lowest == highest and number > 1:
-        raise place.fail(f"all counts are equal ({lowest:g})", "N0…N3", "these are not measurements")
+        raise place.fail(f"all counts are equal ({lowest:g})", f"N0…N{last}", "these are not measurements")
     return intensities, grid.points

@@ -1,14 +1,14 @@
-"""Science catalogues: one row per star and exposure, four intensities each (contract, section 4, `apply`).
+"""Science catalogues: one row per star and exposure, an intensity of every camera (docs: files).
 
 | column | unit | meaning |
 | --- | --- | --- |
 | X, Y | deg | field position in the instrument frame |
-| N, N_ERR | electron | the four cameras O1, E1, O2, E2 and their errors (or N0 … N3, N0_ERR … N3_ERR) |
+| N, N_ERR | electron | the cameras (O1, E1, O2, E2) and their errors (or N0 … N3, N0_ERR … N3_ERR) |
 | ID | | rows of one ID (and one FILTER) are one star; without it every row is one |
 | TEFF | K | colour temperature of the star; NaN: flat photon spectrum |
 | CHWP_IN, CHWP_ANGLE | deg | calibration plate |
 | ROTATOR | deg | position angle of +X; where it is given the results are on the sky |
-| N_FLAG | | bits of the cameras as FLAG of a calibration set, one number or four; any bit: not used |
+| N_FLAG | | bits of the cameras as FLAG of a calibration set, one number or one per camera; any bit: not used |
 | FILTER, TEMP, HA | Celsius, h | as for field points |
 """
 
@@ -23,7 +23,6 @@ from walop_jax.data.schema import Column, Place
 from walop_jax.data.user_tables import FieldPoints, InputTable, field_points, numeric_column, vector_column
 from walop_jax.io.errors import rows_text
 
-_COUNTS = Column("float", "electron", width=4)
 _ROTATOR = Column("float", "deg", float("nan"))
 _NEGATIVE = 5.0  # sigma: what noise about a subtracted background may do, and no more
 
@@ -38,8 +37,8 @@ class Catalogue:
     """
 
     points: FieldPoints
-    counts: Float[np.ndarray, "n 4"]
-    sigma: Float[np.ndarray, "n 4"]
+    counts: Float[np.ndarray, "n k"]
+    sigma: Float[np.ndarray, "n k"]
     spoilt: Bool[np.ndarray, " n"]
     star: Int[np.ndarray, " n"]
     rotator: Float[np.ndarray, " n"]
@@ -48,24 +47,27 @@ class Catalogue:
         return len(self.star)
 
 
-def read_catalogue(source: InputTable, instrument: str, saturation: float = np.inf) -> Catalogue:
-    """The catalogue in a table; counts from `saturation` [electron] on, or below −5 σ, are not used.
+def read_catalogue(
+    source: InputTable, instrument: str, saturation: float = np.inf, *, cameras: int = 4
+) -> Catalogue:
+    """The catalogue in a table of an instrument with so many cameras.
+
+    Counts from `saturation` [electron] on, or below −5 σ, are not used.
 
     Raises `DataError` naming file, column and rows for anything that cannot be meant: errors that are not
     above 0, a ROTATOR that only some rows of a star have.
     """
     place = Place(source.path, "")
     points = field_points(source, instrument)
-    counts, sigma = (vector_column(source, name, _COUNTS) for name in ("N", "N_ERR"))
+    rule = Column("float", "electron", width=cameras, shape_advice=f"one row holds all {cameras} cameras")
+    counts, sigma = (vector_column(source, name, rule) for name in ("N", "N_ERR"))
     impossible = np.flatnonzero(np.any(np.isfinite(counts) & (sigma <= 0), axis=1))
     if impossible.size:
         what = f"is not above 0 in {rows_text(impossible)}"
         raise place.fail(
             what, "N_ERR", "standard errors in electrons; NaN for a camera that is not to be used"
         )
-    bad: Bool[np.ndarray, "n 4"] = (
-        _flagged(source, place) | (counts >= saturation) | (counts < -_NEGATIVE * sigma)
-    )
+    bad = _flagged(source, cameras, place) | (counts >= saturation) | (counts < -_NEGATIVE * sigma)
     rotator = numeric_column(source, "ROTATOR", _ROTATOR)
     star = _stars(source, points)
     on_sky = np.isfinite(rotator)
@@ -85,15 +87,16 @@ def read_catalogue(source: InputTable, instrument: str, saturation: float = np.i
     )
 
 
-def _flagged(source: InputTable, place: Place) -> Bool[np.ndarray, "n 4"]:
+def _flagged(source: InputTable, cameras: int, place: Place) -> Bool[np.ndarray, "n k"]:
     """Cameras that the catalogue itself says are not to be used."""
     if "N_FLAG" not in source.names:
-        return np.zeros((source.rows, 4), bool)
+        return np.zeros((source.rows, cameras), bool)
     column = source.table.columns[source.names.index("N_FLAG")]
     bits = np.ma.filled(np.ma.asarray(column), 0)
-    if bits.dtype.kind not in "iub" or bits.shape[1:] not in ((), (4,)):
-        raise place.fail("is neither one integer in a row nor four", "N_FLAG", "bits as in a calibration set")
-    return np.broadcast_to(bits.reshape(source.rows, -1) != 0, (source.rows, 4))
+    if bits.dtype.kind not in "iub" or bits.shape[1:] not in ((), (cameras,)):
+        what = f"is neither one integer in a row nor {cameras}"
+        raise place.fail(what, "N_FLAG", "bits as in a calibration set")
+    return np.broadcast_to(bits.reshape(source.rows, -1) != 0, (source.rows, cameras))
 
 
 def _stars(source: InputTable, points: FieldPoints) -> Int[np.ndarray, " n"]:

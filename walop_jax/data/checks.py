@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,13 +10,12 @@ import numpy as np
 from walop_jax.data.filters import BUILTIN_FILTERS
 from walop_jax.data.records import KINDS, Exposures, FilterCurve, Points, Site, Sources
 from walop_jax.data.schema import Place
+from walop_jax.instruments.description import described, shipped
 from walop_jax.io.errors import nearest, rows_text
 
-INSTRUMENTS = ("WALOP-SOUTH", "WALOP-NORTH", "WALOP-LAB")
-"""Values of INSTRUME that a calibration set may have."""
-
-FIELD_LIMITS = {"WALOP-SOUTH": 0.35, "WALOP-NORTH": 0.35, "WALOP-LAB": 45.0}
-"""Largest |X|, |Y| in degrees; on the laboratory bench X is the tilt of the plate."""
+_ANY_FIELD = 90.0  # deg
+_LONGEST_NAME = 32
+_FIRST_KINDS = ("clp", "moon", "standard", "flux")  # of version 1
 
 EPHEMERIS_MJD = (15020.0, 88069.0)
 """Where astropy's built-in ephemeris (ERFA `moon98`, the years 1900 to 2100) is meant to be used."""
@@ -36,10 +35,40 @@ def unique(ids: np.ndarray, column: str, place: Place) -> None:
     refuse(number[inverse] > 1, "the identifier is not unique", column, "number the rows", place)
 
 
+def field_limit(instrument: str) -> float:
+    """Largest |X|, |Y| in degrees that a field point of an instrument may have."""
+    return described(instrument).field_limit if instrument in shipped() else _ANY_FIELD
+
+
+def instrument_name(value: object, version: int, place: Place) -> str:
+    """Check INSTRUME, in which the names of shipped instruments know no upper and lower case, and return it.
+
+    Raises `DataError` for another name in version 1; from version 2 on for one that is empty, longer than 32
+    letters, begins or ends with a blank, or is not printable ASCII.
+    """
+    if version == 1:
+        name = str(value).strip().upper()
+        if name not in shipped():
+            raise place.fail(f"is {name!r}", "INSTRUME", nearest(name, shipped()))
+        return name
+    name = value if isinstance(value, str) else ""
+    good = 0 < len(name) <= _LONGEST_NAME and name == name.strip() and name.isascii() and name.isprintable()
+    if not good:
+        advice = f"1 to {_LONGEST_NAME} printable ASCII letters, no blank at either end"
+        raise place.fail(f"is {value!r}, not a name", "INSTRUME", advice)
+    return name.upper() if name.upper() in shipped() else name
+
+
+def oldest_version(instrument: str, exposures: Exposures, cameras: int) -> int:
+    """The oldest version of the calibration set format (CALVERS) that can hold a set."""
+    newer = instrument not in shipped() or cameras != 4 or exposures.moving
+    return 1 if not newer and np.isin(exposures.kind, _FIRST_KINDS).all() else 2
+
+
 def make_points(table: dict[str, Any], instrument: str, place: Place) -> Points:
     """Check the POINTS table (degrees) against the field of the instrument."""
     unique(table["POINT"], "POINT", place)
-    limit = FIELD_LIMITS[instrument]
+    limit = field_limit(instrument)
     for name in ("X", "Y"):
         refuse(~np.isfinite(table[name]), "is not finite", name, "remove these points", place)
         refuse(
@@ -113,14 +142,22 @@ def make_sources(table: dict[str, Any], place: Place) -> Sources:
 
 
 def make_exposures(
-    table: dict[str, Any], filters: Mapping[str, FilterCurve], site: Site, place: Place
+    table: dict[str, Any],
+    filters: Mapping[str, FilterCurve],
+    site: Site,
+    place: Place,
+    *,
+    version: int = 1,
+    kinds: Collection[str] | None = KINDS,
 ) -> Exposures:
-    """Check the EXPOSURES table (degrees, days, kelvin, …) for what every KIND needs."""
+    """Check the EXPOSURES table (degrees, days, kelvin, …) of a CALVERS `version` for what every KIND needs.
+
+    `kinds` are those that KIND may have, None: any.
+    """
     unique(table["EXPOSURE"], "EXPOSURE", place)
     table["KIND"] = kind = np.char.lower(table["KIND"])
-    for name in np.unique(kind).tolist():
-        if name not in KINDS:
-            refuse(kind == name, f"{name!r} is not a kind,", "KIND", nearest(name, KINDS), place)
+    if kinds is not None:
+        _kinds(kind, kinds, version, place)
     known = {*filters, *BUILTIN_FILTERS}
     for name in np.unique(table["FILTER"]).tolist():
         if name not in known:
@@ -133,15 +170,19 @@ def make_exposures(
             )
     clp_in = table["CLP_IN"]
     refuse((kind == "clp") & ~clp_in, "is false", "CLP_IN", "KIND clp needs the polariser in", place)
-    for plate in ("CLP", "CHWP"):
-        angle, inside = table[f"{plate}_ANGLE"], table[f"{plate}_IN"]
-        advice = f"give the encoder reading, or set {plate}_IN false"
-        refuse(inside & ~np.isfinite(angle), "is not finite", f"{plate}_ANGLE", advice, place)
-        # Out of the beam a plate has no angle, whatever the header remembers.
-        table[f"{plate}_ANGLE"] = np.where(inside, angle, np.nan)
-    _not_radians(table["CLP_ANGLE"][clp_in], place)
+    moving = [name.removesuffix("_IN") for name in table if name.endswith("_IN")]
+    for prefix in moving:
+        angle, inside = table[f"{prefix}_ANGLE"], table[f"{prefix}_IN"]
+        advice = f"give the encoder reading, or set {prefix}_IN false"
+        refuse(inside & ~np.isfinite(angle), "is not finite", f"{prefix}_ANGLE", advice, place)
+        # Out of the beam an element has no angle, whatever the header remembers.
+        table[f"{prefix}_ANGLE"] = np.where(inside, angle, np.nan)
+    angles = np.unique(table["CLP_ANGLE"][clp_in])
+    if like_radians(angles):
+        what = f"all {len(angles)} different angles lie between {angles[0]:g} and {angles[-1]:g}"
+        raise place.fail(what, "CLP_ANGLE", "angles are in degrees: are these radians?")
     _temperature(table["TEFF"], place)
-    _ranges(table, place)
+    _ranges(table, [f"{prefix}_ANGLE" for prefix in moving], place)
 
     moon, standard = (kind == "moon") & ~clp_in, (kind == "standard") & ~clp_in
     for name in ("MJD", "RA", "DEC", "ROTATOR"):
@@ -155,7 +196,17 @@ def make_exposures(
     refuse(bad, "is not in 1900 … 2100", "MJD", "is this a Julian Date? subtract 2400000.5", place)
     if np.any(moon):
         _site(site, place)
-    return Exposures(**{name: table[name.upper()] for name in Exposures.__dataclass_fields__})
+    return Exposures.from_columns(table)
+
+
+def _kinds(kind: np.ndarray, kinds: Collection[str], version: int, place: Place) -> None:
+    known = [name for name in kinds if version > 1 or name in _FIRST_KINDS]
+    for name in np.unique(kind).tolist():
+        if name not in kinds:
+            refuse(kind == name, f"{name!r} is not a kind,", "KIND", nearest(name, known), place)
+        if name not in known:
+            what = f"{name!r} is a kind of CALVERS 2, this is {version},"
+            refuse(kind == name, what, "KIND", "set CALVERS = 2 in the primary header", place)
 
 
 def _temperature(teff: np.ndarray, place: Place) -> None:
@@ -163,14 +214,14 @@ def _temperature(teff: np.ndarray, place: Place) -> None:
     refuse(bad, "is not a temperature of a source", "TEFF", "NaN means a flat photon spectrum", place)
 
 
-def _ranges(table: dict[str, Any], place: Place) -> None:
+def _ranges(table: dict[str, Any], angles: list[str], place: Place) -> None:
     """Refuse values that only another unit can explain; NaN passes, it has been dealt with."""
+    encoder = (36000.0, "encoder readings are in degrees: are these steps?")
     limits = {
         "DEC": (90.0, "declinations are in degrees"),
         "RA": (360.0, "right ascensions are in degrees"),
         "ROTATOR": (3600.0, "position angles are in degrees"),
-        "CLP_ANGLE": (36000.0, "encoder readings are in degrees: are these steps?"),
-        "CHWP_ANGLE": (36000.0, "encoder readings are in degrees: are these steps?"),
+        **dict.fromkeys(angles, encoder),
         "HA": (24.0, "hour angles are in hours: are these degrees?"),
         "TEMP": (150.0, "temperatures are in degrees Celsius: are these kelvin?"),
     }
@@ -191,19 +242,15 @@ def _site(site: Site, place: Place) -> None:
             )
 
 
-def _not_radians(angles: np.ndarray, place: Place) -> None:
-    """Refuse polariser angles that are clearly radians.
+def like_radians(angles: np.ndarray) -> bool:
+    """Whether angles are clearly radians, not degrees.
 
     Clearly: five or more, from more than a quarter of a turn in radians, none beyond a turn, and most of
     them off the round numbers that anyone would choose in degrees.
     """
     distinct = np.unique(angles)
     if len(distinct) < 5 or distinct[0] < -2 * np.pi or distinct[-1] > 2 * np.pi + 1e-6:
-        return
+        return False
     steps = distinct / 0.05
-    if distinct[-1] - distinct[0] > 0.5 * np.pi and np.mean(np.abs(steps - np.round(steps)) > 1e-3) > 0.5:
-        raise place.fail(
-            f"all {len(distinct)} different angles lie between {distinct[0]:g} and {distinct[-1]:g}",
-            "CLP_ANGLE",
-            "angles are in degrees: are these radians?",
-        )
+    off = np.mean(np.abs(steps - np.round(steps)) > 1e-3)
+    return bool(distinct[-1] - distinct[0] > 0.5 * np.pi and off > 0.5)

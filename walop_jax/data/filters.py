@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from walop_jax.data.records import FilterCurve
@@ -10,10 +12,10 @@ from walop_jax.io.errors import fail, nearest
 DEFAULT_FILTER = "SDSS-r"
 """What an exposure without a FILTER was taken through."""
 
-_SPECLITE = {"SDSS-r": "sdss2010-r"}
-"""Our names and speclite's. The WALOP filters are custom: the survey's curve is where one starts."""
+_TABLES = {"SDSS-r": "sdss_r.csv"}
+"""Files beside this one. The WALOP filters are custom: the survey's curve is where one starts."""
 
-BUILTIN_FILTERS = tuple(_SPECLITE)
+BUILTIN_FILTERS = tuple(_TABLES)
 """Names that `builtin_filter` knows."""
 
 
@@ -21,22 +23,15 @@ def builtin_filter(name: str) -> FilterCurve:
     """Return a built-in filter curve by name; wavelength in µm.
 
     `SDSS-r` is the r curve of the SDSS camera as measured by Doi et al. 2010, AJ 139, 1628, Table 4, for an
-    airmass of 1.3, as tabulated by speclite (`sdss2010-r`). The curve counts photons: it is the share
-    of the photons at each wavelength that is detected.
+    airmass of 1.3. The curve counts photons: it is the share of the photons at each wavelength that is detected.
 
     Raises `DataError` with the nearest names if there is no such filter.
     """
-    if name not in _SPECLITE:
+    if name not in _TABLES:
         raise fail(
             f"no built-in filter is called {name!r}",
             advice=nearest(name, BUILTIN_FILTERS) + " Otherwise add it to the FILTERS table",
         )
-    # Imported here because it reads its tables and much of astropy, which few callers need.
-    import speclite.filters
-
-    response = speclite.filters.load_filter(_SPECLITE[name])
-    return FilterCurve(
-        name=name,
-        wavelength=np.asarray(response.wavelength, dtype=np.float64) * 1e-4,
-        throughput=np.asarray(response.response, dtype=np.float64),
-    )
+    table = Path(__file__).with_name(_TABLES[name])
+    wavelength, throughput = np.loadtxt(table, delimiter=",", unpack=True, encoding="utf-8")
+    return FilterCurve(name=name, wavelength=wavelength * 1e-4, throughput=throughput.copy())

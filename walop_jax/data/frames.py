@@ -10,13 +10,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.records import Block, Intensities, Points
+from walop_jax.data.records import Block, DataFlag, Intensities, Points
 from walop_jax.data.schema import Place, convert_unit
 from walop_jax.data.table_intensities import empty_block, usable
 from walop_jax.io.errors import fail
-
-COUNT_NAMES = ("N0", "N1", "N2", "N3")
-ERROR_NAMES = ("E0", "E1", "E2", "E3")
 
 _SLAB = 1 << 19  # values of one camera that are looked at together when whole frames are gone through
 
@@ -85,9 +82,24 @@ class Cube:
         return values
 
 
+def count_names(cameras: int) -> tuple[str, ...]:
+    """Names of the image extensions of counts: N0, N1, …"""
+    return tuple(f"N{k}" for k in range(cameras))
+
+
+def error_names(cameras: int) -> tuple[str, ...]:
+    """Names of the image extensions of errors: E0, E1, …"""
+    return tuple(f"E{k}" for k in range(cameras))
+
+
+def image_names(cameras: int) -> tuple[str, ...]:
+    """Names of all image extensions that whole frames may have."""
+    return (*count_names(cameras), *error_names(cameras), "FLAG")
+
+
 @dataclasses.dataclass(frozen=True)
 class FrameStack:
-    """The frames of one file: four cubes of counts, four of errors, and flags if there are any."""
+    """The frames of one file: a cube of counts and one of errors per camera, and flags if there are any."""
 
     exposures: int
     counts: tuple[Cube, ...]
@@ -103,6 +115,11 @@ class FrameIntensities(Intensities):
         self.stacks = stacks
         self.exposures = sum(stack.exposures for stack in stacks)
         self._rows: int | None = None
+
+    @property
+    def cameras(self) -> int:
+        """Number of cameras; nothing is read."""
+        return len(self.stacks[0].counts)
 
     @property
     def rows(self) -> int:
@@ -122,7 +139,7 @@ class FrameIntensities(Intensities):
         """
         start, stop, _ = slice(start, stop).indices(self.grid.width * self.grid.height)
         stop = max(start, stop)
-        block = empty_block(*self.grid.xy(start, stop), self.exposures)
+        block = empty_block(*self.grid.xy(start, stop), self.exposures, self.cameras)
         first = 0
         for stack in self.stacks if stop > start else ():
             here = slice(first, first + stack.exposures)
@@ -136,7 +153,7 @@ class FrameIntensities(Intensities):
                     f"is zero or negative in plane {plane}, row {row}, column {column} (counted from 0), and "
                     f"{int(impossible.sum())} pixel(s) in all",
                     file=stack.sigma[camera].path,
-                    extension=ERROR_NAMES[camera],
+                    extension=stack.sigma[camera].extension,
                     advice="give the true error, or set the FLAG image",
                 )
             block.used[:, here] = used
@@ -146,7 +163,7 @@ class FrameIntensities(Intensities):
         return block
 
     def read(self, stack: FrameStack, start: int, stop: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return counts and errors (points, exposures, 4) and flags (points, exposures) as they stand."""
+        """Return counts and errors (points, exposures, cameras) and flags (points, exposures) as they stand."""
         top, bottom = start // self.grid.width, -(-stop // self.grid.width)
         inside = slice(start - top * self.grid.width, stop - top * self.grid.width)
 
@@ -159,22 +176,30 @@ class FrameIntensities(Intensities):
         if stack.flag is None:
             return counts, sigma, np.zeros(counts.shape[:2], dtype=np.int64)
         # An undefined flag is no clean bill of health.
-        flag = np.nan_to_num(columns(stack.flag), nan=2.0).astype(np.int64)
+        flag = np.nan_to_num(columns(stack.flag), nan=float(DataFlag.BAD_PIXEL)).astype(np.int64)
         return counts, sigma, np.broadcast_to(flag, counts.shape[:2])
 
 
-def frame_stack(images: dict[str, Any], exposures: int, path: Path) -> tuple[Grid, FrameStack]:
+def frame_stack(
+    images: dict[str, Any], exposures: int, path: Path, cameras: int | None = None
+) -> tuple[Grid, FrameStack]:
     """Describe the image extensions of a file, `images` by name, without reading their pixels.
+
+    `cameras` None: as many as there are images, at least two.
 
     Raises `DataError` for a missing or compressed extension, a shape that does not fit the exposures or the
     other extensions, a coordinate system that is not linear in X and Y, and a unit that is not electrons.
     """
     grids: dict[Grid, str] = {}
     cubes: dict[str, Cube] = {}
-    for name in (*COUNT_NAMES, *ERROR_NAMES, *(("FLAG",) if "FLAG" in images else ())):
+    if cameras is None:
+        cameras = max([2, *(int(name[1:]) + 1 for name in images if name != "FLAG")])
+    counts, errors = count_names(cameras), error_names(cameras)
+    for name in (*counts, *errors, *(("FLAG",) if "FLAG" in images else ())):
         place = Place(path, name)
         if name not in images:
-            raise place.fail("the image extension is missing", advice="frames need N0…N3 and E0…E3")
+            advice = f"frames need {counts[0]}…{counts[-1]} and {errors[0]}…{errors[-1]}"
+            raise place.fail("the image extension is missing", advice=advice)
         cubes[name] = _cube(images[name], exposures, place)
         if name != "FLAG":
             grids.setdefault(read_grid(images[name].header, place), name)
@@ -188,8 +213,9 @@ def frame_stack(images: dict[str, Any], exposures: int, path: Path) -> tuple[Gri
     flag = cubes.get("FLAG")
     if flag is not None and flag.shape[1:] != (grid.height, grid.width):
         raise fail("does not have the shape of N0", file=path, extension="FLAG", advice="write it anew")
-    counts, sigma = (tuple(cubes[name] for name in names) for names in (COUNT_NAMES, ERROR_NAMES))
-    return grid, FrameStack(exposures, counts, sigma, flag)
+    return grid, FrameStack(
+        exposures, tuple(cubes[name] for name in counts), tuple(cubes[name] for name in errors), flag
+    )
 
 
 def _cube(hdu: Any, exposures: int, place: Place) -> Cube:

@@ -9,14 +9,17 @@ from typing import Literal
 
 import numpy as np
 
-from walop_jax.data.records import FLAG_BITS, CalibrationSet
+from walop_jax.data.checks import like_radians
+from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, CalibrationSet, DataFlag, Exposures
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.instruments.description import shipped
 
 Severity = Literal["fault", "doubt", "note"]
 
 _LOOKED_AT = 1024  # field points whose intensities are looked at; of frames, in evenly spaced runs
 _RUN = 64
 _FEW_ANGLES = 8
+_FEWEST_SETTINGS = 3
 _NARROW = 30.0  # degrees
 _FEW_POINTS = 15
 _NOISE = (0.8, 25.0)  # believable σ²/N
@@ -52,11 +55,21 @@ class Group:
 
 
 @dataclasses.dataclass(frozen=True)
+class ElementUse:
+    """How a further moving element was used: exposures with it in the beam, and its distinct angles (deg)."""
+
+    prefix: str
+    exposures: int
+    angles: tuple[float, ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class Inspection:
     """A calibration set at a glance.
 
-    `angles` are the distinct polariser angles modulo 180° of exposures with data, `widest_gap` the largest
-    distance between neighbours among them (degrees). `noise_ratio` is the median of σ²/N: 1 for pure photon
+    `kinds` counts the exposures of each KIND. `angles` are the distinct polariser angles modulo 180° of exposures
+    with data, `widest_gap` the largest distance between neighbours among them (degrees); `elements` are the moving
+    elements beyond polariser and calibration plate. `noise_ratio` is the median of σ²/N: 1 for pure photon
     noise, more with read noise; NaN where KIND is `flux` throughout. `rows` counts used (exposure, point)
     pairs of those looked at (`looked_at` points).
     """
@@ -65,11 +78,14 @@ class Inspection:
     telescope: str
     origin: str
     files: tuple[str, ...]
+    cameras: int
+    kinds: dict[str, int]
     groups: tuple[Group, ...]
     points: int
     field: tuple[float, float, float, float]
     angles: tuple[float, ...]
     widest_gap: float
+    elements: tuple[ElementUse, ...]
     looked_at: int
     rows: int
     possible: int
@@ -103,11 +119,14 @@ def inspect(calset: CalibrationSet) -> Inspection:
         telescope=calset.site.telescope,
         origin=calset.origin,
         files=tuple(str(entry.path) for entry in calset.inputs),
+        cameras=calset.cameras,
+        kinds=dict(Counter(e.kind.tolist())),
         groups=_groups(calset, share),
         points=len(points),
         field=(float(points.x.min()), float(points.x.max()), float(points.y.min()), float(points.y.max())),
         angles=tuple(angles.tolist()),
         widest_gap=float(gaps.max(initial=0.0)) if len(angles) > 1 else 180.0,
+        elements=tuple(_element_use(e, prefix, live) for prefix in e.moving),
         looked_at=sample.points,
         rows=int(sample.used.sum()),
         possible=int(sample.used.size),
@@ -118,8 +137,9 @@ def inspect(calset: CalibrationSet) -> Inspection:
         filters=tuple(calset.filters),
         findings=(),
     )
+    findings = [*_findings(calset, made), *_about_settings(calset.exposures, live)]
     notes = [Finding("note", remark) for remark in calset.remarks]
-    return dataclasses.replace(made, findings=(*_findings(calset, made), *notes))
+    return dataclasses.replace(made, findings=(*findings, *notes))
 
 
 def _sample(calset: CalibrationSet) -> _Sample:
@@ -160,20 +180,30 @@ def _groups(calset: CalibrationSet, share: np.ndarray) -> tuple[Group, ...]:
     return tuple(groups)
 
 
+def _element_use(exposures: Exposures, prefix: str, live: np.ndarray) -> ElementUse:
+    """The use of a moving element in the exposures with data."""
+    position = exposures.position(prefix)[np.flatnonzero(live)]
+    angles = np.unique(np.round(position.angle[position.inside], 3))
+    return ElementUse(prefix, int(position.inside.sum()), tuple(angles.tolist()))
+
+
 def _flags(calset: CalibrationSet) -> dict[str, int]:
     """Flagged rows by meaning, for tables only: those of frames would have to be read entirely."""
     if not isinstance(calset.intensities, TableIntensities):
         return {}
     flag = calset.intensities.flag
-    counts = Counter({name: int(np.count_nonzero(flag & bit)) for bit, name in FLAG_BITS.items()})
-    counts["other"] = int(np.count_nonzero(flag & ~sum(FLAG_BITS)))
+    counts = Counter({bit.meaning: int(np.count_nonzero(flag & bit)) for bit in DataFlag})
+    counts["other"] = int(np.count_nonzero(flag & ~sum(DataFlag)))
     return {name: number for name, number in counts.items() if number}
 
 
 def _findings(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
-    yield from _about_angles(calset, made)
+    if not calset.exposures.moving:
+        yield from _about_angles(calset, made)
     if made.points < 2:
-        yield Finding("fault", "a single field point", "the joint fit over the field needs several")
+        # What another instrument needs its own description says.
+        severity = "fault" if calset.instrument in shipped() else "note"
+        yield Finding(severity, "a single field point", "a joint fit over the field needs several")
     elif made.points < _FEW_POINTS:
         yield Finding(
             "doubt",
@@ -193,7 +223,7 @@ def _findings(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
             "no light of known polarisation but through the polariser (neither Moon sky nor standards)",
             "the zero of the polariser and a polarising telescope cannot be seen without",
         )
-    if (saturated := made.flags.get("saturated", 0)) > _MUCH * made.possible:
+    if (saturated := made.flags.get(DataFlag.SATURATED.meaning, 0)) > _MUCH * made.possible:
         yield Finding("doubt", f"{saturated} rows are saturated", "expose for a shorter time")
     if unknown := made.flags.get("other", 0):
         yield Finding("note", f"{unknown} rows have FLAG bits without a meaning", "they are not used")
@@ -222,3 +252,24 @@ def _about_angles(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]
             "the polariser was turned through half a turn only",
             "a full turn tells a wobble of its rotation from the instrument",
         )
+
+
+def _about_settings(exposures: Exposures, live: np.ndarray) -> Iterator[Finding]:
+    """Findings where further elements move: which of them does the polariser's work is not known here."""
+    if not exposures.moving:
+        return
+    used = exposures[np.flatnonzero(live)]
+    prefixes = (POLARISER, CALIBRATION_PLATE, *used.moving)
+    states = [used.position(prefix) for prefix in prefixes]
+    distinct = len({tuple(str(state.angle[row]) for state in states) for row in range(len(used))})
+    if distinct < _FEWEST_SETTINGS:
+        yield Finding(
+            "fault",
+            f"{distinct} distinct setting(s) of the moving elements with usable data",
+            f"a fit needs at least {_FEWEST_SETTINGS}",
+        )
+    for prefix, state in zip(prefixes, states, strict=True):
+        if like_radians(state.angle[state.inside]):
+            yield Finding(
+                "doubt", f"the angles of {prefix} look like radians", f"{prefix}_ANGLE is in degrees"
+            )

@@ -15,6 +15,7 @@ from walop_jax.data.records import (
     FilterCurve,
     Intensities,
     Points,
+    Position,
     Site,
     Sources,
 )
@@ -34,6 +35,11 @@ class JoinedIntensities(Intensities):
         self.exposures = exposures
 
     @property
+    def cameras(self) -> int:
+        """Number of cameras, that of every part."""
+        return self.parts[0][0].cameras
+
+    @property
     def rows(self) -> int:
         """Number of used rows of all parts."""
         return sum(part.rows for part, _, _ in self.parts)
@@ -48,12 +54,12 @@ class JoinedIntensities(Intensities):
             first += len(points)
             if low < high:
                 piece = part.block(low, high)
-                whole = empty_block(piece.x, piece.y, self.exposures)
+                whole = empty_block(piece.x, piece.y, self.exposures, self.cameras)
                 for name in ("counts", "sigma", "used", "source"):
                     getattr(whole, name)[:, exposures] = getattr(piece, name)
                 pieces.append(whole)
         if not pieces:
-            return empty_block(np.zeros(0), np.zeros(0), self.exposures)
+            return empty_block(np.zeros(0), np.zeros(0), self.exposures, self.cameras)
         fields = [field.name for field in dataclasses.fields(Block)]
         return Block(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in fields})
 
@@ -63,15 +69,19 @@ def merge_calibration_sets(*sets: CalibrationSet) -> CalibrationSet:
 
     Exposure and point identifiers that collide are renumbered (and this is remarked on); points of tables
     with identical coordinates become one, sources with the same name and values likewise. Frames on the same
-    grid share their pixels; frames and tables keep field points of their own.
+    grid share their pixels; frames and tables keep field points of their own. A moving element that a set does
+    not have is out there.
 
-    Raises `DataError` for different instruments or sites, and for a filter or source that has one name and
-    two meanings.
+    Raises `DataError` for different instruments, numbers of cameras or sites, and for a filter or source that has
+    one name and two meanings.
     """
     first = sets[0]
     for other in sets[1:]:
         if other.instrument != first.instrument:
             raise _conflict(f"is {other.instrument}, {_name(first)} is {first.instrument}", other, "INSTRUME")
+        if other.cameras != first.cameras:
+            what = f"has {other.cameras} cameras, {_name(first)} has {first.cameras}"
+            raise _conflict(what, other, "N", "these are not sets of one instrument")
         if not _same_site(first.site, other.site):
             raise _conflict(
                 f"is another site than that of {_name(first)}", other, "SITELAT, SITELONG, SITEELEV"
@@ -154,11 +164,17 @@ def _join_exposures(sets: tuple[CalibrationSet, ...]) -> tuple[Exposures, list[s
             remarks.append(f"{_name(entry)} [EXPOSURES] EXPOSURE: taken in another file, raised by {shift}")
             new = new + shift
         ids = np.concatenate([ids, new])
-    columns = {
-        field.name: np.concatenate([getattr(entry.exposures, field.name) for entry in sets])
-        for field in dataclasses.fields(Exposures)
-    }
-    return Exposures(**(columns | {"exposure": ids})), remarks
+    prefixes = list(dict.fromkeys(prefix for entry in sets for prefix in entry.exposures.moving))
+    parts = []
+    for entry in sets:
+        e = entry.exposures
+        absent = {prefix: Position.out(len(e)) for prefix in prefixes if prefix not in e.moving}
+        if absent:
+            names = ", ".join(f"{prefix}_ANGLE" for prefix in absent)
+            remarks.append(f"{_name(entry)} [EXPOSURES] {names}: no such column, taken as out of the beam")
+        parts.append(dataclasses.replace(e, moving={**e.moving, **absent}).columns())
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return Exposures.from_columns(columns | {"EXPOSURE": ids}), remarks
 
 
 def _join_sources(sets: tuple[CalibrationSet, ...]) -> tuple[Sources, list[np.ndarray]]:

@@ -3,15 +3,39 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-CAMERAS = ("N0", "N1", "N2", "N3")
-KINDS = ("clp", "moon", "standard", "flux")
-FLAG_BITS = {1: "saturated", 2: "bad pixel", 4: "edge or vignetted", 8: "blended", 16: "ghost"}
+from walop_jax.io.errors import nearest
+
+KINDS = ("clp", "moon", "standard", "flux", "lamp")
+"""Kinds of exposures: through the polariser, full-Moon sky, standard star, known throughput, lamp."""
+
+POLARISER, CALIBRATION_PLATE = "CLP", "CHWP"
+"""Column prefixes of the moving elements that every calibration set knows."""
+
+PREFIX = re.compile(r"[A-Z][A-Z0-9_]*")
+"""What a column prefix of a moving element looks like."""
+
+
+class DataFlag(enum.IntFlag):
+    """Bits of FLAG of an intensity: any of them keeps it from being used."""
+
+    SATURATED = 1
+    BAD_PIXEL = 2
+    EDGE_OR_VIGNETTED = 4
+    BLENDED = 8
+    GHOST = 16
+
+    @property
+    def meaning(self) -> str:
+        """The name of a bit in words."""
+        return str(self.name).lower().replace("_", " ")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,11 +61,37 @@ class FilterCurve:
 
 
 @dataclasses.dataclass(frozen=True)
+class Position:
+    """Where a moving element stands in every exposure: whether in the beam, and at what angle.
+
+    `angle` is the encoder reading in degrees, NaN where the element is out.
+    """
+
+    inside: Bool[np.ndarray, " e"]
+    angle: Float[np.ndarray, " e"]
+
+    def __len__(self) -> int:
+        return len(self.inside)
+
+    def __getitem__(self, rows: slice | Int[np.ndarray, " r"] | Bool[np.ndarray, " e"]) -> Position:
+        return Position(self.inside[rows], self.angle[rows])
+
+    @classmethod
+    def out(cls, exposures: int) -> Position:
+        """An element that is out of the beam throughout."""
+        return cls(np.zeros(exposures, dtype=bool), np.full(exposures, np.nan))
+
+
+@dataclasses.dataclass(frozen=True)
 class Exposures:
     """One entry per exposure; angles in degrees, NaN where a quantity has no meaning.
 
     `mjd` UTC days at mid-exposure, `exptime` s, `temp` Celsius, `ha` hours, `teff` K (NaN: flat photon
-    spectrum), `rotator` the position angle of ICS +X (north through east).
+    spectrum), `rotator` the position angle of ICS +X (north through east). `moving` holds the moving elements
+    beyond polariser and calibration plate, by column prefix.
+
+    Raises ValueError for a prefix that cannot be one, an element with another number of exposures, and one that
+    is in the beam without an angle.
     """
 
     exposure: Int[np.ndarray, " e"]
@@ -59,9 +109,63 @@ class Exposures:
     dec: Float[np.ndarray, " e"]
     rotator: Float[np.ndarray, " e"]
     teff: Float[np.ndarray, " e"]
+    moving: Mapping[str, Position] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for prefix, position in self.moving.items():
+            if not PREFIX.fullmatch(prefix) or prefix in (POLARISER, CALIBRATION_PLATE):
+                raise ValueError(
+                    f"{prefix!r} cannot be the prefix of a further moving element: capital letters, digits and _, "
+                    f"a letter first, not {POLARISER} or {CALIBRATION_PLATE}"
+                )
+            if len(position) != len(self):
+                raise ValueError(f"{prefix} has {len(position)} positions for {len(self)} exposures")
+            if not np.all(np.isfinite(position.angle[position.inside])):
+                raise ValueError(f"{prefix} is in the beam without an angle")
 
     def __len__(self) -> int:
         return len(self.exposure)
+
+    def __getitem__(self, rows: slice | Int[np.ndarray, " r"] | Bool[np.ndarray, " e"]) -> Exposures:
+        plain = {name.lower(): values[rows] for name, values in self._plain().items()}
+        return Exposures(**plain, moving={prefix: entry[rows] for prefix, entry in self.moving.items()})
+
+    def position(self, prefix: str) -> Position:
+        """The moving element of a column prefix: CLP, CHWP, or one of `moving`.
+
+        Raises ValueError with the nearest names for one that the set does not have.
+        """
+        if prefix == POLARISER:
+            return Position(self.clp_in, self.clp_angle)
+        if prefix == CALIBRATION_PLATE:
+            return Position(self.chwp_in, self.chwp_angle)
+        if prefix in self.moving:
+            return self.moving[prefix]
+        known = (POLARISER, CALIBRATION_PLATE, *self.moving)
+        raise ValueError(f"the exposures have no moving element {prefix!r}: {nearest(prefix, known)}")
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """All columns by their names in EXPOSURES, further moving elements last."""
+        columns = self._plain()
+        for prefix, entry in self.moving.items():
+            columns |= {f"{prefix}_IN": entry.inside, f"{prefix}_ANGLE": entry.angle}
+        return columns
+
+    @classmethod
+    def from_columns(cls, columns: Mapping[str, np.ndarray]) -> Exposures:
+        """Exposures from all columns by their names in EXPOSURES: the inverse of `columns`."""
+        plain = {field.name.upper() for field in dataclasses.fields(cls)} - {"MOVING"}
+        prefixes = [
+            name.removesuffix("_IN") for name in columns if name not in plain and name.endswith("_IN")
+        ]
+        return cls(
+            **{name.lower(): columns[name] for name in plain},
+            moving={p: Position(columns[f"{p}_IN"], columns[f"{p}_ANGLE"]) for p in prefixes},
+        )
+
+    def _plain(self) -> dict[str, np.ndarray]:
+        names = [field.name for field in dataclasses.fields(self) if field.name != "moving"]
+        return {name.upper(): getattr(self, name) for name in names}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,14 +200,14 @@ class Sources:
 class Block:
     """Intensities of some field points in all exposures, dense: what the likelihood is fed with.
 
-    `counts` and `sigma` in electrons; `used` is False where there is no measurement, or a flagged or
-    unusable one (counts 0 and sigma 1 stand there). `source` is a row of `Sources`, -1 for none.
+    `counts` and `sigma` in electrons, camera by camera; `used` is False where there is no measurement, or a
+    flagged or unusable one (counts 0 and sigma 1 stand there). `source` is a row of `Sources`, -1 for none.
     """
 
     x: Float[np.ndarray, " p"]
     y: Float[np.ndarray, " p"]
-    counts: Float[np.ndarray, "p e 4"]
-    sigma: Float[np.ndarray, "p e 4"]
+    counts: Float[np.ndarray, "p e k"]
+    sigma: Float[np.ndarray, "p e k"]
     used: Bool[np.ndarray, "p e"]
     source: Int[np.ndarray, "p e"]
 
@@ -134,9 +238,14 @@ class CalibrationSet:
     inputs: tuple[InputFile, ...] = ()
     remarks: tuple[str, ...] = ()
 
+    @property
+    def cameras(self) -> int:
+        """Number of cameras."""
+        return self.intensities.cameras
+
 
 class Intensities:
-    """The four intensities of every (exposure, point): a table in memory or frames on disk.
+    """The intensities of every (exposure, point): a table in memory or frames on disk.
 
     `block` must be pure and may be called from several threads; the field points it counts in are those
     of `CalibrationSet.points`, the exposures those of `CalibrationSet.exposures`.
@@ -147,6 +256,11 @@ class Intensities:
         raise NotImplementedError
 
     @property
+    def cameras(self) -> int:
+        """Number of cameras. This default reads one point; the classes of the package know it without reading."""
+        return self.block(0, 1).counts.shape[-1]
+
+    @property
     def rows(self) -> int:
-        """Number of used rows, that is of (exposure, point) pairs with four good intensities."""
+        """Number of used rows, that is of (exposure, point) pairs with a good intensity in every camera."""
         raise NotImplementedError

@@ -1,22 +1,26 @@
 """The columns of the calibration tables, and the one way that a column becomes an array.
 
 Columns go by name (FITS names know no upper and lower case). A unit that can be converted is converted;
-a missing unit is the contract's; anything else is refused. What comes out is native-endian.
+a missing unit is that of the schema (docs: files); anything else is refused. What comes out is native-endian.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, Literal
 
 import numpy as np
 from astropy import units
 
+from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, PREFIX
 from walop_jax.io.errors import fail, nearest, rows_text
 
 Kind = Literal["int", "float", "bool", "str"]
+
+CALVERS = 2
+"""Newest version of the calibration set format; a set is written in the oldest version that can hold it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,13 +28,16 @@ class Column:
     """One column of a table: its kind, its unit in memory, and its value where the file lacks it.
 
     `missing` None means that the column is required; `width` is the number of values in a row, or None for
-    as many as the file has.
+    as many as the file has. `shape_advice` says what a row should hold, `remarked` whether it is worth a remark
+    that the column is not there.
     """
 
     kind: Kind
     unit: str = ""
     missing: object = None
     width: int | None = 1
+    shape_advice: str = "see the file format"
+    remarked: bool = True
 
 
 _NAN = float("nan")
@@ -56,12 +63,13 @@ POINTS: Mapping[str, Column] = {
     "X": Column("float", "deg"),
     "Y": Column("float", "deg"),
 }
+_COUNTS = Column("float", "electron", width=4, shape_advice="one row holds the four cameras O1, E1, O2, E2")
 INTENSITIES: Mapping[str, Column] = {
     "EXPOSURE": Column("int"),
     "POINT": Column("int"),
     "SOURCE": Column("int", missing=-1),
-    "N": Column("float", "electron", width=4),
-    "N_ERR": Column("float", "electron", width=4),
+    "N": _COUNTS,
+    "N_ERR": _COUNTS,
     "FLAG": Column("int", missing=0),
 }
 SOURCES: Mapping[str, Column] = {
@@ -73,10 +81,11 @@ SOURCES: Mapping[str, Column] = {
     "U_ERR": Column("float"),
     "TEFF": Column("float", "K", _NAN),
 }
+_PADDED = "use one length, padded with NaN"
 FILTERS: Mapping[str, Column] = {
     "FILTER": Column("str"),
-    "WAVELENGTH": Column("float", "um", width=None),
-    "THROUGHPUT": Column("float", width=None),
+    "WAVELENGTH": Column("float", "um", width=None, shape_advice=_PADDED),
+    "THROUGHPUT": Column("float", width=None, shape_advice=_PADDED),
 }
 TABLES: Mapping[str, Mapping[str, Column]] = {
     "EXPOSURES": EXPOSURES,
@@ -85,7 +94,10 @@ TABLES: Mapping[str, Mapping[str, Column]] = {
     "SOURCES": SOURCES,
     "FILTERS": FILTERS,
 }
-"""The tables of a calibration set in the order in which they are written."""
+"""The tables of a calibration set of version 1, in the order in which they are written."""
+_ANY_CAMERAS = dataclasses.replace(
+    _COUNTS, width=None, shape_advice="one row holds all cameras, the same number in every row"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,18 +112,73 @@ class Place:
         return fail(what, file=self.file, extension=self.extension, column=column, advice=advice)
 
 
-def read_table(hdu: Any, schema: Mapping[str, Column], place: Place) -> tuple[dict[str, Any], list[str]]:
-    """Turn a FITS table into arrays by column name, in the schema's units, and remarks on what was odd.
+def table_rules(name: str, version: int, columns: Collection[str], place: Place) -> Mapping[str, Column]:
+    """The columns of a table of a calibration set of a version, where a file has `columns` (in capitals).
 
-    Raises `DataError` for a missing, duplicated or ill-typed column, a unit that cannot be converted, and a
-    table without rows.
+    From version 2 on EXPOSURES has a pair `<P>_IN`, `<P>_ANGLE` for every further moving element, need not have
+    those of CLP and CHWP, and INTENSITIES has any number of cameras. Raises `DataError` for half a pair and for a
+    prefix that is none.
     """
+    rules = TABLES[name]
+    if version == 1:
+        return rules
+    if name == "INTENSITIES":
+        return {**rules, "N": _ANY_CAMERAS, "N_ERR": _ANY_CAMERAS}
+    return {**rules, **_moving_columns(columns, place)} if name == "EXPOSURES" else rules
+
+
+def _moving_columns(columns: Collection[str], place: Place) -> dict[str, Column]:
+    """The columns of all moving elements: an element without any is out, one with an angle alone is always in."""
+    rules: dict[str, Column] = {}
+    for prefix in (POLARISER, CALIBRATION_PLATE):
+        inside, angle = f"{prefix}_IN", f"{prefix}_ANGLE"
+        absent = inside not in columns and angle not in columns
+        rules[inside] = Column("bool", missing=False if absent else None)
+        rules[angle] = Column("float", "deg", _NAN)
+        if absent:
+            rules |= {name: dataclasses.replace(rules[name], remarked=False) for name in (inside, angle)}
+    for name in columns:
+        prefix, mark, last = name.rpartition("_")
+        if not mark or last not in ("IN", "ANGLE") or name in rules:
+            continue
+        if not PREFIX.fullmatch(prefix):
+            raise place.fail(
+                f"{prefix!r} is no name of a moving element",
+                name,
+                "letters, digits and _, a letter first; rename the column if it is none of a moving element",
+            )
+        inside, angle = f"{prefix}_IN", f"{prefix}_ANGLE"
+        if angle not in columns:
+            pairs = [entry for entry in columns if entry.endswith("_ANGLE")]
+            advice = f"add it, or rename {inside} if there is no such element"
+            raise place.fail(
+                f"the column is missing, {inside} is there",
+                angle,
+                f"{advice} ({nearest(angle, pairs)})" if pairs else advice,
+            )
+        rules[inside] = Column("bool", missing=True, remarked=False)
+        rules[angle] = Column("float", "deg")
+    return rules
+
+
+def column_names(hdu: Any, place: Place) -> list[str]:
+    """Names of the columns of a FITS table in capitals; `DataError` if it is none or has a name twice."""
     if type(hdu).__name__ != "BinTableHDU":
         raise place.fail("is not a binary table", advice="write it as a FITS binary table")
     names = [name.upper() for name in hdu.columns.names]
     for name in names:
         if names.count(name) > 1:
             raise place.fail("the column is there twice", name, "remove or rename one of them")
+    return names
+
+
+def read_table(hdu: Any, schema: Mapping[str, Column], place: Place) -> tuple[dict[str, Any], list[str]]:
+    """Turn a FITS table into arrays by column name, in the schema's units, and remarks on what was odd.
+
+    Raises `DataError` for a missing, duplicated or ill-typed column, a unit that cannot be converted, and a
+    table without rows.
+    """
+    names = column_names(hdu, place)
     for name, column in schema.items():
         if column.missing is None and name not in names:
             others = sorted(set(names) - set(schema))
@@ -132,7 +199,9 @@ def read_table(hdu: Any, schema: Mapping[str, Column], place: Place) -> tuple[di
             table[name] = _read_column(hdu, names.index(name), name, column, place)
         else:
             table[name] = np.full(rows, column.missing)
-            remarks.append(f"{place.file} [{place.extension}] {name}: no such column, {column.missing} taken")
+            if column.remarked:
+                where = f"{place.file} [{place.extension}] {name}"
+                remarks.append(f"{where}: no such column, {column.missing} taken")
     return table, remarks
 
 
@@ -154,7 +223,7 @@ def _read_column(hdu: Any, index: int, name: str, column: Column, place: Place) 
         raise place.fail(
             f"has shape {values.shape[1:] or '()'} in a row where {width} value(s) are needed",
             name,
-            "one row holds the four cameras O1, E1, O2, E2" if column.width == 4 else "see the file format",
+            column.shape_advice,
         )
     null = hdu.columns[index].null
     if null not in (None, "") and np.issubdtype(values.dtype, np.integer) and np.any(values == int(null)):
@@ -169,7 +238,7 @@ def _read_column(hdu: Any, index: int, name: str, column: Column, place: Place) 
 def _rectangular(values: np.ndarray, name: str, column: Column, place: Place) -> np.ndarray:
     """Bring one value per row into a column of width one, refuse arrays whose length varies."""
     if values.dtype == object:
-        raise place.fail("is an array of variable length", name, "use one length, padded with NaN")
+        raise place.fail("is an array of variable length", name, column.shape_advice)
     return values[:, None] if column.width is None else values
 
 

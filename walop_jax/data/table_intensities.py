@@ -33,8 +33,8 @@ class TableIntensities(Intensities):
         exposure: Int[np.ndarray, " r"],
         point: Int[np.ndarray, " r"],
         source: Int[np.ndarray, " r"],
-        counts: Float[np.ndarray, "r 4"],
-        sigma: Float[np.ndarray, "r 4"],
+        counts: Float[np.ndarray, "r k"],
+        sigma: Float[np.ndarray, "r k"],
         flag: Int[np.ndarray, " r"],
         used: Bool[np.ndarray, " r"],
     ) -> None:
@@ -77,6 +77,11 @@ class TableIntensities(Intensities):
         )
 
     @property
+    def cameras(self) -> int:
+        """Number of cameras."""
+        return self.counts.shape[1]
+
+    @property
     def rows(self) -> int:
         """Number of used rows."""
         return len(self._order)
@@ -86,7 +91,8 @@ class TableIntensities(Intensities):
         start, stop, _ = slice(start, stop).indices(len(self.points))
         stop = max(start, stop)
         rows = self._order[self._bounds[start] : self._bounds[stop]]
-        block = empty_block(self.points.x[start:stop], self.points.y[start:stop], self.exposures)
+        x, y = self.points.x[start:stop], self.points.y[start:stop]
+        block = empty_block(x, y, self.exposures, self.cameras)
         at = (self.point[rows] - start, self.exposure[rows])
         block.counts[at] = self.counts[rows]
         block.sigma[at] = self.sigma[rows]
@@ -95,21 +101,23 @@ class TableIntensities(Intensities):
         return block
 
 
-def empty_block(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], exposures: int) -> Block:
+def empty_block(
+    x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], exposures: int, cameras: int
+) -> Block:
     """Return a block without any measurement: counts 0, sigma 1, nothing used. `x`, `y` in degrees."""
     shape = (len(x), exposures)
     return Block(
         x=x,
         y=y,
-        counts=np.zeros((*shape, 4)),
-        sigma=np.ones((*shape, 4)),
+        counts=np.zeros((*shape, cameras)),
+        sigma=np.ones((*shape, cameras)),
         used=np.zeros(shape, dtype=bool),
         source=np.full(shape, -1, dtype=np.int64),
     )
 
 
 def usable(
-    counts: Float[np.ndarray, "*r 4"], sigma: Float[np.ndarray, "*r 4"], flag: Int[np.ndarray, "*r"]
+    counts: Float[np.ndarray, "*r k"], sigma: Float[np.ndarray, "*r k"], flag: Int[np.ndarray, "*r"]
 ) -> tuple[Bool[np.ndarray, "*r"], Bool[np.ndarray, "*r"], Bool[np.ndarray, "*r"]]:
     """Sort measurements (electrons) into used, spoilt and impossible ones; flagged ones are none of these.
 
@@ -128,8 +136,10 @@ def table_intensities(
     """Check the rows of an INTENSITIES table against the other tables; return them and remarks.
 
     Raises `DataError` for identifiers that do not exist, repeated (EXPOSURE, POINT) pairs, errors that are
-    not positive, too many spoilt rows, nothing used, and counts that are all equal.
+    not positive, too many spoilt rows, nothing used, counts that are all equal, fewer than two cameras, and
+    another number of errors than of counts.
     """
+    _cameras(table["N"], table["N_ERR"], place)
     exposure = _rows_of(table["EXPOSURE"], exposures.exposure, "EXPOSURE", "EXPOSURES", place)
     point = _rows_of(table["POINT"], points.point, "POINT", "POINTS", place)
     pair = exposure * len(points) + point
@@ -166,11 +176,20 @@ def table_intensities(
     return intensities, remarks + more
 
 
+def _cameras(counts: np.ndarray, sigma: np.ndarray, place: Place) -> None:
+    number, errors = counts.shape[1], sigma.shape[1]
+    if number < 2:
+        raise place.fail(f"has {number} value in a row", "N", "one row holds all cameras, two at least")
+    if errors != number:
+        what = f"has {errors} value(s) in a row, N has {number}"
+        raise place.fail(what, "N_ERR", "give the error of every camera")
+
+
 def _judge(counts: np.ndarray, used: np.ndarray, spoilt: np.ndarray, place: Place) -> list[str]:
     """Refuse data that cannot be what they should; remark on what has been masked."""
     bad = np.flatnonzero(spoilt)
     if len(bad) > _SPOILT * len(spoilt):
-        cameras = [f"N[{k}]" for k in range(4) if not np.any(np.isfinite(counts[:, k]))]
+        cameras = [f"N[{k}]" for k in range(counts.shape[1]) if not np.any(np.isfinite(counts[:, k]))]
         raise place.fail(
             f"{100 * len(bad) / len(spoilt):.0f} % of the rows are not finite or far below zero "
             f"({rows_text(bad)}){', no data at all in ' + ', '.join(cameras) if cameras else ''}",
@@ -230,6 +249,13 @@ def _source_rows(
             "SOURCE",
             f"SOURCES has {known}",
         )
+    lamp = (exposures.kind == "lamp")[exposure] & used & (ids >= 0)
+    if np.any(lamp):
+        raise place.fail(
+            f"a lamp is no source of the sky, in {rows_text(np.flatnonzero(lamp))}",
+            "SOURCE",
+            "write −1, or another KIND",
+        )
     lost = np.flatnonzero(used & (ids >= 0) & (rows < 0))
     remark = f"{place.file} [{place.extension}] SOURCE: not in SOURCES, taken as unknown in {rows_text(lost)}"
     return rows, [remark] if len(lost) else []
@@ -241,10 +267,10 @@ def mask_repeats(intensities: TableIntensities, exposures: Exposures) -> tuple[T
     A copy has the same time, settings, points and counts to the last bit. Exposures that share only time
     and settings are remarked on.
     """
-    names = [name for name in exposures.__dataclass_fields__ if name != "exposure"]
+    settings = [values for name, values in exposures.columns().items() if name != "EXPOSURE"]
     groups: dict[tuple[str, ...], list[int]] = {}
     for row in np.flatnonzero(np.isfinite(exposures.mjd)):
-        groups.setdefault(tuple(str(getattr(exposures, name)[row]) for name in names), []).append(int(row))
+        groups.setdefault(tuple(str(values[row]) for values in settings), []).append(int(row))
     used = intensities.used.copy()
     remarks: list[str] = []
     alike: list[str] = []

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from walop_jax.data.checks import FIELD_LIMITS
+from walop_jax.data.checks import field_limit
 from walop_jax.data.filters import DEFAULT_FILTER
 from walop_jax.data.schema import Column, Place, convert_unit
 from walop_jax.io.atomic import atomic_path, check_output
@@ -135,7 +135,7 @@ def vector_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
     values = np.ma.getdata(np.ma.asarray(column))
     if values.ndim != 2 or values.shape[1] != width:
         what = f"has shape {values.shape[1:] or '()'} in a row, {width} values are needed"
-        raise place.fail(what, name, "one row holds the four cameras O1, E1, O2, E2")
+        raise place.fail(what, name, rule.shape_advice)
     masked = np.broadcast_to(np.asarray(getattr(column, "mask", False)), values.shape).ravel()
     return _numbers(values.ravel(), masked, str(column.unit or ""), name, rule, place).reshape(values.shape)
 
@@ -218,7 +218,7 @@ def field_points(source: InputTable, instrument: str) -> FieldPoints:
     refuse(cold, "is no temperature of a source", "TEFF", "give kelvin, or leave it empty: flat spectrum")
     refuse(np.abs(columns["TEMP"]) > 150, "exceeds ±150", "TEMP", "degrees Celsius: are these kelvin?")
     refuse(np.abs(columns["HA"]) > 24, "exceeds ±24", "HA", "hours: are these degrees?")
-    limit = FIELD_LIMITS[instrument]
+    limit = field_limit(instrument)
     outside = np.maximum(np.abs(x), np.abs(y)) > limit
     if np.mean(outside) > 0.5:
         raise place.fail(

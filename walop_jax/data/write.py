@@ -11,9 +11,9 @@ import numpy as np
 from astropy.io import fits
 
 from walop_jax.data import schema
-from walop_jax.data.calset import CALVERS
-from walop_jax.data.frames import COUNT_NAMES, ERROR_NAMES, Grid
-from walop_jax.data.records import CalibrationSet, FilterCurve
+from walop_jax.data.checks import instrument_name, oldest_version
+from walop_jax.data.frames import Grid, count_names, error_names
+from walop_jax.data.records import CalibrationSet, DataFlag, Exposures, FilterCurve
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail
@@ -29,10 +29,11 @@ def write_calibration_set(
     """Write a calibration set as tables, with checksums; the file appears whole or not at all.
 
     What was read comes back bit for bit, rows that are not used included; other intensities (frames, say)
-    are written as their used rows. The bytes depend on the set alone, not on the day.
+    are written as their used rows. The bytes depend on the set alone, not on the day. CALVERS is the oldest
+    version of the format that can hold the set.
 
     Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only,
-    and if a name cannot be written in FITS (ASCII only).
+    for fewer than two cameras, and if a name cannot be written in FITS (ASCII only).
     """
     intensities = calset.intensities
     if not isinstance(intensities, TableIntensities):
@@ -52,10 +53,14 @@ def sign_and_write(hdus: list[Any], path: Path) -> None:
 def _head(calset: CalibrationSet, path: object) -> list[Any]:
     primary = fits.PrimaryHDU()
     site = calset.site
+    version = oldest_version(calset.instrument, calset.exposures, calset.cameras)
+    instrument_name(calset.instrument, version, schema.Place(path, "PRIMARY"))
+    if calset.cameras < 2:
+        raise fail(f"{calset.cameras} camera", file=path, advice="a calibration set needs two at least")
     cards = {
         "TELESCOP": (site.telescope, "telescope"),
         "INSTRUME": (calset.instrument, "instrument"),
-        "CALVERS": (CALVERS, "version of the calibration set format"),
+        "CALVERS": (version, "version of the calibration set format"),
         "SITELAT": (site.latitude, "[deg] latitude"),
         "SITELONG": (site.longitude, "[deg] longitude, east positive"),
         "SITEELEV": (site.elevation, "[m] elevation"),
@@ -67,8 +72,14 @@ def _head(calset: CalibrationSet, path: object) -> list[Any]:
         elif not np.isfinite(value):
             continue  # FITS headers know no NaN; a missing card is read as one
         primary.header[name] = (value, comment if not isinstance(value, str) else "")
-    columns = {name: getattr(calset.exposures, name.lower()) for name in schema.EXPOSURES}
-    return [primary, table_hdu("EXPOSURES", columns, path)]
+    return [primary, exposures_hdu(calset.exposures, version, path)]
+
+
+def exposures_hdu(exposures: Exposures, version: int, path: object) -> fits.BinTableHDU:
+    """The EXPOSURES table in a version of the calibration set format."""
+    columns = exposures.columns()
+    rules = schema.table_rules("EXPOSURES", version, list(columns), schema.Place(path, "EXPOSURES"))
+    return table_hdu("EXPOSURES", columns, path, rules)
 
 
 def _body(calset: CalibrationSet, intensities: TableIntensities, path: object) -> list[Any]:
@@ -167,7 +178,8 @@ def write_frames(
             advice="one per pixel",
         )
     shape = (len(calset.exposures), grid.height, grid.width)
-    kinds = dict.fromkeys((*COUNT_NAMES, *ERROR_NAMES), np.dtype(f">{dtype}")) | {"FLAG": np.dtype(">i2")}
+    counts, errors = count_names(calset.cameras), error_names(calset.cameras)
+    kinds = dict.fromkeys((*counts, *errors), np.dtype(f">{dtype}")) | {"FLAG": np.dtype(">i2")}
     with atomic_path(path, overwrite=overwrite) as temporary:
         sign_and_write([*_head(calset, path), *_optional(calset, path)], temporary)
         cubes: dict[str, tuple[np.memmap[Any, Any], int]] = {}
@@ -178,10 +190,11 @@ def write_frames(
             bottom = min(top + step, grid.height)
             block = calset.intensities.block(top * grid.width, bottom * grid.width)
             planes = (shape[0], bottom - top, grid.width)
-            for k in range(4):
-                cubes[COUNT_NAMES[k]][0][:, top:bottom] = block.counts[..., k].T.reshape(planes)
-                cubes[ERROR_NAMES[k]][0][:, top:bottom] = block.sigma[..., k].T.reshape(planes)
-            cubes["FLAG"][0][:, top:bottom] = np.where(block.used.T, 0, 2).reshape(planes)
+            for k in range(calset.cameras):
+                cubes[counts[k]][0][:, top:bottom] = block.counts[..., k].T.reshape(planes)
+                cubes[errors[k]][0][:, top:bottom] = block.sigma[..., k].T.reshape(planes)
+            flag = np.where(block.used.T, 0, DataFlag.BAD_PIXEL)
+            cubes["FLAG"][0][:, top:bottom] = flag.reshape(planes)
         for cube, start in cubes.values():
             cube.flush()
             _sign_image(temporary, start, cube)

@@ -26,12 +26,12 @@ from jaxtyping import Float
 
 from walop_jax.data import schema
 from walop_jax.data.calset import empty_sources
-from walop_jax.data.checks import INSTRUMENTS, make_exposures, make_filters, make_points
-from walop_jax.data.records import CalibrationSet
+from walop_jax.data.checks import make_exposures, make_filters, make_points
+from walop_jax.data.records import CalibrationSet, DataFlag, Site
 from walop_jax.data.schema import Place
-from walop_jax.data.sites import SITES
 from walop_jax.data.table_intensities import table_intensities
 from walop_jax.data.zemax_text import HEADING, TransmissionExport, read_export
+from walop_jax.instruments.description import described, shipped
 from walop_jax.io.errors import fail, nearest
 
 CAMERA_CONFIGURATIONS = (1, 3, 2, 4)
@@ -42,7 +42,6 @@ RELATIVE_ERROR = 1e-3
 
 _UNIT = 1e6  # electrons for light of unit intensity
 _CAMERA_NAMES = ("O1", "E1", "O2", "E2")
-_VIGNETTED = 4  # bit of FLAG
 
 
 def import_transmissions(
@@ -104,7 +103,7 @@ def import_transmissions(
         "N": counts,
         # A number that was rounded to a step is off by step / √12.
         "N_ERR": np.maximum(error * counts, _UNIT * step[row] / math.sqrt(12.0)),
-        "FLAG": np.where(dark, _VIGNETTED, 0),
+        "FLAG": np.where(dark, DataFlag.EDGE_OR_VIGNETTED, 0),
     }
     filters, states = np.nonzero(taken)
     return _calibration_set(
@@ -143,14 +142,14 @@ def _instrument(
 ) -> str:
     """The instrument that was asked for, or the one that all titles name."""
     titles = sorted({export.title for export in exports})
-    named = {name for title in titles for name in INSTRUMENTS if name in title.upper()}
+    named = {name for title in titles for name in shipped() if name in title.upper()}
     if wanted is None and len(named) == 1:
         return named.pop()
     if wanted is None:
         raise fail(f"the titles name {len(named)} instruments ({', '.join(titles)})", file=folder,
-                   advice=f"say which it is: --instrument {' or '.join(INSTRUMENTS)}")  # fmt: skip
-    if wanted.upper() not in INSTRUMENTS:
-        raise fail(f"there is no instrument {wanted!r}", advice=nearest(wanted, INSTRUMENTS))
+                   advice=f"say which it is: --instrument {' or '.join(shipped())}")  # fmt: skip
+    if wanted.upper() not in shipped():
+        raise fail(f"there is no instrument {wanted!r}", advice=nearest(wanted, shipped()))
     if named - {wanted.upper()}:
         remarks.append(
             f"{folder}: the titles name {', '.join(sorted(named))}, {wanted.upper()} was asked for"
@@ -202,7 +201,7 @@ def _calibration_set(
 ) -> CalibrationSet:
     """Put the tables through the checks of any calibration set."""
     names = np.array([f"MONO-{1e4 * value:.0f}" for value in wavelength])
-    n, site = len(names), SITES[instrument]
+    n, site = len(names), Site(*described(instrument).place[:4])
     nothing = np.full(n, np.nan)
     clp_in = np.isfinite(angle)
     curve, first = np.unique(names, return_index=True)

@@ -6,34 +6,38 @@ comes out wrong by A⁻¹ (δm₀ + δA s), at most |A⁻¹ δm₀| + p ‖A⁻�
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_plan
-from walop_jax.data.records import CalibrationSet
+from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.fit.refit import FitResult
 from walop_jax.model import light
 
 LARGEST_P = 0.05
-SMALLEST_DETERMINANT = 0.1  # below, one exposure holds hardly any u
 
 
-def instrument_matrices(result: FitResult, calset: CalibrationSet) -> Float[np.ndarray, "p 2 3"]:
-    """Instrument matrix at the field points of a set, in the filter and plate setting of its first exposure."""
-    instrument = result.model.instrument(result.values)
+def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p a 3"]:
+    """Instrument matrix at the field points of a fit, in the filter and plate setting of its first exposure."""
+    instrument, calset = result.model.instrument(result.values), result.calset
     e = calset.exposures
     setting = Settings.default(1, str(e.filter[0]))
     setting.chwp_angle[0] = e.chwp_angle[0] if e.chwp_in[0] else np.nan
     plan = settings_plan(setting, calset.filters, instrument)
     vectors = analysis_vectors(instrument, plan, calset.points.x, calset.points.y)[:, 0]
-    return np.asarray(light.instrument_matrix(jnp.asarray(vectors) @ light.telescope(instrument)))
+    at = jnp.asarray(calset.points.x), jnp.asarray(calset.points.y)
+    sky = jax.vmap(light.telescope, (None, 0, 0))(instrument, *at)
+    return np.asarray(light.instrument_matrix(jnp.asarray(vectors) @ sky, instrument.cameras.pairs))
 
 
 def largest_change(
-    assumed: Float[np.ndarray, "p 2 3"], true: Float[np.ndarray, "p 2 3"], p: float = LARGEST_P
+    assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
 ) -> float:
     """Largest error of q and u over the field for stars polarised by up to `p`; NaN when no point holds both."""
+    if assumed.shape[1] != 2:  # one exposure of one arm, or of three, does not give q and u and nothing else
+        return float("nan")
     good = np.abs(np.linalg.det(assumed[:, :, 1:])) > SMALLEST_DETERMINANT
     if not good.any():
         return float("nan")

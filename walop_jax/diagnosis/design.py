@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float, Int
 from walop_jax.diagnosis.freeform import Measured
 from walop_jax.diagnosis.score import Projector, whitening
 from walop_jax.fit.refit import FitResult
-from walop_jax.likelihood.problem import Problem
 
 Vector = Float[np.ndarray, " _"]
 
@@ -23,52 +22,38 @@ class Design:
     The rows of the data run over points, then exposures, then cameras, used ones only.
     """
 
-    problem: Problem
     fit: FitResult
     measured: Measured
     residual: Vector
     jacobian: Float[np.ndarray, "_ _"]
 
     @classmethod
-    def of(cls, problem: Problem, fit: FitResult) -> Design:
+    def of(cls, fit: FitResult) -> Design:
         """Lay out a fit."""
-        measured = Measured(problem, fit.values)
+        likelihood = fit.likelihood
+        measured = Measured(likelihood, fit.values)
         scale = fit.noise_scale
         data = measured.residual[measured.used].reshape(-1) / scale
-        slope = problem.jacobian(fit.values) / scale
-        prior, prior_slope = cls._prior_rows(problem, fit.values)
-        return cls(problem, fit, measured, np.concatenate([data, prior]), np.vstack([slope, prior_slope]))
-
-    @staticmethod
-    def _prior_rows(problem: Problem, values: Vector) -> tuple[Vector, Float[np.ndarray, "_ _"]]:
-        model = problem.model
-        select = model.selection()
-        residual, slope = [], []
-        for i, p in enumerate(model.parameters):
-            if p.tie is not None or not select[i].any():
-                continue
-            if p.prior is not None:
-                residual.append((p.prior[0] - values[i]) / p.prior[1])
-                slope.append(-select[i] / p.prior[1])
-            elif p.loose is not None:
-                residual.append((p.start - values[i]) / p.loose)
-                slope.append(-select[i] / p.loose)
-        return np.array(residual), np.array(slope).reshape(len(residual), select.shape[1])
+        slope = likelihood.jacobian(fit.values) / scale
+        # Data − model: priors stand in for data, so their rows are mean − value.
+        prior = -likelihood.priors.residuals(fit.values)
+        prior_slope = -likelihood.priors.jacobian(fit.model.selection())
+        return cls(fit, measured, np.concatenate([data, prior]), np.vstack([slope, prior_slope]))
 
     @property
     def rows(self) -> int:
         """Number of rows that are data."""
-        return 4 * int(self.measured.used.sum())
+        return self.measured.cameras * int(self.measured.used.sum())
 
     @cached_property
     def exposure(self) -> Int[np.ndarray, " d"]:
         """Exposure (position) of every data row."""
-        return np.repeat(np.nonzero(self.measured.used)[1], 4)
+        return np.repeat(np.nonzero(self.measured.used)[1], self.measured.cameras)
 
     @cached_property
     def point(self) -> Int[np.ndarray, " d"]:
         """Field point (position) of every data row."""
-        return np.repeat(np.nonzero(self.measured.used)[0], 4)
+        return np.repeat(np.nonzero(self.measured.used)[0], self.measured.cameras)
 
     @cached_property
     def projector(self) -> Projector:
@@ -79,8 +64,7 @@ class Design:
     def eliminated(self) -> int:
         """Rows that carry no noise: one for every flux that was solved for, one for every weak pull."""
         fluxes = int(self.measured.used[:, ~self.measured.known].sum())
-        pulls = len(self.residual) - self.rows - self.fit.n_priors
-        return fluxes + pulls
+        return fluxes + int((~self.fit.likelihood.priors.known).sum())
 
     def _columns_of(self, name: str) -> Bool[np.ndarray, " f"]:
         """Which columns of the Jacobian are those of an effect."""
@@ -107,11 +91,11 @@ class Design:
             first += piece.shape[1]
         return whole
 
-    def cube(self, rows: Vector) -> Float[np.ndarray, "p e 4"]:
+    def cube(self, rows: Vector) -> Float[np.ndarray, "p e k"]:
         """Data rows put back into (point, exposure, camera); 0 where unused."""
         used = self.measured.used
-        cube = np.zeros((*used.shape, 4))
-        cube[used] = rows[: self.rows].reshape(-1, 4)
+        cube = np.zeros((*used.shape, self.measured.cameras))
+        cube[used] = rows[: self.rows].reshape(-1, self.measured.cameras)
         return cube
 
     def subset_step(self, keep: Bool[np.ndarray, " _"]) -> Float[np.ndarray, " _"]:
@@ -159,13 +143,13 @@ class HeldOut:
 
     @property
     def mean(self) -> float:
-        """Mean squared normalised residual (noise alone gives 3/4 when the flux is free)."""
+        """Mean squared normalised residual (noise alone gives 1 − 1/K with K cameras when the flux is free)."""
         return float(self.squares.sum() / self.counts.sum())
 
 
 def exposure_folds(design: Design) -> Int[np.ndarray, " d"]:
     """Fold of every data row: exposures of each kind and setting dealt out in turn."""
-    e = design.problem.calset.exposures
+    e = design.fit.calset.exposures
     fold = np.zeros(len(e), int)
     groups: dict[tuple[str, ...], int] = {}
     for i in range(len(e)):
@@ -177,7 +161,7 @@ def exposure_folds(design: Design) -> Int[np.ndarray, " d"]:
 
 def field_folds(design: Design) -> Int[np.ndarray, " d"]:
     """Fold of every data row: the field cut into 5 × 5 blocks, dealt out so that neighbours differ."""
-    points = design.problem.calset.points
+    points = design.fit.calset.points
 
     def cell(v: np.ndarray) -> np.ndarray:
         span = np.ptp(v) or 1.0

@@ -1,4 +1,4 @@
-"""A diagnosis as plain data: `diagnosis.json` of the contract, section 5 (further keys may follow the contract's)."""
+"""A diagnosis as plain data, `diagnosis.json` (docs: files)."""
 
 from __future__ import annotations
 

@@ -16,14 +16,14 @@ from jaxtyping import Bool, Float
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.score import Candidate
-from walop_jax.likelihood.problem import Problem
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import light
+from walop_jax.model.dependence import needs, optical_indices
 from walop_jax.model.effects import Context, Effect
-from walop_jax.model.effects.base import overridden
-from walop_jax.model.parameters import field_declarations
+from walop_jax.model.parameters import field_declarations, leaves
 from walop_jax.model.specification import Model
 
-MANY_SHAPES = 8
 LEAST_SURVIVING = 1e-3  # a contrast of 1 % that the band reduces by this factor is 0.001 %: of no consequence
 DEFAULT_WIDTH = 1.0
 
@@ -68,15 +68,11 @@ def probes(catalogue: Sequence[type[Effect]], context: Context) -> Iterator[Prob
                 yield probe
 
 
-def _kind_of_computation(effect: type[Effect], instance: Effect) -> tuple[object, ...]:
-    """What makes a computation costly: optics for every exposure, many nodes, derivatives of the plates."""
-    return (
-        effect.optics_depend_on,
-        effect.fringes,
-        effect.uses_median,
-        overridden((instance,), "mirrored"),
-        overridden((instance,), "plates") or overridden((instance,), "field"),
-    )
+def _kind_of_computation(model: Model, instance: Effect) -> tuple[object, ...]:
+    """What makes a computation costly: optics for every exposure, many nodes, derivatives of the optics."""
+    alone = dataclasses.replace(model.template, effects=(instance,))
+    first = len(leaves(dataclasses.replace(alone, effects=())))
+    return needs(alone), light.has_ghosts(alone), any(i >= first for i in optical_indices(alone))
 
 
 def effect_candidates(
@@ -84,16 +80,15 @@ def effect_candidates(
 ) -> dict[str, Candidate]:
     """Columns of all probes at the fit `values` of `model`, by probe name; without those that the bands blur away."""
     number = Counter(p.effect for p in wanted)
-    several = {effect for effect, count in number.items() if count > MANY_SHAPES}
+    several = {effect for effect, count in number.items() if count > limits.MANY_SHAPES}
     result: dict[str, Candidate] = {}
     together: dict[tuple[object, ...], list[Probe]] = {}
     for probe in wanted:
         if probe.effect not in several:
-            together.setdefault(_kind_of_computation(probe.effect, probe.group[0]), []).append(probe)
+            together.setdefault(_kind_of_computation(model, probe.group[0]), []).append(probe)
     for batch in together.values():
         members = tuple(member for probe in batch for member in probe.group)
-        problem = Problem(calset, model, probes=members)
-        columns = problem.effect_columns(values, members)
+        columns = Likelihood.of(calset, model, members).effect_columns(values, members)
         start = 0
         for probe in batch:
             stop = start + len(probe.widths)
@@ -109,10 +104,10 @@ def _swept(
     calset: CalibrationSet, model: Model, values: Vector, mine: Sequence[Probe]
 ) -> dict[str, Candidate]:
     """Columns of one effect at many shapes: one compiled sweep for each of its discrete choices."""
-    problem = Problem(calset, model, probes=(mine[0].group[0],))
+    likelihood = Likelihood.of(calset, model, (mine[0].group[0],))
     instrument = model.instrument(values)
-    nodes = np.asarray(light.node_wavelengths(instrument, problem.plan))
-    weight = np.asarray(light.band_weights(instrument, problem.plan))
+    nodes = np.asarray(light.node_wavelengths(instrument, likelihood.plan))
+    weight = np.asarray(light.band_weights(instrument, likelihood.plan))
     mine = [probe for probe in mine if probe.group[0].survives(nodes, weight) > LEAST_SURVIVING]
     members = [(i, j) for i, probe in enumerate(mine) for j in range(len(probe.group))]
     by_choice: dict[tuple[tuple[str, object], ...], list[tuple[int, int]]] = {}
@@ -120,7 +115,7 @@ def _swept(
         by_choice.setdefault(tuple(sorted(mine[i].group[j].choices().items())), []).append((i, j))
     found: dict[tuple[int, int], np.ndarray] = {}
     for group in by_choice.values():
-        columns = problem.effect_columns_over_shapes(values, [mine[i].group[j] for i, j in group])
+        columns = likelihood.effect_columns_over_shapes(values, [mine[i].group[j] for i, j in group])
         found |= dict(zip(group, columns, strict=True))
     return {
         probe.name: Candidate(

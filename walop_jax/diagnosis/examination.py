@@ -1,4 +1,4 @@
-"""One look at a fit: its design, the scores of every effect and pattern, and the names in order of evidence."""
+"""One examination of a fit: its design, the scores of every effect and pattern, and the names in order of evidence."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from walop_jax.diagnosis import naming
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.effect_columns import Probe, effect_candidates
 from walop_jax.diagnosis.findings import Limit
-from walop_jax.diagnosis.freeform import SINGLE, strata
+from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, strata
 from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable, separations
 from walop_jax.fit.refit import FitResult
-from walop_jax.likelihood.problem import Problem
 from walop_jax.model.effects import Effect
 from walop_jax.model.parameters import field_declarations
 
@@ -32,7 +31,7 @@ ALIKE = 0.01  # relative change of the counts up to which columns are kept
 
 
 @dataclasses.dataclass(frozen=True)
-class _Own:
+class _Absorbed:
     """What the parameters of an active effect absorb: the projection without them, and the columns' share of it."""
 
     rest: Projector
@@ -40,43 +39,43 @@ class _Own:
     columns: Matrix  # basisᵀ C
 
 
-class Look:
+class Examination:
     """The scores of everything against one fit.
 
     `named` are the columns of the effects ahead of any projection, `space` and `columns` those of all candidates,
     effects first, behind it. `ranked` are the effects in order of linear evidence, `patterns` the scores of the
-    free-form strata.
+    free-form strata, `blocks` the blocks of the free-form term that can take candidates up.
     """
 
     def __init__(
         self,
-        problem: Problem,
         result: FitResult,
         wanted: Sequence[Probe],
         rng: np.random.Generator,
-        earlier: Look | None = None,
+        earlier: Examination | None = None,
     ) -> None:
-        """`earlier` is a look at a smaller model, whose columns serve again where the light has hardly changed."""
-        self.problem, self.result = problem, result
-        active = problem.model.effect_names
-        self.design = Design.of(problem, result)
+        """`earlier` is of a smaller model; its columns serve again where the light has hardly changed."""
+        self.result = result
+        active = result.model.effect_names
+        self.design = Design.of(result)
         inactive = [probe for probe in wanted if probe.effect.name not in active]
         self.named = (
-            effect_candidates(problem.calset, problem.model, result.values, inactive)
+            effect_candidates(result.calset, result.model, result.values, inactive)
             if earlier is None or not self._is_like(earlier)
             else earlier.named
         )
         self.probes = [probe for probe in inactive if probe.name in self.named]
         candidates = [*(self.named[probe.name] for probe in self.probes), *strata(self.design.measured)]
+        self.blocks = {candidate.name: candidate.block for candidate in candidates}
         names, widths = [c.name for c in candidates], [c.widths for c in candidates]
         self.columns = self.design.stacked([candidates.pop(0).columns for _ in names])
-        self._own = {}
+        self._absorbed = {}
         for name in active:
             rest, basis = self.design.without(name)
-            self._own[name] = _Own(rest, basis, basis.T @ self.columns)
+            self._absorbed[name] = _Absorbed(rest, basis, basis.T @ self.columns)
         self.space = ScoreSpace.projected(self.design.projector, names, widths, self.columns)
         self.common_mode = self._common_mode()
-        space, reduce = self.space.with_base([SINGLE], self.common_mode)
+        space, reduce = self.space.with_base([SINGLE_EXPOSURES], self.common_mode)
         r = self.design.projector(self.design.residual)
         self._scored = space, *reduce(self.columns.T @ r, float(r @ r))
         self._rng = rng
@@ -86,15 +85,15 @@ class Look:
         # Where the base is excluded, a name competes with patterns that have none, not with the base.
         self.least_evidence = min(0.0, max(s.log_bayes for s in self.patterns if s.testable))
 
-    def _is_like(self, earlier: Look) -> bool:
+    def _is_like(self, earlier: Examination) -> bool:
         """Whether the expected counts differ so little that derivatives with respect to anything else do as well."""
         ours, theirs = self.design.measured.model, earlier.design.measured.model
         return bool(np.linalg.norm(ours - theirs) < ALIKE * np.linalg.norm(theirs))
 
     def _common_mode(self) -> Vector:
         """Prior widths of the gains of single exposures that amount to `COMMON_MODE` per intensity."""
-        at = self.space.places()[SINGLE]
-        points = np.repeat(self.design.measured.used.sum(axis=0), 3)
+        at = self.space.places()[SINGLE_EXPOSURES]
+        points = np.repeat(self.design.measured.used.sum(axis=0), self.design.measured.cameras - 1)
         square = np.where(self.space.before[at] > 0, self.space.before[at], np.inf)
         return np.maximum(COMMON_MODE * np.sqrt(points / square), 1e-30)
 
@@ -140,14 +139,14 @@ class Look:
     def untestable(self, catalogue: Sequence[type[Effect]]) -> tuple[str, ...]:
         """Effects that these data cannot show at any plausible size."""
         seen = {probe.effect.name for probe in self.probes if self.table[probe.name].testable}
-        seen.update(self.problem.model.effect_names)
+        seen.update(self.result.model.effect_names)
         return tuple(
             effect.name for effect in catalogue if effect.name not in seen and not effect.is_structural()
         )
 
     def separation(self, name: str, change: Vector) -> dict[str, float]:
         """How far (σ) each rival stays from an active effect that changes the residuals (data rows) by `change`."""
-        own = self._own[name]
+        own = self._absorbed[name]
         whole = np.pad(change, (0, len(self.design.residual) - len(change)))
         projected = own.rest(whole)
         space = dataclasses.replace(self.space, gram=self.space.gram + own.columns.T @ own.columns)

@@ -1,4 +1,4 @@
-"""What the pictures of a diagnosis are drawn from: residuals over the field, over the exposures, and in groups.
+"""What the figures of a diagnosis are drawn from: residuals over the field, over the exposures, and in groups.
 
 Combination  r_pk = Σ_e w_e r_pek / (Σ_e w_e² over the used ones)^½ keeps unit noise. The weights w are those of what
              can be said in words (a harmonic of the polariser angle at its best phase, the mean of a kind of
@@ -17,15 +17,20 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.data.records import Exposures
-from walop_jax.diagnosis.figure_file import Comparison, DiagnosisPictures, ExposureLabels, Ladder, Shares
+from walop_jax.diagnosis.figure_file import (
+    DiagnosisFigureData,
+    ExposureLabels,
+    Ladder,
+    ResidualComparison,
+    Shares,
+)
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.location import HARMONICS
-from walop_jax.likelihood.problem import Problem
-from walop_jax.model.conventions import CAMERA_NAMES
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import FreeForm
 
-Cube = Float[np.ndarray, "p e 4"]
-PointMap = Float[np.ndarray, "p 4"]
+Cube = Float[np.ndarray, "p e k"]
+PointMap = Float[np.ndarray, "p k"]
 Weight = Float[np.ndarray, " e"]
 Used = Bool[np.ndarray, "p e"]
 
@@ -49,26 +54,28 @@ class Combination:
         return np.einsum("pek,e->pk", cube, self.weight) / norm[:, None]
 
 
-def pictures(diagnosis: Diagnosis) -> DiagnosisPictures:
-    """The arrays from which the pictures of a diagnosis are drawn, residuals with the errors as given.
+def figure_data(diagnosis: Diagnosis) -> DiagnosisFigureData:
+    """The arrays from which the figures of a diagnosis are drawn, residuals with the errors as given.
 
     A free-form term that is in the final model without being a step comes as a last comparison of its own.
     """
-    problem, start, final = diagnosis.problem, diagnosis.before, diagnosis.after
-    exposures, used = problem.calset.exposures, problem.used
-    after = problem.residuals(final.values)[1]
-    before = after if start is final else Problem(problem.calset, start.model).residuals(start.values)[1]
+    start, final = diagnosis.before, diagnosis.after
+    exposures, used = final.calset.exposures, final.likelihood.used
+    after = final.likelihood.residuals(final.values)[1]
+    before = after if start is final else start.likelihood.residuals(start.values)[1]
     pairs = [("", before, after)]
     pairs += [(step.effect, step.residual_before, step.residual_after) for step in diagnosis.steps]
     if _unnamed_term(diagnosis):
         pairs.append((UNNAMED, pairs[-1][2] if diagnosis.steps else before, after))
     angle = np.where(exposures.clp_in, exposures.clp_angle, np.nan)
-    return DiagnosisPictures(
-        points=problem.calset.points,
+    return DiagnosisFigureData(
+        points=final.calset.points,
         exposures=ExposureLabels(exposures.exposure, exposures.kind, exposures.mjd, angle),
         ladder=_ladder(diagnosis),
-        shares=_shares(problem, before, after),
-        comparisons=tuple(compare(name, first, second, used, exposures) for name, first, second in pairs),
+        shares=_shares(final.likelihood, before, after),
+        comparisons=tuple(
+            compare_residuals(name, first, second, used, exposures) for name, first, second in pairs
+        ),
     )
 
 
@@ -77,7 +84,9 @@ def _unnamed_term(diagnosis: Diagnosis) -> bool:
     return UNNAMED in diagnosis.after.model.effect_names and UNNAMED not in known
 
 
-def compare(effect: str, before: Cube, after: Cube, used: Used, exposures: Exposures) -> Comparison:
+def compare_residuals(
+    effect: str, before: Cube, after: Cube, used: Used, exposures: Exposures
+) -> ResidualComparison:
     """Two cubes of residuals (σ; 0 where unused) side by side, in the combination that shows their difference.
 
     Without a difference the combination is the one that shows the residuals themselves.
@@ -94,7 +103,7 @@ def compare(effect: str, before: Cube, after: Cube, used: Used, exposures: Expos
     scatter = np.sqrt(np.einsum("pek,pk->ek", after**2, pattern**2)) / known
     rows = used.sum(axis=1, keepdims=True)
     rows = np.where(rows > 0, rows, np.nan)
-    return Comparison(
+    return ResidualComparison(
         effect=effect,
         combination=best.words,
         harmonic=best.harmonic,
@@ -163,15 +172,16 @@ def _ladder(diagnosis: Diagnosis) -> Ladder:
     return Ladder(np.array(model), np.array(chi2, float), np.array(freedom, int))
 
 
-def _shares(problem: Problem, before: Cube, after: Cube) -> Shares:
+def _shares(likelihood: Likelihood, before: Cube, after: Cube) -> Shares:
     """Sums of squared residuals by camera, kind, filter and exposure."""
-    e = problem.calset.exposures
-    known = np.asarray(problem.plan.exposures.flux_known)
-    expected = problem.used.sum(axis=0)[:, None] * np.where(known, 1.0, 0.75)[:, None] * np.ones(4)
+    e, known = likelihood.calset.exposures, likelihood.flux_known
+    names = likelihood.model.template.cameras.names
+    share = np.where(known, 1.0, 1.0 - 1.0 / len(names))
+    expected = (likelihood.used.sum(axis=0) * share)[:, None] * np.ones(len(names))
     squares = [expected, (before**2).sum(axis=0), (after**2).sum(axis=0)]  # (exposure, camera)
     members: list[tuple[str, str]] = []
     sums: list[list[float]] = []
-    for k, camera in enumerate(CAMERA_NAMES):
+    for k, camera in enumerate(names):
         members.append(("camera", camera))
         sums.append([float(square[:, k].sum()) for square in squares])
     for group, label in (("kind", e.kind), ("filter", e.filter), ("exposure", e.exposure)):

@@ -10,10 +10,9 @@ from jaxtyping import Float
 
 from walop_jax.diagnosis.design import HeldOut
 from walop_jax.fit.refit import FitResult
-from walop_jax.likelihood.problem import Problem
 
-Verdict = Literal["consistent", "effect_found", "unexplained"]
-Cube = Float[np.ndarray, "p e 4"]
+Outcome = Literal["consistent", "effect_found", "unexplained"]
+Cube = Float[np.ndarray, "p e k"]
 
 NEGLIGIBLE = (
     1e-4  # change of calibrated q and u (0.01 %) that does not matter for an instrument good to 0.1 %
@@ -108,11 +107,11 @@ class Unexplained:
 class Diagnosis:
     """What is missing from a model, according to one calibration set.
 
-    `candidates` are (effect, score, corrected p) in the first look; `after` is the fit of the extended model and
-    `problem` what it was fitted to; `remaining_p` is the significance of what is left at the end.
+    `candidates` are (effect, score, corrected p) in the first examination; `before` is the fit of the model given,
+    `after` that of the extended one; `remaining_p` is the significance of what is left at the end.
     """
 
-    verdict: Verdict
+    verdict: Outcome
     steps: tuple[Step, ...]
     candidates: tuple[tuple[str, float, float], ...]
     limits: tuple[Limit, ...]
@@ -122,7 +121,6 @@ class Diagnosis:
     remaining_p: float
     before: FitResult
     after: FitResult
-    problem: Problem
     seconds: float
     points: int
 
@@ -130,7 +128,7 @@ class Diagnosis:
     def caution(self) -> str:
         """What to bear in mind with these findings; empty when there is nothing."""
         parts = []
-        looked_at = len(self.problem.calset.points)
+        looked_at = len(self.after.calset.points)
         if looked_at < self.points:
             parts.append(
                 f"{looked_at} of {self.points} field points were looked at, and fitted: refit all of them with the "

@@ -25,37 +25,36 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.polynomial.legendre import legvander
 
+from walop_jax.data.records import POLARISER, Exposures
 from walop_jax.diagnosis.score import Candidate
-from walop_jax.likelihood.problem import Problem
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
-from walop_jax.model.conventions import CAMERA_NAMES
 from walop_jax.model.effects.free_form import FINE, HARMONICS, SMOOTH, WIDTH
 
 RINGS = (3, 4, 5, 6, 7, 8)
-SINGLE = "single exposures"
+SINGLE_EXPOSURES = "single exposures"
 
-Cube = Float[np.ndarray, "p e 4"]
+Cube = Float[np.ndarray, "p e k"]
 
 
 class Measured:
-    """The measurements of a problem at its best fit, laid out for building columns of residual derivatives."""
+    """The measurements at a best fit, laid out for building columns of residual derivatives."""
 
-    def __init__(self, problem: Problem, values: Float[np.ndarray, " n"]) -> None:
-        self.problem = problem
-        n = len(problem.calset.points)
-        self.weight: Cube = np.concatenate([np.asarray(c.weight) for c in problem.chunks])[:n]
-        self.counts: Cube = np.concatenate([np.asarray(c.counts) for c in problem.chunks])[:n]
-        self.used: Bool[np.ndarray, "p e"] = problem.used
-        self.values = values
-        self.flux, self.residual = problem.residuals(values)
+    def __init__(self, likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> None:
+        self.likelihood, self.values = likelihood, values
+        self.weight: Cube = likelihood.points.gathered("weight")
+        self.counts: Cube = likelihood.points.gathered("counts")
+        self.used: Bool[np.ndarray, "p e"] = likelihood.used
+        self.flux, self.residual = likelihood.residuals(values)
         # Weighted model at unit flux, from data = flux · model + residual.
         flux = np.where(self.flux == 0, 1.0, self.flux)[..., None]
         self.model: Cube = (self.counts * self.weight - self.residual) / flux
-        self.known = np.asarray(problem.plan.exposures.flux_known)
+        self.known = likelihood.flux_known
+        self.cameras = likelihood.cameras
         # Of the model, not of the counts: patterns that know the noise would find it in the residuals.
         unit = self.model / np.where(self.weight > 0, self.weight, 1.0)
         seen = np.maximum(self.used.sum(axis=1), 1)[:, None]
-        self.level: Float[np.ndarray, "p 4"] = np.where(self.used[..., None], unit, 0.0).sum(axis=1) / seen
+        self.level: Float[np.ndarray, "p k"] = np.where(self.used[..., None], unit, 0.0).sum(axis=1) / seen
 
     def column(self, pattern: Cube) -> Float[np.ndarray, " _"]:
         """Derivative of the residuals with respect to the amplitude of N_k → N_k + F · level_k · pattern."""
@@ -66,104 +65,113 @@ class Measured:
         return -(change - along[..., None] * self.model)[self.used].reshape(-1)
 
     def gains(self) -> Float[np.ndarray, "_ _"]:
-        """Columns of the gain of three cameras in every exposure (the fourth is the flux)."""
+        """Columns of the gain of all cameras but the last in every exposure (that one is the flux)."""
         change = self.flux[..., None] * self.level[:, None, :] * self.weight
         power = np.sum(self.model**2, axis=-1, keepdims=True)
         share = np.where(self.known[:, None], 0.0, change * self.model / np.where(power > 0, power, 1.0))
-        each = change[..., None] * np.eye(4) - share[..., None] * self.model[..., None, :]
+        each = change[..., None] * np.eye(self.cameras) - share[..., None] * self.model[..., None, :]
         row = np.cumsum(self.used).reshape(self.used.shape) - 1
         points, exposures = np.nonzero(self.used)
-        columns = np.zeros((4 * len(points), 3 * self.used.shape[1]))
-        for k in range(3):
-            for channel in range(4):
-                rows = 4 * row[points, exposures] + channel
-                columns[rows, 3 * exposures + k] = -each[points, exposures, k, channel]
+        free = self.cameras - 1
+        columns = np.zeros((self.cameras * len(points), free * self.used.shape[1]))
+        for k in range(free):
+            for channel in range(self.cameras):
+                rows = self.cameras * row[points, exposures] + channel
+                columns[rows, free * exposures + k] = -each[points, exposures, k, channel]
         return columns
 
-    def candidate(self, name: str, patterns: list[Cube]) -> Candidate:
-        """A stratum of patterns."""
+    def candidate(self, name: str, patterns: list[Cube], block: str | None = None) -> Candidate:
+        """A stratum of patterns, and the block of the free-form term that can take it up."""
         columns = np.column_stack([self.column(p) for p in patterns])
-        return Candidate(name, columns, np.full(columns.shape[1], WIDTH))
+        return Candidate(name, columns, np.full(columns.shape[1], WIDTH), block)
 
 
-def _camera(k: int) -> Float[np.ndarray, "1 1 4"]:
-    return np.eye(4)[k][None, None]
+def _positions(e: Exposures, prefix: str) -> np.ndarray:
+    position = e.position(prefix)
+    return np.array([f"{a:g}" if i else "out" for i, a in zip(position.inside, position.angle, strict=True)])
 
 
 def strata(measured: Measured) -> Iterator[Candidate]:
     """All strata that the exposures of the set allow."""
-    problem = measured.problem
-    e, points = problem.calset.exposures, problem.calset.points
-    shape = (len(points), len(e), 4)
+    e, points = measured.likelihood.calset.exposures, measured.likelihood.calset.points
+    names = measured.likelihood.model.template.cameras.names
+    # Calibration plates that are put in at one or two angles are compared as groups, below.
+    further = [(f" {prefix}", prefix) for prefix in measured.likelihood.plan.moving if prefix in e.moving]
+    turning = [("θ", POLARISER), *further]
+    shape = (len(points), len(e), len(names))
+
+    def _camera(k: int) -> Float[np.ndarray, "1 1 k"]:
+        return np.eye(len(names))[k][None, None]
+
     smooth = np.asarray(legendre.basis(jnp.asarray(points.x), jnp.asarray(points.y), SMOOTH))
     fine = np.asarray(legendre.basis(jnp.asarray(points.x), jnp.asarray(points.y), FINE))[
         :, smooth.shape[1] :
     ]
     square = points.x**2 + points.y**2
     rings = legvander(2.0 * square / max(float(square.max()), 1e-300) - 1.0, RINGS[-1])[:, RINGS]
-    stokes = problem.light(measured.values)
-    for k, camera in enumerate(CAMERA_NAMES):
+    stokes = measured.likelihood.stokes(measured.values)
+    for k, camera in enumerate(names):
         for i, element in ((1, "q"), (2, "u")):
             patterns = [(term[:, None] * stokes[..., i])[..., None] * _camera(k) for term in smooth.T]
-            yield measured.candidate(f"vector {element} of {camera}", patterns)
-        through = e.clp_in & measured.used.any(axis=0)
-        angle = np.deg2rad(np.where(through, e.clp_angle, 0.0))
-        for harmonic in HARMONICS:
-            if len(np.unique(np.round(np.mod(e.clp_angle[through], 360.0), 3))) < 2 * harmonic + 1:
-                continue
-            waves = [np.where(through, wave(harmonic * angle), 0.0) for wave in (np.cos, np.sin)]
-            patterns = [
-                (term[:, None] * wave[None, :])[..., None] * _camera(k)
-                for term in smooth.T[:3]
-                for wave in waves
-            ]
-            yield measured.candidate(f"{harmonic}θ of {camera}", patterns)
+            yield measured.candidate(f"vector {element} of {camera}", patterns, "vectors")
+        for symbol, prefix in turning:
+            position = e.position(prefix)
+            through = position.inside & measured.used.any(axis=0)
+            angle = np.deg2rad(np.where(through, position.angle, 0.0))
+            for harmonic in HARMONICS:
+                if len(np.unique(np.round(np.mod(position.angle[through], 360.0), 3))) < 2 * harmonic + 1:
+                    continue
+                waves = [np.where(through, wave(harmonic * angle), 0.0) for wave in (np.cos, np.sin)]
+                patterns = [
+                    (term[:, None] * wave[None, :])[..., None] * _camera(k)
+                    for term in smooth.T[:3]
+                    for wave in waves
+                ]
+                block = "harmonics" if prefix == POLARISER else "exposures"
+                yield measured.candidate(f"{harmonic}{symbol} of {camera}", patterns, block)
         yield measured.candidate(
             f"fine structure of {camera}",
             [np.broadcast_to(term[:, None, None] * _camera(k), shape) for term in fine.T],
+            "fine",
         )
         yield measured.candidate(
             f"rings of {camera}",
             [np.broadcast_to(ring[:, None, None] * _camera(k), shape) for ring in rings.T],
+            "fine",
         )
-    for name, quantity in (
-        ("time", (e.mjd - np.nanmean(e.mjd))[None, :]),
-        ("temperature", (e.temp - np.nanmean(e.temp))[None, :]),
-        ("flux", measured.flux - measured.flux[measured.used].mean()),
+    for name, quantity, block in (
+        ("time", (e.mjd - np.nanmean(e.mjd))[None, :], "exposures"),
+        ("temperature", (e.temp - np.nanmean(e.temp))[None, :], "exposures"),
+        ("flux", measured.flux - measured.flux[measured.used].mean(), None),
     ):
         spread = np.nanstd(quantity)
         if np.isfinite(spread) and spread > 1e-9 * max(1.0, float(np.nanmax(np.abs(quantity)))):
             scaled = np.nan_to_num(quantity / spread)
-            patterns = [np.broadcast_to(scaled[..., None] * _camera(k), shape) for k in range(4)]
-            yield measured.candidate(name, patterns)
-    plate = np.array([f"{a:g}" if i else "out" for i, a in zip(e.chwp_in, e.chwp_angle, strict=True)])
-    for name, label in (("kind", e.kind), ("filter", e.filter), ("plate", plate)):
+            patterns = [np.broadcast_to(scaled[..., None] * _camera(k), shape) for k in range(len(names))]
+            yield measured.candidate(name, patterns, block)
+    positions = [(prefix.lower(), _positions(e, prefix)) for prefix in measured.likelihood.plan.moving]
+    for name, label, block in (
+        ("kind", e.kind, "exposures"),
+        ("filter", e.filter, None),
+        *((("plate" if prefix == "chwp" else prefix), label, None) for prefix, label in positions),
+    ):
         groups = np.unique(label)
         patterns = [
             np.where((label == group)[None, :, None], stokes[..., i : i + 1], 0.0) * _camera(k)
             for group in groups[1:]
             for i in range(3)
-            for k in range(4)
+            for k in range(len(names))
         ]
         if patterns:
-            yield measured.candidate(name, patterns)
+            yield measured.candidate(name, patterns, block)
     sky_gradients = [
         np.where((e.kind == group)[None, :, None], term[:, None, None], 0.0) * _camera(k)
         for group in np.unique(e.kind)[1:]
         for term in smooth.T[1:3]
-        for k in range(4)
+        for k in range(len(names))
     ]
     if sky_gradients:
         yield measured.candidate("kind, over the field", sky_gradients)
-    yield Candidate(SINGLE, measured.gains(), np.full(3 * len(e), WIDTH))
-
-
-def block_of(stratum: str) -> str | None:
-    """The block of the free-form term that can take up a stratum; None for one that it cannot."""
-    if "θ of" in stratum:
-        return "harmonics"
-    if stratum.startswith("vector"):
-        return "vectors"
-    if stratum.startswith(("fine", "rings")):
-        return "fine"
-    return "exposures" if stratum in (SINGLE, "time", "temperature", "kind") else None
+    yield Candidate(
+        SINGLE_EXPOSURES, measured.gains(), np.full((len(names) - 1) * len(e), WIDTH), "exposures"
+    )

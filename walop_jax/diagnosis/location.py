@@ -10,7 +10,6 @@ from jaxtyping import Float
 
 from walop_jax.diagnosis.design import Design
 from walop_jax.model import legendre
-from walop_jax.model.conventions import CAMERA_NAMES
 
 HARMONICS = (0, 1, 2, 3, 4)
 FIELD_WORDS = ("uniform", "gradient", "quadratic", "cubic", "fourth order")
@@ -29,10 +28,10 @@ def _named(groups: dict[str, float]) -> str:
 
 
 def _harmonics(
-    design: Design, pattern: Float[np.ndarray, "p e 4"]
+    design: Design, pattern: Float[np.ndarray, "p e k"]
 ) -> tuple[dict[str, float], Float[np.ndarray, " p"]]:
     """Power of each harmonic of the polariser angle, and the field map of the strongest one."""
-    e = design.problem.calset.exposures
+    e = design.fit.calset.exposures
     use = np.flatnonzero(e.clp_in & design.measured.used.any(axis=0))
     if len(use) < 3:
         return {}, pattern.sum(axis=(1, 2))
@@ -53,7 +52,7 @@ def _harmonics(
 
 
 def _field_words(design: Design, field: Float[np.ndarray, " p"]) -> str:
-    points = design.problem.calset.points
+    points = design.fit.calset.points
     basis = np.asarray(legendre.basis(jnp.asarray(points.x), jnp.asarray(points.y), 4))
     degree = np.array([i + j for i, j in legendre.terms(4)])
     if len(field) <= len(degree):
@@ -71,10 +70,10 @@ def _field_words(design: Design, field: Float[np.ndarray, " p"]) -> str:
 
 
 def describe(design: Design, rows: Float[np.ndarray, " _"]) -> dict[str, Any]:
-    """Where a change of the residuals (data rows of `design`) sits, as the contract's `where`."""
+    """Where a change of the residuals (data rows of `design`) sits, as `where` of diagnosis.json (docs: files)."""
     cube = design.cube(rows)
     square = cube**2
-    e = design.problem.calset.exposures
+    e, names = design.fit.calset.exposures, design.fit.model.template.cameras.names
     by_exposure = square.sum(axis=(0, 2))
 
     def grouped(labels: np.ndarray) -> dict[str, float]:
@@ -83,10 +82,10 @@ def describe(design: Design, rows: Float[np.ndarray, " _"]) -> dict[str, Any]:
     harmonics, field = _harmonics(design, cube)
     hours = (e.mjd - e.mjd.min()) * 24.0
     order = np.argsort(hours)
-    rms = np.sqrt(by_exposure / np.maximum(4 * design.measured.used.sum(axis=0), 1))
+    rms = np.sqrt(by_exposure / np.maximum(len(names) * design.measured.used.sum(axis=0), 1))
     trend = float(np.corrcoef(np.arange(len(e)), rms[order])[0, 1]) if len(e) > 2 and rms.std() > 0 else 0.0
     return {
-        "camera": _named(dict(zip(CAMERA_NAMES, square.sum(axis=(0, 1)).tolist(), strict=True))),
+        "camera": _named(dict(zip(names, square.sum(axis=(0, 1)).tolist(), strict=True))),
         "field": _field_words(design, field),
         "clp_harmonic": _named(harmonics) if harmonics else "no polariser exposures",
         "wavelength": _named(grouped(e.filter)),

@@ -17,14 +17,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.effect_columns import Probe
 from walop_jax.diagnosis.score import Score, ScoreTable
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
-from walop_jax.likelihood.problem import Problem
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Context, Effect
-from walop_jax.model.parameters import leaves
-from walop_jax.model.specification import Model, full_values, with_effects
+from walop_jax.model.parameters import leaves, values_of
+from walop_jax.model.specification import Model, with_effects
 
 SEPARATION = 3.0
 MOST_LEADERS = 5
@@ -50,7 +49,6 @@ class Trial:
     """An effect that was added and refitted; `alternatives` are other shapes of it that do as well, in words."""
 
     effect: type[Effect]
-    problem: Problem
     fit: FitResult
     log_bayes: float
     alternatives: tuple[str, ...] = ()
@@ -104,24 +102,22 @@ def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
     return gain - occam - float(np.sum(np.log(widths)))
 
 
-def try_effect(
-    calset: CalibrationSet, base: FitResult, instance: Effect, context: Context, prior_shapes: int = 1
-) -> Trial:
+def try_effect(base: FitResult, instance: Effect, context: Context, prior_shapes: int = 1) -> Trial:
     """Add an effect at the given values to the fitted model and fit everything again."""
     model = with_effects(base.model, [instance], context)
     start = dict(zip(base.model.names, base.values, strict=True))
     values = np.array([start.get(p.name, p.start) for p in model.parameters])
-    problem = Problem(calset, model)
-    result = fit(problem, start=values, noise_scale=base.noise_scale, worth=base.posterior.objective)
+    likelihood = Likelihood.of(base.calset, model)
+    result = fit(likelihood, start=values, noise_scale=base.noise_scale, worth=base.posterior.objective)
     bayes = log_evidence_ratio(base, result) - (float(np.log(prior_shapes)) if prior_shapes > 1 else 0.0)
-    return Trial(type(instance), problem, result, bayes)
+    return Trial(type(instance), result, bayes)
 
 
-def try_shapes(calset: CalibrationSet, base: FitResult, item: Ranked, context: Context, shapes: int) -> Trial:
+def try_shapes(base: FitResult, item: Ranked, context: Context, shapes: int) -> Trial:
     """Refit an effect from the amplitudes of its linear steps at the shapes that may be best, and keep the best."""
     places = ((item.probe, item.score), *item.others)
     trials = [
-        try_effect(calset, base, item.effect.combine(probe.group, score.amplitudes), context, shapes)
+        try_effect(base, item.effect.combine(probe.group, score.amplitudes), context, shapes)
         for probe, score in places
     ]
     best = max(trials, key=lambda t: t.log_bayes if t.fit.converged else -np.inf)
@@ -135,13 +131,15 @@ def _differ(one: Trial, other: Trial) -> bool:
         return True
     at = one.fit.model.positions(one.effect.name)
     sigma = np.maximum(one.fit.sigma[at], other.fit.sigma[at])
-    away = full_values(one.instance) - full_values(other.instance)
+    away = np.asarray(values_of(one.instance)) - np.asarray(values_of(other.instance))
     return bool(np.any(np.abs(away) > SEPARATION * np.where(sigma > 0, sigma, np.inf)))
 
 
 def in_words(effect: Effect) -> str:
     """Choices and values of an effect, e.g. "camera = 2, depth = 0.006"."""
-    values = {leaf.name: f"{v:.4g}" for leaf, v in zip(leaves(effect), full_values(effect), strict=True)}
+    values = {
+        leaf.name: f"{v:.4g}" for leaf, v in zip(leaves(effect), np.asarray(values_of(effect)), strict=True)
+    }
     return ", ".join(f"{name} = {value}" for name, value in (spoken_choices(effect) | values).items())
 
 
@@ -203,7 +201,7 @@ def evidence_of_presence(result: FitResult, name: str, context: Context) -> floa
     neutral = dict(
         zip(
             (f"{name}.{leaf.name}" for leaf in leaves(effect)),
-            full_values(effect.at_neutral(context)),
+            np.asarray(values_of(effect.at_neutral(context))),
             strict=True,
         )
     )
@@ -223,24 +221,23 @@ def without(model: Model, name: str) -> Model:
     return dataclasses.replace(model, template=template, parameters=parameters)
 
 
-def refit_without(calset: CalibrationSet, result: FitResult, name: str) -> tuple[Problem, FitResult]:
+def refit_without(result: FitResult, name: str) -> FitResult:
     """Take an effect out of a fitted model and fit again, with errors scaled only if what is left needs it."""
     model = without(result.model, name)
     start = dict(zip(result.model.names, result.values, strict=True))
-    problem = Problem(calset, model)
-    return problem, fit(problem, start=np.array([start[n] for n in model.names]))
+    return fit(Likelihood.of(result.calset, model), start=np.array([start[n] for n in model.names]))
 
 
-def signature(problem: Problem, result: FitResult, name: str, context: Context) -> Float[np.ndarray, " _"]:
+def signature(result: FitResult, name: str, context: Context) -> Float[np.ndarray, " _"]:
     """What an active effect does to the residuals (data rows): theirs without it, minus theirs with it."""
     effect = result.model.template.effect(name)
     if type(effect).is_structural():
         model = without(result.model, name)
         kept = [result.model.index(n) for n in model.names]
-        bare = Problem(problem.calset, model).residuals(result.values[kept])[1]
+        bare = Likelihood.of(result.calset, model).residuals(result.values[kept])[1]
     else:
         values = result.values.copy()
-        values[result.model.positions(name)] = full_values(effect.at_neutral(context))
-        bare = problem.residuals(values)[1]
-    change = bare - problem.residuals(result.values)[1]
-    return change[problem.used].reshape(-1) / result.noise_scale
+        values[result.model.positions(name)] = np.asarray(values_of(effect.at_neutral(context)))
+        bare = result.likelihood.residuals(values)[1]
+    change = bare - result.likelihood.residuals(result.values)[1]
+    return change[result.likelihood.used].reshape(-1) / result.noise_scale

@@ -26,6 +26,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
+from walop_jax.likelihood import limits
+
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
 Reduction = Callable[[Vector, float], tuple[Vector, float]]
@@ -34,20 +36,20 @@ ABSORBED = 1e-6  # surviving share of a column's square below which the base has
 FAINTEST = 0.05  # standard deviations that a plausible amplitude must reach to be testable
 RANK_TOLERANCE = 1e-8
 COUNTED = 20  # draws below the smallest p found that make counting them precise enough
-DRAWS = 10_000
-AT_ONCE = 128  # columns that are projected together
 
 
 @dataclasses.dataclass(frozen=True)
 class Candidate:
     """A named set of columns: the derivative of the residuals with respect to its amplitudes.
 
-    `widths` are the prior standard deviations of the amplitudes, in their own units.
+    `widths` are the prior standard deviations of the amplitudes, in their own units. `block` is the block of the
+    free-form term that can take it up, where there is one.
     """
 
     name: str
     columns: Matrix
     widths: Vector
+    block: str | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,8 +153,9 @@ class ScoreSpace:
     ) -> ScoreSpace:
         """The space of candidates whose columns stand side by side; these are projected in place."""
         before = np.einsum("dk,dk->k", columns, columns)
-        for first in range(0, columns.shape[1], AT_ONCE):
-            columns[:, first : first + AT_ONCE] = projector(columns[:, first : first + AT_ONCE])
+        for first in range(0, columns.shape[1], limits.PROJECTED_COLUMNS):
+            some = columns[:, first : first + limits.PROJECTED_COLUMNS]
+            some[:] = projector(some)
         return cls(
             names=tuple(names),
             sizes=tuple(len(w) for w in widths),
@@ -211,7 +214,7 @@ class Scorer:
     Nothing here depends on the residuals, so that many data sets of the same design can be scored in turn.
     """
 
-    def __init__(self, space: ScoreSpace, rng: np.random.Generator, draws: int = DRAWS) -> None:
+    def __init__(self, space: ScoreSpace, rng: np.random.Generator, draws: int = limits.NULL_DRAWS) -> None:
         self.space = space
         alive, gram = space.alive(), np.where(np.outer(space.alive(), space.alive()), space.gram, 0.0)
         self._alive = alive

@@ -1,4 +1,4 @@
-"""What an effect does, told from two fits: the one without it and the one with it."""
+"""What an effect does, by two fits: the one without it and the one with it."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from walop_jax.diagnosis.design import Design, held_out
 from walop_jax.diagnosis.findings import Step
 
 
-def comparison(name: str, before: Design, after: Design) -> dict[str, Any]:
+def before_and_after(name: str, before: Design, after: Design) -> dict[str, Any]:
     """The fields of a `Step` that compare the fits without and with an effect."""
     effect = after.fit.model.instrument(after.fit.values).effect(name)
     # An effect with a number for every exposure cannot predict exposures that it has not seen.
     many = any(np.size(getattr(effect, f)) > 4 for f in effect.amplitudes())
     scheme = "field blocks" if many else "exposures"
-    old, new = (instrument_matrices(design.fit, design.problem.calset) for design in (before, after))
+    old, new = (instrument_matrices(design.fit) for design in (before, after))
     return {
         "chi2_before": before.fit.chi2,
         "chi2_after": after.fit.chi2,
@@ -32,17 +32,17 @@ def comparison(name: str, before: Design, after: Design) -> dict[str, Any]:
     }
 
 
-def retold(steps: Sequence[Step], start: Design, end: Design) -> list[Step]:
+def refitted_in_order(steps: Sequence[Step], start: Design, end: Design) -> list[Step]:
     """The steps as they lead, one after the other, from one fit to another that has no effects beside theirs.
 
-    The models between the two are fitted again; what tells of the discovery of an effect stays.
+    The models between the two are fitted again; what belongs to the discovery of an effect stays.
     """
-    fits = [(end.problem, end.fit)] if steps else []
+    fits = [end.fit] if steps else []
     for step in reversed(steps[1:]):
-        fits.append(naming.refit_without(end.problem.calset, fits[-1][1], step.effect))
-    told, before = [], start
-    for step, (problem, result) in zip(steps, reversed(fits), strict=True):
-        after = end if result is end.fit else Design.of(problem, result)
-        told.append(dataclasses.replace(step, **comparison(step.effect, before, after)))
+        fits.append(naming.refit_without(fits[-1], step.effect))
+    compared, before = [], start
+    for step, result in zip(steps, reversed(fits), strict=True):
+        after = end if result is end.fit else Design.of(result)
+        compared.append(dataclasses.replace(step, **before_and_after(step.effect, before, after)))
         before = after
-    return told
+    return compared

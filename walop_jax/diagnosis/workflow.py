@@ -19,28 +19,27 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import location as where
-from walop_jax.diagnosis import naming
+from walop_jax.diagnosis import location, naming
 from walop_jax.diagnosis.change_of_stokes import instrument_matrices, largest_change
 from walop_jax.diagnosis.design import Design, held_out
 from walop_jax.diagnosis.effect_columns import Probe
 from walop_jax.diagnosis.effect_columns import probes as all_probes
-from walop_jax.diagnosis.examination import Look
-from walop_jax.diagnosis.findings import Diagnosis, Step, Unexplained, Verdict
-from walop_jax.diagnosis.freeform import block_of
+from walop_jax.diagnosis.examination import Examination
+from walop_jax.diagnosis.findings import Diagnosis, Outcome, Step, Unexplained
 from walop_jax.diagnosis.score import Score
-from walop_jax.diagnosis.step_summary import comparison, retold
+from walop_jax.diagnosis.step_summary import before_and_after, refitted_in_order
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit
-from walop_jax.likelihood.chunks import thinned
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.thinning import thinned
 from walop_jax.model.effects import EFFECTS, Context, Effect, FreeForm
-from walop_jax.model.specification import Model, effect_context, full_values
+from walop_jax.model.parameters import values_of
+from walop_jax.model.specification import Model, effect_context
 
-LARGEST_ROWS = 100_000  # 800 columns of four cameras each take 2.5 GB
 MOST_STEPS = 6
 NEEDED = 1.0  # ln B that an effect must be worth to the final model to stay in it
 MISFIT = 1.5  # χ²/dof above which effects that cannot be differentiated are tried
-Progress = Callable[[str], None]
 
 
 def diagnose(
@@ -49,22 +48,23 @@ def diagnose(
     *,
     catalogue: Sequence[type[Effect]] = EFFECTS,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Find what `model` (default: the base model) lacks to explain a calibration set.
 
-    `catalogue` are the effects that may be named. Of a set with more than `LARGEST_ROWS` (exposure, point) pairs,
+    `catalogue` are the effects that may be named. Of a set with more than `limits.DIAGNOSED_ROWS` (exposure, point)
+    pairs,
     points spread over the field are looked at. Raises what `fit` raises.
     """
     began = time.perf_counter()
     tell = progress or (lambda text: None)
-    some = thinned(calset, max(1, LARGEST_ROWS // len(calset.exposures)), run=1)
+    some = thinned(calset, max(1, limits.DIAGNOSED_ROWS // len(calset.exposures)), neighbours=1)
     found = _Diagnosing(some, model or base_model(calset), catalogue, seed, tell).run(began)
     return dataclasses.replace(found, points=len(calset.points))
 
 
 class _Diagnosing:
-    """The state of one diagnosis: the current problem, its fit, the last look at it, the steps so far."""
+    """The state of one diagnosis: the current fit and the steps so far."""
 
     def __init__(
         self,
@@ -72,68 +72,72 @@ class _Diagnosing:
         model: Model,
         catalogue: Sequence[type[Effect]],
         seed: int,
-        tell: Progress,
+        tell: Callable[[str], None],
     ) -> None:
-        self.calset, self.catalogue, self.tell = calset, catalogue, tell
+        self.calset, self.tell = calset, tell
         self.rng = np.random.default_rng(seed)
         self.context: Context = effect_context(model.template, calset.exposures)
-        self.wanted: list[Probe] = list(all_probes(catalogue, self.context))
-        self.problem = Problem(calset, model)
+        fitting = [kind for kind in catalogue if kind.neutral(self.context).fits(model.template)]
+        self.catalogue = tuple(fitting)
+        self.wanted: list[Probe] = list(all_probes(self.catalogue, self.context))
         self.steps: list[Step] = []
         tell("fitting the model")
-        self.fit: FitResult = fit(self.problem)
+        self.fit: FitResult = fit(Likelihood.of(calset, model))
 
     def run(self, began: float) -> Diagnosis:
         before = self.fit
         self.tell("scoring every effect and pattern")
-        first = self._look()
-        look, unexplained = self._conclude(first, self._add_names(first))
-        steps = tuple(self._finished(step, look) for step in self.steps)
-        verdict: Verdict = "unexplained" if unexplained else "effect_found" if steps else "consistent"
+        first = self._examine()
+        examination, unexplained = self._conclude(first, self._add_names(first))
+        steps = tuple(self._finished(step, examination) for step in self.steps)
+        verdict: Outcome = "unexplained" if unexplained else "effect_found" if steps else "consistent"
         return Diagnosis(
             verdict=verdict,
             steps=steps,
             candidates=first.summary(),
-            limits=tuple(look.limits()),
+            limits=tuple(examination.limits()),
             untestable=first.untestable(self.catalogue),
             unexplained=unexplained,
             p_value=first.table.p_global,
-            remaining_p=look.table.p_global,
+            remaining_p=examination.table.p_global,
             before=before,
             after=self.fit,
-            problem=self.problem,
             seconds=time.perf_counter() - began,
             points=len(self.calset.points),
         )
 
-    def _look(self, earlier: Look | None = None) -> Look:
-        return Look(self.problem, self.fit, self.wanted, self.rng, earlier)
+    def _examine(self, earlier: Examination | None = None) -> Examination:
+        return Examination(self.fit, self.wanted, self.rng, earlier)
 
     # ------------------------------------------------------------------------------------------------ a name
 
-    def _add_names(self, look: Look) -> Look:
-        """Add names until nothing is missing or none is found; the look at what they leave."""
-        while look.alarm and len(self.steps) < MOST_STEPS:
-            self.tell(f"p = {look.table.p_global:.2g}: something is missing; trying names")
-            added = self._add_best(look)
+    def _add_names(self, examination: Examination) -> Examination:
+        """Add names until nothing is missing or none is found; the examination of what they leave."""
+        while examination.alarm and len(self.steps) < MOST_STEPS:
+            self.tell(f"p = {examination.table.p_global:.2g}: something is missing; trying names")
+            added = self._add_best(examination)
             if added is None:
                 break
             self.tell(f"added {added}; scoring what is left")
-            look = self._look(look)
-        return look
+            examination = self._examine(examination)
+        return examination
 
-    def _trials(self, look: Look) -> Iterator[naming.Trial]:
-        for item in naming.leaders(look.significant) if look.significant else ():
-            shapes = sum(probe.effect is item.effect for probe in look.probes)
-            yield naming.try_shapes(self.calset, self.fit, item, self.context, shapes)
+    def _trials(self, examination: Examination) -> Iterator[naming.Trial]:
+        for item in naming.leaders(examination.significant) if examination.significant else ():
+            shapes = sum(probe.effect is item.effect for probe in examination.probes)
+            yield naming.try_shapes(self.fit, item, self.context, shapes)
         if self.fit.chi2 > MISFIT * self.fit.dof:
             for effect in self.catalogue:
-                if effect.is_structural() and effect.name not in self.problem.model.effect_names:
-                    yield naming.try_effect(self.calset, self.fit, effect.neutral(self.context), self.context)
+                if effect.is_structural() and effect.name not in self.fit.model.effect_names:
+                    yield naming.try_effect(self.fit, effect.neutral(self.context), self.context)
 
-    def _add_best(self, look: Look) -> str | None:
+    def _add_best(self, examination: Examination) -> str | None:
         """Add the name with the highest evidence that held-out data confirm; None when there is none."""
-        trials = [t for t in self._trials(look) if t.fit.converged and t.log_bayes > look.least_evidence]
+        trials = [
+            t
+            for t in self._trials(examination)
+            if t.fit.converged and t.log_bayes > examination.least_evidence
+        ]
         trials.sort(key=lambda t: -t.log_bayes)
         for trial in trials:
             close = tuple(
@@ -141,49 +145,50 @@ class _Diagnosing:
                 for t in trials
                 if t is not trial and abs(t.log_bayes - trial.log_bayes) < naming.EVEN_ODDS
             )
-            step = self._step(look, trial, close)
+            step = self._step(examination, trial, close)
             if step.confirmed:
                 self.steps.append(step)
-                self._adopt(trial.problem, trial.fit)
+                self._adopt(trial.fit)
                 if self.fit is not trial.fit:
-                    after = Design.of(self.problem, self.fit)
-                    self.steps[-1] = dataclasses.replace(step, **comparison(step.effect, look.design, after))
+                    after = Design.of(self.fit)
+                    compared = before_and_after(step.effect, examination.design, after)
+                    self.steps[-1] = dataclasses.replace(step, **compared)
                 return step.effect
         return None
 
-    def _adopt(self, problem: Problem, result: FitResult) -> None:
+    def _adopt(self, result: FitResult) -> None:
         """Go on with a fit: errors as given where they need not be scaled any more, refuted priors widened."""
         if result.noise_scale > 1.0:
-            result = fit(problem, start=result.values)
-        model = problem.model
+            result = fit(result.likelihood, start=result.values)
+        model = result.model
         for step in self.steps:
             model = naming.with_refuted_priors_widened(model, result.values, step.effect)
-        if model is not problem.model:
-            problem = Problem(self.calset, model)
-            result = fit(problem, start=result.values)
-        self.problem, self.fit = problem, result
+        if model is not result.model:
+            result = fit(Likelihood.of(self.calset, model), start=result.values)
+        self.fit = result
 
-    def _step(self, look: Look, trial: naming.Trial, close: tuple[str, ...]) -> Step:
+    def _step(self, examination: Examination, trial: naming.Trial, close: tuple[str, ...]) -> Step:
         name = trial.effect.name
-        score: Score | None = next((r.score for r in look.ranked if r.effect is trial.effect), None)
+        score: Score | None = next((r.score for r in examination.ranked if r.effect is trial.effect), None)
         return Step(
             effect=name,
             parameters={},
-            score=score.statistic if score else look.result.chi2 - trial.fit.chi2,
-            p_value=look.table.corrected(score) if score else look.table.p_global,
+            score=score.statistic if score else examination.result.chi2 - trial.fit.chi2,
+            p_value=examination.table.corrected(score) if score else examination.table.p_global,
             log_bayes=trial.log_bayes,
             equivalent=close,
             alternatives=trial.alternatives,
-            **comparison(name, look.design, Design.of(trial.problem, trial.fit)),
+            **before_and_after(name, examination.design, Design.of(trial.fit)),
         )
 
     # --------------------------------------------------------------------------------------- what has no name
 
-    def _unexplained(self, look: Look) -> Unexplained:
-        patterns = tuple(look.patterns_needed())
-        if not look.alarm:
+    def _unexplained(self, examination: Examination) -> Unexplained:
+        patterns = tuple(examination.patterns_needed())
+        if not examination.alarm:
+            ratio = examination.result.chi2 / examination.result.dof
             text = (
-                f"residuals scatter more than N_ERR says (χ²/dof = {look.result.chi2 / look.result.dof:.3g}) "
+                f"residuals scatter more than N_ERR says (χ²/dof = {ratio:.3g}) "
                 "without any pattern that was looked for"
             )
         elif patterns:
@@ -191,59 +196,62 @@ class _Diagnosing:
             text = f"patterns without a name: {listed}"
         else:
             text = "something is missing, no single pattern is significant by itself"
-        place = where.describe(look.design, look.design.residual)
+        where = location.describe(examination.design, examination.design.residual)
         text += (
-            f". Residuals sit in: cameras {place['camera']}; kinds {place['kind']}; field {place['field']}"
+            f". Residuals sit in: cameras {where['camera']}; kinds {where['kind']}; field {where['field']}"
         )
-        found = Unexplained(look.table.p_global, text, patterns)
-        blocks = tuple(dict.fromkeys(b for name, _ in patterns if (b := block_of(name)) is not None))
+        found = Unexplained(examination.table.p_global, text, patterns)
+        blocks = tuple(
+            dict.fromkeys(b for name, _ in patterns if (b := examination.blocks[name]) is not None)
+        )
         there = FreeForm.name in self.fit.model.effect_names
-        return self._with_free_form(look, found, blocks) if blocks and not there else found
+        return self._with_free_form(examination, found, blocks) if blocks and not there else found
 
-    def _with_free_form(self, look: Look, found: Unexplained, blocks: tuple[str, ...]) -> Unexplained:
+    def _with_free_form(
+        self, examination: Examination, found: Unexplained, blocks: tuple[str, ...]
+    ) -> Unexplained:
         """Add a free-form term for patterns without a name, so that the calibration improves all the same.
 
         It need not be probable, only useful: it stays when it predicts parts of the field that it has not seen.
         """
         term = FreeForm.of(self.context, blocks=blocks)
-        trial = naming.try_effect(self.calset, self.fit, term, self.context)
+        trial = naming.try_effect(self.fit, term, self.context)
         if not trial.fit.converged:
             return found
         without, with_term = (
-            held_out(design, "field blocks").mean
-            for design in (look.design, Design.of(trial.problem, trial.fit))
+            held_out(design, "field blocks").mean for design in (examination.design, Design.of(trial.fit))
         )
         if with_term >= without:
             return found
         before = self.fit
-        self._adopt(trial.problem, trial.fit)
-        change = largest_change(
-            instrument_matrices(before, self.calset), instrument_matrices(self.fit, self.calset)
-        )
+        self._adopt(trial.fit)
+        change = largest_change(instrument_matrices(before), instrument_matrices(self.fit))
         return dataclasses.replace(
             found, term=blocks, chi2_before=before.chi2, chi2_after=self.fit.chi2, change_of_qu=change
         )
 
     # ---------------------------------------------------------------------------------------------- the end
 
-    def _conclude(self, first: Look, look: Look) -> tuple[Look, Unexplained | None]:
-        """Drop what is not needed, then ask what is left without a name: the look at the final model, and that."""
+    def _conclude(
+        self, first: Examination, examination: Examination
+    ) -> tuple[Examination, Unexplained | None]:
+        """Drop what is not needed, then ask what has no name: the examination of the final model, and that."""
         dropped = self._drop_what_is_not_needed()
         while True:
             if dropped:
-                look = self._look(first)
-                self.steps = retold(self.steps, first.design, look.design)
-            if not look.alarm and self.fit.explains_data:
-                return look, None
+                examination = self._examine(first)
+                self.steps = refitted_in_order(self.steps, first.design, examination.design)
+            if not examination.alarm and self.fit.explains_data:
+                return examination, None
             self.tell("something without a name is left")
-            unexplained = self._unexplained(look)
+            unexplained = self._unexplained(examination)
             if not unexplained.term:
-                return look, unexplained
+                return examination, unexplained
             dropped = self._drop_what_is_not_needed()
             if not dropped:
-                return self._look(look), unexplained
+                return self._examine(examination), unexplained
             # Those names only stood in for what has none: what is it without them?
-            self._adopt(*naming.refit_without(self.calset, self.fit, FreeForm.name))
+            self._adopt(naming.refit_without(self.fit, FreeForm.name))
 
     def _drop_what_is_not_needed(self) -> bool:
         """Take out, one by one, names that the final model does not need; whether there were any."""
@@ -257,18 +265,18 @@ class _Diagnosing:
                 break
             self.tell(f"{least} is no longer needed")
             self.steps = [s for s in self.steps if s.effect != least]
-            self._adopt(*naming.refit_without(self.calset, self.fit, least))
+            self._adopt(naming.refit_without(self.fit, least))
             dropped = True
         return dropped
 
-    def _finished(self, step: Step, look: Look) -> Step:
+    def _finished(self, step: Step, examination: Examination) -> Step:
         """The step with final parameters, what cannot be told from it, and where it sits."""
-        change = naming.signature(self.problem, self.fit, step.effect, self.context)
-        separation = look.separation(step.effect, change)
+        change = naming.signature(self.fit, step.effect, self.context)
+        separation = examination.separation(step.effect, change)
         close = {name for name, s in separation.items() if s < naming.SEPARATION} | set(step.equivalent)
         close -= {other.effect for other in self.steps}
         effect = self.fit.model.instrument(self.fit.values).effect(step.effect)
-        standard = full_values(effect.standard_form()) if not type(effect).is_structural() else ()
+        standard = np.asarray(values_of(effect.standard_form())) if not type(effect).is_structural() else ()
         parameters = {}
         for i, value in zip(self.fit.model.positions(step.effect), standard, strict=True):
             p = self.fit.model.parameters[i]
@@ -279,9 +287,9 @@ class _Diagnosing:
             parameters=parameters,
             far=naming.beyond_prior(self.fit, step.effect),
             choices=naming.spoken_choices(effect),
-            robust_ratio=look.design.robust_ratio(step.effect),
+            robust_ratio=examination.design.robust_ratio(step.effect),
             equivalent=tuple(sorted(close, key=lambda name: separation.get(name, np.inf))),
             separation=separation,
             separated_by=effect.separated_by if close else "",
-            where=where.describe(look.design, change),
+            where=location.describe(examination.design, change),
         )

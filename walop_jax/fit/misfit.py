@@ -14,18 +14,18 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.likelihood.chunks import thinned
-from walop_jax.likelihood.problem import Problem
-from walop_jax.model.conventions import CAMERA_NAMES, MATRIX_ELEMENTS
-
-LOOKED_AT = 65536  # field points
+from walop_jax.fit.refit import FitResult
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.thinning import thinned
+from walop_jax.model.conventions import matrix_elements
 
 
 @dataclasses.dataclass(frozen=True)
 class Misfit:
     """Mean squared normalised residual per intensity in each group, and rms disagreement of matrix elements.
 
-    With the flux eliminated, noise alone gives 3/4 per intensity (1 where the flux is known).
+    With the flux eliminated, noise alone gives 1 − 1/K per intensity of K cameras (1 where the flux is known).
     """
 
     camera: Mapping[str, float]
@@ -56,35 +56,41 @@ class Misfit:
         )
 
 
-def describe(problem: Problem, values: Float[np.ndarray, " n"]) -> Misfit:
-    """Group the residuals of a fit (full vector of parameter values).
+def describe(result: FitResult) -> Misfit:
+    """Group the residuals of a fit.
 
-    Of a very large set, those of `LOOKED_AT` points spread over the field, the worst point among them.
+    Of a very large set, those of `limits.MISFIT_POINTS` points spread over the field, the worst point among them.
     """
-    if len(problem.calset.points) > LOOKED_AT:
-        problem = Problem(thinned(problem.calset, LOOKED_AT), problem.model)
-    e, used = problem.calset.exposures, problem.used
-    flux, residual = problem.residuals(values)
+    return misfit_at(result.likelihood, result.values)
+
+
+def misfit_at(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Misfit:
+    """As `describe`, at any full vector of parameter values."""
+    if likelihood.layout.points > limits.MISFIT_POINTS:
+        likelihood = Likelihood.of(thinned(likelihood.calset, limits.MISFIT_POINTS), likelihood.model)
+    e, used, k = likelihood.calset.exposures, likelihood.used, likelihood.cameras
+    names = likelihood.model.template.cameras.names
+    _, residual = likelihood.residuals(values)
     square = residual**2
     per_exposure, rows = square.sum(axis=(0, 2)), used.sum(axis=0)
 
     def grouped(labels: np.ndarray) -> dict[str, float]:
         return {
-            str(label): float(per_exposure[labels == label].sum() / max(4 * rows[labels == label].sum(), 1))
+            str(label): float(per_exposure[labels == label].sum() / max(k * rows[labels == label].sum(), 1))
             for label in np.unique(labels)
         }
 
     plate = np.array([f"{a:g} deg" if i else "out" for i, a in zip(e.chwp_in, e.chwp_angle, strict=True)])
-    per_point = square.sum(axis=(1, 2)) / np.maximum(4 * used.sum(axis=1), 1)
+    per_point = square.sum(axis=(1, 2)) / np.maximum(k * used.sum(axis=1), 1)
     worst = int(per_point.argmax())
-    points = problem.calset.points
-    exposure = per_exposure / np.maximum(4 * rows, 1)
+    points = likelihood.calset.points
+    exposure = per_exposure / np.maximum(k * rows, 1)
     return Misfit(
-        camera=dict(zip(CAMERA_NAMES, (square.sum(axis=(0, 1)) / used.sum()).tolist(), strict=True)),
+        camera=dict(zip(names, (square.sum(axis=(0, 1)) / used.sum()).tolist(), strict=True)),
         kind=grouped(e.kind),
         filter=grouped(e.filter),
         calibration_plate=grouped(plate),
-        matrix_element=_matrix_elements(problem, flux, residual),
+        matrix_element=_matrix_elements(likelihood, residual),
         worst_exposure=(int(e.exposure[exposure.argmax()]), float(exposure.max())),
         worst_point=(
             int(points.point[worst]),
@@ -95,30 +101,30 @@ def describe(problem: Problem, values: Float[np.ndarray, " n"]) -> Misfit:
     )
 
 
-def _matrix_elements(
-    problem: Problem, flux: Float[np.ndarray, "p e"], residual: Float[np.ndarray, "p e 4"]
-) -> dict[str, float]:
-    e = problem.calset.exposures
-    weight = np.concatenate([np.asarray(c.weight) for c in problem.chunks])[: len(flux)]
-    counts = np.concatenate([np.asarray(c.counts) for c in problem.chunks])[: len(flux)]
+def _matrix_elements(likelihood: Likelihood, residual: Float[np.ndarray, "p e k"]) -> dict[str, float]:
+    e, used = likelihood.calset.exposures, likelihood.used
+    weight, counts = likelihood.points.gathered("weight"), likelihood.points.gathered("counts")
     delta = residual / np.where(weight > 0, weight, np.inf)  # electrons, data − model
-    squares: dict[str, list[float]] = {name: [] for name in MATRIX_ELEMENTS}
+    pairs = likelihood.model.template.cameras.pairs
+    elements = matrix_elements(len(pairs))
+    squares: dict[str, list[float]] = {name: [] for name in elements}
     setting = np.array(
         [f"{f}/{a if i else 'out'}" for f, i, a in zip(e.filter, e.chwp_in, e.chwp_angle, strict=True)]
     )
     for label in np.unique(setting[e.clp_in]):
-        use = np.flatnonzero(e.clp_in & (setting == label) & problem.used.any(axis=0))
+        use = np.flatnonzero(e.clp_in & (setting == label) & used.any(axis=0))
         if len(use) < 3:
             continue
         angle = 2.0 * np.deg2rad(e.clp_angle[use])
         design = np.column_stack([np.ones(len(use)), np.cos(angle), np.sin(angle)])
         # Over a full turn of angles the sum of a pair averages to the unpolarised sum of the definition of m.
-        for pair, names in ((0, MATRIX_ELEMENTS[:3]), (2, MATRIX_ELEMENTS[3:])):
-            total = counts[:, use, pair] + counts[:, use, pair + 1]
-            ok = problem.used[:, use].all(axis=1) & (total > 0).all(axis=1)
+        for n, (first, second) in enumerate(pairs):
+            names = elements[3 * n : 3 * n + 3]
+            total = counts[:, use, first] + counts[:, use, second]
+            ok = used[:, use].all(axis=1) & (total > 0).all(axis=1)
             if not ok.any():
                 continue
-            difference = (delta[ok][:, use, pair] - delta[ok][:, use, pair + 1]) / total[ok].mean(
+            difference = (delta[ok][:, use, first] - delta[ok][:, use, second]) / total[ok].mean(
                 axis=1, keepdims=True
             )
             coefficients, *_ = np.linalg.lstsq(design, difference.T, rcond=None)

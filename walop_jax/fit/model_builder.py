@@ -1,4 +1,7 @@
-"""Models from data, from a model file, or from neither: the one place where the three come together."""
+"""Models from data, from a model file, or from neither: the one place where the three come together.
+
+The scale of the throughput is a gauge unless a flux is known: the constant of camera N0 is held then.
+"""
 
 from __future__ import annotations
 
@@ -6,27 +9,108 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from walop_jax.data.records import CalibrationSet
+from walop_jax.data.records import CalibrationSet, Sources
 from walop_jax.fit.model_file import Header, parse
-from walop_jax.likelihood.problem import base_model
+from walop_jax.instruments.description import shipped
+from walop_jax.io.errors import DataError
+from walop_jax.likelihood import limits
+from walop_jax.model.build import adapted, as_designed, nominal_instrument
 from walop_jax.model.effects import Context, effect_by_name
-from walop_jax.model.instrument import INSTRUMENTS, nominal_instrument
-from walop_jax.model.parameters import unknown_name
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import Model, effect_context, make_model, with_effects
 
-DEFAULT_PLATES = "waves"
-DEFAULT_DEGREE = 4
 GAUGE = "throughput.n0.p00"
+LEVEL = 0.5  # of a throughput whose scale is a gauge
 
 
-def model_for(calset: CalibrationSet, text: str = "") -> Model:
-    """The base model of a calibration set, changed as a model file (TOML text) says.
+def base_model(
+    calset: CalibrationSet,
+    instrument: Instrument | None = None,
+    *,
+    plates: str | None = None,
+    throughput_degree: int | None = None,
+) -> Model:
+    """The base model (docs: model) for the instrument and standards of a calibration set.
+
+    `instrument` is the one as designed, needed where its name is not one that comes with the package; `plates` and
+    `throughput_degree` replace what it says. Raises `DataError` for an instrument that nobody knows, and ValueError
+    for one of another name than the set's.
+    """
+    names = standard_names(calset.sources)
+    sources = calset.sources
+    level = _throughput_level(calset) if has_known_flux(calset) else LEVEL
+    instrument = as_designed(instrument or instrument_of(calset))
+    if instrument.name != calset.instrument:
+        raise ValueError(
+            f"the data come from {calset.instrument}, the instrument described is {instrument.name}"
+        )
+    if len(instrument.cameras) != calset.cameras:
+        raise ValueError(
+            f"{instrument.name} has {len(instrument.cameras)} cameras, the data have {calset.cameras}"
+        )
+    instrument = adapted(
+        instrument,
+        standards=list(zip(names, sources.q, sources.u, strict=True)),
+        plates=plates,
+        throughput_degree=throughput_degree,
+        throughput=level,
+    )
+    priors = {}
+    for i, name in enumerate(names):
+        priors[f"standard.{name}.q"] = (float(sources.q[i]), float(sources.q_err[i]))
+        priors[f"standard.{name}.u"] = (float(sources.u[i]), float(sources.u_err[i]))
+    model = make_model(calset.instrument, instrument, priors=priors)
+    for i in model.positions("throughput"):
+        p = model.parameters[i]
+        model = model.change(p.name, scale=p.scale * level / LEVEL, loose=level)
+    if not has_known_flux(calset):
+        model = model.change(GAUGE, free=False)
+    if not ((calset.exposures.kind == "moon") & ~calset.exposures.clp_in).any():
+        model = model.change("sky.depolarisation", free=False)
+    return model
+
+
+def instrument_of(calset: CalibrationSet) -> Instrument:
+    """The instrument of a set as designed, if it comes with the package; `DataError` with advice if not."""
+    if calset.instrument not in shipped():
+        raise DataError(
+            f"INSTRUME is {calset.instrument!r}, which does not come with the package ({', '.join(shipped())}): give "
+            "its description, --instrument FILE or instrument=Instrument.read(FILE)"
+        )
+    return nominal_instrument(calset.instrument)
+
+
+def standard_names(sources: Sources) -> tuple[str, ...]:
+    """Unique names of the standards, usable in parameter names."""
+    names: list[str] = []
+    for number, name in zip(sources.source, sources.name, strict=True):
+        clean = "".join(c if c.isalnum() else "_" for c in str(name).strip()) or f"source{number}"
+        names.append(clean if clean not in names else f"{clean}_{number}")
+    return tuple(names)
+
+
+def has_known_flux(calset: CalibrationSet) -> bool:
+    """Whether any exposure is of KIND `flux`, so that the overall scale of the throughput is measured."""
+    return bool((calset.exposures.kind == "flux").any())
+
+
+def _throughput_level(calset: CalibrationSet) -> float:
+    # A camera gets half of the unpolarised light: N = T/2.
+    block = calset.intensities.block(0, min(limits.LEVEL_POINTS, len(calset.points)))
+    rows = block.used & (calset.exposures.kind == "flux")
+    return float(2.0 * block.counts[rows].mean())
+
+
+def model_for(calset: CalibrationSet, text: str = "", instrument: Instrument | None = None) -> Model:
+    """The base model of a calibration set, changed as a model file (TOML text) says; `instrument` as for `base_model`.
 
     Raises ValueError for anything in the text that does not exist or does not fit the data.
     """
 
     def build(header: Header) -> Model:
-        model = base_model(calset, plates=_plates(header), throughput_degree=_degree(header))
+        model = base_model(
+            calset, instrument, plates=header.plates, throughput_degree=header.throughput_degree
+        )
         context = effect_context(model.template, calset.exposures)
         return _with_effects(model, header, context)
 
@@ -34,7 +118,7 @@ def model_for(calset: CalibrationSet, text: str = "") -> Model:
 
 
 def model_without_data(
-    instrument: str,
+    instrument: str | Instrument,
     text: str = "",
     *,
     standards: Sequence[tuple[str, float, float]] = (),
@@ -42,28 +126,20 @@ def model_without_data(
 ) -> Model:
     """The model of an instrument as designed, for no data in particular.
 
-    `standards` are (name, q, u); `context` says what effects that grow with the data need to know of them.
-    Raises ValueError for an unknown instrument and as `model_for` does.
+    `instrument` is one that comes with the package, by name, or any other; `standards` are (name, q, u); `context`
+    says what effects that grow with the data need to know of them. Raises `DataError` for an unknown instrument and
+    ValueError as `model_for` does.
     """
-    if instrument not in INSTRUMENTS:
-        raise unknown_name("instrument", instrument, INSTRUMENTS)
+    design = nominal_instrument(instrument) if isinstance(instrument, str) else as_designed(instrument)
 
     def build(header: Header) -> Model:
-        nominal = nominal_instrument(
-            instrument, standards=standards, plates=_plates(header), throughput_degree=_degree(header)
+        nominal = adapted(
+            design, standards=standards, plates=header.plates, throughput_degree=header.throughput_degree
         )
-        model = make_model(instrument, nominal, frozen=(GAUGE,))
+        model = make_model(nominal.name, nominal, frozen=(GAUGE,))
         return _with_effects(model, header, context or Context(sources=nominal.standard.names))
 
     return parse(text, build)
-
-
-def _plates(header: Header) -> str:
-    return DEFAULT_PLATES if header.plates is None else header.plates
-
-
-def _degree(header: Header) -> int:
-    return DEFAULT_DEGREE if header.throughput_degree is None else header.throughput_degree
 
 
 def _with_effects(model: Model, header: Header, context: Context) -> Model:

@@ -55,7 +55,8 @@ def render(model: Model) -> str:
     )
     table = tomlkit.table()
     table["instrument"] = model.name
-    table["plates"] = model.template.plates
+    if model.template.plates is not None:
+        table["plates"] = model.template.plates
     table["throughput_degree"] = model.template.throughput.degree
     table["effects"] = list(model.effect_names)
     document["model"] = table

@@ -1,19 +1,28 @@
-"""The joint fit of a calibration set: start values, Levenberg–Marquardt, gates, covariance."""
+"""The joint fit of a calibration set: start values, the search for the minimum, gates, covariance."""
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.levenberg import MAXIMUM_STEPS, Expansion, Minimum, minimise, polish
-from walop_jax.likelihood.chunks import thinned
-from walop_jax.likelihood.problem import Posterior, Problem, base_model
-from walop_jax.model import materials
+from walop_jax.fit.minimise import Minimum
+from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import render
+from walop_jax.fit.search import find_minimum, free_scales
+from walop_jax.io.software import software_versions
+from walop_jax.likelihood.expansion import Posterior
+from walop_jax.likelihood.journal import Journal, fingerprint
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.processes import Processes
+from walop_jax.likelihood.runner import Progress, Runner
 from walop_jax.model.specification import Model
 
 Vector = Float[np.ndarray, " n"]
@@ -21,42 +30,44 @@ Matrix = Float[np.ndarray, "n n"]
 
 SUSPECT_SIGMA = 5.0  # excess of χ² over its expectation, in its own standard deviations
 PRIOR_EDGE = 4.0  # standard deviations
-FAR_OFF = 25.0  # χ²/dof above which other orders are tried and the errors scaled
-MAXIMUM_RESCALINGS = 4
-FIRST_STEPS = 20
-# Scaled gradient of a large set: 10⁻³ of a standard error is 10⁻⁶ in χ², and of a χ² of 10⁹ rounding leaves 10⁻⁷.
-LARGE_TOLERANCE = 1e-3
-SAMPLE = 16384  # field points of a large set on which its fit begins
-# Points of a set for each one of its sample: the sample's minimum is some six standard errors from that of the set,
-# which a step leaves a thousandth of.
-FARTHEST = 32
-Progress = Callable[[str, int, float], None]
-
-
-@dataclasses.dataclass(frozen=True)
-class _Found:
-    minimum: Minimum
-    values: Vector  # of all parameters
 
 
 @dataclasses.dataclass(frozen=True)
 class FitResult:
-    """A fit and how far it can be trusted.
+    """A fit, the likelihood that it maximises, and how far it can be trusted.
 
     `values` and `covariance` are of all parameters in tree order, frozen ones with zero variance. `trusted` needs a
     converged fit that explains the data; `warnings` says in words what does not hold.
     """
 
-    model: Model
+    likelihood: Likelihood
     values: Vector
     covariance: Matrix
     posterior: Posterior
     minimum: Minimum
-    n_data: int
-    dof: int
     starts: int
     seconds: float
     warnings: tuple[str, ...]
+
+    @property
+    def model(self) -> Model:
+        """The model that was fitted."""
+        return self.likelihood.model
+
+    @property
+    def calset(self) -> CalibrationSet:
+        """The set that it was fitted to."""
+        return self.likelihood.calset
+
+    @property
+    def n_data(self) -> int:
+        """Number of intensities used."""
+        return self.posterior.n_data
+
+    @property
+    def dof(self) -> int:
+        """Degrees of freedom: what the data and priors hold beyond fluxes and free parameters."""
+        return self.posterior.dof
 
     @property
     def chi2(self) -> float:
@@ -104,23 +115,9 @@ class FitResult:
         return float(self.values[i]), float(self.sigma[i])
 
 
-def check_identifiable(problem: Problem) -> None:
-    """Raise ValueError when the exposures cannot determine an instrument at all."""
-    e = problem.calset.exposures
-    through = e.clp_in & (problem.rows_used > 0)
-    angles = np.unique(np.round(np.mod(e.clp_angle[through], 180.0), 3))
-    if len(angles) < 3:
-        raise ValueError(
-            f"{len(angles)} distinct polariser angle(s) modulo 180° with usable data: a fit of the instrument needs "
-            "at least 3, better 8 or more spread over 360°"
-        )
-    if len(problem.calset.points) < 2:
-        raise ValueError("a single field point: the joint fit over the field needs several points")
-
-
-def check_constrained(problem: Problem, posterior: Posterior) -> None:
+def check_constrained(model: Model, posterior: Posterior) -> None:
     """Raise ValueError for a free parameter that neither data nor a prior know anything of."""
-    idle = [problem.model.parameters[i].name for i in problem.model.free[np.diag(posterior.matrix) == 0.0]]
+    idle = [model.parameters[i].name for i in model.free[np.diag(posterior.matrix) == 0.0]]
     if idle:
         raise ValueError(
             f"nothing in the data depends on {', '.join(idle)}, free and without a prior: freeze "
@@ -128,177 +125,50 @@ def check_constrained(problem: Problem, posterior: Posterior) -> None:
         )
 
 
-def covariance(problem: Problem, posterior: Posterior) -> Matrix:
+def covariance(model: Model, posterior: Posterior) -> Matrix:
     """Covariance of all parameters: the inverse of JᵀJ, priors included, ties expanded."""
-    scale = _scale(problem.model)
+    scale = free_scales(model)
     scaled = posterior.matrix * np.outer(scale, scale)
     value, vector = np.linalg.eigh(scaled)
     keep = value > value.max(initial=0.0) * 1e-15
     inverse = (vector[:, keep] / value[keep]) @ vector[:, keep].T
-    select = problem.model.selection() * scale
+    select = model.selection() * scale
     return select @ inverse @ select.T
 
 
-def _scale(model: Model) -> Vector:
-    return np.array([model.parameters[i].scale for i in model.free])
-
-
-def _order_starts(problem: Problem) -> Iterator[tuple[str, Vector]]:
-    """Start values one order of retardance away: first-order plates wrap every 2π."""
-    wavelength = np.asarray(problem.plan.wavelength).mean()
-    birefringence = float(
-        materials.MGF2_E.refractive_index(wavelength) - materials.MGF2_O.refractive_index(wavelength)
-    )
-    one_wave = wavelength / birefringence
-    for name in ("half2.plate.mgf2", "half1.plate.mgf2"):
-        for sign in (-1, 1):
-            start = problem.model.start.copy()
-            start[problem.model.index(name)] += sign * one_wave
-            yield f"{name} {sign:+d} wave", start
-
-
-def _search(
-    problem: Problem,
-    label: str,
-    first: Vector,
-    noise_scale: float,
-    progress: Progress | None,
-    steps: int = MAXIMUM_STEPS,
-) -> _Found:
-    model = problem.model
-    select, origin = model.selection(), first[model.free]
-    report = None if progress is None else lambda step, chi2: progress(label, step, chi2)
-
-    def expand(x: Vector) -> Posterior:
-        return problem.expand(first + select @ (x - origin), noise_scale)
-
-    minimum = minimise(expand, origin, _scale(model), maximum_steps=steps, progress=report)
-    return _Found(minimum, first + select @ (minimum.x - origin))
-
-
-def _near(
-    problem: Problem, first: Vector, noise_scale: float | None, worth: float | None, progress: Progress | None
-) -> tuple[Vector, float, int]:
-    """The minimum of a sample of a large set, the factor on the errors, and from how many places it was sought.
-
-    The sample of a very large set is large itself.
-    """
-
-    def make() -> Vector:
-        points = max(SAMPLE, len(problem.calset.points) // FARTHEST)
-        sample = Problem(thinned(problem.calset, points), problem.model)
-        if sample.is_large:
-            near, scale, starts = _near(sample, first, noise_scale, worth, progress)
-            return np.append(_polished(sample, near, scale, progress).values, [scale, starts])
-        found, starts = _sought(sample, first, noise_scale, worth, progress)
-        return np.append(found.values, [_expansion(found).noise_scale, starts])
-
-    journal = problem.passes.journal
-    key = f"sample {first.tobytes().hex()} {noise_scale} {worth}"
-    *values, scale, starts = make() if journal is None else journal.remembered(key, make)
-    return np.array(values), float(scale), int(starts)
-
-
-def _polished(problem: Problem, first: Vector, noise_scale: float, progress: Progress | None) -> _Found:
-    """The minimum of a large set from a place near it."""
-    model = problem.model
-    select = model.selection()
-    origin = first[model.free]
-
-    def full(x: Vector) -> Float[np.ndarray, " all"]:
-        return first + select @ (x - origin)
-
-    minimum = polish(
-        lambda x: problem.expand(full(x), noise_scale),
-        lambda x, there: problem.slope(full(x), _posterior(there)),
-        origin,
-        _scale(model),
-        tolerance=LARGE_TOLERANCE,
-        progress=None if progress is None else lambda step, chi2: progress("fit of all points", step, chi2),
-    )
-    return _Found(minimum, full(minimum.x))
-
-
 def fit(
-    problem: Problem,
+    likelihood: Likelihood,
     *,
     start: Vector | None = None,
     noise_scale: float | None = None,
     worth: float | None = None,
-    progress: Progress | None = None,
 ) -> FitResult:
-    """Fit the model of `problem` to its data, from the start values of the model or `start` (a full vector).
+    """Maximise a likelihood with its priors, from the start values of the model or `start` (a full vector).
 
-    A model whose χ²/dof stays above `FAR_OFF` would be bent out of all physical shape: priors mean nothing beside
-    such residuals. The errors of the data are then scaled until χ²/dof is 1, the minimum is sought again, from plates
-    one order of retardance away as well, and the result says so (`noise_scale`, `warnings`). A `noise_scale` that
-    is given is kept, with no other start: so that fits can be compared; `worth` is the objective of the other fit,
-    and a search that has not come below it when it should have converged is given up.
-    The minimum of a large set (`Problem.is_large`) is sought on a sample of its points; a pass over all of them gives
+    A model whose χ²/dof stays above `search.FAR_OFF` would be bent out of all physical shape: priors mean nothing
+    beside such residuals. The errors of the data are then scaled until χ²/dof is 1, the minimum is sought again, from
+    plates one order of retardance away as well, and the result says so (`noise_scale`, `warnings`). A `noise_scale`
+    that is given is kept, with no other start: so that fits can be compared; `worth` is the objective of the other
+    fit, and a search that has not come below it when it should have converged is given up.
+    The minimum of a large set (`Layout.large`) is sought on a sample of its points; a pass over all of them gives
     the step from there to its own, and another one shows that nothing is left to do.
     Raises ValueError when the exposures cannot determine the instrument.
     """
-    began = time.perf_counter()
-    first = problem.model.start if start is None else np.asarray(start, float)
-    if problem.is_large:
-        near, scale, starts = _near(problem, first, noise_scale, worth, progress)
-        found = _polished(problem, near, scale, progress)
-    else:
-        found, starts = _sought(problem, first, noise_scale, worth, progress)
-    posterior = _expansion(found)
-    check_constrained(problem, posterior)
+    began, model = time.perf_counter(), likelihood.model
+    first = model.start if start is None else np.asarray(start, float)
+    found = find_minimum(likelihood, first, noise_scale, worth)
+    check_constrained(model, found.posterior)
     result = FitResult(
-        model=problem.model,
+        likelihood=likelihood,
         values=found.values,
-        covariance=covariance(problem, posterior),
-        posterior=posterior,
+        covariance=covariance(model, found.posterior),
+        posterior=found.posterior,
         minimum=found.minimum,
-        n_data=problem.n_data,
-        dof=problem.dof,
-        starts=starts,
+        starts=found.starts,
         seconds=time.perf_counter() - began,
         warnings=(),
     )
     return dataclasses.replace(result, warnings=tuple(_warnings(result)))
-
-
-def _sought(
-    problem: Problem, first: Vector, noise_scale: float | None, worth: float | None, progress: Progress | None
-) -> tuple[_Found, int]:
-    """The minimum from start values that may be far away, and from how many places it was sought."""
-    check_identifiable(problem)
-    fixed = noise_scale is not None
-    found, starts = _search(problem, "fit", first, noise_scale or 1.0, progress, FIRST_STEPS), 1
-    promising = _expansion(found).objective < worth if worth is not None else _raw(found, problem) < FAR_OFF
-    if not found.minimum.converged and promising:
-        found = _search(problem, "fit, continued", found.values, noise_scale or 1.0, progress)
-    for _ in range(0 if fixed else MAXIMUM_RESCALINGS):
-        scale = float(np.sqrt(_raw(found, problem)))
-        if scale**2 < FAR_OFF or abs(scale / _expansion(found).noise_scale - 1.0) < 0.1:
-            break
-        found = _search(problem, f"errors × {scale:.3g}", first, scale, progress)
-    if not fixed and _raw(found, problem) > FAR_OFF:
-        for label, other in _order_starts(problem):
-            trial = _search(problem, label, other, _expansion(found).noise_scale, progress)
-            starts += 1
-            if trial.minimum.expansion.objective < found.minimum.expansion.objective:
-                found = trial
-    return found, starts
-
-
-def _raw(found: _Found, problem: Problem) -> float:
-    """χ² of the data with their errors as given, per degree of freedom."""
-    return _expansion(found).data / max(problem.dof, 1)
-
-
-def _expansion(found: _Found) -> Posterior:
-    return _posterior(found.minimum.expansion)
-
-
-def _posterior(expansion: Expansion) -> Posterior:
-    if not isinstance(expansion, Posterior):
-        raise TypeError("a fit needs a Posterior expansion")
-    return expansion
 
 
 def _warnings(result: FitResult) -> Iterator[str]:
@@ -323,7 +193,31 @@ def _warnings(result: FitResult) -> Iterator[str]:
 
 
 def refit(
-    calset: CalibrationSet, model: Model | None = None, *, progress: Progress | None = None
+    calset: CalibrationSet,
+    model: Model | None = None,
+    *,
+    folder: str | os.PathLike[str] | None = None,
+    progress: Progress | None = None,
+    memory: float | None = None,
+    processes: Processes | None = None,
 ) -> FitResult:
-    """Fit a calibration set with `model` (default: the base model)."""
-    return fit(Problem(calset, model or base_model(calset)), progress=progress)
+    """Fit a calibration set with `model` (default: the base model).
+
+    `progress` is told in a line what is being done. Of large sets (more than `limits.LARGE_ABOVE` points): `memory`
+    (bytes, default 2 GB) is what their data may take; `processes` are those that share the work and make the same
+    call (`processes.join`); finished slabs are kept in `folder`, where the same call goes on after an interruption, to
+    the same last bit. The folder may go when the fit is done. Raises what `fit` raises.
+    """
+    model, crew = model or base_model(calset), processes or Processes()
+    journal = None if folder is None else _journal(Path(folder), calset, model, crew)
+    runner = Runner(processes=crew, progress=progress, journal=journal)
+    likelihood = Likelihood.of(calset, model, memory=memory, runner=runner)
+    runner.tell(f"preparing the fit; data will take {likelihood.layout.memory / 1e9:.2g} GB")
+    return fit(likelihood)
+
+
+def _journal(folder: Path, calset: CalibrationSet, model: Model, processes: Processes) -> Journal:
+    """Where the work of one fit is kept, by all that it depends on: data, model, software, and who does it."""
+    texts = [fingerprint(calset), render(model), f"{processes.index}/{processes.count}"]
+    texts += [f"{name} {version}" for name, version in software_versions().items()]
+    return Journal(folder, hashlib.sha256("\n".join(texts).encode()).hexdigest())

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
-from collections.abc import Iterable, Sequence
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
 
 _SHOWN = 5
 """How many rows or names a message spells out before it only counts the rest."""
@@ -23,6 +27,17 @@ def fail(
         part for part in (str(file) if file else "", f"[{extension}]" if extension else "", column) if part
     )
     return DataError(f"{place + ': ' if place else ''}{what}{'; ' + advice if advice else ''}")
+
+
+@contextlib.contextmanager
+def errors_naming(path: str | os.PathLike[str] | None) -> Iterator[None]:
+    """Put the name of a file at the head of every ValueError of the block that does not hold it; None: of no file."""
+    try:
+        yield
+    except ValueError as error:
+        if path is None or str(path) in str(error):
+            raise
+        raise DataError(f"{path}: {error}") from error
 
 
 def rows_text(rows: Sequence[int] | np.ndarray) -> str:

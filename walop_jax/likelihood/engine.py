@@ -24,28 +24,26 @@ Exposures      are not compressed beforehand, although light is linear in them. 
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
+from walop_jax.likelihood import limits
 from walop_jax.likelihood.nodes import Nodes, interpolated, rows_and_slopes
-from walop_jax.model import legendre, light
+from walop_jax.model import light
 from walop_jax.model.compiled import compiled
-from walop_jax.model.effects.base import Effect, overridden
+from walop_jax.model.dependence import optical_indices
 from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import values_of, with_values
 from walop_jax.model.plan import Plan
-from walop_jax.model.specification import optical_indices, series_indices
+from walop_jax.model.specification import series_indices
 
 Vector = Float[Array, " n"]
 Result = TypeVar("Result")
-BLOCK = 64  # field points whose Jacobians are worked on together
-LARGEST_BLOCK = 256  # up to so many points are one block
 NEWTON_STEPS = 3  # each squares the share of the detectors' distortion that is missing from the flux
 
 
@@ -54,8 +52,8 @@ class PointData(NamedTuple):
 
     x: Float[Array, " p"]
     y: Float[Array, " p"]
-    counts: Float[Array, "p e 4"]
-    weight: Float[Array, "p e 4"]
+    counts: Float[Array, "p e k"]
+    weight: Float[Array, "p e k"]
     sky: Float[Array, "p e 2"]
     source: Int[Array, "p e"]
     band: Int[Array, "p e"]
@@ -71,8 +69,8 @@ class Normal(NamedTuple):
 
 
 def eliminate_flux(
-    weighted_counts: Float[Array, "e 4"], weighted_model: Float[Array, "e 4"], flux_known: Bool[Array, " e"]
-) -> tuple[Float[Array, " e"], Float[Array, "e 4"]]:
+    weighted_counts: Float[Array, "e k"], weighted_model: Float[Array, "e k"], flux_known: Bool[Array, " e"]
+) -> tuple[Float[Array, " e"], Float[Array, "e k"]]:
     """Best flux of every exposure and the normalised residuals data − model."""
     power = jnp.sum(weighted_model**2, axis=-1)
     best = jnp.sum(weighted_counts * weighted_model, axis=-1) / jnp.where(power > 0, power, 1.0)
@@ -82,14 +80,14 @@ def eliminate_flux(
 
 def field_sites(instrument: Instrument, point: PointData) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Field positions whose optics a point needs: its own and, for ghosts, the opposite one."""
-    if overridden(instrument.effects, "mirrored"):
+    if light.has_ghosts(instrument):
         return jnp.stack([point.x, -point.x]), jnp.stack([point.y, -point.y])
     return point.x[None], point.y[None]
 
 
 def _rows_at(
     instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None = None
-) -> Float[Array, "m b 2 2 4"]:
+) -> Float[Array, "m b r 4"]:
     sites = field_sites(instrument, point)
     if nodes is not None:
         return interpolated(nodes, *sites)[0]
@@ -98,7 +96,7 @@ def _rows_at(
 
 def _rows_and_slopes_at(
     instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None
-) -> tuple[Float[Array, "m b 2 2 4"], Float[Array, "o m b 2 2 4"]]:
+) -> tuple[Float[Array, "m b r 4"], Float[Array, "o m b r 4"]]:
     sites = field_sites(instrument, point)
     if nodes is not None:
         rows, slopes = interpolated(nodes, *sites)
@@ -107,17 +105,17 @@ def _rows_and_slopes_at(
     return rows, jnp.swapaxes(slopes, 0, 1)
 
 
-def _throughput_at(instrument: Instrument, point: PointData) -> Float[Array, "m 4"]:
+def _throughput_at(instrument: Instrument, point: PointData) -> Float[Array, "m k"]:
     return jax.vmap(light.throughput_at, (None, 0, 0))(instrument, *field_sites(instrument, point))
 
 
 def _unit_counts(
     instrument: Instrument,
     plan: Plan,
-    rows: Float[Array, "m b 2 2 4"],
-    throughput: Float[Array, "m 4"],
+    rows: Float[Array, "m b r 4"],
+    throughput: Float[Array, "m k"],
     point: PointData,
-) -> Float[Array, "e 4"]:
+) -> Float[Array, "e k"]:
     """Counts for light of unit flux, ahead of the detectors."""
     x, y = field_sites(instrument, point)
     counts = light.counts(
@@ -133,7 +131,7 @@ def _unit_counts(
 
 def point_prediction(
     instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None = None
-) -> Float[Array, "e 4"]:
+) -> Float[Array, "e k"]:
     """Counts of one point for light of unit flux, ahead of the detectors."""
     rows, throughput = _rows_at(instrument, plan, point, nodes), _throughput_at(instrument, point)
     return _unit_counts(instrument, plan, rows, throughput, point)
@@ -141,22 +139,22 @@ def point_prediction(
 
 def vectors_at(
     instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None = None
-) -> Float[Array, "b 4 4"]:
+) -> Float[Array, "b k 4"]:
     """Analysis vectors of a point in every band."""
     rows, throughput = _rows_at(instrument, plan, point, nodes)[0], _throughput_at(instrument, point)[0]
     return light.camera_vectors(instrument, rows, throughput, point.x, point.y)
 
 
-def _best_flux(
-    instrument: Instrument, plan: Plan, unit: Float[Array, "e 4"], point: PointData
+def best_flux(
+    instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], point: PointData
 ) -> Float[Array, " e"]:
     """Flux that fits best: in closed form, refined by Newton steps where detectors are not linear in it."""
     known = plan.exposures.flux_known
     flux, _ = eliminate_flux(point.counts * point.weight, unit * point.weight, known)
-    if overridden(instrument.effects, "detector"):
+    if not light.is_linear(instrument):
         for _ in range(NEWTON_STEPS):
             counts, slope = jax.jvp(
-                lambda f: _real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),)
+                lambda f: real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),)
             )
             missing = (point.counts - counts) * point.weight
             step, _ = eliminate_flux(missing, slope * point.weight, known)
@@ -164,19 +162,20 @@ def _best_flux(
     return flux
 
 
-def _real_counts(
-    instrument: Instrument, plan: Plan, unit: Float[Array, "e 4"], flux: Float[Array, " e"]
-) -> Float[Array, "e 4"]:
+def real_counts(
+    instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], flux: Float[Array, " e"]
+) -> Float[Array, "e k"]:
+    """What the detectors report for light of a flux, `unit` being the counts for light of unit flux."""
     return light.detected(instrument, plan.exposures, flux[:, None] * unit)
 
 
 def point_residuals(
     instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None = None
-) -> tuple[Float[Array, " e"], Float[Array, "e 4"]]:
+) -> tuple[Float[Array, " e"], Float[Array, "e k"]]:
     """Best flux of every exposure of one point and the normalised residuals data − model."""
     unit = point_prediction(instrument, plan, point, nodes)
-    flux = _best_flux(instrument, plan, unit, point)
-    return flux, (point.counts - _real_counts(instrument, plan, unit, flux)) * point.weight
+    flux = best_flux(instrument, plan, unit, point)
+    return flux, (point.counts - real_counts(instrument, plan, unit, flux)) * point.weight
 
 
 def _point_jacobian(
@@ -187,14 +186,14 @@ def _point_jacobian(
     Local quantities are all parameters but the series, then the throughputs of its sites; d runs over
     exposures and cameras.
     """
-    values, to_instrument = ravel_pytree(instrument)
+    values, to_instrument = values_of(instrument), with_values(instrument)
     optical = np.asarray(optical_indices(instrument), int)
     plain = np.setdiff1d(np.arange(values.size), series_indices(instrument))
     throughput = _throughput_at(instrument, point)
 
     def data(
-        rows: Float[Array, "m b 2 2 4"], all_values: Vector, local: Float[Array, "m 4"]
-    ) -> Float[Array, "e 4"]:
+        rows: Float[Array, "m b r 4"], all_values: Vector, local: Float[Array, "m k"]
+    ) -> Float[Array, "e k"]:
         return _unit_counts(to_instrument(all_values), plan, rows, local, point)
 
     rows, d_rows = _rows_and_slopes_at(instrument, plan, point, nodes)
@@ -209,11 +208,11 @@ def _point_jacobian(
     d_local = jax.vmap(lambda dt: push(no_rows, no_values, dt))(each_local)
 
     # From unit flux to counts: `along` is the derivative with respect to the flux itself.
-    flux = _best_flux(instrument, plan, unit, point)
+    flux = best_flux(instrument, plan, unit, point)
     known = plan.exposures.flux_known
     counts, along = flux[:, None] * unit, unit
     d_counts = flux[:, None] * jnp.concatenate([d_plain, d_local])
-    if overridden(instrument.effects, "detector"):
+    if not light.is_linear(instrument):
         counts, push_detector = jax.linearize(
             lambda v, n: light.detected(to_instrument(v), plan.exposures, n), values, counts
         )
@@ -243,7 +242,7 @@ def _over_blocks(function: Callable[[PointData], Result], data: PointData, block
     Points that make no whole number of blocks, and few points, are one block.
     """
     points = data.x.shape[0]
-    if points <= LARGEST_BLOCK or points % block:
+    if points <= limits.GRADIENT_BLOCK or points % block:
         return function(data)
     parts = jax.tree.map(lambda v: v.reshape(-1, block, *v.shape[1:]), data)
     blank = jax.tree.map(
@@ -257,21 +256,23 @@ def _over_blocks(function: Callable[[PointData], Result], data: PointData, block
 def _normal_equations(
     instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes | None = None
 ) -> Normal:
-    return _over_blocks(lambda part: _block_equations(instrument, plan, part, nodes), data, BLOCK)
+    return _over_blocks(
+        lambda part: _block_equations(instrument, plan, part, nodes), data, limits.JACOBIAN_BLOCK
+    )
 
 
 def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes | None) -> Normal:
-    values, _ = ravel_pytree(instrument)
+    values = values_of(instrument)
     series = np.asarray(series_indices(instrument), int)
     plain = np.setdiff1d(np.arange(values.size), series)
     chi2, gradient, gram = jax.vmap(_point_normal, in_axes=(None, None, 0, None))(
         instrument, plan, data, nodes
     )
     k = plain.size
-    basis = legendre.basis(*jax.vmap(field_sites, (None, 0))(instrument, data), instrument.throughput.degree)
+    basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
     g = jnp.zeros(values.size).at[plain].set(gradient[:, :k].sum(axis=0))
     # Local throughputs are (site, camera); a coefficient of a camera acts at all sites of a point.
-    sites = (basis.shape[1], 4)
+    sites = (basis.shape[1], len(instrument.cameras))
     by_site = gradient[:, k:].reshape(-1, *sites)
     g = g.at[series].set(jnp.einsum("pmk,pmt->kt", by_site, basis).reshape(-1))
     by_site = gram[:, :k, k:].reshape(-1, k, *sites)
@@ -293,124 +294,71 @@ def _slope_equations(
     The gradient runs backwards, from the residuals to the rows at the nodes, and only there meets the slopes. χ² does
     not change with the flux at its best, so that is held.
     """
-    values, to_instrument = ravel_pytree(instrument)
+    values, to_instrument = values_of(instrument), with_values(instrument)
     optical = np.asarray(optical_indices(instrument), int)
 
     def slope(part: PointData) -> tuple[Float[Array, ""], Vector]:
-        def chi2(values: Vector, rows: Float[Array, "t b 2 2 4"]) -> Float[Array, ""]:
+        def chi2(values: Vector, rows: Float[Array, "t b r 4"]) -> Float[Array, ""]:
             here, between = to_instrument(values), nodes._replace(rows=rows)
 
             def of_point(point: PointData) -> Float[Array, ""]:
                 unit = point_prediction(here, plan, point, between)
-                flux = jax.lax.stop_gradient(_best_flux(here, plan, unit, point))
-                return jnp.sum(((point.counts - _real_counts(here, plan, unit, flux)) * point.weight) ** 2)
+                flux = jax.lax.stop_gradient(best_flux(here, plan, unit, point))
+                return jnp.sum(((point.counts - real_counts(here, plan, unit, flux)) * point.weight) ** 2)
 
             return jnp.sum(jax.vmap(of_point)(part))
 
         value, (direct, by_rows) = jax.value_and_grad(chi2, (0, 1))(values, nodes.rows)
-        by_optics = jnp.einsum("tbhrs,tobhrs->o", by_rows, nodes.slopes)
+        by_optics = jnp.einsum("tbrs,tobrs->o", by_rows, nodes.slopes)
         return value, 0.5 * direct.at[optical].set(by_optics)
 
-    return _over_blocks(slope, data, LARGEST_BLOCK)
+    return _over_blocks(slope, data, limits.GRADIENT_BLOCK)
 
 
 def _residuals(
     instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes | None = None
-) -> tuple[Float[Array, "p e"], Float[Array, "p e 4"]]:
+) -> tuple[Float[Array, "p e"], Float[Array, "p e k"]]:
     return jax.vmap(point_residuals, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
 
 
 def _prediction(
     instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes | None = None
-) -> Float[Array, "p e 4"]:
+) -> Float[Array, "p e k"]:
     """Counts for light of unit flux; `detected` takes electrons, flux × these, through the detectors."""
     return jax.vmap(point_prediction, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
 
 
 def _dense_jacobian(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p d n"]:
     """Derivatives of all residuals with respect to all parameters: for tables, not for whole frames."""
-    values, _ = ravel_pytree(instrument)
+    values = values_of(instrument)
     series = np.asarray(series_indices(instrument), int)
     plain = np.setdiff1d(np.arange(values.size), series)
     _, local = jax.vmap(_point_jacobian, in_axes=(None, None, 0))(instrument, plan, data)
-    basis = legendre.basis(*jax.vmap(field_sites, (None, 0))(instrument, data), instrument.throughput.degree)
-    by_site = local[:, plain.size :].reshape(len(local), basis.shape[1], 4, -1)
+    basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
+    by_site = local[:, plain.size :].reshape(len(local), basis.shape[1], len(instrument.cameras), -1)
     expanded = jnp.einsum("pmkd,pmt->pdkt", by_site, basis).reshape(len(local), -1, series.size)
     full = jnp.zeros((*expanded.shape[:2], values.size)).at[:, :, series].set(expanded)
     return full.at[:, :, plain].set(jnp.swapaxes(local[:, : plain.size], 1, 2))
 
 
-def _point_effect_columns(
-    instrument: Instrument, plan: Plan, probes: tuple[Effect, ...], point: PointData
-) -> Float[Array, "a d"]:
-    names = [(i, name) for i, probe in enumerate(probes) for name in probe.amplitudes()]
-    neutral = [getattr(probes[i], name) for i, name in names]
-
-    def with_amplitudes(amplitudes: list[Float[Array, ...]]) -> Instrument:
-        changed = list(probes)
-        for (i, name), value in zip(names, amplitudes, strict=True):
-            changed[i] = dataclasses.replace(changed[i], **{name: value})
-        return dataclasses.replace(instrument, effects=(*instrument.effects, *changed))
-
-    at_neutral = with_amplitudes(neutral)
-    unit = point_prediction(at_neutral, plan, point)
-    flux = _best_flux(at_neutral, plan, unit, point)
-
-    def counts(amplitudes: list[Float[Array, ...]]) -> Float[Array, "e 4"]:
-        active = with_amplitudes(amplitudes)
-        return _real_counts(active, plan, point_prediction(active, plan, point), flux)
-
-    _, push = jax.linearize(counts, neutral)
-    flat, to_tree = ravel_pytree(neutral)
-    change = jax.vmap(lambda one: push(to_tree(one)))(jnp.eye(flat.size)) * point.weight
-    _, along = jax.jvp(lambda f: _real_counts(at_neutral, plan, unit, f), (flux,), (jnp.ones_like(flux),))
-    along = along * point.weight
-    power = jnp.sum(along**2, axis=-1)
-    share = jnp.sum(change * along, axis=-1) / jnp.where(power > 0, power, 1.0)
-    projected = change - jnp.where(plan.exposures.flux_known, 0.0, share)[..., None] * along
-    return -projected.reshape(flat.size, -1)
-
-
-def _effect_columns(
-    instrument: Instrument, plan: Plan, probes: tuple[Effect, ...], data: PointData
-) -> Float[Array, "p d a"]:
-    """Derivatives of the residuals with respect to the amplitudes of effects that are not active, at neutral.
-
-    Only what an effect changes is differentiated: one at the detectors costs a dot product, not the optics.
-    """
-    columns = jax.vmap(_point_effect_columns, in_axes=(None, None, None, 0))(instrument, plan, probes, data)
-    return jnp.swapaxes(columns, 1, 2)
-
-
 def _incoming(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p e 4"]:
     """Stokes vectors that enter the collimator."""
-    return jax.vmap(light.stokes, (None, None, 0, 0))(instrument, plan.exposures, data.sky, data.source)
+    return jax.vmap(light.stokes, (None, None, 0, 0, 0, 0))(
+        instrument, plan.exposures, data.sky, data.source, data.x, data.y
+    )
 
 
 incoming = compiled(_incoming)
 
-PROBES_AT_ONCE = 6  # shapes of one effect that are worked on together: bounds the memory
-
-
-def _effect_columns_over_shapes(
-    instrument: Instrument, plan: Plan, probes: Effect, data: PointData
-) -> Float[Array, "g p d a"]:
-    """As `effect_columns`, for one effect at many shapes: its parameters carry a leading axis g."""
-    return jax.lax.map(
-        lambda probe: _effect_columns(instrument, plan, (probe,), data), probes, batch_size=PROBES_AT_ONCE
-    )
-
 
 normal_equations = compiled(_normal_equations)
 slope_equations = compiled(_slope_equations)
-effect_columns_over_shapes = compiled(_effect_columns_over_shapes)
 dense_jacobian = compiled(_dense_jacobian)
-effect_columns = compiled(_effect_columns)
 residuals = compiled(_residuals)
 prediction = compiled(_prediction)
 
 
-def _detected(instrument: Instrument, plan: Plan, counts: Float[Array, "p e 4"]) -> Float[Array, "p e 4"]:
+def _detected(instrument: Instrument, plan: Plan, counts: Float[Array, "p e k"]) -> Float[Array, "p e k"]:
     return jax.vmap(light.detected, (None, None, 0))(instrument, plan.exposures, counts)
 
 

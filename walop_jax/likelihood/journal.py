@@ -12,6 +12,7 @@ after it.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
@@ -19,18 +20,21 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.data.records import CalibrationSet
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.thinning import thinned
+
 Vector = Float[np.ndarray, " n"]
 
 _CHECK = 32  # bytes of a SHA-256
 
 
+@dataclasses.dataclass(frozen=True)
 class Journal:
     """A folder of finished work of one fit; `identity` is what all of its passes have in common."""
 
-    def __init__(self, folder: Path, identity: str) -> None:
-        self.folder, self.identity = folder, identity
-        self.recovered = 0
-        """Records that were there already."""
+    folder: Path
+    identity: str
 
     def path(self, key: str) -> Path:
         """The file of a pass."""
@@ -56,7 +60,6 @@ class Journal:
         if good != len(content):
             with path.open("r+b") as file:
                 file.truncate(good if found else 0)
-        self.recovered += len(found)
         return found
 
     def append(self, key: str, number: int, sums: Vector) -> None:
@@ -74,3 +77,33 @@ class Journal:
             found = {0: np.asarray(make(), float)}
             self.append(key, 0, found[0])
         return found[0]
+
+
+def fingerprint(calset: CalibrationSet) -> str:
+    """SHA-256 of what sums over a set depend on: its exposures and sources, and its measurements.
+
+    Of a set that was read, its files stand for the measurements, with a sample of these in case that they were changed
+    since; of one made in memory all of them are gone through.
+    """
+    total = hashlib.sha256()
+    for record in (calset.site, calset.exposures, calset.sources):
+        total.update(_bytes(record))
+    for name, curve in sorted(calset.filters.items()):
+        total.update(name.encode() + _bytes(curve))
+    for entry in calset.inputs:
+        total.update(entry.sha256.encode())
+    some = thinned(calset, limits.FINGERPRINT_POINTS) if calset.inputs else calset
+    for start in range(0, len(some.points), limits.FINGERPRINT_POINTS):
+        stop = min(start + limits.FINGERPRINT_POINTS, len(some.points))
+        total.update(_bytes(some.intensities.block(start, stop)))
+    return total.hexdigest()
+
+
+def _bytes(record: object) -> bytes:
+    """The content of a dataclass of arrays, texts and numbers."""
+    values = (getattr(record, field.name) for field in dataclasses.fields(record))  # type: ignore[arg-type]
+    arrays = (np.asarray(value) for value in values)
+    return b"".join(
+        array.tobytes() if array.dtype.kind not in "OUS" else repr(array.tolist()).encode()
+        for array in arrays
+    )

@@ -1,7 +1,7 @@
 """The optics of a large set on Chebyshev nodes of the field, with an error that is measured every time.
 
 Band rows and their derivatives with respect to the optical parameters are smooth over the field, and they are all
-the optics there is. They are solved exactly on n × n nodes and at `HELD_OUT` other places; the largest difference
+the optics there is. They are solved exactly on n × n nodes and at other places; the largest difference
 between interpolated and exact values there, derivatives in units of the solver's scales, is the error.
 
 Tolerance   A relative error ε of all n counts, each known to σ/N, moves a parameter by up to √n ε / (σ/N) of its
@@ -16,32 +16,28 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from walop_jax.likelihood import limits
 from walop_jax.model import chebyshev, light
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import compiled
+from walop_jax.model.dependence import optical_indices
 from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import values_of, with_values
 from walop_jax.model.plan import Plan
-from walop_jax.model.specification import optical_indices
 
 Vector = Float[np.ndarray, " n"]
 
 TOLERANCE = 2e-10
-COUNTS = (12, 16, 18, 20, 24, 28, 32)
-"""Numbers of nodes per side that are tried, one after the other."""
-HELD_OUT = 48
-AT_ONCE = 64
-"""Places that are solved together, so that the optics are compiled for one size only."""
 
 
 class Nodes(NamedTuple):
     """Band rows at the nodes t of a rectangle, and their derivatives with respect to the optical parameters o."""
 
     rectangle: Rectangle
-    rows: Float[Array, "t b 2 2 4"]
-    slopes: Float[Array, "t o b 2 2 4"]
+    rows: Float[Array, "t b r 4"]
+    slopes: Float[Array, "t o b r 4"]
 
     @property
     def per_side(self) -> int:
@@ -51,12 +47,12 @@ class Nodes(NamedTuple):
 
 def rows_and_slopes(
     instrument: Instrument, plan: Plan, x: Float[Array, ""], y: Float[Array, ""]
-) -> tuple[Float[Array, "b 2 2 4"], Float[Array, "o b 2 2 4"]]:
+) -> tuple[Float[Array, "b r 4"], Float[Array, "o b r 4"]]:
     """Band rows at a field position and their derivatives with respect to the optical parameters: exact."""
-    values, to_instrument = ravel_pytree(instrument)
+    values, to_instrument = values_of(instrument), with_values(instrument)
     optical = np.asarray(optical_indices(instrument), int)
 
-    def optics(optical_values: Float[Array, " o"]) -> Float[Array, "b 2 2 4"]:
+    def optics(optical_values: Float[Array, " o"]) -> Float[Array, "b r 4"]:
         return light.band_rows(to_instrument(values.at[optical].set(optical_values)), plan, x, y)
 
     rows, push = jax.linearize(optics, values[optical])
@@ -65,7 +61,7 @@ def rows_and_slopes(
 
 def interpolated(
     nodes: Nodes, x: Float[Array, " m"], y: Float[Array, " m"]
-) -> tuple[Float[Array, "m b 2 2 4"], Float[Array, "m o b 2 2 4"]]:
+) -> tuple[Float[Array, "m b r 4"], Float[Array, "m o b r 4"]]:
     """Band rows and their derivatives between the nodes."""
     weights = chebyshev.weights(x, y, nodes.rectangle, nodes.per_side)
     return jnp.tensordot(weights, nodes.rows, 1), jnp.tensordot(weights, nodes.slopes, 1)
@@ -77,11 +73,11 @@ _interpolate = compiled(interpolated)
 
 def _solve_all(
     instrument: Instrument, plan: Plan, x: Vector, y: Vector
-) -> tuple[Float[np.ndarray, "p b 2 2 4"], Float[np.ndarray, "p o b 2 2 4"]]:
+) -> tuple[Float[np.ndarray, "p b r 4"], Float[np.ndarray, "p o b r 4"]]:
     parts = []
-    for start in range(0, len(x), AT_ONCE):
+    for start in range(0, len(x), limits.SOLVED_TOGETHER):
         # The last batch is filled up with its first place.
-        inside = np.minimum(np.arange(start, start + AT_ONCE), len(x) - 1)
+        inside = np.minimum(np.arange(start, start + limits.SOLVED_TOGETHER), len(x) - 1)
         parts.append(_solve(instrument, plan, jnp.asarray(x[inside]), jnp.asarray(y[inside])))
     rows, slopes = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
     return rows[: len(x)], slopes[: len(x)]
@@ -94,7 +90,7 @@ def held_out(rectangle: Rectangle) -> tuple[Vector, Vector]:
     """
     corners = [(a, b) for a in (0.0, 0.5, 1.0) for b in (0.0, 0.5, 1.0)]
     plastic = 1.324717957244746
-    number = np.arange(1, HELD_OUT - len(corners) + 1)[:, None]
+    number = np.arange(1, limits.CHECKED_PLACES - len(corners) + 1)[:, None]
     unit = np.concatenate([corners, np.mod(number * np.array([1 / plastic, 1 / plastic**2]), 1.0)])
     low, high = np.asarray(rectangle.low), np.asarray(rectangle.high)
     x, y = (low + unit * (high - low)).T
@@ -116,7 +112,7 @@ def tabulate(
     nodes = Nodes(rectangle, jnp.asarray(rows[:n]), jnp.asarray(slopes[:n]))
     near, slope = _interpolate(nodes, jnp.asarray(other_x), jnp.asarray(other_y))
     off = np.abs(np.asarray(near) - rows[n:]).max(initial=0.0)
-    tilt = np.abs(np.asarray(slope) - slopes[n:]) * scale[:, None, None, None, None]
+    tilt = np.abs(np.asarray(slope) - slopes[n:]) * scale[:, None, None, None]
     return nodes, float(max(off, tilt.max(initial=0.0)))
 
 
@@ -129,7 +125,7 @@ def accurate_nodes(
     Optics that are not finite somewhere make the table not finite, and with it all that is computed from it.
     """
     error = np.inf
-    for count in COUNTS:
+    for count in limits.NODES_PER_SIDE:
         if first is not None and count < first:
             continue
         nodes, error = tabulate(instrument, plan, rectangle, count, scale)

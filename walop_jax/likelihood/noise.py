@@ -2,7 +2,7 @@
 
 Equation    N = Poisson(μ) + Normal(0, read_noise²);   σ²(μ) = max(μ, 0) + read_noise²
 Symbols     μ expected and N measured counts, read_noise per measurement [electron]
-Source      Howell 2006, Handbook of CCD Astronomy, 4.4; contract, section 3: "N_ERR as given".
+Source      Howell 2006, Handbook of CCD Astronomy, 4.4; N_ERR as given (docs: conventions).
 Limits      The density is the normal one with variance σ²(μ), as good as exact from a variance of a few
             hundred on. What an observer states as N_ERR comes from the measured counts, σ(N): counts that
             came out low are given more weight, which biases a mean by −1 electron.

@@ -4,19 +4,23 @@ Frame       Instrument frame (ICS): X, Y in degrees on the sky; angles grow from
 Stokes      q = +1 is an electric vector along +X, u = +1 one at +45°. With fields that go as
             exp(i(kz − ωt)), S = (|Ex|² + |Ey|², |Ex|² − |Ey|², 2 Re Ex Ey*, 2 Im Ex Ey*), so that a retarder
             with its fast axis along +X has the Mueller matrix of Paper II, equation of appendix B.
-Cameras     N0 = O1 (0°), N1 = E1 (90°), N2 = O2 (45°), N3 = E2 (135°). The first half of the pupil
+Cameras     of WALOP: N0 = O1 (0°), N1 = E1 (90°), N2 = O2 (45°), N3 = E2 (135°). The first half of the pupil
             (HWP1, fast axis 0°) feeds N0 and N1, the second (HWP2, fast axis 22.5°) N2 and N3.
-Matrix      q_m = (N0 − N1)/(N0 + N1) = m21 + m22 q + m23 u and u_m = (N2 − N3)/(N2 + N3) = m31 + m32 q + m33 u,
+Matrix      one row for each arm, the normalised difference of its two cameras, first minus second:
+            q_m = (N0 − N1)/(N0 + N1) = m21 + m22 q + m23 u and u_m = (N2 − N3)/(N2 + N3) = m31 + m32 q + m33 u,
             m being ratios of band-integrated linear coefficients.
 Oblique     The Stokes parameters of a ray of direction k refer to the ICS axes carried from (0, 0, 1) to k by
             the smallest rotation (`optics.carried_axes`).
 """
 
-CAMERAS = ("n0", "n1", "n2", "n3")
+FIELD_SCALE = 0.3  # degrees: the unit of the field polynomials of WALOP
+
+
+def matrix_elements(arms: int) -> tuple[str, ...]:
+    """Names of the elements of the instrument matrix: m21, m22, m23 of the first arm, m31 … of the second."""
+    return tuple(f"m{row}{column}" for row in range(2, 2 + arms) for column in (1, 2, 3))
+
+
+MATRIX_ELEMENTS = matrix_elements(2)
 CAMERA_NAMES = ("O1", "E1", "O2", "E2")
-HALF_OF_CAMERA = (0, 0, 1, 1)
-SIGN_OF_CAMERA = (+1.0, -1.0, +1.0, -1.0)
-FAST_AXES = (0.0, 22.5)  # degrees, of HWP1 and HWP2
-MATRIX_ELEMENTS = ("m21", "m22", "m23", "m31", "m32", "m33")
-FIELD_SCALE = 0.3  # degrees: the unit of the field polynomials
-EXTINCTION = 2e-5  # of the calibration polariser, unwanted over wanted transmission
+EXTINCTION = 2e-5  # of the calibration polariser of WALOP, unwanted over wanted transmission

@@ -1,126 +1,181 @@
-"""The instrument as a tree of components, in the order light meets them; parameters with unit and source.
+"""The instrument: sources, the train of elements, its arms, the cameras, and the effects that were added to it.
 
-Nothing here computes light: `light.py` does, with these values. Nominal values and widths are the contract's
-(section 3); as-built values scatter around them.
+Nothing here computes light: `light.py` folds it. An effect is a patch: `patched` is the instrument with what the
+effects change, and everything that asks for light asks the patched one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+import functools
+import itertools
+import os
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from walop_jax.model import legendre
-from walop_jax.model.conventions import CAMERAS, EXTINCTION, FAST_AXES
-from walop_jax.model.effects.base import Effect
-from walop_jax.model.parameters import Component, param, unknown_name
+from walop_jax.instruments.description import read_description
+from walop_jax.model.cameras import Cameras, Throughput
+from walop_jax.model.elements import Analyser, Element, Polariser, WavePlate
+from walop_jax.model.parameters import Component, number, unknown_name
+from walop_jax.model.ray import NotPlannedError, Ray
+from walop_jax.model.sources import MoonSky, Source, Standards
 
-CONTRACT = "calibration contract, section 3"
-PAPER = "Maharana et al. 2022, Paper II"
+if TYPE_CHECKING:
+    from walop_jax.model.effects.base import Effect
 
 Scalar = Float[Array, ""]
+Any_ = TypeVar("Any_", bound=Component)
 
 
-class MoonSky(Component):
-    """Singly scattered moonlight: p = δ sin²γ / (1 + cos²γ), perpendicular to the scattering plane."""
-
-    depolarisation: Scalar = param(
-        unit="", about="δ, one for all patches and wavelengths", source=f"{PAPER}, eq. 8", scale=0.05
-    )
+NAN = float("nan")
+NO_SITE = ("", NAN, NAN, NAN, NAN)
 
 
-class Standards(Component):
-    """Catalogue Stokes parameters of the standard stars, in the equatorial frame."""
-
-    names: tuple[str, ...] = eqx.field(static=True)
-    q: Float[Array, " s"] = param(unit="", about="catalogue q", source="SOURCES table", scale=2e-4)
-    u: Float[Array, " s"] = param(unit="", about="catalogue u", source="SOURCES table", scale=2e-4)
-
-    def labels(self, field: str) -> Sequence[str]:
-        """One name per star."""
-        return tuple(f"{name}.{field}" for name in self.names)
+class NoSuchPlaceError(ValueError):
+    """An effect asks for an element that this instrument does not have."""
 
 
-class Polariser(Component):
-    """Calibration polariser: a fixed extinction ratio, its axis is the encoder reading."""
+class Placed(Protocol):
+    """Whatever has a name within its holder."""
 
-    extinction: float = eqx.field(static=True, default=EXTINCTION)
-
-
-class Collimator(Component):
-    """Linear diattenuation of the lenses: (q, u) = c r² (cos 2φ, sin 2φ) + (c_q, c_u)."""
-
-    diattenuation: Scalar = param(
-        unit="deg-2", about="c, radial diattenuation of curved lenses", source=CONTRACT, width=0.003
-    )
-    q: Scalar = param(unit="", about="c_q, constant part", source=CONTRACT, width=0.0015)
-    u: Scalar = param(unit="", about="c_u, constant part", source=CONTRACT, width=0.0015)
+    @property
+    def name(self) -> str:
+        """The name."""
+        ...
 
 
-class HalfWavePlate(Component):
-    """Quartz then MgF2 in contact, optic axes at the fast axis and at 90° from it."""
+class Arm(Component):
+    """What one part of the pupil goes through; `path` names its elements in the order light meets them."""
 
-    quartz: Scalar = param(unit="um", about="quartz thickness", source=CONTRACT, width=1.0, optical=True)
-    mgf2: Scalar = param(unit="um", about="MgF2 thickness", source=CONTRACT, width=1.0, optical=True)
+    name: str = eqx.field(static=True)
+    elements: tuple[Element, ...]
+    path: tuple[str, ...] = eqx.field(static=True)
 
+    def train(self) -> Iterator[Element]:
+        """Its elements ahead of the analyser, in the order light meets them."""
+        for name in self.path[:-1]:
+            yield _member(self.elements, name, f"element of arm {self.name}")
 
-class Pupil(Component):
-    """Mapping from the field to the direction of the collimated beam."""
-
-    magnification: Scalar = param(
-        unit="", about="field-to-pupil magnification", source=CONTRACT, width=0.05, optical=True
-    )
-    distortion: Scalar = param(
-        unit="deg-2", about="cubic distortion", source=CONTRACT, width=0.01, optical=True
-    )
-
-
-class Half(Component):
-    """One half of the pupil: wedge, half-wave plate, Wollaston prism."""
-
-    plate: HalfWavePlate
-    wedge: Scalar = param(unit="rad", about="wedge angle", source=CONTRACT, width=0.001, optical=True)
-    efficiency: Scalar = param(
-        unit="", about="η of the analysers ½(1, ±η, 0, 0)", source=CONTRACT, width=0.0003
-    )
-    fast_axis: float = eqx.field(static=True, default=0.0)
-
-
-class Throughput(Component):
-    """Throughput of each camera as a Legendre series over the field (total degree `degree`)."""
-
-    degree: int = eqx.field(static=True)
-    coefficients: Float[Array, "4 t"] = param(
-        unit="", about="Legendre coefficient P_i(x/0.3°) P_j(y/0.3°)", source=CONTRACT, scale=0.02, loose=0.5
-    )
-
-    def labels(self, field: str) -> Sequence[str]:
-        """Camera and exponents: n0.p21 is camera N0, second degree in X, first in Y."""
-        return tuple(f"{camera}.p{i}{j}" for camera in CAMERAS for i, j in legendre.terms(self.degree))
+    @property
+    def analyser(self) -> Analyser:
+        """The element that ends it."""
+        last = _member(self.elements, self.path[-1], f"element of arm {self.name}")
+        if not isinstance(last, Analyser):
+            raise ValueError(f"arm {self.name}: its path must end with an analyser, not with {last.name!r}")
+        return last
 
 
 class Instrument(Component):
-    """Everything that is fitted: light source, optics, cameras, and the effects that were added by name."""
+    """Everything that is fitted. `path` names the elements ahead of the arms in the order light meets them.
 
-    sky: MoonSky
-    standard: Standards
-    polariser: Polariser
-    collimator: Collimator
-    chwp: HalfWavePlate
-    pupil: Pupil
-    half1: Half
-    half2: Half
+    `rotator_zero` (deg) is added to ROTATOR, `filter_shift` (µm) displaces broad bands; None: there is none. Field
+    coordinates reach to ±`field_limit` (deg); `site` is telescope, latitude and longitude (deg, east positive),
+    elevation (m) and MJD of a full Moon, `raster` how the points of a simulated run lie, and how far out (deg).
+    `description` is the text it was described in, empty for an instrument that comes with the package.
+    """
+
+    name: str = eqx.field(static=True)
+    sources: tuple[Source, ...]
+    elements: tuple[Element, ...]
+    arms: tuple[Arm, ...]
     throughput: Throughput
+    cameras: Cameras
+    path: tuple[str, ...] = eqx.field(static=True)
     effects: tuple[Effect, ...] = ()
-    plates: str = eqx.field(static=True, default="waves")
+    rotator_zero: Scalar | None = number(unit="deg", about="true ROTATOR minus the header's", default=None)
+    filter_shift: Scalar | None = number(unit="um", about="displacement of broad bands", default=None)
+    field_limit: float = eqx.field(static=True, default=90.0)
+    site: tuple[str, float, float, float, float] = eqx.field(static=True, default=NO_SITE)
+    raster: tuple[str, float] = eqx.field(static=True, default=("square", 0.0))
+    description: str = eqx.field(static=True, default="", repr=False)
+
+    @classmethod
+    def read(cls, source: str | os.PathLike[str], **options: Any) -> Instrument:
+        """The instrument of a description file, or a shipped one by name; options as for `build.build`.
+
+        Raises `DataError` for a file that is wrong and ValueError for an element that does not exist.
+        """
+        from walop_jax.model.build import build
+
+        return build(read_description(source), **options)
+
+    # ------------------------------------------------------------------------------- asking for parts
+
+    def train(self) -> Iterator[Element]:
+        """The elements ahead of the arms, in the order light meets them."""
+        for name in self.path:
+            yield _member(self.elements, name, "element")
 
     @property
-    def halves(self) -> tuple[Half, Half]:
-        """Both halves of the pupil."""
-        return self.half1, self.half2
+    def polariser(self) -> Polariser | None:
+        """The calibration polariser, if the train has one."""
+        return next((element for element in self.train() if isinstance(element, Polariser)), None)
+
+    def telescope(self) -> tuple[Element, ...]:
+        """The elements ahead of the polariser, which only light from the sky meets; none where there is no polariser.
+
+        Raises ValueError for one that moves, bends the ray or depends on the wavelength: that is not computed there.
+        """
+        if self.polariser is None:
+            return ()
+        elements = tuple(itertools.takewhile(lambda e: not isinstance(e, Polariser), self.train()))
+        for element in elements:
+            if element.moves or type(element).ray is not Element.ray or not _is_achromatic(element):
+                raise ValueError(
+                    f"element {element.name!r} stands ahead of the polariser, where nothing may move, bend the ray "
+                    "or depend on wavelength or exposure; put it behind the polariser"
+                )
+        return elements
+
+    def source(self, name: str) -> Source:
+        """A source by name; ValueError with the nearest names when there is none."""
+        return _member(self.sources, name, "source")
+
+    @property
+    def sky(self) -> MoonSky:
+        """The moonlit sky."""
+        found = self.source(MoonSky.name)
+        assert isinstance(found, MoonSky)
+        return found
+
+    @property
+    def standard(self) -> Standards:
+        """The standard stars."""
+        found = self.source(Standards.name)
+        assert isinstance(found, Standards)
+        return found
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """KINDs of exposures that it can look at."""
+        return tuple(source.kind for source in self.sources)
+
+    def places(self, kind: type[Element]) -> tuple[str, ...]:
+        """Places, as for `changed`, of all elements of a class; arms first, then the common train."""
+        arms = [
+            f"{arm.name}.{element.name}"
+            for arm in self.arms
+            for element in arm.elements
+            if isinstance(element, kind)
+        ]
+        return (*arms, *(element.name for element in self.elements if isinstance(element, kind)))
+
+    def moving(self) -> tuple[str, ...]:
+        """Prefixes of the columns of the moving elements behind the polariser, common train first."""
+        parts = [*self.train(), *(element for arm in self.arms for element in arm.train())]
+        found = [element.moves for element in parts if element.moves and not isinstance(element, Polariser)]
+        return tuple(dict.fromkeys(found))
+
+    @property
+    def plates(self) -> str | None:
+        """How its wave plates are computed (`wave_plate.MODELS`); None where it has none."""
+        elements = (*self.elements, *(element for arm in self.arms for element in arm.elements))
+        return next((element.model for element in elements if isinstance(element, WavePlate)), None)
 
     def effect(self, name: str) -> Effect:
         """The active effect of a name; ValueError when there is none."""
@@ -129,69 +184,108 @@ class Instrument(Component):
                 return effect
         raise unknown_name("active effect", name, [effect.name for effect in self.effects])
 
+    # ------------------------------------------------------------------------------- changing it
 
-PLATE_MODELS = ("waves", "fixed_axis")
-INSTRUMENTS = ("WALOP-SOUTH", "WALOP-NORTH", "WALOP-LAB")
+    def patched(self) -> Instrument:
+        """The instrument with what its effects change, and no effects any more."""
+        bare = dataclasses.replace(self, effects=())
+        return functools.reduce(lambda instrument, effect: effect.patch(instrument), self.effects, bare)
 
-_QUARTZ, _MGF2 = 2407.0, 1930.0
-# Paper II, section 4: 180° − δ = 0.321° (tilt/deg)² for all five tilts. Crossed quartz and MgF2 plates of zero
-# order (δ = 180° at 0.62 µm) give its table of cross-talk in SDSS-r at this thickness, one free number: 474.2 µm
-# fits best, to 0.6 points (`tests/model/test_lab.py`).
-_LAB_MGF2 = 474.0
+    def changed(self, place: str, **fields: Any) -> Instrument:
+        """The instrument with fields of one part replaced.
+
+        `place` is a name with dots: an element, an arm's element ("half1.plate"), a layer of it
+        ("half1.plate.mgf2"), a source, or "" for the instrument itself. A function is applied to what was there.
+        Raises `NoSuchPlaceError` where the instrument has no such part.
+        """
+        return _changed(self, place.split(".") if place else [], fields, place)
+
+    def inserted(self, element: Element, *, before: str = "", after: str = "") -> Instrument:
+        """The instrument with one more element directly before or after another one ("half1.plate" in an arm).
+
+        A name that is taken gets a number. Raises `NoSuchPlaceError` where there is no such element.
+        """
+        where, _, neighbour = (before or after).rpartition(".")
+        if where:
+            arm = next((arm for arm in self.arms if arm.name == where), None)
+            if arm is None:
+                raise NoSuchPlaceError(f"the instrument has no arm {where!r}")
+            holder = _inserted(arm, element, neighbour, bool(after))
+            arms = tuple(holder if one.name == where else one for one in self.arms)
+            return dataclasses.replace(self, arms=arms)
+        return _inserted(self, element, neighbour, bool(after))
+
+    def with_part(self, slot: str, part: Component) -> Instrument:
+        """The instrument with one more part of its cameras.
+
+        `slot` is "transmission", "mixing", "ghosts", "exposures" or "detectors".
+        """
+        cameras = dataclasses.replace(self.cameras, **{slot: (*getattr(self.cameras, slot), part)})
+        return dataclasses.replace(self, cameras=cameras)
+
+    def with_source(self, source: Source) -> Instrument:
+        """The instrument with a source of one more KIND, or with one of its sources replaced."""
+        others = tuple(one for one in self.sources if one.name != source.name)
+        if len(others) == len(self.sources):
+            return dataclasses.replace(self, sources=(*self.sources, source))
+        return dataclasses.replace(
+            self, sources=tuple(source if one.name == source.name else one for one in self.sources)
+        )
 
 
-def zero_order_quartz(mgf2: float, wavelength: float = 0.62) -> float:
-    """Quartz thickness (µm) that makes a half-wave plate of zero order with `mgf2` µm of MgF2."""
-    from walop_jax.model import materials as m
-
-    lam = jnp.asarray(wavelength)
-    dn_mgf2 = float(m.MGF2_E.refractive_index(lam) - m.MGF2_O.refractive_index(lam))
-    dn_quartz = float(m.QUARTZ_E.refractive_index(lam) - m.QUARTZ_O.refractive_index(lam))
-    return (mgf2 * dn_mgf2 - 0.5 * wavelength) / dn_quartz
+def _member(members: tuple[Any_, ...], name: str, what: str) -> Any_:
+    for member in members:
+        if _name(member) == name:
+            return member
+    raise NoSuchPlaceError(str(unknown_name(what, name, [_name(member) for member in members])))
 
 
-def nominal_instrument(
-    name: str = "WALOP-SOUTH",
-    *,
-    standards: Sequence[tuple[str, float, float]] = (),
-    effects: tuple[Effect, ...] = (),
-    plates: str = "waves",
-    throughput_degree: int = 4,
-    throughput: float = 0.5,
-) -> Instrument:
-    """The instrument as designed.
+def _is_achromatic(element: Element) -> bool:
+    zero = jnp.zeros(())
+    try:
+        jax.eval_shape(lambda e: e.mueller(Ray.entering(zero, zero)), element)
+    except NotPlannedError:
+        return False
+    return True
 
-    `standards` are (name, q, u) in the equatorial frame; `throughput` the level of all four cameras. Raises
-    ValueError for an unknown instrument or plate model.
-    """
-    if name not in INSTRUMENTS:
-        raise ValueError(f"unknown instrument {name!r}: choose one of {', '.join(INSTRUMENTS)}")
-    if plates not in PLATE_MODELS:
-        raise ValueError(f"unknown plate model {plates!r}: choose one of {', '.join(PLATE_MODELS)}")
-    magnification = {"WALOP-SOUTH": 15.63, "WALOP-NORTH": 19.5, "WALOP-LAB": 1.0}[name]
-    distortion = 0.0 if name == "WALOP-LAB" else 0.02
-    wedge = 0.0 if name == "WALOP-LAB" else 0.230
-    quartz, mgf2 = (_QUARTZ, _MGF2) if name != "WALOP-LAB" else (zero_order_quartz(_LAB_MGF2), _LAB_MGF2)
-    coefficients = np.zeros((4, len(legendre.terms(throughput_degree))))
-    coefficients[:, 0] = throughput
-    names, q, u = zip(*standards, strict=True) if standards else ((), (), ())
-    number = jnp.asarray
-    plate = HalfWavePlate(quartz=number(quartz), mgf2=number(mgf2))
-    halves = [
-        Half(wedge=number(sign * wedge), plate=plate, efficiency=number(0.999), fast_axis=axis)
-        for sign, axis in zip((-1.0, 1.0), FAST_AXES, strict=True)
-    ]
-    lens = 0.0 if name == "WALOP-LAB" else 0.012
-    return Instrument(
-        sky=MoonSky(depolarisation=number(0.8)),
-        standard=Standards(names=tuple(names), q=number(np.array(q, float)), u=number(np.array(u, float))),
-        polariser=Polariser(),
-        collimator=Collimator(diattenuation=number(lens), q=number(0.0), u=number(0.0)),
-        chwp=plate,
-        pupil=Pupil(magnification=number(magnification), distortion=number(distortion)),
-        half1=halves[0],
-        half2=halves[1],
-        throughput=Throughput(degree=throughput_degree, coefficients=number(coefficients)),
-        effects=effects,
-        plates=plates,
+
+def _name(member: Any) -> str:
+    return member.name
+
+
+def _changed(part: Any_, rest: list[str], fields: dict[str, Any], place: str) -> Any_:
+    if not rest:
+        known = [field.name for field in dataclasses.fields(part)]
+        for name in fields:
+            if name not in known:
+                raise unknown_name(f"field of {place or 'the instrument'}", name, known)
+        new = {
+            name: value(getattr(part, name)) if callable(value) else value for name, value in fields.items()
+        }
+        return dataclasses.replace(part, **new)
+    for field in dataclasses.fields(part):
+        members = getattr(part, field.name)
+        if field.metadata.get("static", False) or not isinstance(members, tuple):
+            continue
+        for i, member in enumerate(members):
+            if isinstance(member, Component) and _name(member) == rest[0]:
+                new = (*members[:i], _changed(member, rest[1:], fields, place), *members[i + 1 :])
+                return dataclasses.replace(part, **{field.name: new})
+    raise NoSuchPlaceError(f"the instrument has no part {place!r}")
+
+
+def _inserted(holder: Any, element: Element, neighbour: str, after: bool) -> Any:
+    if neighbour not in holder.path:
+        raise NoSuchPlaceError(str(unknown_name("element", neighbour, holder.path)))
+    name, number_ = element.name or element.kind, 1
+    while name in holder.path:
+        number_ += 1
+        name = f"{element.name or element.kind}_{number_}"
+    at = holder.path.index(neighbour) + (1 if after else 0)
+    path = (*holder.path[:at], name, *holder.path[at:])
+    return dataclasses.replace(
+        holder, elements=(*holder.elements, dataclasses.replace(element, name=name)), path=path
     )
+
+
+Change = Callable[[Instrument], Instrument]

@@ -1,6 +1,6 @@
 """Polynomials over the field: products of Legendre polynomials up to a total degree.
 
-Equation    f(x, y) = Σ_{i+j ≤ n} c_ij P_i(x/h) P_j(y/h), h = `FIELD_SCALE` = 0.3°.
+Equation    f(x, y) = Σ_{i+j ≤ n} c_ij P_i(x/h) P_j(y/h), h the scale of the field, 0.3° for WALOP.
 Source      Abramowitz & Stegun 22.7.10: (k+1) P_{k+1} = (2k+1) t P_k − k P_{k−1}.
 """
 
@@ -24,7 +24,9 @@ def _one_dimension(t: Float[Array, ...], degree: int) -> list[Float[Array, ...]]
     return values
 
 
-def basis(x: Float[Array, ...], y: Float[Array, ...], degree: int) -> Float[Array, "... t"]:
+def basis(
+    x: Float[Array, ...], y: Float[Array, ...], degree: int, scale: float = FIELD_SCALE
+) -> Float[Array, "... t"]:
     """Values of all terms at field positions in degrees."""
-    px, py = _one_dimension(x / FIELD_SCALE, degree), _one_dimension(y / FIELD_SCALE, degree)
+    px, py = _one_dimension(x / scale, degree), _one_dimension(y / scale, degree)
     return jnp.stack([px[i] * py[j] for i, j in terms(degree)], axis=-1)

@@ -1,131 +1,102 @@
 """The light path, from Stokes vector to counts: read this file to know what the package computes.
 
-    sky or polariser → collimator → calibration plate → wedge → half-wave plate → Wollaston prism → camera
+    source → telescope → polariser → train of elements → arms → analysers → cameras → detectors
 
-Everything up to the cameras is linear, so the path is run backwards from the analysers: `plate_matrices`
-solves the half-wave plates at every wavelength node, `band_rows` keeps the Mueller rows that the Wollaston
-prisms see and integrates them over the bands (all the optics there is, once per field point),
-`camera_vectors` adds analyser, collimator and throughput, and `counts` is a dot product per exposure.
-`trace.py` runs the same functions forward, stage by stage. Effects of the detectors (`detected`) act on
-electrons, when the flux is known.
+Everything up to the detectors is linear, so the train is folded backwards, from the analysers to the polariser:
+each element multiplies the rows that the analysers see by its Mueller matrix. What stands directly behind the
+polariser and asks neither for wavelength nor for the exposure leaves the band integral by itself (`leading`) and is
+multiplied afterwards. `band_rows` is all the optics there is, once per field point; `camera_vectors` adds analysers
+and throughput, `counts` is a dot product per exposure. `trace.py` folds the same elements forwards. No effect is
+named here: effects patch the instrument, and the patched instrument is folded.
 
 Units       counts per unit of unpolarised light at unit throughput; angles rad; wavelengths µm; field deg.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from walop_jax.model import legendre, materials, mueller, optics
-from walop_jax.model import plates as plate_models
-from walop_jax.model.conventions import HALF_OF_CAMERA, SIGN_OF_CAMERA
-from walop_jax.model.effects.base import ExposureArrays, overridden
-from walop_jax.model.instrument import HalfWavePlate, Instrument
+from walop_jax.model import fold
+from walop_jax.model.elements import Element
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
-from walop_jax.model.plates import Plate
+from walop_jax.model.ray import NotPlannedError, Ray
+from walop_jax.model.sources import ExposureArrays, Sight, Source, turned
 
 Scalar = Float[Array, ""]
-Nodes = Float[Array, " n"]
 FEW_BANDS = 3
-_MUELLER = {"waves": plate_models.stack_mueller, "fixed_axis": plate_models.fixed_axis_mueller}
+BROAD = 0.05  # µm: equivalent width from which a filter is displaced by `Instrument.filter_shift`
 
 
-# ----------------------------------------------------------------------------------- the optics, per node
+# ------------------------------------------------------------------------------------------- the train
+
+
+class Train(NamedTuple):
+    """The common train in its three parts: ahead of the polariser, leading elements, those in the band integral."""
+
+    telescope: tuple[Element, ...]
+    leading: tuple[Element, ...]
+    banded: tuple[Element, ...]
+
+
+def divided(instrument: Instrument) -> Train:
+    """The parts of the common train.
+
+    Leading are the elements behind the polariser up to the first that moves, or that asks for the wavelength or for
+    anything else that differs between exposures; which those are is found by asking them.
+    """
+    elements, telescope = tuple(instrument.train()), instrument.telescope()
+    start = len(telescope) + (instrument.polariser is not None)
+    ray, stop = Ray.entering(jnp.zeros(()), jnp.zeros(())), start
+    for element in elements[start:]:
+        if element.moves:
+            break
+        try:
+            element.mueller(ray)
+            ray = element.ray(ray)
+        except NotPlannedError:
+            break
+        stop += 1
+    return Train(telescope, elements[start:stop], elements[stop:])
+
+
+def _product(elements: tuple[Element, ...], ray: Ray) -> Float[Array, "4 4"] | None:
+    """Mueller matrix of achromatic elements, None for the identity."""
+    matrix = None
+    for element in elements:
+        own = element.mueller(ray)
+        if own is not None:
+            matrix = own if matrix is None else own @ matrix
+        ray = element.ray(ray)
+    return matrix
+
+
+def telescope(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
+    """Mueller matrix of what light from the sky, and no other, meets ahead of the polariser."""
+    matrix = _product(instrument.patched().telescope(), Ray.entering(x, y))
+    return jnp.eye(4) if matrix is None else matrix
+
+
+def upstream(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
+    """Mueller matrix of the leading elements at a field point (see `divided`)."""
+    matrix = _product(divided(instrument.patched()).leading, Ray.entering(x, y))
+    return jnp.eye(4) if matrix is None else matrix
+
+
+# ------------------------------------------------------------------------------------ bands and cameras
 
 
 def node_wavelengths(instrument: Instrument, plan: Plan) -> Float[Array, " n"]:
     """Wavelengths (µm) of the nodes."""
-    wavelength = plan.wavelength
-    for effect in instrument.effects:
-        wavelength = effect.wavelengths(wavelength, plan.conditions)
-    return wavelength
-
-
-def _pupil_direction(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> tuple[Nodes, Nodes, Nodes]:
-    for effect in instrument.effects:
-        x, y = effect.field(x, y, plan.conditions)
-    pupil = instrument.pupil
-    kx, ky, kz = optics.pupil_direction(x, y, pupil.magnification, pupil.distortion)
-    nodes = plan.wavelength.shape
-    return jnp.broadcast_to(kx, nodes), jnp.broadcast_to(ky, nodes), jnp.broadcast_to(kz, nodes)
-
-
-def _stack(
-    instrument: Instrument, plan: Plan, where: str, plate: HalfWavePlate, fast_axis: float, wavelength: Nodes
-) -> tuple[Plate, ...]:
-    axis = jnp.full_like(wavelength, jnp.deg2rad(fast_axis))
-    stack: tuple[Plate, ...] = (
-        Plate(
-            plate.quartz,
-            materials.QUARTZ_O.refractive_index(wavelength),
-            materials.QUARTZ_E.refractive_index(wavelength),
-            axis,
-        ),
-        Plate(
-            plate.mgf2,
-            materials.MGF2_O.refractive_index(wavelength),
-            materials.MGF2_E.refractive_index(wavelength),
-            axis + 0.5 * jnp.pi,
-        ),
-    )
-    for effect in instrument.effects:
-        stack = effect.plates(where, stack, plan.conditions)
-    return stack
-
-
-def _with_cuts(stack: tuple[Plate, ...]) -> tuple[Plate, ...]:
-    return tuple(p._replace(cut=jnp.zeros_like(p.axis)) if p.cut is None else p for p in stack)
-
-
-def calibration_angle(instrument: Instrument, angle: float | None) -> float | None:
-    """Angle (deg) at which the calibration plate really stands, None when it is out."""
-    for effect in instrument.effects:
-        angle = effect.calibration_plate(angle)
-    return angle
-
-
-def plate_matrices(
-    instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
-) -> dict[float | str, Float[Array, "n 4 4"]]:
-    """Mueller matrices of all half-wave plates at every node of a field point.
-
-    Keys: "half1" and "half2" behind their wedges, and each angle (deg) of the calibration plate. All of
-    them are solved in one go, as rows of the same arrays: one piece of physics, compiled once.
-    """
-    wavelength = node_wavelengths(instrument, plan)
-    direction = _pupil_direction(instrument, plan, x, y)
-    glass = materials.BK7.refractive_index(wavelength)
-    cases: dict[float | str, tuple[str, tuple[Nodes, Nodes], tuple[Plate, ...]]] = {}
-    for where, half in zip(("half1", "half2"), instrument.halves, strict=True):
-        behind = optics.behind_wedge(direction, half.wedge, glass)
-        cases[where] = where, behind, _stack(instrument, plan, where, half.plate, half.fast_axis, wavelength)
-    for setting, _, _ in plan.settings:
-        angle = calibration_angle(instrument, setting)
-        if angle is not None:
-            stack = _stack(instrument, plan, "chwp", instrument.chwp, angle, wavelength)
-            cases[angle] = "chwp", direction[:2], stack
-
-    if any(plate.cut is not None for _, _, stack in cases.values() for plate in stack):
-        cases = {key: (where, ray, _with_cuts(stack)) for key, (where, ray, stack) in cases.items()}
-
-    def together(*values: Float[Array, "*n"]) -> Float[Array, "cases n"]:
-        return jnp.stack([jnp.broadcast_to(value, wavelength.shape) for value in values])
-
-    sx, sy = (together(*(case[1][i] for case in cases.values())) for i in (0, 1))
-    plates = jax.tree.map(together, *(case[2] for case in cases.values()))
-    matrices = _MUELLER[instrument.plates](sx, sy, plates, wavelength)
-    result: dict[float | str, Float[Array, "n 4 4"]] = {}
-    for i, (key, (where, (kx, ky), stack)) in enumerate(cases.items()):
-        matrix = matrices[i]
-        for effect in instrument.effects:
-            matrix = effect.ahead_of_plates(where, matrix, kx, ky, wavelength, stack[0].axis)
-        result[key] = matrix
-    return result
-
-
-# ------------------------------------------------------------------------------------ bands and cameras
+    shift = instrument.patched().filter_shift
+    if shift is None:
+        return plan.wavelength
+    return plan.wavelength + jnp.where(plan.conditions.band_width > BROAD, shift, 0.0)
 
 
 def band_weights(instrument: Instrument, plan: Plan) -> Float[Array, "b n"]:
@@ -142,140 +113,132 @@ def band_weights(instrument: Instrument, plan: Plan) -> Float[Array, "b n"]:
     return weight / weight.sum(axis=1, keepdims=True)
 
 
-def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b 2 2 4"]:
-    """Band-integrated Mueller rows (band, half, row, Stokes): all the optics there is at a field point.
+def ray_at(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Ray:
+    """The ray from a field point at the wavelength nodes, as it enters the train."""
+    return Ray.entering(x, y, (node_wavelengths(instrument, plan), plan.conditions))
 
-    Row 0 is S0, row 1 what the Wollaston prism analyses (S1, turned by an effect if need be), behind
-    calibration plate, wedge and half-wave plate.
+
+def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b r 4"]:
+    """Band-integrated Mueller rows (band, row, Stokes): all the optics there is at a field point.
+
+    Rows are what the analysers see, arm by arm: S0, then what is analysed. Columns are the light behind the leading
+    elements.
     """
-    matrices = plate_matrices(instrument, plan, x, y)
-    turn: Scalar | float = 0.0
-    for effect in instrument.effects:
-        turn = effect.analyser_angle(turn)
-    halves = jnp.stack([matrices["half1"], matrices["half2"]], axis=1)
-    analysed = halves[:, :, 1]
-    if not isinstance(turn, float):
-        analysed = jnp.cos(2 * turn) * halves[:, :, 1] + jnp.sin(2 * turn) * halves[:, :, 2]
-    rows = jnp.stack([halves[:, :, 0], analysed], axis=2)
+    instrument = instrument.patched()
+    train, ray = divided(instrument), ray_at(instrument, plan, x, y)
+    for element in train.leading:
+        ray = element.ray(ray)
+    common, ray = fold.stations(train.banded, ray)
+    arms = [fold.stations(tuple(arm.train()), ray)[0] for arm in instrument.arms]
+    states = [state for state, _, _ in plan.settings]
+    matrices = fold.solved([*common, *(station for arm in arms for station in arm)], plan.moving, states)
+    analysers = [arm.analyser for arm in instrument.arms]
+    rows = fold.backward(common, arms, analysers, matrices, plan.moving, states, len(plan.wavelength))
     weights = band_weights(instrument, plan)
-    bands = []
-    for setting, first, last in plan.settings:
-        angle = calibration_angle(instrument, setting)
-        seen = rows if angle is None else jnp.einsum("nhrs,nst->nhrt", rows, matrices[angle])
-        bands.append(jnp.einsum("bn,nhrs->bhrs", weights[first:last], seen))
-    return jnp.concatenate(bands, axis=0)
+    return jnp.concatenate(
+        [
+            jnp.einsum("bn,nrs->brs", weights[first:last], rows[i])
+            for i, (_, first, last) in enumerate(plan.settings)
+        ]
+    )
 
 
-def upstream(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
-    """Mueller matrix from the polariser to the calibration plate: the collimator (contract, item 3)."""
-    lens = instrument.collimator
-    q = lens.diattenuation * (x**2 - y**2) + lens.q
-    u = lens.diattenuation * 2.0 * x * y + lens.u
-    matrix = mueller.diattenuator(q, u)
-    for effect in instrument.effects:
-        matrix = effect.upstream(matrix, x, y)
-    return matrix
-
-
-def throughput_at(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, 4]:
-    """Throughput of the four cameras at a field point."""
-    series = instrument.throughput
-    return series.coefficients @ legendre.basis(x, y, series.degree)
+def throughput_at(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, " k"]:
+    """Throughput series of the cameras at a field point."""
+    return instrument.throughput.at(x, y)
 
 
 def camera_vectors(
-    instrument: Instrument, rows: Float[Array, "b 2 2 4"], throughput: Float[Array, 4], x: Scalar, y: Scalar
-) -> Float[Array, "b 4 4"]:
+    instrument: Instrument, rows: Float[Array, "b r 4"], throughput: Float[Array, " k"], x: Scalar, y: Scalar
+) -> Float[Array, "b k 4"]:
     """Analysis vectors (band, camera, Stokes): counts = vector · Stokes for light of unit flux."""
-    for effect in instrument.effects:
-        throughput = effect.throughput(throughput, x, y)
-    efficiency = jnp.stack([half.efficiency for half in instrument.halves])
-    half = jnp.asarray(HALF_OF_CAMERA)
-    sign = jnp.asarray(SIGN_OF_CAMERA) * efficiency[half]
-    analysed = 0.5 * (rows[:, half, 0] + sign[:, None] * rows[:, half, 1])
+    instrument = instrument.patched()
+    for part in instrument.cameras.transmission:
+        throughput = throughput * part.factors(x, y)
+    index, shares = _beams(instrument)
+    analysed = sum(shares[:, j, None] * rows[:, index[:, j]] for j in range(index.shape[1]))
     vectors = throughput[:, None] * (analysed @ upstream(instrument, x, y))
-    for effect in instrument.effects:
-        vectors = effect.cameras(vectors, x, y)
+    for part in instrument.cameras.mixing:
+        vectors = part.vectors(vectors, x, y)
     return vectors
+
+
+def _beams(instrument: Instrument) -> tuple[Int[np.ndarray, "k j"], Float[Array, "k j"]]:
+    """For each camera the rows that its beam is made of, and what it takes of each."""
+    count = max(arm.analyser.rows for arm in instrument.arms)
+    index = np.zeros((len(instrument.cameras), count), int)
+    shares = jnp.zeros((len(instrument.cameras), count))
+    first = 0
+    for arm in instrument.arms:
+        analyser = arm.analyser
+        cameras = np.array([instrument.cameras.names.index(name) for name in analyser.cameras])
+        index[cameras, : analyser.rows] = first + np.arange(analyser.rows)
+        shares = shares.at[cameras, : analyser.rows].set(analyser.shares())
+        first += analyser.rows
+    return index, shares
 
 
 # ----------------------------------------------------------------------------------------- light and counts
 
 
-def telescope(instrument: Instrument) -> Float[Array, "4 4"]:
-    """Mueller matrix that light from the sky, and no other, meets first: 1 unless an effect acts."""
-    matrix = jnp.eye(4)
-    for effect in instrument.effects:
-        matrix = effect.telescope(matrix)
-    return matrix
-
-
-def _catalogue(
-    instrument: Instrument, rotator: Float[Array, " e"], source: Int[Array, " e"]
-) -> Float[Array, "e 2"]:
-    """(q, u) of the standard star of each exposure in the ICS, (q + iu) exp(−2i ROTATOR)."""
-    all_q, all_u = instrument.standard.q, instrument.standard.u
-    for effect in instrument.effects:
-        all_q, all_u = effect.catalogue(all_q, all_u, instrument.standard.names)
-    row = jnp.where(source >= 0, source, 0)
-    return _turned(jnp.stack([all_q[row], all_u[row]], axis=-1), rotator)
-
-
-def _turned(qu: Float[Array, "e 2"], angle: Float[Array, " e"]) -> Float[Array, "e 2"]:
-    """(q, u) referred to axes turned by `angle` (rad): (q + iu) exp(−2i angle)."""
-    cos, sin = jnp.cos(2 * angle), jnp.sin(2 * angle)
-    return jnp.stack([qu[:, 0] * cos + qu[:, 1] * sin, qu[:, 1] * cos - qu[:, 0] * sin], axis=-1)
-
-
 def stokes(
-    instrument: Instrument, exposures: ExposureArrays, sky: Float[Array, "e 2"], source: Int[Array, " e"]
+    instrument: Instrument,
+    exposures: ExposureArrays,
+    sky: Float[Array, "e 2"],
+    source: Int[Array, " e"],
+    x: Scalar,
+    y: Scalar,
 ) -> Float[Array, "e 4"]:
-    """Stokes vectors that enter the collimator, one per exposure, at a field point.
+    """Stokes vectors behind the place of the polariser, one per exposure, at a field point.
 
     `sky` is (q, u) of the Moon sky for δ = 1 in the ICS, `source` the row of the standard star or −1. Light
-    through the polariser forgets its past; light of known flux does not come through the telescope.
+    through the polariser forgets its past; what does not come from the sky does not meet the telescope.
     """
-    rotator = exposures.rotator
-    offset: Scalar | float = 0.0
-    for effect in instrument.effects:
-        offset = effect.rotator(offset)
-    if not isinstance(offset, float):
-        rotator, sky = rotator + offset, _turned(sky, jnp.broadcast_to(offset, rotator.shape))
-    moon = instrument.sky.depolarisation * sky
-    for effect in instrument.effects:
-        moon = effect.moon(moon, sky)
-    beam = jnp.where(exposures.moon[:, None], moon, 0.0)
-    if instrument.standard.names:
-        star = _catalogue(instrument, rotator, source)
-        beam = jnp.where(((source >= 0) & ~exposures.moon)[:, None], star, beam)
-    one = jnp.ones_like(exposures.clp_angle)
-    light = jnp.stack([one, beam[:, 0], beam[:, 1], jnp.zeros_like(one)], axis=-1)
-    if overridden(instrument.effects, "telescope"):
-        light = jnp.where(exposures.flux_known[:, None], light, light @ telescope(instrument).T)
-    angle, extinction = exposures.clp_angle, instrument.polariser.extinction
-    for effect in instrument.effects:
-        angle = effect.polariser_angle(angle, exposures)
-        extinction = effect.extinction(extinction)
-    behind = mueller.polarised(angle, extinction)
-    for effect in instrument.effects:
-        behind = effect.polarised(behind, exposures)
-    return jnp.where(exposures.clp_in[:, None], behind, light)
+    instrument = instrument.patched()
+    sight = _sight(instrument, Sight(exposures, sky, source, x, y))
+    nothing = jnp.zeros(exposures.kind.shape, bool)
+    qu, taken, indoors = jnp.zeros((*nothing.shape, 2)), nothing, nothing
+    for one in instrument.sources:
+        if not one.from_sky:
+            indoors = indoors | one.shines(sight)
+        if type(one).polarisation is not Source.polarisation:
+            seen = one.shines(sight) & ~taken
+            qu, taken = jnp.where(seen[:, None], one.polarisation(sight), qu), taken | seen
+    one, zero = jnp.ones_like(exposures.clp_angle), jnp.zeros_like(exposures.clp_angle)
+    light = jnp.stack([one, qu[:, 0], qu[:, 1], zero], axis=-1)
+    if instrument.telescope():
+        light = jnp.where(indoors[:, None], light, light @ telescope(instrument, x, y).T)
+    polariser = instrument.polariser
+    if polariser is None:
+        return light
+    return jnp.where(exposures.clp_in[:, None], polariser.light(exposures.clp_angle), light)
+
+
+def _sight(instrument: Instrument, sight: Sight) -> Sight:
+    """What is looked at, with the true position angle of the instrument."""
+    if instrument.rotator_zero is None:
+        return sight
+    offset = jnp.deg2rad(instrument.rotator_zero)
+    exposures = sight.exposures.rotated(offset)
+    sky = turned(sight.sky, jnp.broadcast_to(offset, exposures.rotator.shape))
+    return sight._replace(exposures=exposures, sky=sky)
 
 
 def counts(
     instrument: Instrument,
     plan: Plan,
-    rows: Float[Array, "b 2 2 4"],
-    throughput: Float[Array, 4],
+    rows: Float[Array, "b r 4"],
+    throughput: Float[Array, " k"],
     x: Scalar,
     y: Scalar,
     sky: Float[Array, "e 2"],
     source: Int[Array, " e"],
     band: Int[Array, " e"],
-) -> Float[Array, "e 4"]:
-    """Counts of the four cameras in every exposure at a field point, for light of unit flux and no ghosts."""
+) -> Float[Array, "e k"]:
+    """Counts of the cameras in every exposure at a field point, for light of unit flux and no ghosts."""
+    instrument = instrument.patched()
     vectors = camera_vectors(instrument, rows, throughput, x, y)
-    light = stokes(instrument, plan.exposures, sky, source)
+    light = stokes(instrument, plan.exposures, sky, source, x, y)
     if (
         len(vectors) <= FEW_BANDS
     ):  # a product of matrices, where picking vectors would copy them for every exposure
@@ -283,42 +246,52 @@ def counts(
         result = jnp.einsum("bks,eb,es->ek", vectors, in_band, light)
     else:
         result = jnp.einsum("eks,es->ek", vectors[band], light)
-    for effect in instrument.effects:
-        result = effect.recorded(result, vectors[band, :, 0], plan.exposures, x, y)
+    for part in instrument.cameras.exposures:
+        result = result + vectors[band, :, 0] * part.share(plan.exposures, x, y)
     return result
+
+
+def has_ghosts(instrument: Instrument) -> bool:
+    """Whether counts depend on the light of the opposite field point."""
+    return bool(instrument.patched().cameras.ghosts)
 
 
 def with_ghosts(
     instrument: Instrument,
-    counts: Float[Array, "e 4"],
-    opposite: Float[Array, "e 4"],
+    counts: Float[Array, "e k"],
+    opposite: Float[Array, "e k"],
     source: Int[Array, " e"],
-) -> Float[Array, "e 4"]:
+) -> Float[Array, "e k"]:
     """Counts for light of unit flux with what the cameras see of the opposite field point, `opposite`."""
-    for effect in instrument.effects:
-        counts = effect.mirrored(counts, opposite, source < 0)
+    for part in instrument.patched().cameras.ghosts:
+        counts = counts + part.seen(source < 0, opposite)
     return counts
 
 
+def is_linear(instrument: Instrument) -> bool:
+    """Whether the detectors report the electrons as they are."""
+    return not instrument.patched().cameras.detectors
+
+
 def detected(
-    instrument: Instrument, exposures: ExposureArrays, counts: Float[Array, "e 4"]
-) -> Float[Array, "e 4"]:
+    instrument: Instrument, exposures: ExposureArrays, counts: Float[Array, "e k"]
+) -> Float[Array, "e k"]:
     """What the detectors report for counts in electrons: the one stage that is not linear in the light."""
-    for effect in instrument.effects:
-        counts = effect.detector(counts, exposures)
+    for part in instrument.patched().cameras.detectors:
+        counts = part.reported(counts, exposures)
     return counts
 
 
 # --------------------------------------------------------------------------------------- what users ask for
 
 
-def instrument_matrix(vectors: Float[Array, "... 4 4"]) -> Float[Array, "... 2 3"]:
-    """Rows (m21, m22, m23) and (m31, m32, m33) of the instrument matrix from analysis vectors.
+def instrument_matrix(
+    vectors: Float[Array, "... k 4"], pairs: tuple[tuple[int, int], ...]
+) -> Float[Array, "... a 3"]:
+    """Rows (m21, m22, m23), (m31, m32, m33), … of the instrument matrix from analysis vectors, one for each arm.
 
-    Difference of the two cameras' response to 1, q, u, each over the sum of their response to unpolarised
-    light. For light from the sky pass `vectors @ telescope(instrument)`, so that an active effect there is
-    included.
+    Difference of the response of the two cameras of an arm (`pairs`) to 1, q, u, each over the sum of their response to
+    unpolarised light. For light from the sky pass `vectors @ telescope(instrument, x, y)`.
     """
-    first = (vectors[..., 0, :3] - vectors[..., 1, :3]) / (vectors[..., 0, :1] + vectors[..., 1, :1])
-    second = (vectors[..., 2, :3] - vectors[..., 3, :3]) / (vectors[..., 2, :1] + vectors[..., 3, :1])
-    return jnp.stack([first, second], axis=-2)
+    first, second = (vectors[..., np.array([pair[i] for pair in pairs]), :] for i in (0, 1))
+    return (first[..., :3] - second[..., :3]) / (first[..., :1] + second[..., :1])

@@ -45,3 +45,19 @@ MGF2_E = _formula_1((0.41344023, 0.50497499, 2.4904862), (0.03684262, 0.09076162
 QUARTZ_THERMAL = 1.23e-4
 MGF2_THERMAL = 5.37e-5
 REFERENCE_TEMPERATURE = 10.0  # Celsius
+
+
+class Crystal(NamedTuple):
+    """A uniaxial crystal: both dispersion curves, and the relative change of its birefringence per kelvin."""
+
+    ordinary: Sellmeier
+    extraordinary: Sellmeier
+    thermal: float = 0.0
+
+
+CRYSTALS = {
+    "quartz": Crystal(QUARTZ_O, QUARTZ_E, QUARTZ_THERMAL),
+    "mgf2": Crystal(MGF2_O, MGF2_E, MGF2_THERMAL),
+}
+GLASSES = {"BK7": BK7}
+"""Materials that a description file may name."""

@@ -1,32 +1,40 @@
 """Parameters that know their unit, meaning, source and prior; names derived from the tree that holds them.
 
-A module declares a parameter with `param`; nobody types a second list of names. The value in the tree
-carries the unit of the declaration (the unit of the contract, e.g. µm or deg), conversions stand in the
-equations.
+A component declares what it can be asked about in two ways. `param` declares a parameter for good: whoever holds the
+component has it. `number` declares a number that an instrument may leave fixed; which of them are parameters, with
+which prior and from which source, the description of the instrument says (`Element.declared`). Nobody types a second
+list of names: they follow from the tree. The value in the tree carries the unit of the declaration (e.g. um or deg),
+conversions stand in the equations.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-KEY = "walop_jax.parameter"
+PARAMETER = "walop_jax.parameter"
+NUMBER = "walop_jax.number"
+
+Vector = Float[Array, " n"]
+AnyComponent = TypeVar("AnyComponent", bound="Component")
 
 
 @dataclasses.dataclass(frozen=True)
 class Declaration:
-    """What a module says of one of its parameters.
+    """What is known of a parameter beforehand.
 
-    `width` is the standard deviation of the as-built value (None: no prior), `scale` the step a solver
-    should think in (the width where there is one), `optical` whether it enters before the band integral.
-    `loose` is the width of a very weak pull toward the start value that keeps combinations which the data
-    hardly see from running away; it is no prior knowledge and is not counted as such.
+    `width` is the standard deviation of the as-built value (None: no prior), `scale` the step a solver should think
+    in (the width where there is one). `loose` is the width of a very weak pull toward the start value that keeps
+    combinations which the data hardly see from running away; it is no prior knowledge and is not counted as such.
+    `name` replaces the name that follows from the tree.
     """
 
     unit: str
@@ -35,7 +43,14 @@ class Declaration:
     width: float | None = None
     scale: float | None = None
     loose: float | None = None
-    optical: bool = False
+    name: str | None = None
+
+
+class Number(NamedTuple):
+    """Unit and meaning of a number that an instrument may leave fixed."""
+
+    unit: str
+    about: str
 
 
 def param(
@@ -46,13 +61,21 @@ def param(
     width: float | None = None,
     scale: float | None = None,
     loose: float | None = None,
-    optical: bool = False,
     default: float | None = None,
 ) -> Any:
     """Declare a parameter of an Equinox module; values become float64 arrays."""
-    declaration = Declaration(unit, about, source, width, scale, loose, optical)
+    declaration = Declaration(unit, about, source, width, scale, loose)
     extra: dict[str, Any] = {} if default is None else {"default": default}
-    return eqx.field(metadata={KEY: declaration}, converter=jnp.asarray, **extra)
+    return eqx.field(metadata={PARAMETER: declaration}, converter=jnp.asarray, **extra)
+
+
+def number(*, unit: str, about: str, default: float | None = 0.0) -> Any:
+    """Declare a number of an Equinox module; values become float64 arrays, None stays: nothing of the kind."""
+    return eqx.field(metadata={NUMBER: Number(unit, about)}, converter=_array, default=default)
+
+
+def _array(value: Any) -> Any:
+    return None if value is None else jnp.asarray(value, float)
 
 
 def unknown_name(what: str, name: str, known: Iterable[str]) -> ValueError:
@@ -63,49 +86,102 @@ def unknown_name(what: str, name: str, known: Iterable[str]) -> ValueError:
     return ValueError(f"unknown {what} {name!r}; {hint}")
 
 
+class Component(eqx.Module):
+    """A piece of the instrument; what it declares is what a fit may vary."""
+
+    def labels(self, field: str) -> Sequence[str]:
+        """Names, within this component, of the elements of the parameter `field`; "" is the component's own name."""
+        return (field,)
+
+    def declarations(self) -> Mapping[str, Declaration]:
+        """Its parameters, by field."""
+        return field_declarations(type(self))
+
+
 @dataclasses.dataclass(frozen=True)
 class Leaf:
-    """One number of the tree: its name, its declaration and the name of the module class that holds it."""
+    """One number of the tree: its name, its declaration and the field that holds it."""
 
     name: str
     declaration: Declaration
-    owner: str
+    holder: tuple[str, ...]
 
 
-class Component(eqx.Module):
-    """A piece of the instrument; its `param` fields are what a fit may vary."""
-
-    def labels(self, field: str) -> Sequence[str]:
-        """Names, within this component, of the elements of the parameter `field`."""
-        return (field,)
-
-
-def _walk(component: Component, prefix: str) -> Iterator[Leaf]:
+def _arrays(component: Component, prefix: str, place: tuple[str, ...]) -> Iterator[tuple[Leaf, ...]]:
+    """The numbers of every parameter array, in the order in which a tree is flattened."""
+    declared = component.declarations()
     for field in dataclasses.fields(component):
         if field.metadata.get("static", False):
             continue
         value = getattr(component, field.name)
-        declaration = field.metadata.get(KEY)
-        if declaration is not None:
-            labels = component.labels(field.name)
+        here = (*place, field.name)
+        if field.name in declared:
+            labels, declaration = component.labels(field.name), declared[field.name]
             if len(labels) != np.size(value):
                 raise ValueError(
                     f"{type(component).__name__}.{field.name}: {len(labels)} labels, {np.size(value)} values"
                 )
-            for label in labels:
-                yield Leaf(f"{prefix}{label}", declaration, type(component).__name__)
+            names = (declaration.name or f"{prefix}{label}".rstrip(".") for label in labels)
+            yield tuple(Leaf(name, declaration, here) for name in names)
         elif isinstance(value, tuple):
-            for child in value:
-                yield from _walk(child, f"{prefix}{child.name}.")
-        else:
-            yield from _walk(value, f"{prefix}{field.name}.")
+            for i, child in enumerate(value):
+                if isinstance(child, Component) and hasattr(child, "name"):
+                    yield from _arrays(child, f"{prefix}{_name(child)}.", (*here, str(i)))
+        elif isinstance(value, Component):
+            yield from _arrays(value, f"{prefix}{field.name}.", here)
+
+
+def _name(component: Any) -> str:
+    return component.name
 
 
 def leaves(component: Component) -> tuple[Leaf, ...]:
-    """Every number of the tree in the order in which `jax.flatten_util.ravel_pytree` lays them out."""
-    return tuple(_walk(component, ""))
+    """Every parameter of a component, in the order of `values_of`."""
+    return tuple(leaf for array in _arrays(component, "", ()) for leaf in array)
 
 
 def field_declarations(kind: type[Component]) -> dict[str, Declaration]:
-    """The parameters that a component class declares, by field name."""
-    return {f.name: f.metadata[KEY] for f in dataclasses.fields(kind) if KEY in f.metadata}
+    """The parameters that a component class declares for good, by field name."""
+    return {f.name: f.metadata[PARAMETER] for f in dataclasses.fields(kind) if PARAMETER in f.metadata}
+
+
+def numbers_of(kind: type[Component]) -> dict[str, Number]:
+    """The numbers that a component class has, by field name."""
+    return {f.name: f.metadata[NUMBER] for f in dataclasses.fields(kind) if NUMBER in f.metadata}
+
+
+# -------------------------------------------------------------------------------- the tree and the vector
+
+
+def parameter_places(component: Component) -> list[tuple[int, int]]:
+    """For every parameter array its position among the leaves of the flattened tree, and its size."""
+    flat, _ = jax.tree_util.tree_flatten_with_path(component)
+    position = {tuple(_key(entry) for entry in path): i for i, (path, _) in enumerate(flat)}
+    return [(position[array[0].holder], len(array)) for array in _arrays(component, "", ()) if array]
+
+
+def _key(entry: Any) -> str:
+    return str(entry.name if hasattr(entry, "name") else entry.idx)
+
+
+def values_of(component: Component) -> Vector:
+    """The parameters of a component as one vector."""
+    arrays = jax.tree_util.tree_leaves(component)
+    chosen = [jnp.ravel(arrays[i]) for i, _ in parameter_places(component)]
+    return jnp.concatenate(chosen) if chosen else jnp.zeros(0)
+
+
+def with_values(component: AnyComponent) -> Callable[[Vector], AnyComponent]:
+    """The function that puts a vector of parameters in the place of those of a component."""
+    arrays, structure = jax.tree_util.tree_flatten(component)
+    places = [i for i, _ in parameter_places(component)]
+    shapes = [np.shape(arrays[i]) for i in places]
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]
+
+    def replaced(values: Vector) -> AnyComponent:
+        filled = list(arrays)
+        for i, part, shape in zip(places, jnp.split(values, ends), shapes, strict=True) if places else ():
+            filled[i] = part.reshape(shape)
+        return jax.tree_util.tree_unflatten(structure, filled)
+
+    return replaced

@@ -89,12 +89,15 @@ def _fringe_error(
     return float(np.abs(rule - exact).max())
 
 
-def band_rule(wavelength: Vector, throughput: Vector, tolerance: float = 1e-7, fringes: float = 0.0) -> Rule:
+def band_rule(
+    wavelength: Vector, throughput: Vector, tolerance: float = 1e-7, path_difference: float = 0.0
+) -> Rule:
     """Fewest wavelength nodes (µm) and weights (sum 1) that integrate plate fringes to `tolerance`.
 
     Fringes at twice the plates' frequency carry a hundred times less light and are held to a hundred times
-    the tolerance; so are those of a path difference of `fringes` waves at 0.62 µm, if there is an etalon.
+    the tolerance; so are those of a `path_difference` (µm), if there is an air gap.
     """
+    fringes = path_difference / 0.62
     weak = max(2 * WAVES, fringes)
     fine, fine_weight = tabulated_measure(wavelength, throughput)
     # No rule follows a fringe with fewer than two nodes a cycle: there is no need to try those.

@@ -20,7 +20,7 @@ PAPER_II = (
     "Maharana et al. 2022, WALOP-South: A Four-Camera One-Shot Imaging Polarimeter for PASIPHAE Survey. "
     "Paper II - Polarimetric Modelling and Calibration"
 )
-_FILTER = "Doi et al. 2010, AJ 139, 1628, Table 4, as tabulated by speclite"
+_FILTER = "Doi et al. 2010, AJ 139, 1628, Table 4"
 # What only users of this project know: it is no source that a reader could look up.
 _INTERNAL = re.compile(
     r"(calibration )?contract,? (section|item) \d+(, with its section \d+: [^;.]*)?[;.,]? ?"

@@ -6,21 +6,20 @@ Three things of one shape: values, freedom and priors. Names come from the tree 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from walop_jax.data.records import Exposures
+from walop_jax.model.conventions import EXTINCTION
 from walop_jax.model.effects import effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import Component, leaves, unknown_name
+from walop_jax.model.parameters import leaves, unknown_name, values_of, with_values
 
 Vector = Float[np.ndarray, " n"]
 
@@ -134,32 +133,17 @@ class Model:
 
     def instrument(self, values: Vector | None = None) -> Instrument:
         """The instrument at a full vector of values (default: start values)."""
-        return unravel(self.template)(jnp.asarray(self.start if values is None else values))
-
-
-def unravel(template: Instrument) -> Callable[[Float[Array, " n"]], Instrument]:
-    """The function from a full vector of values to an instrument of the template's shape."""
-    return ravel_pytree(template)[1]
-
-
-def full_values(component: Component) -> Vector:
-    """All numbers of an instrument, or of a part of it, in tree order."""
-    return np.asarray(ravel_pytree(component)[0])
-
-
-def optical_indices(instrument: Instrument) -> tuple[int, ...]:
-    """Positions of the parameters that enter before the band integral."""
-    return tuple(i for i, leaf in enumerate(leaves(instrument)) if leaf.declaration.optical)
+        return with_values(self.template)(jnp.asarray(self.start if values is None else values))
 
 
 def series_indices(instrument: Instrument) -> tuple[int, ...]:
-    """Positions of the throughput coefficients (4 × terms, contiguous)."""
-    return tuple(i for i, leaf in enumerate(leaves(instrument)) if leaf.owner == "Throughput")
+    """Positions of the throughput coefficients (cameras × terms, contiguous)."""
+    return tuple(i for i, leaf in enumerate(leaves(instrument)) if leaf.holder[0] == "throughput")
 
 
 def make_template(instrument: Instrument) -> Instrument:
     """The instrument with nothing but arrays in its tree."""
-    return jax.tree.map(jnp.asarray, eqx.filter(instrument, eqx.is_array))
+    return jax.tree.map(jnp.asarray, instrument)
 
 
 def make_model(
@@ -175,7 +159,7 @@ def make_model(
     """
     priors = dict(priors or {})
     parameters = []
-    for leaf, value in zip(leaves(instrument), full_values(instrument), strict=True):
+    for leaf, value in zip(leaves(instrument), np.asarray(values_of(instrument)), strict=True):
         d = leaf.declaration
         prior = priors.pop(leaf.name, None) or ((float(value), d.width) if d.width is not None else None)
         scale = prior[1] if prior is not None else (d.scale or max(abs(float(value)), 1e-3))
@@ -199,6 +183,8 @@ def effect_context(instrument: Instrument, exposures: Exposures) -> Context:
         moon=tuple(moon.tolist()),
         moon_ids=tuple(np.asarray(exposures.exposure)[moon].tolist()),
         sources=instrument.standard.names,
+        cameras=len(instrument.cameras),
+        extinction=float(polariser.extinction) if (polariser := instrument.polariser) else EXTINCTION,
     )
 
 
@@ -220,9 +206,10 @@ def with_effects(model: Model, effects: Sequence[str | Effect], context: Context
         active.append(effect)
         neutral = effect.at_neutral(context)
         names = [f"{effect.name}.{leaf.name}" for leaf in leaves(effect)]
-        values = zip(full_values(effect), full_values(neutral), strict=True)
+        values = zip(np.asarray(values_of(effect)), np.asarray(values_of(neutral)), strict=True)
         starts |= dict(zip(names, values, strict=True))
     instrument = dataclasses.replace(model.template, effects=in_order(active))
+    jax.eval_shape(lambda i: i.patched(), instrument)  # whatever does not fit the instrument is an error here
     known = {p.name: p for p in model.parameters}
     parameters = []
     for p in make_model(model.name, instrument).parameters:

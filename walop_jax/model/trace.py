@@ -1,12 +1,10 @@
-"""Following the light: one source through the instrument, stage by stage, with the functions that a fit uses.
+"""Following the light: one source through the instrument, element by element, with the fold that a fit uses.
 
-    source → collimator → calibration plate → half-wave plates → Wollaston prisms → cameras → counts
+`light.py` folds the train backwards from the analysers, once for all sources. Here the Stokes vector goes forward,
+averaged over the band from where the light depends on wavelength; both ends meet in the counts.
 
-`light.py` runs this path backwards from the cameras, once for all sources. Here the Stokes vector goes
-forward, averaged over the band where the plates make it depend on wavelength; both ends meet in the counts.
-
-Units       Stokes vectors in units of the flux that arrives; counts per unit of flux, as in `light.counts`:
-            ghosts of other field points and effects of the detectors, which act on electrons, come after.
+Units       Stokes vectors in units of the flux that arrives; counts per unit of flux, as in `light.counts`: ghosts of
+            other field points and effects of the detectors, which act on electrons, come after.
 """
 
 from __future__ import annotations
@@ -18,18 +16,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.data.records import Exposures, FilterCurve
-from walop_jax.model import light
-from walop_jax.model.conventions import CAMERA_NAMES, HALF_OF_CAMERA, SIGN_OF_CAMERA
-from walop_jax.model.instrument import Instrument, Standards
+from walop_jax.model import fold, light
+from walop_jax.model.elements import Element
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.materials import REFERENCE_TEMPERATURE
-from walop_jax.model.plan import Plan, plan_for
+from walop_jax.model.plan import Plan
+from walop_jax.model.planning import plan_for
+from walop_jax.model.sources import Standards
 
 STOKES = ("I", "Q", "U", "V")
 
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """The light at one place: rows of `value` are one beam or two halves, columns Stokes or cameras."""
+    """The light at one place: rows of `value` are one beam or the arms, columns Stokes or cameras."""
 
     name: str
     about: str
@@ -39,7 +39,7 @@ class Stage:
 
 
 @dataclasses.dataclass(frozen=True)
-class Ray:
+class Sightline:
     """A source and the way through which it is looked at; angles and field coordinates in degrees.
 
     `q`, `u` are those of the source in the instrument frame (taken as catalogue values at ROTATOR 0);
@@ -75,76 +75,85 @@ class Ray:
         )  # fmt: skip
 
 
-def trace(instrument: Instrument, curve: FilterCurve, ray: Ray) -> tuple[Stage, ...]:
-    """Every stage from the source to the counts of the four cameras."""
-    instrument = _with_source(instrument, ray)
-    plan = plan_for(instrument.effects, ray.exposure(curve.name), {curve.name: curve})
-    x, y = jnp.asarray(ray.x), jnp.asarray(ray.y)
+def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> tuple[Stage, ...]:
+    """Every stage from the source to the counts of the cameras."""
+    instrument = _with_source(instrument.patched(), sightline)
+    plan = plan_for(instrument, sightline.exposure(curve.name), {curve.name: curve})
+    x, y = jnp.asarray(sightline.x), jnp.asarray(sightline.y)
     source = jnp.asarray([len(instrument.standard.names) - 1])
-    beam = light.stokes(instrument, plan.exposures, jnp.zeros((1, 2)), source)[0]
-    stages = [_one("source", "polariser" if np.isfinite(ray.clp_angle) else "sky", beam)]
+    beam = light.stokes(instrument, plan.exposures, jnp.zeros((1, 2)), source, x, y)[0]
+    stages = [_one("source", "polariser" if np.isfinite(sightline.clp_angle) else "sky", beam)]
 
-    beam = light.upstream(instrument, x, y) @ beam
-    stages.append(_one("collimator", "lenses of the collimator, ahead of the calibration plate", beam))
-
-    # From here on light depends on wavelength: one Stokes vector per node, and its average over the band.
-    weight = light.band_weights(instrument, plan)[0]
-    matrices = light.plate_matrices(instrument, plan, x, y)
-    nodes = jnp.broadcast_to(beam, (len(weight), 4))
-    angle = light.calibration_angle(instrument, plan.settings[0][0])
-    if angle is not None:
-        nodes = jnp.einsum("nst,nt->ns", matrices[angle], nodes)
-    about = "out of the beam" if angle is None else f"at {angle:g}°"
-    stages.append(_one("calibration plate", about, weight @ nodes))
-
-    halves = jnp.stack([matrices["half1"] @ nodes[:, :, None], matrices["half2"] @ nodes[:, :, None]])[..., 0]
-    ahead = jnp.einsum("n,hns->hs", weight, halves)
-    stages.append(
-        Stage("half-wave plates", "ahead of the prisms", ("half 1", "half 2"), STOKES, np.asarray(ahead))
+    # One Stokes vector per node, and its average over the band.
+    weight, ray = light.band_weights(instrument, plan)[0], light.ray_at(instrument, plan, x, y)
+    train = light.divided(instrument)
+    common, ray = fold.stations((*train.leading, *train.banded), ray)
+    arms = [fold.stations(tuple(arm.train()), ray)[0] for arm in instrument.arms]
+    matrices = fold.solved(
+        [*common, *(station for arm in arms for station in arm)], plan.moving, [plan.settings[0][0]]
     )
-
-    turn = jnp.asarray(0.0)
-    for effect in instrument.effects:
-        turn = jnp.asarray(effect.analyser_angle(turn))
-    analysed = jnp.cos(2 * turn) * ahead[:, 1] + jnp.sin(2 * turn) * ahead[:, 2]
-    half = jnp.asarray(HALF_OF_CAMERA)
-    efficiency = jnp.stack([h.efficiency for h in instrument.halves])
-    beams = 0.5 * (ahead[half, 0] + jnp.asarray(SIGN_OF_CAMERA) * efficiency[half] * analysed[half])
-    stages.append(_cameras("Wollaston prisms", "share of the light in each beam of its half", beams))
+    nodes = jnp.broadcast_to(beam, (len(weight), 4))
+    for number, (element, _) in enumerate(common):
+        nodes, about = _through(element, matrices, number, nodes, plan)
+        if about is not None:
+            stages.append(_one(element.name, about, weight @ nodes))
+    ahead, beams, number = [], jnp.zeros(len(instrument.cameras)), len(common)
+    for arm, own in zip(instrument.arms, arms, strict=True):
+        here = nodes
+        for element, _ in own:
+            here, _ = _through(element, matrices, number, here, plan)
+            number += 1
+        mean = weight @ here
+        ahead.append(mean)
+        cameras = np.array([instrument.cameras.names.index(name) for name in arm.analyser.cameras])
+        # The rows that the beams are made of, of a matrix whose columns are this light and nothing else.
+        seen = arm.analyser.seen(jnp.zeros((4, 4)).at[:, 0].set(mean))[:, 0]
+        beams = beams.at[cameras].set(arm.analyser.shares() @ seen)
+    names = tuple(arm.name for arm in instrument.arms)
+    stages.append(Stage("arms", "ahead of the analysers", names, STOKES, np.asarray(jnp.stack(ahead))))
+    stages.append(_cameras(instrument, "analysers", "share of the light in each beam of its arm", beams))
 
     throughput = light.throughput_at(instrument, x, y)
-    for effect in instrument.effects:
-        throughput = effect.throughput(throughput, x, y)
+    for part in instrument.cameras.transmission:
+        throughput = throughput * part.factors(x, y)
     beams = throughput * beams
-    stages.append(_cameras("cameras", "behind lenses, filter and detector of each camera", beams))
-    stages.append(
-        _cameras("counts", "electrons per electron of flux", _between_cameras(instrument, plan, beams, x, y))
-    )
+    about = "behind lenses, filter and detector of each camera"
+    stages.append(_cameras(instrument, "cameras", about, beams))
+    # Mixing is linear in the cameras whatever the Stokes parameter: the beams stand where I does.
+    vectors = jnp.zeros((1, len(beams), 4)).at[0, :, 0].set(beams)
+    for part in instrument.cameras.mixing:
+        vectors = part.vectors(vectors, x, y)
+    stages.append(_cameras(instrument, "counts", "electrons per electron of flux", vectors[0, :, 0]))
     return tuple(stages)
 
 
-def _with_source(instrument: Instrument, ray: Ray) -> Instrument:
+def _through(
+    element: Element, matrices: fold.Solved, number: int, nodes: Float[Array, "n 4"], plan: Plan
+) -> tuple[Float[Array, "n 4"], str | None]:
+    """The light behind an element, and what to say of it; None where it does nothing to polarisation."""
+    if element.moves is None:
+        own, about = matrices[number, None], type(element).__doc__ or ""
+    else:
+        angle = fold.positions(element, plan.moving, [plan.settings[0][0]])[0]
+        own = None if angle is None else matrices[number, angle]
+        about = "out of the beam" if angle is None else f"at {angle:g}°"
+        if own is None:
+            return nodes, about
+    if own is None:
+        return nodes, None
+    return nodes @ own.T if own.ndim == 2 else jnp.einsum("nst,nt->ns", own, nodes), about
+
+
+def _with_source(instrument: Instrument, sightline: Sightline) -> Instrument:
     """The instrument with one more standard star: the source that is followed."""
     stars = instrument.standard
-    standard = Standards(
-        q=jnp.append(stars.q, ray.q), u=jnp.append(stars.u, ray.u), names=(*stars.names, "traced")
-    )
-    return dataclasses.replace(instrument, standard=standard)
-
-
-def _between_cameras(
-    instrument: Instrument, plan: Plan, beams: Float[Array, " 4"], x: Float[Array, ""], y: Float[Array, ""]
-) -> Float[Array, " 4"]:
-    # These effects are linear in the cameras whatever the Stokes parameter: put the beams where I stands.
-    vectors = jnp.zeros((plan.bands, 4, 4)).at[0, :, 0].set(beams)
-    for effect in instrument.effects:
-        vectors = effect.cameras(vectors, x, y)
-    return vectors[0, :, 0]
+    q, u = jnp.append(stars.q, sightline.q), jnp.append(stars.u, sightline.u)
+    return instrument.with_source(Standards(q=q, u=u, names=(*stars.names, "traced")))
 
 
 def _one(name: str, about: str, beam: Float[Array, " 4"]) -> Stage:
-    return Stage(name, about, ("",), STOKES, np.asarray(beam)[None])
+    return Stage(name, about.splitlines()[0].rstrip("."), ("",), STOKES, np.asarray(beam)[None])
 
 
-def _cameras(name: str, about: str, beams: Float[Array, " 4"]) -> Stage:
-    return Stage(name, about, ("",), CAMERA_NAMES, np.asarray(beams)[None])
+def _cameras(instrument: Instrument, name: str, about: str, beams: Float[Array, " k"]) -> Stage:
+    return Stage(name, about, ("",), instrument.cameras.names, np.asarray(beams)[None])

@@ -17,10 +17,11 @@ from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import refit
-from walop_jax.likelihood.problem import Problem, base_model
-from walop_jax.model.instrument import HalfWavePlate, Instrument, nominal_instrument
-from walop_jax.paper.polynomial import fit_paper, judged, ratios, sample_stars, transmitted
+from walop_jax.model.build import adapted
+from walop_jax.model.instrument import Instrument
+from walop_jax.paper.polynomial import fit_paper, measured_qu, sample_stars, transmitted, with_test_stars
 from walop_jax.science.star_errors import joint_errors, star_errors
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate, truth_values
@@ -62,16 +63,18 @@ def bench_table(seed: int = 0, electrons: float = 1e6) -> list[BenchRow]:
     for name in model.names:
         if name.startswith(_ABSENT):
             model = model.change(name, free=False)
-    fitted = Calibration.from_fit(refit(run.calset, model), Problem(run.calset, model))
+    fitted = Calibration.from_fit(refit(run.calset, model))
     true = dataclasses.replace(fitted, values=np.array([truth_values(run.truth)[n] for n in model.names]))
     made, stars = fit_paper(run.calset), sample_stars(seed=seed)
     at = [int(np.flatnonzero(np.isclose(made.x, tilt))[0]) for tilt in TILTS]
     x, y = made.x[at], made.y[at]
     reference, joint = (_vectors(c, x, y, plan.teff) for c in (true, fitted))
-    local = judged(x, y, made.coefficients[at], made.condition[at], made.transmission[at], stars)
-    paper = star_errors(local.recover(ratios(transmitted(reference, stars))), stars)
+    local = with_test_stars(x, y, made.coefficients[at], made.condition[at], made.transmission[at], stars)
+    paper = star_errors(local.recover(measured_qu(transmitted(reference, stars))), stars)
     ours = joint_errors(joint, reference, stars)
-    cross_talk = ratios(reference[..., 0] + reference[..., 1])[:, 1] - ratios(reference[..., 0])[:, 1]
+    cross_talk = (
+        measured_qu(reference[..., 0] + reference[..., 1])[:, 1] - measured_qu(reference[..., 0])[:, 1]
+    )
     rows = zip(TILTS, cross_talk.tolist(), PAPER_ERRORS, paper.tolist(), ours.tolist(), strict=True)
     return [BenchRow(t, c, published, tuple(p), tuple(j)) for t, c, published, p, j in rows]
 
@@ -81,16 +84,12 @@ def _as_built(rng: np.random.Generator) -> Instrument:
 
     (A plate of zero order that is off by 1 µm has 7° of retardance too much.)
     """
-    nominal = nominal_instrument("WALOP-LAB", throughput_degree=0)
+    nominal = adapted(ObservingPlan.bench().design, throughput_degree=0)
     throughput = 0.5 + 0.03 * rng.standard_normal((4, 1))
-    plates = [nominal.half1.plate, nominal.half2.plate]
-    off = [eqx.tree_at(lambda p: p.mgf2, plate, plate.mgf2 + 0.1 * rng.standard_normal()) for plate in plates]
-    return eqx.tree_at(
-        lambda i: (i.half1.plate, i.half2.plate, i.throughput.coefficients),
-        nominal,
-        (*off, jnp.asarray(throughput)),
-        is_leaf=lambda v: isinstance(v, HalfWavePlate),
-    )
+    for arm in nominal.arms:
+        off = 0.1 * rng.standard_normal()
+        nominal = nominal.changed(f"{arm.name}.plate.mgf2", thickness=lambda d, off=off: d + off)
+    return eqx.tree_at(lambda i: i.throughput.coefficients, nominal, jnp.asarray(throughput))
 
 
 def _vectors(

@@ -18,7 +18,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_plan
 from walop_jax.data.filters import DEFAULT_FILTER
 from walop_jax.data.records import FilterCurve
-from walop_jax.paper.polynomial import ratios, transmitted
+from walop_jax.paper.polynomial import measured_qu, transmitted
 
 TEMPERATURES = (3500.0, 5000.0, 7000.0, 10000.0)
 """Four stars (K); Paper II names no temperatures, but finds the largest differences below 4000 K."""
@@ -56,7 +56,7 @@ def colour_spread(
     angle = np.arange(ANGLES) * np.pi / ANGLES
     stars = degree * np.stack([np.cos(2 * angle), np.sin(2 * angle)], axis=1)
     vectors = AnalysisVectors(calibration).exact(Setting(filter_name), x, y, list(temperatures))
-    seen = np.stack([ratios(transmitted(vectors[:, k], stars)) for k in range(len(temperatures))])
+    seen = np.stack([measured_qu(transmitted(vectors[:, k], stars)) for k in range(len(temperatures))])
     return np.ptp(seen, axis=0).max(axis=1)
 
 

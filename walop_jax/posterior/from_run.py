@@ -1,4 +1,4 @@
-"""From the folder of a fit back to its problem.
+"""From the folder of a run back to its fit.
 
 The data are found, checked and fitted once more from where it ended.
 """
@@ -14,7 +14,8 @@ from walop_jax.data import read_calibration_set
 from walop_jax.fit.model_builder import model_for
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.io.errors import fail
-from walop_jax.likelihood.problem import LARGE_ABOVE, Problem
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.likelihood import Likelihood
 
 SAME_FIT = 0.05  # standard errors
 
@@ -26,10 +27,8 @@ def _locate(path: Path, run: Path) -> Path:
     raise fail("the data of this run are not there any more", file=path, advice="put them back, or refit")
 
 
-def problem_of_run(
-    product: CalibrationProduct, run: Path, model_text: str | None = None
-) -> tuple[Problem, FitResult]:
-    """The problem and the fit behind a calibration product in the folder `run`.
+def fit_of_run(product: CalibrationProduct, run: Path, model_text: str | None = None) -> FitResult:
+    """The fit behind a calibration product in the folder `run`.
 
     Raises `DataError` when the data are missing, not those of the fit or too many to be sampled, and when the fit does
     not come out as the product says (another model, or another version of the physics).
@@ -45,15 +44,15 @@ def problem_of_run(
         raise fail(
             "was fitted with another model", file=run, advice="run walop-jax refit with this model first"
         )
-    problem = Problem(calset, model)
-    if problem.is_large:
+    likelihood = Likelihood.of(calset, model)
+    if likelihood.layout.large:
         raise fail(
             f"has {len(calset.points)} field points: the posterior of so many is as good as normal, and "
             "calibration.fits holds its covariance",
             file=product.inputs[0].path,
-            advice=f"sample sets of up to {LARGE_ABOVE} points",
+            advice=f"sample sets of up to {limits.LARGE_ABOVE} points",
         )
-    result = fit(problem, start=np.asarray(product.parameters.value, float))
+    result = fit(likelihood, start=np.asarray(product.parameters.value, float))
     away = np.abs(result.values - product.parameters.value) / np.where(result.sigma > 0, result.sigma, 1.0)
     if not result.converged or np.max(away) > SAME_FIT:
         name = model.names[int(np.argmax(away))]
@@ -61,4 +60,4 @@ def problem_of_run(
             f"fitted again, {name} moves by {np.max(away):.2g} standard errors", file=run,
             advice="run walop-jax refit with this model and version first",
         )  # fmt: skip
-    return problem, result
+    return result

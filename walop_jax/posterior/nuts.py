@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 from walop_jax.likelihood import engine
 from walop_jax.model.compiled import compiled
-from walop_jax.model.specification import unravel
+from walop_jax.model.parameters import with_values
 from walop_jax.posterior.target import Target
 
 TARGET_ACCEPTANCE = 0.8
@@ -56,20 +56,20 @@ def _kernel() -> Any:
 
 def whitened(target: Target) -> tuple[Callable[..., Float[Array, ""]], tuple[Any, ...]]:
     """ln p of whitened coordinates, and the arrays that it takes after them: none is compiled in."""
-    problem = target.problem
-    if len(problem.chunks) != 1:
+    likelihood = target.likelihood
+    if len(likelihood.points) != 1:
         raise ValueError(
             "NUTS is a cross-check for sets that fit into one chunk: choose larger points_per_chunk"
         )
-    template, scale = problem.model.template, target.scale
+    template, scale = target.model.template, target.scale
     root = scale[:, None] * np.linalg.cholesky(target.covariance / np.outer(scale, scale))
-    first, select = target.values(target.centre), problem.model.selection()
+    first, select = target.values(target.centre), target.model.selection()
     offset = target.prior_rows(target.centre)
     slope = np.stack([target.prior_rows(target.centre + column) - offset for column in root.T], axis=1)
     arrays = (
         template,
-        problem.plan,
-        problem.chunks[0],
+        likelihood.plan,
+        likelihood.points.chunk(0),
         *(jnp.asarray(a) for a in (first, select @ root, offset, slope)),
     )
 
@@ -77,7 +77,7 @@ def whitened(target: Target) -> tuple[Callable[..., Float[Array, ""]], tuple[Any
 
     def log_density(w: Array, template: Any, plan: Any, data: Any, *linear: Array) -> Float[Array, ""]:
         first, along, offset, slope = linear
-        _, r = residuals(unravel(template)(first + along @ w), plan, data)
+        _, r = residuals(with_values(template)(first + along @ w), plan, data)
         return -0.5 * (jnp.sum(r**2) / target.noise_scale**2 + jnp.sum((offset + slope @ w) ** 2))
 
     return log_density, arrays

@@ -6,6 +6,7 @@ import dataclasses
 import os
 from collections.abc import Mapping
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -27,14 +28,15 @@ def matrix_draws(
     filters: Mapping[str, FilterCurve],
     x: Float[np.ndarray, " p"],
     y: Float[np.ndarray, " p"],
-) -> Float[np.ndarray, "d p 6"]:
-    """m21, m22, m23, m31, m32, m33 at field positions (deg) for every draw of all parameters."""
+) -> Float[np.ndarray, "d p m"]:
+    """m21, m22, m23, m31, m32, m33, … at field positions (deg) for every draw of all parameters."""
     numbers = [
         np.nan_to_num(v, nan=-1e30) for v in (settings.teff, settings.chwp_angle, settings.temp, settings.ha)
     ]
     key = np.rec.fromarrays([settings.filter.astype(str), *numbers])
     _, first, of_row = np.unique(key, return_index=True, return_inverse=True)
-    result = np.empty((len(draws), len(x), 6))
+    pairs = model.template.cameras.pairs
+    result = np.empty((len(draws), len(x), 3 * len(pairs)))
     for k, index in enumerate(first):
         rows = np.flatnonzero(of_row.reshape(-1) == k)
         one = settings[index : index + 1]
@@ -42,8 +44,11 @@ def matrix_draws(
         for i, values in enumerate(draws):
             instrument = model.instrument(values)
             vectors = analysis_vectors(instrument, plan, x[rows], y[rows])[:, 0]
-            matrix = light.instrument_matrix(jnp.asarray(vectors) @ light.telescope(instrument))
-            result[i, rows] = np.asarray(matrix).reshape(len(rows), 6)
+            sky = jax.vmap(light.telescope, (None, 0, 0))(
+                instrument, jnp.asarray(x[rows]), jnp.asarray(y[rows])
+            )
+            matrix = light.instrument_matrix(jnp.asarray(vectors) @ sky, pairs)
+            result[i, rows] = np.asarray(matrix).reshape(len(rows), -1)
     return result
 
 
@@ -55,7 +60,7 @@ class DrawnCalibration(Calibration):
 
     def matrix(
         self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings | None = None
-    ) -> tuple[Float[np.ndarray, "p 6"], Float[np.ndarray, "p 6 6"]]:
+    ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
         """As `Calibration.matrix`, by draws."""
         settings = settings or Settings.default(len(x))
         filters = {str(name): self.filter_curve(str(name)) for name in np.unique(settings.filter)}

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 import os
 import time
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import fail
-from walop_jax.likelihood.problem import Problem
+from walop_jax.io.software import versions_of
 from walop_jax.posterior.checkpoint import Checkpoints, digest
 from walop_jax.posterior.convergence import Chains, Convergence, assess
 from walop_jax.posterior.ensemble import Block, Walkers, advance, start
@@ -27,22 +27,20 @@ Vector = Float[np.ndarray, " n"]
 SOFTWARE = ("walop-jax", "jax", "jaxlib", "numpy", "emcee")
 
 
-def fingerprint(problem: Problem, target: Target, options: Options) -> dict[str, str]:
+def fingerprint(target: Target, options: Options) -> dict[str, str]:
     """Hashes of everything that decides the chain."""
-    model = problem.model
-    data = [np.asarray(part) for chunk in problem.chunks for part in chunk if part is not None]
-    plan = [
-        np.asarray(part) for part in (problem.plan.wavelength, problem.plan.node_weight, problem.plan.teff)
-    ]
-    exposures = [np.asarray(part) for part in problem.plan.exposures if part is not None]
+    model, laid_out = target.model, target.likelihood.plan
+    data = [np.asarray(part) for chunk in target.likelihood.points for part in chunk if part is not None]
+    plan = [np.asarray(part) for part in (laid_out.wavelength, laid_out.node_weight, laid_out.teff)]
+    exposures = [np.asarray(part) for part in jax.tree.leaves(laid_out.exposures)]
     parameters = [(p.name, p.start, p.free, p.tie, p.scale) for p in model.parameters]
     priors = [(p.name, p.prior, p.loose) for p in model.parameters]
     chain = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
     for name in ("maximum_steps", "draws", "checks"):  # how long, and what is made of it: free to change
         del chain[name]
-    versions = {name: _version(name) for name in SOFTWARE}
+    versions = versions_of(SOFTWARE)
     return {
-        "data": digest(*data, *plan, *exposures, problem.plan.settings), "model": digest(model.name,
+        "data": digest(*data, *plan, *exposures, laid_out.settings), "model": digest(model.name,
         parameters, [type(e).__name__ for e in model.template.effects], model.template.plates), "priors":
         digest(priors), "fit": digest(np.round(target.centre, 12), target.noise_scale), "settings":
         digest(sorted(chain.items(), key=lambda item: item[0])), "versions": ", ".join(f"{name} {version}"
@@ -50,15 +48,7 @@ def fingerprint(problem: Problem, target: Target, options: Options) -> dict[str,
     }  # fmt: skip
 
 
-def _version(name: str) -> str:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "unknown"
-
-
 def sample(
-    problem: Problem,
     result: FitResult,
     options: Options | None = None,
     *,
@@ -74,10 +64,10 @@ def sample(
     """
     options = options or Options()
     report = report or (lambda progress: None)
-    target = Target(problem, result)
+    target = Target(result)
     checkpoints = None
     if folder is not None:
-        checkpoints = Checkpoints(folder, fingerprint(problem, target, options))
+        checkpoints = Checkpoints(folder, fingerprint(target, options))
         if checkpoints.exists() and not resume:
             raise fail("holds a chain already", file=folder, advice="go on with --resume, or --overwrite it")
     surrogate, build_seconds = _surrogate(target, options, checkpoints, report)

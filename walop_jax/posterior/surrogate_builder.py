@@ -42,7 +42,7 @@ def _design(rng: np.random.Generator, points: int, width: int) -> Draws:
 
 def _gram(target: Target, x: Float[np.ndarray, "m f"], progress: Callable[[int, int], None] | None) -> Matrix:
     """Gram matrix of (r₀, r(x_1) − r₀, r(x_2) − r₀, …) over all data."""
-    gram, chunks = np.zeros((len(x) + 1, len(x) + 1)), target.problem.chunks
+    gram, chunks = np.zeros((len(x) + 1, len(x) + 1)), target.likelihood.points
     for number, chunk in enumerate(chunks):
         first = target.residuals(target.centre, chunk)
         rows = np.empty((len(x) + 1, first.size))
@@ -105,7 +105,7 @@ def build_surrogate(
 
 def _cubic_terms(target: Target, along: Matrix, k: int) -> Int[np.ndarray, "t 3"]:
     bent = np.zeros(k)
-    for chunk in target.problem.chunks:
+    for chunk in target.likelihood.points:
         here = target.residuals(target.centre, chunk)
         for i in range(k):
             up, down = (target.residuals(target.centre + sign * along[:, i], chunk) for sign in (1, -1))

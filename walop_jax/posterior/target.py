@@ -17,41 +17,32 @@ from jaxtyping import Array, Float, Int
 
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import engine
-from walop_jax.likelihood.problem import Problem
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import leaves, unknown_name
-from walop_jax.model.specification import unravel
+from walop_jax.model.parameters import unknown_name, with_values
 
 Vector = Float[np.ndarray, " f"]
 LARGEST_SAMPLED = 20
-NEAR_LINEAR = ("Throughput", "Standards")
+NEAR_LINEAR = ("throughput", "standard")
 
 
 @jax.jit  # a vector unravelled step by step costs more than the optics of a small set
 def _instrument(template: Instrument, values: Float[Array, " n"]) -> Instrument:
-    return unravel(template)(values)
+    return with_values(template)(values)
 
 
 class Target:
-    """−2 ln posterior of a problem in its free parameters x, around the fit at `centre`."""
+    """−2 ln posterior of a fitted model in its free parameters x, around the fit at `centre`."""
 
-    def __init__(self, problem: Problem, result: FitResult) -> None:
-        self.problem = problem
-        self.model = problem.model
-        self.free = problem.model.free
+    def __init__(self, result: FitResult) -> None:
+        self.likelihood, self._near = result.likelihood, result.posterior
+        self.model = result.model
+        self.free = result.model.free
         self.centre: Vector = np.asarray(result.values)[self.free]
         self.covariance: Float[np.ndarray, "f f"] = np.asarray(result.covariance)[
             np.ix_(self.free, self.free)
         ]
         self.noise_scale = result.noise_scale
-        self._base, self._select = np.asarray(result.values), problem.model.selection()
-        parameters = problem.model.parameters
-        known = [(i, *p.prior) for i, p in enumerate(parameters) if p.prior is not None and p.tie is None]
-        pulls = [
-            (i, p.start, p.loose) for i, p in enumerate(parameters) if p.prior is None and p.loose is not None
-        ]
-        table = np.array([*known, *pulls], float).reshape(-1, 3)
-        self._where, self._mean, self._width = table[:, 0].astype(int), table[:, 1], table[:, 2]
+        self._base, self._select = np.asarray(result.values), result.model.selection()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -66,8 +57,8 @@ class Target:
     @property
     def measured(self) -> int:
         """Independent data: three per used row of four intensities, four where the flux is known."""
-        per_row = np.where(np.asarray(self.problem.plan.exposures.flux_known), 4, 3)
-        return int(self.problem.used.sum(axis=0) @ per_row)
+        per_row = np.where(self.likelihood.flux_known, 4, 3)
+        return int(self.likelihood.used.sum(axis=0) @ per_row)
 
     def values(self, x: Vector) -> Float[np.ndarray, " n"]:
         """All parameters, frozen and tied ones included."""
@@ -76,20 +67,20 @@ class Target:
     def residuals(self, x: Vector, chunk: engine.PointData) -> Float[np.ndarray, " d"]:
         """Normalised residuals of one chunk of the data, errors times `noise_scale`."""
         instrument = _instrument(self.model.template, jnp.asarray(self.values(x)))
-        _, r = engine.residuals(instrument, self.problem.plan, chunk)
+        _, r = engine.residuals(instrument, self.likelihood.plan, chunk)
         return np.asarray(r).ravel() / self.noise_scale
 
     def prior_rows(self, x: Vector) -> Float[np.ndarray, " k"]:
         """Normalised residuals of priors and loose pulls: linear in x."""
-        return (self.values(x)[self._where] - self._mean) / self._width
+        return self.likelihood.priors.residuals(self.values(x))
 
     def half_gradient(self, x: Vector) -> Vector:
         """Half the gradient of the objective."""
-        return self.problem.expand(self.values(x), self.noise_scale).gradient
+        return self.likelihood.expand(self.values(x), self.noise_scale, self._near).gradient
 
     def data(self, x: Vector) -> float:
         """χ² of the data, errors times `noise_scale`."""
-        return sum(float(np.sum(self.residuals(x, chunk) ** 2)) for chunk in self.problem.chunks)
+        return sum(float(np.sum(self.residuals(x, chunk) ** 2)) for chunk in self.likelihood.points)
 
     def objective(self, x: Vector) -> float:
         """−2 ln posterior, up to a constant."""
@@ -98,8 +89,8 @@ class Target:
 
 def near_linear(target: Target) -> Int[np.ndarray, " s"]:
     """Positions, among the free parameters, of throughput coefficients and catalogue values."""
-    owner = [leaf.owner for leaf in leaves(target.model.template)]
-    return np.array([k for k, i in enumerate(target.free) if owner[i] in NEAR_LINEAR], int)
+    chosen = np.concatenate([target.model.positions(component) for component in NEAR_LINEAR])
+    return np.flatnonzero(np.isin(target.free, chosen))
 
 
 def bending(target: Target, k: int) -> float:
@@ -109,7 +100,7 @@ def bending(target: Target, k: int) -> float:
     """
     step = target.covariance[:, k] / np.sqrt(target.covariance[k, k])
     total = 0.0
-    for chunk in target.problem.chunks:
+    for chunk in target.likelihood.points:
         here, up, down = (
             target.residuals(x, chunk) for x in (target.centre, target.centre + step, target.centre - step)
         )

@@ -18,17 +18,23 @@ from matplotlib.patches import Rectangle
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import Settings
+from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
-from walop_jax.likelihood.problem import Problem
-from walop_jax.reports.style import FONT, blank, field_axes, outer_labels
+from walop_jax.fit.refit import FitResult
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.reports.style import (
+    FONT,
+    FROM_MINUS_ONE_TO_ONE,
+    MATRIX_SYMBOLS,
+    OFFSETS,
+    empty_figure,
+    field_axes,
+    outer_labels,
+)
 
 Map = Float[np.ndarray, "y x"]
 
 PIXELS = 61  # along each axis of a map
-_WEAK = 0.1  # |m22 m33 − m23 m32| below which a single exposure holds hardly any u
-_ELEMENTS = ("$m_{21}$", "$m_{22}$", "$m_{23}$", "$m_{31}$", "$m_{32}$", "$m_{33}$")
-_PER_CENT = (0, 3)  # offsets of the zero: in per cent
-_FIXED = (4, 5)  # cross-talk and efficiency in u: from −1 to 1
 
 
 def matrix_figure(calibration: Calibration, settings: Settings | None = None) -> Figure:
@@ -37,56 +43,60 @@ def matrix_figure(calibration: Calibration, settings: Settings | None = None) ->
     `settings` has one row (default: SDSS-r, flat spectrum, calibration plate out). Lines in m32 and m33 bound
     the zone where |m22 m33 − m23 m32| < 0.1: a single exposure holds hardly any u there.
     """
-    figure = blank(7.4, 4.6)
+    figure = empty_figure(7.4, 4.6)
     axes = figure.subplots(2, 3, sharex=True, sharey=True)
     _matrix_maps(figure, axes, calibration, settings)
     return figure
 
 
-def residual_figure(
-    problem: Problem, before: Float[np.ndarray, " n"], after: Float[np.ndarray, " n"]
-) -> Figure:
-    """Residuals of every field point at two full vectors of parameter values; a histogram of the second."""
-    figure = blank(9.6, 3.2)
+def residual_figure(result: FitResult, before: Float[np.ndarray, " n"] | None = None) -> Figure:
+    """Residuals of every field point before and after a fit; a histogram of the latter.
+
+    `before` is a full vector of parameter values (default: the start values of the model).
+    """
+    likelihood = result.likelihood
+    start = result.model.start if before is None else before
+    figure = empty_figure(9.6, 3.2)
     left, middle, right = figure.subplots(1, 3)
-    maps = [point_residuals(problem, values) for values in (before, after)]
+    maps = [point_residuals(likelihood, values) for values in (start, result.values)]
     norm = LogNorm(0.7, max(2.0, float(np.nanmax(maps[0]))))
     field_axes(left, "before the fit")
     field_axes(middle, "after the fit")
-    _tiles(left, problem, maps[0], norm)
-    bar = figure.colorbar(_tiles(middle, problem, maps[1], norm), ax=[left, middle], pad=0.02)
+    _tiles(left, likelihood, maps[0], norm)
+    bar = figure.colorbar(_tiles(middle, likelihood, maps[1], norm), ax=[left, middle], pad=0.02)
     bar.set_label("rms residual (σ)", fontsize=8)
     bar.ax.tick_params(labelsize=7)
     middle.set_ylabel("")
-    _histogram(right, problem, after)
+    _histogram(right, likelihood, result.values)
     return figure
 
 
 def calibration_figure(
-    problem: Problem,
-    calibration: Calibration,
+    result: FitResult,
     before: Float[np.ndarray, " n"] | None = None,
     settings: Settings | None = None,
 ) -> Figure:
-    """A calibration on one page: maps of the matrix, and what a fit has left of the residuals.
+    """A calibration on one page: maps of the matrix, and what the fit has left of the residuals.
 
-    `before` is a full vector of parameter values to compare with (default: the start of the fit).
+    `before` is a full vector of parameter values to compare with (default: the start values of the model).
     """
-    figure = blank(10.2, 4.7)
+    figure = empty_figure(10.2, 4.7)
     grid = figure.subplots(2, 4)
-    _matrix_maps(figure, grid[:, :3], calibration, settings)
-    start = calibration.model.start if before is None else before
+    _matrix_maps(figure, grid[:, :3], Calibration.from_fit(result), settings)
+    start = result.model.start if before is None else before
     for axis, values, title in zip(
         grid[:, 3],
-        (start, calibration.values),
+        (start, result.values),
         ("residuals, as designed", "residuals, as fitted"),
         strict=True,
     ):
-        residual = point_residuals(problem, values)
+        residual = point_residuals(result.likelihood, values)
         far = float(np.nanmax(residual)) > 3.0
         low, high = (float(edge(residual)) for edge in (np.nanmin, np.nanmax))
         field_axes(axis, title)
-        shown = _tiles(axis, problem, residual, Normalize(low, high) if far else Normalize(0.7, 1.3))
+        shown = _tiles(
+            axis, result.likelihood, residual, Normalize(low, high) if far else Normalize(0.7, 1.3)
+        )
         bar = figure.colorbar(shown, ax=axis, pad=0.03, extend="neither" if far else "both")
         bar.set_label("rms residual (σ)", fontsize=8)
         bar.ax.tick_params(labelsize=7)
@@ -94,14 +104,13 @@ def calibration_figure(
     return figure
 
 
-def point_residuals(problem: Problem, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " p"]:
+def point_residuals(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " p"]:
     """Rms normalised residual of each field point; 1 is what noise alone gives (the flux took one in four).
 
     NaN where a point has no data.
     """
-    _, residual = problem.residuals(values)
-    known = np.asarray(problem.plan.exposures.flux_known)
-    freedom = (problem.used * np.where(known, 4.0, 3.0)).sum(axis=1)
+    _, residual = likelihood.residuals(values)
+    freedom = (likelihood.used * np.where(likelihood.flux_known, 4.0, 3.0)).sum(axis=1)
     square = (residual**2).sum(axis=(1, 2))
     return np.sqrt(np.where(freedom > 0, square / np.maximum(freedom, 1.0), np.nan))
 
@@ -115,12 +124,12 @@ def _matrix_maps(figure: Figure, axes: Any, calibration: Calibration, settings: 
     maps = matrix.T.reshape(6, *x.shape)
     weak = np.abs(maps[1] * maps[5] - maps[2] * maps[4])
     for i, axis in enumerate(np.ravel(axes)):
-        shown = maps[i] * (100.0 if i in _PER_CENT else 1.0)
-        name = _ELEMENTS[i] + (" (%)" if i in _PER_CENT else "")
+        shown = maps[i] * (100.0 if i in OFFSETS else 1.0)
+        name = MATRIX_SYMBOLS[i] + (" (%)" if i in OFFSETS else "")
         field_axes(axis, name)
         image = _image(axis, shown, calibration.field, i)
         if i >= 4:
-            axis.contour(x, y, weak, levels=[_WEAK], colors="0.15", linewidths=0.7)
+            axis.contour(x, y, weak, levels=[SMALLEST_DETERMINANT], colors="0.15", linewidths=0.7)
         figure.colorbar(image, ax=axis, pad=0.03).ax.tick_params(labelsize=7)
     outer_labels(axes)
 
@@ -129,7 +138,7 @@ def _image(axis: Axes, values: Map, field: tuple[float, float, float, float], el
     if element == 1:
         norm, colours = Normalize(float(values.min()), float(values.max())), "viridis"
     else:
-        far = 1.0 if element in _FIXED else float(np.abs(values).max())
+        far = 1.0 if element in FROM_MINUS_ONE_TO_ONE else float(np.abs(values).max())
         norm, colours = Normalize(-far, far), "RdBu_r"
     return axis.imshow(
         values,
@@ -142,10 +151,10 @@ def _image(axis: Axes, values: Map, field: tuple[float, float, float, float], el
     )
 
 
-def _tiles(axis: Axes, problem: Problem, values: Float[np.ndarray, " p"], norm: Normalize) -> Any:
+def _tiles(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " p"], norm: Normalize) -> Any:
     """Field points as tiles; the places of the standards, which lie between the others, are left out."""
-    points, extended = problem.calset.points, problem.calset.exposures.kind != "standard"
-    tiles = problem.used[:, extended].any(axis=1)
+    points, extended = likelihood.calset.points, likelihood.calset.exposures.kind != "standard"
+    tiles = likelihood.used[:, extended].any(axis=1)
     tiles = tiles if tiles.any() else np.ones(len(points), bool)
     x, y = points.x[tiles], points.y[tiles]
     tile = max(float(np.ptp(x)), float(np.ptp(y)), 1e-3) / max(np.sqrt(tiles.sum()) - 1.0, 1.0)
@@ -158,12 +167,11 @@ def _tiles(axis: Axes, problem: Problem, values: Float[np.ndarray, " p"], norm: 
     return shown
 
 
-def _histogram(axis: Axes, problem: Problem, values: Float[np.ndarray, " n"]) -> None:
+def _histogram(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> None:
     """All residuals of a fit beside what noise alone would give."""
-    _, residual = problem.residuals(values)
-    used = residual[problem.used].ravel()
-    known = np.asarray(problem.plan.exposures.flux_known)
-    width = np.sqrt(np.mean(np.where(known, 1.0, 0.75)[np.nonzero(problem.used)[1]]))
+    _, residual = likelihood.residuals(values)
+    used = residual[likelihood.used].ravel()
+    width = np.sqrt(np.mean(np.where(likelihood.flux_known, 1.0, 0.75)[np.nonzero(likelihood.used)[1]]))
     edges = np.linspace(-4.0, 4.0, 41)
     axis.hist(
         np.clip(used / width, -4.0, 4.0), bins=edges.tolist(), density=True, color="0.75", label="residuals"
@@ -185,7 +193,7 @@ def modulation_figure(calset: CalibrationSet, points: Sequence[int]) -> Figure:
     e = calset.exposures
     shown = np.flatnonzero(e.clp_in & ~e.chwp_in)
     block = calset.intensities.block(0, len(calset.points))
-    figure = blank(8.2, 3.2)
+    figure = empty_figure(8.2, 3.2)
     angle = np.linspace(0.0, 360.0, 181)
     for axis, pair, name, ideal in zip(
         figure.subplots(1, 2, sharex=True, sharey=True), (0, 2), "qu", (np.cos, np.sin), strict=True

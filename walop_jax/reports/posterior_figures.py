@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from walop_jax.io.atomic import atomic_path
-from walop_jax.reports.wording import measured
+from walop_jax.reports.wording import with_error
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # corner imports ArviZ, which announces a refactoring once a day
-    import corner
-
+SHARES = (0.393, 0.865)  # of the draws: inside 1 and 2 σ of a normal distribution of two coefficients
+BINS = 30  # of a histogram, along each axis
+POINTS = 500  # draws shown as points
 LABELS = {
     "sky.depolarisation": "δ",
     "collimator.diattenuation": "c",
@@ -45,6 +45,45 @@ def label(name: str, unit: str = "") -> str:
     return f"{text} [{unit}]" if unit else text
 
 
+def _edges(values: Float[np.ndarray, " d"]) -> Float[np.ndarray, " b"]:
+    low, high = float(values.min()), float(values.max())
+    margin = 0.05 * (high - low) or abs(low) or 1.0  # a coefficient that never moved has a panel too
+    return np.linspace(low - margin, high + margin, BINS + 1)
+
+
+def density_levels(density: Float[np.ndarray, "a b"], shares: Sequence[float]) -> Float[np.ndarray, " s"]:
+    """Densities above which those shares of the total lie; `shares` ascending, hence levels descending."""
+    ordered = np.sort(density, axis=None)[::-1]
+    inside = np.cumsum(ordered) / ordered.sum()
+    return ordered[np.searchsorted(inside, shares)]
+
+
+def _smoothed(counts: Float[np.ndarray, "a b"]) -> Float[np.ndarray, "a b"]:
+    """Convolved with a normal distribution one bin wide."""
+    kernel = np.exp(-0.5 * np.arange(-3.0, 4.0) ** 2)
+    for axis in (0, 1):
+        counts = np.apply_along_axis(np.convolve, axis, counts, kernel / kernel.sum(), mode="same")
+    return counts
+
+
+def _pair(
+    axes: Axes,
+    x: Float[np.ndarray, " d"],
+    y: Float[np.ndarray, " d"],
+    x_edges: Float[np.ndarray, " b"],
+    y_edges: Float[np.ndarray, " b"],
+) -> None:
+    step = max(1, len(x) // POINTS)
+    axes.plot(x[::step], y[::step], "o", markersize=0.7, color="0.5", markeredgewidth=0, zorder=0)
+    density = _smoothed(np.histogram2d(x, y, (x_edges, y_edges))[0]).T
+    levels = density_levels(density, SHARES)[::-1]
+    if not np.all(np.diff([*levels, density.max()]) > 0):  # too few different draws for a contour
+        return
+    middles = [0.5 * (edges[1:] + edges[:-1]) for edges in (x_edges, y_edges)]
+    axes.contourf(*middles, density, [*levels, density.max()], colors=["0.75", "0.35"])
+    axes.contour(*middles, density, levels, colors="k", linewidths=0.6)
+
+
 def corner_figure(
     draws: Float[np.ndarray, "d k"],
     names: Sequence[str],
@@ -52,42 +91,50 @@ def corner_figure(
     reference: Float[np.ndarray, " k"] | None = None,
     width: float = 7.1,
 ) -> Figure:
-    """Corner plot with 68 and 95 % contours; `reference` marks values (the fit, or a known truth).
+    """Histogram of every coefficient, and below the diagonal contours of every pair of them.
 
-    `width` in inches: 7.1 is two columns of A&A or ApJ. Median and half the 68 % interval stand above the
-    diagonal; beyond six coefficients the axes carry no numbers.
+    Contours hold 39 and 86 % of the draws, which is 1 and 2 σ of a normal distribution of two coefficients.
+    `reference` marks values (the fit, or a known truth). `width` in inches: 7.1 is two columns of A&A or ApJ. Median
+    and half the 68 % interval stand above the diagonal; beyond six coefficients the axes carry no numbers.
     """
     k = draws.shape[1]
     few = k <= 6
     figure = Figure(figsize=(width, width))
-    corner.corner(
-        draws,
-        fig=figure,
-        truths=None if reference is None else list(reference),
-        truth_color="tab:orange",
-        levels=(0.68, 0.95),
-        plot_datapoints=False,
-        fill_contours=True,
-        smooth=1.0,
-        bins=30,
-        max_n_ticks=3,
-        hist_kwargs={"linewidth": 0.8},
-        contour_kwargs={"linewidths": 0.6},
-    )
-    panels = np.array(figure.axes).reshape(k, k)
+    panels = figure.subplots(k, k, squeeze=False)
+    figure.subplots_adjust(left=0.1, right=0.99, bottom=0.08, top=0.94, wspace=0.05, hspace=0.05)
+    edges = [_edges(column) for column in draws.T]
+    for i in range(k):
+        for j in range(k):
+            axes = panels[i, j]
+            if j > i:
+                axes.set_visible(False)
+                continue
+            if i == j:
+                axes.hist(draws[:, i], edges[i], histtype="step", color="k", linewidth=0.8)
+                axes.set_yticks([])
+            else:
+                _pair(axes, draws[:, j], draws[:, i], edges[j], edges[i])
+                axes.yaxis.set_major_locator(MaxNLocator(3, prune="both"))
+                axes.set_ylim(edges[i][0], edges[i][-1])
+            axes.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
+            axes.set_xlim(edges[j][0], edges[j][-1])
+            if reference is not None:
+                axes.axvline(reference[j], color="tab:orange", linewidth=0.8)
+                if i != j:
+                    axes.axhline(reference[i], color="tab:orange", linewidth=0.8)
     low, middle, high = np.quantile(draws, (0.1587, 0.5, 0.8413), axis=0)
     size = 8 if few else 6
     for i in range(k):
-        title = (
-            f"{LABELS.get(names[i], names[i])}\n{measured(float(middle[i]), float(0.5 * (high[i] - low[i])))}"
-        )
+        title = f"{LABELS.get(names[i], names[i])}\n{with_error(float(middle[i]), float(0.5 * (high[i] - low[i])))}"
         panels[i, i].set_title(f"{title} {units[i]}".rstrip(), fontsize=8 if few else 4.5, loc="left")
         for j in range(i + 1):
             axes = panels[i, j]
             axes.tick_params(
                 labelsize=5, length=2, labelbottom=few and i == k - 1, labelleft=few and 0 == j < i
             )
-            for axis in (axes.xaxis, axes.yaxis):
+            axes.tick_params(axis="x", labelrotation=45)
+            for axis in (axes.xaxis, axes.yaxis) if i != j else (axes.xaxis,):
+                axis.set_major_formatter(ScalarFormatter(useOffset=False))
                 axis.get_offset_text().set_fontsize(5)
                 axis.get_offset_text().set_visible(few)
         panels[k - 1, i].set_xlabel(

@@ -18,20 +18,20 @@ from walop_jax.calibration.analysis_vectors import COLOURS, AnalysisVectors, Set
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.field_series import COOLEST, colour_weights
 from walop_jax.calibration.matrix import Settings
+from walop_jax.calibration.records import Quality
 from walop_jax.data.catalogue import Catalogue
 from walop_jax.io.errors import DataError
-from walop_jax.model.effects.base import overridden
-from walop_jax.model.plan import exposure_arrays
-from walop_jax.model.specification import unravel
+from walop_jax.likelihood import limits
+from walop_jax.model import carried, light
+from walop_jax.model.dependence import needs
+from walop_jax.model.parameters import with_values
 from walop_jax.science.estimate import calibration_shift, estimate
 
-BLOCK = 16384  # rows that are worked on together
 MOST_SETTINGS = 200
 ILL_POSED = 10.0  # ratio of the errors of the two principal directions from which FLAG 16 is set
 COOL, HOT = 3500.0, 10000.0
 """Colour temperatures (K) between which stars without TEFF are taken to lie."""
 _NEUTRAL = Setting("")
-_CORRECTED = ("nonlinearity",)  # effects of the detectors that need to know nothing of the exposure
 _ROUNDS = 16
 
 
@@ -42,7 +42,7 @@ class Stars:
     On the sky (equatorial frame) where the catalogue has a ROTATOR, in the instrument frame elsewhere;
     `covariance` is `photon` plus `calibration`. `colour` is the error of (q, u) if the colour of the star were
     ignored; where TEFF is not known, half the difference between stars of 3500 K and 10 000 K, which is not
-    in the covariance. `flag` holds `QUALITY_BITS`; `rows` counts the rows of a star.
+    in the covariance. `flag` holds bits of `Quality`; `rows` counts the rows of a star.
     """
 
     qu: Float[np.ndarray, "s 2"]
@@ -74,30 +74,30 @@ def apply(
     offset, slope = _rotator_zero(vectors)
     order = np.argsort(catalogue.star, kind="stable")
     parts = []
-    for done, rows in _blocks(catalogue.star[order]):
+    for done, rows in _slices_of_stars(catalogue.star[order]):
         rows = order[rows]
         parts.append(
-            _block(vectors, catalogue, rows, counts[rows], settings, setting_of[rows], offset, slope)
+            _stars_of_rows(vectors, catalogue, rows, counts[rows], settings, setting_of[rows], offset, slope)
         )
         if progress is not None:
             progress(done, len(order))
     return Stars(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Stars)))
 
 
-def _blocks(star: Int[np.ndarray, " n"]) -> Iterator[tuple[int, slice]]:
-    """Slices of about `BLOCK` rows that do not divide stars, each with the number of rows done after it."""
+def _slices_of_stars(star: Int[np.ndarray, " n"]) -> Iterator[tuple[int, slice]]:
+    """Slices of about `limits.STAR_ROWS` rows that do not divide stars, each with the number of rows done after it."""
     first = np.flatnonzero(np.diff(star, prepend=-1))
     start = 0
     while start < len(star):
-        at = np.searchsorted(first, start + BLOCK, side="right") - 1
-        end = len(star) if start + BLOCK >= len(star) else int(first[at])
+        at = np.searchsorted(first, start + limits.STAR_ROWS, side="right") - 1
+        end = len(star) if start + limits.STAR_ROWS >= len(star) else int(first[at])
         if end <= start:  # a single star with more rows than a block
             end = int(first[at + 1]) if at + 1 < len(first) else len(star)
         yield end, slice(start, end)
         start = end
 
 
-def _block(
+def _stars_of_rows(
     vectors: AnalysisVectors,
     catalogue: Catalogue,
     rows: Int[np.ndarray, " r"],
@@ -116,24 +116,24 @@ def _block(
     turn = 2.0 * np.where(sky, np.deg2rad(catalogue.rotator[rows]) + offset, 0.0)
 
     spectra = np.empty((len(rows), COLOURS + 1, 4, 3))
-    for k, where in _members(setting_of):
-        spectra[where] = vectors.at(settings[k], x[where], y[where])
+    for k, here in _rows_by_setting(setting_of):
+        spectra[here] = vectors.at(settings[k], x[here], y[here])
     there = np.einsum("rc,rcks->rks", colour_weights(teff, COLOURS), spectra)
     used = np.where(outside[:, None], np.nan, counts)
-    found = estimate(_turned(there, turn), used, sigma, star)
+    found = estimate(_vectors_on_sky(there, turn), used, sigma, star)
 
     s = _instrument_stokes(found.qu[star], turn)
     derivative = np.empty((len(rows), 2, len(vectors.parameters)))
-    for k, where in _members(setting_of):
-        local = vectors.derivatives(settings[k], x[where], y[where], teff[where])
-        plain, throughput = (found.gain[where] @ np.einsum("rs,rksf->rkf", s[where], part) for part in local)
-        derivative[where] = vectors.to_parameters(plain, throughput, x[where], y[where])
+    for k, here in _rows_by_setting(setting_of):
+        local = vectors.derivatives(settings[k], x[here], y[here], teff[here])
+        plain, throughput = (found.gain[here] @ np.einsum("rs,rksf->rkf", s[here], part) for part in local)
+        derivative[here] = vectors.to_parameters(plain, throughput, x[here], y[here])
     if slope.any():
         dq, du = 2.0 * s[:, 2], -2.0 * s[:, 1]  # (q + iu) exp(−2i R) grows by −2i (q + iu) dR
         turned = np.where(sky[:, None], there[..., 1] * dq[:, None] + there[..., 2] * du[:, None], 0.0)
         derivative += (found.gain @ turned[..., None]) * slope
     root = np.add.reduceat(-derivative, first) @ vectors.root
-    colour = np.einsum("rc,rcks,rs->rk", _ignored(teff), spectra, s, optimize=True)
+    colour = np.einsum("rc,rcks,rs->rk", _ignored_colour(teff), spectra, s, optimize=True)
     shift = calibration_shift(found.gain, colour[..., None], star)[..., 0]
     return Stars(
         qu=found.qu,
@@ -156,12 +156,14 @@ def _outside(
     return points.outside[rows] | far
 
 
-def _members(setting_of: Int[np.ndarray, " r"]) -> Iterator[tuple[int, Int[np.ndarray, " w"]]]:
+def _rows_by_setting(setting_of: Int[np.ndarray, " r"]) -> Iterator[tuple[int, Int[np.ndarray, " w"]]]:
     for k in np.unique(setting_of):
         yield int(k), np.flatnonzero(setting_of == k)
 
 
-def _turned(vectors: Float[np.ndarray, "r 4 3"], turn: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r 4 3"]:
+def _vectors_on_sky(
+    vectors: Float[np.ndarray, "r 4 3"], turn: Float[np.ndarray, " r"]
+) -> Float[np.ndarray, "r 4 3"]:
     """Analysis vectors for Stokes parameters on the sky; `turn` is twice the position angle of +X (rad).
 
     (q + iu) of the instrument = (q + iu) of the sky × exp(−i turn).
@@ -180,7 +182,7 @@ def _instrument_stokes(
     return np.stack([np.ones_like(q), cos * q + sin * u, cos * u - sin * q], axis=-1)
 
 
-def _ignored(teff: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r c"]:
+def _ignored_colour(teff: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r c"]:
     """Mixture of spectra that is the error of ignoring the colour (see `Stars.colour`)."""
     flat = colour_weights(np.full(len(teff), np.nan), COLOURS)
     half = 0.5 * np.subtract(*colour_weights(np.array([COOL, HOT]), COLOURS))
@@ -196,7 +198,7 @@ def _settings(calibration: Calibration, catalogue: Catalogue) -> tuple[list[Sett
     Temperature and hour angle count only where an effect of the model makes the optics depend on them.
     """
     points = catalogue.points
-    depends = {name for effect in calibration.model.template.effects for name in effect.optics_depend_on}
+    depends = needs(calibration.model.template).conditions
     temperature = points.temp if "temperature" in depends else np.full(len(catalogue), _NEUTRAL.temperature)
     hours = points.ha if "hour_angle" in depends else np.zeros(len(catalogue))
     plate = np.where(np.isnan(points.chwp_angle), np.inf, np.mod(points.chwp_angle, 180.0))
@@ -234,13 +236,13 @@ def _flags(
     settings = Settings(*(getattr(points, f.name)[rows] for f in dataclasses.fields(Settings)))
     square = np.tile([0.0, 1.0, 0.0, 0.0, 0.0, 1.0], (len(rows), 1))  # 16 is decided below, for all rows
     bits = vectors.calibration.flags(points.x[rows], points.y[rows], settings, square)
-    bits[_outside(vectors, catalogue, rows)] |= 32
-    bits[settings.teff < COOLEST] |= 64
-    bits[~np.isfinite(counts * catalogue.sigma[rows]).all(axis=1)] |= 128
-    bits[catalogue.spoilt[rows]] |= 256
+    bits[_outside(vectors, catalogue, rows)] |= Quality.BEYOND_FIELD
+    bits[settings.teff < COOLEST] |= Quality.BEYOND_SETTINGS
+    bits[~np.isfinite(counts * catalogue.sigma[rows]).all(axis=1)] |= Quality.CAMERA_MISSING
+    bits[catalogue.spoilt[rows]] |= Quality.SATURATED
     flag = np.bitwise_or.reduceat(bits, first) | vectors.calibration.verdict.quality
-    flag[~(condition < ILL_POSED)] |= 16
-    flag[~np.isfinite(qu).all(axis=1)] |= 16384
+    flag[~(condition < ILL_POSED)] |= Quality.HIGH_CROSSTALK
+    flag[~np.isfinite(qu).all(axis=1)] |= Quality.NO_STOKES
     return flag
 
 
@@ -248,33 +250,28 @@ def _flags(
 
 
 def linearised(calibration: Calibration, counts: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
-    """Counts as linear detectors would report them, by the non-linearity that the calibration has found."""
-    effects = [e for e in calibration.model.instrument(calibration.values).effects if e.name in _CORRECTED]
-    exposures = exposure_arrays(calibration.exposures)
+    """Counts as linear detectors would report them, where the calibration has found out what they do to counts."""
+    instrument = calibration.model.instrument(calibration.values)
+    if light.is_linear(instrument):
+        return counts
     true = counts
-    for _ in range(_ROUNDS if effects else 0):
-        seen = jnp.asarray(true)
-        for effect in effects:
-            seen = effect.detector(seen, exposures)
-        true = true + (counts - np.asarray(seen))
+    for _ in range(_ROUNDS):
+        true = true + (counts - np.asarray(carried.reported(instrument, jnp.asarray(true))))
     return true
 
 
 def not_carried_over(calibration: Calibration) -> tuple[str, ...]:
-    """Effects of the fitted model that belong to an exposure's detectors and cannot be undone in a catalogue."""
-    effects = calibration.model.template.effects
-    return tuple(e.name for e in effects if overridden((e,), "detector") and e.name not in _CORRECTED)
+    """Effects of the fitted model that belong to its exposures and cannot be undone in a catalogue."""
+    return carried.left_behind(calibration.model.template)
 
 
 def _rotator_zero(vectors: AnalysisVectors) -> tuple[float, Float[np.ndarray, " k"]]:
     """What the model adds to ROTATOR (rad), and its derivatives to `vectors.parameters`."""
-    to_instrument = unravel(vectors.calibration.model.template)
+    to_instrument = with_values(vectors.calibration.model.template)
 
     def zero(values: jax.Array) -> jax.Array:
-        angle = jnp.zeros(())
-        for effect in to_instrument(values).effects:
-            angle = effect.rotator(angle)
-        return jnp.asarray(angle)
+        angle = to_instrument(values).patched().rotator_zero
+        return jnp.zeros(()) if angle is None else jnp.deg2rad(angle)
 
     values = jnp.asarray(vectors.calibration.values)
     return float(zero(values)), np.asarray(jax.grad(zero)(values))[vectors.parameters]

@@ -22,20 +22,21 @@ from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_builder import effects_text, model_for
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood.problem import Problem
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import Model
-from walop_jax.science.star_errors import WEAK, determinant, joint_errors, sample_stars, statistics
+from walop_jax.science.star_errors import determinant, joint_errors, sample_stars, statistics
 
-NIGHTLY = ("sky.", "standard.")  # parameters of the sky and of stars, not of the instrument
+SKY_AND_STARS = ("sky.", "standard.")  # parameters of the sky and of stars, not of the instrument
 CHANCE = 0.01
 _KNOWN = 1e-7  # share of the largest eigenvalue below which a direction was measured by neither
 
 
 @dataclasses.dataclass(frozen=True)
-class Moved:
+class MovedParameter:
     """A parameter before and after; `z` its change in standard errors of the change."""
 
     name: str
@@ -62,7 +63,7 @@ class Epoch:
     chi2_old: float
     chi2_new: float
     dof: int
-    moved: tuple[Moved, ...]
+    moved: tuple[MovedParameter, ...]
     star_errors: dict[str, dict[str, float]]
 
     def document(self) -> dict[str, Any]:
@@ -78,12 +79,11 @@ def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]
     if calset.instrument != old.model.name:
         raise ValueError(f"the new set is of {calset.instrument}, the calibration of {old.model.name}")
     model = model_for(calset, effects_text(old.model.effect_names))
-    problem = Problem(calset, model)
-    result = fit(problem)
+    result = fit(Likelihood.of(calset, model))
     if not result.converged:
         raise RuntimeError(f"the fit of the new set did not converge: {result.minimum.message}")
-    new = Calibration.from_fit(result, problem)
-    names = shared(old.model, model)
+    new = Calibration.from_fit(result)
+    names = shared_parameters(old.model, model)
     a = np.array([old.model.index(name) for name in names])
     b = np.array([model.index(name) for name in names])
     change = new.values[b] - old.values[a]
@@ -91,12 +91,12 @@ def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]
     width = np.array([(model[name].prior or (0.0, np.inf))[1] for name in names])
     both = before @ (after / width[:, None] ** 2)
     covariance = before + after - both - both.T
-    test, directions = departure(change, covariance, np.sqrt(np.diag(before + after)))
+    test, directions = chi2_of_change(change, covariance, np.sqrt(np.diag(before + after)))
     values = new.values.copy()
     values[b] = old.values[a]
     error = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     moved = [
-        Moved(n, model[n].unit, float(old.values[i]), float(new.values[j]), float(s), float(d / s))
+        MovedParameter(n, model[n].unit, float(old.values[i]), float(new.values[j]), float(s), float(d / s))
         for n, i, j, d, s in zip(names, a, b, change, error, strict=True)
         if s > 0
     ]
@@ -106,7 +106,7 @@ def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]
         p_value=p_value,
         test=test,
         directions=directions,
-        chi2_old=problem.expand(values).chi2,
+        chi2_old=result.likelihood.expand(values, near=result.posterior).chi2,
         chi2_new=result.chi2,
         dof=result.dof,
         moved=tuple(sorted(moved, key=lambda entry: -abs(entry.z))),
@@ -115,13 +115,13 @@ def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]
     return verdict, new
 
 
-def shared(old: Model, new: Model) -> list[str]:
+def shared_parameters(old: Model, new: Model) -> list[str]:
     """Names of the instrument's parameters that are free in both models."""
     free = [{m.parameters[i].name for i in m.free} for m in (old, new)]
-    return [name for name in new.names if name in free[0] & free[1] and not name.startswith(NIGHTLY)]
+    return [name for name in new.names if name in free[0] & free[1] and not name.startswith(SKY_AND_STARS)]
 
 
-def departure(
+def chi2_of_change(
     change: Float[np.ndarray, " k"], covariance: Float[np.ndarray, "k k"], sigma: Float[np.ndarray, " k"]
 ) -> tuple[float, int]:
     """Δᵀ V⁻¹ Δ over the directions that were measured, and their number; `sigma` sets the scale of each parameter."""
@@ -145,4 +145,4 @@ def _star_errors(old: Calibration, new: Calibration) -> dict[str, dict[str, floa
     setting = Setting(str(np.unique(new.exposures.filter)[-1]))
     vectors = [AnalysisVectors(c).exact(setting, x, y, [np.nan])[:, 0] for c in (old, new)]
     errors = joint_errors(vectors[0], vectors[1], sample_stars())
-    return statistics(errors, np.abs(determinant(vectors[1])) >= WEAK)
+    return statistics(errors, np.abs(determinant(vectors[1])) >= SMALLEST_DETERMINANT)

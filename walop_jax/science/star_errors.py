@@ -18,22 +18,21 @@ from walop_jax.science.estimate import estimate
 
 STARS, LARGEST_P = 100, 0.05
 GOAL = 0.001
-WEAK = 0.1  # |m22 m33 − m23 m32| below which one exposure holds hardly any u
 QUANTITIES = ("q", "u", "p")
 _ELECTRONS = 1e6  # of the stars; their photon noise does not enter
 
 Vectors = Float[np.ndarray, "p 4 3"]
-Stars = Float[np.ndarray, "n 2"]
+QuPairs = Float[np.ndarray, "n 2"]
 
 
-def sample_stars(count: int = STARS, largest: float = LARGEST_P, seed: int = 0) -> Stars:
+def sample_stars(count: int = STARS, largest: float = LARGEST_P, seed: int = 0) -> QuPairs:
     """(q, u) of sources with p evenly up to `largest` and any angle."""
     rng = np.random.default_rng(seed)
     p, angle = rng.uniform(0.0, largest, count), rng.uniform(0.0, np.pi, count)
     return np.stack([p * np.cos(2 * angle), p * np.sin(2 * angle)], axis=1)
 
 
-def transmitted(vectors: Float[np.ndarray, "p 4 3"], stars: Stars) -> Float[np.ndarray, "p n 4"]:
+def transmitted(vectors: Float[np.ndarray, "p 4 3"], stars: QuPairs) -> Float[np.ndarray, "p n 4"]:
     """Counts (point, star, camera) of sources of unit flux."""
     s = np.concatenate([np.ones((len(stars), 1)), stars], axis=1)
     return np.einsum("pks,ns->pnk", vectors, s)
@@ -138,7 +137,7 @@ def statistics(errors: Errors, chosen: Bool[np.ndarray, " p"] | None = None) -> 
 
 
 @dataclasses.dataclass(frozen=True)
-class Place:
+class MethodErrors:
     """Errors of both methods at some field points; `zone` marks |m22 m33 − m23 m32| < 0.1."""
 
     x: Float[np.ndarray, " p"]

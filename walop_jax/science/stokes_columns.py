@@ -14,7 +14,7 @@ Columns = dict[str, tuple[np.ndarray, str]]
 
 
 def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) -> Columns:
-    """The columns of the contract, then what they rest on; all rows of a star hold the result of the star.
+    """The columns added to a catalogue (docs: files); all rows of a star hold the result of the star.
 
     Raises ValueError for an unknown `estimator` of the degree of polarisation.
     """

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.data.filters import DEFAULT_FILTER, builtin_filter
-from walop_jax.data.records import Exposures, FilterCurve, Points, Site
-from walop_jax.data.sites import SITES
+from walop_jax.data.records import Exposures, FilterCurve, Points, Position, Site
+from walop_jax.instruments.description import default_name, described, shipped
+from walop_jax.model.build import as_designed, nominal_instrument
 from walop_jax.model.effects.base import Context
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import unknown_name
 from walop_jax.sky.moon import moon_direction
 
 NAN = float("nan")
-FULL_MOON: Mapping[str, float] = {"WALOP-SOUTH": 61220.85, "WALOP-NORTH": 61042.90, "WALOP-LAB": 61042.90}
-"""MJD (UTC) in a night of full Moon in which it stands high: 2026 June 29 (south), 2026 January 2 (north)."""
-
+_SOME_NIGHT = 61041.9  # MJD
 NARROW_BANDS: Mapping[str, float] = {"NB-580": 0.580, "NB-660": 0.660}  # centre, µm
 _SPACING = 0.004  # d between exposures
 _GOLDEN = 0.5 * (3.0 - np.sqrt(5.0))  # of a turn: spreads any number of angles evenly
@@ -34,18 +38,23 @@ def polariser_turn(count: int = 15, *, full_turn: bool = False) -> tuple[float, 
 class ObservingPlan:
     """A calibration run: where, when, through what.
 
-    Field points are a `grid` × `grid` raster over ±`field` degrees, on which polariser and Moon sky are
-    measured, and `standard_grid` × `standard_grid` places of the standards; on the laboratory bench X is the
-    tilt of the plate and the points are `grid` tilts from 0 to `field`. The polariser goes through
-    `polariser_angles` (deg) for each of `filters` and each setting of the calibration plate in `plate` (deg,
-    None: out); Moon patches and standards take the settings in turn, in the first filter. The Moon is
-    observed from `mjd` (UTC) on, at `separations` (deg), the polariser before and the standards after.
+    Field points are a `grid` × `grid` raster over ±`field` degrees, on which polariser and Moon sky are measured, and
+    `standard_grid` × `standard_grid` places of the standards; where the instrument's raster is a line the points are
+    `grid` steps of X from 0 to `field` (the tilts of a plate on a bench). NaN: as far out as its description says.
+    The polariser goes through `polariser_angles` (deg) for each of `filters` and each setting of the calibration
+    plate in `plate` (deg, None: out); Moon patches and standards take the settings in turn, in the first filter. The
+    Moon is observed from `mjd` (UTC) on, at `separations` (deg), the polariser before and the standards after.
     `electrons` is the level of a camera in unpolarised light of full transparency, ahead of reflections.
+
+    `instrument` is one that comes with the package, by name, or any other; None: the first of the family. `moving`
+    holds the positions (deg, None: out) of further moving elements by the prefix of their columns: the polariser goes
+    through its angles for every combination of them, and `lamps` exposures of KIND `lamp` without it follow each
+    time.
     """
 
-    instrument: str = "WALOP-SOUTH"
+    instrument: str | Instrument | None = None
     grid: int = 12
-    field: float = 0.29
+    field: float = NAN
     standard_grid: int = 5
     polariser_angles: tuple[float, ...] = polariser_turn()
     moon_patches: int = 8
@@ -60,11 +69,16 @@ class ObservingPlan:
     teff: float = 5772.0
     temperature: tuple[float, float] = (12.0, 8.0)
     mjd: float | None = None
-    throughput_degree: int = 4
+    throughput_degree: int | None = None
+    moving: Mapping[str, tuple[float | None, ...]] = dataclasses.field(default_factory=dict)
+    lamps: int = 0
 
     def __post_init__(self) -> None:
-        if self.instrument not in SITES:
-            raise ValueError(f"unknown instrument {self.instrument!r}: choose one of {', '.join(SITES)}")
+        if np.isnan(self.field):
+            object.__setattr__(self, "field", self._raster[1])
+        for prefix in self.moving:
+            if prefix not in self.design.moving():
+                raise unknown_name("moving element", prefix, self.design.moving())
         for name in ("grid", "standard_grid"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} = {getattr(self, name)} must be at least 1")
@@ -82,19 +96,46 @@ class ObservingPlan:
     @classmethod
     def bench(cls, tilts: int = 11) -> ObservingPlan:
         """The laboratory bench: plate tilts from 0 to 20°, no sky."""
-        return cls(
-            "WALOP-LAB", tilts, field=20.0, moon_patches=0, standards=0, unpolarised=0, throughput_degree=0
-        )
+        bench = next(name for name in shipped() if described(name).raster == "line")
+        return cls(bench, tilts, moon_patches=0, standards=0, unpolarised=0, throughput_degree=0)
+
+    @functools.cached_property
+    def design(self) -> Instrument:
+        """The instrument as designed."""
+        if isinstance(self.instrument, Instrument):
+            return as_designed(self.instrument)
+        return nominal_instrument(self.instrument)
+
+    @property
+    def _raster(self) -> tuple[str, float]:
+        """How the field points lie, and how far out (deg); found without making the instrument."""
+        if isinstance(self.instrument, Instrument):
+            return self.instrument.raster
+        described_as = described(self.instrument or default_name())
+        return described_as.raster, described_as.edge
+
+    @property
+    def name(self) -> str:
+        """Name of the instrument."""
+        return self.design.name
+
+    def document(self) -> dict[str, Any]:
+        """The plan as plain data."""
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return {**fields, "instrument": self.name, "moving": dict(self.moving)}
 
     @property
     def site(self) -> Site:
         """Where the instrument stands."""
-        return SITES[self.instrument]
+        return Site(*self.design.site[:4])
 
     @property
     def start(self) -> float:
         """MJD (UTC) of the first Moon exposure."""
-        return FULL_MOON[self.instrument] if self.mjd is None else self.mjd
+        night = self.design.site[4]
+        if self.mjd is None and not np.isfinite(night):
+            return _SOME_NIGHT
+        return night if self.mjd is None else self.mjd
 
     @property
     def star_names(self) -> tuple[str, ...]:
@@ -103,7 +144,7 @@ class ObservingPlan:
 
     def points(self) -> Points:
         """Grid points first, then the places of the standards (if there are any)."""
-        if self.instrument == "WALOP-LAB":
+        if self._raster[0] == "line":
             x = np.linspace(0.0, self.field, self.grid)
             y = np.zeros_like(x)
         else:
@@ -120,33 +161,42 @@ class ObservingPlan:
         """The filters with their curves."""
         return {name: filter_curve(name) for name in self.filters}
 
+    def _indoors(self) -> list[tuple[str, float | None, tuple[float | None, ...], float]]:
+        """Filter, calibration plate, further positions, polariser angle (NaN: out) of exposures indoors."""
+        further = list(itertools.product(*self.moving.values()))
+        angles = (*self.polariser_angles, *(NAN for _ in range(self.lamps)))
+        return [(f, p, m, a) for f in self.filters for p in self.plate for m in further for a in angles]
+
     def exposures(self) -> Exposures:
         """All exposures in the order in which they are taken."""
-        clp = [(f, p, a) for f in self.filters for p in self.plate for a in self.polariser_angles]
-        n_clp, n_moon, n_star = len(clp), self.moon_patches, self.standards
-        n = n_clp + n_moon + n_star
+        indoors = self._indoors()
+        n_in, n_moon, n_star = len(indoors), self.moon_patches, self.standards
+        n = n_in + n_moon + n_star
         sky_plate = [self.plate[i % len(self.plate)] for i in range(max(n_moon, n_star))]
-        plate = [p for _, p, _ in clp] + sky_plate[:n_moon] + sky_plate[:n_star]
-        mjd = self.start + _SPACING * (np.arange(n) - n_clp)
-        moon, star = slice(n_clp, n_clp + n_moon), slice(n_clp + n_moon, n)
+        plate = [p for _, p, _, _ in indoors] + sky_plate[:n_moon] + sky_plate[:n_star]
+        angle = np.array([a for _, _, _, a in indoors] + [NAN] * (n_moon + n_star), float)
+        mjd = self.start + _SPACING * (np.arange(n) - n_in)
+        moon, star = slice(n_in, n_in + n_moon), slice(n_in + n_moon, n)
         ra, dec, rotator = np.full((3, n), NAN)
         ra[moon], dec[moon] = self._patches(mjd[moon])
         rotator[moon] = [_MOON_ROTATOR[i % 4] for i in range(n_moon)]
         rotator[star] = [_STAR_ROTATOR[i % 4] for i in range(n_star)]
         # Pointings that the plan does not fix are spread over ±3 h, out of step with the polariser.
         ha = 6.0 * np.mod(np.arange(n) * _GOLDEN, 1.0) - 3.0
-        sidereal = _local_sidereal(mjd, self.site.longitude)
-        ra[star] = np.mod(sidereal[star] - 15.0 * ha[star], 360.0)
-        dec[star] = np.clip(self.site.latitude + 5.0, -85.0, 85.0)
-        ha[moon] = (np.mod(sidereal[moon] - ra[moon] + 180.0, 360.0) - 180.0) / 15.0
+        if n_moon or n_star:
+            sidereal = _local_sidereal(mjd, self.site.longitude)
+            ra[star] = np.mod(sidereal[star] - 15.0 * ha[star], 360.0)
+            dec[star] = np.clip(self.site.latitude + 5.0, -85.0, 85.0)
+            ha[moon] = (np.mod(sidereal[moon] - ra[moon] + 180.0, 360.0) - 180.0) / 15.0
+        kinds = ["clp" if np.isfinite(a) else "lamp" for a in angle[:n_in]]
         return Exposures(
             exposure=np.arange(n),
-            kind=np.array(["clp"] * n_clp + ["moon"] * n_moon + ["standard"] * n_star),
+            kind=np.array(kinds + ["moon"] * n_moon + ["standard"] * n_star),
             mjd=mjd,
-            exptime=np.where(np.arange(n) < n_clp, 30.0, 60.0),
-            filter=np.array([f for f, _, _ in clp] + [self.filters[0]] * (n_moon + n_star)),
-            clp_in=np.arange(n) < n_clp,
-            clp_angle=np.array([a for _, _, a in clp] + [NAN] * (n_moon + n_star), float),
+            exptime=np.where(np.arange(n) < n_in, 30.0, 60.0),
+            filter=np.array([f for f, _, _, _ in indoors] + [self.filters[0]] * (n_moon + n_star)),
+            clp_in=np.isfinite(angle),
+            clp_angle=angle,
             chwp_in=np.array([p is not None for p in plate], bool),
             chwp_angle=np.array([NAN if p is None else p for p in plate], float),
             temp=np.linspace(*self.temperature, n),
@@ -155,7 +205,17 @@ class ObservingPlan:
             dec=dec,
             rotator=rotator,
             teff=np.full(n, self.teff),
+            moving=self._positions(indoors, n),
         )
+
+    def _positions(self, indoors: list[Any], n: int) -> dict[str, Position]:
+        """Positions of the further moving elements; on the sky they stand at their first."""
+        found = {}
+        for k, (prefix, stops) in enumerate(self.moving.items()):
+            chosen = [m[k] for _, _, m, _ in indoors] + [stops[0]] * (n - len(indoors))
+            angle = np.array([NAN if a is None else a for a in chosen], float)
+            found[prefix] = Position(np.isfinite(angle), angle)
+        return found
 
     def layout(self) -> tuple[Bool[np.ndarray, "p e"], np.ndarray]:
         """Which (point, exposure) pairs are measured, and the row of the star in each (−1: none)."""
@@ -174,6 +234,7 @@ class ObservingPlan:
             moon=tuple(int(i) for i in moon),
             moon_ids=tuple(int(i) for i in exposures.exposure[moon]),
             sources=self.star_names,
+            cameras=len(self.design.cameras),
         )
 
     def _patches(

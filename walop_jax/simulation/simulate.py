@@ -18,20 +18,24 @@ from jaxtyping import Array, Float
 from walop_jax.data.records import Block, CalibrationSet, Sources
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.likelihood import engine
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.noise import PhotonNoise
-from walop_jax.likelihood.problem import Problem
 from walop_jax.model import legendre, light
+from walop_jax.model.build import adapted
 from walop_jax.model.compiled import compiled
+from walop_jax.model.dependence import needs
 from walop_jax.model.effects import in_order
-from walop_jax.model.effects.base import Effect, overridden
-from walop_jax.model.instrument import Instrument, Standards, nominal_instrument
-from walop_jax.model.parameters import leaves
+from walop_jax.model.effects.base import Effect
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.plan import Plan, with_median
-from walop_jax.model.specification import Model, full_values, make_model, make_template, series_indices
+from walop_jax.model.sources import Standards
+from walop_jax.model.specification import Model, make_model, make_template, series_indices
 from walop_jax.simulation.observing_plan import ObservingPlan
 
-Cube = Float[np.ndarray, "p e 4"]
+Cube = Float[np.ndarray, "p e k"]
 
+LEVEL = 0.5
 LEVEL_SCATTER = 0.03  # of the cameras' throughput around 0.5
 STRUCTURE = 0.02  # rms over the field, relative
 TRANSPARENCY = (0.7, 1.0)
@@ -50,7 +54,7 @@ class Simulated(NamedTuple):
 def truth_values(truth: Instrument) -> dict[str, float]:
     """The true value of every parameter by name; the names are those of a fit."""
     names = (leaf.name for leaf in leaves(truth))
-    return {name: float(value) for name, value in zip(names, full_values(truth), strict=True)}
+    return {name: float(value) for name, value in zip(names, np.asarray(values_of(truth)), strict=True)}
 
 
 def draw_instrument(model: Model, rng: np.random.Generator) -> Instrument:
@@ -73,11 +77,12 @@ def draw_instrument(model: Model, rng: np.random.Generator) -> Instrument:
     return model.instrument(values)
 
 
-def _throughput(template: Instrument, rng: np.random.Generator) -> Float[np.ndarray, "4 t"]:
+def _throughput(template: Instrument, rng: np.random.Generator) -> Float[np.ndarray, "k t"]:
     terms = np.array(legendre.terms(template.throughput.degree))
     degree = terms.sum(axis=1)
-    level = 0.5 + LEVEL_SCATTER * rng.standard_normal(4)
-    shape = rng.standard_normal((4, len(terms)))
+    cameras = len(template.throughput.coefficients)
+    level = 0.5 + LEVEL_SCATTER * rng.standard_normal(cameras)
+    shape = rng.standard_normal((cameras, len(terms)))
     share = np.where(degree > 0, 1.0 / np.maximum(degree, 1), 0.0)
     share /= max(float(np.linalg.norm(share)), 1.0)
     # The mean square of P_i P_j over the field is 1 / ((2i + 1)(2j + 1)).
@@ -123,11 +128,11 @@ def simulate(
     build, stars, sky, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
     sources, standards = _catalogue(plan, stars)
     if instrument is None:
-        nominal = nominal_instrument(plan.instrument, throughput_degree=plan.throughput_degree)
-        instrument = draw_instrument(make_model(plan.instrument, nominal), build)
+        nominal = adapted(plan.design, throughput_degree=plan.throughput_degree, throughput=LEVEL)
+        instrument = draw_instrument(make_model(plan.name, nominal), build)
     active = in_order((*instrument.effects, *effects))
-    truth = make_template(dataclasses.replace(instrument, standard=standards, effects=active))
-    blank = _blank(plan, sources, seed)
+    truth = make_template(dataclasses.replace(instrument.with_source(standards), effects=active))
+    blank = _blank(plan, sources, seed, len(truth.cameras))
     expected = _expected(blank, truth, _fluxes(plan, sky))
     detector = PhotonNoise(plan.read_noise)
     if noiseless:
@@ -139,14 +144,14 @@ def simulate(
     return Simulated(_with_counts(plan, blank, counts, sigma), truth)
 
 
-def _blank(plan: ObservingPlan, sources: Sources, seed: int) -> CalibrationSet:
+def _blank(plan: ObservingPlan, sources: Sources, seed: int, cameras: int) -> CalibrationSet:
     """The calibration set that the plan announces, before any light: counts and errors are 1."""
     points = plan.points()
     used, source = plan.layout()
-    ones = np.ones((*used.shape, 4))
+    ones = np.ones((*used.shape, cameras))
     block = Block(x=points.x, y=points.y, counts=ones, sigma=ones, used=used, source=source)
     return CalibrationSet(
-        instrument=plan.instrument,
+        instrument=plan.name,
         site=plan.site,
         origin=f"walop-jax simulate, seed {seed}",
         exposures=plan.exposures(),
@@ -176,23 +181,23 @@ def _fluxes(plan: ObservingPlan, rng: np.random.Generator) -> Float[np.ndarray, 
     return 4.0 * plan.electrons * illumination[:, None] * transparency * brightness[source]
 
 
-def _expected(
-    blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, "p e"]
-) -> Float[np.ndarray, "p e 4"]:
+def _expected(blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, "p e"]) -> Cube:
     """Expected counts (electron) of every (point, exposure), what the detectors do to them included."""
-    problem = Problem(blank, make_model(blank.instrument, truth))
-    unit = np.concatenate([np.asarray(engine.prediction(truth, problem.plan, c)) for c in problem.chunks])
+    likelihood = Likelihood.of(blank, make_model(blank.instrument, truth))
+    unit = np.concatenate(
+        [np.asarray(engine.prediction(truth, likelihood.plan, c)) for c in likelihood.points]
+    )
     light_counts = flux[:, :, None] * unit[: len(flux)]
-    if not overridden(truth.effects, "detector"):
+    if light.is_linear(truth):
         return light_counts
     counts = light_counts
-    for _ in range(_MEDIAN_ROUNDS if any(effect.uses_median for effect in truth.effects) else 1):
-        seen = np.where(problem.used[:, :, None], counts, np.nan)
-        plan = with_median(problem.plan, np.nanmedian(seen, axis=0))
+    for _ in range(_MEDIAN_ROUNDS if needs(truth).median else 1):
+        seen = np.where(likelihood.used[:, :, None], counts, np.nan)
+        plan = with_median(likelihood.plan, np.nanmedian(seen, axis=0))
         counts = np.asarray(_detected(truth, plan, jnp.asarray(light_counts)))
     return counts
 
 
 @compiled
-def _detected(instrument: Instrument, plan: Plan, counts: Float[Array, "p e 4"]) -> Float[Array, "p e 4"]:
+def _detected(instrument: Instrument, plan: Plan, counts: Float[Array, "p e k"]) -> Float[Array, "p e k"]:
     return jax.vmap(light.detected, (None, None, 0))(instrument, plan.exposures, counts)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from walop_jax.data import read_calibration_set
-from walop_jax.likelihood.problem import Problem, base_model
+from walop_jax.fit.model_builder import base_model
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Context, Effect, effect_by_name
 from walop_jax.model.specification import effect_context, with_effects
 
@@ -20,17 +21,17 @@ def fit(path, *names: str, start=()):
     model = with_effects(model, effects, context)
     for name, value in start:
         model = model.change(name, start=value)
-    problem, values, free = Problem(calset, model), model.start, model.free
+    likelihood, values, free = Likelihood.of(calset, model), model.start, model.free
     scale = np.array([model.parameters[i].scale for i in free])
     for _ in range(8):
-        here = problem.expand(values)
+        here = likelihood.expand(values)
         step = scale * np.linalg.solve(here.matrix * scale * scale[:, None], here.gradient * scale)
         values = model.full(values[free] - step)
-    here = problem.expand(values)
+    here = likelihood.expand(values)
     sigma = np.zeros(len(values))
     sigma[free] = np.sqrt(np.diag(np.linalg.inv(here.matrix)))
     found = {name: (values[i], sigma[i]) for i, name in enumerate(model.names)}
-    return found, here.chi2, problem.dof
+    return found, here.chi2, likelihood.dof
 
 
 def test_clp_wobble(either_south_set):

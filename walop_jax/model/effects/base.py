@@ -1,64 +1,45 @@
-"""What an effect is: a component with a name that acts at one stage of the light path, or at a few.
+"""What an effect is: a component with a name that patches the instrument.
 
-The light path (`light.py`) passes every stage through the active effects in order; the hooks below are the
-stages, and each leaves the light as it is unless an effect overrides it. An effect that is not active is
-not in the tree: it costs nothing.
+`patch` is all that an effect does: it changes a number that an element has, or inserts an element, a part of the
+cameras, or something of a source. What patches the instrument reaches everything that asks for light; an effect that is
+not active is not in the tree and costs nothing.
 """
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
+from walop_jax.model.conventions import EXTINCTION
 from walop_jax.model.parameters import Component, field_declarations, unknown_name
-from walop_jax.model.plates import Plate
 
-CONTRACT = "calibration contract, section 6"
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
 
-Real = Float[Array, "..."]
 Scalar = Float[Array, ""]
-
-
-class ExposureArrays(NamedTuple):
-    """What the light path needs to know of the exposures (one element each)."""
-
-    clp_in: Bool[Array, " e"]
-    clp_angle: Float[Array, " e"]  # rad; 0 when out
-    moon: Bool[Array, " e"]
-    flux_known: Bool[Array, " e"]
-    rotator: Float[Array, " e"]  # rad; 0 where it has no meaning
-    hours: Float[Array, " e"]  # since the first exposure
-    temperature: Float[Array, " e"]  # Celsius
-    hour_angle: Float[Array, " e"]  # h
-    median: Float[Array, "e 4"] | None = (
-        None  # median counts over the field; only where an effect asks for it
-    )
-
-
-class Conditions(NamedTuple):
-    """What the optics know of the moment: one element per wavelength node."""
-
-    temperature: Float[Array, " n"]  # Celsius
-    hour_angle: Float[Array, " n"]  # h
-    band_width: Float[Array, " n"]  # µm: equivalent width of the filter that the node belongs to
 
 
 class Context(NamedTuple):
     """What effects that grow with the data need to know of them.
 
     `moon` holds the positions of the Moon exposures and `moon_ids` their EXPOSURE numbers; `sources` the
-    names of the standards, `exposures` the number of exposures.
+    names of the standards, `exposures` the number of exposures, `cameras` that of cameras; `extinction` is that of the
+    polariser without the effect.
     """
 
     exposures: int = 0
     moon: tuple[int, ...] = ()
     moon_ids: tuple[int, ...] = ()
     sources: tuple[str, ...] = ()
+    cameras: int = 4
+    extinction: float = EXTINCTION
 
 
 class Effect(Component):
@@ -69,9 +50,7 @@ class Effect(Component):
     amplitudes, and nothing happens when they are neutral, whatever the shape. `starts` are groups of shapes
     from which to look for the effect: groups are alternatives, the members of a group are directions that
     are fitted together and that `combine` turns into one effect. `one_sided` names amplitudes that physics
-    keeps above neutral. `optics_depend_on` names the exposure quantities ("temperature", "hour_angle") that
-    make the optics differ from exposure to exposure; `fringes` is the path difference, in waves at 0.62 µm,
-    that the wavelength nodes must follow; `uses_median` asks for the median counts of every exposure.
+    keeps above neutral; `reference` says where the effect is known from.
     """
 
     name: ClassVar[str] = ""
@@ -80,9 +59,11 @@ class Effect(Component):
     one_sided: ClassVar[tuple[str, ...]] = ()
     revealed_by: ClassVar[str] = ""
     separated_by: ClassVar[str] = ""
-    optics_depend_on: ClassVar[tuple[str, ...]] = ()
-    fringes: ClassVar[float] = 0.0
-    uses_median: ClassVar[bool] = False
+    reference: ClassVar[str] = ""
+
+    @abc.abstractmethod
+    def patch(self, instrument: Instrument) -> Instrument:
+        """The instrument with the effect. Raises `NoSuchPlaceError` where it has no element that the effect acts on."""
 
     # ---------------------------------------------------------------------------------- making and describing
 
@@ -155,119 +136,20 @@ class Effect(Component):
         """The same effect with positive amplitude and with angles in their principal range."""
         return self
 
-    # --------------------------------------------------------------------------------------- the light itself
+    def fits(self, instrument: Instrument) -> bool:
+        """Whether the instrument has what the effect acts on."""
+        from walop_jax.model.instrument import NoSuchPlaceError
 
-    def rotator(self, offset: Scalar | float) -> Scalar | float:
-        """True position angle of +X minus the header's (rad)."""
-        return offset
-
-    def moon(self, beam: Float[Array, "e 2"], sky: Float[Array, "e 2"]) -> Float[Array, "e 2"]:
-        """Polarisation (q, u) of the sky in the ICS; `sky` is that of single scattering for δ = 1."""
-        return beam
-
-    def catalogue(
-        self, q: Float[Array, " s"], u: Float[Array, " s"], names: tuple[str, ...]
-    ) -> tuple[Float[Array, " s"], Float[Array, " s"]]:
-        """True Stokes parameters of the standards (equatorial frame)."""
-        return q, u
-
-    def telescope(self, mueller: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
-        """Mueller matrix that light from the sky meets ahead of the polariser's place."""
-        return mueller
-
-    def polariser_angle(self, angle: Real, exposures: ExposureArrays) -> Real:
-        """Transmission axis (rad) from the encoder reading (rad)."""
-        return angle
-
-    def extinction(self, ratio: Scalar | float) -> Scalar | float:
-        """Extinction ratio of the polariser."""
-        return ratio
-
-    def polarised(self, stokes: Float[Array, "e 4"], exposures: ExposureArrays) -> Float[Array, "e 4"]:
-        """Light behind the polariser."""
-        return stokes
-
-    # ------------------------------------------------------------------------------------------------- optics
-
-    def field(self, x: Real, y: Real, conditions: Conditions) -> tuple[Real, Real]:
-        """Field coordinates (deg) that the pupil mapping sees."""
-        return x, y
-
-    def upstream(self, mueller: Float[Array, "4 4"], x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
-        """Mueller matrix from behind the polariser to the calibration plate, collimator included."""
-        return mueller
-
-    def wavelengths(self, wavelength: Real, conditions: Conditions) -> Real:
-        """Wavelengths (µm) of the nodes of the band."""
-        return wavelength
-
-    def calibration_plate(self, angle: float | None) -> float | None:
-        """Angle (deg) of the calibration plate, None when it is out."""
-        return angle
-
-    def plates(self, where: str, plates: tuple[Plate, ...], conditions: Conditions) -> tuple[Plate, ...]:
-        """Plates (quartz, MgF2) of a half-wave plate; `where` is "chwp", "half1" or "half2"."""
-        return plates
-
-    def ahead_of_plates(
-        self,
-        where: str,
-        mueller: Float[Array, "n 4 4"],
-        sx: Real,
-        sy: Real,
-        wavelength: Real,
-        fast_axis: Real,
-    ) -> Float[Array, "n 4 4"]:
-        """Mueller matrix of a half-wave plate with whatever stands directly ahead of it."""
-        return mueller
-
-    def analyser_angle(self, angle: Scalar | float) -> Scalar | float:
-        """Rotation (rad) of the Wollaston prisms."""
-        return angle
-
-    # ------------------------------------------------------------------------------------------------ cameras
-
-    def throughput(self, throughput: Float[Array, 4], x: Scalar, y: Scalar) -> Float[Array, 4]:
-        """Throughput of the cameras at a field point."""
-        return throughput
-
-    def cameras(self, vectors: Float[Array, "b 4 4"], x: Scalar, y: Scalar) -> Float[Array, "b 4 4"]:
-        """Analysis vectors (band, camera, Stokes) behind the throughput."""
-        return vectors
-
-    def recorded(
-        self,
-        counts: Float[Array, "e 4"],
-        unpolarised: Float[Array, "e 4"],
-        exposures: ExposureArrays,
-        x: Scalar,
-        y: Scalar,
-    ) -> Float[Array, "e 4"]:
-        """Counts for light of unit flux; `unpolarised` are those of unpolarised light."""
-        return counts
-
-    def mirrored(
-        self, counts: Float[Array, "e 4"], opposite: Float[Array, "e 4"], extended: Bool[Array, " e"]
-    ) -> Float[Array, "e 4"]:
-        """Counts for light of unit flux; `opposite` are those of the same source at (−X, −Y)."""
-        return counts
-
-    def detector(self, counts: Float[Array, "e 4"], exposures: ExposureArrays) -> Float[Array, "e 4"]:
-        """What the detectors report for the counts (electrons) that reach them."""
-        return counts
+        try:
+            jax.eval_shape(lambda: self.patch(dataclasses.replace(instrument, effects=())))
+        except NoSuchPlaceError:
+            return False
+        return True
 
 
-def per_camera(value: float = 0.0) -> Float[Array, 4]:
-    """One value for each camera."""
-    return jnp.full(4, value)
-
-
-def check_camera(effect: Effect, camera: int) -> None:
-    """Raise ValueError unless `camera` is 0, 1, 2 or 3."""
-    if camera not in (0, 1, 2, 3):
-        raise ValueError(f"{effect.name}: camera {camera!r} does not exist, choose 0, 1, 2 or 3")
-
-
-def overridden(effects: Sequence[Effect], hook: str) -> bool:
-    """Whether any of the effects does something at a hook."""
-    return any(getattr(type(effect), hook) is not getattr(Effect, hook) for effect in effects)
+def check_camera(effect: Effect, camera: int, names: Sequence[str]) -> int:
+    """The number of a camera of an instrument; ValueError where it does not exist."""
+    if not 0 <= camera < len(names):
+        known = ", ".join(f"{number} ({name})" for number, name in enumerate(names))
+        raise ValueError(f"{effect.name}: camera {camera!r} does not exist; cameras are {known}")
+    return camera

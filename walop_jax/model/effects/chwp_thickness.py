@@ -2,7 +2,7 @@
 
 Equation    d → d + mgf2, d + quartz
 Symbols     d thickness of the crystal; mgf2, quartz [µm]
-Source      calibration contract, section 6; one µm is 6.8° of retardance in MgF2 and 5.3° in quartz at 0.62
+Source      one µm is 6.8° of retardance in MgF2 and 5.3° in quartz at 0.62
             µm.
 Neutral     mgf2 = quartz = 0
 Revealed by exposures with the calibration plate: cross-talk that exceeds what its prior of 1 µm allows. The
@@ -11,33 +11,31 @@ Revealed by exposures with the calibration plate: cross-talk that exceeds what i
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from walop_jax.model.effects.base import CONTRACT, Conditions, Effect, Scalar
+from walop_jax.model.effects.base import Effect, Scalar
 from walop_jax.model.parameters import param
-from walop_jax.model.plates import Plate
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+
+SOURCE = "one um is 6.8 deg of retardance in MgF2 and 5.3 deg in quartz at 0.62 um (Dodge 1984, Ghosh 1999)"
 
 
 class ChwpThickness(Effect):
     """Crystals of the calibration plate thicker than as designed."""
 
-    mgf2: Scalar = param(
-        unit="um", about="added to the MgF2 plate", source=CONTRACT, width=5.0, optical=True, default=0.0
-    )
+    mgf2: Scalar = param(unit="um", about="added to the MgF2 plate", source=SOURCE, width=5.0, default=0.0)
     quartz: Scalar = param(
-        unit="um", about="added to the quartz plate", source=CONTRACT, width=5.0, optical=True, default=0.0
+        unit="um", about="added to the quartz plate", source=SOURCE, width=5.0, default=0.0
     )
 
     name: ClassVar[str] = "chwp_thickness"
+    reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = "exposures with the calibration plate in, best in several bands"
     separated_by: ClassVar[str] = "narrow bands: thickness goes with 1/λ, an error of its axis does not"
 
-    def plates(self, where: str, plates: tuple[Plate, ...], conditions: Conditions) -> tuple[Plate, ...]:
+    def patch(self, instrument: Instrument) -> Instrument:
         """Thicken quartz and MgF2."""
-        if where != "chwp":
-            return plates
-        quartz, mgf2 = plates
-        return (
-            quartz._replace(thickness=quartz.thickness + self.quartz),
-            mgf2._replace(thickness=mgf2.thickness + self.mgf2),
-        )
+        quartz = instrument.changed("chwp.quartz", thickness=lambda d: d + self.quartz)
+        return quartz.changed("chwp.mgf2", thickness=lambda d: d + self.mgf2)

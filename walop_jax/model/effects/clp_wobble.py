@@ -2,7 +2,7 @@
 
 Equation    θ = CLP_ANGLE + amplitude · sin(CLP_ANGLE − phase)
 Symbols     θ transmission axis in the ICS; amplitude [deg]; phase [rad]
-Source      calibration contract, section 6. An eccentric code disc reads wrong by e/r sin: 0.1° is 0.35 %
+Source      An eccentric code disc reads wrong by e/r sin: 0.1° is 0.35 %
             of the intensity at worst.
 Neutral     amplitude = 0, whatever the phase
 Revealed by side bands at one and three times the polariser angle in the normalised intensities of all
@@ -16,25 +16,32 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.model.effects.base import CONTRACT, Effect, ExposureArrays, Real, Scalar
+from walop_jax.model.effects.base import Effect, Scalar
+from walop_jax.model.elements import EncoderError
 from walop_jax.model.parameters import param
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+
+SOURCE = "eccentric code disc of an encoder: expected size"
 
 
 class ClpWobble(Effect):
     """Transmission axis = CLP_ANGLE + amplitude · sin(CLP_ANGLE − phase)."""
 
-    amplitude: Scalar = param(unit="deg", about="largest error", source=CONTRACT, width=0.1, default=0.0)
+    amplitude: Scalar = param(unit="deg", about="largest error", source=SOURCE, width=0.1, default=0.0)
     phase: Scalar = param(
-        unit="rad", about="encoder reading of no error", source=CONTRACT, scale=0.3, loose=10.0, default=0.0
+        unit="rad", about="encoder reading of no error", source=SOURCE, scale=0.3, loose=10.0, default=0.0
     )
 
     name: ClassVar[str] = "clp_wobble"
+    reference: ClassVar[str] = SOURCE
     shape: ClassVar[tuple[str, ...]] = ("phase",)
     starts: ClassVar[tuple[tuple[Mapping[str, Any], ...], ...]] = (({"phase": 0.0}, {"phase": 0.5 * np.pi}),)
     revealed_by: ClassVar[str] = "polariser exposures at many angles, best over a full turn"
@@ -42,10 +49,6 @@ class ClpWobble(Effect):
         "polariser angles over 360° instead of 180°: an encoder error changes sign after half a turn, "
         "nothing that polarised light itself does can"
     )
-
-    def polariser_angle(self, angle: Real, exposures: ExposureArrays) -> Real:
-        """Add the error of the encoder, a function of its reading."""
-        return angle + jnp.deg2rad(self.amplitude) * jnp.sin(exposures.clp_angle - self.phase)
 
     @classmethod
     def combine(cls, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
@@ -58,3 +61,8 @@ class ClpWobble(Effect):
         phase = float(self.phase) + (np.pi if float(self.amplitude) < 0 else 0.0)
         phase = float(np.angle(np.exp(1j * phase)))
         return dataclasses.replace(self, amplitude=jnp.abs(self.amplitude), phase=phase)
+
+    def patch(self, instrument: Instrument) -> Instrument:
+        """Give the encoder an error once per turn."""
+        error = EncoderError(self.amplitude, self.phase)
+        return instrument.changed("polariser", encoder=lambda errors: (*errors, error))

@@ -2,7 +2,7 @@
 
 Equation    θ = CLP_ANGLE + angle
 Symbols     θ transmission axis in the ICS; angle [deg]
-Source      calibration contract, section 6; axes of such polarisers are clocked to 0.1° (Harrington et al.
+Source      axes of such polarisers are clocked to 0.1° (Harrington et al.
             2021, JATIS 7, 018004).
 Neutral     angle = 0
 Revealed by standard stars: polariser and sky then disagree on the direction of +q by the same angle
@@ -11,22 +11,26 @@ Revealed by standard stars: polariser and sky then disagree on the direction of 
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-import jax.numpy as jnp
-
-from walop_jax.model.effects.base import CONTRACT, Effect, ExposureArrays, Real, Scalar
+from walop_jax.model.effects.base import Effect, Scalar
 from walop_jax.model.parameters import param
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+
+SOURCE = "Harrington et al. 2021, JATIS 7, 018004"
 
 
 class ClpZero(Effect):
     """Transmission axis = CLP_ANGLE + angle."""
 
     angle: Scalar = param(
-        unit="deg", about="added to the encoder reading", source=CONTRACT, width=0.3, default=0.0
+        unit="deg", about="added to the encoder reading", source=SOURCE, width=0.3, default=0.0
     )
 
     name: ClassVar[str] = "clp_zero"
+    reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = (
         "polariser exposures together with polarised standards (or a trusted sky angle)"
     )
@@ -35,6 +39,8 @@ class ClpZero(Effect):
         "standards and Moon at several ROTATOR angles separate it from the rotator zero"
     )
 
-    def polariser_angle(self, angle: Real, exposures: ExposureArrays) -> Real:
-        """Add the zero point."""
-        return angle + jnp.deg2rad(self.angle)
+    def patch(self, instrument: Instrument) -> Instrument:
+        """Add to the encoder reading."""
+        return instrument.changed(
+            "polariser", zero=lambda zero: self.angle if zero is None else zero + self.angle
+        )

@@ -3,7 +3,7 @@
 Equation    diattenuator with D = contrast · cos(4π gap cos ϑ / λ) along the fast axis of each plate, ahead
             of it
 Symbols     gap thickness of the air [µm]; ϑ angle of the ray in air at the plate; λ wavelength [µm]
-Source      calibration contract, section 6; fringes of polarised light are "the chief bane" of precise
+Source      fringes of polarised light are "the chief bane" of precise
             polarimetry (Clarke 2005, A&A 434, 377), 1e-3 remains with coatings (Semel 2003, A&A 401, 1).
 Neutral     contrast = 0, whatever the gap
 Revealed by zero offsets that oscillate with wavelength (period λ²/2 gap) and in rings over the field; a
@@ -17,15 +17,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from walop_jax.model import mueller as mm
-from walop_jax.model.effects.base import CONTRACT, Effect, Real, Scalar
+from walop_jax.model.effects.base import Effect, Scalar
+from walop_jax.model.elements import AirGap, WavePlate
 from walop_jax.model.parameters import param
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+
+SOURCE = "Clarke 2005, A&A 434, 377; Semel 2003, A&A 401, 1"
 
 REFERENCE_WAVELENGTH = 0.62  # µm
 LARGEST_GAP = 60.0  # µm
@@ -37,43 +41,28 @@ class Etalon(Effect):
     """Diattenuation of an air gap along the fast axis of each plate."""
 
     contrast: Scalar = param(
-        unit="", about="diattenuation at a maximum", source=CONTRACT, width=0.003, optical=True, default=0.0
+        unit="", about="diattenuation at a maximum", source=SOURCE, width=0.003, default=0.0
     )
     gap: Scalar = param(
         unit="um",
         about="thickness of the air gap",
-        source=CONTRACT,
+        source=SOURCE,
         scale=0.05,
         loose=5.0,
-        optical=True,
         default=10.0,
     )
 
     name: ClassVar[str] = "etalon"
+    reference: ClassVar[str] = SOURCE
     shape: ClassVar[tuple[str, ...]] = ("gap",)
     starts: ClassVar[tuple[tuple[Mapping[str, Any], ...], ...]] = tuple(
         ({"gap": gap}, {"gap": gap + QUARTER}) for gap in GAPS
     )
-    fringes: ClassVar[float] = 2.0 * LARGEST_GAP / REFERENCE_WAVELENGTH
     revealed_by: ClassVar[str] = "unpolarised light or polariser exposures in narrow bands"
     separated_by: ClassVar[str] = (
         "narrow bands of different wavelength, or a change of temperature: throughput and lens polarisation "
         "do not oscillate"
     )
-
-    def ahead_of_plates(
-        self,
-        where: str,
-        mueller: Float[Array, "n 4 4"],
-        sx: Real,
-        sy: Real,
-        wavelength: Real,
-        fast_axis: Real,
-    ) -> Float[Array, "n 4 4"]:
-        """The fringe, then the plate."""
-        cosine = jnp.sqrt(1.0 - sx**2 - sy**2)
-        d = self.contrast * jnp.cos(4.0 * jnp.pi * self.gap * cosine / wavelength)
-        return mueller @ mm.diattenuator(d * jnp.cos(2.0 * fast_axis), d * jnp.sin(2.0 * fast_axis))
 
     def survives(self, wavelength: Float[np.ndarray, " n"], weight: Float[np.ndarray, "b n"]) -> float:
         """Visibility |Σ w exp(4πi gap / λ)| of the fringe in the band that blurs it least."""
@@ -86,3 +75,10 @@ class Etalon(Effect):
         cosine, sine = amplitudes
         shift = np.arctan2(sine, cosine) * REFERENCE_WAVELENGTH / (4.0 * np.pi)
         return dataclasses.replace(group[0], contrast=np.hypot(cosine, sine), gap=float(group[0].gap) + shift)
+
+    def patch(self, instrument: Instrument) -> Instrument:
+        """Put an air gap ahead of every wave plate."""
+        gap = AirGap(self.contrast, self.gap, LARGEST_GAP)
+        for place in instrument.places(WavePlate):
+            instrument = instrument.changed(place, air_gaps=lambda gaps: (*gaps, gap))
+        return instrument

@@ -2,7 +2,7 @@
 
 Equation    THROUGHPUT(λ) → THROUGHPUT(λ − wavelength) for filters of an equivalent width above 0.05 µm
 Symbols     wavelength: displacement [µm]; equivalent width ∫ THROUGHPUT dλ / max THROUGHPUT
-Source      calibration contract, section 6; interference filters shift with tilt and temperature, and
+Source      interference filters shift with tilt and temperature, and
             catalogue curves differ from the filter in the wheel by several nm.
 Neutral     wavelength = 0
 Revealed by cross-talk of the u half that narrow bands do not confirm. Narrow bands stay where they are; the
@@ -11,12 +11,15 @@ Revealed by cross-talk of the u half that narrow bands do not confirm. Narrow ba
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-import jax.numpy as jnp
-
-from walop_jax.model.effects.base import CONTRACT, Conditions, Effect, Real, Scalar
+from walop_jax.model.effects.base import Effect, Scalar
 from walop_jax.model.parameters import param
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+
+SOURCE = "interference filters shift with tilt and temperature: expected size"
 
 BROAD = 0.05  # µm
 
@@ -25,15 +28,18 @@ class FilterShift(Effect):
     """Broad bands are displaced."""
 
     wavelength: Scalar = param(
-        unit="um", about="displacement of the band", source=CONTRACT, width=0.003, optical=True, default=0.0
+        unit="um", about="displacement of the band", source=SOURCE, width=0.003, default=0.0
     )
 
     name: ClassVar[str] = "filter_shift"
+    reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = "polariser exposures in the broad band and in narrow ones"
     separated_by: ClassVar[str] = (
         "narrow bands: they fix the thicknesses of the plates, which alone look the same"
     )
 
-    def wavelengths(self, wavelength: Real, conditions: Conditions) -> Real:
-        """Move the nodes of broad bands."""
-        return wavelength + jnp.where(conditions.band_width > BROAD, self.wavelength, 0.0)
+    def patch(self, instrument: Instrument) -> Instrument:
+        """Displace broad bands."""
+        return instrument.changed(
+            "", filter_shift=lambda shift: self.wavelength if shift is None else shift + self.wavelength
+        )

@@ -2,7 +2,7 @@
 
 Equation    (X, Y) → (X + rate_x · HA, Y + rate_y · HA) ahead of the mapping from field to pupil
 Symbols     rate_x, rate_y [deg/h]; HA hour angle [h]
-Source      calibration contract, section 6; 0.2 % in half an hour and 1 % between pointings were seen in
+Source      0.2 % in half an hour and 1 % between pointings were seen in
             WIRC+Pol (Tinyanont et al. 2019, arXiv:1811.03138; Millar-Blanchaer et al. 2019,
             arXiv:1908.10409).
 Neutral     rate_x = rate_y = 0
@@ -11,27 +11,34 @@ Revealed by a pattern of cross-talk that moves over the field with hour angle. A
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from walop_jax.model.effects.base import CONTRACT, Conditions, Effect, Real, Scalar
+from walop_jax.model.effects.base import Effect, Scalar
+from walop_jax.model.elements import FieldShift
 from walop_jax.model.parameters import param
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+
+SOURCE = "Tinyanont et al. 2019, arXiv:1811.03138; Millar-Blanchaer et al. 2019, arXiv:1908.10409"
 
 
 class Flexure(Effect):
     """Field coordinates displaced in proportion to the hour angle."""
 
     rate_x: Scalar = param(
-        unit="deg/h", about="displacement along X", source=CONTRACT, width=0.003, optical=True, default=0.0
+        unit="deg/h", about="displacement along X", source=SOURCE, width=0.003, default=0.0
     )
     rate_y: Scalar = param(
-        unit="deg/h", about="displacement along Y", source=CONTRACT, width=0.003, optical=True, default=0.0
+        unit="deg/h", about="displacement along Y", source=SOURCE, width=0.003, default=0.0
     )
 
     name: ClassVar[str] = "flexure"
-    optics_depend_on: ClassVar[tuple[str, ...]] = ("hour_angle",)
+    reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = "polariser exposures at different hour angles"
     separated_by: ClassVar[str] = "the same polariser angles at several hour angles and at one temperature"
 
-    def field(self, x: Real, y: Real, conditions: Conditions) -> tuple[Real, Real]:
-        """Displace the field point."""
-        return x + self.rate_x * conditions.hour_angle, y + self.rate_y * conditions.hour_angle
+    def patch(self, instrument: Instrument) -> Instrument:
+        """Displace what the mapping to the pupil sees."""
+        shift = FieldShift(name=self.name, rate_x=self.rate_x, rate_y=self.rate_y)
+        return instrument.inserted(shift, before="pupil")

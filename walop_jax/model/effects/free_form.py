@@ -18,21 +18,25 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.model import legendre
-from walop_jax.model.effects.base import Context, Effect, ExposureArrays, Scalar
+from walop_jax.model.cameras import ExposurePart, Mixing
+from walop_jax.model.effects.base import Context, Effect, Scalar
 from walop_jax.model.parameters import param, unknown_name
+from walop_jax.model.sources import ExposureArrays
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
 
 WIDTH = 0.003  # plausible size, in units of the response to unpolarised light
 SMOOTH, FINE, GRADIENT = 4, 8, 1  # degrees of the field polynomials
 HARMONICS = (1, 3, 4, 5, 6)
 BLOCKS = ("vectors", "harmonics", "fine", "exposures")
-CAMERAS = ("n0", "n1", "n2", "n3")
 _SMOOTH_TERMS = legendre.terms(SMOOTH)
 _GRADIENT_TERMS = legendre.terms(GRADIENT)
 _FINE_TERMS = legendre.terms(FINE)[len(_SMOOTH_TERMS) :]
@@ -46,13 +50,60 @@ def _tags(terms: Sequence[tuple[int, int]]) -> list[str]:
     return [f"p{i}{j}" for i, j in terms]
 
 
+def _cameras(count: int) -> list[str]:
+    return [f"n{k}" for k in range(count)]
+
+
+class Pattern(Mixing):
+    """Smooth changes of q and u elements, fine changes of the response to unpolarised light."""
+
+    smooth: Float[Array, "k 2 s"]
+    fine: Float[Array, "c f"]  # one of the two may be empty
+
+    def vectors(self, vectors: Float[Array, "b k 4"], x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
+        """Add the patterns, relative to the response to unpolarised light."""
+        plain = vectors[:, :, 0]
+        if self.smooth.size:
+            change = self.smooth @ legendre.basis(x, y, SMOOTH)
+            vectors = vectors.at[:, :, 1:3].add(plain[..., None] * change)
+        if self.fine.size:
+            vectors = vectors.at[:, :, 0].add(
+                plain * (self.fine @ legendre.basis(x, y, FINE)[len(_SMOOTH_TERMS) :])
+            )
+        return vectors
+
+
+class Shares(ExposurePart):
+    """Harmonics of the polariser angle and single exposures."""
+
+    harmonics: Float[Array, "c h 2 g"]
+    exposures: Float[Array, "e k"]  # one of the two may be empty
+
+    @property
+    def exposures_known(self) -> int | None:
+        """As many as the block of single exposures was made for."""
+        return len(self.exposures) or None
+
+    def share(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"]:
+        """What is added, in units of the response to unpolarised light."""
+        found = jnp.zeros(())
+        if self.harmonics.size:
+            angle = exposures.clp_angle[:, None] * jnp.asarray(HARMONICS)
+            waves = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+            size = self.harmonics @ legendre.basis(x, y, GRADIENT)
+            found += jnp.where(exposures.clp_in[:, None], jnp.einsum("ehw,khw->ek", waves, size), 0.0)
+        if self.exposures.size:
+            found += self.exposures
+        return found
+
+
 class FreeForm(Effect):
     """Smooth patterns of the analysis vectors, harmonics of the polariser, fine structure, single exposures."""
 
-    vectors: Float[Array, "4 2 s"] = _pattern("change of an analysis vector, relative to its first element")
-    harmonics: Float[Array, "4 h 2 g"] = _pattern("harmonic of the polariser angle, cos and sin")
-    fine: Float[Array, "4 f"] = _pattern("fine structure over the field")
-    exposures: Float[Array, "e 4"] = _pattern("one camera in one exposure")
+    vectors: Float[Array, "k 2 s"] = _pattern("change of an analysis vector, relative to its first element")
+    harmonics: Float[Array, "k h 2 g"] = _pattern("harmonic of the polariser angle, cos and sin")
+    fine: Float[Array, "k f"] = _pattern("fine structure over the field")
+    exposures: Float[Array, "e k"] = _pattern("one camera in one exposure")
     blocks: tuple[str, ...] = eqx.field(static=True, default=(), converter=tuple)
 
     name: ClassVar[str] = "free_form"
@@ -72,10 +123,10 @@ class FreeForm(Effect):
             if name not in BLOCKS:
                 raise unknown_name("block of free_form", name, BLOCKS)
         shapes = {
-            "vectors": (4, 2, len(_SMOOTH_TERMS)),
-            "harmonics": (4, len(HARMONICS), 2, len(_GRADIENT_TERMS)),
-            "fine": (4, len(_FINE_TERMS)),
-            "exposures": (context.exposures, 4),
+            "vectors": (context.cameras, 2, len(_SMOOTH_TERMS)),
+            "harmonics": (context.cameras, len(HARMONICS), 2, len(_GRADIENT_TERMS)),
+            "fine": (context.cameras, len(_FINE_TERMS)),
+            "exposures": (context.exposures, context.cameras),
         }
         zeros = {
             name: jnp.zeros(shape if name in blocks else (0, *shape[1:])) for name, shape in shapes.items()
@@ -93,7 +144,11 @@ class FreeForm(Effect):
         if not getattr(self, field).size:
             return []
         if field == "exposures":
-            return [f"{field}.{i}.{camera}" for i in range(len(self.exposures)) for camera in CAMERAS]
+            return [
+                f"{field}.{i}.{camera}"
+                for i in range(len(self.exposures))
+                for camera in _cameras(self.exposures.shape[1])
+            ]
         if field == "fine":
             inner = _tags(_FINE_TERMS)
         elif field == "vectors":
@@ -105,32 +160,14 @@ class FreeForm(Effect):
                 for wave in ("cos", "sin")
                 for tag in _tags(_GRADIENT_TERMS)
             ]
-        return [f"{field}.{camera}.{rest}" for camera in CAMERAS for rest in inner]
+        return [
+            f"{field}.{camera}.{rest}" for camera in _cameras(getattr(self, field).shape[0]) for rest in inner
+        ]
 
-    def cameras(self, vectors: Float[Array, "b 4 4"], x: Scalar, y: Scalar) -> Float[Array, "b 4 4"]:
-        """Add the smooth pattern to the q and u elements."""
-        if not self.vectors.size:
-            return vectors
-        change = self.vectors @ legendre.basis(x, y, SMOOTH)
-        return vectors.at[:, :, 1:3].add(vectors[:, :, :1] * change)
-
-    def recorded(
-        self,
-        counts: Float[Array, "e 4"],
-        unpolarised: Float[Array, "e 4"],
-        exposures: ExposureArrays,
-        x: Scalar,
-        y: Scalar,
-    ) -> Float[Array, "e 4"]:
-        """Add harmonics, fine structure and single exposures."""
-        share: Float[Array, "e 4"] = jnp.zeros_like(counts)
-        if self.harmonics.size:
-            angle = exposures.clp_angle[:, None] * jnp.asarray(HARMONICS)
-            waves = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
-            size = self.harmonics @ legendre.basis(x, y, GRADIENT)
-            share += jnp.where(exposures.clp_in[:, None], jnp.einsum("ehw,khw->ek", waves, size), 0.0)
-        if self.fine.size:
-            share += self.fine @ legendre.basis(x, y, FINE)[len(_SMOOTH_TERMS) :]
-        if self.exposures.size:
-            share += self.exposures
-        return counts + unpolarised * share
+    def patch(self, instrument: Instrument) -> Instrument:
+        """Add the blocks: smooth and fine patterns to the cameras, harmonics and single exposures to the exposures."""
+        if self.vectors.size or self.fine.size:
+            instrument = instrument.with_part("mixing", Pattern(self.vectors, self.fine))
+        if self.harmonics.size or self.exposures.size:
+            instrument = instrument.with_part("exposures", Shares(self.harmonics, self.exposures))
+        return instrument

@@ -2,7 +2,7 @@
 
 Equation    N(X, Y) → N(X, Y) + share · N(−X, −Y) in the same camera, for extended sources (SOURCE = −1)
 Symbols     share: of the light at the opposite field point
-Source      calibration contract, section 6; reflections between detector and window are point-symmetric
+Source      reflections between detector and window are point-symmetric
             about the axis.
 Neutral     share = 0
 Revealed by polariser and Moon exposures whose response resembles that of the opposite field point, while
@@ -14,31 +14,46 @@ there.
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from walop_jax.model.effects.base import CONTRACT, Effect, Scalar
+from walop_jax.model.cameras import GhostPart
+from walop_jax.model.effects.base import Effect, Scalar
 from walop_jax.model.parameters import param
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+
+SOURCE = "reflections between detector and window: expected size"
+
+
+class PointGhost(GhostPart):
+    """A share of the light of the opposite field point, for extended sources."""
+
+    share: Scalar
+
+    def seen(self, extended: Bool[Array, " e"], opposite: Float[Array, "e k"]) -> Float[Array, "e k"]:
+        """What the opposite point adds."""
+        return jnp.where(extended[:, None], self.share * opposite, 0.0)
 
 
 class Ghost(Effect):
     """A share of the counts at the opposite field point."""
 
     share: Scalar = param(
-        unit="", about="share of the opposite point", source=CONTRACT, width=0.005, default=0.0
+        unit="", about="share of the opposite point", source=SOURCE, width=0.005, default=0.0
     )
 
     name: ClassVar[str] = "ghost"
+    reference: ClassVar[str] = SOURCE
     one_sided: ClassVar[tuple[str, ...]] = ("share",)
     revealed_by: ClassVar[str] = "extended sources and stars at the same field points"
     separated_by: ClassVar[str] = (
         "a star dithered over the field: its ghost moves the other way, flats and throughput do not"
     )
 
-    def mirrored(
-        self, counts: Float[Array, "e 4"], opposite: Float[Array, "e 4"], extended: Bool[Array, " e"]
-    ) -> Float[Array, "e 4"]:
-        """Add the opposite point."""
-        return counts + jnp.where(extended[:, None], self.share * opposite, 0.0)
+    def patch(self, instrument: Instrument) -> Instrument:
+        """Add the opposite field point."""
+        return instrument.with_part("ghosts", PointGhost(self.share))

@@ -3,7 +3,7 @@
 Equation    n_e − n_o → (n_e − n_o) (1 − coefficient · b · (TEMP − 10 °C)), n_o unchanged
 Symbols     b relative change per kelvin, 1.23e-4 quartz and 5.37e-5 MgF2; TEMP [Celsius]; coefficient, 1
             for crystals that behave as published
-Source      calibration contract, section 6; Etzel, Rose & Wang 2000, Appl. Opt. 39, 5796.
+Source      Etzel, Rose & Wang 2000, Appl. Opt. 39, 5796.
 Neutral     coefficient = 0
 Revealed by cross-talk that changes with the temperature of the instrument: 0.84° of retardance per kelvin
             for plates of 1.5 waves, since the two crystals do not cancel. A missing TEMP counts as 10 °C.
@@ -11,12 +11,16 @@ Revealed by cross-talk that changes with the temperature of the instrument: 0.84
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from walop_jax.model.effects.base import CONTRACT, Conditions, Effect, Scalar
-from walop_jax.model.materials import MGF2_THERMAL, QUARTZ_THERMAL, REFERENCE_TEMPERATURE
+from walop_jax.model.effects.base import Effect, Scalar
+from walop_jax.model.elements import WavePlate
 from walop_jax.model.parameters import param
-from walop_jax.model.plates import Plate
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+
+SOURCE = "Etzel, Rose & Wang 2000, Appl. Opt. 39, 5796"
 
 
 class HwpTemperature(Effect):
@@ -25,27 +29,23 @@ class HwpTemperature(Effect):
     coefficient: Scalar = param(
         unit="",
         about="of the published thermal change",
-        source=CONTRACT,
+        source=SOURCE,
         width=1.0,
-        optical=True,
         default=0.0,
     )
 
     name: ClassVar[str] = "hwp_temperature"
-    optics_depend_on: ClassVar[tuple[str, ...]] = ("temperature",)
+    reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = "the same polariser exposures at two temperatures"
     separated_by: ClassVar[str] = (
         "a time series with a temperature log: at one temperature it cannot be told from thickness; wedge "
         "and flexure are odd in the field, this is even"
     )
 
-    def plates(self, where: str, plates: tuple[Plate, ...], conditions: Conditions) -> tuple[Plate, ...]:
-        """Scale the birefringence of quartz and MgF2."""
-        warmer = self.coefficient * (conditions.temperature - REFERENCE_TEMPERATURE)
-        return tuple(
-            plate._replace(
-                extraordinary=plate.ordinary
-                + (plate.extraordinary - plate.ordinary) * (1.0 - thermal * warmer)
+    def patch(self, instrument: Instrument) -> Instrument:
+        """Let the birefringence of all wave plates change with temperature."""
+        for place in instrument.places(WavePlate):
+            instrument = instrument.changed(
+                place, thermal=lambda c: self.coefficient if c is None else c + self.coefficient
             )
-            for plate, thermal in zip(plates, (QUARTZ_THERMAL, MGF2_THERMAL), strict=True)
-        )
+        return instrument

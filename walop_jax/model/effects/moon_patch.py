@@ -2,7 +2,7 @@
 
 Equation    (q, u) of exposure e → (q, u) + (q_e, u_e), the same over the field, in the ICS
 Symbols     q_e, u_e for each exposure of KIND `moon`
-Source      calibration contract, section 6; neutral points and aerosol: a third of the patches of RoboPol
+Source      neutral points and aerosol: a third of the patches of RoboPol
             were not what single scattering says (Maharana et al. 2023, A&A 679, A68).
 Neutral     all 0
 Revealed by Moon patches that disagree with each other under the instrument that polariser and standards
@@ -12,15 +12,20 @@ Revealed by Moon patches that disagree with each other under the instrument that
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from walop_jax.model.effects.base import CONTRACT, Context, Effect
+from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.parameters import param
+from walop_jax.model.sources import Patches
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+
+SOURCE = "Maharana et al. 2023, A&A 679, A68"
 
 
 class MoonPatch(Effect):
@@ -28,10 +33,11 @@ class MoonPatch(Effect):
 
     positions: tuple[int, ...] = eqx.field(static=True)
     ids: tuple[int, ...] = eqx.field(static=True)
-    q: Float[Array, " m"] = param(unit="", about="added to q of the patch", source=CONTRACT, width=0.005)
-    u: Float[Array, " m"] = param(unit="", about="added to u of the patch", source=CONTRACT, width=0.005)
+    q: Float[Array, " m"] = param(unit="", about="added to q of the patch", source=SOURCE, width=0.005)
+    u: Float[Array, " m"] = param(unit="", about="added to u of the patch", source=SOURCE, width=0.005)
 
     name: ClassVar[str] = "moon_patch"
+    reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = "Moon patches with polariser exposures"
     separated_by: ClassVar[str] = (
         "the same patch again an hour later, or at another ROTATOR angle: the sky turns, the telescope not"
@@ -51,6 +57,6 @@ class MoonPatch(Effect):
         """None: the exposures belong to the data."""
         return {}
 
-    def moon(self, beam: Float[Array, "e 2"], sky: Float[Array, "e 2"]) -> Float[Array, "e 2"]:
+    def patch(self, instrument: Instrument) -> Instrument:
         """Add the values of each patch."""
-        return beam.at[np.asarray(self.positions, int)].add(jnp.stack([self.q, self.u], axis=-1))
+        return instrument.changed("sky", patches=Patches(self.q, self.u, self.positions))

@@ -2,7 +2,7 @@
 
 Equation    N_k → N_k + level_k · median over the field of the measured counts of camera k in that exposure
 Symbols     level per camera, a share
-Source      calibration contract, section 6; 0.1–1 % of diffuse light is common in focal reducers.
+Source      0.1–1 % of diffuse light is common in focal reducers.
 Neutral     level = 0
 Revealed by efficiencies that are lower where the field is darker (vignetted corners, stars fainter than the
             median).
@@ -11,22 +11,38 @@ Revealed by efficiencies that are lower where the field is darker (vignetted cor
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 from jaxtyping import Array, Float
 
-from walop_jax.model.conventions import CAMERAS
-from walop_jax.model.effects.base import CONTRACT, Context, Effect, ExposureArrays, per_camera
+from walop_jax.model.cameras import DetectorPart, per_camera
+from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.parameters import param
+from walop_jax.model.sources import ExposureArrays
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+
+SOURCE = "diffuse light of 0.1 to 1 % is common in focal reducers: expected size"
+
+
+class DiffuseLight(DetectorPart):
+    """A share of the median counts of the exposure everywhere."""
+
+    level: Float[Array, " k"]
+
+    def reported(self, counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
+        """Add the pedestal."""
+        return counts + self.level * exposures.median
 
 
 class Pedestal(Effect):
     """A share of the exposure's median counts everywhere."""
 
-    level: Float[Array, 4] = param(unit="", about="share of the median counts", source=CONTRACT, width=0.003)
+    level: Float[Array, " k"] = param(unit="", about="share of the median counts", source=SOURCE, width=0.003)
 
     name: ClassVar[str] = "pedestal"
-    uses_median: ClassVar[bool] = True
+    reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = (
         "polariser exposures: modulation of one camera that is diluted by light of all angles"
     )
@@ -38,14 +54,12 @@ class Pedestal(Effect):
     @classmethod
     def neutral(cls, context: Context) -> Self:
         """No pedestal in any camera."""
-        return cls(level=per_camera())
+        return cls(level=per_camera(context.cameras))
 
     def labels(self, field: str) -> Sequence[str]:
         """One level per camera."""
-        return tuple(f"{field}.{camera}" for camera in CAMERAS)
+        return tuple(f"{field}.n{k}" for k in range(self.level.shape[0]))
 
-    def detector(self, counts: Float[Array, "e 4"], exposures: ExposureArrays) -> Float[Array, "e 4"]:
+    def patch(self, instrument: Instrument) -> Instrument:
         """Add the pedestal."""
-        if exposures.median is None:
-            raise ValueError("pedestal: the median counts of the exposures are missing from the plan")
-        return counts + self.level * exposures.median
+        return instrument.with_part("detectors", DiffuseLight(self.level))

@@ -2,7 +2,7 @@
 
 Equation    α → α + angle for the optic axes of both crystals of the plate
 Symbols     α fast axis in the ICS (0° HWP1, 22.5° HWP2, CHWP_ANGLE); angle [deg]
-Source      calibration contract, section 6; 1.8° was found in an instrument in use (NaCo, SPIE 9147, 87),
+Source      1.8° was found in an instrument in use (NaCo, SPIE 9147, 87),
             0.1° is the repeatability of good mounts.
 Neutral     angle = 0
 Revealed by an analyser turned by 2 angle, in one half (or behind the calibration plate) only, constant over
@@ -11,29 +11,28 @@ Revealed by an analyser turned by 2 angle, in one half (or behind the calibratio
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-import jax.numpy as jnp
-
-from walop_jax.model.effects.base import CONTRACT, Conditions, Effect, Scalar
+from walop_jax.model.effects.base import Effect, Scalar
 from walop_jax.model.parameters import param
-from walop_jax.model.plates import Plate
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+
+SOURCE = "Girard et al. 2014, Proc. SPIE 9147, 87"
 
 
 class PlateAxis(Effect):
     """Both crystals of the plate `where` turned."""
 
-    angle: Scalar = param(
-        unit="deg", about="added to the fast axis", source=CONTRACT, width=0.3, optical=True, default=0.0
-    )
+    angle: Scalar = param(unit="deg", about="added to the fast axis", source=SOURCE, width=0.3, default=0.0)
 
     where: ClassVar[str]
+    reference: ClassVar[str] = SOURCE
 
-    def plates(self, where: str, plates: tuple[Plate, ...], conditions: Conditions) -> tuple[Plate, ...]:
-        """Turn all crystals."""
-        if where != self.where:
-            return plates
-        return tuple(plate._replace(axis=plate.axis + jnp.deg2rad(self.angle)) for plate in plates)
+    def patch(self, instrument: Instrument) -> Instrument:
+        """Turn the plate."""
+        return instrument.changed(self.where, axis=lambda axis: axis + self.angle)
 
 
 class ChwpAxis(PlateAxis):
@@ -51,7 +50,7 @@ class Hwp1Axis(PlateAxis):
     """Fast axis of HWP1 = angle."""
 
     name: ClassVar[str] = "hwp1_axis"
-    where: ClassVar[str] = "half1"
+    where: ClassVar[str] = "half1.plate"
     revealed_by: ClassVar[str] = "polariser exposures: the q half is turned against the u half"
     separated_by: ClassVar[str] = (
         "a polarised standard (together with the u half) separates it from the zero of the polariser; a "
@@ -63,6 +62,6 @@ class Hwp2Axis(PlateAxis):
     """Fast axis of HWP2 = 22.5° + angle."""
 
     name: ClassVar[str] = "hwp2_axis"
-    where: ClassVar[str] = "half2"
+    where: ClassVar[str] = "half2.plate"
     revealed_by: ClassVar[str] = "polariser exposures: the u half is turned against the q half"
     separated_by: ClassVar[str] = Hwp1Axis.separated_by.replace("u half", "q half")

@@ -2,7 +2,7 @@
 
 Equation    optic axis of MgF2 = α + 90° + angle, that of quartz stays at α
 Symbols     α fast axis of the plate; angle [deg]
-Source      calibration contract, section 6; 0.1–0.2° of clocking between crystals (Harrington et al. 2023,
+Source      0.1–0.2° of clocking between crystals (Harrington et al. 2023,
             JATIS 9, 038003), which makes 0.35–1.4 % of cross-talk.
 Neutral     angle = 0
 Revealed by cross-talk that oscillates fast with wavelength (35 waves), and by linear cross-talk of both
@@ -11,46 +11,46 @@ Revealed by cross-talk that oscillates fast with wavelength (35 waves), and by l
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-import jax.numpy as jnp
-
-from walop_jax.model.effects.base import CONTRACT, Conditions, Effect, Scalar
+from walop_jax.model.effects.base import Effect, Scalar
 from walop_jax.model.parameters import param
-from walop_jax.model.plates import Plate
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+
+SOURCE = "Harrington et al. 2023, JATIS 9, 038003"
 
 
 class PlateCrossing(Effect):
     """MgF2 of the plate `where` turned against its quartz."""
 
     angle: Scalar = param(
-        unit="deg", about="added to the axis of MgF2", source=CONTRACT, width=0.15, optical=True, default=0.0
+        unit="deg", about="added to the axis of MgF2", source=SOURCE, width=0.15, default=0.0
     )
 
     where: ClassVar[str]
+    reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = "polariser exposures in narrow bands, or over the field"
     separated_by: ClassVar[str] = (
         "several narrow bands (it oscillates with wavelength, a turned plate does not) and the calibration "
         "plate"
     )
 
-    def plates(self, where: str, plates: tuple[Plate, ...], conditions: Conditions) -> tuple[Plate, ...]:
+    def patch(self, instrument: Instrument) -> Instrument:
         """Turn the MgF2 alone."""
-        if where != self.where:
-            return plates
-        quartz, mgf2 = plates
-        return quartz, mgf2._replace(axis=mgf2.axis + jnp.deg2rad(self.angle))
+        return instrument.changed(f"{self.where}.mgf2", axis=lambda axis: axis + self.angle)
 
 
 class Hwp1Crossing(PlateCrossing):
     """HWP1."""
 
     name: ClassVar[str] = "hwp1_crossing"
-    where: ClassVar[str] = "half1"
+    where: ClassVar[str] = "half1.plate"
 
 
 class Hwp2Crossing(PlateCrossing):
     """HWP2."""
 
     name: ClassVar[str] = "hwp2_crossing"
-    where: ClassVar[str] = "half2"
+    where: ClassVar[str] = "half2.plate"

@@ -2,25 +2,28 @@
 
 Equation    c = (cos α cos angle, sin α cos angle, sin angle) for one crystal of the plate
 Symbols     c optic axis, along the light for 90°; α its azimuth; angle [deg]
-Source      calibration contract, section 6; to first order the retardance changes by 2π d Δn/(λ n) · 2
+Source      to first order the retardance changes by 2π d Δn/(λ n) · 2
             angle · s·c, odd in the field angle: about 0.55° per degree of incidence for 0.1° in a plate of
             36 waves. Cutting errors of large crystals: Harrington et al. 2023, JATIS 9, 038003.
 Neutral     angle = 0 (the waves are then those of `plates.stack_jones`; the general solver gives the same)
 Revealed by a part of the cross-talk that is odd in the field angle and grows with the number of waves.
 
-The contract speaks of "a plate": the discrete choice `crystal` says which, quartz unless said otherwise.
+The discrete choice `crystal` says which, quartz unless said otherwise.
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import equinox as eqx
-import jax.numpy as jnp
 
-from walop_jax.model.effects.base import CONTRACT, Conditions, Context, Effect, Scalar
+from walop_jax.model.effects.base import Context, Effect, Scalar
 from walop_jax.model.parameters import param
-from walop_jax.model.plates import Plate
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+
+SOURCE = "Harrington et al. 2023, JATIS 9, 038003"
 
 CRYSTALS = ("quartz", "mgf2")
 
@@ -31,14 +34,14 @@ class PlateCut(Effect):
     angle: Scalar = param(
         unit="deg",
         about="optic axis out of the surface",
-        source=CONTRACT,
+        source=SOURCE,
         width=0.1,
-        optical=True,
         default=0.0,
     )
     crystal: str = eqx.field(static=True, default=CRYSTALS[0])
 
     where: ClassVar[str]
+    reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = "polariser exposures over the field, best in narrow bands"
     separated_by: ClassVar[str] = (
         "narrow bands separate it from the wedge angle (it grows with the waves, the wedge with geometry); "
@@ -54,26 +57,22 @@ class PlateCut(Effect):
         """Either crystal."""
         return tuple((cls(crystal=crystal),) for crystal in CRYSTALS)
 
-    def plates(self, where: str, plates: tuple[Plate, ...], conditions: Conditions) -> tuple[Plate, ...]:
+    def patch(self, instrument: Instrument) -> Instrument:
         """Tilt the optic axis of the crystal."""
-        if where != self.where:
-            return plates
-        changed: list[Any] = list(plates)
-        i = CRYSTALS.index(self.crystal)
-        tilt = jnp.broadcast_to(jnp.deg2rad(self.angle), jnp.shape(plates[i].axis))
-        changed[i] = plates[i]._replace(cut=tilt)
-        return tuple(changed)
+        return instrument.changed(
+            f"{self.where}.{self.crystal}", cut=lambda cut: self.angle if cut is None else cut + self.angle
+        )
 
 
 class Hwp1AxisCut(PlateCut):
     """HWP1."""
 
     name: ClassVar[str] = "hwp1_axis_cut"
-    where: ClassVar[str] = "half1"
+    where: ClassVar[str] = "half1.plate"
 
 
 class Hwp2AxisCut(PlateCut):
     """HWP2."""
 
     name: ClassVar[str] = "hwp2_axis_cut"
-    where: ClassVar[str] = "half2"
+    where: ClassVar[str] = "half2.plate"

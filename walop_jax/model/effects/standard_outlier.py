@@ -2,7 +2,7 @@
 
 Equation    (Q, U) of the star → (Q + q, U + u), equatorial frame
 Symbols     q, u difference from the catalogue; source: name of the star
-Source      calibration contract, section 6; some classical standards vary (Blinov et al. 2023, A&A 677,
+Source      some classical standards vary (Blinov et al. 2023, A&A 677,
             A144).
 Neutral     q = u = 0
 Revealed by one star that is off by the same Stokes parameters wherever in the field it stands.
@@ -10,23 +10,28 @@ Revealed by one star that is off by the same Stokes parameters wherever in the f
 
 from __future__ import annotations
 
-from typing import ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import equinox as eqx
-from jaxtyping import Array, Float
 
-from walop_jax.model.effects.base import CONTRACT, Context, Effect, Scalar
+from walop_jax.model.effects.base import Context, Effect, Scalar
 from walop_jax.model.parameters import param, unknown_name
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+
+SOURCE = "Blinov et al. 2023, A&A 677, A144"
 
 
 class StandardOutlier(Effect):
     """Stokes parameters of one standard differ from the catalogue."""
 
-    q: Scalar = param(unit="", about="added to the catalogue q", source=CONTRACT, width=0.005, default=0.0)
-    u: Scalar = param(unit="", about="added to the catalogue u", source=CONTRACT, width=0.005, default=0.0)
+    q: Scalar = param(unit="", about="added to the catalogue q", source=SOURCE, width=0.005, default=0.0)
+    u: Scalar = param(unit="", about="added to the catalogue u", source=SOURCE, width=0.005, default=0.0)
     source: str = eqx.field(static=True, default="")
 
     name: ClassVar[str] = "standard_outlier"
+    reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = "several standards, one of which disagrees with the others"
     separated_by: ClassVar[str] = (
         "the star at several ROTATOR angles: a wrong catalogue turns with the sky, the telescope not"
@@ -42,11 +47,14 @@ class StandardOutlier(Effect):
         """Any one of the stars."""
         return tuple((cls(source=name),) for name in context.sources)
 
-    def catalogue(
-        self, q: Float[Array, " s"], u: Float[Array, " s"], names: tuple[str, ...]
-    ) -> tuple[Float[Array, " s"], Float[Array, " s"]]:
+    def patch(self, instrument: Instrument) -> Instrument:
         """Move the values of the star."""
+        from walop_jax.model.instrument import NoSuchPlaceError
+
+        names = instrument.standard.names
         if self.source not in names:
-            raise unknown_name("standard star", self.source, names)
+            raise NoSuchPlaceError(str(unknown_name("standard star", self.source, names)))
         row = names.index(self.source)
-        return q.at[row].add(self.q), u.at[row].add(self.u)
+        return instrument.changed(
+            "standard", q=lambda q: q.at[row].add(self.q), u=lambda u: u.at[row].add(self.u)
+        )

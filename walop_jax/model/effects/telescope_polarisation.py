@@ -3,7 +3,7 @@
 Equation    M = [[1, 0], [(q, u, 0)ᵀ, 1]]: (0, q, u, 0) per unit of light is added to every beam from the
             sky
 Symbols     q, u in the ICS
-Source      calibration contract, section 6; 0.3 % was found on a Cassegrain telescope with aged mirrors
+Source      0.3 % was found on a Cassegrain telescope with aged mirrors
             (Patat & Taubenberger 2011, A&A 529, A57), Paper II assumes less than 0.01 %.
 Neutral     q = u = 0
 Revealed by zero offsets of Moon and stars that polariser exposures do not have (light through the polariser
@@ -12,23 +12,26 @@ Revealed by zero offsets of Moon and stars that polariser exposures do not have 
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from jaxtyping import Array, Float
-
-from walop_jax.model.effects.base import CONTRACT, Effect, Scalar
+from walop_jax.model.effects.base import Effect, Scalar
+from walop_jax.model.elements import AddedPolarisation
 from walop_jax.model.parameters import param
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+
+SOURCE = "Patat & Taubenberger 2011, A&A 529, A57"
 
 
 class TelescopePolarisation(Effect):
     """(0, q, u, 0) added to light from the sky."""
 
-    q: Scalar = param(unit="", about="polarisation added along +X", source=CONTRACT, width=0.002, default=0.0)
-    u: Scalar = param(
-        unit="", about="polarisation added along +45°", source=CONTRACT, width=0.002, default=0.0
-    )
+    q: Scalar = param(unit="", about="polarisation added along +X", source=SOURCE, width=0.002, default=0.0)
+    u: Scalar = param(unit="", about="polarisation added along +45°", source=SOURCE, width=0.002, default=0.0)
 
     name: ClassVar[str] = "telescope_polarisation"
+    reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = (
         "unpolarised or known standards, with polariser exposures of the same field points"
     )
@@ -38,6 +41,7 @@ class TelescopePolarisation(Effect):
         "does not"
     )
 
-    def telescope(self, mueller: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
-        """Add to S1 and S2 in proportion to S0."""
-        return mueller.at[1].add(self.q * mueller[0]).at[2].add(self.u * mueller[0])
+    def patch(self, instrument: Instrument) -> Instrument:
+        """Insert what the telescope adds ahead of the polariser."""
+        added = AddedPolarisation(name=self.name, q=self.q, u=self.u)
+        return instrument.inserted(added, before="polariser")

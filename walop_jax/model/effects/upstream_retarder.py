@@ -2,7 +2,7 @@
 
 Equation    M = Ret(delta, axis) · collimator
 Symbols     delta retardance [rad]; axis of the fast direction, from +X toward +Y [deg]
-Source      calibration contract, section 6; stress in a window or in the last lens (Selbing 2005,
+Source      stress in a window or in the last lens (Selbing 2005,
             arXiv:1010.4142, needed five parameters for one lens).
 Neutral     delta = 0, whatever the axis
 Revealed by V picked up ahead of the plates: cross-talk in both halves that does not follow their field
@@ -15,24 +15,30 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from walop_jax.model import mueller as mm
-from walop_jax.model.effects.base import CONTRACT, Effect, Scalar
+from walop_jax.model.effects.base import Effect, Scalar
+from walop_jax.model.elements import Retarder
 from walop_jax.model.parameters import param
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+
+SOURCE = "Selbing 2005, arXiv:1010.4142"
 
 
 class UpstreamRetarder(Effect):
     """Uniform linear retarder behind the collimator."""
 
-    delta: Scalar = param(unit="rad", about="retardance", source=CONTRACT, width=0.02, default=0.0)
-    axis: Scalar = param(unit="deg", about="fast axis", source=CONTRACT, scale=10.0, loose=500.0, default=0.0)
+    delta: Scalar = param(unit="rad", about="retardance", source=SOURCE, width=0.02, default=0.0)
+    axis: Scalar = param(unit="deg", about="fast axis", source=SOURCE, scale=10.0, loose=500.0, default=0.0)
 
     name: ClassVar[str] = "upstream_retarder"
+    reference: ClassVar[str] = SOURCE
     shape: ClassVar[tuple[str, ...]] = ("axis",)
     starts: ClassVar[tuple[tuple[Mapping[str, Any], ...], ...]] = (({"axis": 0.0}, {"axis": 45.0}),)
     revealed_by: ClassVar[str] = "polariser exposures over the field"
@@ -40,10 +46,6 @@ class UpstreamRetarder(Effect):
         "the calibration plate at 45° turns what it makes but not errors of HWP2; narrow bands and "
         "temperature tell it from retardance of the plates"
     )
-
-    def upstream(self, mueller: Float[Array, "4 4"], x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
-        """Retard what leaves the collimator."""
-        return mm.retarder(self.delta, jnp.deg2rad(self.axis)) @ mueller
 
     @classmethod
     def combine(cls, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
@@ -56,3 +58,7 @@ class UpstreamRetarder(Effect):
         """Positive retardance, axis in [0°, 180°)."""
         axis = (float(self.axis) + (90.0 if float(self.delta) < 0 else 0.0)) % 180.0
         return dataclasses.replace(self, delta=jnp.abs(self.delta), axis=axis)
+
+    def patch(self, instrument: Instrument) -> Instrument:
+        """Insert a retarder behind the collimator."""
+        return instrument.inserted(Retarder(name=self.name, delta=self.delta, axis=self.axis), before="pupil")

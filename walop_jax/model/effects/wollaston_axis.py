@@ -2,29 +2,33 @@
 
 Equation    analysers ½ (1, ±η cos 2 angle, ±η sin 2 angle, 0)
 Symbols     angle of the analysers from +X toward +Y [deg]; η their efficiency
-Source      calibration contract, section 6.
+Source      mounting of the prisms.
 Neutral     angle = 0
 Revealed by an analysed direction that is turned the same way in both halves.
 """
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-import jax.numpy as jnp
-
-from walop_jax.model.effects.base import CONTRACT, Effect, Scalar
+from walop_jax.model.effects.base import Effect, Scalar
 from walop_jax.model.parameters import param
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+
+SOURCE = "mounting of the prisms: expected size"
 
 
 class WollastonAxis(Effect):
     """Analysers of both halves rotated."""
 
     angle: Scalar = param(
-        unit="deg", about="rotation of the analysers", source=CONTRACT, width=0.3, optical=True, default=0.0
+        unit="deg", about="rotation of the analysers", source=SOURCE, width=0.3, default=0.0
     )
 
     name: ClassVar[str] = "wollaston_axis"
+    reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = "polariser exposures with polarised standards"
     separated_by: ClassVar[str] = (
         "nothing at one field point: only 2 α − angle enters; the field pattern of the plates, whose axes "
@@ -32,6 +36,11 @@ class WollastonAxis(Effect):
         "from the polariser's zero"
     )
 
-    def analyser_angle(self, angle: Scalar | float) -> Scalar | float:
-        """Turn the analysers."""
-        return angle + jnp.deg2rad(self.angle)
+    def patch(self, instrument: Instrument) -> Instrument:
+        """Turn the analysers of all arms."""
+        for arm in instrument.arms:
+            place = f"{arm.name}.{arm.path[-1]}"
+            instrument = instrument.changed(
+                place, angle=lambda a: self.angle if a is None else a + self.angle
+            )
+        return instrument

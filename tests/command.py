@@ -1,0 +1,35 @@
+"""The program called in this process, for tests that hold a command against something."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from walop_jax.cli import app
+
+Call = Callable[..., Any]  # gives a `Result`: typer brings its own click, or uses an installed one
+
+
+@pytest.fixture(autouse=True, scope="session")
+def no_cache():
+    """No cache of compiled code but that of pytest; wide tables."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("WALOP_JAX_CACHE", "off")
+        patch.setenv("COLUMNS", "200")
+        yield
+
+
+@pytest.fixture(scope="session")
+def call() -> Call:
+    """Run a command in this process; exceptions that are no exit code count as test failures."""
+
+    def run(*args: object) -> Any:
+        result = CliRunner().invoke(app, [str(arg) for arg in args])
+        if result.exception is not None and not isinstance(result.exception, SystemExit):
+            raise result.exception
+        return result
+
+    return run

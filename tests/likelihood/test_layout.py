@@ -1,0 +1,83 @@
+"""What is decided before anything is computed, and that nothing computed changes it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from walop_jax.fit.model_builder import base_model
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.layout import Layout, bytes_per_point
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
+
+RUN = ObservingPlan(
+    grid=20, standard_grid=1, standards=0, unpolarised=0, moon_patches=2, polariser_angles=polariser_turn(6),
+    throughput_degree=2,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def calset():
+    return simulate(RUN, seed=2).calset
+
+
+@pytest.fixture(scope="module")
+def model(calset):
+    return base_model(calset, throughput_degree=2)
+
+
+@pytest.mark.parametrize("memory", [1e9, 1e7, 2e6])
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("chunk", [None, 7, 64, 10_000])
+def test_pieces_cover_the_set_within_its_memory(calset, model, memory, threads, chunk):
+    layout = Layout.of(calset, model, memory=memory, threads=threads, points_per_chunk=chunk)
+    assert layout.points == 400
+    assert layout.chunk == min(chunk or limits.POINTS_PER_CHUNK, 400)
+    assert layout.slab % layout.chunk == 0
+    assert (layout.slabs - 1) * layout.slab < 400 <= layout.slabs * layout.slab
+    assert (layout.chunks - 1) * layout.chunk < 400 <= layout.chunks * layout.chunk
+    each = bytes_per_point(len(calset.exposures))
+    assert layout.kept == (2 * each * 400 <= memory)
+    # One chunk for each thread is the least that there can be.
+    assert layout.memory <= max(memory, limits.READING * threads * each * layout.chunk)
+
+
+def test_the_size_of_a_set_decides_how_it_is_handled(calset, model, monkeypatch):
+    def handled():
+        layout = Layout.of(calset, model)
+        return layout.interpolated, layout.large, layout.chunk
+
+    assert handled() == (False, False, limits.POINTS_PER_CHUNK)
+    monkeypatch.setattr(limits, "INTERPOLATE_ABOVE", 399)
+    monkeypatch.setattr(limits, "LARGE_CHUNK", 100)
+    assert handled() == (True, False, 100)
+    monkeypatch.setattr(limits, "LARGE_ABOVE", 399)
+    assert handled() == (True, True, 100)
+    # Where the optics are solved point by point a matrix costs little more than a gradient.
+    assert not Layout.of(calset, model, interpolate=False).large
+
+
+def test_what_was_computed_before_changes_nothing(calset, model):
+    """Steeper rays need more nodes; back at the start it is as if nobody had been there."""
+    likelihood = Likelihood.of(calset, model, interpolate=True)
+    steep = model.start.copy()
+    steep[model.index("pupil.magnification")] *= 1.7
+    first = likelihood.expand(model.start)
+    far = likelihood.expand(steep)
+    again = likelihood.expand(model.start)
+    assert far.optics.nodes_per_side > first.optics.nodes_per_side
+    assert again.optics == first.optics
+    assert again.data == first.data
+    np.testing.assert_array_equal(again.matrix, first.matrix)
+
+
+def test_nothing_can_be_installed_afterwards(calset, model):
+    likelihood = Likelihood.of(calset, model)
+    for record in (likelihood, likelihood.layout, likelihood.points, likelihood.runner):
+        for field in dataclasses.fields(record):
+            with pytest.raises(dataclasses.FrozenInstanceError):
+                setattr(record, field.name, None)

@@ -1,0 +1,182 @@
+"""Sets that are read anew on every pass against the same sets in memory."""
+
+from __future__ import annotations
+
+import dataclasses
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import numpy as np
+import pytest
+
+from walop_jax.data import Grid, read_calibration_set, write_frames
+from walop_jax.data.records import Intensities
+from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.refit import refit
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.layout import bytes_per_point
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.points import PointReader, PointsInMemory, StreamedPoints
+from walop_jax.likelihood.thinning import thinned
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
+from walop_jax.sky.moon import moon_sky
+
+SIDE = 9
+RUN = ObservingPlan(
+    grid=SIDE, standard_grid=1, standards=0, unpolarised=0, moon_patches=3,
+    polariser_angles=polariser_turn(8, full_turn=True), throughput_degree=2,
+)  # fmt: skip
+STEP = 2 * RUN.field / (SIDE - 1)
+GRID = Grid(SIDE, SIDE, (1.0, 1.0), (-RUN.field, -RUN.field), ((STEP, 0.0), (0.0, STEP)))
+
+
+class Counted(Intensities):
+    """Notes which slabs are asked for."""
+
+    def __init__(self, inner):
+        self.inner, self.asked = inner, []
+
+    @property
+    def cameras(self):
+        return self.inner.cameras
+
+    def block(self, start, stop):
+        self.asked.append((start, stop))
+        return self.inner.block(start, stop)
+
+
+@pytest.fixture(scope="module")
+def calset(tmp_path_factory):
+    """A small run written as whole frames, a few pixels bad, and read back."""
+    table = simulate(RUN, seed=6).calset
+    # Pixels run along the rows, the points of the simulator in an order of its own.
+    order = np.lexsort((table.points.x.round(9), table.points.y.round(9)))
+    np.testing.assert_allclose(
+        np.stack([table.points.x, table.points.y])[:, order], GRID.xy(0, SIDE**2), atol=1e-12
+    )
+
+    class Ordered(Intensities):
+        def block(self, start, stop):
+            whole = table.intensities.block(0, SIDE**2)
+            rows = order[start:stop]
+            block = {f.name: np.array(getattr(whole, f.name)[rows]) for f in dataclasses.fields(whole)}
+            block["used"] &= (np.arange(start, stop) % 17 != 3)[:, None]
+            return dataclasses.replace(whole, **block)
+
+    path = tmp_path_factory.mktemp("frames") / "frames.fits"
+    write_frames(
+        path, dataclasses.replace(table, points=GRID.points, intensities=Ordered()), GRID, dtype="f8"
+    )
+    return read_calibration_set(path)
+
+
+@pytest.fixture
+def streaming(calset, monkeypatch):
+    """The same set when there is hardly any memory: three slabs of two chunks of 16 points."""
+    each = bytes_per_point(len(calset.exposures))
+    monkeypatch.setattr(limits, "MEMORY", 81 * each)
+    monkeypatch.setattr(limits, "READING", 1)
+    monkeypatch.setattr(limits, "SLABS", 2)
+    monkeypatch.setattr(limits, "LARGEST_SLAB", 32 * each)
+    return dataclasses.replace(calset, intensities=Counted(calset.intensities))
+
+
+def equal(one, other):
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_what_is_read_is_what_is_kept(calset, streaming):
+    layout = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16).layout
+    reader = PointReader(calset, layout.plan)
+    kept, read = PointsInMemory(reader, layout), StreamedPoints(reader, layout)
+    assert (len(kept), len(read), layout.slabs) == (6, 6, 3)
+    for i, (one, other) in enumerate(zip(read, kept, strict=True)):
+        equal(one, other)
+        equal(read.chunk(i), other)
+        equal(kept.chunk(i), other)
+    for points in (kept, read):
+        assert [len(points.slab(n)) for n in range(3)] == [2, 2, 2]
+        np.testing.assert_array_equal(points.gathered("x"), calset.points.x)
+
+
+def test_every_pass_reads_every_slab_once(calset, streaming):
+    likelihood = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
+    asked = streaming.intensities.asked
+    for _ in range(2):
+        asked.clear()
+        assert (
+            sum(int((np.asarray(c.weight[..., 0]) > 0).sum()) for c in likelihood.points)
+            == calset.intensities.rows
+        )
+        assert asked == [(0, 32), (32, 64), (64, 81)]
+
+
+def test_expansion_and_counts_agree(calset, streaming):
+    one = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
+    other = Likelihood.of(calset, base_model(calset, throughput_degree=2), points_per_chunk=16)
+    assert isinstance(one.points, StreamedPoints)
+    other = dataclasses.replace(other, points=PointsInMemory(other.points.reader, other.layout))
+    a, b = one.expand(one.model.start), other.expand(other.model.start)
+    assert a.data == b.data
+    np.testing.assert_array_equal(a.matrix, b.matrix)
+    # What an expansion has counted on its way is what a pass of its own counts.
+    for found in (a, b):
+        np.testing.assert_array_equal(found.census.rows, one.census.rows)
+        assert (found.n_data, found.dof) == (other.census.n_data, other.dof)
+    assert a.n_data == 4 * other.used.sum() == 4 * calset.intensities.rows
+    used = np.arange(81) % 17 != 3
+    x, y = calset.points.x[used], calset.points.y[used]
+    assert a.census.field == one.census.field == (x.min(), x.max(), y.min(), y.max())
+
+
+def test_refit_of_frames_that_do_not_fit_into_memory(calset, streaming):
+    model = base_model(calset, throughput_degree=2)
+    one, other = refit(streaming, model), refit(calset, model)
+    assert one.converged
+    assert one.chi2 == pytest.approx(other.chi2, rel=1e-12)
+
+
+def test_moon_sky_is_that_of_the_ephemeris(calset):
+    e = calset.exposures
+    moon = np.flatnonzero(e.kind == "moon")
+    read = PointReader(calset, Likelihood.of(calset, base_model(calset, throughput_degree=2)).plan)
+    x, y = GRID.xy(0, 5)
+    sky = read.sky_polarisation(x, y)
+    expected = moon_sky(e.mjd[moon], e.ra[moon], e.dec[moon], e.rotator[moon], calset.site, x, y)
+    np.testing.assert_array_equal(sky[:, moon], np.stack(expected, axis=-1))
+    assert (np.delete(sky, moon, axis=1) == 0).all()
+
+
+def test_a_fault_in_the_file_stops_the_pass(calset, streaming):
+    def broken(start, stop):
+        if start >= 32:
+            raise OSError("the disk has gone")
+        return calset.intensities.block(start, stop)
+
+    likelihood = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
+    streaming.intensities.block = broken
+    with pytest.raises(OSError, match="the disk has gone"):
+        likelihood.expand(likelihood.model.start)
+
+
+def test_a_pass_may_be_left_half_way(calset, streaming):
+    likelihood = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
+    first = next(iter(likelihood.points))
+    assert first.x.shape == (16,)
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(lambda: len(list(likelihood.points))).result(timeout=60) == 6
+
+
+def test_a_sample_is_part_of_the_set(calset):
+    sample = thinned(calset, 30)
+    assert len(sample.points) == 30
+    assert thinned(calset, 81) is calset
+    rows = np.searchsorted(calset.points.point, sample.points.point)
+    whole, part = calset.intensities.block(0, 81), sample.intensities.block(0, 30)
+    assert len(np.unique(rows)) == 30
+    for field in dataclasses.fields(part):
+        np.testing.assert_array_equal(getattr(part, field.name), getattr(whole, field.name)[rows])
+    # Spread over the field: the mean position is near its centre.
+    assert np.abs([sample.points.x.mean(), sample.points.y.mean()]).max() < 0.3 * RUN.field

@@ -1,0 +1,111 @@
+"""The arrays behind the figures, from cubes of residuals made by hand; and their file."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import handmade_run
+import numpy as np
+import pytest
+from astropy.io import fits
+from builders import exposures
+
+from walop_jax.data import DataError
+from walop_jax.diagnosis.figure_data import best_combination, compare_residuals
+from walop_jax.diagnosis.figure_file import read_figure_data, write_figure_data
+
+ANGLES = 22.5 * np.arange(16)
+SEQUENCE = exposures(
+    *({"clp_angle": a, "mjd": 61043.0 + 0.01 * i} for i, a in enumerate(ANGLES)),
+    *({"kind": "moon", "mjd": 61044.0 + 0.01 * i} for i in range(4)),
+)
+USED = np.ones((25, 20), bool)
+FIELD = np.linspace(-1.0, 1.0, 25)
+CAMERAS = np.array([1.0, -1.0, 0.5, 0.0])
+
+
+def cube(along: np.ndarray) -> np.ndarray:
+    return FIELD[:, None, None] * along[:, None] * CAMERAS
+
+
+def test_a_harmonic_is_recognised_with_its_phase():
+    wave = np.append(np.cos(3 * np.deg2rad(ANGLES) - 1.0), np.zeros(4))
+    best = best_combination(cube(wave), USED, SEQUENCE)
+    assert (best.harmonic, best.words) == (3, "cos(3 theta - 57 deg), theta the polariser angle")
+    # 16 angles over a full turn: the norm of the wave is √8, which is what the combined residual must be.
+    np.testing.assert_allclose(best.of(cube(wave), USED), FIELD[:, None] * CAMERAS * np.sqrt(8.0), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("along", "words"),
+    [
+        (np.append(np.zeros(16), np.ones(4)), "mean of the moon exposures"),
+        (SEQUENCE.mjd - SEQUENCE.mjd.mean(), "trend with time"),
+        (np.append(np.zeros(16), [1.0, -1.0, 1.0, -1.0]), "the combination of all exposures that shows it best"),
+    ],
+)  # fmt: skip
+def test_other_combinations_are_put_into_words(along, words):
+    best = best_combination(cube(along), USED, SEQUENCE)
+    assert (best.harmonic, best.words) == (-1, words)
+
+
+def test_a_pattern_that_changes_sign_over_the_field_does_not_average_out():
+    rng = np.random.default_rng(3)
+    wave = np.append(np.cos(3 * np.deg2rad(ANGLES)), np.zeros(4))
+    noise = rng.standard_normal((25, 20, 4))
+    one = compare_residuals("x", 5.0 * cube(wave) + noise, noise, USED, SEQUENCE)
+    rms = np.sqrt(np.mean(FIELD**2))
+    # Camera by camera the weights have rms 1 and the sign of the pattern: the mean of 5 · FIELD is 5 · rms.
+    expected = 5.0 * rms * wave[:, None] * np.abs(CAMERAS[:3])
+    np.testing.assert_allclose(np.abs(one.curve_explained[:, :3]), np.abs(expected), atol=1e-9)
+    assert np.median(one.curve_error) == pytest.approx(1 / 5, rel=0.2)  # 25 points of unit noise
+    np.testing.assert_allclose(one.rms_after, np.sqrt((noise**2).mean(axis=1)))
+
+
+def test_points_without_the_exposures_are_not_shown():
+    used = USED.copy()
+    used[3, :16] = False
+    wave = np.append(np.cos(2 * np.deg2rad(ANGLES)), np.zeros(4))
+    before = np.where(used[..., None], cube(wave), 0.0)
+    one = compare_residuals("", before, 0.0 * before, used, SEQUENCE)
+    assert np.flatnonzero(np.isnan(one.before).any(axis=1)).tolist() == [3]
+    assert np.isfinite(one.mean_before).all()
+
+
+def test_they_come_back_from_their_file(tmp_path):
+    made = handmade_run.figure_data(("clp_wobble", "ghost"))
+    write_figure_data(tmp_path / "diagnosis.fits", made)
+    back = read_figure_data(tmp_path / "diagnosis.fits")
+
+    def same(one, other):
+        for field in dataclasses.fields(one):
+            a, b = getattr(one, field.name), getattr(other, field.name)
+            if dataclasses.is_dataclass(a):
+                same(a, b)
+            elif isinstance(a, tuple):
+                for first, second in zip(a, b, strict=True):
+                    same(first, second)
+            else:
+                np.testing.assert_array_equal(a, b)
+
+    same(made, back)
+    with fits.open(tmp_path / "diagnosis.fits") as hdus:
+        header = hdus["FIELD"].header
+        columns = hdus["FIELD"].columns
+        assert columns["X"].unit == "deg"
+        assert "standard deviations" in header[f"TCOMM{columns.names.index('BEFORE') + 1}"]
+
+
+def test_what_is_not_such_a_file_is_refused(tmp_path):
+    path = tmp_path / "other.fits"
+    fits.PrimaryHDU().writeto(path)
+    with pytest.raises(DataError, match="DIAGVERS: is missing; run walop-jax diagnose again"):
+        read_figure_data(path)
+    with fits.open(path, mode="update") as hdus:
+        hdus[0].header["DIAGVERS"] = 7
+    with pytest.raises(DataError, match="is 7, this program reads 1"):
+        read_figure_data(path)
+    with fits.open(path, mode="update") as hdus:
+        hdus[0].header["DIAGVERS"] = 1
+    with pytest.raises(DataError, match="cannot be read"):
+        read_figure_data(path)

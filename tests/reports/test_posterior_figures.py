@@ -1,0 +1,73 @@
+"""Corner plots: what the contours hold, which panel shows what."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from matplotlib import pyplot
+
+from walop_jax.reports.posterior_figures import SHARES, corner_figure, density_levels
+
+NAMES, UNITS = ("half1.wedge", "sky.depolarisation", "noise.ln_f"), ("deg", "", "")
+
+
+@pytest.fixture(scope="module")
+def draws() -> np.ndarray:
+    covariance = np.array([[4.0, -1.2, 0.0], [-1.2, 1.0, 0.0], [0.0, 0.0, 0.01]])
+    return np.random.default_rng(1).multivariate_normal((13.0, 0.8, 0.0), covariance, 40_000)
+
+
+def test_shares_are_those_of_one_and_two_sigma():
+    np.testing.assert_allclose(SHARES, 1.0 - np.exp(-0.5 * np.array([1.0, 2.0]) ** 2), atol=6e-4)
+
+
+def test_levels_of_a_normal_density():
+    """Where the density is more than 1 − s of its peak lies the share s: exact in two dimensions."""
+    axis = np.linspace(-6.0, 6.0, 601)
+    density = np.exp(-0.5 * (axis[:, None] ** 2 + axis**2))
+    shares = (0.1, *SHARES, 0.99)
+    np.testing.assert_allclose(density_levels(density, shares), 1.0 - np.array(shares), rtol=0.01)
+
+
+def test_contours_hold_their_share_of_the_draws(draws: np.ndarray):
+    figure = corner_figure(draws, NAMES, UNITS)
+    panels = np.array(figure.axes).reshape(3, 3)
+    for i, j in ((1, 0), (2, 0), (2, 1)):
+        lines = panels[i, j].collections[1].get_paths()
+        inside = [path.contains_points(draws[:, [j, i]]).mean() for path in lines]
+        # Smoothing widens them a little.
+        np.testing.assert_allclose(inside, SHARES[::-1], atol=0.05)
+        assert np.all(inside > np.array(SHARES[::-1]) - 0.01)
+
+
+def test_every_panel_shows_its_coefficients(draws: np.ndarray):
+    figure = corner_figure(draws, NAMES, UNITS, reference=np.array([13.5, 0.9, 0.0]))
+    panels = np.array(figure.axes).reshape(3, 3)
+    assert [[axes.get_visible() for axes in row] for row in panels] == np.tri(3, dtype=bool).tolist()
+    for i in range(3):
+        for j in range(i + 1):
+            low, high = panels[i, j].get_xlim()
+            assert low < draws[:, j].min() < draws[:, j].max() < high
+            if i > j:
+                low, high = panels[i, j].get_ylim()
+                assert low < draws[:, i].min() < draws[:, i].max() < high
+    counts = panels[0, 0].patches[0].get_xy()[:, 1]
+    assert (
+        counts.max() == np.histogram(draws[:, 0], np.unique(panels[0, 0].patches[0].get_xy()[:, 0]))[0].max()
+    )
+    assert panels[0, 0].get_title(loc="left") == "$w_1$\n13.0 ± 2.0 deg"
+    assert [line.get_xdata()[0] for line in panels[2, 1].lines[1:2]] == [0.9]
+    assert panels[2, 0].get_xlabel() == "$w_1$ [deg]"
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png")
+    assert stream.getvalue().startswith(b"\x89PNG")
+    assert pyplot.get_fignums() == []
+
+
+def test_one_coefficient_and_one_that_never_moved(draws: np.ndarray):
+    assert len(corner_figure(draws[:, :1], NAMES, UNITS, reference=draws[0, :1]).axes) == 1
+    still = draws[:100].copy()
+    still[:, 1] = 0.8
+    corner_figure(still, NAMES, UNITS).savefig(io.BytesIO(), format="png")

@@ -1,0 +1,85 @@
+"""`sample_run`: the posterior of a run for a Python caller, interrupted, resumed, refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import walop_jax.runs.sample
+from walop_jax.calibration.product import read_product
+from walop_jax.io.errors import DataError
+from walop_jax.posterior import Options, Progress
+from walop_jax.runs.sample import OUTPUTS, sample_run
+
+from .conftest import FittedSet, assert_same_files
+
+STEPS = 300
+OPTIONS = Options(interval=100, maximum_steps=STEPS, moves="de")
+
+
+def copied(fitted: FittedSet, folder: Path) -> Path:
+    return Path(shutil.copytree(fitted.run, folder))
+
+
+def test_an_interrupted_run_goes_on_as_if_nothing_had_been(
+    call, fitted: FittedSet, tmp_path: Path, monkeypatch
+):
+    command, caller = copied(fitted, tmp_path / "command"), copied(fitted, tmp_path / "caller")
+    options = ("--interval", 100, "--maximum-steps", STEPS, "--moves", "de", "--quiet")
+    assert call("sample", command, *options).exit_code == 1  # so few steps do not converge
+
+    told: list[Progress] = []
+
+    def interrupt(progress: Progress) -> None:
+        told.append(progress)
+        if sum(entry.stage == "sampling" for entry in told) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sample_run(caller, OPTIONS, progress=interrupt)
+    assert {entry.stage for entry in told} == {"tabulating the model", "sampling"}
+    assert [np.isfinite(entry.tau) for entry in told][-1]
+    assert not any((caller / name).exists() for name in OUTPUTS)
+    assert len(list((caller / "sampling").glob("block-*.h5"))) == 2
+
+    with pytest.raises(DataError, match="holds a chain already"):
+        sample_run(caller, OPTIONS)
+    found = sample_run(caller, OPTIONS, resume=True)
+    assert found.posterior.convergence.steps == found.summary["steps"]
+    assert not found.posterior.trusted
+    assert read_product(caller / "calibration.fits").verdict.covariance_from == "fit"
+    assert_same_files(command, caller, but=("sampling", "summary.json"))
+
+    with pytest.raises(DataError, match=r"holds posterior\.nc already"):
+        sample_run(caller, OPTIONS)
+
+    # On to convergence; the files of a posterior that is to be trusted appear together or not at all.
+    before = {name: (caller / name).read_bytes() for name in (*OUTPUTS, "calibration.fits")}
+    more = dataclasses.replace(OPTIONS, maximum_steps=100_000)
+
+    def fail(*args: object) -> None:
+        raise OSError("No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(walop_jax.runs.sample, "write_product", fail)
+        with pytest.raises(DataError, match="what was there is untouched"):
+            sample_run(caller, more, resume=True)
+    assert {name: (caller / name).read_bytes() for name in before} == before
+    found = sample_run(caller, more, resume=True)
+    assert found.posterior.trusted
+    product = read_product(caller / "calibration.fits")
+    assert product.verdict.covariance_from == "posterior"
+    np.testing.assert_array_equal(product.covariance, found.posterior.covariance)
+
+
+def test_what_is_no_run_is_refused(fitted: FittedSet, tmp_path: Path):
+    with pytest.raises(DataError, match="not a folder"):
+        sample_run(fitted.calset)
+    with pytest.raises(DataError, match="no such file"):
+        sample_run(tmp_path)
+    with pytest.raises(DataError, match=r"m\.toml: cannot be read"):
+        sample_run(fitted.run, model=tmp_path / "m.toml")

@@ -1,0 +1,309 @@
+"""The reference pages: every topic is there, links lead somewhere, and what the code writes is explained."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import importlib
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from walop_jax.cli.app import COMMANDS
+from walop_jax.cli.docs import about, pages
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = pages()
+TOPICS = (
+    "adding-an-effect",
+    "adding-an-instrument",
+    "conventions",
+    "effects",
+    "files",
+    "model",
+    "sources",
+    "vocabulary",
+)
+every_page = pytest.mark.parametrize("topic", TOPICS)
+
+
+def slug(heading: str) -> str:
+    """The anchor that GitHub gives a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
+
+
+def anchors(text: str) -> set[str]:
+    return {slug(heading) for heading in re.findall(r"^#+ (.+)$", text, re.MULTILINE)}
+
+
+def section(topic: str, title: str) -> str:
+    """The text below a heading, down to the next one of its level or above."""
+    lines = PAGES[topic].splitlines()
+    start = next(i for i, line in enumerate(lines) if re.fullmatch(rf"#+ {re.escape(title)}", line))
+    level = lines[start].index(" ")
+    rest = [i for i in range(start + 1, len(lines)) if re.match(rf"#{{1,{level}}} ", lines[i])]
+    return "\n".join(lines[start + 1 : rest[0] if rest else None])
+
+
+def rows(text: str) -> Iterator[list[str]]:
+    """Cells of all rows of the tables in a text, headers left out."""
+    lines = text.splitlines()
+    for line, following in zip(lines, [*lines[1:], ""], strict=True):
+        if line.startswith("|") and not line.startswith("| ---") and not following.startswith("| ---"):
+            yield [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def keys_written(module: str, *functions: str) -> set[str]:
+    """Keys of the dictionaries that functions of a module write out, from their syntax trees."""
+    tree = ast.parse(Path(importlib.import_module(module).__file__ or "").read_text(encoding="utf-8"))
+    found = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and node.name in functions]
+    assert {node.name for node in found} == set(functions)
+    dictionaries = [node for function in found for node in ast.walk(function) if isinstance(node, ast.Dict)]
+    keys = [key for dictionary in dictionaries for key in dictionary.keys]
+    return {key.value for key in keys if isinstance(key, ast.Constant) and isinstance(key.value, str)}
+
+
+def unexplained(names: set[str], text: str) -> list[str]:
+    """Names that a text does not give: keys of JSON between backticks, columns and keywords as words."""
+
+    def given(name: str) -> bool:
+        pattern = rf"\b{re.escape(name)}\b" if name.isupper() else rf"`{re.escape(name)}`"
+        return re.search(pattern, text) is not None
+
+    assert names
+    return sorted(name for name in names if not given(name))
+
+
+# ----------------------------------------------------------------------------------------------- the pages
+
+
+def test_topics():
+    assert tuple(PAGES) == TOPICS
+
+
+@every_page
+def test_a_page_has_a_title_and_says_in_a_sentence_what_it_is_about(topic):
+    lines = PAGES[topic].splitlines()
+    assert re.fullmatch(r"# \S.*", lines[0])
+    assert lines[1] == "" == lines[3]
+    assert re.fullmatch(r"[A-Z].{20,110}\.", about(PAGES[topic]))
+    assert len(PAGES[topic]) > 2000
+    assert PAGES[topic].endswith("\n")
+    assert [line for line in lines if len(line) > 120 and not line.startswith("|")] == []
+
+
+@every_page
+def test_links_lead_somewhere(topic):
+    links = re.findall(r"\]\(([^)]+)\)", PAGES[topic])
+    for link in links:
+        page, _, anchor = link.partition("#")
+        target = page.removesuffix(".md") if page else topic
+        assert target in PAGES, link
+        assert not anchor or anchor in anchors(PAGES[target]), link
+
+
+def test_every_page_can_be_reached_from_the_readme():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    linked = re.findall(r"\]\(walop_jax/docs/([\w-]+)\.md\)", readme)
+    assert sorted(linked) == list(TOPICS)
+
+
+def test_tables_have_as_many_cells_in_every_row():
+    for topic, text in PAGES.items():
+        for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+            counts = {line.count("|") for line in table.splitlines()}
+            assert len(counts) == 1, (topic, table.splitlines()[0])
+
+
+def test_code_cites_pages_that_exist():
+    cited = {
+        (path.name, topic)
+        for folder in ("walop_jax", "tests")
+        for path in (ROOT / folder).rglob("*.py")
+        if path.name != Path(__file__).name
+        for topic in re.findall(r"\bdocs: ([a-z-]+)", path.read_text(encoding="utf-8"))
+    }
+    assert len(cited) > 5
+    assert [entry for entry in cited if entry[1] not in TOPICS] == []
+
+
+def test_every_command_is_told_of():
+    told = "\n".join([(ROOT / "README.md").read_text(encoding="utf-8"), *PAGES.values()])
+    assert [name for name in COMMANDS if f"walop-jax {name}" not in told] == []
+
+
+@every_page
+def test_commands_of_a_page_exist(topic):
+    named = set(re.findall(r"(?:`|^    )walop-jax ([a-z][a-z-]*)", PAGES[topic], re.MULTILINE))
+    assert named <= {*COMMANDS, "instrument"}  # the last one comes with description files
+
+
+# --------------------------------------------------------------------------------------------------- files
+
+
+def test_columns_of_a_calibration_set():
+    """Every table of the schema with the columns, types, units and defaults of the page, and none besides."""
+    from walop_jax.data.schema import TABLES
+
+    widths = {1: "", None: " (any number)"}
+    for name, columns in TABLES.items():
+        told = {row[0]: tuple(row[1:4]) for row in rows(section("files", name)) if len(row) == 5}
+        expected = {
+            column: (
+                rule.kind + widths.get(rule.width, f" ({rule.width})"),
+                rule.unit,
+                "required" if rule.missing is None else str(rule.missing).replace("nan", "NaN"),
+            )
+            for column, rule in columns.items()
+        }
+        assert told == expected, name
+
+
+def test_kinds_and_flags():
+    from walop_jax.data.records import KINDS, DataFlag
+
+    kinds = [row[0].strip("`") for row in rows(section("files", "Kinds of exposure"))]
+    assert set(KINDS) <= set(kinds)
+    flags = {
+        int(row[0]): row[1]
+        for row in rows(section("files", "INTENSITIES"))
+        if len(row) == 2 and row[0].isdigit()
+    }
+    assert flags == {bit.value: bit.meaning for bit in DataFlag}
+
+
+def test_quality_bits():
+    from walop_jax.calibration.records import Quality
+
+    told = {int(row[0]): row[1] for row in rows(section("files", "Quality bits"))}
+    assert told == {bit.value: bit.meanings[0] for bit in Quality}
+
+
+def test_calibration():
+    from walop_jax.calibration import product
+
+    text = section("files", "Calibration")
+    names = {*product._RULES, *product._IMAGES, *product._RULES["PARAMETERS"]}
+    names |= keys_written("walop_jax.calibration.product", "_primary")
+    assert unexplained(names, text) == []
+
+
+def test_tables_and_catalogues():
+    from walop_jax.data.user_tables import POINT_COLUMNS
+
+    assert unexplained(set(POINT_COLUMNS), section("files", "Tables of field points")) == []
+    catalogues = section("files", "Catalogues")
+    assert unexplained({"X", "Y", "N", "N_ERR", "ID", "ROTATOR", "N_FLAG", *POINT_COLUMNS}, catalogues) == []
+    added = keys_written("walop_jax.science.stokes_columns", "stokes_columns", "header")
+    assert unexplained(added, catalogues) == []
+
+
+def test_keys_of_the_summary():
+    from walop_jax.fit.misfit import Misfit
+
+    text = section("files", "summary.json")
+    names = keys_written("walop_jax.calibration.summary", "summary") | {"seed"}
+    assert unexplained(names | {field.name for field in dataclasses.fields(Misfit)}, text) == []
+
+
+def test_keys_of_the_diagnosis():
+    names = keys_written("walop_jax.diagnosis.document", "document", "_step")
+    names |= keys_written("walop_jax.diagnosis.location", "describe")
+    assert unexplained(names, section("files", "diagnosis.json")) == []
+
+
+def test_tables_of_the_diagnosis():
+    from walop_jax.diagnosis.figure_file import _TABLES
+
+    told = {row[0]: row[1] for row in rows(section("files", "diagnosis.fits"))}
+    assert set(told) == set(_TABLES)
+    for name, columns in _TABLES.items():
+        assert unexplained(set(columns), told[name]) == [], name
+
+
+def test_keys_of_the_sampling():
+    from walop_jax.runs.sample import OUTPUTS
+
+    assert (
+        unexplained(keys_written("walop_jax.posterior.output", "report"), section("files", "Posterior")) == []
+    )
+    assert [name for name in OUTPUTS if name not in section("files", "RUN")] == []
+
+
+def test_example_of_a_model_file():
+    """The example is read, and does what it says."""
+    from walop_jax.fit.model_builder import model_without_data
+
+    lines = [line for line in section("files", "MODEL.toml").splitlines() if line.startswith("    ")]
+    text = "\n".join(line.removeprefix("    ") for line in lines)
+    assert set(tomllib.loads(text)) == {"model", "effects", "parameters"}
+    made = model_without_data("WALOP-SOUTH", text)
+    assert made.effect_names == ("clp_wobble", "blemish")
+    assert made["half2.plate.mgf2"].tie == "half1.plate.mgf2"
+
+
+# -------------------------------------------------------------------------------------- model and effects
+
+
+def test_effects_with_parameters_units_and_widths():
+    from walop_jax.model.effects import EFFECTS
+    from walop_jax.model.parameters import field_declarations
+
+    told: dict[str, dict[str, tuple[str, float | None]]] = {}
+    name = ""
+    for row in rows(section("effects", "The catalogue of effects")):
+        name = row[0] or name
+        parameters = told.setdefault(name, {})
+        if row[1] != "none":
+            parameters[row[1]] = row[2], float(row[3]) if row[3] else None
+    assert told == {
+        kind.name: {field: (d.unit, d.width) for field, d in field_declarations(kind).items()}
+        for kind in EFFECTS
+    }
+
+
+@pytest.mark.parametrize(
+    ("effect", "choice"),
+    [
+        ("blemish", "camera"),
+        ("camera_gain_drift", "camera"),
+        ("hwp1_axis_cut", "crystal"),
+        ("standard_outlier", "source"),
+    ],
+)
+def test_choices_of_effects(effect, choice):
+    from walop_jax.model.effects import Context, effect_by_name
+
+    assert choice in effect_by_name(effect).neutral(Context(sources=("HD1",))).choices()
+    told = next(row for row in rows(section("effects", "The catalogue of effects")) if row[0] == effect)
+    assert f"choice: `{choice}`" in told[4]
+
+
+def test_what_looks_alike_has_names_that_exist():
+    from walop_jax.model.effects import EFFECTS
+
+    names = {kind.name for kind in EFFECTS}
+    mentioned = set(re.findall(r"\b[a-z0-9]+_[a-z0-9_]+\b", section("effects", "Effects that look alike")))
+    assert len(mentioned) > 12
+    assert mentioned <= names
+
+
+def test_verdicts():
+    from typing import get_args
+
+    from walop_jax.diagnosis.findings import Outcome
+
+    told = [row[0] for row in rows(section("effects", "How a diagnosis reports"))]
+    assert set(told) == set(get_args(Outcome))
+
+
+def test_no_page_of_others_is_cited():
+    """The package cites its own pages and literature, nothing that its users do not have."""
+    files = [*(ROOT / "walop_jax").rglob("*.py"), *(ROOT / "walop_jax").rglob("*.md")]
+    guilty = [
+        path for path in files if re.search(r"contract", path.read_text(encoding="utf-8"), re.IGNORECASE)
+    ]
+    assert [path.name for path in guilty] == []

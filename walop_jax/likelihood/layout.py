@@ -1,0 +1,125 @@
+"""What will be computed for a set under a model, and in what pieces: decided once, before anything is computed."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from walop_jax.data.records import CalibrationSet
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.thinning import median_counts
+from walop_jax.model import light
+from walop_jax.model.chebyshev import Rectangle
+from walop_jax.model.dependence import needs
+from walop_jax.model.effects.base import Effect
+from walop_jax.model.plan import Plan, with_median
+from walop_jax.model.planning import plan_for
+from walop_jax.model.specification import Model
+
+THINNEST = 1e-3  # deg: shortest side of a rectangle with nodes
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Layout:
+    """The plan of the exposures, and how the field points are cut.
+
+    There are `points` field points, `chunk` in a chunk (one call of the engine) and `slab` in a slab (read together, by
+    one thread). `kept` says whether their data stay in memory, `memory` how many bytes going through them takes
+    (estimated), of those `allowed`. `interpolated` says whether the optics are to be solved on nodes over `rectangle`
+    (deg) and interpolated, `large` whether a fit should do with as few matrices as can be, `mirrored` whether the
+    optics of the opposite points are needed too, for ghosts.
+    """
+
+    plan: Plan
+    points: int
+    chunk: int
+    slab: int
+    kept: bool
+    memory: int
+    allowed: float
+    interpolated: bool
+    large: bool
+    mirrored: bool
+    rectangle: Rectangle
+
+    @classmethod
+    def of(
+        cls,
+        calset: CalibrationSet,
+        model: Model,
+        probes: tuple[Effect, ...] = (),
+        *,
+        memory: float | None = None,
+        threads: int = 1,
+        points_per_chunk: int | None = None,
+        interpolate: bool | None = None,
+    ) -> Layout:
+        """Lay out a set under a model; `probes` are effects beyond the model whose columns will be asked for.
+
+        `memory` (bytes) is what point data may take, None for the usual 2 GB; `threads` is the number of slabs in use
+        at a time. `points_per_chunk` and `interpolate` are decided by the size of the set where they are None.
+        """
+        whole = dataclasses.replace(model.template, effects=(*model.template.effects, *probes))
+        plan = plan_for(whole, calset.exposures, calset.filters, calset.sources)
+        if needs(whole).median:
+            plan = with_median(plan, median_counts(calset))
+        mirrored = light.has_ghosts(whole)
+        points, exposures = len(calset.points), len(calset.exposures)
+        many = points > limits.INTERPOLATE_ABOVE
+        interpolated = many if interpolate is None else interpolate
+        usual = limits.LARGE_CHUNK if many else min(limits.POINTS_PER_CHUNK, _largest_chunk(model, exposures))
+        chunk = min(points_per_chunk or usual, points)
+        allowed = limits.MEMORY if memory is None else memory
+        each = bytes_per_point(exposures, calset.cameras, mirrored=mirrored)
+        kept = 2 * each * points <= allowed
+        # Whole chunks; and many of them, as pixels are read in whole rows of the frames.
+        most = min(
+            limits.LARGEST_SLAB, int(allowed) // (limits.READING * threads), each * points // limits.SLABS
+        )
+        slab = chunk * max(1, most // (each * chunk))
+        return cls(
+            plan=plan,
+            points=points,
+            chunk=chunk,
+            slab=slab,
+            kept=kept,
+            memory=2 * each * points if kept else limits.READING * threads * each * slab,
+            allowed=allowed,
+            interpolated=interpolated,
+            large=interpolated and points > limits.LARGE_ABOVE,
+            mirrored=mirrored,
+            rectangle=_rectangle(calset, mirrored=mirrored),
+        )
+
+    @property
+    def chunks(self) -> int:
+        """Number of chunks."""
+        return -(-self.points // self.chunk)
+
+    @property
+    def slabs(self) -> int:
+        """Number of slabs."""
+        return -(-self.points // self.slab)
+
+
+def bytes_per_point(exposures: int, cameras: int = 4, *, mirrored: bool = False) -> int:
+    """Size of the point data of one field point: per exposure counts and weights, sky, source and band."""
+    return 8 * (2 + exposures * (2 * cameras + (4 if mirrored else 2) + 1 + 1))
+
+
+def _largest_chunk(model: Model, exposures: int) -> int:
+    """The largest multiple of four points whose Jacobian in local quantities stays small."""
+    cameras = len(model.template.cameras)
+    local = len(model.parameters) - len(model.template.throughput.coefficients.ravel()) + cameras
+    return max(1, limits.LARGEST_CHUNK // (cameras * exposures * local) * 4)
+
+
+def _rectangle(calset: CalibrationSet, *, mirrored: bool) -> Rectangle:
+    """The part of the field on which optics are needed; ghosts need those of the opposite points too."""
+    xy = np.stack([calset.points.x, calset.points.y])
+    low, high = xy.min(axis=1), xy.max(axis=1)
+    if mirrored:
+        low, high = np.minimum(low, -high), np.maximum(high, -low)
+    thin = 0.5 * np.maximum(THINNEST - (high - low), 0.0)
+    return Rectangle(low - thin, high + thin)

@@ -1,0 +1,289 @@
+"""A calibration set and a model brought together: what a fit, a sampler or a diagnosis works on."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from walop_jax.data.records import CalibrationSet
+from walop_jax.likelihood import effect_columns, engine
+from walop_jax.likelihood.expansion import Census, OpticsUsed, Posterior
+from walop_jax.likelihood.layout import Layout
+from walop_jax.likelihood.nodes import Nodes, accurate_nodes
+from walop_jax.likelihood.points import MeasuredPoints, measured_points
+from walop_jax.likelihood.priors import PriorRows, prior_rows
+from walop_jax.likelihood.runner import Runner, SlabSums
+from walop_jax.model.compiled import require_double_precision
+from walop_jax.model.dependence import optical_indices
+from walop_jax.model.effects.base import Effect
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.plan import Plan
+from walop_jax.model.specification import Model
+
+Vector = Float[np.ndarray, " n"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Likelihood:
+    """The joint likelihood of one calibration set under one model.
+
+    Field points are handled in chunks of equal size, so that a set larger than memory goes through the same code
+    (`likelihood/points.py`), several of them at a time (`likelihood/runner.py`). Where `layout` says so, `expand`,
+    `slope` and `residuals` solve the optics on Chebyshev nodes only (`likelihood/nodes.py`). Immutable: what a pass
+    finds out beside its sums comes back with them (`Posterior`).
+    """
+
+    layout: Layout
+    points: MeasuredPoints
+    runner: Runner
+    model: Model
+
+    @classmethod
+    def of(
+        cls,
+        calset: CalibrationSet,
+        model: Model,
+        probes: tuple[Effect, ...] = (),
+        *,
+        memory: float | None = None,
+        runner: Runner | None = None,
+        points_per_chunk: int | None = None,
+        interpolate: bool | None = None,
+    ) -> Likelihood:
+        """Bring a set and a model together; `probes` are effects beyond the model whose columns will be asked for.
+
+        `memory` (bytes) is what the data of the points may take, None for the usual 2 GB. A large set is shared with
+        the processes of `runner`, and finished slabs are kept in its journal; smaller ones are not worth it.
+        `points_per_chunk` and `interpolate` are decided by the size of the set where they are None. Raises
+        RuntimeError when float64 is switched off.
+        """
+        require_double_precision()
+        runner = runner or Runner()
+        layout = Layout.of(
+            calset,
+            model,
+            probes,
+            memory=memory,
+            threads=runner.threads,
+            points_per_chunk=points_per_chunk,
+            interpolate=interpolate,
+        )
+        return cls(layout, measured_points(calset, layout), runner if layout.large else runner.alone(), model)
+
+    @property
+    def calset(self) -> CalibrationSet:
+        """The set that the points are from."""
+        return self.points.reader.calset
+
+    @property
+    def cameras(self) -> int:
+        """Number of cameras."""
+        return len(self.model.template.cameras)
+
+    @property
+    def plan(self) -> Plan:
+        """What is computed for the exposures."""
+        return self.layout.plan
+
+    @property
+    def flux_known(self) -> Bool[np.ndarray, " e"]:
+        """Exposures of sources whose flux is known."""
+        return np.asarray(self.plan.exposures.flux_known)
+
+    @cached_property
+    def priors(self) -> PriorRows:
+        """What the model says of its free parameters beforehand."""
+        return prior_rows(self.model)
+
+    def nodes(self, instrument: Instrument, near: Posterior | None = None) -> tuple[Nodes | None, OpticsUsed]:
+        """The optics on nodes of the field, and how accurate; None where they are to be solved point by point.
+
+        `near` is an expansion at similar values: as many nodes as it needed are tried first, and none if there are
+        never enough, since the optics oscillate over the field.
+        """
+        hint = None if near is None else near.optics.nodes_per_side
+        if not self.layout.interpolated or (near is not None and hint is None):
+            return None, OpticsUsed(None)
+        scale = np.array([p.scale for p in self.model.parameters])[list(optical_indices(instrument))]
+        nodes, error = accurate_nodes(instrument, self.plan, self.layout.rectangle, scale, hint)
+        return (None, OpticsUsed(None)) if nodes is None else (nodes, OpticsUsed(nodes.per_side, error))
+
+    # -------------------------------------------------------------------------------------- the posterior
+
+    def expand(self, values: Vector, noise_scale: float = 1.0, near: Posterior | None = None) -> Posterior:
+        """χ² and its quadratic expansion at a full vector of parameter values.
+
+        `noise_scale` multiplies the errors of the data (not the priors'): above 1 it stands for what the
+        model cannot explain. `near` is an earlier expansion at similar values, which saves the search for nodes.
+        """
+        values = self._agreed(values)
+        instrument, n = self.model.instrument(values), len(values)
+        nodes, optics = self.nodes(instrument, near)
+        (data, gradient, matrix), census = self._total(
+            "χ², gradient and matrix",
+            f"matrix {values.tobytes().hex()}",
+            lambda chunk: engine.normal_equations(instrument, self.plan, chunk, nodes),
+            ((), (n,), (n, n)),
+        )
+        matrix = matrix / noise_scale**2
+        at = self.priors.index
+        matrix[at, at] += self.priors.width**-2
+        select = self.model.selection()
+        return self._posterior(
+            values, float(data), gradient, select.T @ matrix @ select, noise_scale, census, optics
+        )
+
+    def slope(self, values: Vector, near: Posterior) -> Posterior:
+        """As `expand`, with the matrix of an expansion nearby: a third of the time, where optics are interpolated."""
+        values = self._agreed(values)
+        instrument, n = self.model.instrument(values), len(values)
+        nodes, optics = self.nodes(instrument, near)
+        if nodes is None:
+            return self.expand(values, near.noise_scale, near)
+        (data, gradient), census = self._total(
+            "χ² and gradient",
+            f"gradient {values.tobytes().hex()}",
+            lambda chunk: engine.slope_equations(instrument, self.plan, chunk, nodes),
+            ((), (n,)),
+        )
+        return self._posterior(values, float(data), gradient, near.matrix, near.noise_scale, census, optics)
+
+    def _agreed(self, values: Vector) -> Vector:
+        return self.runner.processes.agreed("values", np.asarray(values, float))
+
+    def _posterior(
+        self,
+        values: Vector,
+        data: float,
+        gradient: Vector,
+        matrix: Float[np.ndarray, "free free"],
+        noise_scale: float,
+        census: Census,
+        optics: OpticsUsed,
+    ) -> Posterior:
+        rows, gradient = self.priors, gradient / noise_scale**2
+        pull = rows.residuals(values)
+        gradient[rows.index] += pull / rows.width
+        return Posterior(
+            data=data,
+            priors=float(np.sum(pull[rows.known] ** 2)),
+            loose=float(np.sum(pull[~rows.known] ** 2)),
+            noise_scale=noise_scale,
+            gradient=self.model.selection().T @ gradient,
+            matrix=matrix,
+            census=census,
+            dof=self._degrees_of_freedom(census),
+            optics=optics,
+        )
+
+    def _degrees_of_freedom(self, census: Census) -> int:
+        per_row = np.where(self.flux_known, self.cameras, self.cameras - 1)
+        return int(census.rows @ per_row) + int(self.priors.known.sum()) - len(self.model.free)
+
+    # ----------------------------------------------------------------------------------- a pass over the points
+
+    def _total(
+        self,
+        label: str,
+        key: str | None,
+        function: Callable[[engine.PointData], Sequence[Array]],
+        shapes: Sequence[tuple[int, ...]],
+    ) -> tuple[list[np.ndarray], Census]:
+        """Sums over all points of the arrays that `function` gives for a chunk, the points counted on the way."""
+
+        def work(number: int) -> SlabSums:
+            chunks = self.points.slab(number)
+            sums = np.zeros(sum(math.prod(shape) for shape in shapes))
+            for chunk in chunks:
+                sums += np.concatenate([sums[:0], *(np.ravel(array) for array in function(chunk))])
+            used = np.concatenate([np.asarray(chunk.weight[..., 0]) > 0 for chunk in chunks])
+            x, y = (np.concatenate([np.asarray(getattr(chunk, name)) for chunk in chunks]) for name in "xy")
+            extent = np.stack([-x, x, -y, y])[:, used.any(axis=1)].max(axis=1, initial=-np.inf)
+            return SlabSums(np.concatenate([sums, used.sum(axis=0)]), extent)
+
+        total = self.runner.total(label, key, work, self.layout)
+        *arrays, rows = np.split(total.sums, np.cumsum([math.prod(shape) for shape in shapes]))
+        low_x, high_x, low_y, high_y = (total.extent * np.array([-1.0, 1.0, -1.0, 1.0])).tolist()
+        census = Census(rows.astype(int), (low_x, high_x, low_y, high_y), self.cameras)
+        return [array.reshape(shape) for array, shape in zip(arrays, shapes, strict=True)], census
+
+    @cached_property
+    def census(self) -> Census:
+        """What is used of the set: a pass of its own; an expansion brings its own census with it."""
+        return self._total("counting", "census", lambda _: (), ())[1]
+
+    @property
+    def dof(self) -> int:
+        """Per used row one less than cameras (all where the flux is known), one per prior, less the free parameters."""
+        return self._degrees_of_freedom(self.census)
+
+    @cached_property
+    def used(self) -> Bool[np.ndarray, "p e"]:
+        """True where the intensities of a (point, exposure) are used."""
+        return np.concatenate([np.asarray(chunk.weight[..., 0]) > 0 for chunk in self.points])[
+            : self.layout.points
+        ]
+
+    # ----------------------------------------------------------------------------------------- row by row
+
+    def residuals(self, values: Vector) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e k"]]:
+        """Best flux and normalised residuals (data − model)/σ of every (point, exposure); 0 where unused.
+
+        All of them at once: for whole frames take a sample (`thinning.thinned`).
+        """
+        instrument = self.model.instrument(values)
+        nodes, _ = self.nodes(instrument)
+        parts = [engine.residuals(instrument, self.plan, chunk, nodes) for chunk in self.points]
+        flux, residual = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
+        return flux[: self.layout.points], residual[: self.layout.points]
+
+    def jacobian(self, values: Vector) -> Float[np.ndarray, "d f"]:
+        """Derivatives of the used residuals with respect to the free parameters, dense: for tables, not frames.
+
+        Rows run over points, then exposures, then cameras, as in `residuals(values)[1][self.used]`.
+        """
+        instrument, select = self.model.instrument(values), self.model.selection()
+        parts = [_rows(engine.dense_jacobian(instrument, self.plan, c), c) @ select for c in self.points]
+        return np.concatenate(parts)
+
+    def effect_columns(self, values: Vector, probes: tuple[Effect, ...]) -> Float[np.ndarray, "d a"]:
+        """Derivatives of the used residuals with respect to the amplitudes of neutral effects added to the model."""
+        instrument = self.model.instrument(values)
+        parts = [
+            _rows(effect_columns.effect_columns(instrument, self.plan, probes, c), c) for c in self.points
+        ]
+        return np.concatenate(parts)
+
+    def effect_columns_over_shapes(
+        self, values: Vector, probes: Sequence[Effect]
+    ) -> Float[np.ndarray, "g d a"]:
+        """As `effect_columns` for one effect at many shapes, all with the same discrete choices."""
+        instrument = self.model.instrument(values)
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *probes)
+        parts = []
+        for chunk in self.points:
+            cube = np.asarray(
+                effect_columns.effect_columns_over_shapes(instrument, self.plan, stacked, chunk)
+            )
+            parts.append(np.stack([_rows(one, chunk) for one in cube]))
+        return np.concatenate(parts, axis=1)
+
+    def stokes(self, values: Vector) -> Float[np.ndarray, "p e 4"]:
+        """Stokes vectors that enter the instrument, per unit flux."""
+        instrument = self.model.instrument(values)
+        parts = [np.asarray(engine.incoming(instrument, self.plan, chunk)) for chunk in self.points]
+        return np.concatenate(parts)[: self.layout.points]
+
+
+def _rows(columns: Array | np.ndarray, chunk: engine.PointData) -> Float[np.ndarray, "d n"]:
+    """The rows of a chunk that are used."""
+    used = np.asarray(chunk.weight[..., 0] > 0)
+    cube = np.asarray(columns).reshape(*used.shape, chunk.weight.shape[-1], -1)
+    return cube[used].reshape(-1, cube.shape[-1])

@@ -1,0 +1,97 @@
+"""Sizes of the work: how much is computed together, kept in memory or looked at, and why just so much.
+
+Nothing here changes what is computed, only in what pieces, or how large a part of a set stands for all of it.
+"""
+
+from __future__ import annotations
+
+# ------------------------------------------------------------------------------------- chunks, slabs, memory
+
+POINTS_PER_CHUNK = 256
+"""Field points of a chunk whose optics are solved point by point: enough to keep a core busy."""
+LARGEST_CHUNK = 2_000_000
+"""Intensities × local quantities of a chunk: its Jacobian then takes 16 MB."""
+LARGE_CHUNK = 1024
+"""Field points of a chunk whose optics are interpolated: each of them costs less, and the engine divides it further."""
+MEMORY = 2e9
+"""Bytes that point data may take unless told otherwise: half of them for a set that is kept, all for one read anew."""
+READING = 5
+"""Bytes that reading takes for a moment, times those of the slab: the file, its float64, masks and a copy or two."""
+LARGEST_SLAB = 1 << 26
+"""Bytes of point data that are read together at most: larger slabs are no faster."""
+SLABS = 16
+"""A set is cut into so many slabs at least, if it has as many chunks: work for several threads and processes."""
+
+# ---------------------------------------------------------------------------------------- within one chunk
+
+JACOBIAN_BLOCK = 64
+"""Field points whose Jacobians are worked on together: these stay in the processor's cache."""
+GRADIENT_BLOCK = 256
+"""Field points whose gradients are worked on together, and largest number that is not cut: they need a quarter."""
+PROBES_AT_ONCE = 6
+"""Shapes of one effect that are worked on together: bounds the memory, and more are no faster."""
+
+# ------------------------------------------------------------------------------- optics on nodes of the field
+
+NODES_PER_SIDE = (12, 16, 18, 20, 24, 28, 32)
+"""Numbers of nodes per side that are tried in turn: two more gain a factor of 30, beyond 32 the optics oscillate."""
+CHECKED_PLACES = 48
+"""Places between the nodes at which the error is measured: within a factor of three of the largest anywhere."""
+SOLVED_TOGETHER = 64
+"""Places whose optics are solved together, so that they are compiled for one size only."""
+
+# ------------------------------------------------------------------------------------------------- large sets
+
+INTERPOLATE_ABOVE = 4096
+"""Field points above which the optics are interpolated: more than ten times the nodes that they need."""
+LARGE_ABOVE = 65536
+"""Field points above which the matrix of a fit is computed as seldom as can be: a pass then takes seconds."""
+SAMPLE = 16384
+"""Field points of a large set on which its fit begins: a fit of these takes as long as a pass or two of the set."""
+FARTHEST = 32
+"""Points of a set for each one of its sample at most: the minima are then some six standard errors apart, and a step
+leaves a thousandth of that."""
+MEDIAN_POINTS = 65536
+"""Field points that the median of the counts is taken of: it is then known to half a per cent of its scatter."""
+MEDIAN_SLAB = 4096
+"""Field points that are read together for the median: whole rows of a frame."""
+NEIGHBOURS = 256
+"""Points of a sample that lie side by side: frames are read in rows, and single pixels cost as much as a row."""
+RUNS = (16, 128)
+"""Smallest and largest number of runs of neighbours in a sample: spread over the field, yet few to read."""
+FINGERPRINT_POINTS = 4096
+"""Field points whose measurements go into the fingerprint of a set that was read: a change of the set shows in some."""
+LEVEL_POINTS = 256
+"""Field points from which the start value of a throughput is taken: a start need not be exact."""
+
+# ------------------------------------------------------------------------------------------- after the fit
+
+MISFIT_POINTS = 65536
+"""Field points whose residuals are grouped to describe a misfit: their cube then takes 50 MB at 25 exposures."""
+POINTS_PER_CELL = 64
+"""Field points of a cell of the residual map: its errors are an eighth of those of a point."""
+MOST_CELLS = 128
+"""Cells of the residual map along a side: 32 × 32 pixels each for a detector of 4096 pixels."""
+
+MATRIX_POINTS = (16, 256)
+"""Field points whose instrument matrices are computed together, a few and many: compiled for these two sizes only."""
+VECTOR_POINTS = 100
+"""Field points whose analysis vectors are computed together: a quarter of a field table of 20 × 20."""
+VECTOR_CHECKS = 24
+"""Field points at which a table of analysis vectors is checked."""
+
+# ------------------------------------------------------------------------------------------------- diagnosis
+
+DIAGNOSED_ROWS = 100_000
+"""(Exposure, point) pairs that a diagnosis looks at: 800 columns of four cameras each take 2.5 GB."""
+PROJECTED_COLUMNS = 128
+"""Columns that are projected together: a copy of them is small beside all."""
+NULL_DRAWS = 10_000
+"""Draws of all scores under the base model: probabilities down to 0.002 are counted, not extrapolated."""
+MANY_SHAPES = 8
+"""Shapes of an effect above which they are swept in one compiled loop instead of differentiated together."""
+
+# --------------------------------------------------------------------------------------------------- science
+
+STAR_ROWS = 16384
+"""Rows of a star catalogue that are worked on together: their matrices take some MB."""

@@ -1,0 +1,128 @@
+"""The cameras: throughput over the field, what mixes them, ghosts, and what the detectors make of the electrons.
+
+Everything here but the throughput is empty in the base model; an effect or a description adds parts. A part acts at one
+stage, and the class says at which:
+
+    Transmission    factors of the throughput at a field point
+    Mixing          analysis vectors behind the throughput: part of the instrument, linear in the light
+    GhostPart       light of the opposite field point: needs to know what is there
+    ExposurePart    linear in the flux, but known only exposure by exposure
+    DetectorPart    acts on electrons; not linear in the light
+
+What of this can be carried over to other exposures, `carried` says.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from walop_jax.model import legendre
+from walop_jax.model.conventions import FIELD_SCALE
+from walop_jax.model.parameters import Component, Declaration
+from walop_jax.model.sources import ExposureArrays
+
+Scalar = Float[Array, ""]
+
+
+class Throughput(Component):
+    """Throughput of each camera as a Legendre series over the field (total degree `degree`)."""
+
+    degree: int = eqx.field(static=True)
+    coefficients: Float[Array, "k t"]
+    declared: Declaration = eqx.field(static=True)
+    scale: float = eqx.field(static=True, default=FIELD_SCALE)  # h, degrees
+
+    def declarations(self) -> Mapping[str, Declaration]:
+        """The series is a parameter of every instrument."""
+        return {"coefficients": self.declared}
+
+    def labels(self, field: str) -> Sequence[str]:
+        """Camera and exponents: n0.p21 is camera N0, second degree in X, first in Y."""
+        terms = legendre.terms(self.degree)
+        return tuple(f"n{k}.p{i}{j}" for k in range(self.coefficients.shape[0]) for i, j in terms)
+
+    def basis(self, x: Float[Array, ...], y: Float[Array, ...]) -> Float[Array, "... t"]:
+        """Values of the terms of the series at field positions in degrees."""
+        return legendre.basis(x, y, self.degree, self.scale)
+
+    def at(self, x: Scalar, y: Scalar) -> Float[Array, " k"]:
+        """Throughput of the cameras at a field point."""
+        return self.coefficients @ self.basis(x, y)
+
+
+class Transmission(Component):
+    """A factor of the throughput."""
+
+    @abc.abstractmethod
+    def factors(self, x: Scalar, y: Scalar) -> Float[Array, " k"] | Scalar:
+        """Factors of the cameras at a field point (deg)."""
+
+
+class Mixing(Component):
+    """A change of the analysis vectors behind the throughput."""
+
+    @abc.abstractmethod
+    def vectors(self, vectors: Float[Array, "b k 4"], x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
+        """Analysis vectors (band, camera, Stokes) from those ahead of it."""
+
+
+class GhostPart(Component):
+    """Light of the opposite field point."""
+
+    @abc.abstractmethod
+    def seen(self, extended: Bool[Array, " e"], opposite: Float[Array, "e k"]) -> Float[Array, "e k"]:
+        """What is added to the counts; `opposite` are those of the same source at (−X, −Y)."""
+
+
+class ExposurePart(Component):
+    """A share of the response to unpolarised light that is added in some exposures."""
+
+    @property
+    def exposures_known(self) -> int | None:
+        """Number of exposures that it has values for; None: any number."""
+        return None
+
+    @abc.abstractmethod
+    def share(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"]:
+        """The share, exposure by exposure."""
+
+
+class DetectorPart(Component):
+    """What a detector does to electrons."""
+
+    @abc.abstractmethod
+    def reported(self, counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
+        """Counts reported for counts (electrons) that arrive."""
+
+
+class Cameras(Component):
+    """Names of the cameras and what is known of them beyond their throughput."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    transmission: tuple[Transmission, ...] = ()
+    mixing: tuple[Mixing, ...] = ()
+    ghosts: tuple[GhostPart, ...] = ()
+    exposures: tuple[ExposurePart, ...] = ()
+    detectors: tuple[DetectorPart, ...] = ()
+    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def orthogonal(self) -> tuple[int, ...]:
+        """For each camera the one that sees the other beam of its analyser."""
+        other = list(range(len(self)))
+        for a, b in self.pairs:
+            other[a], other[b] = b, a
+        return tuple(other)
+
+
+def per_camera(count: int, value: float = 0.0) -> Float[Array, " k"]:
+    """One value for each camera."""
+    return jnp.full(count, value)

@@ -1,0 +1,110 @@
+"""What a light path depends on, found by running it on shapes alone: nothing of this is declared by hand.
+
+`needs` runs the path until it asks for nothing more that a plan would have to hold. `optical_indices` follows every
+parameter through the operations of `light.band_rows`: those that reach the result enter before the band integral.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from walop_jax.model import light
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import leaves, parameter_places
+from walop_jax.model.plan import blank_plan
+from walop_jax.model.ray import NotPlannedError
+
+Shapes = tuple[tuple[tuple[int, ...], str], ...]
+
+
+class Needs(NamedTuple):
+    """What a light path asks for: conditions of the optics, median counts, fringes that nodes must follow."""
+
+    conditions: frozenset[str]
+    median: bool
+    path_difference: float  # µm
+
+
+def _shapes(instrument: Instrument) -> tuple[Any, Shapes]:
+    arrays, structure = jax.tree_util.tree_flatten(instrument)
+    return structure, tuple((tuple(np.shape(a)), jnp.result_type(a).name) for a in arrays)
+
+
+def _of_shapes(structure: Any, shapes: Shapes) -> Instrument:
+    return jax.tree_util.tree_unflatten(structure, [jax.ShapeDtypeStruct(s, d) for s, d in shapes])
+
+
+def needs(instrument: Instrument) -> Needs:
+    """What the light path of an instrument, effects included, asks for; found by running it on shapes alone."""
+    return _needs(*_shapes(instrument))
+
+
+@functools.lru_cache(maxsize=256)
+def _needs(structure: Any, shapes: Shapes) -> Needs:
+    instrument = _of_shapes(structure, shapes)
+    asked: set[str] = set()
+    median = False
+
+    def run(instrument: Instrument) -> tuple[Array, Array]:
+        plan = blank_plan(instrument, asked, median)
+        zero = jnp.zeros(())
+        rows = light.band_rows(instrument, plan, zero, zero)
+        each = jnp.zeros_like(plan.exposures.kind)
+        counts = light.counts(
+            instrument, plan, rows, light.throughput_at(instrument, zero, zero), zero, zero,
+            jnp.zeros((*each.shape, 2)), each - 1, each,
+        )  # fmt: skip
+        return rows, light.detected(instrument, plan.exposures, counts)
+
+    while True:
+        try:
+            jax.eval_shape(run, instrument)
+            break
+        except NotPlannedError as missing:
+            if missing.quantity in asked or (missing.quantity == "median" and median):
+                raise
+            if missing.quantity == "median":
+                median = True
+            else:
+                asked.add(missing.quantity)
+    patched = jax.eval_shape(lambda i: i.patched(), instrument)
+    parts = [*patched.elements, *(element for arm in patched.arms for element in arm.elements)]
+    return Needs(frozenset(asked), median, max((part.path_difference for part in parts), default=0.0))
+
+
+def optical_indices(instrument: Instrument) -> tuple[int, ...]:
+    """Positions of the parameters that enter before the band integral."""
+    return _optical(*_shapes(instrument))
+
+
+@functools.lru_cache(maxsize=256)
+def _optical(structure: Any, shapes: Shapes) -> tuple[int, ...]:
+    instrument = _of_shapes(structure, shapes)
+    asked = _needs(structure, shapes)
+
+    def rows(*arrays: Array) -> Array:
+        whole = jax.tree_util.tree_unflatten(structure, arrays)
+        plan = blank_plan(whole, asked.conditions, asked.median)
+        # Off the axis and at an odd place: a dependence must not vanish by symmetry in the operations that are written.
+        return light.band_rows(whole, plan, jnp.asarray(0.11), jnp.asarray(0.07))
+
+    reached = _reaching(jax.make_jaxpr(rows)(*jax.tree_util.tree_leaves(instrument)))
+    flags = [reached[place] for place, count in parameter_places(instrument) for _ in range(count)]
+    assert len(flags) == len(leaves(instrument))
+    return tuple(i for i, flag in enumerate(flags) if flag)
+
+
+def _reaching(program: Any) -> Sequence[bool]:
+    """Which inputs of a traced program reach its outputs; an inner program counts as using all it is given."""
+    needed = {id(v) for v in program.jaxpr.outvars}
+    for equation in reversed(program.jaxpr.eqns):
+        if any(id(v) in needed for v in equation.outvars):
+            needed |= {id(v) for v in equation.invars}
+    return [id(v) in needed for v in program.jaxpr.invars]

@@ -1,0 +1,44 @@
+"""The elements of a train: one class each, and `ELEMENTS`, the kinds that a description file may name."""
+
+from walop_jax.model.elements.analyser import Analyser
+from walop_jax.model.elements.base import Element
+from walop_jax.model.elements.collimator import Collimator, RadialRetarder
+from walop_jax.model.elements.geometry import FieldShift, PupilMapping, Wedge
+from walop_jax.model.elements.polariser import EncoderError, Polariser
+from walop_jax.model.elements.simple import AddedPolarisation, Depolariser, Diattenuator, Retarder
+from walop_jax.model.elements.wave_plate import AirGap, Layer, WavePlate
+
+ELEMENTS: tuple[type[Element], ...] = (
+    Polariser,
+    Collimator,
+    RadialRetarder,
+    PupilMapping,
+    FieldShift,
+    Wedge,
+    WavePlate,
+    Retarder,
+    Diattenuator,
+    Depolariser,
+    AddedPolarisation,
+    Analyser,
+)
+
+__all__ = [
+    "ELEMENTS",
+    "AddedPolarisation",
+    "AirGap",
+    "Analyser",
+    "Collimator",
+    "Depolariser",
+    "Diattenuator",
+    "Element",
+    "EncoderError",
+    "FieldShift",
+    "Layer",
+    "Polariser",
+    "PupilMapping",
+    "RadialRetarder",
+    "Retarder",
+    "WavePlate",
+    "Wedge",
+]

@@ -1,0 +1,51 @@
+"""Analysers: where an arm ends and the beams of its cameras begin.
+
+Equation    beams of an arm ½ (1, ±η cos 2α, ±η sin 2α, 0), first camera +
+Symbols     η efficiency, close to 1; α axis of the first beam, from +X toward +Y
+Source      Wollaston prism as a pair of crossed analysers: Goldstein 2003, Polarized Light, ch. 9.
+Limits      η = 1, α = 0 are ideal analysers along +X and +Y.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from walop_jax.model.elements.base import Element
+from walop_jax.model.parameters import number
+
+Scalar = Float[Array, ""]
+
+
+class Analyser(Element):
+    """A polarising beam splitter: two beams, one for each of its cameras.
+
+    What depends on the light ahead of it (`seen`) and what does not (`shares`) are kept apart: only the first
+    enters the band integral.
+    """
+
+    efficiency: Scalar = number(unit="", about="η of the analysers ½(1, ±η, 0, 0)", default=1.0)
+    angle: Scalar | None = number(unit="deg", about="rotation of the analysers", default=None)
+    cameras: tuple[str, ...] = eqx.field(static=True, default=())
+
+    kind: ClassVar[str] = "analyser"
+    reference: ClassVar[str] = "Goldstein 2003, Polarized Light, ch. 9"
+
+    rows: ClassVar[int] = 2
+
+    def seen(self, mueller: Float[Array, "*n 4 4"]) -> Float[Array, "*n 2 4"]:
+        """Rows of the Mueller matrix ahead of it that the beams are made of: S0 and what is analysed."""
+        analysed = mueller[..., 1, :]
+        if self.angle is not None:
+            twice = 2.0 * jnp.deg2rad(self.angle)
+            analysed = jnp.cos(twice) * mueller[..., 1, :] + jnp.sin(twice) * mueller[..., 2, :]
+        return jnp.stack([mueller[..., 0, :], analysed], axis=-2)
+
+    def shares(self) -> Float[Array, "k 2"]:
+        """What each beam takes of `seen`."""
+        half = 0.5 * jnp.ones_like(self.efficiency)
+        along = 0.5 * self.efficiency
+        return jnp.stack([jnp.stack([half, along]), jnp.stack([half, -along])])

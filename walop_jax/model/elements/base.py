@@ -1,0 +1,71 @@
+"""What an element of the train is: it maps a ray to a ray and has a Mueller matrix for it.
+
+An element is neutral when it is made without numbers. It may move: `moves` is the prefix of its columns in EXPOSURES
+(`CHWP` for CHWP_IN and CHWP_ANGLE), which say whether it stands in the beam and at what angle.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from walop_jax.model.parameters import Component, Declaration
+from walop_jax.model.ray import Ray
+
+Mueller = Float[Array, "... 4 4"]
+
+
+class Element(Component):
+    """An element of the train; concrete ones are final.
+
+    `declared` says which of its numbers are parameters of the instrument, by field. `path_difference` (µm) is the
+    largest optical path between waves that meet again in it: the wavelength nodes must follow its fringes.
+    """
+
+    name: str = eqx.field(static=True, default="")
+    moves: str | None = eqx.field(static=True, default=None)
+    declared: tuple[tuple[str, Declaration], ...] = eqx.field(static=True, default=())
+
+    kind: ClassVar[str] = ""
+    reference: ClassVar[str] = ""
+
+    def declarations(self) -> Mapping[str, Declaration]:
+        """Its parameters: those of the class and those that the instrument has declared."""
+        return {**super().declarations(), **dict(self.declared)}
+
+    def ray(self, ray: Ray) -> Ray:
+        """The ray behind the element."""
+        return ray
+
+    def mueller(self, ray: Ray) -> Mueller | None:
+        """Mueller matrix for a ray that enters; None: the identity.
+
+        It has a leading axis where it depends on wavelength.
+        """
+        del ray
+        return None
+
+    @classmethod
+    def solved(cls, cases: Sequence[tuple[Any, Ray]]) -> list[Mueller | None]:
+        """Mueller matrices of several elements of this class; overridden where solving them together pays."""
+        return [element.mueller(ray) for element, ray in cases]
+
+    def turned(self, angle: float) -> Self:
+        """The element turned by `angle` (deg) from +X toward +Y. Raises TypeError if it has no `axis`."""
+        if not hasattr(self, "axis"):
+            raise TypeError(f"element {self.name!r} has no axis that could turn")
+        return dataclasses.replace(self, axis=self.axis + jnp.asarray(angle, float))  # pyright: ignore
+
+    def position(self, angle: float | None) -> float | None:
+        """Angle (deg) at which it really stands when the exposure says `angle`, None when it is out."""
+        return angle
+
+    @property
+    def path_difference(self) -> float:
+        """See the class."""
+        return 0.0

@@ -1,0 +1,68 @@
+"""Lenses that polarise weakly: diattenuation and retardance growing with the square of the field radius.
+
+Equation    diattenuation (q, u) = c r² (cos 2φ, sin 2φ) + (c_q, c_u)
+            retardance Δ = 2π delta (r/0.3°)², fast axis radial
+Symbols     r, φ polar coordinates of the field point [deg]; c [deg⁻²]; delta in waves at 0.3°
+Source      Fresnel transmission of curved surfaces and stress of mounted lenses, both ∝ r²: Paper II of WALOP-South
+            (Maharana et al. 2022); Selbing 2005, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146.
+Limits      nothing on the axis but (c_q, c_u). Written with (1 − cos Δ)/Δ² and sin Δ/Δ, both smooth at the centre of
+            the field, Δ(cos 2φ, sin 2φ) being k (x² − y², 2xy).
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from walop_jax.model import mueller
+from walop_jax.model.elements.base import Element, Mueller
+from walop_jax.model.parameters import number
+from walop_jax.model.ray import Ray
+
+Scalar = Float[Array, ""]
+REFERENCE_RADIUS = 0.3  # degrees
+PAPER_II = "Maharana et al. 2022, Paper II"
+
+
+class Collimator(Element):
+    """Weak linear diattenuation: a radial part and a constant one."""
+
+    diattenuation: Scalar = number(unit="deg-2", about="c, radial diattenuation of curved lenses")
+    q: Scalar = number(unit="", about="c_q, constant part")
+    u: Scalar = number(unit="", about="c_u, constant part")
+
+    kind: ClassVar[str] = "collimator"
+    reference: ClassVar[str] = PAPER_II
+
+    def mueller(self, ray: Ray) -> Mueller:
+        """A non-depolarising diattenuator."""
+        q = self.diattenuation * (ray.x**2 - ray.y**2) + self.q
+        u = self.diattenuation * 2.0 * ray.x * ray.y + self.u
+        return mueller.diattenuator(q, u)
+
+
+class RadialRetarder(Element):
+    """Retardance with a radial fast axis, growing with the square of the field radius."""
+
+    delta: Scalar = number(unit="wave", about="retardance at 0.3°")
+
+    kind: ClassVar[str] = "radial_retarder"
+    reference: ClassVar[str] = "Selbing 2005, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146"
+
+    def mueller(self, ray: Ray) -> Mueller:
+        """A linear retarder, smooth at the centre of the field."""
+        x, y = ray.x, ray.y
+        k = 2.0 * jnp.pi * self.delta / REFERENCE_RADIUS**2
+        a, b, total = k * (x**2 - y**2), k * 2.0 * x * y, k * (x**2 + y**2)
+        sine = jnp.sinc(total / jnp.pi)  # sin Δ / Δ
+        bend = 0.5 * jnp.sinc(0.5 * total / jnp.pi) ** 2  # (1 − cos Δ) / Δ²
+        one, zero = jnp.ones_like(total), jnp.zeros_like(total)
+        rows = (
+            (one, zero, zero, zero),
+            (zero, one - bend * b**2, bend * a * b, -sine * b),
+            (zero, bend * a * b, one - bend * a**2, sine * a),
+            (zero, sine * b, -sine * a, jnp.cos(total)),
+        )
+        return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)

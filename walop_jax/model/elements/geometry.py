@@ -1,0 +1,72 @@
+"""Elements that change where a ray goes: the mapping from field to pupil, wedges, flexure (equations: `optics`)."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from walop_jax.model import materials, optics
+from walop_jax.model.elements.base import Element
+from walop_jax.model.parameters import number
+from walop_jax.model.ray import Ray
+
+Scalar = Float[Array, ""]
+
+
+class PupilMapping(Element):
+    """From the field point to the direction of the collimated beam."""
+
+    magnification: Scalar = number(unit="", about="field-to-pupil magnification", default=1.0)
+    distortion: Scalar = number(unit="deg-2", about="cubic distortion")
+
+    kind: ClassVar[str] = "pupil_mapping"
+    reference: ClassVar[str] = "Maharana et al. 2022, Paper II, appendix B"
+
+    def ray(self, ray: Ray) -> Ray:
+        """The collimated ray."""
+        kx, ky, _ = optics.pupil_direction(ray.x, ray.y, self.magnification, self.distortion)
+        return ray.toward(kx, ky)
+
+
+class Wedge(Element):
+    """A glass wedge: exact refraction, no rotation of the frame, no loss."""
+
+    angle: Scalar = number(unit="rad", about="wedge angle")
+    material: str = eqx.field(static=True, default="BK7")
+
+    kind: ClassVar[str] = "wedge"
+    reference: ClassVar[str] = "Born & Wolf, Principles of Optics, 1.5.1"
+
+    def labels(self, field: str) -> tuple[str, ...]:
+        """The angle has the name of the wedge."""
+        return ("",) if field == "angle" else (field,)
+
+    def ray(self, ray: Ray) -> Ray:
+        """The ray behind the wedge."""
+        index = materials.GLASSES[self.material].refractive_index(ray.wavelength)
+        return ray.toward(*optics.behind_wedge((ray.kx, ray.ky, ray.kz), self.angle, index))
+
+
+class FieldShift(Element):
+    """Field coordinates displaced: by a constant, and in proportion to the hour angle."""
+
+    x: Scalar | None = number(unit="deg", about="displacement along X", default=None)
+    y: Scalar | None = number(unit="deg", about="displacement along Y", default=None)
+    rate_x: Scalar | None = number(unit="deg/h", about="displacement along X per hour", default=None)
+    rate_y: Scalar | None = number(unit="deg/h", about="displacement along Y per hour", default=None)
+
+    kind: ClassVar[str] = "field_shift"
+
+    def ray(self, ray: Ray) -> Ray:
+        """The ray from the place that the optics behind see."""
+        x = ray.x if self.x is None else ray.x + self.x
+        y = ray.y if self.y is None else ray.y + self.y
+        if self.rate_x is not None:
+            x = x + self.rate_x * ray.conditions.hour_angle
+        if self.rate_y is not None:
+            y = y + self.rate_y * ray.conditions.hour_angle
+        x, y = jnp.broadcast_arrays(x, y)
+        return ray.moved(x, y)

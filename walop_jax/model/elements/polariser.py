@@ -1,0 +1,60 @@
+"""The calibration polariser: light behind it forgets its past.
+
+Equation    light behind it (1, c cos 2θ, c sin 2θ, v), c = (1 − ε)/(1 + ε), per unit of transmitted light
+            θ = reading + zero + Σ errors of the encoder
+Symbols     θ transmission axis in the instrument frame; ε extinction ratio, unwanted over wanted transmission;
+            v circular polarisation behind it; reading: encoder [deg]
+Source      Malus' law for a polariser of finite extinction: Goldstein 2003, Polarized Light, ch. 9.
+Limits      ε = 0 is the ideal polariser. What it does to the flux of polarised light is part of the unknown flux.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from walop_jax.model import mueller
+from walop_jax.model.elements.base import Element
+from walop_jax.model.parameters import Component, number
+
+Scalar = Float[Array, ""]
+Angles = Float[Array, " e"]
+
+
+class EncoderError(Component):
+    """Error of the reading at a harmonic of the turn: amplitude · sin(order · reading − phase)."""
+
+    amplitude: Scalar = number(unit="deg", about="largest error")
+    phase: Scalar = number(unit="rad", about="phase at which there is none")
+    order: int = eqx.field(static=True, default=1)
+
+    def error(self, reading: Angles) -> Angles:
+        """What is added to the reading (rad)."""
+        return jnp.deg2rad(self.amplitude) * jnp.sin(self.order * reading - self.phase)
+
+
+class Polariser(Element):
+    """A polariser whose axis is read from an encoder."""
+
+    extinction: Scalar = number(unit="", about="ε, unwanted over wanted transmission")
+    zero: Scalar | None = number(unit="deg", about="added to the encoder reading", default=None)
+    ellipticity: Scalar | None = number(unit="", about="circular polarisation behind it", default=None)
+    encoder: tuple[EncoderError, ...] = ()
+
+    kind: ClassVar[str] = "polariser"
+    reference: ClassVar[str] = "Goldstein 2003, Polarized Light, ch. 9"
+
+    def axis_of(self, reading: Angles) -> Angles:
+        """Transmission axis (rad) from the encoder reading (rad)."""
+        axis = reading if self.zero is None else reading + jnp.deg2rad(self.zero)
+        for error in self.encoder:
+            axis = axis + error.error(reading)
+        return axis
+
+    def light(self, reading: Angles) -> Float[Array, "e 4"]:
+        """Stokes vectors behind it, per unit of transmitted light."""
+        behind = mueller.polarised(self.axis_of(reading), self.extinction)
+        return behind if self.ellipticity is None else behind.at[:, 3].add(self.ellipticity)

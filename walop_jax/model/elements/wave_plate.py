@@ -1,0 +1,145 @@
+"""Wave plates: crystal layers in contact, solved as plane waves (equations: `plates`).
+
+Layers      optic axis of a layer at fast axis + axis, out of its surface by cut.
+Thermal     n_e − n_o → (n_e − n_o) (1 − thermal · b · (T − 10 °C)), b the published change per kelvin.
+Air gap     diattenuator D = contrast · cos(4π gap cos ϑ / λ) along the fast axis, directly ahead of the plate;
+            ϑ angle of the ray in air.
+Sources     Etzel, Rose & Wang 2000, Appl. Opt. 39, 5796 (thermal); Clarke 2005, A&A 434, 377 (fringes).
+Limits      a plate without layers does nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from walop_jax.model import materials, mueller, plates
+from walop_jax.model.elements.base import Element, Mueller
+from walop_jax.model.parameters import Component, Declaration, number
+from walop_jax.model.ray import Ray
+
+Scalar = Float[Array, ""]
+Real = Float[Array, "..."]
+# Inlined: the operations are those of the plain functions, but they are traced once for all plates of a kind.
+MODELS = {
+    name: jax.jit(function, inline=True)
+    for name, function in (("waves", plates.stack_mueller), ("fixed_axis", plates.fixed_axis_mueller))
+}
+
+
+class Layer(Component):
+    """One crystal of a plate."""
+
+    name: str = eqx.field(static=True, default="")
+    material: str = eqx.field(static=True, default="quartz")
+    thickness: Scalar = number(unit="um", about="thickness")
+    axis: Scalar = number(unit="deg", about="optic axis, from the fast axis of the plate")
+    cut: Scalar | None = number(unit="deg", about="optic axis out of the surface", default=None)
+    declared: tuple[tuple[str, Declaration], ...] = eqx.field(static=True, default=())
+
+    def declarations(self) -> Mapping[str, Declaration]:
+        """What the instrument has declared."""
+        return dict(self.declared)
+
+    def labels(self, field: str) -> tuple[str, ...]:
+        """The thickness has the name of the layer."""
+        return ("",) if field == "thickness" else (field,)
+
+
+class AirGap(Component):
+    """An air gap ahead of a plate, with fringes of polarised light."""
+
+    contrast: Scalar = number(unit="", about="diattenuation at a maximum")
+    gap: Scalar = number(unit="um", about="thickness of the air")
+    longest: float = eqx.field(
+        static=True, default=0.0
+    )  # µm: gaps up to which the wavelength nodes must follow
+
+
+class WavePlate(Element):
+    """Crystal layers in contact, in air, faces normal to the axis of the instrument."""
+
+    layers: tuple[Layer, ...] = ()
+    axis: Scalar = number(unit="deg", about="fast axis, from +X toward +Y")
+    thermal: Scalar | None = number(unit="", about="thermal change, 1 as published", default=None)
+    air_gaps: tuple[AirGap, ...] = ()
+    model: str = eqx.field(static=True, default="waves")
+    always_in: bool = eqx.field(static=True, default=False)
+
+    kind: ClassVar[str] = "wave_plate"
+    reference: ClassVar[str] = "Born & Wolf, Principles of Optics, ch. 15; Yeh 1982, Surf. Sci. 96, 41"
+
+    def position(self, angle: float | None) -> float | None:
+        """At 0° where it always stands in the beam and the exposure says that it is out."""
+        return 0.0 if angle is None and self.always_in else angle
+
+    @property
+    def path_difference(self) -> float:
+        """Of the air gaps: there and back."""
+        return 2.0 * max((gap.longest for gap in self.air_gaps), default=0.0)
+
+    def crystals(self, ray: Ray) -> tuple[plates.Plate, ...]:
+        """The layers at the wavelengths of a ray."""
+        made = []
+        for layer in self.layers:
+            crystal = materials.CRYSTALS[layer.material]
+            ordinary = crystal.ordinary.refractive_index(ray.wavelength)
+            extraordinary = crystal.extraordinary.refractive_index(ray.wavelength)
+            if self.thermal is not None:
+                warmer = self.thermal * (ray.conditions.temperature - materials.REFERENCE_TEMPERATURE)
+                extraordinary = ordinary + (extraordinary - ordinary) * (1.0 - crystal.thermal * warmer)
+            axis = jnp.deg2rad(self.axis + layer.axis)
+            cut = None if layer.cut is None else jnp.deg2rad(layer.cut)
+            made.append(plates.Plate(layer.thickness, ordinary, extraordinary, axis, cut))
+        return tuple(made)
+
+    def mueller(self, ray: Ray) -> Mueller | None:
+        """The plate with the air gap ahead of it."""
+        return self.solved([(self, ray)])[0]
+
+    @classmethod
+    def solved(cls, cases: Sequence[tuple[WavePlate, Ray]]) -> list[Mueller | None]:
+        """All plates of as many layers as rows of the same arrays: one piece of physics, compiled once."""
+        result: list[Mueller | None] = [None] * len(cases)
+        groups: dict[tuple[int, str], list[int]] = {}
+        for i, (plate, _) in enumerate(cases):
+            if plate.layers:
+                groups.setdefault((len(plate.layers), plate.model), []).append(i)
+        for (_, model), members in groups.items():
+            chosen = [cases[i] for i in members]
+            for i, matrix in zip(members, _solved_together(chosen, model), strict=True):
+                plate, ray = cases[i]
+                result[i] = _behind_gap(plate, ray, matrix)
+        return result
+
+
+def _solved_together(cases: Sequence[tuple[WavePlate, Ray]], model: str) -> Float[Array, "c n 4 4"]:
+    nodes = jnp.shape(cases[0][1].wavelength)
+
+    def together(*values: Real) -> Float[Array, "c n"]:
+        return jnp.stack([jnp.broadcast_to(value, nodes) for value in values])
+
+    stacks = [plate.crystals(ray) for plate, ray in cases]
+    if any(crystal.cut is not None for stack in stacks for crystal in stack):
+        stacks = [tuple(_with_cut(crystal) for crystal in stack) for stack in stacks]
+    kx, ky = together(*(ray.kx for _, ray in cases)), together(*(ray.ky for _, ray in cases))
+    return MODELS[model](
+        kx, ky, jax.tree.map(together, *stacks), together(*(ray.wavelength for _, ray in cases))
+    )
+
+
+def _with_cut(crystal: plates.Plate) -> plates.Plate:
+    return crystal if crystal.cut is not None else crystal._replace(cut=jnp.zeros(()))
+
+
+def _behind_gap(plate: WavePlate, ray: Ray, matrix: Mueller) -> Mueller:
+    for gap in plate.air_gaps:
+        axis = jnp.deg2rad(plate.axis + plate.layers[0].axis)
+        d = gap.contrast * jnp.cos(4.0 * jnp.pi * gap.gap * ray.kz / ray.wavelength)
+        matrix = matrix @ mueller.diattenuator(d * jnp.cos(2.0 * axis), d * jnp.sin(2.0 * axis))
+    return matrix

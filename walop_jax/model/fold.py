@@ -1,0 +1,151 @@
+"""The fold of the train: Mueller matrices of all elements at all their positions, multiplied into the analysers' rows.
+
+A *station* is an element with the ray that meets it; a *state* holds the positions of the moving elements in one
+optical setting (an angle in degrees, None when out), in the order of their columns. Settings that agree in the
+elements nearest to the analysers share the products of these, so every product is made once. `solved` hands all
+elements of one class over together: the half-wave plates are one computation, compiled once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from walop_jax.model.elements import Analyser, Element
+from walop_jax.model.ray import Ray
+
+Station = tuple[Element, Ray]
+State = tuple[float | None, ...]
+Mueller = Float[Array, "... 4 4"]
+Solved = dict[tuple[int, float | None], Mueller | None]
+"""Mueller matrices by number of the station and angle at which its element stands (None for one that does not move)."""
+
+
+def stations(elements: Sequence[Element], ray: Ray) -> tuple[list[Station], Ray]:
+    """Elements with their rays, and the ray behind the last."""
+    found = []
+    for element in elements:
+        found.append((element, ray))
+        ray = element.ray(ray)
+    return found, ray
+
+
+def positions(element: Element, moving: Sequence[str], states: Sequence[State]) -> list[float | None]:
+    """Where an element stands in each state; None where it is out (or does not move: see `Solved`)."""
+    if element.moves is None:
+        return [None] * len(states)
+    column = moving.index(element.moves)
+    return [element.position(state[column]) for state in states]
+
+
+def solved(every: Sequence[Station], moving: Sequence[str], states: Sequence[State]) -> Solved:
+    """Mueller matrices of all stations at all the positions in which they occur."""
+    cases: list[tuple[tuple[int, float | None], Element, Ray]] = []
+    for number, (element, ray) in enumerate(every):
+        if element.moves is None:
+            cases.append(((number, None), element, ray))
+            continue
+        angles = {angle for angle in positions(element, moving, states) if angle is not None}
+        cases += [((number, angle), element.turned(angle), ray) for angle in sorted(angles)]
+    result: Solved = {}
+    for kind in dict.fromkeys(type(element) for _, element, _ in cases):
+        own = [case for case in cases if type(case[1]) is kind]
+        matrices = kind.solved([(element, ray) for _, element, ray in own])
+        result.update({key: matrix for (key, _, _), matrix in zip(own, matrices, strict=True)})
+    return result
+
+
+def backward(
+    common: Sequence[Station],
+    arms: Sequence[Sequence[Station]],
+    analysers: Sequence[Analyser],
+    matrices: Solved,
+    moving: Sequence[str],
+    states: Sequence[State],
+    nodes: int,
+) -> Float[Array, "c n r 4"]:
+    """Rows that the analysers see in every state, of light ahead of the common train."""
+    in_arms = [element.moves for arm in arms for element, _ in arm if element.moves is not None]
+    known = {moving.index(prefix) for prefix in in_arms}
+    keys = _distinct(states, known)
+    number, parts = len(common), []
+    for arm, analyser in zip(arms, analysers, strict=True):
+        matrix: Mueller | None = None
+        for i, (element, _) in enumerate(arm):
+            own = _stacked(matrices, number + i, element, moving, keys)
+            if own is not None:
+                matrix = own if matrix is None else own @ matrix
+        number += len(arm)
+        seen = analyser.seen(jnp.eye(4) if matrix is None else matrix)
+        parts.append(jnp.broadcast_to(seen, (len(keys), nodes, *seen.shape[-2:])))
+    rows = jnp.concatenate(parts, axis=2)
+    for number in reversed(range(len(common))):
+        element = common[number][0]
+        if element.moves is not None:
+            more = known | {moving.index(element.moves)}
+            rows, keys = _branched(rows, keys, known, more, states)
+            known = more
+        rows = _multiplied(rows, matrices, number, element, moving, keys)
+    order = [keys.index(_restricted(state, known)) for state in states]
+    return rows if order == list(range(len(keys))) else rows[np.array(order)]
+
+
+def _restricted(state: State, known: set[int]) -> State:
+    return tuple(position if i in known else None for i, position in enumerate(state))
+
+
+def _distinct(states: Sequence[State], known: set[int]) -> list[State]:
+    return list(dict.fromkeys(_restricted(state, known) for state in states))
+
+
+def _branched(
+    rows: Float[Array, "c n r 4"],
+    keys: list[State],
+    before: set[int],
+    after: set[int],
+    states: Sequence[State],
+) -> tuple[Float[Array, "d n r 4"], list[State]]:
+    """The rows once for every position of one more moving element; `before` and `after` are the columns that count."""
+    parents = {_restricted(state, after): _restricted(state, before) for state in states}
+    order = [keys.index(parent) for parent in parents.values()]
+    return (rows if order == list(range(len(keys))) else rows[np.array(order)]), list(parents)
+
+
+def _stacked(
+    matrices: Solved, number: int, element: Element, moving: Sequence[str], keys: Sequence[State]
+) -> Mueller | None:
+    """Matrices of a station in every state, None where it is the identity in all."""
+    if element.moves is None:
+        return matrices[number, None]
+    own = [None if at is None else matrices[number, at] for at in positions(element, moving, keys)]
+    inside = [matrix for matrix in own if matrix is not None]
+    if not inside:
+        return None
+    whole = np.broadcast_shapes(*(matrix.shape for matrix in inside))
+    eye = jnp.broadcast_to(jnp.eye(4), whole)
+    stack = jnp.stack([eye if m is None else jnp.broadcast_to(m, whole) for m in own])
+    return stack if len(whole) == 3 else stack[:, None]
+
+
+def _multiplied(
+    rows: Float[Array, "c n r 4"],
+    matrices: Solved,
+    number: int,
+    element: Element,
+    moving: Sequence[str],
+    keys: Sequence[State],
+) -> Float[Array, "c n r 4"]:
+    """Rows of the light ahead of a station; states in which it is out are left as they are."""
+    if element.moves is None:
+        own = matrices[number, None]
+        return rows if own is None else rows @ own
+    inside = [i for i, at in enumerate(positions(element, moving, keys)) if at is not None]
+    own = _stacked(matrices, number, element, moving, [keys[i] for i in inside]) if inside else None
+    if own is None:
+        return rows
+    if len(inside) == len(keys):
+        return rows @ own
+    return rows.at[np.array(inside)].set(rows[np.array(inside)] @ own)

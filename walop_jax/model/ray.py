@@ -1,0 +1,102 @@
+"""A ray on its way through the train: where it comes from, where it goes, and under which conditions.
+
+Units       field coordinates deg; direction cosines of the unit vector along the ray in air, axes of the instrument
+            frame; vacuum wavelength µm. Leading achromatic elements meet a ray that knows no wavelength.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Real = Float[Array, "..."]
+
+CONDITIONS = {"temperature": "TEMP", "hour_angle": "HA", "hours": "MJD"}
+"""What the optics may depend on from exposure to exposure, and the column of EXPOSURES that says it."""
+
+
+class NotPlannedError(ValueError):
+    """The optics have asked for a quantity that the computation was not laid out for; `quantity` is its name."""
+
+    def __init__(self, quantity: str) -> None:
+        self.quantity = quantity
+        super().__init__(
+            f"the optics ask for {quantity!r}, which this plan does not hold; make the plan with `plan_for` for the "
+            "instrument that is computed, effects included"
+        )
+
+
+class Conditions(eqx.Module):
+    """What an exposure says of the moment, at every wavelength node; only what the optics have asked for is there.
+
+    `band_width` is the equivalent width (µm) of the filter that a node belongs to.
+    """
+
+    band_width: Real
+    planned: Mapping[str, Real]
+
+    def _get(self, name: str) -> Real:
+        if name not in self.planned:
+            raise NotPlannedError(name)
+        return self.planned[name]
+
+    @property
+    def temperature(self) -> Real:
+        """Temperature of the instrument (Celsius)."""
+        return self._get("temperature")
+
+    @property
+    def hour_angle(self) -> Real:
+        """Hour angle (h)."""
+        return self._get("hour_angle")
+
+    @property
+    def hours(self) -> Real:
+        """Time since the first exposure (h)."""
+        return self._get("hours")
+
+
+class Ray(eqx.Module):
+    """A ray at a place of the train; its direction is (kx, ky, kz), in air."""
+
+    x: Real
+    y: Real
+    kx: Real
+    ky: Real
+    spectrum: tuple[Real, Conditions] | None
+
+    @classmethod
+    def entering(cls, x: Real, y: Real, spectrum: tuple[Real, Conditions] | None = None) -> Ray:
+        """The ray from a field point (deg) ahead of the mapping from field to pupil: along the axis."""
+        zero = jnp.zeros(())
+        return cls(x, y, zero, zero, spectrum)
+
+    @property
+    def kz(self) -> Real:
+        """Cosine of the angle to the axis."""
+        return jnp.sqrt(1.0 - self.kx**2 - self.ky**2)
+
+    @property
+    def wavelength(self) -> Real:
+        """Vacuum wavelengths (µm) of the nodes."""
+        if self.spectrum is None:
+            raise NotPlannedError("wavelength")
+        return self.spectrum[0]
+
+    @property
+    def conditions(self) -> Conditions:
+        """What the exposure says."""
+        if self.spectrum is None:
+            raise NotPlannedError("conditions")
+        return self.spectrum[1]
+
+    def moved(self, x: Real, y: Real) -> Ray:
+        """The ray from another field point."""
+        return Ray(x, y, self.kx, self.ky, self.spectrum)
+
+    def toward(self, kx: Real, ky: Real) -> Ray:
+        """The ray in another direction."""
+        return Ray(self.x, self.y, kx, ky, self.spectrum)

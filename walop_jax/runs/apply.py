@@ -1,0 +1,130 @@
+"""A calibration applied to a catalogue of intensities, from file to file."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from walop_jax.calibration.from_file import read_calibration
+from walop_jax.calibration.records import Quality
+from walop_jax.data.catalogue import read_catalogue
+from walop_jax.data.user_tables import read_input_table, table_format, write_output_table
+from walop_jax.io.atomic import check_output
+from walop_jax.io.errors import errors_naming
+from walop_jax.posterior.propagate import with_moments
+from walop_jax.science.apply import apply, not_carried_over
+from walop_jax.science.polarisation import ESTIMATORS
+from walop_jax.science.stokes_columns import header, stokes_columns
+
+BITS = (
+    Quality.HIGH_CROSSTALK,
+    Quality.BEYOND_FIELD,
+    Quality.BEYOND_SETTINGS,
+    Quality.CAMERA_MISSING,
+    Quality.SATURATED,
+    Quality.NO_STOKES,
+)
+"""Bits of FLAG that a star can have by itself."""
+
+
+@dataclasses.dataclass(frozen=True)
+class StokesTable:
+    """A catalogue that was written.
+
+    `flags` counts the stars with each bit of FLAG; `product` is the content hash of the calibration, `trusted` what
+    it says of itself; `warnings` are sentences about both.
+    """
+
+    path: Path
+    rows: int
+    stars: int
+    seconds: float
+    estimator: str
+    trusted: bool
+    flags: Mapping[Quality, int]
+    product: str
+    warnings: tuple[str, ...]
+
+    def document(self) -> dict[str, Any]:
+        """Everything but the warnings as plain data."""
+        return {
+            "output": str(self.path),
+            "rows": self.rows,
+            "stars": self.stars,
+            "seconds": self.seconds,
+            "estimator": self.estimator,
+            "trusted": self.trusted,
+            "flags": {str(int(bit)): count for bit, count in self.flags.items()},
+            "product": self.product,
+        }
+
+
+def apply_to_catalogue(
+    product: str | os.PathLike[str],
+    catalogue: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    estimator: str = ESTIMATORS[0],
+    saturation: float | None = None,
+    posterior: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    progress: Callable[[str], None] | None = None,
+) -> StokesTable:
+    """Add Q, U, P, EVPA, their errors and FLAG to the table `catalogue`, and write it as `output`.
+
+    `product` is a calibration product or the folder of a run; `estimator` is one of `ESTIMATORS`; counts (electrons)
+    from `saturation` on are not used; with `posterior` (a `posterior.nc`) mean and covariance are those of its
+    draws. `progress` is told what is being done. Raises `DataError` for files that cannot be read or written and as
+    `science.apply` does; ValueError for an unknown estimator and a saturation that is not above 0.
+    """
+    began = time.perf_counter()
+    tell = progress or (lambda text: None)
+    if estimator not in ESTIMATORS:
+        raise ValueError(f"{estimator!r} is neither {' nor '.join(ESTIMATORS)}")
+    if saturation is not None and not saturation > 0:
+        raise ValueError(f"saturation {saturation} must be above 0 electrons")
+    table_format(output)
+    check_output(output, overwrite=overwrite)
+    held = read_calibration(product)
+    table = read_input_table(catalogue)
+    rows = read_catalogue(table, held.product.instrument, math.inf if saturation is None else saturation)
+
+    tell("tabulating the analysis vectors")
+    calibration = held.calibration if posterior is None else with_moments(held.calibration, posterior)
+    with errors_naming(catalogue):
+        stars = apply(calibration, rows, lambda done, all_: tell(f"{done} of {all_} rows"))
+    tell("writing")
+    columns = stokes_columns(stars, rows.star, estimator)
+    content = held.product.content_hash()
+    cards = header(content, estimator, float(np.mean(np.isfinite(rows.rotator))))
+    write_output_table(output, table, columns, overwrite=overwrite, header=cards)
+
+    counts = {bit: int((stars.flag & bit > 0).sum()) for bit in BITS}
+    lost = [
+        f"{held.path}: {effect} of the calibration's exposures cannot be undone in a catalogue; it is left out"
+        for effect in not_carried_over(calibration)
+    ]
+    said = (
+        (Quality.NO_STOKES, "star(s) without a result (FLAG 16384)"),
+        (Quality.BEYOND_FIELD, "star(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)"),
+        (Quality.BEYOND_SETTINGS, "star(s) with a filter, temperature or TEFF beyond the calibration"),
+    )
+    flagged = [f"{catalogue}: {counts[bit]} {text}" for bit, text in said if counts[bit]]
+    return StokesTable(
+        path=Path(output),
+        rows=table.rows,
+        stars=len(stars.qu),
+        seconds=time.perf_counter() - began,
+        estimator=estimator,
+        trusted=held.product.verdict.trusted,
+        flags=counts,
+        product=content,
+        warnings=(*held.warnings, *lost, *flagged),
+    )

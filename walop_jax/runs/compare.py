@@ -1,0 +1,86 @@
+"""The method of Paper II beside the joint model on the same calibration sets: from files to a folder of results."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.data import DEFAULT_FILTER, read_calibration_set
+from walop_jax.data.user_tables import new_table, true_matrices, write_output_table
+from walop_jax.fit.model_builder import model_for
+from walop_jax.fit.refit import refit
+from walop_jax.io.errors import errors_naming
+from walop_jax.io.folder import atomic_folder, check_folder
+from walop_jax.io.text import json_text, read_text
+from walop_jax.model.instrument import Instrument
+from walop_jax.paper.comparison import Comparison, compare
+from walop_jax.reports import comparison_figures
+from walop_jax.science.star_errors import Truth
+
+DOCUMENT, TABLE = "comparison.json", "comparison.fits"
+FIGURES: Mapping[str, Callable[[Comparison], Any]] = {
+    "comparison_histogram.png": comparison_figures.histogram_figure,
+    "comparison_map.png": comparison_figures.map_figure,
+    "comparison_offset.png": comparison_figures.offset_figure,
+    "comparison_spectral.png": comparison_figures.spectral_figure,
+}
+OUTPUTS = (DOCUMENT, TABLE, *FIGURES)
+"""In the order in which they are looked for."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ComparedRun:
+    """A comparison, the content of `comparison.json`, and sentences to bear in mind."""
+
+    comparison: Comparison
+    document: dict[str, Any]
+    warnings: tuple[str, ...]
+
+
+def compare_methods(
+    calsets: Sequence[str | os.PathLike[str]],
+    output: str | os.PathLike[str],
+    *,
+    truth: str | os.PathLike[str] | None = None,
+    filter_name: str = DEFAULT_FILTER,
+    model: str | os.PathLike[str] | None = None,
+    instrument: str | os.PathLike[str] | None = None,
+    seed: int | None = None,
+    overwrite: bool = False,
+    progress: Callable[[str], None] | None = None,
+) -> ComparedRun:
+    """Calibrate with a polynomial per point and with the joint model, judge both, and write the folder `output`.
+
+    `truth` is a table of true X, Y, M21 … M33; without it the reference is the joint model. `instrument` is a shipped
+    one by name or a description file (default: what the sets say), `model` a TOML file (default: the base model);
+    `seed` (None: 0) is that of the stars. `progress` is told what is being done.
+
+    Raises `DataError` for files that cannot be read or written, ValueError for a model file that does not fit, if
+    the joint fit does not converge, and as `compare` does.
+    """
+    tell = progress or (lambda text: None)
+    text = "" if model is None else read_text(model)
+    check_folder(output, OUTPUTS, overwrite=overwrite)
+    tell("reading")
+    calset = read_calibration_set(*calsets)
+    known = None if truth is None else Truth(*true_matrices(truth, calset.instrument))
+    design = None if instrument is None else Instrument.read(instrument)
+    with errors_naming(model):
+        chosen = model_for(calset, text, design)
+    tell("fitting the joint model")
+    result = refit(calset, chosen, progress=tell)
+    if not result.converged:
+        raise ValueError(f"the joint fit did not converge ({result.minimum.message})")
+    tell("fitting and judging the polynomials")
+    found = compare(calset, Calibration.from_fit(result), known, filter_name, seed or 0)
+    document = found.document()
+    with atomic_folder(output, OUTPUTS, overwrite=overwrite) as folder:
+        (folder / DOCUMENT).write_text(json_text(document), encoding="utf-8")
+        write_output_table(folder / TABLE, new_table(found.columns()), {})
+        for name, figure in FIGURES.items():
+            figure(found).savefig(folder / name, dpi=130)
+    warnings = () if result.trusted else ("the joint fit is not trusted: see walop-jax refit",)
+    return ComparedRun(found, document, warnings)

@@ -1,0 +1,80 @@
+"""What a model lacks to explain calibration sets: found, named and added, from files to the folder of a run."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.product import write_product
+from walop_jax.calibration.summary import PRODUCT, SUMMARY, summary
+from walop_jax.data import read_calibration_set
+from walop_jax.diagnosis.document import DIAGNOSIS, document
+from walop_jax.diagnosis.figure_data import figure_data
+from walop_jax.diagnosis.figure_file import FIGURE_DATA, write_figure_data
+from walop_jax.diagnosis.findings import Diagnosis
+from walop_jax.diagnosis.workflow import diagnose
+from walop_jax.fit.misfit import describe
+from walop_jax.fit.model_builder import model_for
+from walop_jax.io.errors import errors_naming
+from walop_jax.io.folder import atomic_folder, check_folder
+from walop_jax.io.text import json_text, read_text
+from walop_jax.model.instrument import Instrument
+
+OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, FIGURE_DATA)
+
+
+@dataclasses.dataclass(frozen=True)
+class DiagnosedRun:
+    """A diagnosis, and the content of `diagnosis.json`."""
+
+    diagnosis: Diagnosis
+    document: dict[str, Any]
+
+
+def diagnose_sets(
+    calsets: Sequence[str | os.PathLike[str]],
+    output: str | os.PathLike[str],
+    *,
+    model: str | os.PathLike[str] | None = None,
+    instrument: str | os.PathLike[str] | None = None,
+    seed: int | None = None,
+    overwrite: bool = False,
+    progress: Callable[[str], None] | None = None,
+) -> DiagnosedRun:
+    """Find what is missing from the model of calibration sets, add it, fit again, and write the folder `output`.
+
+    `calibration.fits` and `summary.json` are of the extended model, `diagnosis.json` is what was found and
+    `diagnosis.fits` what figures of it need: all four appear, or none. `instrument` is a shipped one by name or a
+    description file (default: what the sets say), `model` a TOML file (default: the base model); `seed` (None: 0) is
+    that of the Monte Carlo. `progress` is told what is being done.
+
+    Raises `DataError` for files that cannot be read or written, ValueError for a model file that does not fit, and
+    what `diagnose` raises.
+    """
+    began = time.perf_counter()
+    tell = progress or (lambda text: None)
+    text = "" if model is None else read_text(model)
+    check_folder(output, OUTPUTS, overwrite=overwrite)
+    tell("reading")
+    calset = read_calibration_set(*calsets)
+    design = None if instrument is None else Instrument.read(instrument)
+    with errors_naming(model):
+        chosen = model_for(calset, text, design)
+    found = diagnose(calset, chosen, seed=seed or 0, progress=tell)
+    tell("mapping the field")
+    product = Calibration.from_fit(found.after).to_product()
+    misfit = None if found.after.explains_data else describe(found.after)
+    content = document(found)
+    fitted = summary(found.after, seconds=time.perf_counter() - began, misfit=misfit) | {"seed": seed}
+    drawn_from = figure_data(found)
+    with atomic_folder(Path(output), OUTPUTS, overwrite=overwrite) as folder:
+        write_product(folder / PRODUCT, product)
+        (folder / SUMMARY).write_text(json_text(fitted), encoding="utf-8")
+        (folder / DIAGNOSIS).write_text(json_text(content), encoding="utf-8")
+        write_figure_data(folder / FIGURE_DATA, drawn_from)
+    return DiagnosedRun(found, content)

@@ -1,0 +1,49 @@
+"""An old calibration, from its file, held against new calibration sets."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.from_file import product_path
+from walop_jax.calibration.product import read_product
+from walop_jax.data import read_calibration_set
+from walop_jax.io.errors import errors_naming
+from walop_jax.science.epoch import Epoch, epoch
+
+
+@dataclasses.dataclass(frozen=True)
+class EpochComparison:
+    """What has moved; the content hash of the old product and the SHA-256 of the new sets."""
+
+    found: Epoch
+    old: str
+    new: tuple[str, ...]
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {"old": self.old, "new": list(self.new)} | self.found.document()
+
+
+def compare_epochs(
+    old: str | os.PathLike[str],
+    calsets: Sequence[str | os.PathLike[str]],
+    *,
+    progress: Callable[[str], None] | None = None,
+) -> EpochComparison:
+    """Fit new calibration sets and compare with the calibration `old` (a product, or the folder of a run).
+
+    `progress` is told what is being done. Raises `DataError` for files that cannot be read, and what
+    `science.epoch` raises.
+    """
+    path = product_path(old)
+    product = read_product(path)
+    calset = read_calibration_set(*calsets)
+    if progress is not None:
+        progress("fitting the new set")
+    with errors_naming(path):
+        found, _ = epoch(Calibration.from_product(product), calset)
+    return EpochComparison(found, product.content_hash(), tuple(entry.sha256 for entry in calset.inputs))

@@ -1,0 +1,98 @@
+"""The instrument matrix of a calibration at the field points of a table, from file to file."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from walop_jax.calibration.from_file import read_calibration
+from walop_jax.calibration.matrix import Settings
+from walop_jax.calibration.matrix_table import matrix_columns
+from walop_jax.calibration.records import Quality
+from walop_jax.data.user_tables import field_points, read_input_table, table_format, write_output_table
+from walop_jax.io.atomic import check_output
+from walop_jax.io.errors import errors_naming
+from walop_jax.posterior.propagate import with_draws
+
+BITS = (Quality.HIGH_CROSSTALK, Quality.BEYOND_FIELD, Quality.BEYOND_SETTINGS)
+"""Bits of FLAG that a row of a table of matrices can have."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MatrixTable:
+    """A table that was written.
+
+    `flags` counts the rows with each bit of FLAG; `product` is the content hash of the calibration, `trusted` what
+    it says of itself; `warnings` are sentences about both.
+    """
+
+    path: Path
+    rows: int
+    trusted: bool
+    flags: Mapping[Quality, int]
+    product: str
+    warnings: tuple[str, ...]
+
+    def document(self) -> dict[str, Any]:
+        """Everything but the warnings as plain data."""
+        return {
+            "output": str(self.path),
+            "rows": self.rows,
+            "trusted": self.trusted,
+            "flags": {str(int(bit)): count for bit, count in self.flags.items()},
+            "product": self.product,
+        }
+
+
+def tabulate_matrix(
+    product: str | os.PathLike[str],
+    points: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    posterior: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    progress: Callable[[str], None] | None = None,
+) -> MatrixTable:
+    """Add M21 … M33, their errors and FLAG to the table `points`, and write it as `output`.
+
+    `product` is a calibration product or the folder of a run; with `posterior` (a `posterior.nc`) values and errors
+    are those of its draws. `progress` is told what is being done. Raises `DataError` for files that cannot be read
+    or written, for columns and cells that cannot be meant, and for a filter that nobody knows.
+    """
+    table_format(output)
+    check_output(output, overwrite=overwrite)
+    held = read_calibration(product)
+    table = read_input_table(points)
+    wanted = field_points(table, held.product.instrument)
+    if progress is not None:
+        progress("working out the matrix")
+    calibration = held.calibration if posterior is None else with_draws(held.calibration, posterior)
+    settings = Settings(wanted.filter, wanted.teff, wanted.chwp_angle, wanted.temp, wanted.ha)
+    with errors_naming(points):
+        columns = matrix_columns(calibration, wanted.x, wanted.y, settings, wanted.outside)
+    write_output_table(output, table, columns, overwrite=overwrite)
+
+    flag = columns["FLAG"][0]
+    counts = {bit: int((flag & bit > 0).sum()) for bit in BITS}
+    warnings = list(held.warnings)
+    if counts[Quality.BEYOND_FIELD]:
+        warnings.append(
+            f"{points}: {counts[Quality.BEYOND_FIELD]} point(s) beyond the calibrated field: extrapolated, or NaN "
+            "(FLAG 32)"
+        )
+    if counts[Quality.BEYOND_SETTINGS]:
+        warnings.append(
+            f"{points}: {counts[Quality.BEYOND_SETTINGS]} row(s) with a filter or temperature not in the "
+            "calibration (FLAG 64)"
+        )
+    return MatrixTable(
+        path=Path(output),
+        rows=table.rows,
+        trusted=held.product.verdict.trusted,
+        flags=counts,
+        product=held.product.content_hash(),
+        warnings=tuple(warnings),
+    )

@@ -1,0 +1,112 @@
+"""The posterior around the fit of a run: chains kept on the way, then draws, intervals and figures beside the fit."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.product import CalibrationProduct, read_product, write_product
+from walop_jax.calibration.summary import PRODUCT
+from walop_jax.io.errors import fail
+from walop_jax.io.folder import atomic_folder
+from walop_jax.io.plain_tables import write_columns
+from walop_jax.io.text import json_text, read_text
+from walop_jax.posterior import Options, PosteriorSample, sample
+from walop_jax.posterior.checkpoint import Checkpoints
+from walop_jax.posterior.from_run import fit_of_run
+from walop_jax.posterior.output import intervals, report, write_posterior
+from walop_jax.posterior.result import Report
+from walop_jax.reports.posterior_figures import corner_figure, save_figure, trace_figure
+from walop_jax.reports.run import CORNER, INTERVALS, POSTERIOR, SAMPLE
+
+CHAINS = "sampling"
+"""Folder, in that of the run, of the checkpoints."""
+
+INTERVALS_FITS, TRACE = "posterior.fits", "posterior_trace.png"
+OUTPUTS = (POSTERIOR, INTERVALS_FITS, INTERVALS, CORNER, TRACE, SAMPLE)
+
+
+@dataclasses.dataclass(frozen=True)
+class SampledRun:
+    """A posterior, and the content of `sample.json`."""
+
+    posterior: PosteriorSample
+    summary: dict[str, Any]
+
+
+def sample_run(
+    run: str | os.PathLike[str],
+    options: Options | None = None,
+    *,
+    model: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: Report | None = None,
+) -> SampledRun:
+    """Sample the posterior around the fit in the folder `run`, and write it there.
+
+    Checkpoints lie in `run`/sampling: with `resume` an interrupted call goes on from them, bit for bit. `model` is
+    the TOML file of the fit, by default the model that `calibration.fits` holds. A posterior that is to be trusted
+    puts its covariance into `calibration.fits`; another is written and marked so, and `calibration.fits` stays.
+
+    `progress` is told what is done, how much of it, τ and the effective sample size. Raises `DataError` if `run` is
+    no folder of a fit, holds a posterior already (neither `resume` nor `overwrite`), or does not fit its data any
+    more; and as `posterior.sample` does.
+    """
+    folder = Path(run)
+    if not folder.is_dir():
+        raise fail("is not a folder", file=folder, advice="give the RUN of walop-jax refit")
+    product = read_product(folder / PRODUCT)
+    text = None if model is None else read_text(model)
+    found = [name for name in OUTPUTS if (folder / name).exists()]
+    if found and not (overwrite or resume):
+        raise fail(f"holds {found[0]} already", file=folder, advice="go on with --resume, or --overwrite it")
+    result = fit_of_run(product, folder, text)
+    if overwrite and not resume:
+        Checkpoints(folder / CHAINS, {}).clear()
+    posterior = sample(result, options, folder=folder / CHAINS, resume=resume, report=progress)
+    summary = report(posterior)
+    _write(folder, product, posterior, summary)
+    return SampledRun(posterior, summary)
+
+
+def _write(
+    run: Path, product: CalibrationProduct, posterior: PosteriorSample, summary: dict[str, Any]
+) -> None:
+    units = dict(zip(posterior.names, posterior.units, strict=True))
+    sampled = [units.get(name, "") for name in posterior.sampled]
+    notes = {"TRUSTED": posterior.trusted, "STEPS": posterior.convergence.steps}
+    names = OUTPUTS + ((PRODUCT,) if posterior.trusted else ())
+    with atomic_folder(run, names, overwrite=True) as folder:
+        write_posterior(folder / POSTERIOR, posterior)
+        for name in (INTERVALS_FITS, INTERVALS):
+            write_columns(folder / name, intervals(posterior), notes)
+        save_figure(folder / CORNER, corner_figure(_sampled_draws(posterior), posterior.sampled, sampled))
+        trace = trace_figure(
+            posterior.chains, posterior.sampled, sampled, posterior.thin, posterior.convergence.tau
+        )
+        save_figure(folder / TRACE, trace)
+        (folder / SAMPLE).write_text(json_text(summary), encoding="utf-8")
+        if posterior.trusted:
+            write_product(folder / PRODUCT, _with_covariance(product, posterior))
+
+
+def _sampled_draws(posterior: PosteriorSample) -> np.ndarray:
+    """Draws of the sampled coefficients (draw, coefficient), the factor on the errors last where it is sampled."""
+    columns = [posterior.names.index(name) for name in posterior.sampled if name in posterior.names]
+    draws = posterior.draws.reshape(-1, len(posterior.names))[:, columns]
+    if posterior.ln_f is None:
+        return draws
+    return np.concatenate([draws, posterior.ln_f.reshape(-1, 1)], axis=1)
+
+
+def _with_covariance(product: CalibrationProduct, posterior: PosteriorSample) -> CalibrationProduct:
+    """The product with the covariance of the posterior in place of that of the fit."""
+    calibration = Calibration.from_product(product)
+    verdict = dataclasses.replace(calibration.verdict, covariance_from="posterior")
+    return dataclasses.replace(calibration, covariance=posterior.covariance, verdict=verdict).to_product()
