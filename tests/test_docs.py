@@ -186,8 +186,8 @@ def test_calibration():
     from walop_jax.calibration import product
 
     text = section("files", "Calibration")
-    names = {*product._RULES, *product._IMAGES, *product._RULES["PARAMETERS"]}
-    names |= keys_written("walop_jax.calibration.product", "_primary")
+    names = {*product._RULES, "COVARIANCE", *product._RULES["PARAMETERS"]}
+    names |= keys_written("walop_jax.calibration.product_header", "primary_hdu")
     assert unexplained(names, text) == []
 
 

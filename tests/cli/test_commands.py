@@ -13,10 +13,10 @@ from astropy.io import fits
 from astropy.table import Table
 
 import walop_jax.calibration.product
-import walop_jax.fit.refit
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import Settings
 from walop_jax.calibration.product import read_product
+from walop_jax.fit import search
 
 SUMMARY_KEYS = (
     "chi2", "dof", "n_data", "parameters", "converged", "message", "seconds", "versions", "inputs",
@@ -102,11 +102,9 @@ def test_a_misfit_is_written_but_not_trusted(call, spoilt_file, tmp_path):
 
 
 def test_no_convergence_no_product(call, calset_file, tmp_path, monkeypatch):
-    monkeypatch.setattr(walop_jax.fit.search, "FIRST_STEPS", 1)
-    monkeypatch.setattr(walop_jax.fit.refit, "MAXIMUM_STEPS", 1)
-    search = walop_jax.fit.refit._search
-    monkeypatch.setattr(walop_jax.fit.refit, "_search", lambda *args, **more: search(*args[:5], 1))
-    monkeypatch.setattr(walop_jax.fit.refit, "MAXIMUM_RESCALINGS", 0)
+    whole = search.minimise
+    monkeypatch.setattr(search, "minimise", lambda *args, **how: whole(*args, **{**how, "maximum_steps": 1}))
+    monkeypatch.setattr(search, "MAXIMUM_RESCALINGS", 0)
     result = call("refit", calset_file, "-o", tmp_path / "run", "--json")
     assert "did not converge" in one_line(result)
     assert [entry.name for entry in (tmp_path / "run").iterdir()] == ["summary.failed.json"]

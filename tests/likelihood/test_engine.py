@@ -103,7 +103,7 @@ def likelihood():
 def values(likelihood):
     """A point of parameter space some standard deviations off the truth: residuals far from noise."""
     rng = np.random.default_rng(8)
-    return values_of(builders.as_built(TRUTH, rng, 0.5))
+    return np.asarray(values_of(builders.as_built(TRUTH, rng, 0.5)))
 
 
 TEMPLATE = likelihood_of(BLOCK).model.template
@@ -179,7 +179,7 @@ def test_matrix_is_kaufmans(likelihood, values, plain):
 def test_matrix_is_the_fisher_information_with_fluxes_marginalised():
     """Without noise and at the truth: Schur complement of the joint information of parameters and fluxes."""
     block, truth = make_block(noise=False)
-    likelihood, values = likelihood_of(block), values_of(truth)
+    likelihood, values = likelihood_of(block), np.asarray(values_of(truth))
     data = likelihood.points.chunk(0)
     r, a, dr, da = jacobians(likelihood, values, data)
     np.testing.assert_allclose(r, 0.0, atol=1e-6)

@@ -59,7 +59,7 @@ def quick(simulated):
 
 def test_expansion_agrees(simulated, exact, quick):
     """Calibration plate in and out, Moon sky, standards of several temperatures; at the truth and away from it."""
-    for values in (exact.model.start, values_of(simulated.truth)):
+    for values in (exact.model.start, np.asarray(values_of(simulated.truth))):
         one, other = quick.expand(values), exact.expand(values)
         same((one.data, one.gradient, one.matrix), (other.data, other.gradient, other.matrix))
         assert 0.0 < one.optics.error <= nodes.TOLERANCE

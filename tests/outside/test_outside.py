@@ -34,7 +34,7 @@ SMALL = ObservingPlan(
 LENGTHS = {
     "lossy_wedge.py": 15,
     "blue_depolariser.py": 15,
-    "twilight.py": 15,
+    "twilight.py": 18,
     "two_cameras.toml": 45,
     "other_arms.toml": 28,
 }

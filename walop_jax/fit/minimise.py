@@ -103,6 +103,7 @@ def minimise(
     if not stop:
         result = RESULTS.nonlinear_max_steps_reached
     y, expansion, gates = solver.postprocess(function, y, state.expansion, None, {}, state, tags, result)
+    assert isinstance(expansion, _Scaled)
     return Minimum(
         x=origin + y * scale,
         expansion=expansion.given,

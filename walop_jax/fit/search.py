@@ -177,7 +177,8 @@ def _order_starts(likelihood: Likelihood) -> Iterator[tuple[str, Vector]]:
         materials.MGF2_E.refractive_index(wavelength) - materials.MGF2_O.refractive_index(wavelength)
     )
     one_wave = wavelength / birefringence
-    for name in ("half2.plate.mgf2", "half1.plate.mgf2"):
+    thick = [name for name in reversed(likelihood.model.names) if name.endswith("plate.mgf2")]
+    for name in thick:
         for sign in (-1, 1):
             start = likelihood.model.start.copy()
             start[likelihood.model.index(name)] += sign * one_wave

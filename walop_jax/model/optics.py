@@ -4,8 +4,8 @@ Pupil       (X, Y) leaves the collimator along (tan M X′, tan M Y′, 1), X′
             κ distortion [deg⁻²], r² = X² + Y² [deg²].
 Wedge       exact refraction at a front face with normal n = (sin w, 0, cos w) and a rear face normal to z:
             in the glass k_g = k + (√(N² − 1 + (k·n)²) − k·n) n; behind the rear face the transverse part of k_g
-            stays. N index of BK7, w wedge angle [rad]. No rotation of the frame, no loss (contract).
-Source      vector form of Snell's law, Born & Wolf 1.5.1; mapping: Paper II, appendix B, contract item 5.
+            stays. N index of BK7, w wedge angle [rad]. No rotation of the frame, no loss.
+Source      vector form of Snell's law, Born & Wolf 1.5.1; mapping: Paper II, appendix B.
 Limits      w = 0 leaves the direction as it is; X = Y = 0 goes along z.
 """
 

@@ -21,10 +21,6 @@ PAPER_II = (
     "Paper II - Polarimetric Modelling and Calibration"
 )
 _FILTER = "Doi et al. 2010, AJ 139, 1628, Table 4"
-# What only users of this project know: it is no source that a reader could look up.
-_INTERNAL = re.compile(
-    r"(calibration )?contract,? (section|item) \d+(, with its section \d+: [^;.]*)?[;.,]? ?"
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +35,7 @@ def stated_source(docstring: str | None) -> str:
     """What a docstring says under `Source` or `Sources`, on one line; empty when it says nothing."""
     found = re.search(r"^Sources? +(\S.*(?:\n +\S.*)*)", inspect.cleandoc(docstring or ""), re.MULTILINE)
     text = " ".join(found.group(1).split()) if found else ""
-    return _INTERNAL.sub("", text).strip().rstrip(",;")
+    return text.strip().rstrip(",;")
 
 
 def _has_moon(model: Model) -> bool:

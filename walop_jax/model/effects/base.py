@@ -86,6 +86,10 @@ class Effect(Component):
                 raise unknown_name(f"parameter of {cls.name}", name, names)
             if name in field_declarations(cls):
                 values[name] = jnp.broadcast_to(jnp.asarray(value, float), np.shape(getattr(effect, name)))
+        if values.get("camera", 0) not in range(context.cameras):
+            raise ValueError(
+                f"{cls.name}: camera {values['camera']!r} does not exist, there are {context.cameras}"
+            )
         return dataclasses.replace(effect, **values)
 
     @classmethod
