@@ -17,6 +17,12 @@ SEED = 4
 
 
 @functools.cache
-def fitted_run(plan: ObservingPlan) -> FitResult:
-    """The fit of a run of seed `SEED`, made once."""
-    return refit(simulate(plan, seed=SEED).calset)
+def small_fit() -> FitResult:
+    """The fit of a small run, made once."""
+    return refit(simulate(SMALL, seed=SEED).calset)
+
+
+@functools.cache
+def small_fit_with_plate() -> FitResult:
+    """The same of a run with the calibration plate."""
+    return refit(simulate(WITH_PLATE, seed=SEED).calset)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from between_points import WORST, between_points
 from science.truth import TrueInstrument, chance
-from small_run import WITH_PLATE, fitted_run
+from small_run import WITH_PLATE, small_fit_with_plate
 
 from walop_jax.calibration.calibration import Calibration, at_prior_edge, quality
 from walop_jax.calibration.matrix import Settings
@@ -28,7 +28,7 @@ X, Y = np.array([-0.21, 0.03, 0.2]), np.array([0.1, -0.05, 0.22])
 
 @pytest.fixture(scope="module")
 def result() -> FitResult:
-    return fitted_run(WITH_PLATE)
+    return small_fit_with_plate()
 
 
 @pytest.fixture(scope="module")

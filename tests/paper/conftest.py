@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from small_run import WITH_PLATE, fitted_run
+from small_run import small_fit_with_plate
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
@@ -11,9 +11,9 @@ from walop_jax.data.records import CalibrationSet
 
 @pytest.fixture(scope="session")
 def calset() -> CalibrationSet:
-    return fitted_run(WITH_PLATE).calset
+    return small_fit_with_plate().calset
 
 
 @pytest.fixture(scope="session")
 def calibration() -> Calibration:
-    return Calibration.from_fit(fitted_run(WITH_PLATE))
+    return Calibration.from_fit(small_fit_with_plate())

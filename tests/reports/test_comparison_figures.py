@@ -6,7 +6,7 @@ import io
 
 import numpy as np
 import pytest
-from small_run import SMALL, fitted_run
+from small_run import small_fit
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
 from walop_jax.calibration.calibration import Calibration
@@ -17,7 +17,7 @@ from walop_jax.science.star_errors import plate_errors
 
 @pytest.fixture(scope="module")
 def calibration_and_set():
-    result = fitted_run(SMALL)
+    result = small_fit()
     return Calibration.from_fit(result), result.calset
 
 

@@ -9,7 +9,7 @@ import threading
 import numpy as np
 import pytest
 from matplotlib import pyplot
-from small_run import SMALL, fitted_run
+from small_run import small_fit
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.diagnosis.figure_data import figure_data
@@ -20,7 +20,7 @@ from walop_jax.reports.diagnosis_figures import signature_figure
 
 @pytest.fixture(scope="module")
 def fitted():
-    result = fitted_run(SMALL)
+    result = small_fit()
     return result, Calibration.from_fit(result)
 
 
