@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jaxtyping
@@ -15,8 +17,10 @@ from south_sets import ABSENT, CUTS, SHARED, SouthSet
 jax.config.update("jax_enable_x64", True)  # the package itself never switches it on
 # Every annotated shape and type of the package is checked, under pytest only. Must precede its import.
 jaxtyping.install_import_hook("walop_jax", "shapes.checked")
-from south_fits import SouthFit  # noqa: E402
+from walop_jax.data import read_calibration_set  # noqa: E402
+from walop_jax.fit.refit import FitResult, refit  # noqa: E402
 
+LEAST_COMPILED = 0.1  # seconds: what compiles faster is not worth a file
 OPTIONS = {"long": "studies that take minutes", "benchmark": "timings"}
 
 
@@ -26,12 +30,24 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Keep compiled code in pytest's own cache: workers share it, and a second run hardly compiles at all."""
+    """Keep compiled code in pytest's own cache: workers and processes of tests share it, and so does the next run."""
     cache = getattr(config, "cache", None)
-    if cache is not None:
-        jax.config.update("jax_compilation_cache_dir", str(cache.mkdir("xla")))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
-        jax.config.update("jax_raise_persistent_cache_errors", False)
+    if cache is None:
+        return
+    folder = str(cache.mkdir("xla"))
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", LEAST_COMPILED)
+    jax.config.update("jax_raise_persistent_cache_errors", False)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = str(LEAST_COMPILED)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Workers begin at tests of different rooms and steal from each other: fixtures are made once, as a rule."""
+    from xdist.scheduler import WorkStealingScheduling
+
+    return WorkStealingScheduling(config, log) if config.getoption("dist") == "load" else None
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -77,9 +93,9 @@ def either_south_set(request: pytest.FixtureRequest) -> Callable[[str], SouthSet
 
 
 @pytest.fixture(scope="session")
-def south_fit() -> Callable[[SouthSet], SouthFit]:
+def south_fit() -> Callable[[SouthSet], FitResult]:
     """Fits of the base model to sets with known truth, each made once."""
-    return functools.cache(SouthFit.of)
+    return functools.cache(lambda south: refit(read_calibration_set(south.path)))
 
 
 @pytest.fixture

@@ -1,31 +1,28 @@
-"""A calibration of a small simulated run, shared by the tests of this room."""
+"""Small simulated runs that tests share, because what is compiled for one layout of exposures and points serves all."""
 
 from __future__ import annotations
 
-import pytest
+import dataclasses
+import functools
 
-from walop_jax.calibration.calibration import Calibration
-from walop_jax.fit.model_builder import base_model
-from walop_jax.fit.refit import refit
+from walop_jax.fit.refit import FitResult, refit
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
-PLAN = ObservingPlan(
-    grid=5,
-    standard_grid=2,
-    polariser_angles=polariser_turn(8),
-    moon_patches=3,
-    standards=3,
-    plate=(None, 0.0, 22.5),
+SMALL = ObservingPlan(
+    grid=5, standard_grid=2, polariser_angles=polariser_turn(8), moon_patches=3, standards=3
 )
+WITH_PLATE = dataclasses.replace(SMALL, plate=(None, 0.0, 22.5))
+SEED = 4
 
 
-@pytest.fixture(scope="session")
-def calset():
-    return simulate(PLAN, seed=4).calset
+@functools.cache
+def small_fit() -> FitResult:
+    """The fit of a small run, made once."""
+    return refit(simulate(SMALL, seed=SEED).calset)
 
 
-@pytest.fixture(scope="session")
-def calibration(calset) -> Calibration:
-    model = base_model(calset)
-    return Calibration.from_fit(refit(calset, model))
+@functools.cache
+def small_fit_with_plate() -> FitResult:
+    """The same of a run with the calibration plate."""
+    return refit(simulate(WITH_PLATE, seed=SEED).calset)

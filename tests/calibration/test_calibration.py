@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from between_points import WORST, between_points
 from science.truth import TrueInstrument, chance
+from small_run import WITH_PLATE, small_fit_with_plate
 
 from walop_jax.calibration.calibration import Calibration, at_prior_edge, quality
 from walop_jax.calibration.matrix import Settings
@@ -17,28 +18,17 @@ from walop_jax.calibration.product import ParameterTable, read_product, write_pr
 from walop_jax.data import DataError
 from walop_jax.fit.model_builder import model_for, model_without_data
 from walop_jax.fit.model_file import render
-from walop_jax.fit.refit import FitResult, refit
+from walop_jax.fit.refit import FitResult
 from walop_jax.fit.solver import RESULTS
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.references import references
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
-from walop_jax.simulation.simulate import simulate
 
-TINY = ObservingPlan(
-    grid=5,
-    standard_grid=2,
-    polariser_angles=polariser_turn(8),
-    moon_patches=3,
-    standards=3,
-    plate=(None, 45.0),
-)
 X, Y = np.array([-0.21, 0.03, 0.2]), np.array([0.1, -0.05, 0.22])
 
 
 @pytest.fixture(scope="module")
 def result() -> FitResult:
-    calset = simulate(TINY, seed=3).calset
-    return refit(calset, model_for(calset))
+    return small_fit_with_plate()
 
 
 @pytest.fixture(scope="module")
@@ -199,7 +189,7 @@ def test_effects_and_their_choices_survive_the_product(result, tmp_path):
     assert effects["blemish"].camera == 2
     assert effects["standard_outlier"].source == star
     assert back.model["half2.plate.mgf2"].tie == "half1.plate.mgf2"
-    assert sum(name.startswith("moon_patch.") for name in back.model.names) == 2 * TINY.moon_patches
+    assert sum(name.startswith("moon_patch.") for name in back.model.names) == 2 * WITH_PLATE.moon_patches
     np.testing.assert_array_equal(back.matrix(X, Y)[0], calibration.matrix(X, Y)[0])
     cited = {entry.what: entry.source for entry in references(back.model)}
     assert "Blinov et al. 2023" in cited["effect standard_outlier"]
@@ -290,11 +280,11 @@ def test_a_product_of_other_physics_is_refused(calibration):
 def test_errors_are_what_the_covariance_says(either_south_set, south_fit, name):
     """Complete model, true values of other code: all parameters at once, and the matrix between the grid points."""
     south = either_south_set(name)
-    _, result, calibration = south_fit(south)
+    result = south_fit(south)
     assert result.trusted
     assert result.chi2 == pytest.approx(result.dof, abs=3 * np.sqrt(2 * result.dof))
     assert 1e-3 < chance(result, TrueInstrument(south).values()) < 1 - 1e-3
-    found = between_points(south.matrix, calibration)
+    found = between_points(south.matrix, Calibration.from_fit(result))
     assert np.all(found.error < WORST * found.expected)
     assert np.sqrt(np.mean(found.pulls**2)) < 2.0
 
@@ -310,9 +300,9 @@ def test_errors_are_what_the_covariance_says(either_south_set, south_fit, name):
 def test_error_between_grid_points(whole_south_set, south_fit, name, limit):
     """The numbers asked for of 144 points."""
     south = whole_south_set(name)
-    _, result, calibration = south_fit(south)
+    result = south_fit(south)
     assert 0.97 < result.chi2 / result.dof < 1.03
-    found = between_points(south.matrix, calibration)
+    found = between_points(south.matrix, Calibration.from_fit(result))
     print(
         f"set {name}: χ²/dof {result.chi2 / result.dof:.4f}, {result.minimum.steps} steps; error in q, u "
         f"{found.error.round(5)} % at {100 * found.easy:.0f} % of the points, {found.expected.round(5)} % expected; "

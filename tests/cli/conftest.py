@@ -6,21 +6,19 @@ from pathlib import Path
 
 import pytest
 from command import call, no_cache
+from small_run import SEED, SMALL
 
 from walop_jax.data import write_calibration_set
 from walop_jax.model.effects import effect_by_name
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
 __all__ = ["call", "no_cache"]
-
-PLAN = ObservingPlan(grid=5, standard_grid=2, polariser_angles=polariser_turn(8), moon_patches=3, standards=3)
 
 
 @pytest.fixture(scope="session")
 def calset_file(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("sets") / "small.fits"
-    write_calibration_set(path, simulate(PLAN, seed=4).calset)
+    write_calibration_set(path, simulate(SMALL, seed=SEED).calset)
     return path
 
 
@@ -28,8 +26,8 @@ def calset_file(tmp_path_factory) -> Path:
 def spoilt_file(tmp_path_factory) -> Path:
     """A set with an effect that the base model does not have."""
     path = tmp_path_factory.mktemp("sets") / "spoilt.fits"
-    effect = effect_by_name("clp_wobble").of(PLAN.context(), amplitude=0.3, phase=1.0)
-    write_calibration_set(path, simulate(PLAN, seed=4, effects=(effect,)).calset)
+    effect = effect_by_name("clp_wobble").of(SMALL.context(), amplitude=0.3, phase=1.0)
+    write_calibration_set(path, simulate(SMALL, seed=SEED, effects=(effect,)).calset)
     return path
 
 

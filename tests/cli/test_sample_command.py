@@ -26,17 +26,17 @@ def test_sample_writes_everything_and_resumes(call, run_folder: Path, tmp_path: 
     run = tmp_path / "RUN"
     shutil.copytree(run_folder, run)
     before = read_product(run / "calibration.fits")
-    short = call("sample", run, "--moves", "de", "--interval", 100, "--maximum-steps", 200)
+    short = call("sample", run, "--moves", "laplace", "--interval", 40, "--maximum-steps", 80)
     assert short.exit_code == 1
     assert "NOT converged" in short.stderr
     assert read_product(run / "calibration.fits").content_hash() == before.content_hash()
     assert json.loads((run / "sample.json").read_text())["converged"] is False
-    assert call("sample", run, "--moves", "de", "--interval", 100).exit_code == 1, "outputs are there already"
-    refused = call("sample", run, "--moves", "de", "--interval", 100, "--seed", 1, "--resume")
+    assert call("sample", run, "--moves", "laplace", "--interval", 40).exit_code == 1, "outputs are there already"
+    refused = call("sample", run, "--moves", "laplace", "--interval", 40, "--seed", 1, "--resume")
     assert refused.exit_code == 1
     assert "other settings" in refused.stderr
 
-    done = call("sample", run, "--moves", "de", "--interval", 100, "--resume", "--json")
+    done = call("sample", run, "--moves", "laplace", "--interval", 40, "--resume", "--json")
     assert done.exit_code == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["trusted"] is True

@@ -7,6 +7,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from scenes import PLAN
 
 from walop_jax.diagnosis import naming, workflow
 from walop_jax.diagnosis.design import Design
@@ -17,13 +18,8 @@ from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import FreeForm, effect_by_name
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
-# That of test_judging.py: the two share compiled code.
-PLAN = ObservingPlan(
-    grid=6, standard_grid=2, polariser_angles=polariser_turn(12), moon_patches=4, standards=4
-)
 ZERO, WOBBLE, LEAKAGE, DRIFT = map(
     effect_by_name, ("clp_zero", "clp_wobble", "camera_leakage", "camera_gain_drift")
 )

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scenes import PLAN
 from scipy import integrate, stats
 
 from walop_jax.diagnosis import naming
@@ -20,12 +21,7 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import FreeForm, effect_by_name
 from walop_jax.model.effects.free_form import BLOCKS
 from walop_jax.model.specification import effect_context, with_effects
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
-
-PLAN = ObservingPlan(
-    grid=6, standard_grid=2, polariser_angles=polariser_turn(12), moon_patches=4, standards=4
-)
 
 
 @pytest.fixture(scope="module")

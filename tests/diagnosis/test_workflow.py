@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pytest
 from between_points import WORST, between_points
+from scenes import PLAN
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data import read_calibration_set
@@ -16,21 +17,16 @@ from walop_jax.diagnosis.effect_columns import probes
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_builder import base_model
-from walop_jax.fit.refit import fit
+from walop_jax.fit.refit import fit, refit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS
 from walop_jax.model.specification import effect_context
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
 
 @pytest.fixture(scope="module")
 def design():
-    plan = ObservingPlan(
-        grid=9, standard_grid=2, polariser_angles=polariser_turn(10), moon_patches=5, standards=5
-    )
-    calset, _ = simulate(plan, seed=31)
-    return Design.of(fit(Likelihood.of(calset, base_model(calset))))
+    return Design.of(refit(simulate(PLAN, seed=31).calset))
 
 
 def test_rows_and_priors_make_the_objective(design):

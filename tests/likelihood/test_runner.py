@@ -49,15 +49,6 @@ def likelihood():
     return made()
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _compiled_once(tmp_path_factory):
-    """The processes of this module share a cache of compiled code."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
-        patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-        yield
-
-
 def test_the_number_of_threads_changes_nothing(likelihood):
     found = []
     for threads in (1, 2, 5):

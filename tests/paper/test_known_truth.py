@@ -11,6 +11,7 @@ from science.truth import TrueInstrument
 from scipy import stats
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.user_tables import read_input_table
@@ -25,10 +26,10 @@ TEFF = 5772.0  # of the light that the true matrices are of
 # ------------------------------------------------------------------------------------- one exposure of a star
 
 
-def errors_of_both(fitted, truth):
+def errors_of_both(result, truth):
     """Rms errors (%) of q, u, p outside the zone without u, by (place, method), and the shares below 0.1 %."""
-    stars, made = paper.sample_stars(), paper.fit_paper(fitted.calset)
-    analysis = AnalysisVectors(fitted.calibration)
+    stars, made = paper.sample_stars(), paper.fit_paper(result.calset)
+    analysis = AnalysisVectors(Calibration.from_fit(result))
     rms, share = {}, {}
     for where, x, y, local in (
         ("grid", made.x, made.y, made),
@@ -56,7 +57,7 @@ def test_paper_and_joint_model_on_a_cut(south_set, south_fit):
     """What the joint model promises holds between the points as on them."""
     south = south_set("a")
     rms = errors_of_both(south_fit(south), TrueInstrument(south))
-    promised = between_points(south.matrix, south_fit(south).calibration).expected
+    promised = between_points(south.matrix, Calibration.from_fit(south_fit(south))).expected
     for where in ("grid", "between"):
         assert np.all(rms[where, "joint"][:2] < WORST * promised)
     assert np.all(rms["grid", "paper"] > rms["grid", "joint"])
@@ -89,10 +90,10 @@ def turned(vectors, rotator):
     return vectors @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
 
 
-def errors_of_pairs(fitted, truth):
+def errors_of_pairs(result, truth):
     """Errors (point, q u p) of two exposures together, by the names of `PAIRS`."""
     x, y, sample = truth.table["X"], truth.table["Y"], paper.sample_stars(20)
-    analysis = AnalysisVectors(fitted.calibration)
+    analysis = AnalysisVectors(Calibration.from_fit(result))
     errors = {}
     for name, pair in PAIRS.items():
         ours = [turned(analysis.exact(Setting("SDSS-r", plate), x, y, [TEFF])[:, 0], r) for plate, r in pair]
@@ -134,7 +135,7 @@ def check_pairs(errors, table, limit):
 def test_two_exposures_on_a_cut(south_set, south_fit):
     """As good everywhere as one exposure is expected to be where it holds q and u."""
     south = south_set("b")
-    expected = between_points(south.matrix, south_fit(south).calibration).expected
+    expected = between_points(south.matrix, Calibration.from_fit(south_fit(south))).expected
     truth = TrueInstrument(south)
     check_pairs(errors_of_pairs(south_fit(south), truth), truth.table, WORST * expected.max() / 100)
 
@@ -151,7 +152,7 @@ def test_two_exposures_on_set_b(whole_south_set, south_fit):
 # -------------------------------------------------------------------------------------------- whole observations
 
 
-def observe(fitted, truth, electrons, tmp_path):
+def observe(result, truth, electrons, tmp_path):
     """Stars between the grid points at two rotator angles, counts by the oracle with noise: estimate and error."""
     x, y = truth.table["X"], truth.table["Y"]
     rng = np.random.default_rng(0)
@@ -170,7 +171,8 @@ def observe(fitted, truth, electrons, tmp_path):
         rows.append(row)
     whole = Table({name: np.concatenate([r[name] for r in rows]) for name in rows[0].colnames})
     whole.write(tmp_path / "c.fits", overwrite=True)
-    found = apply(fitted.calibration, read_catalogue(read_input_table(tmp_path / "c.fits"), "WALOP-SOUTH"))
+    catalogue = read_catalogue(read_input_table(tmp_path / "c.fits"), "WALOP-SOUTH")
+    found = apply(Calibration.from_fit(result), catalogue)
     # Two rotator angles 45° apart bring u back everywhere: no star is flagged, and none is lost.
     assert np.all(found.flag == 0)
     return found, found.qu - sample

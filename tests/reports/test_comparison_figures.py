@@ -6,28 +6,19 @@ import io
 
 import numpy as np
 import pytest
+from small_run import small_fit
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.fit.model_builder import base_model
-from walop_jax.fit.refit import refit
 from walop_jax.paper.comparison import compare
 from walop_jax.reports import comparison_figures as figures
 from walop_jax.science.star_errors import plate_errors
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
-from walop_jax.simulation.simulate import simulate
 
 
 @pytest.fixture(scope="module")
 def calibration_and_set():
-    calset = simulate(
-        ObservingPlan(
-            grid=5, standard_grid=2, polariser_angles=polariser_turn(8), moon_patches=3, standards=3
-        ),
-        4,
-    ).calset
-    model = base_model(calset)
-    return Calibration.from_fit(refit(calset, model)), calset
+    result = small_fit()
+    return Calibration.from_fit(result), result.calset
 
 
 @pytest.fixture(scope="module")

@@ -9,24 +9,18 @@ import threading
 import numpy as np
 import pytest
 from matplotlib import pyplot
+from small_run import small_fit
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.diagnosis.figure_data import figure_data
 from walop_jax.diagnosis.findings import Diagnosis
-from walop_jax.fit.model_builder import base_model
-from walop_jax.fit.refit import refit
 from walop_jax.reports import figures
 from walop_jax.reports.diagnosis_figures import signature_figure
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
-from walop_jax.simulation.simulate import simulate
-
-PLAN = ObservingPlan(grid=4, standard_grid=2, polariser_angles=polariser_turn(8), moon_patches=4, standards=3)
 
 
 @pytest.fixture(scope="module")
 def fitted():
-    calset, _ = simulate(PLAN, 1)
-    result = refit(calset, base_model(calset))
+    result = small_fit()
     return result, Calibration.from_fit(result)
 
 
@@ -39,7 +33,7 @@ def drawn(figure) -> bytes:
 def test_residuals_of_points_are_noise_after_a_fit(fitted):
     result, _ = fitted
     after = figures.point_residuals(result.likelihood, result.values)
-    assert after.shape == (16 + 4,)
+    assert after.shape == (25 + 4,)
     assert np.sqrt(np.nanmean(after**2)) == pytest.approx(1.0, abs=0.15)
     assert figures.point_residuals(result.likelihood, result.model.start).min() > 5.0
 
@@ -84,7 +78,7 @@ def test_figures_of_a_diagnosis_hold_its_residuals(fitted):
     likelihood, start = result.likelihood, dataclasses.replace(result, values=result.model.start)
     found = Diagnosis(
         verdict="consistent", steps=(), candidates=(), limits=(), untestable=(), unexplained=None, p_value=0.5,
-        remaining_p=0.5, before=start, after=result, seconds=0.0, points=20,
+        remaining_p=0.5, before=start, after=result, seconds=0.0, points=29,
     )  # fmt: skip
     made = figure_data(found)
     before, after = (likelihood.residuals(values)[1] for values in (likelihood.model.start, result.values))

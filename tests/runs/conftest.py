@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from command import call, no_cache
+from small_run import SEED, SMALL
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import write_product
@@ -20,12 +21,10 @@ from walop_jax.calibration.summary import summary
 from walop_jax.data import read_calibration_set, write_calibration_set
 from walop_jax.fit.refit import refit
 from walop_jax.model.effects import effect_by_name
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
 __all__ = ["call", "no_cache"]
 
-PLAN = ObservingPlan(grid=5, standard_grid=2, polariser_angles=polariser_turn(8), moon_patches=3, standards=3)
 TIMES = ("DATE", "CHECKSUM", "DATASUM")  # cards that say when a file was written, and sums over those
 
 
@@ -42,7 +41,7 @@ class FittedSet:
 def fitted(tmp_path_factory) -> FittedSet:
     folder = tmp_path_factory.mktemp("fitted")
     path, run = folder / "small.fits", folder / "RUN"
-    write_calibration_set(path, simulate(PLAN, seed=4).calset)
+    write_calibration_set(path, simulate(SMALL, seed=SEED).calset)
     calset = read_calibration_set(path)
     result = refit(calset)
     calibration = Calibration.from_fit(result)
@@ -56,8 +55,8 @@ def fitted(tmp_path_factory) -> FittedSet:
 def spoilt(tmp_path_factory) -> Path:
     """A set with an effect that the base model does not have."""
     path = tmp_path_factory.mktemp("spoilt") / "spoilt.fits"
-    effect = effect_by_name("clp_wobble").of(PLAN.context(), amplitude=0.3, phase=1.0)
-    write_calibration_set(path, simulate(PLAN, seed=4, effects=(effect,)).calset)
+    effect = effect_by_name("clp_wobble").of(SMALL.context(), amplitude=0.3, phase=1.0)
+    write_calibration_set(path, simulate(SMALL, seed=SEED, effects=(effect,)).calset)
     return path
 
 

@@ -17,8 +17,8 @@ from walop_jax.runs.sample import OUTPUTS, sample_run
 
 from .conftest import FittedSet, assert_same_files
 
-STEPS = 300
-OPTIONS = Options(interval=100, maximum_steps=STEPS, moves="de")
+STEPS = 300  # 400 are enough
+OPTIONS = Options(interval=100, maximum_steps=STEPS, moves="laplace")
 
 
 def copied(fitted: FittedSet, folder: Path) -> Path:
@@ -29,7 +29,7 @@ def test_an_interrupted_run_goes_on_as_if_nothing_had_been(
     call, fitted: FittedSet, tmp_path: Path, monkeypatch
 ):
     command, caller = copied(fitted, tmp_path / "command"), copied(fitted, tmp_path / "caller")
-    options = ("--interval", 100, "--maximum-steps", STEPS, "--moves", "de", "--quiet")
+    options = ("--interval", 100, "--maximum-steps", STEPS, "--moves", "laplace", "--quiet")
     assert call("sample", command, *options).exit_code == 1  # so few steps do not converge
 
     told: list[Progress] = []

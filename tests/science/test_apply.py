@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 from astropy.table import Table
-from small_run import PLAN
+from small_run import SEED, WITH_PLATE
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
 from walop_jax.calibration.matrix import Settings
@@ -382,7 +382,8 @@ def test_too_many_settings(calibration, calset, vectors, tmp_path):
 
 def test_simulated_observation_of_standards(calset, calibration, tmp_path):
     """Standards of another run, noise and all: counts that the package drew, pulls of unit width."""
-    run = simulate(dataclasses.replace(PLAN, standards=6), seed=99, instrument=simulate(PLAN, seed=4).truth)
+    instrument = simulate(WITH_PLATE, seed=SEED).truth
+    run = simulate(dataclasses.replace(WITH_PLATE, standards=6), seed=99, instrument=instrument)
     exposures, block = run.calset.exposures, run.calset.intensities.block(0, len(run.calset.points))
     star, point = [], []
     for p in range(len(run.calset.points)):

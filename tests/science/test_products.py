@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from scipy import stats
+from small_run import SMALL
 from typer.testing import CliRunner
 
 from walop_jax.calibration.calibration import Calibration
@@ -17,24 +18,19 @@ from walop_jax.calibration.certify import certify, validity
 from walop_jax.calibration.product import write_product
 from walop_jax.cli import app
 from walop_jax.data import write_calibration_set
-from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.science.epoch import chi2_of_change, chi2_tail, epoch
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
-
-PLAN = ObservingPlan(grid=5, standard_grid=2, polariser_angles=polariser_turn(8), moon_patches=3, standards=3)
 
 
 def calibrate(calset):
-    model = base_model(calset)
-    return Calibration.from_fit(refit(calset, model))
+    return Calibration.from_fit(refit(calset))
 
 
 @pytest.fixture(scope="module")
 def first():
     """An instrument, and what a first run has learnt of it."""
-    run = simulate(PLAN, seed=5)
+    run = simulate(SMALL, seed=5)
     calset = dataclasses.replace(run.calset, inputs=())
     return run.truth, calibrate(calset)
 
@@ -44,7 +40,7 @@ def product(first, tmp_path_factory):
     from walop_jax.data import read_calibration_set
 
     path = tmp_path_factory.mktemp("sets") / "first.fits"
-    write_calibration_set(path, simulate(PLAN, seed=5).calset)
+    write_calibration_set(path, simulate(SMALL, seed=5).calset)
     return calibrate(read_calibration_set(path)).to_product()
 
 
@@ -132,7 +128,7 @@ def test_departure_by_hand():
 def test_an_instrument_that_has_not_changed_still_fits(first):
     """Over six later runs of the same instrument T follows its χ², and no run is called a change."""
     truth, old = first
-    found = [epoch(old, simulate(PLAN, seed=100 + k, instrument=truth).calset)[0] for k in range(6)]
+    found = [epoch(old, simulate(SMALL, seed=100 + k, instrument=truth).calset)[0] for k in range(6)]
     assert all(entry.fits for entry in found)
     k = found[0].directions
     # The old calibration is one and the same: half of the variance of T is common to the six.
@@ -147,7 +143,7 @@ def test_a_change_is_found_and_named(first):
     """A wedge that has yielded by half a milliradian."""
     truth, old = first
     bent = eqx.tree_at(lambda i: i.half2.wedge, truth, truth.half2.wedge + 5e-4)
-    found, _ = epoch(old, simulate(PLAN, seed=200, instrument=bent).calset)
+    found, _ = epoch(old, simulate(SMALL, seed=200, instrument=bent).calset)
     assert not found.fits
     assert found.moved[0].name == "half2.wedge"
     assert found.moved[0].new - found.moved[0].old == pytest.approx(5e-4, abs=4 * found.moved[0].error)
@@ -157,7 +153,7 @@ def test_a_change_is_found_and_named(first):
 
 def test_epoch_from_the_command_line(product, first, tmp_path):
     write_product(tmp_path / "old.fits", product)
-    write_calibration_set(tmp_path / "new.fits", simulate(PLAN, seed=300, instrument=first[0]).calset)
+    write_calibration_set(tmp_path / "new.fits", simulate(SMALL, seed=300, instrument=first[0]).calset)
     result = CliRunner().invoke(
         app, ["epoch", str(tmp_path / "old.fits"), str(tmp_path / "new.fits"), "--json"]
     )
@@ -169,6 +165,6 @@ def test_epoch_from_the_command_line(product, first, tmp_path):
 
 
 def test_another_instrument_is_refused(first):
-    calset = simulate(dataclasses.replace(PLAN, instrument="WALOP-NORTH")).calset
+    calset = simulate(dataclasses.replace(SMALL, instrument="WALOP-NORTH")).calset
     with pytest.raises(ValueError, match="of WALOP-NORTH, the calibration of WALOP-SOUTH"):
         epoch(first[1], calset)
