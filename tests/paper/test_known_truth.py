@@ -10,9 +10,11 @@ from between_points import WORST, between_points
 from science.truth import TrueInstrument
 from scipy import stats
 
-from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.data.catalogue import read_catalogue
+from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
+from walop_jax.model.build import nominal_instrument
 from walop_jax.paper import polynomial as paper
 from walop_jax.science import star_errors as accuracy
 from walop_jax.science.apply import apply
@@ -34,7 +36,7 @@ def errors_of_both(fitted, truth):
         ("between", *(truth.table[k] for k in "XY"), made.between(truth.table["X"], truth.table["Y"])),
     ):
         true = truth.vectors(x, y)
-        joint = analysis.exact(Setting("SDSS-r"), x, y, [TEFF])[:, 0]
+        joint = analysis.exact(Settings.default(1), x, y, [TEFF])[:, 0]
         outside = np.abs(accuracy.determinant(true)) >= accuracy.WEAK
         seen = paper.ratios(paper.transmitted(true, stars))
         for method, errors in (
@@ -94,7 +96,7 @@ def errors_of_pairs(fitted, truth):
     analysis = AnalysisVectors(fitted.calibration)
     errors = {}
     for name, pair in PAIRS.items():
-        ours = [turned(analysis.exact(Setting("SDSS-r", plate), x, y, [TEFF])[:, 0], r) for plate, r in pair]
+        ours = [turned(analysis.exact(Settings.default(1).at(CHWP=plate), x, y, [TEFF])[:, 0], r) for plate, r in pair]
         theirs = [turned(truth.vectors(x, y, plate), r) for plate, r in pair]
         counts = np.stack([1e6 * paper.transmitted(v, sample) for v in theirs], axis=2)
         n, m, r, _ = counts.shape
@@ -169,7 +171,7 @@ def observe(fitted, truth, electrons, tmp_path):
         rows.append(row)
     whole = Table({name: np.concatenate([r[name] for r in rows]) for name in rows[0].colnames})
     whole.write(tmp_path / "c.fits", overwrite=True)
-    found = apply(fitted.calibration, read_catalogue(read_input_table(tmp_path / "c.fits"), "WALOP-SOUTH"))
+    found = apply(fitted.calibration, read_catalogue(read_input_table(tmp_path / "c.fits"), nominal_instrument()))
     # Two rotator angles 45° apart bring u back everywhere: no star is flagged, and none is lost.
     assert np.all(found.flag == 0)
     return found, found.qu - sample

@@ -10,9 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_plan
+from walop_jax.calibration.matrix import analysis_vectors
+from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
 from walop_jax.model import light
+from walop_jax.model.planning import plan_for_settings
 
 LARGEST_P = 0.05
 SMALLEST_DETERMINANT = 0.1  # below, one exposure holds hardly any u
@@ -21,10 +23,9 @@ SMALLEST_DETERMINANT = 0.1  # below, one exposure holds hardly any u
 def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p a 3"]:
     """Instrument matrix at the field points of a fit, in the filter and plate setting of its first exposure."""
     instrument, calset = result.model.instrument(result.values), result.calset
-    e = calset.exposures
-    setting = Settings.default(1, str(e.filter[0]))
-    setting.chwp_angle[0] = e.chwp_angle[0] if e.chwp_in[0] else np.nan
-    plan = settings_plan(setting, calset.filters, instrument)
+    first = Settings.of(calset.exposures[:1], instrument.patched().moving())
+    setting = Settings.default(1, str(first.filter[0])).at(**first.positions)
+    plan = plan_for_settings(instrument, setting, calset.filters)
     vectors = analysis_vectors(instrument, plan, calset.points.x, calset.points.y)[:, 0]
     return np.asarray(
         light.instrument_matrix(jnp.asarray(vectors) @ light.telescope(instrument), instrument.cameras.pairs)

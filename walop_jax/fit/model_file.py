@@ -29,6 +29,8 @@ from typing import Any
 
 import tomlkit
 
+from walop_jax.model.elements import WavePlate
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import Model, Parameter, unknown_name
 
 TABLES = ("model", "effects", "parameters")
@@ -55,7 +57,9 @@ def render(model: Model) -> str:
     )
     table = tomlkit.table()
     table["instrument"] = model.name
-    table["plates"] = model.template.plates
+    plates = _plate_models(model.template)
+    if len(plates) == 1:
+        table["plates"] = plates.pop()
     table["throughput_degree"] = model.template.throughput.degree
     table["effects"] = list(model.effect_names)
     document["model"] = table
@@ -77,6 +81,11 @@ def render(model: Model) -> str:
         parameters[p.name] = entry
     document["parameters"] = parameters
     return tomlkit.dumps(document)
+
+
+def _plate_models(instrument: Instrument) -> set[str]:
+    elements = [*instrument.elements, *(element for arm in instrument.arms for element in arm.elements)]
+    return {element.model for element in elements if isinstance(element, WavePlate)}
 
 
 def parse(text: str, build: Callable[[Header], Model]) -> Model:

@@ -2,11 +2,12 @@
 
 Light is linear, so an exposure is a dot product with the analysis vectors of its *band* (filter, colour temperature,
 positions of the moving elements, conditions); the optics are worked out once per point and wavelength node, never per
-exposure. Angles of the polariser never meet wavelengths. Plans are made by `planning.plan_for`.
+exposure. Angles of the polariser never meet wavelengths. Plans are made by `planning`.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Collection
 
 import equinox as eqx
@@ -76,16 +77,21 @@ def exposure_arrays(
     )
 
 
+def blank_exposures(instrument: Instrument, count: int) -> ExposureArrays:
+    """Exposures of which nothing is said but that they are there."""
+    zero, off = jnp.zeros(count), jnp.zeros(count, bool)
+    return ExposureArrays(
+        kind=jnp.zeros(count, int), clp_in=off, clp_angle=zero, flux_known=off, rotator=zero, hours=zero,
+        temperature=zero, hour_angle=zero, kinds=instrument.kinds,
+    )  # fmt: skip
+
+
 def blank_plan(instrument: Instrument, asked: Collection[str] = (), median: bool = False) -> Plan:
     """A plan of one exposure with every moving element in the beam, one node, one band: for shapes and derivatives."""
-    one = jnp.ones(1)
-    moving = instrument.patched().moving()
-    kinds = instrument.kinds
-    exposures = ExposureArrays(
-        kind=jnp.zeros(1, int), clp_in=jnp.zeros(1, bool), clp_angle=0.0 * one, flux_known=jnp.zeros(1, bool),
-        rotator=0.0 * one, hours=one, temperature=one, hour_angle=one,
-        median_counts=jnp.ones((1, len(instrument.cameras))) if median else None, kinds=kinds,
-    )  # fmt: skip
+    one, moving = jnp.ones(1), instrument.patched().moving()
+    exposures = blank_exposures(instrument, 1)
+    if median:
+        exposures = dataclasses.replace(exposures, median_counts=jnp.ones((1, len(instrument.cameras))))
     return Plan(
         wavelength=0.62 * one,
         conditions=Conditions(band_width=0.1 * one, planned=dict.fromkeys(asked, one)),
@@ -96,6 +102,19 @@ def blank_plan(instrument: Instrument, asked: Collection[str] = (), median: bool
         settings=((tuple(30.0 for _ in moving), 0, 1),),
         moving=moving,
     )
+
+
+def with_numbers(
+    plan: Plan, teff: Float[Array, ""], temperature: Float[Array, ""], hour_angle: Float[Array, ""]
+) -> Plan:
+    """The plan of a single setting with other numbers; `teff` is 0 for a flat spectrum."""
+    own = {"temperature": temperature, "hour_angle": hour_angle}
+    planned = {
+        name: jnp.broadcast_to(own[name], plan.wavelength.shape) if name in own else value
+        for name, value in plan.conditions.planned.items()
+    }
+    changed = (jnp.broadcast_to(teff, plan.teff.shape), Conditions(plan.conditions.band_width, planned))
+    return eqx.tree_at(lambda p: (p.teff, p.conditions), plan, changed)
 
 
 def with_median(plan: Plan, median: Float[np.ndarray, "e k"]) -> Plan:
