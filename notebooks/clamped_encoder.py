@@ -12,10 +12,10 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar
 
-import jax.numpy as jnp
 import numpy as np
 
 from walop_jax.model.effects import Effect
+from walop_jax.model.elements import EncoderError
 from walop_jax.model.parameters import param
 
 SOURCE = "notebook your_own_effect"
@@ -35,9 +35,10 @@ class ClampedEncoder(Effect):
         "the polariser turned in its mount: an error of the encoder stays with the encoder"
     )
 
-    def polariser_angle(self, angle, exposures):
-        """Add the error of the encoder, a function of its reading."""
-        return angle + jnp.deg2rad(self.amplitude) * jnp.sin(3 * exposures.clp_angle - self.phase)
+    def patch(self, instrument):
+        """Give the encoder an error three times per turn."""
+        error = EncoderError(self.amplitude, self.phase, order=3)
+        return instrument.changed("polariser", encoder=lambda errors: (*errors, error))
 
     @classmethod
     def combine(cls, group, amplitudes):

@@ -20,12 +20,12 @@ from walop_jax.data import empty_sources
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import InputFile, Points, Site
 from walop_jax.diagnosis.figure_file import (
-    Comparison,
-    DiagnosisPictures,
+    DiagnosisFigureData,
     ExposureLabels,
     Ladder,
+    ResidualComparison,
     Shares,
-    write_pictures,
+    write_figure_data,
 )
 
 INPUT = "night <b>one</b> & two.fits"
@@ -101,14 +101,14 @@ def product() -> CalibrationProduct:
     )
 
 
-def comparison(effect: str, size: float = 6.0) -> Comparison:
+def comparison(effect: str, size: float = 6.0) -> ResidualComparison:
     """Camera k shows `size` · (k + 1) / 4 at one corner before, nothing but ±0.5 after."""
     before = np.zeros((9, 4))
     before[0] = size * np.array([1, 2, 3, -4]) / 4
     after = np.full((9, 4), 0.5) * (-1.0) ** np.arange(9)[:, None]
     angle = np.deg2rad(22.5 * np.arange(8))
     wave = np.sin(3 * angle)[:, None] * np.array([1.0, -1.0, 0.5, 0.25])
-    return Comparison(
+    return ResidualComparison(
         effect=effect,
         combination="cos(3 theta - 57 deg), theta the polariser angle",
         harmonic=3,
@@ -124,8 +124,8 @@ def comparison(effect: str, size: float = 6.0) -> Comparison:
     )
 
 
-def pictures(effects: tuple[str, ...] = ("clp_wobble",)) -> DiagnosisPictures:
-    return DiagnosisPictures(
+def figure_data(effects: tuple[str, ...] = ("clp_wobble",)) -> DiagnosisFigureData:
+    return DiagnosisFigureData(
         points=Points(np.arange(9), X, Y),
         exposures=ExposureLabels(
             np.arange(8), np.array(["clp"] * 8), 61043.0 + 0.01 * np.arange(8), 22.5 * np.arange(8)
@@ -160,5 +160,5 @@ def make_diagnosis(folder: Path, **changes: Any) -> Path:
     content = DIAGNOSIS | changes
     (folder / "diagnosis.json").write_text(json.dumps(content))
     effects = tuple(step["effect"] for step in content["steps"])
-    write_pictures(folder / "diagnosis.fits", pictures(effects), overwrite=True)
+    write_figure_data(folder / "diagnosis.fits", figure_data(effects), overwrite=True)
     return folder

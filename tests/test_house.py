@@ -14,6 +14,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "walop_jax"
 ROOMS = (
     "io",
+    "instruments",
     "data",
     "sky",
     "model",
@@ -42,7 +43,7 @@ OWNERS = {
 }
 # Imported by nobody: tools of the tests, and what there is no need of.
 STRANGERS = {"pandas", "elli", "beartype", "hypothesis", "pytest", "oracle", "tests"}
-LONGEST = 500
+LONGEST = 400
 MACHINE = re.compile(r"""/(?:home|root|work|tmp|Users|opt|mnt|data)/|[A-Z]:\\\\|\.\./shared|file://""")
 
 

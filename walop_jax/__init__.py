@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from walop_jax.likelihood.likelihood import Likelihood
     from walop_jax.model.build import nominal_instrument
     from walop_jax.model.effects import effect_by_name
+    from walop_jax.model.instrument import Instrument
     from walop_jax.model.specification import with_effects
     from walop_jax.model.trace import Sightline, trace
     from walop_jax.science.apply import apply
@@ -39,6 +40,7 @@ __all__ = [
     "Calibration",
     "DataError",
     "FitResult",
+    "Instrument",
     "Likelihood",
     "ObservingPlan",
     "Settings",
@@ -62,6 +64,7 @@ _HOME = {
     "Calibration": ("calibration.calibration", "Calibration"),
     "DataError": ("io.errors", "DataError"),
     "FitResult": ("fit.refit", "FitResult"),
+    "Instrument": ("model.instrument", "Instrument"),
     "Likelihood": ("likelihood.likelihood", "Likelihood"),
     "ObservingPlan": ("simulation.observing_plan", "ObservingPlan"),
     "Sightline": ("model.trace", "Sightline"),

@@ -74,7 +74,7 @@ def noiseless():
 @pytest.fixture
 def cells(monkeypatch):
     """Six by six cells of sixteen points."""
-    monkeypatch.setattr(remainder, "POINTS_PER_CELL", 16)
+    monkeypatch.setattr(limits, "POINTS_PER_CELL", 16)
 
 
 def likelihood_of(calset):

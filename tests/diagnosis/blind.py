@@ -24,7 +24,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import naming
 from walop_jax.diagnosis.effect_columns import Probe, probes
 from walop_jax.diagnosis.examination import ALARM, Examination
-from walop_jax.diagnosis.freeform import SINGLE, Measured
+from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, Measured
 from walop_jax.diagnosis.score import Candidate, Scorer, ScoreSpace, separations, whitening
 from walop_jax.diagnosis.workflow import MOST_STEPS
 from walop_jax.fit.model_builder import base_model
@@ -193,11 +193,11 @@ class Blind:
         return self._scorers[added, removed]
 
     def _space(self, added: tuple[str, ...]) -> ScoreSpace:
-        space = self.space.with_base([SINGLE], self.nuisance)[0]
+        space = self.space.with_base([SINGLE_EXPOSURES], self.nuisance)[0]
         return space.with_base(list(added))[0] if added else space
 
     def _reduced(self, s: np.ndarray, square: float, added: tuple[str, ...]) -> tuple[np.ndarray, float]:
-        space, reduce = self.space.with_base([SINGLE], self.nuisance)
+        space, reduce = self.space.with_base([SINGLE_EXPOSURES], self.nuisance)
         s, square = reduce(s, square)
         return space.with_base(list(added))[1](s, square) if added else (s, square)
 

@@ -11,7 +11,7 @@ import pytest
 from walop_jax.diagnosis import naming, workflow
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import Examination
-from walop_jax.diagnosis.figure_data import pictures
+from walop_jax.diagnosis.figure_data import figure_data
 from walop_jax.diagnosis.findings import Unexplained
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.refit import FitResult, fit
@@ -44,7 +44,7 @@ def lead_from_the_first_fit_to_the_last(found):
     for one, next_one in itertools.pairwise(found.steps):
         assert one.heldout_after.mean == next_one.heldout_before.mean
         np.testing.assert_array_equal(one.residual_after, next_one.residual_before)
-    ladder = pictures(found).ladder
+    ladder = figure_data(found).ladder
     assert list(ladder.model) == ["starting model", *(step.effect for step in found.steps)]
     assert (ladder.dof[0], ladder.dof[-1]) == (found.before.dof, found.after.dof)
     return True
@@ -139,4 +139,4 @@ def test_what_has_no_name_is_told_without_the_name_that_stood_in_for_it():
     assert found.unexplained.chi2_before == pytest.approx(found.before.chi2, rel=1e-9)
     assert found.unexplained.chi2_after == found.after.chi2
     assert found.unexplained.p_value == pytest.approx(found.p_value, rel=0.5)
-    assert list(pictures(found).ladder.model) == ["starting model", "free_form"]
+    assert list(figure_data(found).ladder.model) == ["starting model", "free_form"]

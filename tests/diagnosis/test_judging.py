@@ -124,7 +124,7 @@ def test_limits_against_integrals(value, sigma):
     assert inside / whole == pytest.approx(0.95, abs=1e-6)
 
 
-def test_consequences_by_hand():
+def test_change_of_stokes_by_hand():
     """An ideal instrument; a constant of 0.001 in q moves q by that, 1 % less efficiency moves 5 % by 0.05 %."""
     ideal = np.array([[[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]])
     assert largest_change(ideal, ideal) == 0.0
@@ -140,7 +140,12 @@ def test_consequences_by_hand():
 def test_every_block_of_the_free_form_term_answers_to_a_stratum(leaking):
     *_, extended = leaking
     measured = Measured(extended.likelihood, extended.values)
-    assert {candidate.block for candidate in strata(measured)} == {*BLOCKS, None}
+    blocks = {stratum.name: stratum.block for stratum in strata(measured)}
+    assert set(blocks.values()) == {*BLOCKS, None}
+    assert blocks["4θ of O1"] == "harmonics"
+    assert blocks["rings of E2"] == "fine"
+    assert blocks["kind"] == "exposures"
+    assert blocks["flux"] is None
 
 
 def test_many_names_and_weak_errors_call_for_caution():

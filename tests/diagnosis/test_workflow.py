@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from between_points import between_points
+from between_points import WORST, between_points
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data import read_calibration_set
@@ -79,15 +79,16 @@ def test_held_out_residuals_of_a_complete_model_are_noise(design, scheme):
         ("d", "effect_found", {"camera_leakage", "hwp2_axis"}),
     ],
 )
-def test_sets_of_other_code(shared_data, name, verdict, effects):
-    truth = json.loads((shared_data / f"walop_south_{name}_truth.json").read_text())["effects"]
-    found = diagnose(read_calibration_set(shared_data / f"walop_south_{name}.fits"), progress=print)
+def test_sets_of_other_code(either_south_set, name, verdict, effects):
+    south = either_south_set(name)
+    truth = south.as_built()["effects"]
+    found = diagnose(read_calibration_set(south.path), progress=print)
     content = document(found)
     print(json.dumps(content, indent=1, ensure_ascii=False))
     assert found.verdict == verdict
     assert {step.effect for step in found.steps} == effects == set(truth)
     assert all(step.confirmed and not step.equivalent for step in found.steps)
-    assert 0.97 < found.after.chi2 / found.after.dof < 1.03
+    assert found.after.chi2 == pytest.approx(found.after.dof, abs=3 * np.sqrt(2 * found.after.dof))
     for step in found.steps:
         true = truth[step.effect]
         if step.effect == "clp_wobble":
@@ -96,17 +97,20 @@ def test_sets_of_other_code(shared_data, name, verdict, effects):
         else:
             ((value, sigma, unit),) = step.parameters.values()
             assert abs(value - (np.rad2deg(true) if unit == "deg" else true)) < 3 * sigma
-    calibration = Calibration.from_fit(found.after)
-    error, _, _ = between_points(shared_data / f"walop_south_{name}_truth.fits", calibration)
-    print(f"set {name}: {found.seconds:.0f} s; error between grid points, q and u: {error.round(5)} %")
-    # Asked for: 0.005 and 0.015 %. The covariance of set c expects 0.0039 % in q, and its noise made 0.0051 of it.
-    assert np.all(error <= (0.0055 if name == "c" else 0.005, 0.015))
+    between = between_points(south.matrix, Calibration.from_fit(found.after))
+    print(
+        f"set {name}: {found.seconds:.0f} s; error between grid points, q and u: {between.error.round(5)} %"
+    )
+    assert np.all(between.error < WORST * between.expected)
+    if len(found.after.calset.points) == 169:
+        # Asked for: 0.005 and 0.015 %. The covariance of set c expects 0.0039 % in q, and its noise made 0.0051 of it.
+        assert np.all(between.error <= (0.0055 if name == "c" else 0.005, 0.015))
 
 
 @pytest.mark.benchmark
-def test_cost_of_the_scores_of_the_whole_catalogue(shared_data):
+def test_cost_of_the_scores_of_the_whole_catalogue(either_south_set):
     """Some 800 columns of candidates beside the 86 of the base: three refits were asked for, this guards six or so."""
-    calset = read_calibration_set(shared_data / "walop_south_a.fits")
+    calset = read_calibration_set(either_south_set("a").path)
     model = base_model(calset)
     wanted = list(probes(EFFECTS, effect_context(model.template, calset.exposures)))
     seconds = {}

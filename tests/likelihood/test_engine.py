@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
 from oracle import forward, validate
 
 from walop_jax.data import read_calibration_set
@@ -19,7 +18,7 @@ from walop_jax.likelihood import engine
 from walop_jax.likelihood.flux import eliminate_flux
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.compiled import compiled
-from walop_jax.model.specification import full_values
+from walop_jax.model.parameters import values_of, with_values
 
 POINTS = 7
 # flux exposures come last so that they can be left off
@@ -105,14 +104,14 @@ def likelihood():
 def values(likelihood):
     """A point of parameter space some standard deviations off the truth: residuals far from noise."""
     rng = np.random.default_rng(8)
-    return full_values(builders.as_built(TRUTH, rng, 0.5))
+    return values_of(builders.as_built(TRUTH, rng, 0.5))
 
 
 TEMPLATE = likelihood_of(BLOCK).model.template
 
 
 def _plain(values, plan, data):
-    model = engine._prediction(ravel_pytree(TEMPLATE)[1](values), plan, data) * data.weight
+    model = engine._prediction(with_values(TEMPLATE)(values), plan, data) * data.weight
     eliminate = jax.vmap(eliminate_flux, in_axes=(0, 0, None))
     residual = eliminate(data.counts * data.weight, model, plan.exposures.flux_known)[1]
     return (residual, model), (residual, model)
@@ -181,7 +180,7 @@ def test_matrix_is_kaufmans(likelihood, values, plain):
 def test_matrix_is_the_fisher_information_with_fluxes_marginalised():
     """Without noise and at the truth: Schur complement of the joint information of parameters and fluxes."""
     block, truth = make_block(noise=False)
-    likelihood, values = likelihood_of(block), full_values(truth)
+    likelihood, values = likelihood_of(block), values_of(truth)
     data = likelihood.points.chunk(0)
     r, a, dr, da = jacobians(likelihood, values, data)
     np.testing.assert_allclose(r, 0.0, atol=1e-6)

@@ -9,13 +9,13 @@ import pytest
 
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood import engine, nodes
+from walop_jax.likelihood import engine, limits, nodes
+from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.chebyshev import Rectangle
+from walop_jax.model.dependence import optical_indices
 from walop_jax.model.effects import effect_by_name
-from walop_jax.model.field_table import FieldTable
-from walop_jax.model.parameters import leaves
-from walop_jax.model.specification import full_values, optical_indices
+from walop_jax.model.parameters import leaves, values_of
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -60,7 +60,7 @@ def quick(simulated):
 
 def test_expansion_agrees(simulated, exact, quick):
     """Calibration plate in and out, Moon sky, standards of several temperatures; at the truth and away from it."""
-    for values in (exact.model.start, full_values(simulated.truth)):
+    for values in (exact.model.start, values_of(simulated.truth)):
         one, other = quick.expand(values), exact.expand(values)
         same((one.data, one.gradient, one.matrix), (other.data, other.gradient, other.matrix))
         assert 0.0 < one.optics.error <= nodes.TOLERANCE
@@ -103,21 +103,21 @@ def test_optics_that_change_and_ghosts_go_through_the_same_tables():
 def test_error_is_measured(exact, simulated, monkeypatch):
     """Too few nodes are noticed, and the stated error is that of places nobody asked about."""
     plan, scale = exact.plan, scales(simulated.truth)
-    monkeypatch.setattr(nodes, "COUNTS", (8,))
+    monkeypatch.setattr(limits, "NODES_PER_SIDE", (8,))
     table, stated = nodes.accurate_nodes(simulated.truth, plan, FIELD, scale)
     assert table is None
     assert nodes.TOLERANCE < stated < 0.01
     monkeypatch.setattr(nodes, "TOLERANCE", 0.01)
     table, again = nodes.accurate_nodes(simulated.truth, plan, FIELD, scale)
     assert again == stated
-    x, y = np.random.default_rng(3).uniform(-0.3, 0.3, (2, nodes.AT_ONCE))
+    x, y = np.random.default_rng(3).uniform(-0.3, 0.3, (2, limits.SOLVED_TOGETHER))
     rows, _ = nodes.solved_optics(simulated.truth, plan, x, y)
     between, _ = table(jnp.asarray(x), jnp.asarray(y))
     assert 0.1 * stated < np.abs(np.asarray(between - rows)).max() < 3.0 * stated
 
 
 def test_what_cannot_be_interpolated_is_solved_point_by_point(simulated, exact, monkeypatch):
-    monkeypatch.setattr(nodes, "COUNTS", (6, 8))
+    monkeypatch.setattr(limits, "NODES_PER_SIDE", (6, 8))
     likelihood = Likelihood.of(simulated.calset, base_model(simulated.calset), interpolate=True)
     values = likelihood.model.start
     found = likelihood.expand(values)

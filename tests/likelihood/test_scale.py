@@ -41,7 +41,7 @@ from walop_jax.data.records import Block, CalibrationSet, Intensities
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood import engine
+from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.points import StreamedPoints
 from walop_jax.model.light import instrument_matrix
@@ -244,7 +244,7 @@ def test_work_per_point():
     """Floating-point operations and bytes that the compiled code counts, and the rate at which it does them."""
     calset = made(32)
     likelihood = Likelihood.of(
-        calset, base_model(calset), points_per_chunk=engine.LARGEST_BLOCK, interpolate=True
+        calset, base_model(calset), points_per_chunk=limits.GRADIENT_BLOCK, interpolate=True
     )
     instrument = likelihood.model.instrument()
     arguments = (instrument, likelihood.plan, likelihood.points.chunk(0), likelihood.nodes(instrument)[0])
@@ -252,7 +252,7 @@ def test_work_per_point():
         cost = jax.jit(function.__wrapped__).lower(*arguments).compile().cost_analysis()
         jax.block_until_ready(function(*arguments))
         best = min(seconds(lambda f=function: jax.block_until_ready(f(*arguments))) for _ in range(5))
-        n = engine.LARGEST_BLOCK
+        n = limits.GRADIENT_BLOCK
         print(
             f"\n{label}: {cost['flops'] / n / 1e3:.0f} kflop and {cost['bytes accessed'] / n / 1e3:.0f} kB a point; "
             f"{1e6 * best / n:.1f} µs, {cost['flops'] / best / 1e9:.1f} Gflop/s, "

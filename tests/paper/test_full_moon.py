@@ -46,10 +46,10 @@ def spoilt():
 def test_boxes_by_hand():
     x = np.array([-0.29, 0.0, 0.057, 0.059, 0.29, 0.29])
     y = np.array([-0.29, 0.0, 0.0, 0.0, -0.29, 0.29])
-    assert moon.boxes(x, y).tolist() == [0, 12, 12, 13, 4, 24]
+    assert moon.box_number(x, y).tolist() == [0, 12, 12, 13, 4, 24]
     centres = moon.box_centres()
     np.testing.assert_allclose([centres[0][7], centres[1][7]], [0.0, -0.116], atol=1e-12)
-    assert moon.boxes(*centres).tolist() == list(range(25))
+    assert moon.box_number(*centres).tolist() == list(range(25))
 
 
 def test_good_patches_are_trusted(clean):
@@ -67,7 +67,7 @@ def test_a_patch_that_is_not_rayleigh_is_found_and_does_no_harm(spoilt):
     run, believing = spoilt
     first = moon.judge_patches(run.calset, believing)
     assert int(np.argmin(first.weight)) == SPOILT
-    careful, found = moon.careful_calibration(run.calset, believing.model)
+    careful, found = moon.reweighted_calibration(run.calset, believing.model)
     assert np.flatnonzero(found.doubted).tolist() == [SPOILT]
     assert found.document(run.calset.exposures.exposure)["doubted"] == [
         run.calset.exposures.exposure[found.exposure[SPOILT]]
@@ -110,7 +110,7 @@ def test_scheme_takes_offsets_from_the_sky(clean):
     )
     outside = np.abs(accuracy.determinant(vectors)) > 0.3
     stars = paper.sample_stars()
-    seen = paper.ratios(paper.transmitted(vectors, stars))
+    seen = paper.measured_qu(paper.transmitted(vectors, stars))
     plain = dataclasses.replace(made, delta=np.zeros_like(made.delta))
     errors = {
         name: np.sqrt(np.mean(accuracy.star_errors(c.recover(seen), stars)[outside, 0] ** 2))

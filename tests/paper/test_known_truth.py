@@ -11,6 +11,7 @@ from science.truth import TrueInstrument
 from scipy import stats
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
@@ -37,8 +38,8 @@ def errors_of_both(fitted, truth):
     ):
         true = truth.vectors(x, y)
         joint = analysis.exact(Settings.default(1), x, y, [TEFF])[:, 0]
-        outside = np.abs(accuracy.determinant(true)) >= accuracy.WEAK
-        seen = paper.ratios(paper.transmitted(true, stars))
+        outside = accuracy.determinant(true) >= SMALLEST_DETERMINANT
+        seen = paper.measured_qu(paper.transmitted(true, stars))
         for method, errors in (
             ("paper", accuracy.star_errors(local.recover(seen), stars)),
             ("joint", accuracy.joint_errors(joint, true, stars)),
@@ -96,7 +97,10 @@ def errors_of_pairs(fitted, truth):
     analysis = AnalysisVectors(fitted.calibration)
     errors = {}
     for name, pair in PAIRS.items():
-        ours = [turned(analysis.exact(Settings.default(1).at(CHWP=plate), x, y, [TEFF])[:, 0], r) for plate, r in pair]
+        ours = [
+            turned(analysis.exact(Settings.default(1).at(CHWP=plate), x, y, [TEFF])[:, 0], r)
+            for plate, r in pair
+        ]
         theirs = [turned(truth.vectors(x, y, plate), r) for plate, r in pair]
         counts = np.stack([1e6 * paper.transmitted(v, sample) for v in theirs], axis=2)
         n, m, r, _ = counts.shape
@@ -171,7 +175,9 @@ def observe(fitted, truth, electrons, tmp_path):
         rows.append(row)
     whole = Table({name: np.concatenate([r[name] for r in rows]) for name in rows[0].colnames})
     whole.write(tmp_path / "c.fits", overwrite=True)
-    found = apply(fitted.calibration, read_catalogue(read_input_table(tmp_path / "c.fits"), nominal_instrument()))
+    found = apply(
+        fitted.calibration, read_catalogue(read_input_table(tmp_path / "c.fits"), nominal_instrument())
+    )
     # Two rotator angles 45° apart bring u back everywhere: no star is flagged, and none is lost.
     assert np.all(found.flag == 0)
     return found, found.qu - sample

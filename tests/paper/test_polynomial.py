@@ -35,7 +35,7 @@ def test_measured_ratio_of_an_imbalanced_pair_is_not_linear():
     """r = (α + q)/(1 + αq)."""
     stars = np.array([[0.4, -0.3], [-1.0, 0.0], [0.0, 0.0]])
     alpha = 0.03
-    found = paper.ratios(paper.transmitted(pair(alpha)[None], stars))[0]
+    found = paper.measured_qu(paper.transmitted(pair(alpha)[None], stars))[0]
     np.testing.assert_allclose(found, (alpha + stars) / (1 + alpha * stars), rtol=1e-13)
 
 
@@ -70,22 +70,22 @@ def test_why_there_is_a_delta():
     """
     vectors, stars = pair(0.03, 0.999)[None], paper.sample_stars()
     states = paper.polariser_states(ANGLES)
-    measured = paper.ratios(paper.transmitted(vectors, states))
+    measured = paper.measured_qu(paper.transmitted(vectors, states))
     coefficients, condition = paper.fit_polynomials(measured, states)
     rng = np.random.default_rng(2)
     noisy = measured + 1e-3 * rng.standard_normal(measured.shape)
     spoilt, _ = paper.fit_polynomials(noisy, states)
     zero = np.zeros(1)
-    made = paper.judged(zero, zero, spoilt, condition, vectors, stars)
+    made = paper.with_test_stars(zero, zero, spoilt, condition, vectors, stars)
     why = comparison.offsets(made, noisy, states, vectors, stars)
-    weakest = np.linalg.svd(paper.terms(measured[0]), full_matrices=False)[2][-1]
+    weakest = np.linalg.svd(paper.polynomial_terms(measured[0]), full_matrices=False)[2][-1]
     np.testing.assert_allclose(weakest / weakest[0], [1, 0, 0, -1, -1], atol=0.1)
     assert condition[0] > 15
     assert np.abs(made.delta).max() > 2e-3
     np.testing.assert_allclose(why.along, made.delta, atol=0.1 * np.abs(made.delta).max())
     assert np.abs(why.anchored).max() < 0.15 * np.abs(made.delta).max()
     np.testing.assert_allclose(
-        made.recover(paper.ratios(paper.transmitted(vectors, stars)))[0].mean(axis=0),
+        made.recover(paper.measured_qu(paper.transmitted(vectors, stars)))[0].mean(axis=0),
         stars.mean(axis=0),
         atol=1e-12,
     )

@@ -61,7 +61,8 @@ class Study:
             instrument = to_instrument(values)
             rows = light.band_rows(instrument, plan, x, y)  # pyright: ignore[reportArgumentType]
             throughput = light.throughput_at(instrument, x, y)
-            return light.instrument_matrix(light.camera_vectors(instrument, rows, throughput, x, y)[0])
+            vectors = light.camera_vectors(instrument, rows, throughput, x, y)[0]
+            return light.instrument_matrix(vectors, instrument.cameras.pairs)
 
         over_points = jax.vmap(matrix, (None, None, 0, 0))
         self._matrices = compiled(

@@ -18,9 +18,9 @@ def tiles(figure) -> list[PatchCollection]:
 
 
 def test_residual_maps_share_one_symmetric_scale():
-    pictures = handmade_run.pictures()
-    one = pictures.comparisons[1]
-    figure = figures.residual_maps(pictures.points, {"before": one.before, "after": one.after})
+    data = handmade_run.figure_data()
+    one = data.comparisons[1]
+    figure = figures.residual_maps(data.points, {"before": one.before, "after": one.after})
     maps = tiles(figure)
     assert len(maps) == 8
     # The largest residual by hand: −6 in camera E2, without the effect.
@@ -35,22 +35,22 @@ def test_residual_maps_share_one_symmetric_scale():
 
 
 def test_points_without_data_are_left_out():
-    pictures = handmade_run.pictures()
-    before = pictures.comparisons[1].before.copy()
+    data = handmade_run.figure_data()
+    before = data.comparisons[1].before.copy()
     before[4] = np.nan
-    shown = tiles(figures.residual_maps(pictures.points, {"": before}))[0]
+    shown = tiles(figures.residual_maps(data.points, {"": before}))[0]
     assert len(shown.get_array()) == 8
-    figures.residual_maps(pictures.points, {"": np.full((9, 4), np.nan)})
+    figures.residual_maps(data.points, {"": np.full((9, 4), np.nan)})
 
 
 @pytest.mark.parametrize(
     ("harmonic", "abscissa"), [(3, "polariser angle (deg)"), (-1, "time since the first exposure (h)")]
 )
 def test_signature_lies_beside_the_data(harmonic, abscissa):
-    pictures = handmade_run.pictures()
-    out = dataclasses.replace(pictures.exposures, clp_angle=np.full(8, np.nan))
-    one = dataclasses.replace(pictures.comparisons[1], harmonic=harmonic)
-    figure = figures.signature_figure(one, pictures.exposures if harmonic > 0 else out)
+    data = handmade_run.figure_data()
+    out = dataclasses.replace(data.exposures, clp_angle=np.full(8, np.nan))
+    one = dataclasses.replace(data.comparisons[1], harmonic=harmonic)
+    figure = figures.signature_figure(one, data.exposures if harmonic > 0 else out)
     assert figure.axes[4].get_xlabel() == abscissa
     for k, axis in enumerate(figure.axes[:4]):
         effect = next(line for line in axis.lines if line.get_label() == "effect")
@@ -62,19 +62,19 @@ def test_signature_lies_beside_the_data(harmonic, abscissa):
 
 
 def test_exposures_at_one_angle_are_averaged():
-    pictures = handmade_run.pictures()
+    data = handmade_run.figure_data()
     angle = np.repeat([0.0, 45.0, 90.0, 135.0], 2)
     figure = figures.signature_figure(
-        pictures.comparisons[1], dataclasses.replace(pictures.exposures, clp_angle=angle)
+        data.comparisons[1], dataclasses.replace(data.exposures, clp_angle=angle)
     )
     dots = figure.axes[0].containers[0].lines[0]
     np.testing.assert_allclose(
-        dots.get_ydata(), pictures.comparisons[1].curve_before[:, 0].reshape(4, 2).mean(axis=1)
+        dots.get_ydata(), data.comparisons[1].curve_before[:, 0].reshape(4, 2).mean(axis=1)
     )
 
 
 def test_ladder_shows_chi2_per_degree_of_freedom():
-    figure = figures.ladder_figure(handmade_run.pictures().ladder)
+    figure = figures.ladder_figure(handmade_run.figure_data().ladder)
     axis = figure.axes[0]
     assert [label.get_text() for label in axis.get_yticklabels()] == ["starting model", "+ clp_wobble"]
     assert [text.get_text() for text in axis.texts] == ["1.625", "1.029"]

@@ -1,4 +1,4 @@
-"""Figures show what they say: numbers behind them are checked, pictures are drawn without a screen."""
+"""Figures show what they say: numbers behind them are checked, they are drawn without a screen."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from matplotlib import pyplot
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.diagnosis.figure_data import pictures
+from walop_jax.diagnosis.figure_data import figure_data
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import refit
@@ -79,14 +79,14 @@ def test_modulation_is_that_of_the_data(fitted):
         np.testing.assert_allclose(shown, (n[:, pair] - n[:, pair + 1]) / (n[:, pair] + n[:, pair + 1]))
 
 
-def test_pictures_of_a_diagnosis_hold_its_residuals(fitted):
+def test_figures_of_a_diagnosis_hold_its_residuals(fitted):
     result, _ = fitted
     likelihood, start = result.likelihood, dataclasses.replace(result, values=result.model.start)
     found = Diagnosis(
         verdict="consistent", steps=(), candidates=(), limits=(), untestable=(), unexplained=None, p_value=0.5,
         remaining_p=0.5, before=start, after=result, seconds=0.0, points=20,
     )  # fmt: skip
-    made = pictures(found)
+    made = figure_data(found)
     before, after = (likelihood.residuals(values)[1] for values in (likelihood.model.start, result.values))
     for group in ("camera", "kind", "filter", "exposure"):
         rows = made.shares.group == group

@@ -14,7 +14,7 @@ from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import write_columns
 from walop_jax.reports.page import render
 from walop_jax.reports.run import read_run
-from walop_jax.reports.wording import digits, probability, verdict_of_diagnosis
+from walop_jax.reports.wording import probability, value_and_error, verdict_of_diagnosis
 
 VOID = {"meta", "img", "br", "link", "hr", "input"}
 
@@ -167,7 +167,7 @@ def test_missing_pieces_are_named(tmp_path):
 
 def test_files_of_different_diagnoses_are_not_mixed(tmp_path):
     run = handmade_run.make_diagnosis(tmp_path / "run", steps=[], verdict="consistent")
-    handmade_run.write_pictures(run / "diagnosis.fits", handmade_run.pictures(), overwrite=True)
+    handmade_run.write_figure_data(run / "diagnosis.fits", handmade_run.figure_data(), overwrite=True)
     assert "diagnosis.fits is of another diagnosis" in read_run(run).missing[0]
     handmade_run.make_refit(run, chi2=1300.0)
     assert "diagnosis.json is of another fit" in read_run(run).missing[1]
@@ -237,7 +237,7 @@ def test_what_is_no_run_is_refused(tmp_path, spoil, said):
     ],
 )
 def test_two_digits_of_the_error(value, sigma, shown):
-    assert digits(value, sigma) == shown
+    assert value_and_error(value, sigma) == shown
 
 
 def test_probabilities_in_words():
@@ -261,7 +261,9 @@ def test_a_free_form_term_is_shown_as_what_it_is(tmp_path):
     run = handmade_run.make_diagnosis(
         tmp_path / "run", verdict="unexplained", steps=[], unexplained=unexplained
     )
-    handmade_run.write_pictures(run / "diagnosis.fits", handmade_run.pictures(("free_form",)), overwrite=True)
+    handmade_run.write_figure_data(
+        run / "diagnosis.fits", handmade_run.figure_data(("free_form",)), overwrite=True
+    )
     found = read_run(run)
     assert found.missing == ()
     page = Page(render(found))

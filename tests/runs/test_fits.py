@@ -1,27 +1,49 @@
-"""`diagnose_sets` and `compare_methods`: calibration sets in, the folder of a run out."""
+"""`refit_sets`, `diagnose_sets`, `compare_methods`: calibration sets in, the folder of a run out."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from walop_jax.calibration.product import read_product
 from walop_jax.io.errors import DataError
 from walop_jax.reports.run import read_run
-from walop_jax.runs import compare, diagnose
+from walop_jax.runs import compare, diagnose, refit
 
 from .conftest import FittedSet, assert_same_files
 
-OUTPUTS = {diagnose.diagnose_sets: diagnose.OUTPUTS, compare.compare_methods: compare.OUTPUTS}
+OUTPUTS = {
+    refit.refit_sets: refit.OUTPUTS,
+    diagnose.diagnose_sets: diagnose.OUTPUTS,
+    compare.compare_methods: compare.OUTPUTS,
+}
 
 
 def fail(*args: object) -> None:
     raise OSError("No space left on device")
 
 
-def test_a_diagnosis(call, spoilt: Path, tmp_path: Path, monkeypatch):
+def test_a_fit(call, fitted: FittedSet, tmp_path: Path, monkeypatch):
+    told: list[str] = []
+    found = refit.refit_sets([fitted.calset], tmp_path / "caller", seed=3, progress=told.append)
+    assert told[0] == "reading"
+    assert told[-1] == "mapping the field"
+    assert (found.residuals, found.misfit, found.warnings) == (None, None, ())
+    np.testing.assert_allclose(found.result.values, fitted.calibration.values, rtol=1e-12)
+    assert call("refit", fitted.calset, "-o", tmp_path / "command", "--seed", 3, "-q").exit_code == 0
+    assert_same_files(tmp_path / "command", tmp_path / "caller")
+
+    monkeypatch.setattr(refit, "refit", lambda *args, **more: found.result)
+    monkeypatch.setattr(refit, "write_product", fail)
+    with pytest.raises(DataError, match="what was there is untouched"):
+        refit.refit_sets([fitted.calset], tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_diagnosis(spoilt: Path, tmp_path: Path, monkeypatch):
     told: list[str] = []
     found = diagnose.diagnose_sets([spoilt], tmp_path / "caller", seed=3, progress=told.append)
     assert told[0] == "reading"
@@ -32,14 +54,19 @@ def test_a_diagnosis(call, spoilt: Path, tmp_path: Path, monkeypatch):
     assert written.diagnosis == json.loads(json.dumps(found.document))
     assert written.summary["seed"] == 3
     assert read_product(tmp_path / "caller" / "calibration.fits").verdict.trusted
-    assert call("diagnose", spoilt, "-o", tmp_path / "command", "--seed", 3, "-q").exit_code == 0
-    assert_same_files(tmp_path / "command", tmp_path / "caller")
 
     monkeypatch.setattr(diagnose, "diagnose", lambda *args, **more: found.diagnosis)
-    monkeypatch.setattr(diagnose, "write_pictures", fail)
+    monkeypatch.setattr(diagnose, "write_figure_data", fail)
     with pytest.raises(DataError, match="what was there is untouched"):
         diagnose.diagnose_sets([spoilt], tmp_path / "other")
     assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.long
+def test_a_diagnosis_is_that_of_the_command(call, spoilt: Path, tmp_path: Path):
+    diagnose.diagnose_sets([spoilt], tmp_path / "caller", seed=3)
+    assert call("diagnose", spoilt, "-o", tmp_path / "command", "--seed", 3, "-q").exit_code == 0
+    assert_same_files(tmp_path / "command", tmp_path / "caller")
 
 
 def test_a_comparison(call, fitted: FittedSet, tmp_path: Path, monkeypatch):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
+from walop_jax.calibration.records import Quality
 from walop_jax.io.errors import DataError
 from walop_jax.runs.apply import apply_to_catalogue
 from walop_jax.runs.matrix import tabulate_matrix
@@ -48,7 +49,7 @@ def test_a_table_of_matrices(call, fitted: FittedSet, points: Path, tmp_path: Pa
     found = tabulate_matrix(fitted.run, points, caller / "o.fits", progress=told.append)
     assert_same_files(command, caller)
     assert told
-    assert (found.rows, found.trusted, found.flags[32]) == (3, True, 1)
+    assert (found.rows, found.trusted, found.flags[Quality.BEYOND_FIELD]) == (3, True, 1)
     assert "points.csv: 1 point(s) beyond the calibrated field" in found.warnings[0]
     assert found.product == fitted.calibration.to_product().content_hash()
     values, covariance = fitted.calibration.matrix(np.array([0.0, 0.2, 0.33]), np.array([0.0, -0.1, 0.0]))
@@ -65,7 +66,7 @@ def test_a_catalogue(call, fitted: FittedSet, catalogue: Path, tmp_path: Path):
     found = apply_to_catalogue(fitted.run, catalogue, caller / "o.fits", estimator="WK", progress=told.append)
     assert_same_files(command, caller)
     assert "6 of 6 rows" in told
-    assert (found.rows, found.stars, found.flags[16384]) == (6, 6, 1)
+    assert (found.rows, found.stars, found.flags[Quality.NO_STOKES]) == (6, 6, 1)
     assert "1 star(s) without a result" in found.warnings[0]
     assert found.document()["flags"]["16384"] == 1
 

@@ -19,7 +19,7 @@ from walop_jax.cli import app
 from walop_jax.data import write_calibration_set
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import refit
-from walop_jax.science.epoch import chi2_tail, departure, epoch
+from walop_jax.science.epoch import chi2_of_change, chi2_tail, epoch
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -126,7 +126,7 @@ def test_tail_of_chi2_by_scipy():
 def test_departure_by_hand():
     """3-4-5: Δ = (3, 4) with unit errors, and a third parameter that nobody measured."""
     change, covariance = np.array([3.0, 4.0, 0.0]), np.diag([1.0, 1.0, 0.0])
-    assert departure(change, covariance, np.array([1.0, 1.0, 1.0])) == (pytest.approx(25.0), 2)
+    assert chi2_of_change(change, covariance, np.array([1.0, 1.0, 1.0])) == (pytest.approx(25.0), 2)
 
 
 def test_an_instrument_that_has_not_changed_still_fits(first):

@@ -25,7 +25,8 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
 from walop_jax.model.build import nominal_instrument
 from walop_jax.model.effects import effect_by_name
-from walop_jax.model.specification import full_values, make_model, with_effects
+from walop_jax.model.parameters import values_of
+from walop_jax.model.specification import make_model, with_effects
 from walop_jax.simulation.observing_plan import (
     NARROW_BANDS,
     SITES,
@@ -51,7 +52,7 @@ def at_truth(simulated: Simulated) -> tuple[Likelihood, np.ndarray]:
     model = base_model(simulated.calset)
     added = [type(e).of(SMALL.context(), **e.choices()) for e in simulated.truth.effects]
     model = with_effects(model, added, SMALL.context()) if added else model
-    return Likelihood.of(simulated.calset, model), full_values(simulated.truth)
+    return Likelihood.of(simulated.calset, model), values_of(simulated.truth)
 
 
 def chi2(likelihood: Likelihood, values: np.ndarray) -> float:
@@ -163,7 +164,7 @@ def test_impossible_plans_are_refused(change: dict, message: str):
 def test_as_built_values_follow_their_priors():
     model = make_model("WALOP-SOUTH", nominal_instrument())
     rng = np.random.default_rng(2)
-    drawn = np.array([full_values(draw_instrument(model, rng)) for _ in range(400)])
+    drawn = np.array([values_of(draw_instrument(model, rng)) for _ in range(400)])
     for i, p in enumerate(model.parameters):
         if p.prior is not None:
             z = (drawn[:, i] - p.prior[0]) / p.prior[1]
@@ -210,7 +211,7 @@ def test_a_seed_decides_everything():
     first, second, third = (block_of(s) for s in (one, two, other))
     np.testing.assert_array_equal(first.counts, second.counts)
     np.testing.assert_array_equal(first.sigma, second.sigma)
-    np.testing.assert_array_equal(full_values(one.truth), full_values(two.truth))
+    np.testing.assert_array_equal(values_of(one.truth), values_of(two.truth))
     assert not np.any(first.counts[first.used] == third.counts[third.used])
 
 
@@ -247,7 +248,7 @@ def test_effects_are_in_the_data(name: str, values: dict):
     likelihood, true = at_truth(with_it)
     assert chi2(likelihood, true) < 1e-6
     bare = Likelihood.of(with_it.calset, base_model(with_it.calset))
-    assert chi2(bare, full_values(without.truth)) > 10.0
+    assert chi2(bare, values_of(without.truth)) > 10.0
 
 
 def test_an_instrument_may_be_given():
@@ -280,7 +281,7 @@ def test_other_instruments(plan: ObservingPlan, tmp_path: Path):
     assert again.instrument == plan.instrument
     likelihood = Likelihood.of(again, base_model(again, throughput_degree=plan.throughput_degree))
     rows = calset.intensities.rows
-    assert chi2(likelihood, full_values(truth)) == pytest.approx(3 * rows, abs=4 * np.sqrt(6 * rows))
+    assert chi2(likelihood, values_of(truth)) == pytest.approx(3 * rows, abs=4 * np.sqrt(6 * rows))
 
 
 def test_two_nights_can_be_merged():

@@ -25,12 +25,12 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.colour import colour_nodes, colour_weights
 from walop_jax.calibration.matrix import analysis_vectors, in_chunks
 from walop_jax.data.settings import Settings
-from walop_jax.likelihood import linear
+from walop_jax.likelihood import limits, linear
+from walop_jax.likelihood.field_table import FieldTable, accurate_table, held_out
 from walop_jax.model import light
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import compiled
 from walop_jax.model.dependence import needs
-from walop_jax.model.field_table import FieldTable, accurate_table, held_out
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import with_values
 from walop_jax.model.plan import Plan
@@ -44,7 +44,6 @@ TOLERANCE = 1e-7  # of a vector's largest element
 DERIVATIVE_TOLERANCE = 1e-3  # of a derivative's largest value: errors of errors
 BETWEEN = (2300.0, 3500.0, 5772.0, 12000.0, np.nan)  # colour temperatures (K) at which a table is checked
 REACH = 1.25  # of the calibrated field: beyond, no polynomial of the throughput means anything
-_CHUNK = 100  # field points that are computed together
 
 
 class Local(NamedTuple):
@@ -169,7 +168,7 @@ class AnalysisVectors:
     ) -> Float[np.ndarray, "p c k 3"]:
         """Vectors (point, colour, camera, Stokes) without any table; `teff` NaN is a flat spectrum."""
         plan, bands = self._plan(setting, teff)
-        vectors = analysis_vectors(self.instrument, plan, x, y, _CHUNK)[:, bands]
+        vectors = analysis_vectors(self.instrument, plan, x, y, limits.VECTOR_POINTS)[:, bands]
         return (vectors @ np.asarray(light.telescope(self.instrument)))[..., :3]
 
     def _plan(self, setting: Settings, teff: Sequence[float]) -> tuple[Plan, Int[np.ndarray, " c"]]:
@@ -218,7 +217,7 @@ class AnalysisVectors:
         def exact(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p f"]:
             """Derivatives in the order point, (colour, camera, Stokes, parameter)."""
             (values,) = in_chunks(
-                lambda a, b: (_derivatives_at(self.instrument, plan, a, b),), x, y, size=_CHUNK
+                lambda a, b: (_derivatives_at(self.instrument, plan, a, b),), x, y, size=limits.VECTOR_POINTS
             )
             return np.moveaxis(values[:, wanted][:, :, bands], 1, -1).reshape(len(x), -1)
 

@@ -9,13 +9,13 @@ import dataclasses
 import datetime
 import functools
 import operator
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from walop_jax.calibration.matrix import matrices
-from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, ParameterTable, Verdict, spelt
+from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, ParameterTable, Verdict, in_ascii
 from walop_jax.calibration.records import Quality, ResidualMap
 from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter
 from walop_jax.data.frames import Grid
@@ -24,11 +24,13 @@ from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import model_without_data, standard_names
 from walop_jax.fit.model_file import render
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult
+from walop_jax.instruments.description import parsed
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.software import software_versions
 from walop_jax.model import carried
-from walop_jax.model.build import nominal_instrument
+from walop_jax.model.build import adapted, build, nominal_instrument
 from walop_jax.model.dependence import needs
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import Model, effect_context
 
 Vector = Float[np.ndarray, " n"]
@@ -151,18 +153,19 @@ class Calibration:
         x: Float[np.ndarray, " p"],
         y: Float[np.ndarray, " p"],
         settings: Settings,
-        values: Float[np.ndarray, "p m"],
+        values: Float[np.ndarray, "p m"] | None = None,
     ) -> Int[np.ndarray, " p"]:
-        """Bits of `Quality` of matrices at field positions: high cross-talk, beyond the field or the settings.
+        """Bits of `Quality` at field positions: beyond the field or the settings; for matrices, high cross-talk.
 
         A single arm sees one combination of q and u, which has no inverse: it is marked only where it sees neither.
         """
         flags = np.zeros(len(x), np.int64)
-        blocks = values.reshape(len(x), values.shape[1] // 3, 3)[:, :, 1:]
-        known = np.all(np.isfinite(values), axis=1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            condition = np.linalg.cond(np.where(known[:, None, None], blocks, np.eye(*blocks.shape[1:])))
-        flags[~(condition <= HIGH_CROSSTALK)] |= Quality.HIGH_CROSSTALK
+        if values is not None:
+            blocks = values.reshape(len(x), values.shape[1] // 3, 3)[:, :, 1:]
+            known = np.all(np.isfinite(values), axis=1)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                condition = np.linalg.cond(np.where(known[:, None, None], blocks, np.eye(*blocks.shape[1:])))
+            flags[~(condition <= HIGH_CROSSTALK)] |= Quality.HIGH_CROSSTALK
         margin = 0.5 / MAP_SIZE * (self.field[1] - self.field[0])
         low_x, low_y = self.field[0] - margin, self.field[2] - margin
         high_x, high_y = self.field[1] + margin, self.field[3] + margin
@@ -203,11 +206,11 @@ class Calibration:
         parameters = self.model.parameters
         priors = np.array([p.prior or (np.nan, np.nan) for p in parameters]).reshape(-1, 2)
         maps = self.maps()
-        texts = tuple(spelt(text) for text in self.verdict.warnings)
+        texts = tuple(in_ascii(text) for text in self.verdict.warnings)
         return CalibrationProduct(
             instrument=self.model.name,
             site=self.site,
-            origin=spelt(self.origin),
+            origin=in_ascii(self.origin),
             date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds").replace("+00:00", ""),
             verdict=dataclasses.replace(self.verdict, warnings=texts),
             parameters=ParameterTable(
@@ -225,10 +228,11 @@ class Calibration:
             exposures=self.exposures,
             filters=self.filters,
             sources=self.sources,
-            model=tuple(spelt(line) for line in render(self.model).splitlines() if line.strip()),
+            model=tuple(_lines(render(self.model))),
             inputs=self.inputs,
             versions=software_versions(),
             residuals=self.residuals,
+            description=tuple(_lines(self.model.template.description)),
         )
 
     @classmethod
@@ -264,15 +268,30 @@ class Calibration:
         )
 
 
+def _lines(text: str) -> Iterator[str]:
+    return (in_ascii(line) for line in text.splitlines() if line.strip())
+
+
+def instrument_as_designed(product: CalibrationProduct) -> Instrument:
+    """The instrument of a product as designed, from the description that it holds or that comes with the package.
+
+    Raises `DataError` for elements that only the fit has known: such a product is rebuilt where they are known.
+    """
+    if not product.description:
+        return nominal_instrument(product.instrument)
+    return build(
+        parsed("\n".join(product.description), f"the description of {product.instrument} in the product")
+    )
+
+
 def rebuild(product: CalibrationProduct) -> Model:
     """The model of a product from its lines of TOML, its standards and its exposures."""
     sources = product.sources
     names = standard_names(sources)
     standards = list(zip(names, sources.q.tolist(), sources.u.tolist(), strict=True))
-    context = effect_context(nominal_instrument(product.instrument, standards=standards), product.exposures)
-    return model_without_data(
-        product.instrument, "\n".join(product.model), standards=standards, context=context
-    )
+    design = instrument_as_designed(product)
+    context = effect_context(adapted(design, standards=standards), product.exposures)
+    return model_without_data(design, "\n".join(product.model), standards=standards, context=context)
 
 
 def quality(result: FitResult) -> Quality:

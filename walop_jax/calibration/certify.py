@@ -18,8 +18,8 @@ from walop_jax.calibration.product import CalibrationProduct
 from walop_jax.calibration.records import Quality
 from walop_jax.data.filters import BUILTIN_FILTERS
 
-SAME = 1e-7  # between maps in the file and maps of its parameters, on another machine
-NEGATIVE = 1e-4  # of the response to unpolarised light: what "less than no light" may be
+MAP_TOLERANCE = 1e-7  # between maps in the file and maps of its parameters, on another machine
+DARKEST = 1e-4  # of the response to unpolarised light: what "less than no light" may be
 _POINTS = 64
 
 
@@ -118,7 +118,9 @@ def _maps(product: CalibrationProduct, calibration: Calibration) -> Check:
         return Check("maps", False, "are not of the grid and setting that this program makes")
     off = float(np.abs(again.values - product.maps.values).max())
     errors = float(np.abs(again.errors / np.maximum(product.maps.errors, 1e-30) - 1.0).max())
-    return Check("maps", off < SAME and errors < 1e-4, f"differ from those of the parameters by {off:.1e}")
+    return Check(
+        "maps", off < MAP_TOLERANCE and errors < 1e-4, f"differ from those of the parameters by {off:.1e}"
+    )
 
 
 def _physics(calibration: Calibration) -> Check:
@@ -131,5 +133,5 @@ def _physics(calibration: Calibration) -> Check:
     least = np.min(1.0 - np.hypot(vectors[..., 1], vectors[..., 2]) / vectors[..., 0], axis=0)
     arms = zip(analysis.instrument.arms, analysis.instrument.cameras.pairs, strict=True)
     found = ", ".join(f"{arm.name} {least[list(pair)].min():.1e}" for arm, pair in arms)
-    good = bool(np.all(vectors[..., 0] > 0)) and bool(np.all(least > -NEGATIVE))
+    good = bool(np.all(vectors[..., 0] > 0)) and bool(np.all(least > -DARKEST))
     return Check("physics", good, f"least light that a camera sees, of unpolarised: {found}")

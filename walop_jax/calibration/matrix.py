@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.settings import Settings
-from walop_jax.likelihood import linear
+from walop_jax.likelihood import limits, linear
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
@@ -24,8 +24,6 @@ from walop_jax.model.plan import Plan, with_numbers
 from walop_jax.model.planning import plan_for_settings
 
 Scalar = Float[Array, ""]
-CHUNK = 256  # field points that are computed together
-SMALL_CHUNK = 16
 
 
 def _point_vectors(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
@@ -112,7 +110,8 @@ def in_chunks(
     """Apply a compiled function to slices of the columns, padded to `size` rows (None: to one of two sizes)."""
     count = len(columns[0])
     if size is None:
-        size = SMALL_CHUNK if count <= SMALL_CHUNK else CHUNK
+        few, many = limits.MATRIX_POINTS
+        size = few if count <= few else many
     parts = []
     for start in range(0, count, size):
         slices = [column[start : start + size] for column in columns]

@@ -12,6 +12,7 @@
     EXPOSURES    the exposures that went in                }
     SOURCES      the standards, if there were any          }
     MODEL        LINE: the model file of the fit, line by line
+    INSTRUMENT   LINE: the description file of an instrument that does not come with the package
     INPUTS       PATH, SHA256 of the calibration sets
     WARNINGS     TEXT: what does not hold
 
@@ -44,8 +45,8 @@ from walop_jax.calibration.records import (
     MatrixMaps,
     ParameterTable,
     Verdict,
+    in_ascii,
     matrix_names,
-    spelt,
 )
 from walop_jax.calibration.residual_map_file import read_residual_map, residual_hdus
 from walop_jax.data import schema
@@ -65,8 +66,8 @@ __all__ = [
     "MatrixMaps",
     "ParameterTable",
     "Verdict",
+    "in_ascii",
     "read_product",
-    "spelt",
     "write_product",
 ]
 
@@ -81,6 +82,7 @@ _RULES: Mapping[str, Mapping[str, Column]] = {
         "FREE": Column("bool"),
     },
     "MODEL": {"LINE": Column("str")},
+    "INSTRUMENT": {"LINE": Column("str")},
     "INPUTS": {"PATH": Column("str"), "SHA256": Column("str")},
     "WARNINGS": {"TEXT": Column("str")},
     "FILTERS": schema.FILTERS,
@@ -110,10 +112,12 @@ def _hdus(product: CalibrationProduct, path: object) -> list[Any]:
         "FILTERS": filter_columns(product.filters),
         "MODEL": {"LINE": _strings(product.model)},
     }
+    if product.description:
+        tables["INSTRUMENT"] = {"LINE": _strings(product.description)}
     if len(product.sources):
         tables["SOURCES"] = {name: getattr(product.sources, name.lower()) for name in schema.SOURCES}
     if product.inputs:
-        paths = _strings(spelt(str(entry.path)) for entry in product.inputs)
+        paths = _strings(in_ascii(str(entry.path)) for entry in product.inputs)
         tables["INPUTS"] = {"PATH": paths, "SHA256": _strings(entry.sha256 for entry in product.inputs)}
     if product.verdict.warnings:
         tables["WARNINGS"] = {"TEXT": _strings(product.verdict.warnings)}
@@ -187,6 +191,7 @@ def _from_hdus(opened: OpenFile) -> CalibrationProduct:
     filters = make_filters(table("FILTERS") or {}, Place(path, "FILTERS"))
     sources, inputs = table("SOURCES", optional=True), table("INPUTS", optional=True)
     warnings, model = table("WARNINGS", optional=True), table("MODEL") or {}
+    description = table("INSTRUMENT", optional=True)
     product = CalibrationProduct(
         instrument=header.instrument(version),
         site=site,
@@ -221,6 +226,7 @@ def _from_hdus(opened: OpenFile) -> CalibrationProduct:
         else tuple(InputFile(Path(p), s) for p, s in zip(inputs["PATH"], inputs["SHA256"], strict=True)),
         versions=header.versions(),
         residuals=read_residual_map(units, maps.arms, path),
+        description=() if description is None else tuple(description["LINE"].tolist()),
     )  # fmt: skip
     if header.text("CONTHASH") != product.content_hash():
         raise fail(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
-from walop_jax.calibration.records import CalibrationProduct, spelt
+from walop_jax.calibration.records import CalibrationProduct, in_ascii
 from walop_jax.data.checks import instrument_name, oldest_version
 from walop_jax.data.records import PREFIX
 from walop_jax.data.schema import Place
@@ -84,10 +84,10 @@ def primary_hdu(product: CalibrationProduct, version: int) -> fits.PrimaryHDU:
     for name, (value, comment) in cards.items():
         if isinstance(value, float) and not np.isfinite(value):
             continue  # FITS headers know no NaN; a missing card is read as one
-        primary.header[name] = (spelt(value) if isinstance(value, str) else value, comment)
+        primary.header[name] = (in_ascii(value) if isinstance(value, str) else value, comment)
     primary.header["INSTRUME"] = product.instrument  # blanks inside a name count
     for number, (name, release) in enumerate(product.versions.items(), start=1):
-        primary.header[f"SOFT{number}"] = spelt(f"{name} {release}")
+        primary.header[f"SOFT{number}"] = in_ascii(f"{name} {release}")
     return primary
 
 

@@ -13,6 +13,9 @@ from jaxtyping import Bool, Float, Shaped
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import Exposures, FilterCurve, InputFile, Site, Sources
 
+SMALLEST_DETERMINANT = 0.1
+"""|m22 m33 − m23 m32| below which a single exposure holds hardly any u."""
+
 
 def matrix_names(arms: int) -> tuple[str, ...]:
     """Names of the matrix elements of an instrument, three for each arm: M21, M22, M23, M31, … (two arms: to M33)."""
@@ -79,7 +82,7 @@ _SPELT = {
 }  # fmt: skip
 
 
-def spelt(text: str) -> str:
+def in_ascii(text: str) -> str:
     """The text on one line in ASCII: signs spelt out where that is usual, escaped (\\u00e9) otherwise."""
     for sign, word in _SPELT.items():
         text = text.replace(sign, word)
@@ -203,8 +206,9 @@ class Verdict:
 class CalibrationProduct:
     """Everything that `calibration.fits` holds, free of FITS.
 
-    `field` is (smallest x, largest x, smallest y, largest y) of the field points that were used, in degrees;
-    `model` are the lines of the model's TOML text; `versions` name the software; `date` is UTC, ISO 8601.
+    `field` is (smallest x, largest x, smallest y, largest y) of the field points that were used, in degrees; `model`
+    are the lines of the model's TOML text, `description` those of the instrument's description file where it does not
+    come with the package; `versions` name the software; `date` is UTC, ISO 8601.
     """
 
     instrument: str
@@ -223,6 +227,7 @@ class CalibrationProduct:
     inputs: tuple[InputFile, ...] = ()
     versions: Mapping[str, str] = dataclasses.field(default_factory=dict)
     residuals: ResidualMap | None = None
+    description: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.parameters)
@@ -238,7 +243,7 @@ class CalibrationProduct:
         # Twelve digits: a number in a FITS header may lose its last bit.
         numbers = (verdict.chi2, verdict.noise_scale, *self.field)
         texts = [
-            *(self.instrument, *self.model, *verdict.warnings, verdict.covariance_from),
+            *(self.instrument, *self.model, *self.description, *verdict.warnings, verdict.covariance_from),
             *(str(value) for value in (verdict.dof, verdict.n_data, verdict.converged, verdict.trusted)),
             *(str(int(verdict.quality)), *(f"{value:.11e}" for value in numbers)),
             *(entry.sha256 for entry in self.inputs),

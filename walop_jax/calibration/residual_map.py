@@ -26,12 +26,12 @@ from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.expansion import Census, Posterior
+from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.runner import SlabSums
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
-from walop_jax.model.field_table import FieldTable
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 
@@ -76,7 +76,9 @@ def _chunk_sums(
     nodes: FieldTable | None,
 ) -> Float[Array, "p n"]:
     return jax.lax.map(
-        lambda point: _point_sums(instrument, plan, chosen, point, nodes), data, batch_size=engine.BLOCK
+        lambda point: _point_sums(instrument, plan, chosen, point, nodes),
+        data,
+        batch_size=limits.JACOBIAN_BLOCK,
     )
 
 
@@ -101,7 +103,9 @@ def cell_of(grid: Grid, x: Vector, y: Vector) -> Int[np.ndarray, " p"]:
     return row * grid.width + column
 
 
-def _chosen(settings: Settings, through: Bool[np.ndarray, " e"]) -> tuple[Settings, Bool[np.ndarray, " e"]]:
+def _main_setting(
+    settings: Settings, through: Bool[np.ndarray, " e"]
+) -> tuple[Settings, Bool[np.ndarray, " e"]]:
     """The setting with the most exposures `through` the polariser, all else out preferred, and its exposures."""
 
     def preferred(layout: tuple[Settings, Int[np.ndarray, " r"]]) -> tuple[object, ...]:
@@ -123,7 +127,7 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
     instrument = likelihood.model.instrument(values)
     nodes, _ = likelihood.nodes(instrument, near)
     exposures = likelihood.calset.exposures
-    setting, chosen = _chosen(Settings.of(exposures, likelihood.plan.moving), exposures.clp_in)
+    setting, chosen = _main_setting(Settings.of(exposures, likelihood.plan.moving), exposures.clp_in)
     grid = cells_for(likelihood.layout.points, likelihood.census if near is None else near.census)
     count = grid.width * grid.height
 

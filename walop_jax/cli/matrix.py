@@ -47,6 +47,7 @@ def matrix(
     """
     del seed  # nothing is random here
     switch_on_jax()
+    from walop_jax.calibration.records import Quality
     from walop_jax.runs.matrix import tabulate_matrix
 
     with progress(quiet or json) as tell:
@@ -58,4 +59,5 @@ def matrix(
     if json:
         print_json(found.document())
     elif not quiet:
-        typer.echo(f"{output}: {found.rows} rows, {found.flags[16]} of them in zones of high cross-talk")
+        high = found.flags[Quality.HIGH_CROSSTALK]
+        typer.echo(f"{output}: {found.rows} rows, {high} of them in zones of high cross-talk")

@@ -78,8 +78,13 @@ class Settings:
         return len(self.teff)
 
     def __getitem__(self, rows: Rows) -> Settings:
-        plain = (values[rows] for values in self._plain())
-        return Settings(*plain, {prefix: angle[rows] for prefix, angle in self.positions.items()})
+        return Settings(
+            filter=self.filter[rows],
+            teff=self.teff[rows],
+            temperature=self.temperature[rows],
+            hour_angle=self.hour_angle[rows],
+            positions={prefix: angle[rows] for prefix, angle in self.positions.items()},
+        )
 
     def _plain(self) -> tuple[np.ndarray, ...]:
         return self.filter, self.teff, self.temperature, self.hour_angle

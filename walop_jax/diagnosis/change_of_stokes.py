@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.matrix import analysis_vectors
+from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
 from walop_jax.model import light
 from walop_jax.model.planning import plan_for_settings
 
 LARGEST_P = 0.05
-SMALLEST_DETERMINANT = 0.1  # below, one exposure holds hardly any u
 
 
 def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p a 3"]:

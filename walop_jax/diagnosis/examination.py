@@ -14,7 +14,7 @@ from walop_jax.diagnosis import naming
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.effect_columns import Probe, effect_candidates
 from walop_jax.diagnosis.findings import Limit
-from walop_jax.diagnosis.freeform import SINGLE, strata
+from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, strata
 from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable, separations
 from walop_jax.fit.refit import FitResult
 from walop_jax.model.effects import Effect
@@ -66,8 +66,8 @@ class Examination:
         )
         self.probes = [probe for probe in inactive if probe.name in self.named]
         candidates = [*(self.named[probe.name] for probe in self.probes), *strata(self.design.measured)]
+        self.blocks = {candidate.name: candidate.block for candidate in candidates}
         names, widths = [c.name for c in candidates], [c.widths for c in candidates]
-        self.blocks = {c.name: c.block for c in candidates}
         self.columns = self.design.stacked([candidates.pop(0).columns for _ in names])
         self._absorbed = {}
         for name in active:
@@ -75,7 +75,7 @@ class Examination:
             self._absorbed[name] = _Absorbed(rest, basis, basis.T @ self.columns)
         self.space = ScoreSpace.projected(self.design.projector, names, widths, self.columns)
         self.common_mode = self._common_mode()
-        space, reduce = self.space.with_base([SINGLE], self.common_mode)
+        space, reduce = self.space.with_base([SINGLE_EXPOSURES], self.common_mode)
         r = self.design.projector(self.design.residual)
         self._scored = space, *reduce(self.columns.T @ r, float(r @ r))
         self._rng = rng
@@ -92,7 +92,7 @@ class Examination:
 
     def _common_mode(self) -> Vector:
         """Prior widths of the gains of single exposures that amount to `COMMON_MODE` per intensity."""
-        at = self.space.places()[SINGLE]
+        at = self.space.places()[SINGLE_EXPOSURES]
         points = np.repeat(self.design.measured.used.sum(axis=0), self.design.measured.cameras - 1)
         square = np.where(self.space.before[at] > 0, self.space.before[at], np.inf)
         return np.maximum(COMMON_MODE * np.sqrt(points / square), 1e-30)

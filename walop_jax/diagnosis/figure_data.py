@@ -1,4 +1,4 @@
-"""What the pictures of a diagnosis are drawn from: residuals over the field, over the exposures, and in groups.
+"""What the figures of a diagnosis are drawn from: residuals over the field, over the exposures, and in groups.
 
 Combination  r_pk = Σ_e w_e r_pek / (Σ_e w_e² over the used ones)^½ keeps unit noise. The weights w are those of what
              can be said in words (a harmonic of the polariser angle at its best phase, the mean of a kind of
@@ -17,7 +17,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.data.records import Exposures
-from walop_jax.diagnosis.figure_file import Comparison, DiagnosisPictures, ExposureLabels, Ladder, Shares
+from walop_jax.diagnosis.figure_file import (
+    DiagnosisFigureData,
+    ExposureLabels,
+    Ladder,
+    ResidualComparison,
+    Shares,
+)
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.location import HARMONICS
 from walop_jax.likelihood.likelihood import Likelihood
@@ -48,8 +54,8 @@ class Combination:
         return np.einsum("pek,e->pk", cube, self.weight) / norm[:, None]
 
 
-def pictures(diagnosis: Diagnosis) -> DiagnosisPictures:
-    """The arrays from which the pictures of a diagnosis are drawn, residuals with the errors as given.
+def figure_data(diagnosis: Diagnosis) -> DiagnosisFigureData:
+    """The arrays from which the figures of a diagnosis are drawn, residuals with the errors as given.
 
     A free-form term that is in the final model without being a step comes as a last comparison of its own.
     """
@@ -62,12 +68,14 @@ def pictures(diagnosis: Diagnosis) -> DiagnosisPictures:
     if _unnamed_term(diagnosis):
         pairs.append((UNNAMED, pairs[-1][2] if diagnosis.steps else before, after))
     angle = np.where(exposures.clp_in, exposures.clp_angle, np.nan)
-    return DiagnosisPictures(
+    return DiagnosisFigureData(
         points=final.calset.points,
         exposures=ExposureLabels(exposures.exposure, exposures.kind, exposures.mjd, angle),
         ladder=_ladder(diagnosis),
         shares=_shares(final.likelihood, before, after),
-        comparisons=tuple(compare(name, first, second, used, exposures) for name, first, second in pairs),
+        comparisons=tuple(
+            compare_residuals(name, first, second, used, exposures) for name, first, second in pairs
+        ),
     )
 
 
@@ -76,7 +84,9 @@ def _unnamed_term(diagnosis: Diagnosis) -> bool:
     return UNNAMED in diagnosis.after.model.effect_names and UNNAMED not in known
 
 
-def compare(effect: str, before: Cube, after: Cube, used: Used, exposures: Exposures) -> Comparison:
+def compare_residuals(
+    effect: str, before: Cube, after: Cube, used: Used, exposures: Exposures
+) -> ResidualComparison:
     """Two cubes of residuals (σ; 0 where unused) side by side, in the combination that shows their difference.
 
     Without a difference the combination is the one that shows the residuals themselves.
@@ -93,7 +103,7 @@ def compare(effect: str, before: Cube, after: Cube, used: Used, exposures: Expos
     scatter = np.sqrt(np.einsum("pek,pk->ek", after**2, pattern**2)) / known
     rows = used.sum(axis=1, keepdims=True)
     rows = np.where(rows > 0, rows, np.nan)
-    return Comparison(
+    return ResidualComparison(
         effect=effect,
         combination=best.words,
         harmonic=best.harmonic,

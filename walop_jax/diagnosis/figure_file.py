@@ -1,4 +1,4 @@
-"""What the pictures of a diagnosis are drawn from, `diagnosis.fits` (DIAGVERS = 1): small arrays, no data set.
+"""What the figures of a diagnosis are drawn from, `diagnosis.fits` (DIAGVERS = 1): small arrays, no data set.
 
     LADDER       MODEL, CHI2, DOF: the starting model and every model after it, a row for each
     SHARES       GROUP (camera, kind, filter or exposure), MEMBER, EXPECTED, BEFORE, AFTER: sums of squared
@@ -30,7 +30,7 @@ import numpy as np
 from astropy.io import fits
 from jaxtyping import Float, Int, Shaped
 
-from walop_jax.calibration.records import spelt
+from walop_jax.calibration.records import in_ascii
 from walop_jax.data.records import Points
 from walop_jax.data.schema import Column, Place, read_table
 from walop_jax.data.write import sign_and_write, table_hdu
@@ -38,7 +38,7 @@ from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits
 
-PICTURES = "diagnosis.fits"
+FIGURE_DATA = "diagnosis.fits"
 DIAGVERS = 1
 """Version of the file format that is written, and the newest that is read."""
 
@@ -119,7 +119,7 @@ class Shares:
 
 
 @dataclasses.dataclass(frozen=True)
-class Comparison:
+class ResidualComparison:
     """Residuals without and with something, as maps over the field and as curves over the exposures.
 
     `effect` is empty where the starting model is compared with the final one. `combination` (plain ASCII) and
@@ -161,18 +161,18 @@ class ExposureLabels:
 
 
 @dataclasses.dataclass(frozen=True)
-class DiagnosisPictures:
+class DiagnosisFigureData:
     """Everything that `diagnosis.fits` holds; `comparisons[0]` is of the starting and the final model."""
 
     points: Points
     exposures: ExposureLabels
     ladder: Ladder
     shares: Shares
-    comparisons: tuple[Comparison, ...]
+    comparisons: tuple[ResidualComparison, ...]
 
 
-def write_pictures(
-    path: str | os.PathLike[str], pictures: DiagnosisPictures, *, overwrite: bool = False
+def write_figure_data(
+    path: str | os.PathLike[str], data: DiagnosisFigureData, *, overwrite: bool = False
 ) -> None:
     """Write `diagnosis.fits` with checksums; the file appears whole or not at all.
 
@@ -182,7 +182,7 @@ def write_pictures(
     primary.header["DIAGVERS"] = (DIAGVERS, "version of the format of these pictures")
     primary.header["CREATOR"] = "walop-jax"
     hdus: list[Any] = [primary]
-    for name, columns in _columns(pictures).items():
+    for name, columns in _columns(data).items():
         hdu = table_hdu(name, columns, path, {key: rule for key, (rule, _) in _TABLES[name].items()})
         for number, (_, about) in enumerate(_TABLES[name].values(), start=1):
             hdu.header[f"TCOMM{number}"] = about
@@ -191,8 +191,8 @@ def write_pictures(
         sign_and_write(hdus, temporary)
 
 
-def _columns(pictures: DiagnosisPictures) -> dict[str, dict[str, np.ndarray]]:
-    points, exposures, all_of = pictures.points, pictures.exposures, pictures.comparisons
+def _columns(data: DiagnosisFigureData) -> dict[str, dict[str, np.ndarray]]:
+    points, exposures, all_of = data.points, data.exposures, data.comparisons
     count, many = len(all_of), np.arange(len(all_of))
 
     def stacked(name: str) -> np.ndarray:
@@ -203,12 +203,12 @@ def _columns(pictures: DiagnosisPictures) -> dict[str, dict[str, np.ndarray]]:
 
     maps = ("before", "after", "explained", "mean_before", "mean_after", "rms_before", "rms_after")
     return {
-        "LADDER": record(pictures.ladder),
-        "SHARES": record(pictures.shares),
+        "LADDER": record(data.ladder),
+        "SHARES": record(data.shares),
         "COMPARISONS": {
             "COMPARISON": many,
             "EFFECT": np.array([one.effect for one in all_of]),
-            "COMBINATION": np.array([spelt(one.combination) for one in all_of]),
+            "COMBINATION": np.array([in_ascii(one.combination) for one in all_of]),
             "HARMONIC": np.array([one.harmonic for one in all_of]),
         },
         "FIELD": {
@@ -227,7 +227,7 @@ def _columns(pictures: DiagnosisPictures) -> dict[str, dict[str, np.ndarray]]:
     }
 
 
-def read_pictures(path: str | os.PathLike[str]) -> DiagnosisPictures:
+def read_figure_data(path: str | os.PathLike[str]) -> DiagnosisFigureData:
     """Read `diagnosis.fits`.
 
     Raises `DataError`, with advice, for a file that is damaged, of another kind or from a newer version.
@@ -243,7 +243,7 @@ def read_pictures(path: str | os.PathLike[str]) -> DiagnosisPictures:
             for name, columns in _TABLES.items():
                 rules = {key: rule for key, (rule, _) in columns.items()}
                 tables[name] = read_table(units[name], rules, Place(path, name))[0]
-            return _pictures(tables)
+            return _figure_data(tables)
         except DataError:
             raise
         except UNREADABLE as error:
@@ -252,14 +252,14 @@ def read_pictures(path: str | os.PathLike[str]) -> DiagnosisPictures:
             ) from error
 
 
-def _pictures(tables: Mapping[str, Mapping[str, Any]]) -> DiagnosisPictures:
+def _figure_data(tables: Mapping[str, Mapping[str, Any]]) -> DiagnosisFigureData:
     field, curves, about = tables["FIELD"], tables["CURVES"], tables["COMPARISONS"]
     comparisons = []
     for number in about["COMPARISON"]:
         here, there = field["COMPARISON"] == number, curves["COMPARISON"] == number
         maps = ("before", "after", "mean_before", "mean_after", "rms_before", "rms_after")
         comparisons.append(
-            Comparison(
+            ResidualComparison(
                 effect=str(about["EFFECT"][number]),
                 combination=str(about["COMBINATION"][number]),
                 harmonic=int(about["HARMONIC"][number]),
@@ -268,7 +268,7 @@ def _pictures(tables: Mapping[str, Mapping[str, Any]]) -> DiagnosisPictures:
             )
         )
     first, rows = field["COMPARISON"] == 0, curves["COMPARISON"] == 0
-    return DiagnosisPictures(
+    return DiagnosisFigureData(
         points=Points(*(field[name][first] for name in ("POINT", "X", "Y"))),
         exposures=ExposureLabels(
             *(curves[name][rows] for name in ("EXPOSURE", "KIND", "MJD", "CLP_ANGLE")),

@@ -32,7 +32,7 @@ from walop_jax.model import legendre
 from walop_jax.model.effects.free_form import FINE, HARMONICS, SMOOTH, WIDTH
 
 RINGS = (3, 4, 5, 6, 7, 8)
-SINGLE = "single exposures"
+SINGLE_EXPOSURES = "single exposures"
 
 Cube = Float[np.ndarray, "p e k"]
 
@@ -172,4 +172,6 @@ def strata(measured: Measured) -> Iterator[Candidate]:
     ]
     if sky_gradients:
         yield measured.candidate("kind, over the field", sky_gradients)
-    yield Candidate(SINGLE, measured.gains(), np.full((len(names) - 1) * len(e), WIDTH), "exposures")
+    yield Candidate(
+        SINGLE_EXPOSURES, measured.gains(), np.full((len(names) - 1) * len(e), WIDTH), "exposures"
+    )

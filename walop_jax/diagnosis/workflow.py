@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -120,7 +120,7 @@ class _Diagnosing:
                 break
             self.tell(f"added {added}; scoring what is left")
             examination = self._examine(examination)
-        return look
+        return examination
 
     def _trials(self, examination: Examination) -> Iterator[naming.Trial]:
         for item in naming.leaders(examination.significant) if examination.significant else ():

@@ -29,8 +29,6 @@ from typing import Any
 
 import tomlkit
 
-from walop_jax.model.elements import WavePlate
-from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import Model, Parameter, unknown_name
 
 TABLES = ("model", "effects", "parameters")
@@ -57,9 +55,8 @@ def render(model: Model) -> str:
     )
     table = tomlkit.table()
     table["instrument"] = model.name
-    plates = _plate_models(model.template)
-    if len(plates) == 1:
-        table["plates"] = plates.pop()
+    if model.template.plates is not None:
+        table["plates"] = model.template.plates
     table["throughput_degree"] = model.template.throughput.degree
     table["effects"] = list(model.effect_names)
     document["model"] = table
@@ -81,11 +78,6 @@ def render(model: Model) -> str:
         parameters[p.name] = entry
     document["parameters"] = parameters
     return tomlkit.dumps(document)
-
-
-def _plate_models(instrument: Instrument) -> set[str]:
-    elements = [*instrument.elements, *(element for arm in instrument.arms for element in arm.elements)]
-    return {element.model for element in elements if isinstance(element, WavePlate)}
 
 
 def parse(text: str, build: Callable[[Header], Model]) -> Model:

@@ -40,7 +40,7 @@ class FitResult:
     converged fit that explains the data; `warnings` says in words what does not hold.
     """
 
-    likelihood: Likelihood = dataclasses.field(repr=False)
+    likelihood: Likelihood
     values: Vector
     covariance: Matrix
     posterior: Posterior

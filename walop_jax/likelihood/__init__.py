@@ -1,1 +1,1 @@
-"""How probable data are: one noise object that scores and draws, the flux eliminated, priors, synthetic scenes."""
+"""How probable data are: noise that scores and draws, the flux eliminated, priors, a set in memory or read anew."""

@@ -27,24 +27,20 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from walop_jax.likelihood import linear
+from walop_jax.likelihood import limits, linear
+from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.flux import eliminate_flux, project_flux
 from walop_jax.likelihood.linear import rows_and_slopes
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
-from walop_jax.model.effects.base import Effect
-from walop_jax.model.field_table import FieldTable
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import values_of, with_values
 from walop_jax.model.plan import Plan
 
 Vector = Float[Array, " n"]
 Result = TypeVar("Result")
-BLOCK = 64  # field points whose Jacobians are worked on together
-LARGEST_BLOCK = 256  # up to so many points are one block
 NEWTON_STEPS = 3  # each squares the share of the detectors' distortion that is missing from the flux
 
 
@@ -136,7 +132,7 @@ def vectors_at(
     return light.camera_vectors(instrument, rows, throughput, point.x, point.y)
 
 
-def _best_flux(
+def best_flux(
     instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], point: PointData
 ) -> Float[Array, " e"]:
     """Flux that fits best: in closed form, refined by Newton steps where detectors are not linear in it."""
@@ -145,7 +141,7 @@ def _best_flux(
     if not light.is_linear(instrument):
         for _ in range(NEWTON_STEPS):
             counts, slope = jax.jvp(
-                lambda f: _real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),)
+                lambda f: real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),)
             )
             missing = (point.counts - counts) * point.weight
             step, _ = eliminate_flux(missing, slope * point.weight, known)
@@ -153,9 +149,10 @@ def _best_flux(
     return flux
 
 
-def _real_counts(
+def real_counts(
     instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], flux: Float[Array, " e"]
 ) -> Float[Array, "e k"]:
+    """What the detectors report for light of a flux, `unit` being the counts for light of unit flux."""
     return light.detected(instrument, plan.exposures, flux[:, None] * unit)
 
 
@@ -164,8 +161,8 @@ def point_residuals(
 ) -> tuple[Float[Array, " e"], Float[Array, "e k"]]:
     """Best flux of every exposure of one point and the normalised residuals data − model."""
     unit = point_prediction(instrument, plan, point, nodes)
-    flux = _best_flux(instrument, plan, unit, point)
-    return flux, (point.counts - _real_counts(instrument, plan, unit, flux)) * point.weight
+    flux = best_flux(instrument, plan, unit, point)
+    return flux, (point.counts - real_counts(instrument, plan, unit, flux)) * point.weight
 
 
 def _point_jacobian(
@@ -187,7 +184,7 @@ def _point_jacobian(
     throughput = _throughput_at(instrument, point)
     unit, d_plain, d_local = linear.linearised(instrument, unit_counts, rows, slopes, throughput)
     # From unit flux to counts: `along` is the derivative with respect to the flux itself.
-    flux = _best_flux(instrument, plan, unit, point)
+    flux = best_flux(instrument, plan, unit, point)
     counts, along = flux[:, None] * unit, unit
     d_counts = flux[:, None] * jnp.concatenate([d_plain, d_local])
     if not light.is_linear(instrument):
@@ -217,7 +214,7 @@ def _over_blocks(function: Callable[[PointData], Result], data: PointData, block
     Points that make no whole number of blocks, and few points, are one block.
     """
     points = data.x.shape[0]
-    if points <= LARGEST_BLOCK or points % block:
+    if points <= limits.GRADIENT_BLOCK or points % block:
         return function(data)
     parts = jax.tree.map(lambda v: v.reshape(-1, block, *v.shape[1:]), data)
     blank = jax.tree.map(
@@ -231,7 +228,9 @@ def _over_blocks(function: Callable[[PointData], Result], data: PointData, block
 def _normal_equations(
     instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None = None
 ) -> Normal:
-    return _over_blocks(lambda part: _block_equations(instrument, plan, part, nodes), data, BLOCK)
+    return _over_blocks(
+        lambda part: _block_equations(instrument, plan, part, nodes), data, limits.JACOBIAN_BLOCK
+    )
 
 
 def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None) -> Normal:
@@ -277,8 +276,8 @@ def _slope_equations(
 
             def of_point(point: PointData) -> Float[Array, ""]:
                 unit = point_prediction(here, plan, point, between)
-                flux = jax.lax.stop_gradient(_best_flux(here, plan, unit, point))
-                return jnp.sum(((point.counts - _real_counts(here, plan, unit, flux)) * point.weight) ** 2)
+                flux = jax.lax.stop_gradient(best_flux(here, plan, unit, point))
+                return jnp.sum(((point.counts - real_counts(here, plan, unit, flux)) * point.weight) ** 2)
 
             return jnp.sum(jax.vmap(of_point)(part))
 
@@ -286,7 +285,7 @@ def _slope_equations(
         by_optics = jnp.einsum("tbrs,tobrs->o", by_rows, nodes.coefficients[1])
         return value, 0.5 * direct.at[optical].set(by_optics)
 
-    return _over_blocks(slope, data, LARGEST_BLOCK)
+    return _over_blocks(slope, data, limits.GRADIENT_BLOCK)
 
 
 def _residuals(
@@ -312,45 +311,6 @@ def _dense_jacobian(instrument: Instrument, plan: Plan, data: PointData) -> Floa
     )
 
 
-def _point_effect_columns(
-    instrument: Instrument, plan: Plan, probes: tuple[Effect, ...], point: PointData
-) -> Float[Array, "a d"]:
-    names = [(i, name) for i, probe in enumerate(probes) for name in probe.amplitudes()]
-    neutral = [getattr(probes[i], name) for i, name in names]
-
-    def with_amplitudes(amplitudes: list[Float[Array, ...]]) -> Instrument:
-        changed = list(probes)
-        for (i, name), value in zip(names, amplitudes, strict=True):
-            changed[i] = dataclasses.replace(changed[i], **{name: value})
-        return dataclasses.replace(instrument, effects=(*instrument.effects, *changed))
-
-    at_neutral = with_amplitudes(neutral)
-    unit = point_prediction(at_neutral, plan, point)
-    flux = _best_flux(at_neutral, plan, unit, point)
-
-    def counts(amplitudes: list[Float[Array, ...]]) -> Float[Array, "e k"]:
-        active = with_amplitudes(amplitudes)
-        return _real_counts(active, plan, point_prediction(active, plan, point), flux)
-
-    _, push = jax.linearize(counts, neutral)
-    flat, to_tree = ravel_pytree(neutral)
-    change = jax.vmap(lambda one: push(to_tree(one)))(jnp.eye(flat.size)) * point.weight
-    _, along = jax.jvp(lambda f: _real_counts(at_neutral, plan, unit, f), (flux,), (jnp.ones_like(flux),))
-    projected = project_flux(change, along * point.weight, plan.exposures.flux_known)
-    return -projected.reshape(flat.size, -1)
-
-
-def _effect_columns(
-    instrument: Instrument, plan: Plan, probes: tuple[Effect, ...], data: PointData
-) -> Float[Array, "p d a"]:
-    """Derivatives of the residuals with respect to the amplitudes of effects that are not active, at neutral.
-
-    Only what an effect changes is differentiated: one at the detectors costs a dot product, not the optics.
-    """
-    columns = jax.vmap(_point_effect_columns, in_axes=(None, None, None, 0))(instrument, plan, probes, data)
-    return jnp.swapaxes(columns, 1, 2)
-
-
 def _incoming(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p e 4"]:
     """Stokes vectors that enter the collimator."""
     return jax.vmap(light.stokes, (None, None, 0, 0, 0, 0))(
@@ -360,23 +320,10 @@ def _incoming(instrument: Instrument, plan: Plan, data: PointData) -> Float[Arra
 
 incoming = compiled(_incoming)
 
-PROBES_AT_ONCE = 6  # shapes of one effect that are worked on together: bounds the memory
-
-
-def _effect_columns_over_shapes(
-    instrument: Instrument, plan: Plan, probes: Effect, data: PointData
-) -> Float[Array, "g p d a"]:
-    """As `effect_columns`, for one effect at many shapes: its parameters carry a leading axis g."""
-    return jax.lax.map(
-        lambda probe: _effect_columns(instrument, plan, (probe,), data), probes, batch_size=PROBES_AT_ONCE
-    )
-
 
 normal_equations = compiled(_normal_equations)
 slope_equations = compiled(_slope_equations)
-effect_columns_over_shapes = compiled(_effect_columns_over_shapes)
 dense_jacobian = compiled(_dense_jacobian)
-effect_columns = compiled(_effect_columns)
 residuals = compiled(_residuals)
 prediction = compiled(_prediction)
 

@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.likelihood import engine
+from walop_jax.likelihood import effect_columns, engine
 from walop_jax.likelihood.expansion import Census, OpticsUsed, Posterior
+from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.layout import Layout
 from walop_jax.likelihood.nodes import accurate_nodes
 from walop_jax.likelihood.points import MeasuredPoints, measured_points
@@ -23,7 +24,6 @@ from walop_jax.likelihood.runner import Runner, SlabSums
 from walop_jax.model.compiled import require_double_precision
 from walop_jax.model.dependence import optical_indices
 from walop_jax.model.effects.base import Effect
-from walop_jax.model.field_table import FieldTable
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 from walop_jax.model.specification import Model
@@ -31,7 +31,7 @@ from walop_jax.model.specification import Model
 Vector = Float[np.ndarray, " n"]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Likelihood:
     """The joint likelihood of one calibration set under one model.
 
@@ -259,7 +259,9 @@ class Likelihood:
     def effect_columns(self, values: Vector, probes: tuple[Effect, ...]) -> Float[np.ndarray, "d a"]:
         """Derivatives of the used residuals with respect to the amplitudes of neutral effects added to the model."""
         instrument = self.model.instrument(values)
-        parts = [_rows(engine.effect_columns(instrument, self.plan, probes, c), c) for c in self.points]
+        parts = [
+            _rows(effect_columns.effect_columns(instrument, self.plan, probes, c), c) for c in self.points
+        ]
         return np.concatenate(parts)
 
     def effect_columns_over_shapes(
@@ -270,7 +272,9 @@ class Likelihood:
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *probes)
         parts = []
         for chunk in self.points:
-            cube = np.asarray(engine.effect_columns_over_shapes(instrument, self.plan, stacked, chunk))
+            cube = np.asarray(
+                effect_columns.effect_columns_over_shapes(instrument, self.plan, stacked, chunk)
+            )
             parts.append(np.stack([_rows(one, chunk) for one in cube]))
         return np.concatenate(parts, axis=1)
 

@@ -22,6 +22,24 @@ LARGEST_SLAB = 1 << 26
 SLABS = 16
 """A set is cut into so many slabs at least, if it has as many chunks: work for several threads and processes."""
 
+# ---------------------------------------------------------------------------------------- within one chunk
+
+JACOBIAN_BLOCK = 64
+"""Field points whose Jacobians are worked on together: these stay in the processor's cache."""
+GRADIENT_BLOCK = 256
+"""Field points whose gradients are worked on together, and largest number that is not cut: they need a quarter."""
+PROBES_AT_ONCE = 6
+"""Shapes of one effect that are worked on together: bounds the memory, and more are no faster."""
+
+# ------------------------------------------------------------------------------- optics on nodes of the field
+
+NODES_PER_SIDE = (12, 16, 18, 20, 24, 28, 32)
+"""Numbers of nodes per side that are tried in turn: two more gain a factor of 30, beyond 32 the optics oscillate."""
+CHECKED_PLACES = 48
+"""Places between the nodes at which the error is measured: within a factor of three of the largest anywhere."""
+SOLVED_TOGETHER = 64
+"""Places whose optics are solved together, so that they are compiled for one size only."""
+
 # ------------------------------------------------------------------------------------------------- large sets
 
 INTERPOLATE_ABOVE = 4096
@@ -54,6 +72,11 @@ POINTS_PER_CELL = 64
 """Field points of a cell of the residual map: its errors are an eighth of those of a point."""
 MOST_CELLS = 128
 """Cells of the residual map along a side: 32 × 32 pixels each for a detector of 4096 pixels."""
+
+MATRIX_POINTS = (16, 256)
+"""Field points whose instrument matrices are computed together, a few and many: compiled for these two sizes only."""
+VECTOR_POINTS = 100
+"""Field points whose analysis vectors are computed together: a quarter of a field table of 20 × 20."""
 
 # ------------------------------------------------------------------------------------------------- diagnosis
 

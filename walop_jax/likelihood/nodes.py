@@ -1,7 +1,7 @@
 """The optics of a large set on Chebyshev nodes of the field, with an error that is measured every time.
 
 Band rows and their derivatives with respect to the optical parameters are smooth over the field, and they are all
-the optics there is. They are solved exactly on n × n nodes and at other places (`model/field_table.py`); the largest
+the optics there is. They are solved exactly on n × n nodes and at other places (`field_table.py`); the largest
 difference between interpolated and exact values there, derivatives in units of the solver's scales, is the error.
 
 Tolerance   A relative error ε of all n counts, each known to σ/N, moves a parameter by up to √n ε / (σ/N) of its
@@ -16,10 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.field_table import FieldTable, accurate_table
 from walop_jax.likelihood.linear import rows_and_slopes
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import compiled
-from walop_jax.model.field_table import FieldTable, accurate_table
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 
@@ -28,10 +29,6 @@ Optics = tuple[Float[np.ndarray, "p b r 4"], Float[np.ndarray, "p o b r 4"]]
 """Band rows, and their derivatives with respect to the optical parameters."""
 
 TOLERANCE = 2e-10
-COUNTS = (12, 16, 18, 20, 24, 28, 32)
-"""Numbers of nodes per side that are tried, one after the other."""
-AT_ONCE = 64
-"""Places that are solved together, so that the optics are compiled for one size only."""
 
 _solve = compiled(jax.vmap(rows_and_slopes, in_axes=(None, None, 0, 0)))
 
@@ -39,9 +36,9 @@ _solve = compiled(jax.vmap(rows_and_slopes, in_axes=(None, None, 0, 0)))
 def solved_optics(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> Optics:
     """Band rows and their derivatives at field positions (deg): exact."""
     parts = []
-    for start in range(0, len(x), AT_ONCE):
+    for start in range(0, len(x), limits.SOLVED_TOGETHER):
         # The last batch is filled up with its first place.
-        inside = np.minimum(np.arange(start, start + AT_ONCE), len(x) - 1)
+        inside = np.minimum(np.arange(start, start + limits.SOLVED_TOGETHER), len(x) - 1)
         parts.append(_solve(instrument, plan, jnp.asarray(x[inside]), jnp.asarray(y[inside])))
     rows, slopes = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
     return rows[: len(x)], slopes[: len(x)]
@@ -65,7 +62,7 @@ def accurate_nodes(
     table, off = accurate_table(
         lambda x, y: solved_optics(instrument, plan, x, y),
         rectangle,
-        [count for count in COUNTS if count >= (first or 0)],
+        [count for count in limits.NODES_PER_SIDE if count >= (first or 0)],
         TOLERANCE,
         error,
     )

@@ -82,6 +82,11 @@ class GhostPart(Component):
 class ExposurePart(Component):
     """A share of the response to unpolarised light that is added in some exposures."""
 
+    @property
+    def exposures_known(self) -> int | None:
+        """Number of exposures that it has values for; None: any number."""
+        return None
+
     @abc.abstractmethod
     def share(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"]:
         """The share, exposure by exposure."""

@@ -56,10 +56,10 @@ def _needs(structure: Any, shapes: Shapes) -> Needs:
         plan = blank_plan(instrument, asked, median)
         zero = jnp.zeros(())
         rows = light.band_rows(instrument, plan, zero, zero)
-        one = jnp.ones(1, int)
+        each = jnp.zeros_like(plan.exposures.kind)
         counts = light.counts(
             instrument, plan, rows, light.throughput_at(instrument, zero, zero), zero, zero,
-            jnp.zeros((1, 2)), -one, 0 * one,
+            jnp.zeros((*each.shape, 2)), each - 1, each,
         )  # fmt: skip
         return rows, light.detected(instrument, plan.exposures, counts)
 

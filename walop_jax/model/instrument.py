@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from walop_jax.instruments.description import read_description
 from walop_jax.model.cameras import Cameras, Throughput
-from walop_jax.model.elements import Analyser, Element, Polariser
+from walop_jax.model.elements import Analyser, Element, Polariser, WavePlate
 from walop_jax.model.parameters import Component, number, unknown_name
 from walop_jax.model.sources import MoonSky, Source, Standards
 
@@ -150,6 +150,12 @@ class Instrument(Component):
         parts = [*self.train(), *(element for arm in self.arms for element in arm.train())]
         found = [element.moves for element in parts if element.moves and not isinstance(element, Polariser)]
         return tuple(dict.fromkeys(found))
+
+    @property
+    def plates(self) -> str | None:
+        """How its wave plates are computed (`wave_plate.MODELS`); None where it has none."""
+        elements = (*self.elements, *(element for arm in self.arms for element in arm.elements))
+        return next((element.model for element in elements if isinstance(element, WavePlate)), None)
 
     def effect(self, name: str) -> Effect:
         """The active effect of a name; ValueError when there is none."""

@@ -87,18 +87,20 @@ def blank_exposures(instrument: Instrument, count: int) -> ExposureArrays:
 
 
 def blank_plan(instrument: Instrument, asked: Collection[str] = (), median: bool = False) -> Plan:
-    """A plan of one exposure with every moving element in the beam, one node, one band: for shapes and derivatives."""
-    one, moving = jnp.ones(1), instrument.patched().moving()
-    exposures = blank_exposures(instrument, 1)
+    """A plan with every moving element in the beam, one node, one band: for shapes and derivatives."""
+    patched, one = instrument.patched(), jnp.ones(1)
+    count = max((part.exposures_known or 1 for part in patched.cameras.exposures), default=1)
+    exposures = blank_exposures(instrument, count)
     if median:
-        exposures = dataclasses.replace(exposures, median_counts=jnp.ones((1, len(instrument.cameras))))
+        exposures = dataclasses.replace(exposures, median_counts=jnp.ones((count, len(instrument.cameras))))
+    moving = patched.moving()
     return Plan(
         wavelength=0.62 * one,
         conditions=Conditions(band_width=0.1 * one, planned=dict.fromkeys(asked, one)),
         node_weight=jnp.ones((1, 1)),
         teff=5000.0 * one,
         exposures=exposures,
-        band_of=np.zeros((1, 1 + len(instrument.standard.names)), int),
+        band_of=np.zeros((count, 1 + len(instrument.standard.names)), int),
         settings=((tuple(30.0 for _ in moving), 0, 1),),
         moving=moving,
     )

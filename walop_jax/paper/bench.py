@@ -22,7 +22,7 @@ from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.model.build import adapted
 from walop_jax.model.instrument import Instrument
-from walop_jax.paper.polynomial import fit_paper, judged, ratios, sample_stars, transmitted
+from walop_jax.paper.polynomial import fit_paper, measured_qu, sample_stars, transmitted, with_test_stars
 from walop_jax.science.star_errors import joint_errors, star_errors
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate, truth_values
@@ -70,10 +70,12 @@ def bench_table(seed: int = 0, electrons: float = 1e6) -> list[BenchRow]:
     at = [int(np.flatnonzero(np.isclose(made.x, tilt))[0]) for tilt in TILTS]
     x, y = made.x[at], made.y[at]
     reference, joint = (_vectors(c, x, y, plan.teff) for c in (true, fitted))
-    local = judged(x, y, made.coefficients[at], made.condition[at], made.transmission[at], stars)
-    paper = star_errors(local.recover(ratios(transmitted(reference, stars))), stars)
+    local = with_test_stars(x, y, made.coefficients[at], made.condition[at], made.transmission[at], stars)
+    paper = star_errors(local.recover(measured_qu(transmitted(reference, stars))), stars)
     ours = joint_errors(joint, reference, stars)
-    cross_talk = ratios(reference[..., 0] + reference[..., 1])[:, 1] - ratios(reference[..., 0])[:, 1]
+    cross_talk = (
+        measured_qu(reference[..., 0] + reference[..., 1])[:, 1] - measured_qu(reference[..., 0])[:, 1]
+    )
     rows = zip(TILTS, cross_talk.tolist(), PAPER_ERRORS, paper.tolist(), ours.tolist(), strict=True)
     return [BenchRow(t, c, published, tuple(p), tuple(j)) for t, c, published, p, j in rows]
 

@@ -22,6 +22,7 @@ from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.filters import DEFAULT_FILTER
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
@@ -31,11 +32,11 @@ from walop_jax.paper.polynomial import (
     PaperCalibration,
     fit_paper,
     fit_polynomials,
-    judged,
+    measured_qu,
     polariser_exposures,
     polariser_states,
-    ratios,
-    terms,
+    polynomial_terms,
+    with_test_stars,
 )
 from walop_jax.paper.spectral import DEGREE, TEMPERATURES, colour_spread, efficiencies, spread_document
 from walop_jax.science.star_errors import (
@@ -43,8 +44,7 @@ from walop_jax.science.star_errors import (
     LARGEST_P,
     QUANTITIES,
     STARS,
-    WEAK,
-    Place,
+    MethodErrors,
     Truth,
     Vectors,
     determinant,
@@ -114,28 +114,30 @@ def offsets(
     stars: Float[np.ndarray, "n 2"],
 ) -> Offsets:
     """The reason for Δ shown on data: `measured` are the polarised states, `reference` the instrument."""
-    centre = ratios(reference[..., 0])  # (q_m, u_m) of unpolarised light
+    centre = measured_qu(reference[..., 0])  # (q_m, u_m) of unpolarised light
     small = transmitted(reference, np.concatenate([np.zeros((1, 2)), stars]))
     exact, _ = fit_polynomials(
-        np.concatenate([ratios(transmitted(reference, states)), ratios(small)], axis=1),
+        np.concatenate([measured_qu(transmitted(reference, states)), measured_qu(small)], axis=1),
         np.concatenate([states, np.zeros((1, 2)), stars]),
     )
-    design = terms(measured)
+    design = polynomial_terms(measured)
     scale = np.linalg.norm(design, axis=1)
     directions = np.linalg.svd(design / scale[:, None], full_matrices=False)[2]
     departure = (paper.coefficients - exact) * scale[:, None]
 
     def along(count: int) -> Float[np.ndarray, "p 2"]:
         weak = directions[:, -count:]
-        return np.einsum("pct,pnt,pnv,pv->pc", departure, weak, weak, terms(centre) / scale, optimize=True)
+        return np.einsum(
+            "pct,pnt,pnv,pv->pc", departure, weak, weak, polynomial_terms(centre) / scale, optimize=True
+        )
 
-    smooth, _ = fit_polynomials(ratios(transmitted(reference, states)), states)
+    smooth, _ = fit_polynomials(measured_qu(transmitted(reference, states)), states)
     anchored, _ = fit_polynomials(
         np.concatenate([measured, centre[:, None]], axis=1), np.concatenate([states, np.zeros((1, 2))])
     )
 
     def delta(coefficients: Float[np.ndarray, "p 2 5"]) -> Float[np.ndarray, "p 2"]:
-        return judged(paper.x, paper.y, coefficients, paper.condition, reference, stars).delta
+        return with_test_stars(paper.x, paper.y, coefficients, paper.condition, reference, stars).delta
 
     return Offsets(
         delta(paper.coefficients), along(1), along(3), delta(smooth), delta(anchored), paper.condition
@@ -155,8 +157,8 @@ class Comparison:
 
     paper: PaperCalibration
     offsets: Offsets
-    grid: Place
-    between: Place
+    grid: MethodErrors
+    between: MethodErrors
     truth: bool
     filter: str
     teff: float
@@ -237,18 +239,18 @@ def compare(
     def vectors(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Vectors:
         return analysis.coloured(setting, x, y, np.full(len(x), teff))
 
-    def place(
+    def errors_at(
         x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], local: PaperCalibration, true: Vectors | None
-    ) -> Place:
+    ) -> MethodErrors:
         joint = vectors(x, y)
         reference = joint if true is None else true
         promised = promised_errors(analysis, setting, x, y, stars)
-        return Place(
+        return MethodErrors(
             x,
             y,
-            star_errors(local.recover(ratios(transmitted(reference, stars))), stars),
+            star_errors(local.recover(measured_qu(transmitted(reference, stars))), stars),
             promised if true is None else joint_errors(joint, reference, stars),
-            np.abs(determinant(reference)) < WEAK,
+            np.abs(determinant(reference)) < SMALLEST_DETERMINANT,
         )
 
     if truth is None:
@@ -261,7 +263,7 @@ def compare(
     on_grid = vectors(paper.x, paper.y)
     block = calset.intensities.block(0, len(calset.points))
     whole = block.used[:, exposures].all(axis=1)
-    measured = ratios(block.counts[whole][:, exposures])
+    measured = measured_qu(block.counts[whole][:, exposures])
     states = polariser_states(calset.exposures.clp_angle[exposures])
     curve = calibration.filter_curve(filter_name)
     lit = curve.wavelength[curve.throughput > 0.05 * curve.throughput.max()]
@@ -271,8 +273,8 @@ def compare(
     return Comparison(
         paper=paper,
         offsets=offsets(paper, measured, states, on_grid, stars),
-        grid=place(paper.x, paper.y, paper, None),
-        between=place(x, y, paper.between(x, y), true),
+        grid=errors_at(paper.x, paper.y, paper, None),
+        between=errors_at(x, y, paper.between(x, y), true),
         truth=truth is not None,
         filter=filter_name,
         teff=teff,
@@ -303,7 +305,7 @@ def _moon(
         }
     except (DataError, ValueError) as error:
         return document | {"scheme": None, "why_not": str(error)}
-    seen = ratios(transmitted(reference, stars))
-    outside = np.abs(determinant(reference)) >= WEAK
+    seen = measured_qu(transmitted(reference, stars))
+    outside = np.abs(determinant(reference)) >= SMALLEST_DETERMINANT
     found = {name: star_errors(scheme.recover(seen), stars) for name, scheme in schemes.items()}
     return document | {"scheme_outside_zone": {name: statistics(v, outside) for name, v in found.items()}}

@@ -29,13 +29,13 @@ from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model.specification import Model
-from walop_jax.paper.polynomial import PaperCalibration, ratios, terms
+from walop_jax.paper.polynomial import PaperCalibration, measured_qu, polynomial_terms
 from walop_jax.science.estimate import estimate
 from walop_jax.sky.moon import moon_sky
 
-BOXES, BOX = 5, 0.116  # boxes along a side; deg (7 arcmin)
+BOXES_ALONG, BOX_WIDTH = 5, 0.116  # boxes along a side; deg (7 arcmin)
 TOLERANCE = 5e-4
-DOUBTED = 0.5  # weight below which a patch is pointed out
+DOUBTED_BELOW = 0.5  # weight below which a patch is pointed out
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Patches:
     @property
     def doubted(self) -> Bool[np.ndarray, " m"]:
         """Patches that are not to be trusted."""
-        return self.weight < DOUBTED
+        return self.weight < DOUBTED_BELOW
 
     def document(self, numbers: Int[np.ndarray, " e"]) -> dict[str, Any]:
         """The verdicts as plain data; `numbers` are the EXPOSURE numbers of the set."""
@@ -143,7 +143,9 @@ def down_weighted(calset: CalibrationSet, patches: Patches) -> CalibrationSet:
     return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, changed))
 
 
-def careful_calibration(calset: CalibrationSet, model: Model, rounds: int = 6) -> tuple[Calibration, Patches]:
+def reweighted_calibration(
+    calset: CalibrationSet, model: Model, rounds: int = 6
+) -> tuple[Calibration, Patches]:
     """Fit, judge the patches, weigh them down, fit again, until the weights settle (iterative reweighting).
 
     A bad patch spoils the calibration that it is judged with, and with it the look of good ones; a few rounds
@@ -163,15 +165,17 @@ def careful_calibration(calset: CalibrationSet, model: Model, rounds: int = 6) -
 # ----------------------------------------------------------------------------------- the scheme of the paper
 
 
-def boxes(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Int[np.ndarray, " p"]:
+def box_number(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Int[np.ndarray, " p"]:
     """Number of the box of every field point, row by row from the lower left; the outer boxes reach the edge."""
-    column, row = (np.clip(np.floor(v / BOX + 0.5 * BOXES), 0, BOXES - 1).astype(int) for v in (x, y))
-    return row * BOXES + column
+    column, row = (
+        np.clip(np.floor(v / BOX_WIDTH + 0.5 * BOXES_ALONG), 0, BOXES_ALONG - 1).astype(int) for v in (x, y)
+    )
+    return row * BOXES_ALONG + column
 
 
 def box_centres() -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, " b"]]:
-    """Centres of the boxes in degrees, in the order of `boxes`."""
-    edge = (np.arange(BOXES) - 0.5 * (BOXES - 1)) * BOX
+    """Centres of the boxes in degrees, in the order of `box_number`."""
+    edge = (np.arange(BOXES_ALONG) - 0.5 * (BOXES_ALONG - 1)) * BOX_WIDTH
     y, x = np.meshgrid(edge, edge, indexing="ij")
     return x.ravel(), y.ravel()
 
@@ -205,20 +209,20 @@ def full_moon_scheme(
     # Standards: Δ at the centres, where the polynomials are interpolated.
     local = paper.between(centre_x, centre_y).coefficients
     true = _catalogue(calset, block, standard)
-    found = _polynomial(local, ratios(block.counts[middle][:, standard]))
+    found = _polynomial(local, measured_qu(block.counts[middle][:, standard]))
     known = block.used[middle][:, standard]
     delta_centre = _mean(found - true[middle], known[..., None], axis=1)
 
     # Moon: the patch is measured where the polynomials are closest to a centre, and is the same in all the box.
-    seen = _polynomial(paper.coefficients, ratios(block.counts[grid][:, moon]))
-    box = boxes(paper.x, paper.y)
+    seen = _polynomial(paper.coefficients, measured_qu(block.counts[grid][:, moon]))
+    box = box_number(paper.x, paper.y)
     delta = np.empty_like(paper.delta)
-    for b in range(BOXES * BOXES):
+    for b in range(BOXES_ALONG * BOXES_ALONG):
         inside = np.flatnonzero(box == b)
         if inside.size == 0:
             continue
         away = np.hypot(paper.x[inside] - centre_x[b], paper.y[inside] - centre_y[b])
-        near = inside[away <= away.min() + 0.25 * BOX]
+        near = inside[away <= away.min() + 0.25 * BOX_WIDTH]
         patch = seen[near].mean(axis=0) - delta_centre[b]
         delta[inside] = np.average(seen[inside] - patch, axis=1, weights=weight)
     return dataclasses.replace(paper, delta=delta)
@@ -234,7 +238,7 @@ def _positions(block: Block, x: Float[np.ndarray, " k"], y: Float[np.ndarray, " 
 def _polynomial(
     coefficients: Float[np.ndarray, "p 2 5"], measured: Float[np.ndarray, "p e 2"]
 ) -> Float[np.ndarray, "p e 2"]:
-    return np.einsum("pet,pct->pec", terms(measured), coefficients)
+    return np.einsum("pet,pct->pec", polynomial_terms(measured), coefficients)
 
 
 def _catalogue(

@@ -23,19 +23,19 @@ from walop_jax.data.filters import DEFAULT_FILTER
 from walop_jax.data.records import CalibrationSet
 from walop_jax.io.errors import DataError
 from walop_jax.model.conventions import EXTINCTION
-from walop_jax.science.star_errors import Stars, sample_stars, transmitted
+from walop_jax.science.star_errors import QuPairs, sample_stars, transmitted
 
 TERMS = ("1", "qm", "um", "qm^2", "um^2")
 _ROUNDS = 300  # of alternating least squares for transmissions and fluxes; 40 are enough
 
 
-def ratios(counts: Float[np.ndarray, "... 4"]) -> Float[np.ndarray, "... 2"]:
+def measured_qu(counts: Float[np.ndarray, "... 4"]) -> Float[np.ndarray, "... 2"]:
     """Measured (q_m, u_m) of four intensities."""
     n0, n1, n2, n3 = np.moveaxis(counts, -1, 0)
     return np.stack([(n0 - n1) / (n0 + n1), (n2 - n3) / (n2 + n3)], axis=-1)
 
 
-def terms(measured: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "... 5"]:
+def polynomial_terms(measured: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "... 5"]:
     """The terms of the polynomial (`TERMS`) at measured (q_m, u_m)."""
     q, u = measured[..., 0], measured[..., 1]
     return np.stack([np.ones_like(q), q, u, q**2, u**2], axis=-1)
@@ -60,7 +60,7 @@ class PaperCalibration:
 
     def recover(self, measured: Float[np.ndarray, "p n 2"]) -> Float[np.ndarray, "p n 2"]:
         """(q_i, u_i) − (Δq, Δu) of measurements at the grid points."""
-        return np.einsum("pnt,pct->pnc", terms(measured), self.coefficients) - self.delta[:, None]
+        return np.einsum("pnt,pct->pnc", polynomial_terms(measured), self.coefficients) - self.delta[:, None]
 
     def between(self, x: Float[np.ndarray, " m"], y: Float[np.ndarray, " m"]) -> PaperCalibration:
         """Coefficients and Δ interpolated bilinearly to other positions: what the paper says cannot be done.
@@ -103,7 +103,7 @@ def polariser_exposures(calset: CalibrationSet, filter_name: str = DEFAULT_FILTE
 
 
 def fit_paper(
-    calset: CalibrationSet, filter_name: str = DEFAULT_FILTER, stars: Stars | None = None
+    calset: CalibrationSet, filter_name: str = DEFAULT_FILTER, stars: QuPairs | None = None
 ) -> PaperCalibration:
     """Steps 1 and 2 of Paper II at all points that have all polariser exposures.
 
@@ -116,29 +116,31 @@ def fit_paper(
         raise DataError("INTENSITIES: no point has been measured at all polariser angles")
     counts = block.counts[whole][:, rows]
     states = polariser_states(calset.exposures.clp_angle[rows])
-    coefficients, condition = fit_polynomials(ratios(counts), states)
+    coefficients, condition = fit_polynomials(measured_qu(counts), states)
     transmission = fit_transmissions(counts, states)
-    return judged(block.x[whole], block.y[whole], coefficients, condition, transmission, stars)
+    return with_test_stars(block.x[whole], block.y[whole], coefficients, condition, transmission, stars)
 
 
-def judged(
+def with_test_stars(
     x: Float[np.ndarray, " p"],
     y: Float[np.ndarray, " p"],
     coefficients: Float[np.ndarray, "p 2 5"],
     condition: Float[np.ndarray, " p"],
     transmission: Float[np.ndarray, "p 4 3"],
-    stars: Stars | None = None,
+    stars: QuPairs | None = None,
 ) -> PaperCalibration:
     """Step 2: Δ and σ of the test stars (default: `sample_stars()`) seen through the transmissions."""
     stars = sample_stars() if stars is None else stars
-    found = np.einsum("pnt,pct->pnc", terms(ratios(transmitted(transmission, stars))), coefficients)
+    found = np.einsum(
+        "pnt,pct->pnc", polynomial_terms(measured_qu(transmitted(transmission, stars))), coefficients
+    )
     error = found - stars
     return PaperCalibration(
         x, y, coefficients, transmission, error.mean(axis=1), error.std(axis=1, ddof=1), condition
     )
 
 
-def polariser_states(angle: Float[np.ndarray, " e"]) -> Stars:
+def polariser_states(angle: Float[np.ndarray, " e"]) -> QuPairs:
     """(q, u) behind the polariser at `angle` (deg)."""
     c = (1.0 - EXTINCTION) / (1.0 + EXTINCTION)
     two = 2.0 * np.deg2rad(angle)
@@ -146,17 +148,17 @@ def polariser_states(angle: Float[np.ndarray, " e"]) -> Stars:
 
 
 def fit_polynomials(
-    measured: Float[np.ndarray, "p e 2"], states: Stars
+    measured: Float[np.ndarray, "p e 2"], states: QuPairs
 ) -> tuple[Float[np.ndarray, "p 2 5"], Float[np.ndarray, " p"]]:
     """Coefficients at every point by least squares, and the condition number of the scaled design matrix."""
-    design = terms(measured)
+    design = polynomial_terms(measured)
     scale = np.linalg.norm(design, axis=1)
     u, size, vt = np.linalg.svd(design / scale[:, None], full_matrices=False)
     solution = np.einsum("pst,ps,pes,ec->pct", vt, 1.0 / size, u, states, optimize=True)
     return solution / scale[:, None], size[:, 0] / size[:, -1]
 
 
-def fit_transmissions(counts: Float[np.ndarray, "p e 4"], states: Stars) -> Float[np.ndarray, "p 4 3"]:
+def fit_transmissions(counts: Float[np.ndarray, "p e 4"], states: QuPairs) -> Float[np.ndarray, "p 4 3"]:
     """T_k at every point, with the flux of every exposure free: alternating least squares.
 
     Given the fluxes the transmissions are linear, and the other way round. Photon noise weighs 1/N; the mean of

@@ -20,7 +20,7 @@ from walop_jax.data.filters import DEFAULT_FILTER
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.model.planning import plan_for_settings
-from walop_jax.paper.polynomial import ratios, transmitted
+from walop_jax.paper.polynomial import measured_qu, transmitted
 
 TEMPERATURES = (3500.0, 5000.0, 7000.0, 10000.0)
 """Four stars (K); Paper II names no temperatures, but finds the largest differences below 4000 K."""
@@ -58,7 +58,7 @@ def colour_spread(
     angle = np.arange(ANGLES) * np.pi / ANGLES
     stars = degree * np.stack([np.cos(2 * angle), np.sin(2 * angle)], axis=1)
     vectors = AnalysisVectors(calibration).exact(Settings.default(1, filter_name), x, y, temperatures)
-    seen = np.stack([ratios(transmitted(vectors[:, k], stars)) for k in range(len(temperatures))])
+    seen = np.stack([measured_qu(transmitted(vectors[:, k], stars)) for k in range(len(temperatures))])
     return np.ptp(seen, axis=0).max(axis=1)
 
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 import os
 import time
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import fail
+from walop_jax.io.software import versions_of
 from walop_jax.posterior.checkpoint import Checkpoints, digest
 from walop_jax.posterior.convergence import Chains, Convergence, assess
 from walop_jax.posterior.ensemble import Block, Walkers, advance, start
@@ -31,13 +32,13 @@ def fingerprint(target: Target, options: Options) -> dict[str, str]:
     model, laid_out = target.model, target.likelihood.plan
     data = [np.asarray(part) for chunk in target.likelihood.points for part in chunk if part is not None]
     plan = [np.asarray(part) for part in (laid_out.wavelength, laid_out.node_weight, laid_out.teff)]
-    exposures = [np.asarray(part) for part in laid_out.exposures if part is not None]
+    exposures = [np.asarray(part) for part in jax.tree.leaves(laid_out.exposures)]
     parameters = [(p.name, p.start, p.free, p.tie, p.scale) for p in model.parameters]
     priors = [(p.name, p.prior, p.loose) for p in model.parameters]
     chain = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
     for name in ("maximum_steps", "draws", "checks"):  # how long, and what is made of it: free to change
         del chain[name]
-    versions = {name: _version(name) for name in SOFTWARE}
+    versions = versions_of(SOFTWARE)
     return {
         "data": digest(*data, *plan, *exposures, laid_out.settings), "model": digest(model.name,
         parameters, [type(e).__name__ for e in model.template.effects], model.template.plates), "priors":
@@ -45,13 +46,6 @@ def fingerprint(target: Target, options: Options) -> dict[str, str]:
         digest(sorted(chain.items(), key=lambda item: item[0])), "versions": ", ".join(f"{name} {version}"
         for name, version in versions.items()),
     }  # fmt: skip
-
-
-def _version(name: str) -> str:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "unknown"
 
 
 def sample(

@@ -18,11 +18,11 @@ from jaxtyping import Array, Float, Int
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import engine
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import leaves, unknown_name, with_values
+from walop_jax.model.parameters import unknown_name, with_values
 
 Vector = Float[np.ndarray, " f"]
 LARGEST_SAMPLED = 20
-NEAR_LINEAR = ("Throughput", "Standards")
+NEAR_LINEAR = ("throughput", "standard")
 
 
 @jax.jit  # a vector unravelled step by step costs more than the optics of a small set
@@ -89,8 +89,8 @@ class Target:
 
 def near_linear(target: Target) -> Int[np.ndarray, " s"]:
     """Positions, among the free parameters, of throughput coefficients and catalogue values."""
-    owner = [leaf.owner for leaf in leaves(target.model.template)]
-    return np.array([k for k, i in enumerate(target.free) if owner[i] in NEAR_LINEAR], int)
+    chosen = np.concatenate([target.model.positions(component) for component in NEAR_LINEAR])
+    return np.flatnonzero(np.isin(target.free, chosen))
 
 
 def bending(target: Target, k: int) -> float:

@@ -13,7 +13,7 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.settings import Settings
 from walop_jax.paper.comparison import Comparison
-from walop_jax.science.star_errors import GOAL, QUANTITIES, Place, plate_errors
+from walop_jax.science.star_errors import GOAL, QUANTITIES, MethodErrors, plate_errors
 
 _COLOURS = {"paper": "tab:orange", "joint": "tab:blue"}
 _NAMES = {"paper": "Paper II, point by point", "joint": "joint model"}
@@ -72,7 +72,7 @@ def map_figure(comparison: Comparison) -> Figure:
     return figure
 
 
-def _contours(axis: Axes, place: Place, method: str, k: int, norm: LogNorm):  # type: ignore[no-untyped-def]
+def _contours(axis: Axes, place: MethodErrors, method: str, k: int, norm: LogNorm):  # type: ignore[no-untyped-def]
     values = 100 * getattr(place, method)[:, k]
     levels = np.geomspace(norm.vmin or 1e-3, norm.vmax or 1.0, 13)
     filled = axis.tricontourf(

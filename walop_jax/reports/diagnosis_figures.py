@@ -1,7 +1,7 @@
 """Figures of a diagnosis: residuals over the field and over the exposures, what explains them, and the ladder of χ².
 
-They are drawn from the plain arrays of `diagnosis.fits` (`read_pictures`, or `diagnose.pictures.pictures` of a
-`Diagnosis` in memory). Residuals are (data − model) in standard deviations throughout.
+They are drawn from the plain arrays of `diagnosis.fits` (`read_figure_data`, or `figure_data` of a `Diagnosis`
+in memory). Residuals are (data − model) in standard deviations throughout.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator, NullLocator
 
 from walop_jax.data.records import Points
-from walop_jax.diagnosis.figure_file import Comparison, ExposureLabels, Ladder, PointMap, Shares
+from walop_jax.diagnosis.figure_file import ExposureLabels, Ladder, PointMap, ResidualComparison, Shares
 from walop_jax.reports.style import (
     AFTER,
     BEFORE,
@@ -28,14 +28,14 @@ from walop_jax.reports.style import (
     FONT,
     QUIET,
     SMALL,
-    blank,
+    empty_figure,
     field_axes,
-    largest,
+    largest_size,
     outer_labels,
 )
 
 CAMERAS = ("O1", "E1", "O2", "E2")
-MARKED = 3.0  # σ beyond which a tile carries its sign
+SIGN_BEYOND = 3.0  # σ beyond which a tile carries its sign
 MOST_MARKED = 400  # points above which signs would run into each other
 MOST_VECTOR = 2000  # points above which tiles are drawn as pixels
 MOST_BINS = 48  # of polariser angle
@@ -48,7 +48,7 @@ def residual_maps(points: Points, maps: Mapping[str, PointMap]) -> Figure:
     `maps` are (point, camera) by title, NaN where there is nothing. The scale is symmetric about 0; tiles beyond
     3 σ carry their sign, so that the maps can be read without colours.
     """
-    far = max(largest(*maps.values()), MARKED)
+    far = max(largest_size(*maps.values()), SIGN_BEYOND)
     return _maps(
         points, maps, Normalize(-far, far), DIVERGING, "residual (σ)", signs=len(points) <= MOST_MARKED
     )
@@ -59,7 +59,7 @@ def rms_maps(points: Points, maps: Mapping[str, PointMap]) -> Figure:
 
     It shows all that is wrong at once, whatever exposures it sits in; noise alone gives 0.87 (flux free).
     """
-    far = max(largest(*maps.values()), 1.5)
+    far = max(largest_size(*maps.values()), 1.5)
     return _maps(points, maps, Normalize(0.5, far), "magma_r", "rms residual (σ)", signs=False)
 
 
@@ -68,7 +68,7 @@ def _maps(
 ) -> Figure:
     shown = np.any([np.isfinite(values).any(axis=1) for values in maps.values()], axis=0)
     shown = shown if shown.any() else np.ones(len(points), bool)
-    figure = blank(8.6, 0.55 + 1.75 * len(maps))
+    figure = empty_figure(8.6, 0.55 + 1.75 * len(maps))
     axes = figure.subplots(len(maps), 4, sharex=True, sharey=True, squeeze=False)
     tiles: Any = None
     for number, values in enumerate(maps.values()):
@@ -114,7 +114,7 @@ def _tiles(
 
 
 def _signs(axis: Axes, points: Points, values: Float[np.ndarray, " p"], norm: Normalize) -> None:
-    for i in np.flatnonzero(np.abs(np.nan_to_num(values)) > MARKED):
+    for i in np.flatnonzero(np.abs(np.nan_to_num(values)) > SIGN_BEYOND):
         ink = "white" if abs(norm(values[i]) - 0.5) > 0.35 else "0.25"
         sign = "+" if values[i] > 0 else "−"
         axis.text(points.x[i], points.y[i], sign, color=ink, fontsize=5, ha="center", va="center")
@@ -130,14 +130,14 @@ def _spacing(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> float:
     return float(np.median(nearest)) if nearest.size else 0.05
 
 
-def signature_figure(comparison: Comparison, exposures: ExposureLabels) -> Figure:
+def signature_figure(comparison: ResidualComparison, exposures: ExposureLabels) -> Figure:
     """Residuals averaged over the field, camera by camera: data as dots, what the effect explains as a line.
 
     Against the polariser angle where the comparison shows a harmonic of it, or most of its signal is behind the
     polariser; against time otherwise. Exposures at one angle are averaged. The lower panels hold what is left.
     """
     angular = _against_angle(comparison, exposures)
-    figure = blank(8.6, 3.5)
+    figure = empty_figure(8.6, 3.5)
     upper, lower = figure.subplots(2, 4, sharex=True, sharey="row", height_ratios=(2.2, 1))
     position, label = _abscissa(exposures, angular)
     for k in range(4):
@@ -167,7 +167,7 @@ def signature_figure(comparison: Comparison, exposures: ExposureLabels) -> Figur
     return figure
 
 
-def _against_angle(comparison: Comparison, exposures: ExposureLabels) -> bool:
+def _against_angle(comparison: ResidualComparison, exposures: ExposureLabels) -> bool:
     behind = np.isfinite(exposures.clp_angle)
     if comparison.harmonic >= 0 or not behind.any():
         return comparison.harmonic >= 0
@@ -214,7 +214,7 @@ def ladder_figure(ladder: Ladder, names: Sequence[str] | None = None) -> Figure:
     ratio = ladder.chi2 / np.maximum(ladder.dof, 1)
     place = np.arange(len(ratio))
     width = EXPLAINS * np.sqrt(2.0 / max(int(ladder.dof[-1]), 1))
-    figure = blank(7.0, 0.8 + 0.38 * len(ratio))
+    figure = empty_figure(7.0, 0.8 + 0.38 * len(ratio))
     axis = figure.subplots()
     axis.axvspan(max(1.0 - width, 1e-3), 1.0 + width, color="0.88", lw=0, zorder=0)
     axis.axvline(1.0, color="0.5", lw=0.8, zorder=1)
@@ -256,7 +256,7 @@ def shares_figure(shares: Shares) -> Figure:
     """Mean squared residual by camera, kind, filter and exposure, over what noise alone gives: before and after."""
     groups = [g for g in ("camera", "kind", "filter") if np.count_nonzero(shares.group == g) > 1]
     widths = [np.count_nonzero(shares.group == g) + 1.0 for g in groups]
-    figure = blank(8.6, 2.7)
+    figure = empty_figure(8.6, 2.7)
     axes = figure.subplots(1, len(groups) + 1, width_ratios=[*widths, max(12.0, sum(widths))], sharey=True)
     before, after = (values / np.maximum(shares.expected, 1e-300) for values in (shares.before, shares.after))
     for axis, group in zip(axes, [*groups, "exposure"], strict=True):

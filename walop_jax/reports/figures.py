@@ -17,19 +17,24 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.reports.style import FONT, blank, field_axes, outer_labels
+from walop_jax.reports.style import (
+    FONT,
+    FROM_MINUS_ONE_TO_ONE,
+    MATRIX_SYMBOLS,
+    OFFSETS,
+    empty_figure,
+    field_axes,
+    outer_labels,
+)
 
 Map = Float[np.ndarray, "y x"]
 
 PIXELS = 61  # along each axis of a map
-_WEAK = 0.1  # |m22 m33 − m23 m32| below which a single exposure holds hardly any u
-_ELEMENTS = ("$m_{21}$", "$m_{22}$", "$m_{23}$", "$m_{31}$", "$m_{32}$", "$m_{33}$")
-_PER_CENT = (0, 3)  # offsets of the zero: in per cent
-_FIXED = (4, 5)  # cross-talk and efficiency in u: from −1 to 1
 
 
 def matrix_figure(calibration: Calibration, settings: Settings | None = None) -> Figure:
@@ -38,7 +43,7 @@ def matrix_figure(calibration: Calibration, settings: Settings | None = None) ->
     `settings` has one row (default: SDSS-r, flat spectrum, calibration plate out). Lines in m32 and m33 bound
     the zone where |m22 m33 − m23 m32| < 0.1: a single exposure holds hardly any u there.
     """
-    figure = blank(7.4, 4.6)
+    figure = empty_figure(7.4, 4.6)
     axes = figure.subplots(2, 3, sharex=True, sharey=True)
     _matrix_maps(figure, axes, calibration, settings)
     return figure
@@ -51,7 +56,7 @@ def residual_figure(result: FitResult, before: Float[np.ndarray, " n"] | None = 
     """
     likelihood = result.likelihood
     start = result.model.start if before is None else before
-    figure = blank(9.6, 3.2)
+    figure = empty_figure(9.6, 3.2)
     left, middle, right = figure.subplots(1, 3)
     maps = [point_residuals(likelihood, values) for values in (start, result.values)]
     norm = LogNorm(0.7, max(2.0, float(np.nanmax(maps[0]))))
@@ -75,7 +80,7 @@ def calibration_figure(
 
     `before` is a full vector of parameter values to compare with (default: the start values of the model).
     """
-    figure = blank(10.2, 4.7)
+    figure = empty_figure(10.2, 4.7)
     grid = figure.subplots(2, 4)
     _matrix_maps(figure, grid[:, :3], Calibration.from_fit(result), settings)
     start = result.model.start if before is None else before
@@ -119,12 +124,12 @@ def _matrix_maps(figure: Figure, axes: Any, calibration: Calibration, settings: 
     maps = matrix.T.reshape(6, *x.shape)
     weak = np.abs(maps[1] * maps[5] - maps[2] * maps[4])
     for i, axis in enumerate(np.ravel(axes)):
-        shown = maps[i] * (100.0 if i in _PER_CENT else 1.0)
-        name = _ELEMENTS[i] + (" (%)" if i in _PER_CENT else "")
+        shown = maps[i] * (100.0 if i in OFFSETS else 1.0)
+        name = MATRIX_SYMBOLS[i] + (" (%)" if i in OFFSETS else "")
         field_axes(axis, name)
         image = _image(axis, shown, calibration.field, i)
         if i >= 4:
-            axis.contour(x, y, weak, levels=[_WEAK], colors="0.15", linewidths=0.7)
+            axis.contour(x, y, weak, levels=[SMALLEST_DETERMINANT], colors="0.15", linewidths=0.7)
         figure.colorbar(image, ax=axis, pad=0.03).ax.tick_params(labelsize=7)
     outer_labels(axes)
 
@@ -133,7 +138,7 @@ def _image(axis: Axes, values: Map, field: tuple[float, float, float, float], el
     if element == 1:
         norm, colours = Normalize(float(values.min()), float(values.max())), "viridis"
     else:
-        far = 1.0 if element in _FIXED else float(np.abs(values).max())
+        far = 1.0 if element in FROM_MINUS_ONE_TO_ONE else float(np.abs(values).max())
         norm, colours = Normalize(-far, far), "RdBu_r"
     return axis.imshow(
         values,
@@ -188,7 +193,7 @@ def modulation_figure(calset: CalibrationSet, points: Sequence[int]) -> Figure:
     e = calset.exposures
     shown = np.flatnonzero(e.clp_in & ~e.chwp_in)
     block = calset.intensities.block(0, len(calset.points))
-    figure = blank(8.2, 3.2)
+    figure = empty_figure(8.2, 3.2)
     angle = np.linspace(0.0, 360.0, 181)
     for axis, pair, name, ideal in zip(
         figure.subplots(1, 2, sharex=True, sharey=True), (0, 2), "qu", (np.cos, np.sin), strict=True

@@ -20,14 +20,14 @@ from walop_jax.reports import diagnosis_figures, product_figures
 from walop_jax.reports.run import Run
 from walop_jax.reports.wording import (
     UNNAMED,
-    about,
-    digits,
-    measured,
-    minus,
+    effect_in_words,
     probability,
     rounded,
+    value_and_error,
     verdict_of_diagnosis,
     verdict_of_fit,
+    with_error,
+    with_minus_sign,
 )
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -46,7 +46,12 @@ def render(run: Run) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals.update(about=about, digits=digits, rounded=rounded, probability=probability)
+    environment.globals.update(
+        effect_in_words=effect_in_words,
+        value_and_error=value_and_error,
+        rounded=rounded,
+        probability=probability,
+    )
     return environment.get_template("report.html").render(_context(run))
 
 
@@ -74,8 +79,8 @@ def _context(run: Run) -> dict[str, Any]:
         "shown_candidates": SHOWN_CANDIDATES,
         "ladder": _ladder(run),
         "whole_combination": ""
-        if run.pictures is None
-        else in_greek(run.pictures.comparisons[0].combination),
+        if run.figure_data is None
+        else in_greek(run.figure_data.comparisons[0].combination),
         "pulls": _pulls(run),
         "parameters": main,
         "other_parameters": rest,
@@ -93,22 +98,22 @@ def _steps(run: Run) -> list[dict[str, Any]]:
 
 def _drawn(run: Run, number: int) -> dict[str, str]:
     """The figures of one comparison of `diagnosis.fits` and its combination in words; empty without that."""
-    if run.pictures is None or number >= len(run.pictures.comparisons):
+    if run.figure_data is None or number >= len(run.figure_data.comparisons):
         return {"maps": "", "signature": "", "combination": ""}
-    one, points = run.pictures.comparisons[number], run.pictures.points
+    one, points = run.figure_data.comparisons[number], run.figure_data.points
     rows = {f"without\n{one.effect}": one.before, one.effect: one.explained, f"with\n{one.effect}": one.after}
     return {
         "maps": embedded(diagnosis_figures.residual_maps(points, rows)),
-        "signature": embedded(diagnosis_figures.signature_figure(one, run.pictures.exposures)),
+        "signature": embedded(diagnosis_figures.signature_figure(one, run.figure_data.exposures)),
         "combination": in_greek(one.combination),
     }
 
 
 def _ladder(run: Run) -> list[dict[str, Any]]:
     """Rungs as rows: model, χ², degrees of freedom and what each has gained."""
-    if run.pictures is None:
+    if run.figure_data is None:
         return []
-    ladder, rows, before = run.pictures.ladder, [], math.nan
+    ladder, rows, before = run.figure_data.ladder, [], math.nan
     for model, chi2, dof in zip(ladder.model, ladder.chi2, ladder.dof, strict=True):
         rows.append({"model": str(model), "chi2": float(chi2), "dof": int(dof), "gain": before - float(chi2)})
         before = float(chi2)
@@ -119,7 +124,7 @@ def _parameters(run: Run) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Rows of the fitted coefficients of the instrument; rows of throughputs and of what was not fitted."""
     main, rest = [], []
     for name, entry in run.summary["parameters"].items():
-        value, sigma = digits(entry["value"], entry["sigma"])
+        value, sigma = value_and_error(entry["value"], entry["sigma"])
         row = {"name": name, "value": value, "sigma": sigma or "fixed", "unit": entry["unit"]}
         (rest if name.startswith("throughput.") or not sigma else main).append(row)
     return main, rest
@@ -136,10 +141,10 @@ def _pulls(run: Run) -> list[dict[str, Any]]:
     return [
         {
             "name": str(table.name[i]),
-            "value": measured(float(table.value[i]), float(table.sigma[i])),
+            "value": with_error(float(table.value[i]), float(table.sigma[i])),
             "unit": str(table.unit[i]),
-            "prior": f"{minus(f'{table.prior_mean[i] + 0.0:.6g}')} ± {table.prior_width[i]:.3g}",
-            "pull": minus(f"{size:+.2f}"),
+            "prior": f"{with_minus_sign(f'{table.prior_mean[i] + 0.0:.6g}')} ± {table.prior_width[i]:.3g}",
+            "pull": with_minus_sign(f"{size:+.2f}"),
             "strong": abs(float(size)) > STRONG_PULL,
         }
         for i, size in zip(known[order], pull[order], strict=True)
@@ -150,12 +155,13 @@ def _interval(row: Mapping[str, Any]) -> dict[str, str]:
     median, low, high = (float(row[name]) for name in ("MEDIAN", "LOW68", "HIGH68"))
     half = 0.5 * (high - low)
     spans = {
-        level: [digits(float(row[f"{end}{level}"]), half)[0] for end in ("LOW", "HIGH")] for level in (68, 95)
+        level: [value_and_error(float(row[f"{end}{level}"]), half)[0] for end in ("LOW", "HIGH")]
+        for level in (68, 95)
     }
     return {
         "name": str(row["NAME"]),
         "unit": str(row["UNIT"]),
-        "median": digits(median, half)[0],
+        "median": value_and_error(median, half)[0],
         "span68": " … ".join(spans[68]),
         "span95": " … ".join(spans[95]),
         "ess": f"{float(row['ESS']):.0f}",
@@ -170,15 +176,15 @@ def _figures(run: Run) -> dict[str, str]:
         made["errors"] = product_figures.matrix_errors_figure(run.product.maps)
         if run.product.residuals is not None:
             made["remainder"] = product_figures.residual_map_figure(run.product.residuals)
-    if run.pictures is not None:
-        pictures = run.pictures
-        whole = pictures.comparisons[0]
-        made["shares"] = diagnosis_figures.shares_figure(pictures.shares)
-        if len(pictures.comparisons) == 1:
-            made["residuals"] = diagnosis_figures.residual_maps(pictures.points, {"residuals": whole.before})
+    if run.figure_data is not None:
+        data = run.figure_data
+        whole = data.comparisons[0]
+        made["shares"] = diagnosis_figures.shares_figure(data.shares)
+        if len(data.comparisons) == 1:
+            made["residuals"] = diagnosis_figures.residual_maps(data.points, {"residuals": whole.before})
         else:
-            made["ladder"] = diagnosis_figures.ladder_figure(pictures.ladder)
-        if len(pictures.comparisons) > 2:
+            made["ladder"] = diagnosis_figures.ladder_figure(data.ladder)
+        if len(data.comparisons) > 2:
             # Several effects need not show in one combination of the exposures: rms over all of them.
             # Standards lie between the other points and are measured in other exposures: left out, if need be.
             there = np.isfinite(whole.before)
@@ -186,7 +192,7 @@ def _figures(run: Run) -> dict[str, str]:
                 "starting\nmodel": np.where(there, whole.rms_before, np.nan),
                 "final\nmodel": np.where(there, whole.rms_after, np.nan),
             }
-            made["rms"] = diagnosis_figures.rms_maps(pictures.points, rows)
+            made["rms"] = diagnosis_figures.rms_maps(data.points, rows)
     uris = {name: embedded(figure) for name, figure in made.items()}
     if run.corner is not None:
         uris["corner"] = "data:image/png;base64," + base64.b64encode(run.corner).decode("ascii")

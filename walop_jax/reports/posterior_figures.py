@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from walop_jax.io.atomic import atomic_path
-from walop_jax.reports.wording import measured
+from walop_jax.reports.wording import with_error
 
 SHARES = (0.393, 0.865)  # of the draws: inside 1 and 2 σ of a normal distribution of two coefficients
 BINS = 30  # of a histogram, along each axis
@@ -125,9 +125,7 @@ def corner_figure(
     low, middle, high = np.quantile(draws, (0.1587, 0.5, 0.8413), axis=0)
     size = 8 if few else 6
     for i in range(k):
-        title = (
-            f"{LABELS.get(names[i], names[i])}\n{measured(float(middle[i]), float(0.5 * (high[i] - low[i])))}"
-        )
+        title = f"{LABELS.get(names[i], names[i])}\n{with_error(float(middle[i]), float(0.5 * (high[i] - low[i])))}"
         panels[i, i].set_title(f"{title} {units[i]}".rstrip(), fontsize=8 if few else 4.5, loc="left")
         for j in range(i + 1):
             axes = panels[i, j]

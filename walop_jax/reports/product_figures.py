@@ -6,13 +6,18 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from walop_jax.calibration.records import MatrixMaps, ResidualMap
-from walop_jax.reports.style import DIVERGING, SMALL, blank, field_axes, largest, outer_labels
-
-ELEMENTS = ("$m_{21}$", "$m_{22}$", "$m_{23}$", "$m_{31}$", "$m_{32}$", "$m_{33}$")
-OFFSETS = (0, 3)  # zero points: in per cent
-UNIT = (4, 5)  # cross-talk and efficiency in u: from −1 to 1
-WEAK = 0.1  # |m22 m33 − m23 m32| below which a single exposure holds hardly any u
+from walop_jax.calibration.records import SMALLEST_DETERMINANT, MatrixMaps, ResidualMap
+from walop_jax.reports.style import (
+    DIVERGING,
+    FROM_MINUS_ONE_TO_ONE,
+    MATRIX_SYMBOLS,
+    OFFSETS,
+    SMALL,
+    empty_figure,
+    field_axes,
+    largest_size,
+    outer_labels,
+)
 
 
 def matrix_maps_figure(maps: MatrixMaps) -> Figure:
@@ -20,21 +25,23 @@ def matrix_maps_figure(maps: MatrixMaps) -> Figure:
 
     Lines bound the zone where |m22 m33 − m23 m32| < 0.1: a single exposure holds hardly any u there.
     """
-    figure = blank(8.6, 4.9)
+    figure = empty_figure(8.6, 4.9)
     axes = figure.subplots(2, 3, sharex=True, sharey=True)
     weak = np.abs(maps.values[1] * maps.values[5] - maps.values[2] * maps.values[4])
     for i, axis in enumerate(axes.ravel()):
         values = maps.values[i] * (100.0 if i in OFFSETS else 1.0)
-        far = 1.0 if i in UNIT else largest(values)
+        far = 1.0 if i in FROM_MINUS_ONE_TO_ONE else largest_size(values)
         norm, colours = Normalize(-far, far), DIVERGING
         if i == 1:
             norm, colours = Normalize(float(values.min()), float(values.max())), "viridis"
-        field_axes(axis, ELEMENTS[i] + (" (%)" if i in OFFSETS else ""))
+        field_axes(axis, MATRIX_SYMBOLS[i] + (" (%)" if i in OFFSETS else ""))
         image = axis.imshow(
             values, origin="lower", extent=extent(maps), norm=norm, cmap=colours, interpolation="nearest"
         )
-        if i in UNIT and weak.min() < WEAK < weak.max():
-            axis.contour(weak, levels=[WEAK], extent=extent(maps), colors="0.15", linewidths=0.7)
+        if i in FROM_MINUS_ONE_TO_ONE and weak.min() < SMALLEST_DETERMINANT < weak.max():
+            axis.contour(
+                weak, levels=[SMALLEST_DETERMINANT], extent=extent(maps), colors="0.15", linewidths=0.7
+            )
         figure.colorbar(image, ax=axis, pad=0.03).ax.tick_params(labelsize=SMALL)
     outer_labels(axes)
     return figure
@@ -45,12 +52,12 @@ def matrix_errors_figure(maps: MatrixMaps) -> Figure:
 
     The scale is logarithmic over at most three decades: errors grow steeply at the edge of the field.
     """
-    figure = blank(8.6, 4.6)
+    figure = empty_figure(8.6, 4.6)
     axes = figure.subplots(2, 3, sharex=True, sharey=True)
-    high = 100.0 * largest(maps.errors)
+    high = 100.0 * largest_size(maps.errors)
     norm = LogNorm(min(max(100.0 * float(maps.errors.min()), 1e-3 * high), 0.5 * high), high, clip=True)
     image = None
-    for axis, errors, name in zip(axes.ravel(), maps.errors, ELEMENTS, strict=True):
+    for axis, errors, name in zip(axes.ravel(), maps.errors, MATRIX_SYMBOLS, strict=True):
         field_axes(axis, f"error of {name}")
         image = axis.imshow(
             100.0 * errors,
@@ -73,9 +80,9 @@ def residual_map_figure(residuals: ResidualMap) -> Figure:
 
     The six elements share one scale, which the median error and the largest corrections but one in a hundred set.
     """
-    figure = blank(9.4, 4.0)
+    figure = empty_figure(9.4, 4.0)
     axes = figure.subplots(2, 4, sharex=True, sharey=True)
-    titles = (*(f"$\\delta${name} (%)" for name in ELEMENTS), "N2, N3 / N0, N1 (%)", "χ²/dof")
+    titles = (*(f"$\\delta${name} (%)" for name in MATRIX_SYMBOLS), "N2, N3 / N0, N1 (%)", "χ²/dof")
     # Row by row: the three elements of a pair, then the other quantity.
     order = (0, 1, 2, 6, 3, 4, 5, 7)
     matrix = 100.0 * np.abs(residuals.values[:6])

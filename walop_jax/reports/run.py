@@ -15,14 +15,14 @@ from walop_jax.calibration.summary import FAILED, PRODUCT, SUMMARY
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.document import DIAGNOSIS
 from walop_jax.diagnosis.figure_data import UNNAMED
-from walop_jax.diagnosis.figure_file import PICTURES, DiagnosisPictures, read_pictures
+from walop_jax.diagnosis.figure_file import FIGURE_DATA, DiagnosisFigureData, read_figure_data
 from walop_jax.io.errors import DataError, fail
 
 POSTERIOR, INTERVALS, CORNER, SAMPLE = "posterior.nc", "posterior.ecsv", "posterior_corner.png", "sample.json"
 SUMMARY_KEYS = ("chi2", "dof", "n_data", "parameters", "converged", "message", "versions", "inputs")
 DIAGNOSIS_KEYS = ("verdict", "steps", "candidates", "unexplained")
 DEFAULTS: dict[str, Any] = {"warnings": [], "remarks": [], "misfit": None}  # what a summary may lack
-SAME = 1e-6  # relative difference of χ²/dof of one and the same fit, read from two files
+SAME_CHI2 = 1e-6  # relative difference of χ²/dof of one and the same fit, read from two files
 
 T = TypeVar("T")
 
@@ -39,7 +39,7 @@ class Run:
     summary: dict[str, Any]
     product: CalibrationProduct | None
     diagnosis: dict[str, Any] | None
-    pictures: DiagnosisPictures | None
+    figure_data: DiagnosisFigureData | None
     sample: dict[str, Any] | None
     intervals: tuple[dict[str, Any], ...]
     corner: bytes | None
@@ -81,16 +81,20 @@ def read_run(folder: Path) -> Run:
     summary = DEFAULTS | _document(folder / SUMMARY, SUMMARY_KEYS)
     product = optional(PRODUCT, read_product, "no maps of the matrix, no pulls from the priors")
     diagnosis = _document(folder / DIAGNOSIS, DIAGNOSIS_KEYS) if (folder / DIAGNOSIS).exists() else None
-    pictures = None
+    figure_data = None
     if diagnosis is None:
         missing.append("This run is a refit: maps of the residuals come with walop-jax diagnose.")
     else:
-        pictures = optional(PICTURES, read_pictures, "no maps of the residuals, no curves, no ladder of χ²")
+        figure_data = optional(
+            FIGURE_DATA, read_figure_data, "no maps of the residuals, no curves, no ladder of χ²"
+        )
         names = [step["effect"] for step in diagnosis["steps"]]
-        drawn = [] if pictures is None else [one.effect for one in pictures.comparisons[1:]]
-        if pictures is not None and drawn not in (names, [*names, UNNAMED]):
-            missing.append(f"{PICTURES} is of another diagnosis than {DIAGNOSIS}: its pictures are left out.")
-            pictures = None
+        drawn = [] if figure_data is None else [one.effect for one in figure_data.comparisons[1:]]
+        if figure_data is not None and drawn not in (names, [*names, UNNAMED]):
+            missing.append(
+                f"{FIGURE_DATA} is of another diagnosis than {DIAGNOSIS}: its pictures are left out."
+            )
+            figure_data = None
         if _another_fit(summary, diagnosis):
             missing.append(
                 f"{DIAGNOSIS} is of another fit than {SUMMARY}: this folder was written to again since."
@@ -101,7 +105,7 @@ def read_run(folder: Path) -> Run:
         summary=summary,
         product=product,
         diagnosis=diagnosis,
-        pictures=pictures,
+        figure_data=figure_data,
         sample=optional(SAMPLE, lambda path: _document(path, ()), "no verdict on the sampling", sampled),
         intervals=optional(INTERVALS, _intervals, "no table of the posterior", sampled) or (),
         corner=optional(CORNER, Path.read_bytes, "no corner plot", sampled),
@@ -126,7 +130,7 @@ def _document(path: Path, keys: tuple[str, ...]) -> dict[str, Any]:
 def _another_fit(summary: dict[str, Any], diagnosis: dict[str, Any]) -> bool:
     said = diagnosis.get("chi2_per_dof_after")
     ratio = summary["chi2"] / max(summary["dof"], 1)
-    return said is not None and abs(said - ratio) > SAME * ratio
+    return said is not None and abs(said - ratio) > SAME_CHI2 * ratio
 
 
 def _intervals(path: Path) -> tuple[dict[str, Any], ...]:

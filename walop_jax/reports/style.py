@@ -16,8 +16,12 @@ BEFORE = "#b2182b"  # dark enough to be told from AFTER in grey as well; both ar
 AFTER = "#2166ac"
 QUIET = "0.8"
 
+MATRIX_SYMBOLS = ("$m_{21}$", "$m_{22}$", "$m_{23}$", "$m_{31}$", "$m_{32}$", "$m_{33}$")
+OFFSETS = (0, 3)  # elements that are zero points: in per cent
+FROM_MINUS_ONE_TO_ONE = (4, 5)  # elements: cross-talk and efficiency in u
 
-def blank(width: float, height: float) -> Figure:
+
+def empty_figure(width: float, height: float) -> Figure:
     """An empty figure, sizes in inches."""
     layout = ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.05)
     return Figure(figsize=(width, height), dpi=120, layout=layout)
@@ -41,7 +45,7 @@ def outer_labels(axes: Any) -> None:
         axis.label_outer()
 
 
-def largest(*maps: Any) -> float:
+def largest_size(*maps: Any) -> float:
     """The largest size of any finite value: the end of a symmetric scale that all of the maps share."""
     sizes = [np.abs(values[np.isfinite(values)]) for values in map(np.asarray, maps)]
     return max((float(one.max()) for one in sizes if one.size), default=0.0) or 1.0

@@ -20,34 +20,34 @@ _PROPER = ("Wollaston", "Moon", "Stokes")
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def measured(value: float, sigma: float) -> str:
+def with_error(value: float, sigma: float) -> str:
     """Value and error, two digits of the error: 0.23227 ± 0.00024."""
-    return " ± ".join(digits(value, sigma)) if sigma > 0 else digits(value, sigma)[0]
+    return " ± ".join(value_and_error(value, sigma)) if sigma > 0 else value_and_error(value, sigma)[0]
 
 
-def digits(value: float | str | None, sigma: float | None) -> tuple[str, str]:
+def value_and_error(value: float | str | None, sigma: float | None) -> tuple[str, str]:
     """Value and error as two texts, both to the second digit of the error; the error is empty where there is none."""
     if isinstance(value, str):
         return value, ""
     if value is None or not math.isfinite(value):
         return "–", ""
     if sigma is None or not 0 < sigma < math.inf:
-        return minus(f"{value:.7g}"), ""
+        return with_minus_sign(f"{value:.7g}"), ""
     places = max(0, 1 - math.floor(math.log10(sigma)))
     if places > 8:
         more = max(0, places + math.floor(math.log10(abs(value) or sigma)))
-        return minus(f"{value:.{more}e}"), minus(f"{sigma:.1e}")
-    return minus(f"{value:.{places}f}"), f"{sigma:.{places}f}"
+        return with_minus_sign(f"{value:.{more}e}"), with_minus_sign(f"{sigma:.1e}")
+    return with_minus_sign(f"{value:.{places}f}"), f"{sigma:.{places}f}"
 
 
-def minus(text: str) -> str:
+def with_minus_sign(text: str) -> str:
     """A number with a true minus sign."""
     return text.replace("-", "−")
 
 
 def rounded(value: float | None, form: str = ".4g") -> str:
     """A number, or a dash where there is none."""
-    return "–" if value is None or not math.isfinite(value) else minus(format(value, form))
+    return "–" if value is None or not math.isfinite(value) else with_minus_sign(format(value, form))
 
 
 def probability(p: float | None) -> str:
@@ -66,7 +66,7 @@ def _power(value: float) -> str:
     return "10" + str(round(math.log10(value))).translate(_RAISED)
 
 
-def about(effect: str) -> str:
+def effect_in_words(effect: str) -> str:
     """What an effect is, in a few words that may stand inside a sentence; empty for a name that is not known."""
     if effect == UNNAMED:
         return "patterns without a name"
@@ -121,9 +121,9 @@ def verdict_of_diagnosis(diagnosis: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _found(step: Mapping[str, Any]) -> str:
-    words, values = about(step["effect"]), []
+    words, values = effect_in_words(step["effect"]), []
     for name, entry in step["parameters"].items():
-        value, sigma = digits(entry["value"], entry["sigma"])
+        value, sigma = value_and_error(entry["value"], entry["sigma"])
         unit = f" {entry['unit']}" if entry["unit"] else ""
         values.append(f"{name} = {value}{f' ± {sigma}' if sigma else ''}{unit}")
     if len(values) > MOST_PARAMETERS:

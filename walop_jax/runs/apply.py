@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from walop_jax.calibration.from_file import read_calibration
+from walop_jax.calibration.records import Quality
 from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.user_tables import read_input_table, table_format, write_output_table
 from walop_jax.io.atomic import check_output
@@ -23,7 +24,14 @@ from walop_jax.science.apply import apply
 from walop_jax.science.polarisation import ESTIMATORS
 from walop_jax.science.stokes_columns import header, stokes_columns
 
-BITS = (16, 32, 64, 128, 256, 16384)
+BITS = (
+    Quality.HIGH_CROSSTALK,
+    Quality.BEYOND_FIELD,
+    Quality.BEYOND_SETTINGS,
+    Quality.CAMERA_MISSING,
+    Quality.SATURATED,
+    Quality.NO_STOKES,
+)
 """Bits of FLAG that a star can have by itself."""
 
 
@@ -42,7 +50,7 @@ class StokesTable:
     seconds: float
     estimator: str
     trusted: bool
-    flags: Mapping[int, int]
+    flags: Mapping[Quality, int]
     product: str
     not_carried_over: tuple[str, ...]
     warnings: tuple[str, ...]
@@ -56,7 +64,7 @@ class StokesTable:
             "seconds": self.seconds,
             "estimator": self.estimator,
             "trusted": self.trusted,
-            "flags": {str(bit): count for bit, count in self.flags.items()},
+            "flags": {str(int(bit)): count for bit, count in self.flags.items()},
             "product": self.product,
             KEY: list(self.not_carried_over),
         }
@@ -107,9 +115,9 @@ def apply_to_catalogue(
 
     counts = {bit: int((stars.flag & bit > 0).sum()) for bit in BITS}
     said = (
-        (16384, "star(s) without a result (FLAG 16384)"),
-        (32, "star(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)"),
-        (64, "star(s) with a filter, temperature or TEFF beyond the calibration"),
+        (Quality.NO_STOKES, "star(s) without a result (FLAG 16384)"),
+        (Quality.BEYOND_FIELD, "star(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)"),
+        (Quality.BEYOND_SETTINGS, "star(s) with a filter, temperature or TEFF beyond the calibration"),
     )
     flagged = [f"{catalogue}: {counts[bit]} {text}" for bit, text in said if counts[bit]]
     return StokesTable(

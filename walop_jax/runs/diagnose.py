@@ -14,8 +14,8 @@ from walop_jax.calibration.product import write_product
 from walop_jax.calibration.summary import PRODUCT, SUMMARY, summary
 from walop_jax.data import read_calibration_set
 from walop_jax.diagnosis.document import DIAGNOSIS, document
-from walop_jax.diagnosis.figure_data import pictures
-from walop_jax.diagnosis.figure_file import PICTURES, write_pictures
+from walop_jax.diagnosis.figure_data import figure_data
+from walop_jax.diagnosis.figure_file import FIGURE_DATA, write_figure_data
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.misfit import describe
@@ -25,7 +25,7 @@ from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
 from walop_jax.model.instrument import Instrument
 
-OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, PICTURES)
+OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, FIGURE_DATA)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,10 +71,10 @@ def diagnose_sets(
     misfit = None if found.after.explains_data else describe(found.after)
     content = document(found)
     fitted = summary(found.after, seconds=time.perf_counter() - began, misfit=misfit) | {"seed": seed}
-    drawn_from = pictures(found)
+    drawn_from = figure_data(found)
     with atomic_folder(Path(output), OUTPUTS, overwrite=overwrite) as folder:
         write_product(folder / PRODUCT, product)
         (folder / SUMMARY).write_text(json_text(fitted), encoding="utf-8")
         (folder / DIAGNOSIS).write_text(json_text(content), encoding="utf-8")
-        write_pictures(folder / PICTURES, drawn_from)
+        write_figure_data(folder / FIGURE_DATA, drawn_from)
     return DiagnosedRun(found, content)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-from walop_jax.calibration.records import spelt
+from walop_jax.calibration.records import in_ascii
 
 KEY = "not_carried_over"
 """Where results in JSON list the effects."""
@@ -22,4 +22,4 @@ def left_out_sentences(names: Sequence[str], source: str | os.PathLike[str] | No
 
 def left_out_cards(names: Sequence[str]) -> dict[str, str]:
     """The card NOTCARR of a table, which lists the effects; none where all are in it."""
-    return {"NOTCARR": spelt(", ".join(names))} if names else {}
+    return {"NOTCARR": in_ascii(", ".join(names))} if names else {}

@@ -10,6 +10,7 @@ from typing import Any
 
 from walop_jax.calibration.from_file import read_calibration
 from walop_jax.calibration.matrix_table import matrix_columns
+from walop_jax.calibration.records import Quality
 from walop_jax.data.field_points import field_points
 from walop_jax.data.user_tables import read_input_table, table_format, write_output_table
 from walop_jax.io.atomic import check_output
@@ -17,7 +18,7 @@ from walop_jax.io.errors import errors_naming
 from walop_jax.posterior.propagate import with_draws
 from walop_jax.runs.left_out import KEY, left_out_cards, left_out_sentences
 
-BITS = (16, 32, 64)
+BITS = (Quality.HIGH_CROSSTALK, Quality.BEYOND_FIELD, Quality.BEYOND_SETTINGS)
 """Bits of FLAG that a row of a table of matrices can have."""
 
 
@@ -33,7 +34,7 @@ class MatrixTable:
     path: Path
     rows: int
     trusted: bool
-    flags: Mapping[int, int]
+    flags: Mapping[Quality, int]
     product: str
     not_carried_over: tuple[str, ...]
     warnings: tuple[str, ...]
@@ -44,7 +45,7 @@ class MatrixTable:
             "output": str(self.path),
             "rows": self.rows,
             "trusted": self.trusted,
-            "flags": {str(bit): count for bit, count in self.flags.items()},
+            "flags": {str(int(bit)): count for bit, count in self.flags.items()},
             "product": self.product,
             KEY: list(self.not_carried_over),
         }
@@ -82,14 +83,11 @@ def tabulate_matrix(
     flag = columns["FLAG"][0]
     counts = {bit: int((flag & bit > 0).sum()) for bit in BITS}
     warnings = [*held.warnings, *left_out_sentences(lost, held.path)]
-    if counts[32]:
-        warnings.append(
-            f"{points}: {counts[32]} point(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)"
-        )
-    if counts[64]:
-        warnings.append(
-            f"{points}: {counts[64]} row(s) with a filter or temperature not in the calibration (FLAG 64)"
-        )
+    said = {
+        Quality.BEYOND_FIELD: "point(s) beyond the calibrated field: extrapolated, or NaN",
+        Quality.BEYOND_SETTINGS: "row(s) with a filter or temperature not in the calibration",
+    }
+    warnings += [f"{points}: {counts[bit]} {text} (FLAG {bit:d})" for bit, text in said.items() if counts[bit]]
     return MatrixTable(
         path=Path(output),
         rows=table.rows,

@@ -21,11 +21,11 @@ from walop_jax.calibration.records import Quality
 from walop_jax.data.catalogue import Catalogue
 from walop_jax.data.settings import Settings
 from walop_jax.io.errors import DataError
+from walop_jax.likelihood import limits
 from walop_jax.model import carried, light
 from walop_jax.model.parameters import with_values
 from walop_jax.science.estimate import calibration_shift, estimate
 
-BLOCK = 16384  # rows that are worked on together
 MOST_SETTINGS = 200
 ILL_POSED = 10.0  # ratio of the errors of the two principal directions from which FLAG 16 is set
 COOL, HOT = 3500.0, 10000.0
@@ -72,30 +72,30 @@ def apply(
     offset, slope = _rotator_zero(vectors)
     order = np.argsort(catalogue.star, kind="stable")
     parts = []
-    for done, rows in _blocks(catalogue.star[order]):
+    for done, rows in _slices_of_stars(catalogue.star[order]):
         rows = order[rows]
         parts.append(
-            _block(vectors, catalogue, rows, counts[rows], settings, setting_of[rows], offset, slope)
+            _stars_of_rows(vectors, catalogue, rows, counts[rows], settings, setting_of[rows], offset, slope)
         )
         if progress is not None:
             progress(done, len(order))
     return Stars(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Stars)))
 
 
-def _blocks(star: Int[np.ndarray, " n"]) -> Iterator[tuple[int, slice]]:
-    """Slices of about `BLOCK` rows that do not divide stars, each with the number of rows done after it."""
+def _slices_of_stars(star: Int[np.ndarray, " n"]) -> Iterator[tuple[int, slice]]:
+    """Slices of about `limits.STAR_ROWS` rows that do not divide stars, each with the number of rows done after it."""
     first = np.flatnonzero(np.diff(star, prepend=-1))
     start = 0
     while start < len(star):
-        at = np.searchsorted(first, start + BLOCK, side="right") - 1
-        end = len(star) if start + BLOCK >= len(star) else int(first[at])
+        at = np.searchsorted(first, start + limits.STAR_ROWS, side="right") - 1
+        end = len(star) if start + limits.STAR_ROWS >= len(star) else int(first[at])
         if end <= start:  # a single star with more rows than a block
             end = int(first[at + 1]) if at + 1 < len(first) else len(star)
         yield end, slice(start, end)
         start = end
 
 
-def _block(
+def _stars_of_rows(
     vectors: AnalysisVectors,
     catalogue: Catalogue,
     rows: Int[np.ndarray, " r"],
@@ -114,24 +114,24 @@ def _block(
     turn = 2.0 * np.where(sky, np.deg2rad(catalogue.rotator[rows]) + offset, 0.0)
 
     spectra = np.empty((len(rows), COLOURS + 1, vectors.cameras, 3))
-    for k, where in _members(setting_of):
-        spectra[where] = vectors.at(settings[k], x[where], y[where])
+    for k, here in _rows_by_setting(setting_of):
+        spectra[here] = vectors.at(settings[k], x[here], y[here])
     there = np.einsum("rc,rcks->rks", colour_weights(teff, COLOURS), spectra)
     used = np.where(outside[:, None], np.nan, counts)
-    found = estimate(_turned(there, turn), used, sigma, star)
+    found = estimate(_vectors_on_sky(there, turn), used, sigma, star)
 
     s = _instrument_stokes(found.qu[star], turn)
     derivative = np.empty((len(rows), 2, len(vectors.parameters)))
-    for k, where in _members(setting_of):
-        local = vectors.derivatives(settings[k], x[where], y[where], teff[where])
-        plain, throughput = (found.gain[where] @ np.einsum("rs,rksf->rkf", s[where], part) for part in local)
-        derivative[where] = vectors.to_parameters(plain, throughput, x[where], y[where])
+    for k, here in _rows_by_setting(setting_of):
+        local = vectors.derivatives(settings[k], x[here], y[here], teff[here])
+        plain, throughput = (found.gain[here] @ np.einsum("rs,rksf->rkf", s[here], part) for part in local)
+        derivative[here] = vectors.to_parameters(plain, throughput, x[here], y[here])
     if slope.any():
         dq, du = 2.0 * s[:, 2], -2.0 * s[:, 1]  # (q + iu) exp(−2i R) grows by −2i (q + iu) dR
         turned = np.where(sky[:, None], there[..., 1] * dq[:, None] + there[..., 2] * du[:, None], 0.0)
         derivative += (found.gain @ turned[..., None]) * slope
     root = np.add.reduceat(-derivative, first) @ vectors.root
-    colour = np.einsum("rc,rcks,rs->rk", _ignored(teff), spectra, s, optimize=True)
+    colour = np.einsum("rc,rcks,rs->rk", _ignored_colour(teff), spectra, s, optimize=True)
     shift = calibration_shift(found.gain, colour[..., None], star)[..., 0]
     return Stars(
         qu=found.qu,
@@ -154,12 +154,14 @@ def _outside(
     return points.outside[rows] | far
 
 
-def _members(setting_of: Int[np.ndarray, " r"]) -> Iterator[tuple[int, Int[np.ndarray, " w"]]]:
+def _rows_by_setting(setting_of: Int[np.ndarray, " r"]) -> Iterator[tuple[int, Int[np.ndarray, " w"]]]:
     for k in np.unique(setting_of):
         yield int(k), np.flatnonzero(setting_of == k)
 
 
-def _turned(vectors: Float[np.ndarray, "r k 3"], turn: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r k 3"]:
+def _vectors_on_sky(
+    vectors: Float[np.ndarray, "r k 3"], turn: Float[np.ndarray, " r"]
+) -> Float[np.ndarray, "r k 3"]:
     """Analysis vectors for Stokes parameters on the sky; `turn` is twice the position angle of +X (rad).
 
     (q + iu) of the instrument = (q + iu) of the sky × exp(−i turn).
@@ -178,7 +180,7 @@ def _instrument_stokes(
     return np.stack([np.ones_like(q), cos * q + sin * u, cos * u - sin * q], axis=-1)
 
 
-def _ignored(teff: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r c"]:
+def _ignored_colour(teff: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r c"]:
     """Mixture of spectra that is the error of ignoring the colour (see `Stars.colour`)."""
     flat = colour_weights(np.full(len(teff), np.nan), COLOURS)
     half = 0.5 * np.subtract(*colour_weights(np.array([COOL, HOT]), COLOURS))

@@ -22,21 +22,22 @@ from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import effects_text, model_for
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import Model
-from walop_jax.science.star_errors import WEAK, determinant, joint_errors, sample_stars, statistics
+from walop_jax.science.star_errors import determinant, joint_errors, sample_stars, statistics
 
-NIGHTLY = ("sky.", "standard.")  # parameters of the sky and of stars, not of the instrument
+SKY_AND_STARS = ("sky.", "standard.")  # parameters of the sky and of stars, not of the instrument
 CHANCE = 0.01
 _KNOWN = 1e-7  # share of the largest eigenvalue below which a direction was measured by neither
 
 
 @dataclasses.dataclass(frozen=True)
-class Moved:
+class MovedParameter:
     """A parameter before and after; `z` its change in standard errors of the change."""
 
     name: str
@@ -63,7 +64,7 @@ class Epoch:
     chi2_old: float
     chi2_new: float
     dof: int
-    moved: tuple[Moved, ...]
+    moved: tuple[MovedParameter, ...]
     star_errors: dict[str, dict[str, float]]
 
     def document(self) -> dict[str, Any]:
@@ -83,7 +84,7 @@ def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]
     if not result.converged:
         raise RuntimeError(f"the fit of the new set did not converge: {result.minimum.message}")
     new = Calibration.from_fit(result)
-    names = shared(old.model, model)
+    names = shared_parameters(old.model, model)
     a = np.array([old.model.index(name) for name in names])
     b = np.array([model.index(name) for name in names])
     change = new.values[b] - old.values[a]
@@ -91,12 +92,12 @@ def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]
     width = np.array([(model[name].prior or (0.0, np.inf))[1] for name in names])
     both = before @ (after / width[:, None] ** 2)
     covariance = before + after - both - both.T
-    test, directions = departure(change, covariance, np.sqrt(np.diag(before + after)))
+    test, directions = chi2_of_change(change, covariance, np.sqrt(np.diag(before + after)))
     values = new.values.copy()
     values[b] = old.values[a]
     error = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     moved = [
-        Moved(n, model[n].unit, float(old.values[i]), float(new.values[j]), float(s), float(d / s))
+        MovedParameter(n, model[n].unit, float(old.values[i]), float(new.values[j]), float(s), float(d / s))
         for n, i, j, d, s in zip(names, a, b, change, error, strict=True)
         if s > 0
     ]
@@ -115,13 +116,13 @@ def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]
     return verdict, new
 
 
-def shared(old: Model, new: Model) -> list[str]:
+def shared_parameters(old: Model, new: Model) -> list[str]:
     """Names of the instrument's parameters that are free in both models."""
     free = [{m.parameters[i].name for i in m.free} for m in (old, new)]
-    return [name for name in new.names if name in free[0] & free[1] and not name.startswith(NIGHTLY)]
+    return [name for name in new.names if name in free[0] & free[1] and not name.startswith(SKY_AND_STARS)]
 
 
-def departure(
+def chi2_of_change(
     change: Float[np.ndarray, " k"], covariance: Float[np.ndarray, "k k"], sigma: Float[np.ndarray, " k"]
 ) -> tuple[float, int]:
     """Δᵀ V⁻¹ Δ over the directions that were measured, and their number; `sigma` sets the scale of each parameter."""
@@ -148,7 +149,7 @@ def _star_errors(old: Calibration, new: Calibration) -> dict[str, dict[str, floa
         analysis = AnalysisVectors(calibration)
         vectors.append(np.stack([analysis.exact(setting, x, y)[:, 0] for setting in settings], axis=1))
     errors = joint_errors(vectors[0], vectors[1], sample_stars())
-    return statistics(errors, determinant(vectors[1], pairs) >= WEAK)
+    return statistics(errors, determinant(vectors[1], pairs) >= SMALLEST_DETERMINANT)
 
 
 def _seen_through(calibration: Calibration) -> list[Settings]:

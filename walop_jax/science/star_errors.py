@@ -19,24 +19,23 @@ from walop_jax.science.estimate import estimate
 
 STARS, LARGEST_P = 100, 0.05
 GOAL = 0.001
-WEAK = 0.1  # |m22 m33 − m23 m32| below which one exposure holds hardly any u
 QUANTITIES = ("q", "u", "p")
 _ELECTRONS = 1e6  # of the stars; their photon noise does not enter
 
 Vectors = Float[np.ndarray, "p *r k 3"]
 """Analysis vectors at field points, of one exposure or of several (r) in which a star is seen."""
-Stars = Float[np.ndarray, "n 2"]
-Pairs = tuple[tuple[int, int], ...]
+QuPairs = Float[np.ndarray, "n 2"]
+CameraPairs = tuple[tuple[int, int], ...]
 
 
-def sample_stars(count: int = STARS, largest: float = LARGEST_P, seed: int = 0) -> Stars:
+def sample_stars(count: int = STARS, largest: float = LARGEST_P, seed: int = 0) -> QuPairs:
     """(q, u) of sources with p evenly up to `largest` and any angle."""
     rng = np.random.default_rng(seed)
     p, angle = rng.uniform(0.0, largest, count), rng.uniform(0.0, np.pi, count)
     return np.stack([p * np.cos(2 * angle), p * np.sin(2 * angle)], axis=1)
 
 
-def transmitted(vectors: Vectors, stars: Stars) -> Float[np.ndarray, "p n *r k"]:
+def transmitted(vectors: Vectors, stars: QuPairs) -> Float[np.ndarray, "p n *r k"]:
     """Counts (point, star, camera) of sources of unit flux."""
     s = np.concatenate([np.ones((len(stars), 1)), stars], axis=1)
     return np.einsum("p...ks,ns->pn...k", vectors, s)
@@ -114,7 +113,7 @@ def plate_errors(
     return worst / np.sqrt(2.0 / counts.sum(axis=(1, 2)))
 
 
-def determinant(vectors: Vectors, pairs: Pairs | None = None) -> Float[np.ndarray, " p"]:
+def determinant(vectors: Vectors, pairs: CameraPairs | None = None) -> Float[np.ndarray, " p"]:
     """What the exposures hold of (q, u) at every point: |m22 m33 − m23 m32| for one exposure of two arms.
 
     In general the root of det MᵀM, M having a row (m22, m23) for every arm and exposure: 0 where all see the same
@@ -125,7 +124,7 @@ def determinant(vectors: Vectors, pairs: Pairs | None = None) -> Float[np.ndarra
     return np.sqrt(np.maximum(np.linalg.det(rows.swapaxes(1, 2) @ rows), 0.0))
 
 
-def _two_by_two(vectors: Vectors) -> Pairs:
+def _two_by_two(vectors: Vectors) -> CameraPairs:
     return tuple((k, k + 1) for k in range(0, vectors.shape[-2], 2))
 
 
@@ -145,7 +144,7 @@ def statistics(errors: Errors, chosen: Bool[np.ndarray, " p"] | None = None) -> 
 
 
 @dataclasses.dataclass(frozen=True)
-class Place:
+class MethodErrors:
     """Errors of both methods at some field points; `zone` marks |m22 m33 − m23 m32| < 0.1."""
 
     x: Float[np.ndarray, " p"]
@@ -164,7 +163,9 @@ class Place:
         return out
 
 
-def truth_vectors(joint: Vectors, matrix: Float[np.ndarray, "p m"], pairs: Pairs | None = None) -> Vectors:
+def truth_vectors(
+    joint: Vectors, matrix: Float[np.ndarray, "p m"], pairs: CameraPairs | None = None
+) -> Vectors:
     """Analysis vectors with true matrices (m21, m22, …) and, what these do not hold, the sums of the joint model.
 
     a± = ½ (S ± S₀ m) with S the sum of a pair of cameras; an error of S is second order in p. `pairs` as for

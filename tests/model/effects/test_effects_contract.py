@@ -16,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects import EFFECTS, effect_by_name
 from walop_jax.model.effects.base import Effect
-from walop_jax.model.parameters import field_declarations, leaves
+from walop_jax.model.parameters import field_declarations, leaves, values_of
 
 # Names, parameters and units of docs: effects, typed by hand.
 CONTRACT = {
@@ -81,7 +81,8 @@ def test_parameters_units_and_sources(kind: type[Effect]):
         assert declaration.width or declaration.loose, "an amplitude has a prior, a shape a weak pull"
     assert kind.revealed_by
     assert kind.separated_by
-    assert len(leaves(effect)) == ravel_pytree(effect)[0].size
+    # Nothing in it is a number without a name.
+    assert len(leaves(effect)) == ravel_pytree(effect)[0].size == values_of(effect).size
 
 
 @every_effect

@@ -8,11 +8,11 @@ import effect_scenes as scenes
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
 
 from walop_jax.likelihood import engine
 from walop_jax.model import light
 from walop_jax.model.effects import effect_by_name
+from walop_jax.model.parameters import values_of, with_values
 
 COUNTS = jnp.array([[1e5, 2e5, 3e5, 4e5]] * 9)
 
@@ -46,7 +46,7 @@ def test_pedestal_by_hand():
 
 
 def test_pedestal_needs_the_medians():
-    exposures = scenes.plan().exposures._replace(median=None)
+    exposures = dataclasses.replace(scenes.plan().exposures, median_counts=None)
     with pytest.raises(ValueError, match="median"):
         light.detected(scenes.instrument(make("pedestal")), exposures, COUNTS)
 
@@ -61,15 +61,23 @@ def test_gain_drift_by_hand():
     assert hours[[0, 1, 4]] == pytest.approx([0.0, 2.4, 3.6])
     found = detected(make("camera_gain_drift", camera=2, rate=0.01))
     assert found[4] == pytest.approx([1e5, 2e5, 3e5 * 1.036, 4e5], rel=1e-12)
-    with pytest.raises(ValueError, match="camera 4 does not exist"):
-        make("camera_gain_drift", camera=4)
+
+
+@pytest.mark.parametrize("name", ["camera_gain_drift", "blemish"])
+@pytest.mark.parametrize("camera", [4, -1])
+def test_a_camera_that_does_not_exist_is_refused(name, camera):
+    """An index out of range would otherwise change nothing, and a negative one another camera."""
+    with pytest.raises(ValueError, match=rf"camera {camera} does not exist; cameras are 0 \(O1\), 1 \(E1\)"):
+        scenes.instrument(make(name, camera=camera)).patched()
 
 
 def test_blemish_by_hand():
     effect = make("blemish", camera=1, x=0.1, y=-0.1, size=0.05, depth=0.2)
 
+    (spot,) = scenes.instrument(effect).patched().cameras.transmission
+
     def at(x, y):
-        return np.asarray(effect.throughput(jnp.full(4, 0.5), jnp.asarray(x), jnp.asarray(y)))
+        return 0.5 * np.asarray(spot.factors(jnp.asarray(x), jnp.asarray(y)))
 
     assert at(0.1, -0.1) == pytest.approx([0.5, 0.4, 0.5, 0.5])
     assert at(0.1, -0.05) == pytest.approx([0.5, 0.5 * (1 - 0.2 * np.exp(-0.5)), 0.5, 0.5])
@@ -115,14 +123,14 @@ def test_gradient_of_chi2_is_exact(name):
         counts=data.counts * (1 + 0.01 * np.random.default_rng(3).normal(size=data.counts.shape))
     )
     device = scenes.instrument(effect)
-    values, unravel = ravel_pytree(device)
+    values, unravel = values_of(device), with_values(device)
     gradient = np.asarray(engine.normal_equations(device, layout, data).gradient)
 
     def chi2(v) -> float:
         return float(jnp.sum(engine.residuals(unravel(v), layout, data)[1] ** 2))
 
     # The last parameters are the effect's; throughputs, an optical and a polarimetric one besides.
-    for i in (0, 5, 9, 12, 30, 60, *range(values.size - np.size(ravel_pytree(effect)[0]), values.size)):
+    for i in (0, 5, 9, 12, 30, 60, *range(values.size - values_of(effect).size, values.size)):
         h = 1e-5 * max(1.0, abs(float(values[i])) * 0.1)
         step = jnp.zeros(values.size).at[i].set(h)
         assert (chi2(values + step) - chi2(values - step)) / (4 * h) == pytest.approx(

@@ -12,9 +12,9 @@ import pytest
 
 from walop_jax.model import light, materials, mueller, plates
 from walop_jax.model.effects import effect_by_name
-from walop_jax.model.effects.base import Conditions
-from walop_jax.model.plan import build_plan, plan_for
+from walop_jax.model.planning import plan_for
 from walop_jax.model.plates import Plate
+from walop_jax.model.ray import Conditions, Ray
 
 LINE = 0.61
 
@@ -24,20 +24,38 @@ def make(name: str, **values):
 
 
 def rows(device, *, x=0.1, y=-0.2, settings=(None,), band=None, **exposure) -> np.ndarray:
-    """Mueller rows (band, half, row, Stokes) at a field point, in the order of `settings`."""
+    """Mueller rows (band, row, Stokes) at a field point, in the order of `settings`.
+
+    Rows are S0 and what is analysed in the first half, then the same in the second.
+    """
     exposures = builders.exposures(
         *({} | exposure | ({} if s is None else {"chwp_angle": s}) for s in settings)
     )
-    layout = plan_for(device.effects, exposures, {"band": band or builders.monochromatic(LINE)})
+    layout = plan_for(device, exposures, {"band": band or builders.monochromatic(LINE)})
     found = np.asarray(light.band_rows(device, layout, jnp.asarray(x), jnp.asarray(y)))
     return found[layout.band_of[:, 0]]
 
 
 def straight(**options):
     """An instrument without wedges: the middle of the field is at normal incidence."""
-    device = builders.south(**options)
-    flat = [dataclasses.replace(half, wedge=jnp.asarray(0.0)) for half in device.halves]
-    return dataclasses.replace(device, half1=flat[0], half2=flat[1])
+    return builders.without_wedges(builders.south(**options))
+
+
+def plate(device, name, *, kx=0.0, lam=LINE, temperature=10.0) -> np.ndarray:
+    """Mueller matrix of a plate of the patched instrument in monochromatic light."""
+    one = jnp.ones(1)
+    conditions = Conditions(0.0 * one, {"temperature": temperature * one})
+    zero = jnp.asarray(0.0)
+    ray = Ray(zero, zero, jnp.asarray(kx), zero, (lam * one, conditions))
+    return np.asarray(element(device, name).mueller(ray))[0]
+
+
+def element(device, name):
+    """An element of the patched instrument by its place, such as "half1.plate"."""
+    *where, name = name.split(".")
+    patched = device.patched()
+    holder = next(arm for arm in patched.arms if arm.name == where[0]) if where else patched
+    return next(one for one in holder.elements if one.name == name)
 
 
 @pytest.mark.parametrize(("name", "half"), [("hwp1_axis", 0), ("hwp2_axis", 1)])
@@ -45,13 +63,14 @@ def test_turned_plate_at_normal_incidence(name, half):
     """R(−a) M R(a) with the matrix of the plate as it was; the other half does not care."""
     angle = 3.0
     plain, turned = straight(), straight(effects=(make(name, angle=angle),))
-    layout = build_plan(builders.exposures({}), {"band": builders.monochromatic(LINE)})
-    origin = jnp.asarray(0.0)
-    before, after = (light.plate_matrices(i, layout, origin, origin) for i in (plain, turned))
     there, back = (np.asarray(mueller.rotation(jnp.asarray(s * np.deg2rad(angle)))) for s in (1.0, -1.0))
-    keys = ("half1", "half2")
-    assert after[keys[half]][0] == pytest.approx(back @ np.asarray(before[keys[half]][0]) @ there, abs=1e-12)
-    assert np.array_equal(after[keys[1 - half]], before[keys[1 - half]])
+    keys = ("half1.plate", "half2.plate")
+    mine, other = keys[half], keys[1 - half]
+    assert plate(turned, mine) == pytest.approx(back @ plate(plain, mine) @ there, abs=1e-12)
+    assert np.array_equal(plate(turned, other), plate(plain, other))
+    # Rows of the light path: those of the plates, S0 and S1, per unit of what each half gets.
+    found = rows(turned, x=0.0, y=0.0)[0]
+    assert found == pytest.approx(np.concatenate([plate(turned, key)[:2] for key in keys]), abs=1e-12)
 
 
 def test_chwp_axis_is_its_setting():
@@ -65,10 +84,9 @@ def test_chwp_in_beam_is_a_plate_at_zero():
 
 
 def test_chwp_thickness_adds_to_the_base_model():
-    device = builders.south()
-    thick = dataclasses.replace(device.chwp, mgf2=device.chwp.mgf2 + 3.0, quartz=device.chwp.quartz - 2.0)
+    thick = builders.with_plates(builders.south(), 2405.0, 1933.0, ("chwp",))
     found = rows(builders.south(effects=(make("chwp_thickness", mgf2=3.0, quartz=-2.0),)), settings=(45.0,))
-    assert found == pytest.approx(rows(dataclasses.replace(device, chwp=thick), settings=(45.0,)), abs=1e-14)
+    assert found == pytest.approx(rows(thick, settings=(45.0,)), abs=1e-14)
 
 
 def test_uncrossed_plates_add_their_retardance():
@@ -76,16 +94,10 @@ def test_uncrossed_plates_add_their_retardance():
     lam = jnp.asarray(LINE)
     quartz = float(materials.QUARTZ_E.refractive_index(lam) - materials.QUARTZ_O.refractive_index(lam))
     mgf2 = float(materials.MGF2_E.refractive_index(lam) - materials.MGF2_O.refractive_index(lam))
-    layout = build_plan(builders.exposures({}), {"band": builders.monochromatic(LINE)})
-    device = straight(effects=(make("hwp1_crossing", angle=-90.0),))
-    matrix = np.asarray(light.plate_matrices(device, layout, jnp.asarray(0.0), jnp.asarray(0.0))["half1"][0])
+    matrix = plate(straight(effects=(make("hwp1_crossing", angle=-90.0),)), "half1.plate")
     delta = 2 * np.pi * (2407.0 * quartz + 1930.0 * mgf2) / LINE
     assert matrix[2, 2] / matrix[0, 0] == pytest.approx(np.cos(delta), abs=1e-4)  # Fresnel losses: 1e-5
     assert abs(matrix[2, 3]) / matrix[0, 0] == pytest.approx(abs(np.sin(delta)), abs=1e-4)
-
-
-def conditions(temperature=10.0, hours=0.0, width=0.0) -> Conditions:
-    return Conditions(jnp.array([temperature]), jnp.array([hours]), jnp.array([width]))
 
 
 def stack(quartz=2407.0, mgf2=1930.0, lam=0.62) -> tuple[Plate, ...]:
@@ -106,11 +118,21 @@ def stack(quartz=2407.0, mgf2=1930.0, lam=0.62) -> tuple[Plate, ...]:
     )
 
 
-def test_temperature_changes_retardance_by_published_amount():
+def crystals(device, name, *, temperature=10.0, lam=0.62) -> tuple[Plate, ...]:
+    """Layers of a plate of the patched instrument."""
+    one = jnp.ones(1)
+    conditions = Conditions(0.0 * one, {"temperature": temperature * one})
+    zero = jnp.asarray(0.0)
+    return element(device, name).crystals(Ray(zero, zero, zero, zero, (lam * one, conditions)))
+
+
+@pytest.mark.parametrize("name", ["chwp", "half1.plate", "half2.plate"])
+def test_temperature_changes_retardance_by_published_amount(name):
     """0.84° per kelvin for 1.93 mm of MgF2 against 2.41 mm of quartz at 0.62 µm (NIST coefficients)."""
+    device = builders.south(effects=(make("hwp_temperature", coefficient=1.0),))
 
     def retardance(temperature):
-        warm = make("hwp_temperature", coefficient=1.0).plates("half2", stack(), conditions(temperature))
+        warm = crystals(device, name, temperature=temperature)
         quartz, mgf2 = (float(p.thickness * (p.extraordinary - p.ordinary)[0]) for p in warm)
         return 360.0 * (mgf2 - quartz) / 0.62
 
@@ -118,15 +140,31 @@ def test_temperature_changes_retardance_by_published_amount():
     assert retardance(10.0) == pytest.approx(360.0 * (22.7506 - 21.8074) / 0.62, abs=2.0)
 
 
-def test_etalon_by_hand():
-    effect = make("etalon", contrast=0.01, gap=0.31)  # 4π gap / λ = 2π at 0.62 µm
+def test_temperature_of_the_exposure_reaches_the_plates():
+    """Rows at 25 °C are those of plates whose birefringence is smaller by 15 · 1.23e-4 and 15 · 5.37e-5.
 
-    def matrix(sine):
-        zero, one = jnp.zeros(1), jnp.eye(4)[None]
-        return np.asarray(effect.ahead_of_plates("half1", one, zero + sine, zero, zero + 0.62, zero))[0]
+    To first order in the change: n_e − n_o enters with its thickness, and with the bending of the rays (1e-5).
+    """
+    warm = rows(builders.south(effects=(make("hwp_temperature", coefficient=1.0),)), temp=25.0)
+    thin = builders.with_plates(builders.south(), 2407.0 * (1 - 15 * 1.23e-4), 1930.0 * (1 - 15 * 5.37e-5))
+    cold = rows(builders.south())
+    assert np.abs(warm - cold).max() > 0.05
+    assert warm == pytest.approx(rows(thin), abs=3e-4)
 
-    assert matrix(0.0)[0] == pytest.approx([1.0, 0.01, 0.0, 0.0], abs=1e-15)
-    assert matrix(np.sin(np.pi / 3))[0] == pytest.approx([1.0, -0.01, 0.0, 0.0], abs=1e-15)  # cos 60° = ½
+
+@pytest.mark.parametrize(("name", "axis"), [("half1.plate", 0.0), ("half2.plate", 22.5), ("chwp", 0.0)])
+def test_etalon_by_hand(name, axis):
+    """What stands ahead of the plate: contrast along its fast axis, one fringe for 4π gap / λ = 2π."""
+    device = builders.south(effects=(make("etalon", contrast=0.01, gap=0.31),))
+
+    def ahead(sine):
+        before, after = (plate(one, name, kx=sine, lam=0.62) for one in (builders.south(), device))
+        return np.linalg.solve(before, after)[0]
+
+    along, across = np.cos(2 * np.deg2rad(axis)), np.sin(2 * np.deg2rad(axis))
+    assert ahead(0.0) == pytest.approx([1.0, 0.01 * along, 0.01 * across, 0.0], abs=1e-14)
+    oblique = ahead(np.sin(np.pi / 3))  # cos 60° = ½
+    assert oblique == pytest.approx([1.0, -0.01 * along, -0.01 * across, 0.0], abs=1e-14)
 
 
 def test_etalon_from_its_linear_directions():
@@ -143,7 +181,7 @@ def test_etalon_from_its_linear_directions():
 def test_wavelength_nodes_follow_the_etalon():
     """Band mean of cos(4π gap/λ) for a gap of 50 µm against the whole table."""
     curve = builders.broad_band()
-    layout = plan_for([make("etalon")], builders.exposures({}), {"band": curve})
+    layout = plan_for(builders.south(effects=(make("etalon"),)), builders.exposures({}), {"band": curve})
     fine = np.linspace(curve.wavelength[0], curve.wavelength[-1], 200_001)
     weight = np.interp(fine, curve.wavelength, curve.throughput)
     exact = np.sum(weight * np.cos(4 * np.pi * 50.0 / fine)) / weight.sum()
@@ -154,16 +192,15 @@ def test_wavelength_nodes_follow_the_etalon():
 def test_wollaston_turned_by_90_degrees_swaps_the_cameras():
     turned = rows(builders.south(effects=(make("wollaston_axis", angle=90.0),)))
     plain = rows(builders.south())
-    assert turned[:, :, 1] == pytest.approx(-plain[:, :, 1], abs=1e-15)
-    assert np.array_equal(turned[:, :, 0], plain[:, :, 0])
+    assert turned[:, 1::2] == pytest.approx(-plain[:, 1::2], abs=1e-15)
+    assert np.array_equal(turned[:, ::2], plain[:, ::2])
 
 
 def test_wollaston_at_45_degrees_sees_u():
     """Identity in front (plates of no thickness): q = 1 splits no longer, u = 1 goes into N0 and N2."""
     device = straight(effects=(make("wollaston_axis", angle=45.0),))
-    empty = dataclasses.replace(device.half1.plate, quartz=jnp.asarray(0.0), mgf2=jnp.asarray(0.0))
-    device = dataclasses.replace(device, half1=dataclasses.replace(device.half1, plate=empty))
-    row = rows(device, x=0.0, y=0.0)[0, 0, 1]
+    device = builders.with_plates(device, 0.0, 0.0, ("half1.plate",))
+    row = rows(device, x=0.0, y=0.0)[0, 1]
     assert row / row[2] == pytest.approx([0.0, 0.0, 1.0, 0.0], abs=1e-4)
 
 
@@ -274,8 +311,10 @@ def test_cut_makes_retardance_odd_in_the_field_angle():
 
 
 def test_cut_of_one_crystal():
-    quartz, mgf2 = make("hwp2_axis_cut", angle=0.5, crystal="mgf2").plates("half2", stack(), conditions())
+    device = builders.south(effects=(make("hwp2_axis_cut", angle=0.5, crystal="mgf2"),))
+    quartz, mgf2 = crystals(device, "half2.plate")
     assert quartz.cut is None
-    assert float(mgf2.cut[0]) == pytest.approx(np.deg2rad(0.5))
+    assert float(mgf2.cut) == pytest.approx(np.deg2rad(0.5))
+    assert all(crystal.cut is None for crystal in crystals(device, "half1.plate"))
     with pytest.raises(ValueError, match="choose quartz or mgf2"):
         make("hwp2_axis_cut", crystal="calcite")

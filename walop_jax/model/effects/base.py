@@ -147,7 +147,9 @@ class Effect(Component):
         return True
 
 
-def check_camera(effect: Effect, camera: int) -> None:
-    """Raise ValueError for a camera number below 0."""
-    if camera < 0:
-        raise ValueError(f"{effect.name}: camera {camera!r} does not exist")
+def check_camera(effect: Effect, camera: int, names: Sequence[str]) -> int:
+    """The number of a camera of an instrument; ValueError where it does not exist."""
+    if not 0 <= camera < len(names):
+        known = ", ".join(f"{number} ({name})" for number, name in enumerate(names))
+        raise ValueError(f"{effect.name}: camera {camera!r} does not exist; cameras are {known}")
+    return camera

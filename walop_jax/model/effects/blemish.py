@@ -69,9 +69,6 @@ class Blemish(Effect):
         "the telescope dithered: a spot stays on the detector, anything of the sky moves"
     )
 
-    def __check_init__(self) -> None:
-        check_camera(self, self.camera)
-
     @classmethod
     def probes(cls, context: Context) -> tuple[tuple[Self, ...], ...]:
         """Spots on a grid over the field, in any of the cameras."""
@@ -80,5 +77,7 @@ class Blemish(Effect):
 
     def patch(self, instrument: Instrument) -> Instrument:
         """Darken the camera around the spot."""
-        spot = Spot(self.x, self.y, self.size, self.depth, self.camera, len(instrument.cameras))
+        names = instrument.cameras.names
+        camera = check_camera(self, self.camera, names)
+        spot = Spot(self.x, self.y, self.size, self.depth, camera, len(names))
         return instrument.with_part("transmission", spot)

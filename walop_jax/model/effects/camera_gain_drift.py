@@ -53,9 +53,6 @@ class CameraGainDrift(Effect):
         "polariser angles in random order: a drift then cannot look like a harmonic of the angle"
     )
 
-    def __check_init__(self) -> None:
-        check_camera(self, self.camera)
-
     @classmethod
     def probes(cls, context: Context) -> tuple[tuple[Self, ...], ...]:
         """Any one of the cameras."""
@@ -63,4 +60,5 @@ class CameraGainDrift(Effect):
 
     def patch(self, instrument: Instrument) -> Instrument:
         """Let the gain of the camera drift."""
-        return instrument.with_part("detectors", GainDrift(self.rate, self.camera))
+        camera = check_camera(self, self.camera, instrument.cameras.names)
+        return instrument.with_part("detectors", GainDrift(self.rate, camera))

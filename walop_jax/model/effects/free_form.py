@@ -58,7 +58,7 @@ class Pattern(Mixing):
     """Smooth changes of q and u elements, fine changes of the response to unpolarised light."""
 
     smooth: Float[Array, "k 2 s"]
-    fine: Float[Array, "k f"]
+    fine: Float[Array, "c f"]  # one of the two may be empty
 
     def vectors(self, vectors: Float[Array, "b k 4"], x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
         """Add the patterns, relative to the response to unpolarised light."""
@@ -76,8 +76,13 @@ class Pattern(Mixing):
 class Shares(ExposurePart):
     """Harmonics of the polariser angle and single exposures."""
 
-    harmonics: Float[Array, "k h 2 g"]
-    exposures: Float[Array, "e k"]
+    harmonics: Float[Array, "c h 2 g"]
+    exposures: Float[Array, "e k"]  # one of the two may be empty
+
+    @property
+    def exposures_known(self) -> int | None:
+        """As many as the block of single exposures was made for."""
+        return len(self.exposures) or None
 
     def share(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"]:
         """What is added, in units of the response to unpolarised light."""

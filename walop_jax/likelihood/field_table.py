@@ -19,15 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from walop_jax.likelihood import limits
 from walop_jax.model import chebyshev
 from walop_jax.model.chebyshev import Rectangle
 
 Vector = Float[np.ndarray, " p"]
 Tree = Any
 """Arrays, or a tuple of them, with the field positions (or the terms of a series) along the first axis."""
-
-HELD_OUT = 48
-"""Places at which a table is checked."""
 
 
 class FieldTable(eqx.Module):
@@ -82,7 +80,7 @@ def held_out(rectangle: Rectangle) -> tuple[Vector, Vector]:
     """
     corners = [(a, b) for a in (0.0, 0.5, 1.0) for b in (0.0, 0.5, 1.0)]
     plastic = 1.324717957244746
-    number = np.arange(1, HELD_OUT - len(corners) + 1)[:, None]
+    number = np.arange(1, limits.CHECKED_PLACES - len(corners) + 1)[:, None]
     unit = np.concatenate([corners, np.mod(number * np.array([1 / plastic, 1 / plastic**2]), 1.0)])
     low, high = np.asarray(rectangle.low), np.asarray(rectangle.high)
     x, y = (low + unit * (high - low)).T

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from walop_jax.likelihood.field_table import FieldTable, accurate_table, held_out
 from walop_jax.model import chebyshev
 from walop_jax.model.chebyshev import Rectangle
-from walop_jax.model.field_table import FieldTable, accurate_table, held_out
 
 LOW, HIGH = np.array([-0.3, -0.1]), np.array([0.2, 0.25])
 RECTANGLE = Rectangle(LOW, HIGH)

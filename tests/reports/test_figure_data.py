@@ -1,4 +1,4 @@
-"""The arrays behind the pictures, from cubes of residuals made by hand; and their file."""
+"""The arrays behind the figures, from cubes of residuals made by hand; and their file."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from astropy.io import fits
 from builders import exposures
 
 from walop_jax.data import DataError
-from walop_jax.diagnosis.figure_data import best_combination, compare
-from walop_jax.diagnosis.figure_file import read_pictures, write_pictures
+from walop_jax.diagnosis.figure_data import best_combination, compare_residuals
+from walop_jax.diagnosis.figure_file import read_figure_data, write_figure_data
 
 ANGLES = 22.5 * np.arange(16)
 SEQUENCE = exposures(
@@ -53,7 +53,7 @@ def test_a_pattern_that_changes_sign_over_the_field_does_not_average_out():
     rng = np.random.default_rng(3)
     wave = np.append(np.cos(3 * np.deg2rad(ANGLES)), np.zeros(4))
     noise = rng.standard_normal((25, 20, 4))
-    one = compare("x", 5.0 * cube(wave) + noise, noise, USED, SEQUENCE)
+    one = compare_residuals("x", 5.0 * cube(wave) + noise, noise, USED, SEQUENCE)
     rms = np.sqrt(np.mean(FIELD**2))
     # Camera by camera the weights have rms 1 and the sign of the pattern: the mean of 5 · FIELD is 5 · rms.
     expected = 5.0 * rms * wave[:, None] * np.abs(CAMERAS[:3])
@@ -67,15 +67,15 @@ def test_points_without_the_exposures_are_not_shown():
     used[3, :16] = False
     wave = np.append(np.cos(2 * np.deg2rad(ANGLES)), np.zeros(4))
     before = np.where(used[..., None], cube(wave), 0.0)
-    one = compare("", before, 0.0 * before, used, SEQUENCE)
+    one = compare_residuals("", before, 0.0 * before, used, SEQUENCE)
     assert np.flatnonzero(np.isnan(one.before).any(axis=1)).tolist() == [3]
     assert np.isfinite(one.mean_before).all()
 
 
-def test_pictures_come_back_from_their_file(tmp_path):
-    made = handmade_run.pictures(("clp_wobble", "ghost"))
-    write_pictures(tmp_path / "diagnosis.fits", made)
-    back = read_pictures(tmp_path / "diagnosis.fits")
+def test_they_come_back_from_their_file(tmp_path):
+    made = handmade_run.figure_data(("clp_wobble", "ghost"))
+    write_figure_data(tmp_path / "diagnosis.fits", made)
+    back = read_figure_data(tmp_path / "diagnosis.fits")
 
     def same(one, other):
         for field in dataclasses.fields(one):
@@ -100,12 +100,12 @@ def test_what_is_not_such_a_file_is_refused(tmp_path):
     path = tmp_path / "other.fits"
     fits.PrimaryHDU().writeto(path)
     with pytest.raises(DataError, match="DIAGVERS: is missing; run walop-jax diagnose again"):
-        read_pictures(path)
+        read_figure_data(path)
     with fits.open(path, mode="update") as hdus:
         hdus[0].header["DIAGVERS"] = 7
     with pytest.raises(DataError, match="is 7, this program reads 1"):
-        read_pictures(path)
+        read_figure_data(path)
     with fits.open(path, mode="update") as hdus:
         hdus[0].header["DIAGVERS"] = 1
     with pytest.raises(DataError, match="cannot be read"):
-        read_pictures(path)
+        read_figure_data(path)
