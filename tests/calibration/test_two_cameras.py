@@ -83,7 +83,7 @@ efficiency = { value = 0.99, sigma = 0.002 }
 LINE = {"line": FilterCurve("line", np.array([0.62]), np.ones(1))}
 SERIES = np.array(
     [[0.60, 0.05, -0.02], [0.55, -0.04, 0.03]]
-)  # 1, Y/h, X/h: order of the terms, left and right
+)  # 1, X/h, Y/h; left and right
 X, Y = np.array([0.0, 0.08, -0.15, 0.05]), np.array([0.0, -0.12, 0.06, 0.15])
 HWP, RET = np.array([0.0, 22.5, 67.0, np.nan]), np.array([10.0, np.nan, 75.0, 33.0])
 
@@ -165,7 +165,7 @@ def typed(x: float, y: float, hwp: float, ret: float, wavelength: float = 0.62) 
     if np.isfinite(ret):
         train = retarder(1.1, 2.0 + ret) @ train
     beams = 0.5 * np.array([[1, 0.99, 0, 0], [1, -0.99, 0, 0]])
-    throughput = SERIES @ [1.0, y / 0.1, x / 0.1]
+    throughput = SERIES @ [1.0, x / 0.1, y / 0.1]
     return throughput[:, None] * (beams @ train)
 
 

@@ -103,7 +103,7 @@ def _stars_of_rows(
     settings: list[Settings],
     setting_of: Int[np.ndarray, " r"],
     offset: float,
-    slope: Float[np.ndarray, " k"],
+    slope: Float[np.ndarray, " n"],
 ) -> Stars:
     points, sigma = catalogue.points, catalogue.sigma[rows]
     _, star = np.unique(catalogue.star[rows], return_inverse=True)
@@ -243,7 +243,7 @@ def linearised(calibration: Calibration, counts: Float[np.ndarray, "n k"]) -> Fl
     return true
 
 
-def _rotator_zero(vectors: AnalysisVectors) -> tuple[float, Float[np.ndarray, " k"]]:
+def _rotator_zero(vectors: AnalysisVectors) -> tuple[float, Float[np.ndarray, " n"]]:
     """What the model adds to ROTATOR (rad), and its derivatives to `vectors.parameters`."""
     to_instrument = with_values(vectors.calibration.model.template)
 
