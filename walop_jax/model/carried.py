@@ -1,8 +1,9 @@
 """What of an instrument holds for other exposures than those it was fitted to, and what stays behind.
 
 The instrument matrix and the analysis of a catalogue know the optics and the cameras. Light of the opposite field
-point, shares of single exposures and detectors that need to know of their exposure do not go with them; a detector
-that asks for nothing but its own counts is undone. Which effects that concerns is found by patching, not declared.
+point, shares of single exposures, optics that change with the time of a run and detectors that need to know of their
+exposure do not go with them; a detector that asks for nothing but its own counts is undone. Which effects that
+concerns is found by patching, not declared.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.model.cameras import DetectorPart
+from walop_jax.model.dependence import needs
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.ray import NotPlannedError
 from walop_jax.model.sources import ExposureArrays
@@ -46,7 +48,9 @@ def left_behind(instrument: Instrument) -> tuple[str, ...]:
     for effect in instrument.effects:
         cameras = effect.patch(bare).cameras
         kept = all(is_undone(part, len(cameras)) for part in cameras.detectors)
-        if cameras.ghosts or cameras.exposures or not kept:
+        # Settings know temperature and hour angle, but no time since the first exposure of a set.
+        timed = "hours" in needs(dataclasses.replace(bare, effects=(effect,))).conditions
+        if cameras.ghosts or cameras.exposures or timed or not kept:
             names.append(effect.name)
     return tuple(names)
 
