@@ -10,7 +10,7 @@ import numpy as np
 from astropy.io import fits
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import Settings
+from walop_jax.data.settings import Settings
 
 EASY = 0.1  # determinant of the 2 × 2 matrix above which one exposure holds q and u
 P, ANGLES = 0.05, 24  # of the sources that the errors are of

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from walop_jax.calibration.calibration import Calibration
-    from walop_jax.calibration.matrix import Settings
     from walop_jax.calibration.residual_map import residual_map
     from walop_jax.data.calset import read_calibration_set
+    from walop_jax.data.settings import Settings
     from walop_jax.data.write import write_calibration_set
     from walop_jax.diagnosis.workflow import diagnose as find_effects
     from walop_jax.fit.misfit import describe as describe_misfit
@@ -68,7 +68,7 @@ _HOME = {
     "Likelihood": ("likelihood.likelihood", "Likelihood"),
     "ObservingPlan": ("simulation.observing_plan", "ObservingPlan"),
     "Sightline": ("model.trace", "Sightline"),
-    "Settings": ("calibration.matrix", "Settings"),
+    "Settings": ("data.settings", "Settings"),
     "apply": ("science.apply", "apply"),
     "base_model": ("fit.model_builder", "base_model"),
     "describe_misfit": ("fit.misfit", "describe"),

@@ -12,10 +12,10 @@ from science.truth import TrueInstrument, chance
 from small_run import WITH_PLATE, small_fit_with_plate
 
 from walop_jax.calibration.calibration import Calibration, at_prior_edge, quality
-from walop_jax.calibration.matrix import Settings
 from walop_jax.calibration.matrix_table import matrix_columns
 from walop_jax.calibration.product import ParameterTable, read_product, write_product
 from walop_jax.data import DataError
+from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import model_for, model_without_data
 from walop_jax.fit.model_file import render
 from walop_jax.fit.refit import FitResult
@@ -64,8 +64,8 @@ def test_matrix_from_the_product_is_that_of_the_fit(calibration, product_file):
     back = Calibration.from_product(read_product(product_file))
     count = len(X)
     settings = Settings(
-        np.full(count, "SDSS-r"), np.array([np.nan, 4000.0, 9000.0]), np.array([np.nan, 45.0, 45.0]),
-        np.full(count, 10.0), np.zeros(count),
+        np.full(count, "SDSS-r"), np.array([np.nan, 4000.0, 9000.0]), np.full(count, 10.0), np.zeros(count),
+        {"CHWP": np.array([np.nan, 45.0, 45.0])},
     )  # fmt: skip
     for ask in (None, settings):
         one, other = calibration.matrix(X, Y, ask), back.matrix(X, Y, ask)
@@ -90,7 +90,7 @@ def test_rows_are_computed_each_with_its_own_numbers(calibration):
     x, y = rng.uniform(-0.25, 0.25, (2, count))
     teff = np.where(rng.random(count) < 0.3, np.nan, rng.uniform(3000, 9000, count))
     plate = np.where(rng.random(count) < 0.5, np.nan, 45.0)
-    settings = Settings(np.full(count, "SDSS-r"), teff, plate, np.full(count, 10.0), np.zeros(count))
+    settings = dataclasses.replace(Settings.default(count).at(CHWP=plate), teff=teff)
     values, covariance = calibration.matrix(x, y, settings)
     for row in (0, 7, 39):
         one = calibration.matrix(x[[row]], y[[row]], settings[np.array([row])])
@@ -141,7 +141,7 @@ def test_cross_talk_of_other_numbers_of_arms(calibration):
 def test_temperature_counts_where_the_model_depends_on_it(result):
     plain = starting(result, "")
     warm = starting(result, '[model]\neffects = ["hwp_temperature"]\n')
-    settings = dataclasses.replace(Settings.default(2), temp=np.array([10.0, 30.0]))
+    settings = dataclasses.replace(Settings.default(2), temperature=np.array([10.0, 30.0]))
     x, values = np.zeros(2), np.tile([0.0, 1, 0, 0, 0, 1], (2, 1))
     assert plain.flags(x, x, settings, values).tolist() == [0, 0]
     assert warm.flags(x, x, settings, values).tolist() == [0, 64]

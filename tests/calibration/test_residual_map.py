@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 
 from walop_jax.calibration import residual_map
-from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_plan
+from walop_jax.calibration.matrix import analysis_vectors
 from walop_jax.calibration.records import residual_names
 from walop_jax.calibration.residual_map import cell_of, cells_for, residual_map_at
 from walop_jax.data.records import Block
+from walop_jax.data.settings import Settings
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.model_builder import base_model
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.planning import plan_for_settings
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -49,7 +51,7 @@ def with_structure(simulated, west):
     e = calset.exposures
     # The lamp, whose colour is not flat.
     lamp = dataclasses.replace(Settings.default(1), teff=e.teff[e.clp_in][:1])
-    plan = settings_plan(lamp, calset.filters, simulated.truth)
+    plan = plan_for_settings(simulated.truth, lamp, calset.filters)
     vectors = analysis_vectors(simulated.truth, plan, block.x, block.y)[:, 0, :, :3]
     twice = 2.0 * np.deg2rad(np.where(e.clp_in, e.clp_angle, 0.0))
     light = np.stack([np.ones(len(e)), np.cos(twice), np.sin(twice)], axis=-1)
@@ -93,9 +95,9 @@ def test_structure_is_found_where_it_is(noiseless, cells, monkeypatch):
     assert (found.chi2[:, :3] > 1e3 * found.chi2[:, 3:]).all()
 
 
-def polariser_only(exposures):
+def polariser_only(settings, through):
     """The Moon sky is in the same setting, and its counts were left alone."""
-    return "SDSS-r", np.nan, exposures.clp_in
+    return settings[:1], through
 
 
 def test_noise_alone_makes_corrections_of_the_size_of_their_errors(cells):
@@ -131,14 +133,14 @@ def test_structure_below_the_noise_of_a_point_stands_out_of_many(cells, monkeypa
 
 def test_the_map_is_of_the_setting_with_the_most_exposures():
     plan = dataclasses.replace(RUN, plate=(None, 45.0), moon_patches=0, grid=4)
-    calset = simulate(plan, seed=1).calset
-    name, angle, chosen = residual_map._main_setting(calset.exposures)
-    assert name == "SDSS-r"
-    assert np.isnan(angle)
-    np.testing.assert_array_equal(chosen, ~calset.exposures.chwp_in)
+    e = simulate(plan, seed=1).calset.exposures
+    setting, chosen = residual_map._main_setting(Settings.of(e, ("CHWP",)), e.clp_in)
+    assert setting.filter[0] == "SDSS-r"
+    assert np.isnan(setting.position("CHWP")[0])
+    np.testing.assert_array_equal(chosen, ~e.chwp_in)
     only = dataclasses.replace(plan, plate=(45.0,))
-    calset = simulate(only, seed=1).calset
-    assert residual_map._main_setting(calset.exposures)[1] == 45.0
+    e = simulate(only, seed=1).calset.exposures
+    assert residual_map._main_setting(Settings.of(e, ("CHWP",)), e.clp_in)[0].position("CHWP")[0] == 45.0
 
 
 def test_cells_without_enough_light_hold_no_number(cells):

@@ -14,8 +14,8 @@ from astropy.table import Table
 
 import walop_jax.calibration.product
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import Settings
 from walop_jax.calibration.product import read_product
+from walop_jax.data.settings import Settings
 from walop_jax.fit import search
 
 SUMMARY_KEYS = (
@@ -193,9 +193,8 @@ def test_matrix_adds_columns(call, run, tmp_path, suffix):
     assert table.colnames[6:] == [*names, *(f"{name}_ERR" for name in names), "FLAG"]
     calibration = Calibration.from_product(read_product(run / "calibration.fits"))
     settings = dataclasses.replace(
-        Settings.default(20),
+        Settings.default(20).at(CHWP=np.where(np.arange(20) % 3 == 0, 45.0, np.nan)),
         teff=np.where(np.arange(20) % 2, 5772.0, np.nan),
-        chwp_angle=np.where(np.arange(20) % 3 == 0, 45.0, np.nan),
     )
     values, covariance = calibration.matrix(x, y, settings)
     for k, name in enumerate(names):

@@ -31,7 +31,9 @@ def test_sample_writes_everything_and_resumes(call, run_folder: Path, tmp_path: 
     assert "NOT converged" in short.stderr
     assert read_product(run / "calibration.fits").content_hash() == before.content_hash()
     assert json.loads((run / "sample.json").read_text())["converged"] is False
-    assert call("sample", run, "--moves", "laplace", "--interval", 40).exit_code == 1, "outputs are there already"
+    assert call("sample", run, "--moves", "laplace", "--interval", 40).exit_code == 1, (
+        "outputs are there already"
+    )
     refused = call("sample", run, "--moves", "laplace", "--interval", 40, "--seed", 1, "--resume")
     assert refused.exit_code == 1
     assert "other settings" in refused.stderr

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
@@ -10,17 +11,19 @@ import pytest
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import read_product
 from walop_jax.data import builtin_filter
+from walop_jax.data.settings import Settings
 from walop_jax.model.build import nominal_instrument
 from walop_jax.model.trace import Sightline, trace
 
 STAR = ("--x", 0.2, "--y", -0.1, "--q", 0.03, "--u", 0.01, "--teff", 5772)
-RAY = Sightline(x=0.2, y=-0.1, q=0.03, u=0.01, teff=5772.0)
+SUN = dataclasses.replace(Settings.default(1), teff=np.array([5772.0]))
+RAY = Sightline(x=0.2, y=-0.1, q=0.03, u=0.01, setting=SUN)
 
 
 def test_as_designed(call):
     result = call("trace", *STAR, "--json")
     assert result.exit_code == 0, result.output
-    told = json.loads(result.stdout)
+    told = json.loads(result.stdout)["stages"]
     stages = trace(nominal_instrument(), builtin_filter("SDSS-r"), RAY)
     assert [stage["stage"] for stage in told] == [stage.name for stage in stages]
     np.testing.assert_allclose(told[-1]["value"], stages[-1].value, rtol=1e-12)
@@ -31,11 +34,11 @@ def test_as_fitted(call, run):
     assert result.exit_code == 0, result.output
     calibration = Calibration.from_product(read_product(run / "calibration.fits"))
     stages = trace(calibration.model.instrument(calibration.values), builtin_filter("SDSS-r"), RAY)
-    np.testing.assert_allclose(json.loads(result.stdout)[-1]["value"], stages[-1].value, rtol=1e-12)
+    np.testing.assert_allclose(json.loads(result.stdout)["stages"][-1]["value"], stages[-1].value, rtol=1e-12)
 
 
 def test_the_table_has_a_line_for_every_stage(call):
-    lines = call("trace", "--angle", 30, "--chwp", 45).stdout.splitlines()
+    lines = call("trace", "--angle", 30, "--at", "CHWP=45").stdout.splitlines()
     starts = [
         "source",
         "collimator",
@@ -51,7 +54,12 @@ def test_the_table_has_a_line_for_every_stage(call):
     assert lines[1].split()[1:4] == ["1.000000", "0.499980", "0.865991"]
 
 
-@pytest.mark.parametrize("options", [("--q", 1.5), ("--instrument", "WALOP-WEST"), ("--filter", "SDSS-rr")])
+WRONG = (
+    ("--q", 1.5), ("--instrument", "WALOP-WEST"), ("--filter", "SDSS-rr"), ("--at", "CHWP"), ("--at", "CHPW=3"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("options", WRONG)
 def test_wrong_usage(call, options):
     assert call("trace", *options).exit_code == 2
 

@@ -8,9 +8,11 @@ from astropy import units
 from astropy.table import MaskedColumn, Table
 
 from walop_jax.data import DataError
-from walop_jax.data.user_tables import field_points, read_input_table, write_output_table
+from walop_jax.data.field_points import field_points
+from walop_jax.data.user_tables import read_input_table, write_output_table
+from walop_jax.model.build import nominal_instrument
 
-SOUTH = "WALOP-SOUTH"
+SOUTH = nominal_instrument("WALOP-SOUTH")
 
 
 def read(path):
@@ -26,10 +28,10 @@ def test_formats_agree(tmp_path, name):
     table.write(tmp_path / name)
     points = read(tmp_path / name)
     np.testing.assert_array_equal(points.x, [0.1, -0.2])
-    np.testing.assert_array_equal(points.teff, [5000.0, np.nan])
-    np.testing.assert_array_equal(points.chwp_angle, [45.0, np.nan])
-    assert points.filter.tolist() == ["SDSS-r", "NB"]
-    np.testing.assert_array_equal(points.temp, [10.0, 10.0])
+    np.testing.assert_array_equal(points.settings.teff, [5000.0, np.nan])
+    np.testing.assert_array_equal(points.settings.position("CHWP"), [45.0, np.nan])
+    assert points.settings.filter.tolist() == ["SDSS-r", "NB"]
+    np.testing.assert_array_equal(points.settings.temperature, [10.0, 10.0])
 
 
 def test_units_are_converted(tmp_path):
@@ -38,16 +40,16 @@ def test_units_are_converted(tmp_path):
     table.write(tmp_path / "p.ecsv")
     points = read(tmp_path / "p.ecsv")
     np.testing.assert_allclose(points.x, [0.1, 0.2], rtol=1e-14)
-    np.testing.assert_allclose(points.temp, [10.0, 20.0], rtol=1e-10)
+    np.testing.assert_allclose(points.settings.temperature, [10.0, 20.0], rtol=1e-10)
 
 
 def test_empty_cells_are_the_defaults(tmp_path):
     (tmp_path / "p.csv").write_text("X,Y,TEFF,FILTER,CHWP_ANGLE,TEMP\n0.1,0,,,,\n0.2,0,4000,NB,45,20\n")
     points = read(tmp_path / "p.csv")
-    assert points.filter.tolist() == ["SDSS-r", "NB"]
-    np.testing.assert_array_equal(points.teff, [np.nan, 4000.0])
-    np.testing.assert_array_equal(points.chwp_angle, [np.nan, 45.0])
-    np.testing.assert_array_equal(points.temp, [10.0, 20.0])
+    assert points.settings.filter.tolist() == ["SDSS-r", "NB"]
+    np.testing.assert_array_equal(points.settings.teff, [np.nan, 4000.0])
+    np.testing.assert_array_equal(points.settings.position("CHWP"), [np.nan, 45.0])
+    np.testing.assert_array_equal(points.settings.temperature, [10.0, 20.0])
 
 
 @pytest.mark.parametrize(

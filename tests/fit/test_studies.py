@@ -16,8 +16,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from walop_jax.calibration.matrix import Settings, matrices
+from walop_jax.calibration.matrix import matrices
 from walop_jax.data.records import CalibrationSet
+from walop_jax.data.settings import Settings
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.minimise import minimise
 from walop_jax.fit.model_builder import base_model

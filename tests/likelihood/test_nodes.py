@@ -10,6 +10,7 @@ import pytest
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood import engine, limits, nodes
+from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.dependence import optical_indices
@@ -99,14 +100,19 @@ def test_optics_that_change_and_ghosts_go_through_the_same_tables():
     same(engine.normal_equations(device, plan, data, table), engine.normal_equations(device, plan, data))
 
 
-def test_error_is_measured(exact, simulated):
+def test_error_is_measured(exact, simulated, monkeypatch):
     """Too few nodes are noticed, and the stated error is that of places nobody asked about."""
     plan, scale = exact.plan, scales(simulated.truth)
-    table, stated = nodes.tabulate(simulated.truth, plan, FIELD, 8, scale)
+    monkeypatch.setattr(limits, "NODES_PER_SIDE", (8,))
+    table, stated = nodes.accurate_nodes(simulated.truth, plan, FIELD, scale)
+    assert table is None
     assert nodes.TOLERANCE < stated < 0.01
+    monkeypatch.setattr(nodes, "TOLERANCE", 0.01)
+    table, again = nodes.accurate_nodes(simulated.truth, plan, FIELD, scale)
+    assert again == stated
     x, y = np.random.default_rng(3).uniform(-0.3, 0.3, (2, limits.SOLVED_TOGETHER))
-    rows, _ = nodes._solve(simulated.truth, plan, jnp.asarray(x), jnp.asarray(y))
-    between, _ = nodes._interpolate(table, jnp.asarray(x), jnp.asarray(y))
+    rows, _ = nodes.solved_optics(simulated.truth, plan, x, y)
+    between, _ = table(jnp.asarray(x), jnp.asarray(y))
     assert 0.1 * stated < np.abs(np.asarray(between - rows)).max() < 3.0 * stated
 
 
@@ -124,13 +130,13 @@ def test_what_cannot_be_interpolated_is_solved_point_by_point(simulated, exact, 
 
 def test_as_many_nodes_as_nearby_are_tried_first(quick, monkeypatch):
     here = quick.expand(quick.model.start)
-    tried, tabulate = [], nodes.tabulate
+    tried, through = [], FieldTable.through
 
-    def noted(*arguments):
-        tried.append(arguments[-2])
-        return tabulate(*arguments)
+    def noted(rectangle, count, values, **options):
+        tried.append(count)
+        return through(rectangle, count, values, **options)
 
-    monkeypatch.setattr(nodes, "tabulate", noted)
+    monkeypatch.setattr(FieldTable, "through", noted)
     again = quick.expand(quick.model.start, near=here)
     assert tried == [here.optics.nodes_per_side]
     assert again.optics == here.optics

@@ -34,10 +34,11 @@ import numpy as np
 import pytest
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_plan
+from walop_jax.calibration.matrix import analysis_vectors
 from walop_jax.calibration.residual_map import residual_map
 from walop_jax.data import Grid, read_calibration_set, write_frames
 from walop_jax.data.records import Block, CalibrationSet, Intensities
+from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood import engine, limits
@@ -45,6 +46,7 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.points import StreamedPoints
 from walop_jax.model.light import instrument_matrix
 from walop_jax.model.parameters import values_of
+from walop_jax.model.planning import plan_for_settings
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -195,7 +197,7 @@ def matrix_error(calset, truth, result) -> tuple[float, float]:
     x, y = (part.ravel() for part in np.meshgrid(*[np.linspace(-0.23, 0.23, 11)] * 2))
     calibration = Calibration.from_fit(result)
     found, covariance = calibration.matrix(x, y)
-    plan = settings_plan(Settings.default(1), calset.filters, truth)
+    plan = plan_for_settings(truth, Settings.default(1), calset.filters)
     exact = instrument_matrix(jnp.asarray(analysis_vectors(truth, plan, x, y)[:, 0]))
     error = found - np.asarray(exact).reshape(len(x), 6)
     return float(np.sqrt(np.mean(error**2))), float(

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from walop_jax.data import builtin_filter
+from walop_jax.data.settings import Settings
 from walop_jax.model import light
 from walop_jax.model.build import nominal_instrument
 from walop_jax.model.effects import effect_by_name
@@ -17,12 +18,17 @@ from walop_jax.model.effects.base import Context
 from walop_jax.model.planning import plan_for
 from walop_jax.model.trace import STOKES, Sightline, Stage, trace
 
+
+def setting(plate: float | None, teff: float = np.nan) -> Settings:
+    return dataclasses.replace(Settings.default(1, "band").at(CHWP=plate), teff=np.array([teff]))
+
+
 SIGHTLINES = {
     "unpolarised star on axis": Sightline(),
-    "star": Sightline(x=0.2, y=-0.13, q=0.031, u=-0.02, teff=5772.0),
-    "star, plate in": Sightline(x=-0.25, y=0.11, q=0.031, u=-0.02, chwp_angle=45.0, teff=9000.0),
+    "star": Sightline(x=0.2, y=-0.13, q=0.031, u=-0.02, setting=setting(None, 5772.0)),
+    "star, plate in": Sightline(x=-0.25, y=0.11, q=0.031, u=-0.02, setting=setting(45.0, 9000.0)),
     "polariser": Sightline(x=0.1, y=0.28, clp_angle=33.0),
-    "polariser, plate in": Sightline(x=0.1, y=0.28, clp_angle=123.0, chwp_angle=0.0, teff=3000.0),
+    "polariser, plate in": Sightline(x=0.1, y=0.28, clp_angle=123.0, setting=setting(0.0, 3000.0)),
 }
 CONTEXT = Context(exposures=1, sources=("STD00",))
 
@@ -41,7 +47,12 @@ def counts_of(instrument, sightline: Sightline) -> np.ndarray:
     )
     instrument = instrument.with_source(standard)
     band = builders.broad_band()
-    plan = plan_for(instrument, sightline.exposure(band.name), {band.name: band})
+    row = {"kind": "standard", "rotator": 0.0, "teff": float(sightline.setting.teff[0])}
+    if np.isfinite(sightline.clp_angle):
+        row["clp_angle"] = sightline.clp_angle
+    if np.isfinite(plate := sightline.setting.position("CHWP")[0]):
+        row["chwp_angle"] = float(plate)
+    plan = plan_for(instrument, builders.exposures(row), {band.name: band})
     x, y = jnp.asarray(sightline.x), jnp.asarray(sightline.y)
     rows = light.band_rows(instrument, plan, x, y)
     source, sky = jnp.asarray([1]), jnp.zeros((1, 2))
@@ -96,7 +107,7 @@ def test_half_wave_plate_at_45_degrees_turns_x_into_y():
     # On axis the retardance is 2π (2407 µm Δn(quartz) − 1930 µm Δn(MgF2)) / λ, of Q its cosine is left.
     # Δn at 0.62 µm: 0.00906 and 0.01179 (handbook values; the plates are 35 and 37 waves thick).
     stages = trace(
-        nominal_instrument(), builders.monochromatic(0.62), Sightline(clp_angle=0.0, chwp_angle=45.0)
+        nominal_instrument(), builders.monochromatic(0.62), Sightline(clp_angle=0.0, setting=setting(45.0))
     )
     np.testing.assert_allclose(named(stages, "source")[0], [1, 1, 0, 0], atol=5e-5)
     behind = named(stages, "chwp")[0]

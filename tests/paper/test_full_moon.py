@@ -102,10 +102,11 @@ def test_scheme_takes_offsets_from_the_sky(clean):
     calset = simulate(dataclasses.replace(PLAN, grid=12), seed=11).calset  # the same instrument, more points
     made = paper.fit_paper(calset)
     scheme = moon.full_moon_scheme(calset, made)
-    from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+    from walop_jax.calibration.analysis_vectors import AnalysisVectors
+    from walop_jax.data.settings import Settings
 
     vectors = AnalysisVectors(calibration).coloured(
-        Setting("SDSS-r"), made.x, made.y, np.full(len(made.x), PLAN.teff)
+        Settings.default(1), made.x, made.y, np.full(len(made.x), PLAN.teff)
     )
     outside = np.abs(accuracy.determinant(vectors)) > 0.3
     stars = paper.sample_stars()

@@ -10,11 +10,13 @@ from between_points import WORST, between_points
 from science.truth import TrueInstrument
 from scipy import stats
 
-from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.catalogue import read_catalogue
+from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
+from walop_jax.model.build import nominal_instrument
 from walop_jax.paper import polynomial as paper
 from walop_jax.science import star_errors as accuracy
 from walop_jax.science.apply import apply
@@ -36,8 +38,8 @@ def errors_of_both(result, truth):
         ("between", *(truth.table[k] for k in "XY"), made.between(truth.table["X"], truth.table["Y"])),
     ):
         true = truth.vectors(x, y)
-        joint = analysis.exact(Setting("SDSS-r"), x, y, [TEFF])[:, 0]
-        outside = np.abs(accuracy.determinant(true)) >= SMALLEST_DETERMINANT
+        joint = analysis.exact(Settings.default(1), x, y, [TEFF])[:, 0]
+        outside = accuracy.determinant(true) >= SMALLEST_DETERMINANT
         seen = paper.measured_qu(paper.transmitted(true, stars))
         for method, errors in (
             ("paper", accuracy.star_errors(local.recover(seen), stars)),
@@ -96,7 +98,10 @@ def errors_of_pairs(result, truth):
     analysis = AnalysisVectors(Calibration.from_fit(result))
     errors = {}
     for name, pair in PAIRS.items():
-        ours = [turned(analysis.exact(Setting("SDSS-r", plate), x, y, [TEFF])[:, 0], r) for plate, r in pair]
+        ours = [
+            turned(analysis.exact(Settings.default(1).at(CHWP=plate), x, y, [TEFF])[:, 0], r)
+            for plate, r in pair
+        ]
         theirs = [turned(truth.vectors(x, y, plate), r) for plate, r in pair]
         counts = np.stack([1e6 * paper.transmitted(v, sample) for v in theirs], axis=2)
         n, m, r, _ = counts.shape
@@ -171,7 +176,7 @@ def observe(result, truth, electrons, tmp_path):
         rows.append(row)
     whole = Table({name: np.concatenate([r[name] for r in rows]) for name in rows[0].colnames})
     whole.write(tmp_path / "c.fits", overwrite=True)
-    catalogue = read_catalogue(read_input_table(tmp_path / "c.fits"), "WALOP-SOUTH")
+    catalogue = read_catalogue(read_input_table(tmp_path / "c.fits"), nominal_instrument())
     found = apply(Calibration.from_fit(result), catalogue)
     # Two rotator angles 45° apart bring u back everywhere: no star is flagged, and none is lost.
     assert np.all(found.flag == 0)

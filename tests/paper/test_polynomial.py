@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.data import DataError
+from walop_jax.data.settings import Settings
 from walop_jax.paper import comparison
 from walop_jax.paper import polynomial as paper
 from walop_jax.science import star_errors as accuracy
@@ -143,7 +144,7 @@ def test_promised_errors_are_the_covariance(calibration):
     """Against a set of wrong calibrations: root mean square of `joint_errors` over draws."""
     import dataclasses
 
-    analysis, setting = AnalysisVectors(calibration), Setting("SDSS-r")
+    analysis, setting = AnalysisVectors(calibration), Settings.default(1)
     x, y, stars = np.array([-0.1, 0.05, 0.2]), np.array([-0.1, -0.2, 0.1]), paper.sample_stars(5)
     promised = accuracy.promised_errors(analysis, setting, x, y, stars)
     reference = analysis.exact(setting, x, y, [np.nan])[:, 0]

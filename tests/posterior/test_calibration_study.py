@@ -19,11 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_plan
+from walop_jax.calibration.matrix import analysis_vectors
+from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.parameters import with_values
+from walop_jax.model.planning import plan_for_settings
 from walop_jax.posterior import Options, sample
 from walop_jax.posterior.target import Target
 
@@ -52,7 +54,7 @@ class Study:
         model = self.worlds.model
         axis = np.linspace(-0.25, 0.25, 4)
         self.x, self.y = (v.ravel() for v in np.meshgrid(axis, axis))
-        self.plan = settings_plan(Settings.default(1), self.worlds.blank.filters, model.template)
+        self.plan = plan_for_settings(model.template, Settings.default(1), self.worlds.blank.filters)
         to_instrument = with_values(model.template)
 
         def matrix(values: jax.Array, plan: object, x: jax.Array, y: jax.Array) -> jax.Array:

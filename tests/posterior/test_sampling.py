@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import Settings, matrices
+from walop_jax.calibration.matrix import matrices
+from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import write_columns

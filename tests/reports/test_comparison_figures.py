@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from small_run import small_fit
 
-from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.data.settings import Settings
 from walop_jax.paper.comparison import compare
 from walop_jax.reports import comparison_figures as figures
 from walop_jax.science.star_errors import plate_errors
@@ -55,7 +56,7 @@ def test_plates_and_the_strip(calibration_and_set):
     """Near the lower left corner the instrument is nearly ideal; in the strip only 22.5° helps."""
     calibration, _ = calibration_and_set
     analysis = AnalysisVectors(calibration)
-    out, zero, exchange, quarter = (Setting("SDSS-r", plate) for plate in (None, 0.0, 22.5, 45.0))
+    out, zero, exchange, quarter = (Settings.default(1).at(CHWP=plate) for plate in (None, 0.0, 22.5, 45.0))
     x, y = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(-0.28, 0.28, 15)]))
     alone = plate_errors(analysis, [out], x, y)
     assert alone.min() == pytest.approx(1.0, abs=0.05)

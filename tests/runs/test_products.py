@@ -12,6 +12,7 @@ import pytest
 import walop_jax.runs.report
 from walop_jax.calibration.product import read_product, write_product
 from walop_jax.data import builtin_filter
+from walop_jax.data.settings import Settings
 from walop_jax.io.errors import DataError
 from walop_jax.model.trace import Sightline, trace
 from walop_jax.runs.certify import certify_product
@@ -82,16 +83,17 @@ def test_a_report_that_fails_leaves_the_old_one(fitted: FittedSet, tmp_path: Pat
 
 
 def test_light_is_traced_through_what_was_fitted(fitted: FittedSet):
-    ray = Sightline(x=0.2, y=-0.1, q=0.03, u=0.01, teff=5772.0)
+    sun = dataclasses.replace(Settings.default(1), teff=np.array([5772.0]))
+    ray = Sightline(x=0.2, y=-0.1, q=0.03, u=0.01, setting=sun)
     curve = builtin_filter("SDSS-r")
     expected = trace(fitted.calibration.model.instrument(fitted.calibration.values), curve, ray)
-    np.testing.assert_allclose(trace_source(ray, fitted.run)[-1].value, expected[-1].value, rtol=1e-12)
-    designed = trace_source(ray, instrument="walop-south")
+    np.testing.assert_allclose(trace_source(ray, fitted.run).stages[-1].value, expected[-1].value, rtol=1e-12)
+    designed = trace_source(ray, instrument="walop-south").stages
     assert np.abs(designed[-1].value - expected[-1].value).max() > 1e-4
     with pytest.raises(ValueError, match="WALOP-SOUTH"):
         trace_source(ray, instrument="WALOP-SUOTH")
     with pytest.raises(DataError, match="SDSS-rr"):
-        trace_source(ray, fitted.run, filter_name="SDSS-rr")
+        trace_source(Sightline(setting=Settings.default(1, "SDSS-rr")), fitted.run)
 
 
 def test_the_base_model_and_a_run_have_the_same_sources(fitted: FittedSet):

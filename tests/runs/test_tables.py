@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from astropy.table import Table
 
+from walop_jax.calibration.product import write_product
 from walop_jax.calibration.records import Quality
 from walop_jax.io.errors import DataError
+from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.model.trace import Sightline
 from walop_jax.runs.apply import apply_to_catalogue
 from walop_jax.runs.matrix import tabulate_matrix
+from walop_jax.runs.trace import trace_source
 
 from .conftest import FittedSet, assert_same_files
 
@@ -69,6 +75,44 @@ def test_a_catalogue(call, fitted: FittedSet, catalogue: Path, tmp_path: Path):
     assert (found.rows, found.stars, found.flags[Quality.NO_STOKES]) == (6, 6, 1)
     assert "1 star(s) without a result" in found.warnings[0]
     assert found.document()["flags"]["16384"] == 1
+
+
+@pytest.fixture
+def drifting(fitted: FittedSet, tmp_path: Path) -> Path:
+    """The folder of a run whose model has a drift of single exposures, at the values of the fit."""
+    old = fitted.calibration
+    context = effect_context(old.model.template, old.exposures)
+    model = with_effects(old.model, ["camera_gain_drift"], context)
+    place = np.array([model.index(name) for name in old.model.names])
+    values, covariance = model.start.copy(), np.zeros((len(model.names),) * 2)
+    values[place], covariance[np.ix_(place, place)] = old.values, old.covariance
+    changed = dataclasses.replace(old, model=model, values=values, covariance=covariance)
+    (tmp_path / "RUN").mkdir()
+    write_product(tmp_path / "RUN" / "calibration.fits", changed.to_product())
+    return tmp_path / "RUN"
+
+
+def test_effects_that_cannot_be_carried_over_are_named(
+    call, fitted: FittedSet, drifting: Path, points: Path, catalogue: Path, tmp_path: Path
+):
+    """In a warning, in the document and in the header; the rest is what it is without them."""
+    for function, source in ((tabulate_matrix, points), (apply_to_catalogue, catalogue)):
+        found = function(drifting, source, tmp_path / "o.fits", overwrite=True)
+        plain = function(fitted.run, source, tmp_path / "plain.fits", overwrite=True)
+        assert found.not_carried_over == ("camera_gain_drift",)
+        assert found.document()["not_carried_over"] == ["camera_gain_drift"]
+        assert any("camera_gain_drift" in sentence and "left out" in sentence for sentence in found.warnings)
+        assert plain.document()["not_carried_over"] == []
+        one, other = Table.read(tmp_path / "o.fits"), Table.read(tmp_path / "plain.fits")
+        assert one.meta["NOTCARR"] == "camera_gain_drift"
+        assert "NOTCARR" not in other.meta
+        name = "M22" if function is tabulate_matrix else "Q"
+        np.testing.assert_allclose(one[name], other[name], rtol=0, atol=1e-12)
+    traced = trace_source(Sightline(), drifting)
+    assert traced.document()["not_carried_over"] == ["camera_gain_drift"]
+    result = call("trace", drifting, "--json")
+    assert "camera_gain_drift" in result.stderr
+    assert json.loads(result.stdout)["not_carried_over"] == ["camera_gain_drift"]
 
 
 def test_what_cannot_be_is_said_before_any_work(fitted: FittedSet, catalogue: Path, tmp_path: Path):

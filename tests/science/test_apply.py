@@ -10,19 +10,24 @@ import pytest
 from astropy.table import Table
 from small_run import SEED, WITH_PLATE
 
-from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
-from walop_jax.calibration.matrix import Settings
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.data import DataError
 from walop_jax.data.catalogue import read_catalogue
+from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.model.build import nominal_instrument
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, make_model, with_effects
 from walop_jax.science import apply as application
-from walop_jax.science.apply import apply, linearised, not_carried_over
+from walop_jax.science.apply import apply, linearised
 from walop_jax.simulation.simulate import simulate
 
-SOUTH = "WALOP-SOUTH"
+SOUTH = nominal_instrument("WALOP-SOUTH")
+
+
+def setting(plate=None) -> Settings:
+    """SDSS-r, the calibration plate at an angle (deg) or out."""
+    return Settings.default(1).at(CHWP=plate)
 
 
 @pytest.fixture(scope="module")
@@ -44,21 +49,21 @@ def stars(vectors, count, rng=None, plate=(None,), rotator=None, flux=4e6, teff=
     """A table of stars with exact vectors, every star once for each setting of the plate; and its truth."""
     draw = np.random.default_rng(8)
     x, y = draw.uniform(-0.28, 0.28, (2, count))
-    p, angle = draw.uniform(0, 0.05, count), draw.uniform(0, np.pi, count)
-    qu = np.stack([p * np.cos(2 * angle), p * np.sin(2 * angle)], axis=1)
+    p, evpa = draw.uniform(0, 0.05, count), draw.uniform(0, np.pi, count)
+    qu = np.stack([p * np.cos(2 * evpa), p * np.sin(2 * evpa)], axis=1)
     rows = []
-    for k, setting in enumerate(plate):
+    for k, angle in enumerate(plate):
         turn = 0.0 if rotator is None else 2 * np.deg2rad(rotator[k])
         seen = (qu[:, 0] + 1j * qu[:, 1]) * np.exp(
             -1j * turn
         )  # docs: conventions, EVPA in the ICS = sky − ROTATOR
-        a = vectors.exact(Setting("SDSS-r", setting), x, y, [teff])[:, 0]
+        a = vectors.exact(setting(angle), x, y, [teff])[:, 0]
         n = flux * np.einsum("pks,ps->pk", a, np.stack([np.ones(count), seen.real, seen.imag], axis=1))
         error = np.sqrt(n + 900.0)
         if rng is not None:
             n = n + error * rng.standard_normal(n.shape)
         row = Table({"ID": np.arange(count), "X": x, "Y": y, "N": n, "N_ERR": error})
-        row["CHWP_ANGLE"] = np.nan if setting is None else setting
+        row["CHWP_ANGLE"] = np.nan if angle is None else angle
         row["TEFF"] = teff
         if rotator is not None:
             row["ROTATOR"] = rotator[k]
@@ -81,11 +86,9 @@ def test_series_meet_the_optics(vectors, calibration):
     x, y = rng.uniform(-0.34, 0.34, (2, 60))
     teff = np.where(np.arange(60) % 4 == 0, np.nan, rng.uniform(2000, 30000, 60))
     for plate in (None, 22.5):
-        a = vectors.coloured(Setting("SDSS-r", plate), x, y, teff)
+        a = vectors.coloured(setting(plate), x, y, teff)
         rows = [(a[:, i] - a[:, i + 1]) / (a[:, i, :1] + a[:, i + 1, :1]) for i in (0, 2)]
-        settings = dataclasses.replace(
-            Settings.default(60), teff=teff, chwp_angle=np.full(60, np.nan if plate is None else plate)
-        )
+        settings = dataclasses.replace(Settings.default(60).at(CHWP=plate), teff=teff)
         values, _ = calibration.matrix(x, y, settings)
         np.testing.assert_allclose(np.concatenate(rows, axis=1), values, atol=1e-6)
 
@@ -93,8 +96,7 @@ def test_series_meet_the_optics(vectors, calibration):
 def test_derivatives_meet_differences(vectors, calibration):
     """To every parameter the vectors depend on, by changing it; one step of one standard error."""
     x, y, teff = np.array([0.11, -0.2]), np.array([0.2, 0.05]), np.array([np.nan, 4500.0])
-    setting = Setting("SDSS-r", 22.5)
-    local = vectors.derivatives(setting, x, y, teff)
+    local = vectors.derivatives(setting(22.5), x, y, teff)
     gain = np.random.default_rng(1).standard_normal((2, 2, 4))
     s = np.array([1.0, 0.02, -0.01])
     plain, throughput = (gain @ np.einsum("s,rksf->rkf", s, part) for part in local)
@@ -107,7 +109,7 @@ def test_derivatives_meet_differences(vectors, calibration):
             values = calibration.values.copy()
             values[index] += sign * step
             there = AnalysisVectors(dataclasses.replace(calibration, values=values))
-            a = there.exact(setting, x, y, [np.nan, 4500.0])[[0, 1], [0, 1]]
+            a = there.exact(setting(22.5), x, y, [np.nan, 4500.0])[[0, 1], [0, 1]]
             shifted.append(np.einsum("rik,rks,s->ri", gain, a, s))
         difference = (shifted[0] - shifted[1]) / (2 * step)
         scale = np.abs(difference).max()
@@ -154,8 +156,9 @@ def _brute_force(calibration, catalogue):
     points = catalogue.points
     a = np.empty((len(catalogue), 4, 3))
     for plate in (None, 22.5):
-        rows = np.isnan(points.chwp_angle) if plate is None else points.chwp_angle == plate
-        a[rows] = vectors.exact(Setting("SDSS-r", plate), points.x[rows], points.y[rows], [np.nan])[:, 0]
+        angle = points.settings.position("CHWP")
+        rows = np.isnan(angle) if plate is None else angle == plate
+        a[rows] = vectors.exact(setting(plate), points.x[rows], points.y[rows])[:, 0]
     out = []
     for star in range(catalogue.star.max() + 1):
         rows = np.flatnonzero(catalogue.star == star)
@@ -216,9 +219,9 @@ def vectors_of_single_rows_differ(vectors, table):
     for plate in (None, 22.5):
         rows = table[np.isnan(table["CHWP_ANGLE"]) if plate is None else table["CHWP_ANGLE"] == plate]
         columns = [np.array(rows[name], float) for name in ("X", "Y", "TEFF")]
-        together = vectors.coloured(Setting("SDSS-r", plate), *columns)
+        together = vectors.coloured(setting(plate), *columns)
         for i, one in enumerate(together):
-            single = vectors.coloured(Setting("SDSS-r", plate), *(column[[i]] for column in columns))[0]
+            single = vectors.coloured(setting(plate), *(column[[i]] for column in columns))[0]
             worst = max(worst, float(np.abs(single - one).max() / np.abs(one).max()))
     return worst
 
@@ -267,7 +270,7 @@ def test_the_zone_without_u(vectors, calibration, tmp_path):
     values, _ = calibration.matrix(x.ravel(), y.ravel())
     blind = np.argsort(np.abs(values[:, 1] * values[:, 5] - values[:, 2] * values[:, 4]))[:5]
     base = Table({"X": x.ravel()[blind], "Y": y.ravel()[blind], "ID": np.arange(5)})
-    a = {p: vectors.exact(Setting("SDSS-r", p), base["X"], base["Y"], [np.nan])[:, 0] for p in (None, 22.5)}
+    a = {p: vectors.exact(setting(p), base["X"], base["Y"])[:, 0] for p in (None, 22.5)}
 
     def error(*rows):
         parts = []
@@ -298,11 +301,10 @@ def test_detectors_and_rotator_of_the_model(calset, calibration, tmp_path):
     there = _with(calibration, model)
     counts = np.array([[1e5, 5e5, 1e6, 2e6]])
     np.testing.assert_allclose(linearised(there, counts * (1 + 0.02 * counts / 1e6)), counts, rtol=1e-12)
-    assert not_carried_over(there) == ()
+    assert there.left_behind == ()
     drift = effect_by_name("camera_gain_drift").of(context)
-    assert not_carried_over(_with(calibration, with_effects(calibration.model, [drift], context))) == (
-        "camera_gain_drift",
-    )
+    drifting = _with(calibration, with_effects(calibration.model, [drift], context))
+    assert drifting.left_behind == ("camera_gain_drift",)
     turned = _with(
         calibration,
         with_effects(calibration.model, [effect_by_name("rotator_zero").of(context, angle=2.0)], context),
@@ -416,8 +418,8 @@ def test_every_instrument_can_be_tabulated(calibration, instrument, edge):
     )
     vectors = AnalysisVectors(other)
     assert vectors.half_width == pytest.approx(min(1.25 * edge, 45.0))
-    series = vectors._vector_series(Setting("SDSS-r"))
-    assert series.half_width == vectors.half_width
+    table = vectors._vector_table(setting())
+    np.testing.assert_array_equal(table.rectangle.high, vectors.half_width)
 
 
 @pytest.mark.benchmark

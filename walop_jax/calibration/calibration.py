@@ -14,18 +14,20 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from jaxtyping import Float, Int
 
-from walop_jax.calibration.matrix import Settings, matrices
+from walop_jax.calibration.matrix import matrices
 from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, ParameterTable, Verdict, in_ascii
 from walop_jax.calibration.records import Quality, ResidualMap
 from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter
 from walop_jax.data.frames import Grid
-from walop_jax.data.records import Exposures, FilterCurve, InputFile, Site, Sources
+from walop_jax.data.records import CALIBRATION_PLATE, Exposures, FilterCurve, InputFile, Site, Sources
+from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import model_without_data, standard_names
 from walop_jax.fit.model_file import render
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult
 from walop_jax.instruments.description import parsed
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.software import software_versions
+from walop_jax.model import carried
 from walop_jax.model.build import adapted, build, nominal_instrument
 from walop_jax.model.dependence import needs
 from walop_jax.model.instrument import Instrument
@@ -107,13 +109,35 @@ class Calibration:
     ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
         """m21, m22, m23, m31, … and their covariance at field positions (deg), a setting for each.
 
-        Without `settings`: SDSS-r, a flat photon spectrum, calibration plate out. Raises `DataError` for a
-        filter that neither the calibration nor the package knows.
+        Without `settings` those of `usual_settings`. Raises `DataError` for a filter that neither the calibration
+        nor the package knows, and ValueError for a moving element that the instrument does not have.
         """
-        settings = settings or Settings.default(len(x))
+        settings = settings or self.usual_settings(len(x))
         filters = {str(name): self.filter_curve(str(name)) for name in np.unique(settings.filter)}
         instrument = self.model.instrument(self.values)
         return matrices(instrument, settings, filters, np.asarray(x), np.asarray(y), self.covariance)
+
+    def usual_settings(self, count: int = 1, filter_name: str = DEFAULT_FILTER) -> Settings:
+        """Flat photon spectrum, 10 °C, on the meridian, moving elements out.
+
+        Those `always_in` stand where they did in most exposures, as without them the instrument was never seen.
+        """
+        settings = Settings.default(count, filter_name)
+        for prefix in self.always_in:
+            angles, number = np.unique(self.exposures.position(prefix).angle, return_counts=True)
+            settings = settings.at(**{prefix: float(angles[np.argmax(number)])})
+        return settings
+
+    @property
+    def always_in(self) -> tuple[str, ...]:
+        """Column prefixes of the moving elements, calibration plate apart, that were in the beam in all exposures."""
+        moving = (p for p in self.model.template.patched().moving() if p != CALIBRATION_PLATE)
+        return tuple(prefix for prefix in moving if self.exposures.position(prefix).inside.all())
+
+    @property
+    def left_behind(self) -> tuple[str, ...]:
+        """Effects of the model of which a part belongs to its exposures, so that no matrix and no star can have it."""
+        return carried.left_behind(self.model.template)
 
     def filter_curve(self, name: str) -> FilterCurve:
         """The curve of a filter; `DataError` with the nearest names when there is none."""
@@ -129,18 +153,19 @@ class Calibration:
         x: Float[np.ndarray, " p"],
         y: Float[np.ndarray, " p"],
         settings: Settings,
-        values: Float[np.ndarray, "p m"],
+        values: Float[np.ndarray, "p m"] | None = None,
     ) -> Int[np.ndarray, " p"]:
-        """Bits of `Quality` of matrices at field positions: high cross-talk, beyond the field or the settings.
+        """Bits of `Quality` at field positions: beyond the field or the settings; for matrices, high cross-talk.
 
         A single arm sees one combination of q and u, which has no inverse: it is marked only where it sees neither.
         """
         flags = np.zeros(len(x), np.int64)
-        blocks = values.reshape(len(x), values.shape[1] // 3, 3)[:, :, 1:]
-        known = np.all(np.isfinite(values), axis=1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            condition = np.linalg.cond(np.where(known[:, None, None], blocks, np.eye(*blocks.shape[1:])))
-        flags[~(condition <= HIGH_CROSSTALK)] |= Quality.HIGH_CROSSTALK
+        if values is not None:
+            blocks = values.reshape(len(x), values.shape[1] // 3, 3)[:, :, 1:]
+            known = np.all(np.isfinite(values), axis=1)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                condition = np.linalg.cond(np.where(known[:, None, None], blocks, np.eye(*blocks.shape[1:])))
+            flags[~(condition <= HIGH_CROSSTALK)] |= Quality.HIGH_CROSSTALK
         margin = 0.5 / MAP_SIZE * (self.field[1] - self.field[0])
         low_x, low_y = self.field[0] - margin, self.field[2] - margin
         high_x, high_y = self.field[1] + margin, self.field[3] + margin
@@ -148,14 +173,16 @@ class Calibration:
         flags[~np.isin(settings.filter, np.unique(self.exposures.filter))] |= Quality.BEYOND_SETTINGS
         if "temperature" in needs(self.model.template).conditions:
             low, high = np.nanmin(self.exposures.temp), np.nanmax(self.exposures.temp)
-            beyond = (settings.temp < low - TEMPERATURE_MARGIN) | (settings.temp > high + TEMPERATURE_MARGIN)
+            beyond = (settings.temperature < low - TEMPERATURE_MARGIN) | (
+                settings.temperature > high + TEMPERATURE_MARGIN
+            )
             flags[beyond] |= Quality.BEYOND_SETTINGS
         return flags
 
     def maps(self, size: int = MAP_SIZE) -> MatrixMaps:
         """The matrix over the field on a regular grid, for a look at it.
 
-        Through SDSS-r, or the first filter of the exposures where they do not use that.
+        In `usual_settings`, through SDSS-r or the first filter of the exposures where they do not use that.
         """
         used = [str(name) for name in np.unique(self.exposures.filter)]
         name = DEFAULT_FILTER if DEFAULT_FILTER in used or not used else used[0]
@@ -164,10 +191,13 @@ class Calibration:
         centre = 0.5 * (size + 1)
         grid = Grid(size, size, (centre, centre), (0.0, 0.0), ((step, 0.0), (0.0, step)))
         points = grid.points
-        values, covariance = self.matrix(points.x, points.y, Settings.default(size * size, name))
+        settings = self.usual_settings(size * size, name)
+        values, covariance = self.matrix(points.x, points.y, settings)
         errors = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
         planes = (-1, size, size)
-        return MatrixMaps(grid, name, values.T.reshape(planes), errors.T.reshape(planes))
+        return MatrixMaps(
+            grid, name, values.T.reshape(planes), errors.T.reshape(planes), settings[:1].further()
+        )
 
     # ------------------------------------------------------------------------------- into a file and back
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import CalibrationProduct
 from walop_jax.calibration.records import Quality
@@ -114,8 +114,8 @@ def _parents(product: CalibrationProduct) -> Check:
 
 def _maps(product: CalibrationProduct, calibration: Calibration) -> Check:
     again = calibration.maps(product.maps.values.shape[1])
-    if again.grid != product.maps.grid:
-        return Check("maps", False, "do not lie on the grid that this program makes")
+    if again.grid != product.maps.grid or again.positions != product.maps.positions:
+        return Check("maps", False, "are not of the grid and setting that this program makes")
     off = float(np.abs(again.values - product.maps.values).max())
     errors = float(np.abs(again.errors / np.maximum(product.maps.errors, 1e-30) - 1.0).max())
     return Check(
@@ -124,11 +124,14 @@ def _maps(product: CalibrationProduct, calibration: Calibration) -> Check:
 
 
 def _physics(calibration: Calibration) -> Check:
-    """No camera sees less than no light, whatever the polarisation: a₀ ≥ √(a₁² + a₂²)."""
+    """In no arm does a camera see less than no light, whatever the polarisation: a₀ ≥ √(a₁² + a₂²)."""
     limit = min(calibration.model.template.field_limit, float(np.abs(calibration.field).max()))
     x, y = np.random.default_rng(0).uniform(-limit, limit, (2, _POINTS))
-    name = str(np.unique(calibration.exposures.filter)[0])
-    vectors = AnalysisVectors(calibration).exact(Setting(name), x, y, [np.nan])[:, 0]
-    darkest = float(np.min(1.0 - np.hypot(vectors[..., 1], vectors[..., 2]) / vectors[..., 0]))
-    good = bool(np.all(vectors[..., 0] > 0)) and darkest > -DARKEST
-    return Check("physics", good, f"least light a camera sees: {darkest:.1e} of unpolarised")
+    setting = calibration.usual_settings(filter_name=str(np.unique(calibration.exposures.filter)[0]))
+    analysis = AnalysisVectors(calibration)
+    vectors = analysis.exact(setting, x, y)[:, 0]
+    least = np.min(1.0 - np.hypot(vectors[..., 1], vectors[..., 2]) / vectors[..., 0], axis=0)
+    arms = zip(analysis.instrument.arms, analysis.instrument.cameras.pairs, strict=True)
+    found = ", ".join(f"{arm.name} {least[list(pair)].min():.1e}" for arm, pair in arms)
+    good = bool(np.all(vectors[..., 0] > 0)) and bool(np.all(least > -DARKEST))
+    return Check("physics", good, f"least light that a camera sees, of unpolarised: {found}")

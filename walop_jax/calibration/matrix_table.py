@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import Settings
 from walop_jax.calibration.records import Quality, matrix_names
+from walop_jax.data.settings import Settings
 
 
 def matrix_columns(

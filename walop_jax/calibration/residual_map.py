@@ -1,12 +1,13 @@
 """What the smooth model leaves of the instrument matrix, cell by cell of the field: a map of superpixels.
 
-Quantities  In a cell of the field, at one optical setting, δm21 … δm33 are added to the instrument matrix and the
-            throughput of cameras N2, N3 is multiplied by 1 + ρ. To first order, with light S, flux F, analysis vectors
-            v_k and T the pair's response to unpolarised light,
-                δN_k = ± ½ F T (δm · S) in a pair of cameras,   δN_k = ρ F v_k · S in N2, N3.
+Quantities  In a cell of the field, at one optical setting, δm (three elements for each arm) is added to the instrument
+            matrix and the throughput of the cameras of every arm but the first is multiplied by 1 + ρ. To first order,
+            with light S, flux F, analysis vectors v_k and T the response of the two cameras of an arm to unpolarised
+            light,
+                δN_k = ± ½ F T (δm · S) in the two cameras of an arm,   δN_k = ρ F v_k · S in those of a later one.
 Estimate    weighted least squares over the exposures and points of the cell, the flux of each exposure eliminated:
             (Σ A P Aᵀ) δ = Σ A r, with r the normalised residuals, A = δN/σ and P what is left beside the flux.
-            Its covariance is the inverse of the sum. A cell has seven numbers of the millions of the smooth model's
+            Its covariance is the inverse of the sum. A cell has few numbers of the millions of the smooth model's
             data, so what the fit takes out of a cell is left out of account.
 Limit       no structure smaller than the smooth model's: δ scatters about 0 with its standard errors.
 """
@@ -20,12 +21,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.calibration.records import ResidualMap, residual_names
 from walop_jax.data.frames import Grid
-from walop_jax.data.records import Exposures
+from walop_jax.data.records import CALIBRATION_PLATE
+from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.expansion import Census, Posterior
+from walop_jax.likelihood.field_table import FieldTable
+from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.nodes import Nodes
 from walop_jax.likelihood.runner import SlabSums
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
@@ -34,46 +37,43 @@ from walop_jax.model.plan import Plan
 
 Vector = Float[np.ndarray, " n"]
 
-_QUANTITIES = residual_names(2)
-_UPPER = np.triu_indices(len(_QUANTITIES))
-_NUMBERS = 2 + len(_QUANTITIES) + len(_UPPER[0])  # χ², degrees of freedom, Σ A r, upper half of Σ A P Aᵀ
-
 
 def _point_sums(
     instrument: Instrument,
     plan: Plan,
     chosen: Bool[Array, " e"],
     point: engine.PointData,
-    nodes: Nodes | None,
+    nodes: FieldTable | None,
 ) -> Float[Array, " n"]:
     flux, residual = engine.point_residuals(instrument, plan, point, nodes)
     unit = engine.point_prediction(instrument, plan, point, nodes)
     vectors = engine.vectors_at(instrument, plan, point, nodes)[point.band]
-    stokes = light.stokes(instrument, plan.exposures, point.sky, point.source, point.x, point.y)[:, :3]
-    first, second = (vectors[:, k, 0] + vectors[:, k + 1, 0] for k in (0, 2))
-    signs = jnp.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
-    pairs = [
-        0.5 * total[:, None, None] * stokes[:, :, None] * sign
-        for total, sign in zip((first, second), signs, strict=True)
-    ]
-    ratio = (unit * jnp.array([0.0, 0.0, 1.0, 1.0]))[:, None]
+    stokes = light.stokes(instrument, plan.exposures, point.sky, point.source, point.x, point.y)
+    stokes = stokes[:, :3]
+    # One row of signs for each arm: first camera minus second.
+    pairs = np.array(instrument.cameras.pairs)
+    signs = np.eye(unit.shape[-1])[pairs[:, 0]] - np.eye(unit.shape[-1])[pairs[:, 1]]
+    total = vectors[:, pairs[:, 0], 0] + vectors[:, pairs[:, 1], 0]
+    elements = 0.5 * jnp.einsum("ea,es,ak->eask", total, stokes, signs).reshape(len(unit), -1, unit.shape[-1])
+    later = unit[:, None] * np.abs(signs[1:])
     weight = point.weight * chosen[:, None]
-    change = jnp.concatenate([*pairs, ratio], axis=1) * (flux[:, None] * weight)[:, None]
-    along = unit * weight
-    power = jnp.sum(along**2, axis=-1)
-    share = jnp.einsum("edk,ek->ed", change, along) / jnp.where(power > 0, power, 1.0)[:, None]
+    change = jnp.concatenate([elements, later], axis=1) * (flux[:, None] * weight)[:, None]
     known = plan.exposures.flux_known
-    change = change - jnp.where(known, 0.0, 1.0)[:, None, None] * share[..., None] * along[:, None]
+    change = project_flux(change, (unit * weight)[:, None], known[:, None])
     seen = (point.weight[:, 0] > 0) & chosen
-    freedom = jnp.sum(jnp.where(seen, jnp.where(known, 4.0, 3.0), 0.0))
+    freedom = jnp.sum(jnp.where(seen, unit.shape[-1] - jnp.where(known, 0.0, 1.0), 0.0))
     chi2 = jnp.sum(jnp.where(chosen[:, None], residual, 0.0) ** 2)
     right = jnp.einsum("edk,ek->d", change, residual)
-    left = jnp.einsum("edk,efk->df", change, change)[_UPPER]
+    left = jnp.einsum("edk,efk->df", change, change)[np.triu_indices(len(right))]
     return jnp.concatenate([jnp.stack([chi2, freedom]), right, left])
 
 
 def _chunk_sums(
-    instrument: Instrument, plan: Plan, chosen: Bool[Array, " e"], data: engine.PointData, nodes: Nodes | None
+    instrument: Instrument,
+    plan: Plan,
+    chosen: Bool[Array, " e"],
+    data: engine.PointData,
+    nodes: FieldTable | None,
 ) -> Float[Array, "p n"]:
     return jax.lax.map(
         lambda point: _point_sums(instrument, plan, chosen, point, nodes),
@@ -103,15 +103,18 @@ def cell_of(grid: Grid, x: Vector, y: Vector) -> Int[np.ndarray, " p"]:
     return row * grid.width + column
 
 
-def _main_setting(e: Exposures) -> tuple[str, float, Bool[np.ndarray, " e"]]:
-    """The setting with the most polariser exposures, plate out preferred, and its exposures."""
-    angle = np.where(e.chwp_in, e.chwp_angle, -np.inf)
-    settings = sorted(
-        set(zip(e.filter.tolist(), angle.tolist(), strict=True)), key=lambda setting: setting[1]
-    )
-    exposures = {setting: (e.filter == setting[0]) & (angle == setting[1]) for setting in settings}
-    name, at = max(settings, key=lambda setting: int(np.sum(exposures[setting] & e.clp_in)))
-    return name, at if np.isfinite(at) else np.nan, exposures[name, at]
+def _main_setting(
+    settings: Settings, through: Bool[np.ndarray, " e"]
+) -> tuple[Settings, Bool[np.ndarray, " e"]]:
+    """The setting with the most exposures `through` the polariser, all else out preferred, and its exposures."""
+
+    def preferred(layout: tuple[Settings, Int[np.ndarray, " r"]]) -> tuple[object, ...]:
+        setting, rows = layout
+        angles = (float(np.nan_to_num(angle[0], nan=-np.inf)) for angle in setting.positions.values())
+        return (-int(through[rows].sum()), *angles, str(setting.filter[0]))
+
+    setting, rows = min(settings.layouts(), key=preferred)
+    return setting, np.isin(np.arange(len(settings)), rows)
 
 
 def residual_map(result: FitResult) -> ResidualMap:
@@ -123,7 +126,8 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
     """As `residual_map`, at any full vector of parameter values; `near` is an expansion at similar ones."""
     instrument = likelihood.model.instrument(values)
     nodes, _ = likelihood.nodes(instrument, near)
-    filter_name, chwp_angle, chosen = _main_setting(likelihood.calset.exposures)
+    exposures = likelihood.calset.exposures
+    setting, chosen = _main_setting(Settings.of(exposures, likelihood.plan.moving), exposures.clp_in)
     grid = cells_for(likelihood.layout.points, likelihood.census if near is None else near.census)
     count = grid.width * grid.height
 
@@ -138,10 +142,11 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
         return SlabSums(np.concatenate(sums), np.zeros(4))
 
     total = likelihood.runner.total("residual map", None, work, likelihood.layout)
-    total = total.sums.reshape(_NUMBERS, count)
-    n = len(_QUANTITIES)
+    n = len(residual_names(len(instrument.arms)))
+    i, j = np.triu_indices(n)
+    total = total.sums.reshape(2 + n + len(i), count)  # χ², degrees of freedom, Σ A r, upper half of Σ A P Aᵀ
     matrix = np.zeros((count, n, n))
-    matrix[:, _UPPER[0], _UPPER[1]] = matrix[:, _UPPER[1], _UPPER[0]] = total[2 + n :].T
+    matrix[:, i, j] = matrix[:, j, i] = total[2 + n :].T
     size = np.sqrt(np.diagonal(matrix, axis1=1, axis2=2))
     scaled = matrix / np.where(size > 0, size, 1.0)[:, :, None] / np.where(size > 0, size, 1.0)[:, None]
     known = np.linalg.eigvalsh(scaled)[:, 0] > 1e-9
@@ -152,9 +157,10 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
     shape = (grid.height, grid.width)
     return ResidualMap(
         grid=grid,
-        filter=filter_name,
-        chwp_angle=chwp_angle,
+        filter=str(setting.filter[0]),
+        chwp_angle=float(setting.position(CALIBRATION_PLATE)[0]),
         values=found.reshape(n, *shape),
         errors=errors.reshape(n, *shape),
         chi2=(total[0] / np.where(total[1] > 0, total[1], np.nan)).reshape(shape),
+        positions=setting.further(),
     )

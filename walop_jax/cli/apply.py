@@ -47,11 +47,12 @@ def apply(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Turn the four intensities of stars into Stokes parameters: Q, U, P, EVPA and their errors.
+    """Turn the intensities of stars into Stokes parameters: Q, U, P, EVPA and their errors.
 
-    X and Y in degrees, N and N_ERR (4) in electrons; optional ID, TEFF, CHWP_IN, CHWP_ANGLE, ROTATOR, N_FLAG,
-    FILTER, TEMP, HA. Rows of one ID (and filter) are one star: they are combined, whatever the angle of the
-    calibration plate, and all hold the same result. With ROTATOR the results are on the sky.
+    X and Y in degrees, N and N_ERR (one value per camera) in electrons; optional ID, TEFF, ROTATOR, N_FLAG,
+    FILTER, TEMP, HA, and CHWP_ANGLE, CHWP_IN or those of any other moving element. Rows of one ID (and filter)
+    are one star: they are combined, wherever the moving elements stand, and all hold the same result. With
+    ROTATOR the results are on the sky. Two cameras see one combination of q and u: a star needs several settings.
 
     Errors hold photon noise and calibration; Q_COLOUR and U_COLOUR say what ignoring TEFF does. FLAG: 16 a
     direction of (q, u) is hardly measured, 32 beyond the calibrated field (no result a quarter beyond), 64

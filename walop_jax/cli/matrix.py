@@ -36,14 +36,14 @@ def matrix(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Add M21, M22, M23, M31, M32, M33 and their errors to a table of field points.
+    """Add M21, M22, M23, M31, M32, M33 and their errors to a table of field points (three for each arm).
 
-    X and Y in degrees; optional TEFF, CHWP_IN, CHWP_ANGLE, FILTER, TEMP, HA (absent: flat spectrum,
-    calibration plate out, SDSS-r, 10 Celsius, on the meridian).
+    X and Y in degrees; optional TEFF, FILTER, TEMP, HA (absent: flat spectrum, SDSS-r, 10 Celsius, on the
+    meridian), and CHWP_ANGLE, CHWP_IN, or those of any other moving element of the instrument (absent: out).
 
     FLAG is added: 16 high cross-talk (a single exposure can hardly be inverted there), 32 beyond the field
     points of the calibration, 64 filter or temperature that the calibration has not seen. Beyond the field
-    of the instrument (0.35 degrees) there is no value: NaN and FLAG 32.
+    of the instrument (0.35 degrees for the WALOPs) there is no value: NaN and FLAG 32.
     """
     del seed  # nothing is random here
     switch_on_jax()

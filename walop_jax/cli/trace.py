@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from walop_jax.cli.common import InstrumentOption, JsonOption, print_json, switch_on_jax
+from walop_jax.cli.common import InstrumentOption, JsonOption, print_json, switch_on_jax, warn
 
 if TYPE_CHECKING:
     from walop_jax.model.trace import Stage
@@ -23,9 +23,14 @@ ProductArgument = Annotated[
 AngleOption = Annotated[
     float | None, typer.Option("--angle", help="Polariser in, with its axis here (deg).", show_default=False)
 ]
-PlateOption = Annotated[
-    float | None,
-    typer.Option("--chwp", help="Calibration plate in, with its axis here (deg).", show_default=False),
+AtOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--at",
+        metavar="P=ANGLE",
+        help="A moving element in the beam, by the prefix of its columns: CHWP=45 (deg). May be repeated.",
+        show_default=False,
+    ),
 ]
 TeffOption = Annotated[
     float | None,
@@ -41,55 +46,54 @@ def trace(
     q: Annotated[float, typer.Option("--q", help="Stokes q of the source, a fraction.")] = 0.0,
     u: Annotated[float, typer.Option("--u", help="Stokes u of the source, a fraction.")] = 0.0,
     angle: AngleOption = None,
-    chwp: PlateOption = None,
+    at: AtOption = None,
     teff: TeffOption = None,
     filter: Annotated[str, typer.Option("--filter", help="Filter of the calibration, or SDSS-r.")] = "SDSS-r",
     json: JsonOption = False,
 ) -> None:
     """Follow the light of one source through the instrument.
 
-    Every line is the light at one place: Stokes vectors averaged over the band, then the four cameras. The
+    Every line is the light at one place: Stokes vectors averaged over the band, then the cameras. The
     last line is what a fit works with.
     """
     nan = float("nan")
     switch_on_jax()
+    from walop_jax.data.settings import Settings
     from walop_jax.model.trace import Sightline
     from walop_jax.runs.trace import trace_source
 
+    setting = Settings.default(1, filter).at(**positions(at or []))
+    if teff is not None:
+        setting.teff[0] = teff
     try:
-        ray = Sightline(
-            x=x,
-            y=y,
-            q=q,
-            u=u,
-            clp_angle=nan if angle is None else angle,
-            chwp_angle=nan if chwp is None else chwp,
-            teff=nan if teff is None else teff,
-        )
+        ray = Sightline(x=x, y=y, q=q, u=u, clp_angle=nan if angle is None else angle, setting=setting)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
     try:
-        stages = trace_source(ray, product, instrument=instrument, filter_name=filter)
+        found = trace_source(ray, product, instrument=instrument)
     except ValueError as error:
         if product is not None:
             raise
         raise typer.BadParameter(str(error)) from None  # the options say all there is
+    for sentence in found.warnings:
+        warn(sentence)
     if json:
-        print_json(
-            [
-                {
-                    "stage": s.name,
-                    "about": s.about,
-                    "rows": s.rows,
-                    "columns": s.columns,
-                    "value": s.value.tolist(),
-                }
-                for s in stages
-            ]
-        )
+        print_json(found.document())
         return
-    for line in table(stages):
+    for line in table(found.stages):
         typer.echo(line)
+
+
+def positions(texts: list[str]) -> dict[str, float]:
+    """Angles (deg) by column prefix from texts such as CHWP=45; typer.BadParameter for what is none."""
+    found = {}
+    for text in texts:
+        prefix, _, angle = text.partition("=")
+        try:
+            found[prefix.strip().upper()] = float(angle)
+        except ValueError:
+            raise typer.BadParameter(f"{text!r} is no P=ANGLE, such as CHWP=45", param_hint="--at") from None
+    return found
 
 
 def table(stages: tuple[Stage, ...]) -> list[str]:

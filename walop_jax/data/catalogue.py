@@ -3,10 +3,10 @@
 | column | unit | meaning |
 | --- | --- | --- |
 | X, Y | deg | field position in the instrument frame |
-| N, N_ERR | electron | the cameras (O1, E1, O2, E2) and their errors (or N0 … N3, N0_ERR … N3_ERR) |
+| N, N_ERR | electron | the cameras, in the order of the instrument, and their errors (or N0, N1, …, N0_ERR, …) |
 | ID | | rows of one ID (and one FILTER) are one star; without it every row is one |
 | TEFF | K | colour temperature of the star; NaN: flat photon spectrum |
-| CHWP_IN, CHWP_ANGLE | deg | calibration plate |
+| `<P>_IN`, `<P>_ANGLE` | deg | moving elements behind the polariser, such as CHWP_IN, CHWP_ANGLE |
 | ROTATOR | deg | position angle of +X; where it is given the results are on the sky |
 | N_FLAG | | bits of the cameras as FLAG of a calibration set, one number or one per camera; any bit: not used |
 | FILTER, TEMP, HA | Celsius, h | as for field points |
@@ -15,12 +15,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Collection
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from walop_jax.data.field_points import FieldPoints, InstrumentOfTables, field_points
 from walop_jax.data.schema import Column, Place
-from walop_jax.data.user_tables import FieldPoints, InputTable, field_points, numeric_column, vector_column
+from walop_jax.data.user_tables import InputTable, numeric_column, vector_column
 from walop_jax.io.errors import rows_text
 
 _ROTATOR = Column("float", "deg", float("nan"))
@@ -48,9 +50,13 @@ class Catalogue:
 
 
 def read_catalogue(
-    source: InputTable, instrument: str, saturation: float = np.inf, *, cameras: int = 4
+    source: InputTable,
+    instrument: InstrumentOfTables,
+    saturation: float = np.inf,
+    *,
+    always_in: Collection[str] = (),
 ) -> Catalogue:
-    """The catalogue in a table of an instrument with so many cameras.
+    """The catalogue in a table of an instrument; `always_in` as for `field_points`.
 
     Counts from `saturation` [electron] on, or below −5 σ, are not used.
 
@@ -58,7 +64,7 @@ def read_catalogue(
     above 0, a ROTATOR that only some rows of a star have.
     """
     place = Place(source.path, "")
-    points = field_points(source, instrument)
+    points, cameras = field_points(source, instrument, always_in), len(instrument.cameras)
     rule = Column("float", "electron", width=cameras, shape_advice=f"one row holds all {cameras} cameras")
     counts, sigma = (vector_column(source, name, rule) for name in ("N", "N_ERR"))
     impossible = np.flatnonzero(np.any(np.isfinite(counts) & (sigma <= 0), axis=1))
@@ -111,7 +117,7 @@ def _stars(source: InputTable, points: FieldPoints) -> Int[np.ndarray, " n"]:
         values = np.char.strip(values.astype(str))
         masked = masked | (values == "") | (values == "nan")
     _, name = np.unique(values, return_inverse=True)
-    _, band = np.unique(points.filter, return_inverse=True)
+    _, band = np.unique(points.settings.filter, return_inverse=True)
     key = name.reshape(-1) * (band.max() + 1) + band.reshape(-1)
     alone = key.max() + 1 + rows
     return np.unique(np.where(masked, alone, key), return_inverse=True)[1].reshape(-1)

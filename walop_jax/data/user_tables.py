@@ -14,28 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float
 
-from walop_jax.data.checks import field_limit
-from walop_jax.data.filters import DEFAULT_FILTER
 from walop_jax.data.schema import Column, Place, convert_unit
 from walop_jax.io.atomic import atomic_path, check_output
 from walop_jax.io.errors import DataError, fail, nearest, rows_text
 from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits
 from walop_jax.io.plain_tables import table_format
 
-_NAN = float("nan")
 _TRUE, _FALSE = ("true", "t", "1", "yes"), ("false", "f", "0", "no", "")
-POINT_COLUMNS: Mapping[str, Column] = {
-    "X": Column("float", "deg"),
-    "Y": Column("float", "deg"),
-    "TEFF": Column("float", "K", _NAN),
-    "CHWP_IN": Column("bool", missing=False),
-    "CHWP_ANGLE": Column("float", "deg", _NAN),
-    "FILTER": Column("str", missing=DEFAULT_FILTER),
-    "TEMP": Column("float", "Celsius", 10.0),
-    "HA": Column("float", "h", 0.0),
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,79 +160,6 @@ def _numbers(
     if unit:
         numbers = convert_unit(numbers, unit, rule.unit, name, place)
     return np.where(empty, float("nan" if rule.missing is None else str(rule.missing)), numbers)
-
-
-@dataclasses.dataclass(frozen=True)
-class FieldPoints:
-    """Where, and under which optical settings, an instrument matrix is asked for.
-
-    `x`, `y` in degrees; `teff` in K (NaN: flat spectrum); `chwp_angle` in degrees (NaN: plate out); `temp` in
-    Celsius; `ha` in hours. `outside` marks points beyond the field of the instrument.
-    """
-
-    x: Float[np.ndarray, " n"]
-    y: Float[np.ndarray, " n"]
-    teff: Float[np.ndarray, " n"]
-    chwp_angle: Float[np.ndarray, " n"]
-    filter: Shaped[np.ndarray, " n"]
-    temp: Float[np.ndarray, " n"]
-    ha: Float[np.ndarray, " n"]
-    outside: Bool[np.ndarray, " n"]
-
-
-def field_points(source: InputTable, instrument: str) -> FieldPoints:
-    """The X, Y and optional settings of a table of field points of an instrument.
-
-    Without CHWP_IN the calibration plate is in the beam where CHWP_ANGLE has a value. Single points outside
-    the field are marked; if most of them lie outside, the unit must be wrong.
-
-    Raises `DataError` naming file, column and row for anything that cannot be meant.
-    """
-    place = Place(source.path, "")
-    columns = {name: numeric_column(source, name, rule) for name, rule in POINT_COLUMNS.items()}
-    x, y, angle, teff = (columns[name] for name in ("X", "Y", "CHWP_ANGLE", "TEFF"))
-    inside = columns["CHWP_IN"] if "CHWP_IN" in source.names else np.isfinite(angle)
-
-    def refuse(bad: np.ndarray, what: str, column: str, advice: str) -> None:
-        if np.any(bad):
-            raise place.fail(f"{what} in {rows_text(np.flatnonzero(bad))}", column, advice)
-
-    for name in ("X", "Y", "TEMP", "HA"):
-        refuse(~np.isfinite(columns[name]), "is not finite", name, "correct or remove these rows")
-    refuse(inside & ~np.isfinite(angle), "is not finite", "CHWP_ANGLE", "CHWP_IN is true: give the angle")
-    refuse(np.abs(angle) > 36000, "exceeds ±36000", "CHWP_ANGLE", "encoder readings are in degrees")
-    cold = ~np.isnan(teff) & ~((teff >= 500) & (teff < 1e6))
-    refuse(cold, "is no temperature of a source", "TEFF", "give kelvin, or leave it empty: flat spectrum")
-    refuse(np.abs(columns["TEMP"]) > 150, "exceeds ±150", "TEMP", "degrees Celsius: are these kelvin?")
-    refuse(np.abs(columns["HA"]) > 24, "exceeds ±24", "HA", "hours: are these degrees?")
-    limit = field_limit(instrument)
-    outside = np.maximum(np.abs(x), np.abs(y)) > limit
-    if np.mean(outside) > 0.5:
-        raise place.fail(
-            f"most points lie outside ±{limit:g}° of {instrument}: {rows_text(np.flatnonzero(outside))}",
-            "X, Y",
-            "field coordinates are in degrees: are these arcmin or pixels?",
-        )
-    return FieldPoints(
-        x=x, y=y, teff=teff, chwp_angle=np.where(inside, angle, np.nan), filter=columns["FILTER"],
-        temp=columns["TEMP"], ha=columns["HA"], outside=outside,
-    )  # fmt: skip
-
-
-def true_matrices(
-    path: str | os.PathLike[str], instrument: str
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n 6"]]:
-    """X, Y (deg) and M21 … M33 of a table of true matrices; `DataError` for what is missing or not finite."""
-    source = read_input_table(path)
-    points = field_points(source, instrument)
-    columns = [numeric_column(source, f"M{k}", Column("float")) for k in (21, 22, 23, 31, 32, 33)]
-    matrix = np.stack(columns, axis=1)
-    bad = np.flatnonzero(~np.isfinite(matrix).all(axis=1))
-    if bad.size:
-        raise fail(
-            f"not finite in {rows_text(bad)}", file=path, column="M21 … M33", advice="remove these rows"
-        )
-    return points.x, points.y, matrix
 
 
 def new_table(columns: Mapping[str, Any]) -> InputTable:

@@ -6,15 +6,16 @@ comes out wrong by A⁻¹ (δm₀ + δA s), at most |A⁻¹ δm₀| + p ‖A⁻�
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_plan
+from walop_jax.calibration.matrix import sky_vectors
 from walop_jax.calibration.records import SMALLEST_DETERMINANT
+from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
 from walop_jax.model import light
+from walop_jax.model.planning import plan_for_settings
 
 LARGEST_P = 0.05
 
@@ -22,14 +23,11 @@ LARGEST_P = 0.05
 def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p a 3"]:
     """Instrument matrix at the field points of a fit, in the filter and plate setting of its first exposure."""
     instrument, calset = result.model.instrument(result.values), result.calset
-    e = calset.exposures
-    setting = Settings.default(1, str(e.filter[0]))
-    setting.chwp_angle[0] = e.chwp_angle[0] if e.chwp_in[0] else np.nan
-    plan = settings_plan(setting, calset.filters, instrument)
-    vectors = analysis_vectors(instrument, plan, calset.points.x, calset.points.y)[:, 0]
-    at = jnp.asarray(calset.points.x), jnp.asarray(calset.points.y)
-    sky = jax.vmap(light.telescope, (None, 0, 0))(instrument, *at)
-    return np.asarray(light.instrument_matrix(jnp.asarray(vectors) @ sky, instrument.cameras.pairs))
+    first = Settings.of(calset.exposures[:1], instrument.patched().moving())
+    setting = Settings.default(1, str(first.filter[0])).at(**first.positions)
+    plan = plan_for_settings(instrument, setting, calset.filters)
+    vectors = sky_vectors(instrument, plan, calset.points.x, calset.points.y)[:, 0]
+    return np.asarray(light.instrument_matrix(jnp.asarray(vectors), instrument.cameras.pairs))
 
 
 def largest_change(

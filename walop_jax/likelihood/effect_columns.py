@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.engine import PointData, best_flux, point_prediction, real_counts
+from walop_jax.likelihood.flux import project_flux
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.instrument import Instrument
@@ -41,10 +42,7 @@ def _point_effect_columns(
     flat, to_tree = ravel_pytree(neutral)
     change = jax.vmap(lambda one: push(to_tree(one)))(jnp.eye(flat.size)) * point.weight
     _, along = jax.jvp(lambda f: real_counts(at_neutral, plan, unit, f), (flux,), (jnp.ones_like(flux),))
-    along = along * point.weight
-    power = jnp.sum(along**2, axis=-1)
-    share = jnp.sum(change * along, axis=-1) / jnp.where(power > 0, power, 1.0)
-    projected = change - jnp.where(plan.exposures.flux_known, 0.0, share)[..., None] * along
+    projected = project_flux(change, along * point.weight, plan.exposures.flux_known)
     return -projected.reshape(flat.size, -1)
 
 

@@ -3,17 +3,13 @@
 Three layers, each with its own small Jacobian:
 
 1. optics      band rows of a field point, derivatives with respect to the ~10 optical parameters only,
-               once per (point, band), however many exposures there are; or interpolated between `Nodes`;
+               once per (point, band), however many exposures there are; or from a table of them (`nodes.py`);
 2. data        counts and normalised residuals of all exposures of the point: dot products;
 3. field       throughput is a series over the field, so at one point only its four values matter; the small
                Gram matrix of the point is expanded through the series afterwards.
 
-Flux           For each (exposure, point) with y = N/σ and a = model/σ over the four cameras, the flux that
-               fits best is F = y·a / a·a, and r = y − F a. Its derivative is taken as −F (1 − â âᵀ) da
-               (Kaufman's form of variable projection, Golub & Pereyra 2003, Inverse Problems 19, R1): the
-               gradient is exact, and JᵀJ is the Fisher information with the flux marginalised. KIND `flux`:
-               F = 1. Where an effect of the detectors D acts, the model is D(F a), F follows by Newton
-               steps and ∂D/∂F takes the place of a.
+Flux           of every (exposure, point) is eliminated (`flux.py`). Where an effect of the detectors D acts, the model
+               is D(F a), F follows by Newton steps and ∂D/∂F takes the place of a.
 Exposures      are not compressed beforehand, although light is linear in them. With the flux eliminated what could
                be kept of a point holds only near one set of values, as F and â depend on them; for 4 cameras × 3
                Stokes parameters it is 91 numbers per band instead of 200 for 25 exposures. Reading would halve,
@@ -24,23 +20,24 @@ Exposures      are not compressed beforehand, although light is linear in them. 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from walop_jax.likelihood import limits
-from walop_jax.likelihood.nodes import Nodes, interpolated, rows_and_slopes
+from walop_jax.likelihood import limits, linear
+from walop_jax.likelihood.field_table import FieldTable
+from walop_jax.likelihood.flux import eliminate_flux, project_flux
+from walop_jax.likelihood.linear import rows_and_slopes
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
-from walop_jax.model.dependence import optical_indices
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import values_of, with_values
 from walop_jax.model.plan import Plan
-from walop_jax.model.specification import series_indices
 
 Vector = Float[Array, " n"]
 Result = TypeVar("Result")
@@ -68,16 +65,6 @@ class Normal(NamedTuple):
     matrix: Float[Array, "n n"]
 
 
-def eliminate_flux(
-    weighted_counts: Float[Array, "e k"], weighted_model: Float[Array, "e k"], flux_known: Bool[Array, " e"]
-) -> tuple[Float[Array, " e"], Float[Array, "e k"]]:
-    """Best flux of every exposure and the normalised residuals data − model."""
-    power = jnp.sum(weighted_model**2, axis=-1)
-    best = jnp.sum(weighted_counts * weighted_model, axis=-1) / jnp.where(power > 0, power, 1.0)
-    flux = jnp.where(flux_known, 1.0, best)
-    return flux, weighted_counts - flux[:, None] * weighted_model
-
-
 def field_sites(instrument: Instrument, point: PointData) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Field positions whose optics a point needs: its own and, for ghosts, the opposite one."""
     if light.has_ghosts(instrument):
@@ -86,20 +73,20 @@ def field_sites(instrument: Instrument, point: PointData) -> tuple[Float[Array, 
 
 
 def _rows_at(
-    instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None = None
+    instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None = None
 ) -> Float[Array, "m b r 4"]:
     sites = field_sites(instrument, point)
     if nodes is not None:
-        return interpolated(nodes, *sites)[0]
+        return nodes(*sites)[0]
     return jax.vmap(light.band_rows, (None, None, 0, 0))(instrument, plan, *sites)
 
 
 def _rows_and_slopes_at(
-    instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None
+    instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None
 ) -> tuple[Float[Array, "m b r 4"], Float[Array, "o m b r 4"]]:
     sites = field_sites(instrument, point)
     if nodes is not None:
-        rows, slopes = interpolated(nodes, *sites)
+        rows, slopes = nodes(*sites)
     else:
         rows, slopes = jax.vmap(rows_and_slopes, (None, None, 0, 0))(instrument, plan, *sites)
     return rows, jnp.swapaxes(slopes, 0, 1)
@@ -130,7 +117,7 @@ def _unit_counts(
 
 
 def point_prediction(
-    instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None = None
+    instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None = None
 ) -> Float[Array, "e k"]:
     """Counts of one point for light of unit flux, ahead of the detectors."""
     rows, throughput = _rows_at(instrument, plan, point, nodes), _throughput_at(instrument, point)
@@ -138,7 +125,7 @@ def point_prediction(
 
 
 def vectors_at(
-    instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None = None
+    instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None = None
 ) -> Float[Array, "b k 4"]:
     """Analysis vectors of a point in every band."""
     rows, throughput = _rows_at(instrument, plan, point, nodes)[0], _throughput_at(instrument, point)[0]
@@ -170,7 +157,7 @@ def real_counts(
 
 
 def point_residuals(
-    instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None = None
+    instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None = None
 ) -> tuple[Float[Array, " e"], Float[Array, "e k"]]:
     """Best flux of every exposure of one point and the normalised residuals data − model."""
     unit = point_prediction(instrument, plan, point, nodes)
@@ -179,57 +166,42 @@ def point_residuals(
 
 
 def _point_jacobian(
-    instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None = None
+    instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None = None
 ) -> tuple[Float[Array, " d"], Float[Array, "l d"]]:
     """Residuals of one point and their derivatives with respect to its local quantities.
 
     Local quantities are all parameters but the series, then the throughputs of its sites; d runs over
     exposures and cameras.
     """
-    values, to_instrument = values_of(instrument), with_values(instrument)
-    optical = np.asarray(optical_indices(instrument), int)
-    plain = np.setdiff1d(np.arange(values.size), series_indices(instrument))
-    throughput = _throughput_at(instrument, point)
+    to_instrument = with_values(instrument)
 
-    def data(
+    def unit_counts(
         rows: Float[Array, "m b r 4"], all_values: Vector, local: Float[Array, "m k"]
     ) -> Float[Array, "e k"]:
         return _unit_counts(to_instrument(all_values), plan, rows, local, point)
 
-    rows, d_rows = _rows_and_slopes_at(instrument, plan, point, nodes)
-    unit, push = jax.linearize(data, rows, values, throughput)
-    each = jnp.eye(values.size)[plain]
-
-    # Tangents: plain parameters first (the optical ones carry their rows), then the throughputs of the sites.
-    rows_of = jnp.zeros((values.size, *rows.shape)).at[optical].set(d_rows)[plain]
-    no_rows, no_values, no_local = jnp.zeros_like(rows), jnp.zeros_like(values), jnp.zeros_like(throughput)
-    d_plain = jax.vmap(lambda dr, dv: push(dr, dv, no_local))(rows_of, each)
-    each_local = jnp.eye(throughput.size).reshape(-1, *throughput.shape)
-    d_local = jax.vmap(lambda dt: push(no_rows, no_values, dt))(each_local)
-
+    rows, slopes = _rows_and_slopes_at(instrument, plan, point, nodes)
+    throughput = _throughput_at(instrument, point)
+    unit, d_plain, d_local = linear.linearised(instrument, unit_counts, rows, slopes, throughput)
     # From unit flux to counts: `along` is the derivative with respect to the flux itself.
     flux = best_flux(instrument, plan, unit, point)
-    known = plan.exposures.flux_known
     counts, along = flux[:, None] * unit, unit
     d_counts = flux[:, None] * jnp.concatenate([d_plain, d_local])
     if not light.is_linear(instrument):
+        values = values_of(instrument)
         counts, push_detector = jax.linearize(
             lambda v, n: light.detected(to_instrument(v), plan.exposures, n), values, counts
         )
+        each = jnp.eye(values.size)[linear.plain_positions(instrument)]
         all_values = jnp.concatenate([each, jnp.zeros((throughput.size, values.size))])
         d_counts = jax.vmap(push_detector)(all_values, d_counts)
-        along = push_detector(no_values, unit)
-    along = along * point.weight
-    d_counts = d_counts * point.weight
-    power = jnp.sum(along**2, axis=-1)
-    share = jnp.sum(d_counts * along, axis=-1) / jnp.where(power > 0, power, 1.0)
-    projected = d_counts - jnp.where(known, 0.0, share)[..., None] * along
-    jacobian = -projected.reshape(d_counts.shape[0], -1)
-    return ((point.counts - counts) * point.weight).reshape(-1), jacobian
+        along = push_detector(jnp.zeros_like(values), unit)
+    projected = project_flux(d_counts * point.weight, along * point.weight, plan.exposures.flux_known)
+    return ((point.counts - counts) * point.weight).reshape(-1), -projected.reshape(d_counts.shape[0], -1)
 
 
 def _point_normal(
-    instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes | None
+    instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None
 ) -> tuple[Float[Array, ""], Float[Array, " l"], Float[Array, "l l"]]:
     """χ², Jᵀr and JᵀJ of one point in its local quantities."""
     r, jacobian = _point_jacobian(instrument, plan, point, nodes)
@@ -254,23 +226,23 @@ def _over_blocks(function: Callable[[PointData], Result], data: PointData, block
 
 
 def _normal_equations(
-    instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes | None = None
+    instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None = None
 ) -> Normal:
     return _over_blocks(
         lambda part: _block_equations(instrument, plan, part, nodes), data, limits.JACOBIAN_BLOCK
     )
 
 
-def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes | None) -> Normal:
-    values = values_of(instrument)
-    series = np.asarray(series_indices(instrument), int)
-    plain = np.setdiff1d(np.arange(values.size), series)
+def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None) -> Normal:
+    size, series, plain = (
+        values_of(instrument).size, linear.series_positions(instrument), linear.plain_positions(instrument),
+    )  # fmt: skip
     chi2, gradient, gram = jax.vmap(_point_normal, in_axes=(None, None, 0, None))(
         instrument, plan, data, nodes
     )
     k = plain.size
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
-    g = jnp.zeros(values.size).at[plain].set(gradient[:, :k].sum(axis=0))
+    g = jnp.zeros(size).at[plain].set(gradient[:, :k].sum(axis=0))
     # Local throughputs are (site, camera); a coefficient of a camera acts at all sites of a point.
     sites = (basis.shape[1], len(instrument.cameras))
     by_site = gradient[:, k:].reshape(-1, *sites)
@@ -279,7 +251,7 @@ def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes:
     cross = jnp.einsum("pimk,pmt->ikt", by_site, basis).reshape(k, -1)
     by_site = gram[:, k:, k:].reshape(-1, *sites, *sites)
     square = jnp.einsum("pmknl,pmt,pnu->ktlu", by_site, basis, basis).reshape(series.size, series.size)
-    matrix = jnp.zeros((values.size, values.size))
+    matrix = jnp.zeros((size, size))
     matrix = matrix.at[np.ix_(plain, plain)].set(gram[:, :k, :k].sum(axis=0))
     matrix = matrix.at[np.ix_(plain, series)].set(cross).at[np.ix_(series, plain)].set(cross.T)
     matrix = matrix.at[np.ix_(series, series)].set(square)
@@ -287,19 +259,20 @@ def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes:
 
 
 def _slope_equations(
-    instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes
+    instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable
 ) -> tuple[Float[Array, ""], Vector]:
     """χ² and gradient of points without the matrix: a fifth of the work.
 
-    The gradient runs backwards, from the residuals to the rows at the nodes, and only there meets the slopes. χ² does
+    The gradient runs backwards, from the residuals to the rows of the table, and only there meets the slopes. χ² does
     not change with the flux at its best, so that is held.
     """
     values, to_instrument = values_of(instrument), with_values(instrument)
-    optical = np.asarray(optical_indices(instrument), int)
+    optical = linear.optical_positions(instrument)
 
     def slope(part: PointData) -> tuple[Float[Array, ""], Vector]:
         def chi2(values: Vector, rows: Float[Array, "t b r 4"]) -> Float[Array, ""]:
-            here, between = to_instrument(values), nodes._replace(rows=rows)
+            here = to_instrument(values)
+            between = dataclasses.replace(nodes, coefficients=(rows, nodes.coefficients[1]))
 
             def of_point(point: PointData) -> Float[Array, ""]:
                 unit = point_prediction(here, plan, point, between)
@@ -308,21 +281,21 @@ def _slope_equations(
 
             return jnp.sum(jax.vmap(of_point)(part))
 
-        value, (direct, by_rows) = jax.value_and_grad(chi2, (0, 1))(values, nodes.rows)
-        by_optics = jnp.einsum("tbrs,tobrs->o", by_rows, nodes.slopes)
+        value, (direct, by_rows) = jax.value_and_grad(chi2, (0, 1))(values, nodes.coefficients[0])
+        by_optics = jnp.einsum("tbrs,tobrs->o", by_rows, nodes.coefficients[1])
         return value, 0.5 * direct.at[optical].set(by_optics)
 
     return _over_blocks(slope, data, limits.GRADIENT_BLOCK)
 
 
 def _residuals(
-    instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes | None = None
+    instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None = None
 ) -> tuple[Float[Array, "p e"], Float[Array, "p e k"]]:
     return jax.vmap(point_residuals, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
 
 
 def _prediction(
-    instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes | None = None
+    instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None = None
 ) -> Float[Array, "p e k"]:
     """Counts for light of unit flux; `detected` takes electrons, flux × these, through the detectors."""
     return jax.vmap(point_prediction, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
@@ -330,15 +303,12 @@ def _prediction(
 
 def _dense_jacobian(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p d n"]:
     """Derivatives of all residuals with respect to all parameters: for tables, not for whole frames."""
-    values = values_of(instrument)
-    series = np.asarray(series_indices(instrument), int)
-    plain = np.setdiff1d(np.arange(values.size), series)
     _, local = jax.vmap(_point_jacobian, in_axes=(None, None, 0))(instrument, plan, data)
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
-    by_site = local[:, plain.size :].reshape(len(local), basis.shape[1], len(instrument.cameras), -1)
-    expanded = jnp.einsum("pmkd,pmt->pdkt", by_site, basis).reshape(len(local), -1, series.size)
-    full = jnp.zeros((*expanded.shape[:2], values.size)).at[:, :, series].set(expanded)
-    return full.at[:, :, plain].set(jnp.swapaxes(local[:, : plain.size], 1, 2))
+    count = linear.plain_positions(instrument).size
+    return jax.vmap(lambda columns, at: linear.to_all(instrument, columns[:count], columns[count:], at))(
+        local, basis
+    )
 
 
 def _incoming(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p e 4"]:

@@ -15,8 +15,9 @@ from jaxtyping import Array, Bool, Float
 from walop_jax.data.records import CalibrationSet
 from walop_jax.likelihood import effect_columns, engine
 from walop_jax.likelihood.expansion import Census, OpticsUsed, Posterior
+from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.layout import Layout
-from walop_jax.likelihood.nodes import Nodes, accurate_nodes
+from walop_jax.likelihood.nodes import accurate_nodes
 from walop_jax.likelihood.points import MeasuredPoints, measured_points
 from walop_jax.likelihood.priors import PriorRows, prior_rows
 from walop_jax.likelihood.runner import Runner, SlabSums
@@ -102,7 +103,9 @@ class Likelihood:
         """What the model says of its free parameters beforehand."""
         return prior_rows(self.model)
 
-    def nodes(self, instrument: Instrument, near: Posterior | None = None) -> tuple[Nodes | None, OpticsUsed]:
+    def nodes(
+        self, instrument: Instrument, near: Posterior | None = None
+    ) -> tuple[FieldTable | None, OpticsUsed]:
         """The optics on nodes of the field, and how accurate; None where they are to be solved point by point.
 
         `near` is an expansion at similar values: as many nodes as it needed are tried first, and none if there are
@@ -113,7 +116,7 @@ class Likelihood:
             return None, OpticsUsed(None)
         scale = np.array([p.scale for p in self.model.parameters])[list(optical_indices(instrument))]
         nodes, error = accurate_nodes(instrument, self.plan, self.layout.rectangle, scale, hint)
-        return (None, OpticsUsed(None)) if nodes is None else (nodes, OpticsUsed(nodes.per_side, error))
+        return (None, OpticsUsed(None)) if nodes is None else (nodes, OpticsUsed(nodes.count, error))
 
     # -------------------------------------------------------------------------------------- the posterior
 

@@ -77,8 +77,6 @@ MATRIX_POINTS = (16, 256)
 """Field points whose instrument matrices are computed together, a few and many: compiled for these two sizes only."""
 VECTOR_POINTS = 100
 """Field points whose analysis vectors are computed together: a quarter of a field table of 20 × 20."""
-VECTOR_CHECKS = 24
-"""Field points at which a table of analysis vectors is checked."""
 
 # ------------------------------------------------------------------------------------------------- diagnosis
 

@@ -1,16 +1,19 @@
-"""Interpolation between Chebyshev nodes over a rectangle of the field.
+"""Chebyshev polynomials and the nodes at which a function is sampled for a series in them.
 
 Nodes       t_j = cos(π (j + ½)/n), j = 0 … n − 1, in each direction, stretched over the rectangle.
-Weights     f(t) ≈ Σ_j w_j(t) f(t_j), w_j(t) = Σ_k (2 − δ_k0)/n · T_k(t_j) T_k(t): the polynomial of degree n − 1
-            through the nodes. In two dimensions the product of the weights.
+Series      f(t) ≈ Σ_k c_k T_k(t), c_k = (2 − δ_k0)/n · Σ_j T_k(t_j) f(t_j): the polynomial of degree n − 1
+            through the nodes.
 Source      Trefethen 2013, Approximation Theory and Approximation Practice, chapters 2–4 and 8: for a function that
             is analytic in a neighbourhood of the rectangle the error falls geometrically with n.
+
+Arrays of numpy stay arrays of numpy, those of jax stay theirs.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -36,22 +39,25 @@ def grid(rectangle: Rectangle, count: int) -> tuple[Float[np.ndarray, " t"], Flo
     return np.repeat(x, count), np.tile(y, count)
 
 
-def _one_dimension(t: Float[Array, "*p"], count: int) -> Float[Array, "*p n"]:
-    values = [jnp.ones_like(t), t]
+def to_coefficients(count: int) -> Float[np.ndarray, "n n"]:
+    """The matrix from values at `nodes` to coefficients."""
+    k, j = np.arange(count)[:, None], np.arange(count)[None]
+    return np.where(k > 0, 2.0, 1.0) / count * np.cos(np.pi * k * (j + 0.5) / count)
+
+
+def polynomials(t: Float[Any, "*p"], count: int) -> Float[Any, "*p n"]:
+    """T_0 … T_{count − 1} at t in [−1, 1]."""
+    xp = jnp if isinstance(t, jax.Array) else np
+    values = [xp.ones_like(t), t]
     for _ in range(2, count):
         values.append(2.0 * t * values[-1] - values[-2])
-    k, j = np.arange(count)[:, None], np.arange(count)[None]
-    to_nodes = np.where(k > 0, 2.0, 1.0) / count * np.cos(np.pi * k * (j + 0.5) / count)
-    return jnp.stack(values[:count], axis=-1) @ to_nodes
+    return xp.stack(values[:count], axis=-1)
 
 
-def weights(
-    x: Float[Array, "*p"], y: Float[Array, "*p"], rectangle: Rectangle, count: int
-) -> Float[Array, "*p t"]:
-    """Weights of the nodes of `grid` at field positions (deg) in the rectangle."""
-    low, high = jnp.asarray(rectangle.low), jnp.asarray(rectangle.high)
-    wx, wy = (
-        _one_dimension((2.0 * value - low[i] - high[i]) / (high[i] - low[i]), count)
-        for i, value in enumerate((x, y))
-    )
-    return (wx[..., :, None] * wy[..., None, :]).reshape(*wx.shape[:-1], count * count)
+def scaled(
+    x: Float[Any, "*p"], y: Float[Any, "*p"], rectangle: Rectangle
+) -> tuple[Float[Any, "*p"], Float[Any, "*p"]]:
+    """Field positions (deg) in units that run from −1 to 1 over the rectangle."""
+    low, high = rectangle
+    tx, ty = ((2.0 * value - low[i] - high[i]) / (high[i] - low[i]) for i, value in enumerate((x, y)))
+    return tx, ty

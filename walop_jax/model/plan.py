@@ -2,11 +2,12 @@
 
 Light is linear, so an exposure is a dot product with the analysis vectors of its *band* (filter, colour temperature,
 positions of the moving elements, conditions); the optics are worked out once per point and wavelength node, never per
-exposure. Angles of the polariser never meet wavelengths. Plans are made by `planning.plan_for`.
+exposure. Angles of the polariser never meet wavelengths. Plans are made by `planning`.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Collection
 
 import equinox as eqx
@@ -76,18 +77,22 @@ def exposure_arrays(
     )
 
 
+def blank_exposures(instrument: Instrument, count: int) -> ExposureArrays:
+    """Exposures of which nothing is said but that they are there."""
+    zero, off = jnp.zeros(count), jnp.zeros(count, bool)
+    return ExposureArrays(
+        kind=jnp.zeros(count, int), clp_in=off, clp_angle=zero, flux_known=off, rotator=zero, hours=zero,
+        temperature=zero, hour_angle=zero, kinds=instrument.kinds,
+    )  # fmt: skip
+
+
 def blank_plan(instrument: Instrument, asked: Collection[str] = (), median: bool = False) -> Plan:
     """A plan with every moving element in the beam, one node, one band: for shapes and derivatives."""
-    patched = instrument.patched()
+    patched, one = instrument.patched(), jnp.ones(1)
     count = max((part.exposures_known or 1 for part in patched.cameras.exposures), default=1)
-    one, each = jnp.ones(1), jnp.ones(count)
-    none = jnp.zeros(count, bool)
-    exposures = ExposureArrays(
-        kind=jnp.zeros(count, int), clp_in=none, clp_angle=0.0 * each, flux_known=none, rotator=0.0 * each,
-        hours=each, temperature=each, hour_angle=each,
-        median_counts=jnp.ones((count, len(instrument.cameras))) if median else None,
-        kinds=instrument.kinds,
-    )  # fmt: skip
+    exposures = blank_exposures(instrument, count)
+    if median:
+        exposures = dataclasses.replace(exposures, median_counts=jnp.ones((count, len(instrument.cameras))))
     moving = patched.moving()
     return Plan(
         wavelength=0.62 * one,
@@ -99,6 +104,19 @@ def blank_plan(instrument: Instrument, asked: Collection[str] = (), median: bool
         settings=((tuple(30.0 for _ in moving), 0, 1),),
         moving=moving,
     )
+
+
+def with_numbers(
+    plan: Plan, teff: Float[Array, ""], temperature: Float[Array, ""], hour_angle: Float[Array, ""]
+) -> Plan:
+    """The plan of a single setting with other numbers; `teff` is 0 for a flat spectrum."""
+    own = {"temperature": temperature, "hour_angle": hour_angle}
+    planned = {
+        name: jnp.broadcast_to(own[name], plan.wavelength.shape) if name in own else value
+        for name, value in plan.conditions.planned.items()
+    }
+    changed = (jnp.broadcast_to(teff, plan.teff.shape), Conditions(plan.conditions.band_width, planned))
+    return eqx.tree_at(lambda p: (p.teff, p.conditions), plan, changed)
 
 
 def with_median(plan: Plan, median: Float[np.ndarray, "e k"]) -> Plan:

@@ -1,46 +1,22 @@
-"""Making a plan: the nodes and bands of a set of exposures, as detailed as the instrument and its effects need them."""
+"""Making a plan: nodes and bands of exposures or settings, as detailed as the instrument and its effects need them."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import dataclasses
+from collections.abc import Callable, Mapping
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from walop_jax.data.records import Exposures, FilterCurve, Sources
+from walop_jax.data.settings import Settings
 from walop_jax.model.dependence import needs
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.materials import REFERENCE_TEMPERATURE
-from walop_jax.model.plan import Plan, State, exposure_arrays, hours_of
+from walop_jax.model.plan import Plan, blank_exposures, exposure_arrays, hours_of
 from walop_jax.model.quadrature import band_rule
 from walop_jax.model.ray import CONDITIONS, Conditions
-
-
-def _state(exposures: Exposures, e: int, moving: Collection[str]) -> State:
-    found = []
-    for prefix in moving:
-        position = exposures.position(prefix)
-        found.append(float(position.angle[e]) if position.inside[e] else None)
-    return tuple(found)
-
-
-def _teff(exposures: Exposures, sources: Sources | None, e: int, s: int) -> float:
-    if s >= 0 and sources is not None and np.isfinite(sources.teff[s]):
-        return float(sources.teff[s])
-    return float(exposures.teff[e])
-
-
-def _conditions(exposures: Exposures) -> dict[str, Float[np.ndarray, " e"]]:
-    """Everything that the optics may ask for; a missing temperature is the reference, all else 0."""
-    temperature = np.where(np.isfinite(exposures.temp), exposures.temp, REFERENCE_TEMPERATURE)
-    values = {
-        "temperature": temperature,
-        "hour_angle": np.nan_to_num(exposures.ha),
-        "hours": hours_of(exposures),
-    }
-    assert set(values) == set(CONDITIONS)
-    return values
+from walop_jax.model.sources import ExposureArrays
 
 
 def equivalent_width(curve: FilterCurve) -> float:
@@ -58,34 +34,60 @@ def plan_for(
 
     Raises KeyError for a filter that `filters` does not hold and ValueError for a KIND without a source.
     """
-    asked = needs(instrument)
-    moving = instrument.patched().moving()
-    values = _conditions(exposures)
+    own = Settings.of(exposures, instrument.patched().moving())
+    each, stars = np.arange(len(exposures)), 0 if sources is None else len(sources)
+    # A row for every exposure, for light of no star; then those of the stars, which may have a colour of their own.
+    of_stars = np.flatnonzero((exposures.kind == "standard") & ~exposures.clp_in) if stars else each[:0]
+    row = np.concatenate([each, np.repeat(of_stars, stars)])
+    settings = own[row]
+    if sources is not None and of_stars.size:
+        colour = np.tile(sources.teff, of_stars.size)
+        teff = np.concatenate([own.teff, np.where(np.isfinite(colour), colour, own.teff[row[len(each) :]])])
+        settings = dataclasses.replace(settings, teff=teff)
+
+    def band_of(band: Int[np.ndarray, " n"]) -> Int[np.ndarray, "e s"]:
+        table = np.repeat(band[: len(each), None], 1 + stars, axis=1)
+        table[of_stars, 1:] = band[len(each) :].reshape(of_stars.size, stars)
+        return table
+
+    known = [source.kind for source in instrument.sources if source.flux_known]
+    arrays = exposure_arrays(exposures, instrument.kinds, known)
+    return _plan(instrument, settings, hours_of(exposures)[row], filters, arrays, band_of)
+
+
+def plan_for_settings(instrument: Instrument, settings: Settings, filters: Mapping[str, FilterCurve]) -> Plan:
+    """Lay out the nodes and bands of `settings`, without any light: for analysis vectors.
+
+    The band of a row is `band_of[row, 0]`. Raises KeyError for a filter that `filters` does not hold and ValueError
+    for a moving element that the instrument does not have.
+    """
+    settings.check_moving(instrument.patched().moving())
+    blank = blank_exposures(instrument, len(settings))
+    return _plan(instrument, settings, np.zeros(len(settings)), filters, blank, lambda band: band[:, None])
+
+
+def _plan(
+    instrument: Instrument,
+    settings: Settings,
+    hours: Float[np.ndarray, " n"],
+    filters: Mapping[str, FilterCurve],
+    exposures: ExposureArrays,
+    band_of: Callable[[Int[np.ndarray, " n"]], Int[np.ndarray, "e s"]],
+) -> Plan:
+    asked, moving = needs(instrument), instrument.patched().moving()
     names = sorted(asked.conditions)
-    n_sources = 0 if sources is None else len(sources)
+    values = {"temperature": settings.temperature, "hour_angle": settings.hour_angle, "hours": hours}
+    assert set(values) == set(CONDITIONS)
     # A band is (positions, filter, conditions, colour temperature); sorting puts equal positions together.
-    # NaN (flat spectrum) and None (out) become sortable stand-ins.
-    states = [_state(exposures, e, moving) for e in range(len(exposures))]
-    moments = [tuple(float(values[name][e]) for name in names) for e in range(len(exposures))]
-    keys = {}
-    for e in range(len(exposures)):
-        standard = exposures.kind[e] == "standard" and not exposures.clp_in[e]
-        for s in range(-1, n_sources if standard else 0):
-            teff = _teff(exposures, sources, e, s)
-            keys[e, s] = (
-                tuple(-np.inf if angle is None else angle for angle in states[e]),
-                str(exposures.filter[e]),
-                moments[e],
-                teff if np.isfinite(teff) else 0.0,
-            )
-    bands = sorted(set(keys.values()))
+    # NaN (out, flat spectrum) becomes a sortable stand-in.
+    states = _rows(
+        [np.nan_to_num(settings.position(prefix), nan=-np.inf) for prefix in moving], len(settings)
+    )
+    moments = _rows([values[name] for name in names], len(settings))
+    teff = np.nan_to_num(settings.teff).tolist()
+    keys = list(zip(states, settings.filter.astype(str).tolist(), moments, teff, strict=True))
+    bands = sorted(set(keys))
     index = {key: i for i, key in enumerate(bands)}
-    band_of = np.zeros((len(exposures), n_sources + 1), int)
-    for e in range(len(exposures)):
-        band_of[e] = index[keys[e, -1]]
-        for s in range(n_sources):
-            if (e, s) in keys:
-                band_of[e, s + 1] = index[keys[e, s]]
 
     groups = sorted({(name, moment) for _, name, moment, _ in bands})
     rules = {
@@ -108,12 +110,11 @@ def plan_for(
         counts = [len(rules[name][0]) for name, _ in groups]
         return jnp.asarray(np.repeat(np.asarray(of_group, float), counts))
 
-    settings = []
+    laid = []
     found = [key[0] for key in bands]
     for value in sorted(set(found)):
         state = tuple(None if np.isinf(angle) else float(angle) for angle in value)
-        settings.append((state, found.index(value), len(found) - found[::-1].index(value)))
-    known = [source.kind for source in instrument.sources if source.flux_known]
+        laid.append((state, found.index(value), len(found) - found[::-1].index(value)))
     return Plan(
         wavelength=jnp.asarray(np.concatenate([rules[name][0] for name, _ in groups])),
         conditions=Conditions(
@@ -122,8 +123,12 @@ def plan_for(
         ),
         node_weight=jnp.asarray(weight),
         teff=jnp.asarray([key[3] for key in bands]),
-        exposures=exposure_arrays(exposures, instrument.kinds, known),
-        band_of=band_of,
-        settings=tuple(settings),
+        exposures=exposures,
+        band_of=band_of(np.array([index[key] for key in keys], int)),
+        settings=tuple(laid),
         moving=moving,
     )
+
+
+def _rows(columns: list[Float[np.ndarray, " n"]], count: int) -> list[tuple[float, ...]]:
+    return list(zip(*(column.tolist() for column in columns), strict=True)) if columns else [()] * count

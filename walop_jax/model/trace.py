@@ -15,13 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from walop_jax.data.records import Exposures, FilterCurve
+from walop_jax.data.records import FilterCurve
+from walop_jax.data.settings import Settings
 from walop_jax.model import fold, light
 from walop_jax.model.elements import Element
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.materials import REFERENCE_TEMPERATURE
 from walop_jax.model.plan import Plan
-from walop_jax.model.planning import plan_for
+from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.sources import Standards
 
 STOKES = ("I", "Q", "U", "V")
@@ -42,8 +42,9 @@ class Stage:
 class Sightline:
     """A source and the way through which it is looked at; angles and field coordinates in degrees.
 
-    `q`, `u` are those of the source in the instrument frame (taken as catalogue values at ROTATOR 0);
-    `clp_angle`, `chwp_angle` are NaN where polariser and calibration plate are out; `teff` in K, NaN: flat.
+    `q`, `u` are those of the source in the instrument frame (taken as catalogue values at ROTATOR 0); `clp_angle` is
+    NaN where the polariser is out; `setting` is a single row: the colour of the source, and where the optics stand.
+    Raises ValueError for light that is polarised by more than 1, and for several settings.
     """
 
     x: float = 0.0
@@ -51,38 +52,32 @@ class Sightline:
     q: float = 0.0
     u: float = 0.0
     clp_angle: float = float("nan")
-    chwp_angle: float = float("nan")
-    teff: float = float("nan")
-    temperature: float = REFERENCE_TEMPERATURE
-    hour_angle: float = 0.0
+    setting: Settings = dataclasses.field(default_factory=lambda: Settings.default(1))
 
     def __post_init__(self) -> None:
         if not np.hypot(self.q, self.u) <= 1.0:
             raise ValueError(f"q = {self.q:g}, u = {self.u:g}: light cannot be polarised by more than 1")
-
-    def exposure(self, filter_name: str) -> Exposures:
-        """The one exposure that looks at it."""
-
-        def one(value: float) -> Float[np.ndarray, " 1"]:
-            return np.array([value], float)
-
-        return Exposures(
-            exposure=np.zeros(1, int), kind=np.array(["standard"]), mjd=one(0.0), exptime=one(0.0),
-            filter=np.array([filter_name]), clp_in=np.isfinite(one(self.clp_angle)),
-            clp_angle=one(self.clp_angle), chwp_in=np.isfinite(one(self.chwp_angle)),
-            chwp_angle=one(self.chwp_angle), temp=one(self.temperature), ha=one(self.hour_angle),
-            ra=one(np.nan), dec=one(np.nan), rotator=one(0.0), teff=one(self.teff),
-        )  # fmt: skip
+        if len(self.setting) != 1:
+            raise ValueError(f"a sightline has one setting, not {len(self.setting)}")
 
 
 def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> tuple[Stage, ...]:
-    """Every stage from the source to the counts of the cameras."""
+    """Every stage from the source to the counts of the cameras, through a filter of this curve."""
     instrument = _with_source(instrument.patched(), sightline)
-    plan = plan_for(instrument, sightline.exposure(curve.name), {curve.name: curve})
+    plan = plan_for_settings(instrument, sightline.setting, {str(sightline.setting.filter[0]): curve})
+    through = np.isfinite(sightline.clp_angle)
+    exposure = dataclasses.replace(
+        plan.exposures,
+        kind=jnp.array([instrument.kinds.index(Standards.kind)]),
+        clp_in=jnp.array([through]),
+        clp_angle=jnp.deg2rad(jnp.array([sightline.clp_angle if through else 0.0])),
+        temperature=jnp.asarray(sightline.setting.temperature),
+        hour_angle=jnp.asarray(sightline.setting.hour_angle),
+    )
     x, y = jnp.asarray(sightline.x), jnp.asarray(sightline.y)
     source = jnp.asarray([len(instrument.standard.names) - 1])
-    beam = light.stokes(instrument, plan.exposures, jnp.zeros((1, 2)), source, x, y)[0]
-    stages = [_one("source", "polariser" if np.isfinite(sightline.clp_angle) else "sky", beam)]
+    beam = light.stokes(instrument, exposure, jnp.zeros((1, 2)), source, x, y)[0]
+    stages = [_one("source", "polariser" if through else "sky", beam)]
 
     # One Stokes vector per node, and its average over the band.
     weight, ray = light.band_weights(instrument, plan)[0], light.ray_at(instrument, plan, x, y)

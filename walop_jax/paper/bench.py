@@ -15,8 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.model.build import adapted
@@ -95,4 +96,4 @@ def _as_built(rng: np.random.Generator) -> Instrument:
 def _vectors(
     calibration: Calibration, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], teff: float
 ) -> Float[np.ndarray, "p 4 3"]:
-    return AnalysisVectors(calibration).exact(Setting("SDSS-r"), x, y, [teff])[:, 0]
+    return AnalysisVectors(calibration).exact(Settings.default(1), x, y, [teff])[:, 0]

@@ -20,11 +20,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.filters import DEFAULT_FILTER
 from walop_jax.data.records import CalibrationSet
+from walop_jax.data.settings import Settings
 from walop_jax.io.errors import DataError
 from walop_jax.paper.full_moon import full_moon_scheme, judge_patches
 from walop_jax.paper.polynomial import (
@@ -233,7 +234,7 @@ def compare(
     paper = fit_paper(calset, filter_name, stars)
     exposures = polariser_exposures(calset, filter_name)
     teff = float(np.median(calset.exposures.teff[exposures]))
-    analysis, setting = AnalysisVectors(calibration), Setting(filter_name)
+    analysis, setting = AnalysisVectors(calibration), Settings.default(1, filter_name)
 
     def vectors(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Vectors:
         return analysis.coloured(setting, x, y, np.full(len(x), teff))

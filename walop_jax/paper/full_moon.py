@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import Block, CalibrationSet
+from walop_jax.data.settings import Settings
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
@@ -89,12 +90,12 @@ def judge_patches(calset: CalibrationSet, calibration: Calibration) -> Patches:
     q, u = moon_sky(e.mjd[moon], e.ra[moon], e.dec[moon], e.rotator[moon], calset.site, block.x, block.y)
     sky = np.stack([q, u], axis=-1)  # point, exposure, (q, u)
     analysis = AnalysisVectors(calibration)
+    settings = analysis.reduced(Settings.of(e, analysis.instrument.patched().moving()))
     rows = []
     for k, m in enumerate(moon):
         there = np.flatnonzero(block.used[:, m])
-        setting = Setting(str(e.filter[m]), float(e.chwp_angle[m]) if e.chwp_in[m] else None)
         vectors = analysis.coloured(
-            setting, block.x[there], block.y[there], np.full(len(there), float(e.teff[m]))
+            settings[m : m + 1], block.x[there], block.y[there], np.full(len(there), float(e.teff[m]))
         )
         found = estimate(vectors, block.counts[there, m], block.sigma[there, m], np.arange(len(there)))
         rows.append(_smooth_fit(found.qu, found.photon, sky[there, k]))

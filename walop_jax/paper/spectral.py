@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_plan
+from walop_jax.calibration.matrix import analysis_vectors
 from walop_jax.data.filters import DEFAULT_FILTER
 from walop_jax.data.records import FilterCurve
+from walop_jax.data.settings import Settings
+from walop_jax.model.planning import plan_for_settings
 from walop_jax.paper.polynomial import measured_qu, transmitted
 
 TEMPERATURES = (3500.0, 5000.0, 7000.0, 10000.0)
@@ -38,7 +40,7 @@ def efficiencies(
     n = len(names)
     settings = dataclasses.replace(Settings.default(n), filter=np.array(names))
     instrument = calibration.model.instrument(calibration.values)
-    plan = settings_plan(settings, curves, instrument)
+    plan = plan_for_settings(instrument, settings, curves)
     a = analysis_vectors(instrument, plan, np.array([x]), np.array([y]))[0][np.asarray(plan.band_of)[:, 0]]
     rows = [(a[:, i] - a[:, i + 1]) / (a[:, i] + a[:, i + 1])[:, :1] for i in (0, 2)]
     return np.stack(rows, axis=1)[..., :3]
@@ -55,7 +57,7 @@ def colour_spread(
     """Δq_m, Δu_m at every point between stars of the given temperatures (K), largest over position angles."""
     angle = np.arange(ANGLES) * np.pi / ANGLES
     stars = degree * np.stack([np.cos(2 * angle), np.sin(2 * angle)], axis=1)
-    vectors = AnalysisVectors(calibration).exact(Setting(filter_name), x, y, list(temperatures))
+    vectors = AnalysisVectors(calibration).exact(Settings.default(1, filter_name), x, y, temperatures)
     seen = np.stack([measured_qu(transmitted(vectors[:, k], stars)) for k in range(len(temperatures))])
     return np.ptp(seen, axis=0).max(axis=1)
 

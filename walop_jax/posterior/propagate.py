@@ -6,15 +6,16 @@ import dataclasses
 import os
 from collections.abc import Mapping
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import Settings, analysis_vectors, settings_plan
+from walop_jax.calibration.matrix import sky_vectors
 from walop_jax.data.records import FilterCurve
+from walop_jax.data.settings import Settings
 from walop_jax.model import light
+from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import Model
 from walop_jax.posterior.output import read_draws
 
@@ -29,25 +30,15 @@ def matrix_draws(
     x: Float[np.ndarray, " p"],
     y: Float[np.ndarray, " p"],
 ) -> Float[np.ndarray, "d p m"]:
-    """m21, m22, m23, m31, m32, m33, … at field positions (deg) for every draw of all parameters."""
-    numbers = [
-        np.nan_to_num(v, nan=-1e30) for v in (settings.teff, settings.chwp_angle, settings.temp, settings.ha)
-    ]
-    key = np.rec.fromarrays([settings.filter.astype(str), *numbers])
-    _, first, of_row = np.unique(key, return_index=True, return_inverse=True)
+    """Elements of the instrument matrix at field positions (deg) for every draw of all parameters."""
     pairs = model.template.cameras.pairs
     result = np.empty((len(draws), len(x), 3 * len(pairs)))
-    for k, index in enumerate(first):
-        rows = np.flatnonzero(of_row.reshape(-1) == k)
-        one = settings[index : index + 1]
-        plan = settings_plan(one, filters, model.template)
+    for setting, rows in settings.distinct():
+        plan = plan_for_settings(model.template, setting, filters)
         for i, values in enumerate(draws):
             instrument = model.instrument(values)
-            vectors = analysis_vectors(instrument, plan, x[rows], y[rows])[:, 0]
-            sky = jax.vmap(light.telescope, (None, 0, 0))(
-                instrument, jnp.asarray(x[rows]), jnp.asarray(y[rows])
-            )
-            matrix = light.instrument_matrix(jnp.asarray(vectors) @ sky, pairs)
+            vectors = sky_vectors(instrument, plan, x[rows], y[rows])[:, 0]
+            matrix = light.instrument_matrix(jnp.asarray(vectors), pairs)
             result[i, rows] = np.asarray(matrix).reshape(len(rows), -1)
     return result
 
@@ -62,7 +53,7 @@ class DrawnCalibration(Calibration):
         self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings | None = None
     ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
         """As `Calibration.matrix`, by draws."""
-        settings = settings or Settings.default(len(x))
+        settings = settings or self.usual_settings(len(x))
         filters = {str(name): self.filter_curve(str(name)) for name in np.unique(settings.filter)}
         m = matrix_draws(self.model, self.draws, settings, filters, np.asarray(x), np.asarray(y))
         mean = m.mean(axis=0)

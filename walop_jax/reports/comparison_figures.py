@@ -9,8 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.data.settings import Settings
 from walop_jax.paper.comparison import Comparison
 from walop_jax.science.star_errors import GOAL, QUANTITIES, MethodErrors, plate_errors
 
@@ -149,7 +150,7 @@ def plate_figure(calibration: Calibration, combinations: Sequence[Sequence[float
     axes = figure.subplots(1, len(combinations), sharey=True, squeeze=False)[0]
     norm, shown = LogNorm(1.0, 100.0), None
     for axis, plates in zip(axes, combinations, strict=True):
-        settings = [Setting("SDSS-r", plate) for plate in plates]
+        settings = [Settings.default(1).at(CHWP=plate) for plate in plates]
         worst = plate_errors(analysis, settings, x.ravel(), y.ravel()).reshape(x.shape)
         shown = axis.pcolormesh(x, y, np.clip(worst, 1.0, 100.0), norm=norm, cmap="magma_r", rasterized=True)
         names = ["out" if plate is None else f"{plate:g}°" for plate in plates]

@@ -17,9 +17,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import Settings
 from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
+from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.reports.style import (
@@ -118,7 +118,7 @@ def point_residuals(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> 
 def _matrix_maps(figure: Figure, axes: Any, calibration: Calibration, settings: Settings | None) -> None:
     low_x, high_x, low_y, high_y = calibration.field
     x, y = np.meshgrid(np.linspace(low_x, high_x, PIXELS), np.linspace(low_y, high_y, PIXELS))
-    one = settings or Settings.default(1)
+    one = settings or calibration.usual_settings()
     rows = one[np.zeros(x.size, int)]
     matrix, _ = calibration.matrix(x.ravel(), y.ravel(), rows)
     maps = matrix.T.reshape(6, *x.shape)

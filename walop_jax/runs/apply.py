@@ -19,7 +19,8 @@ from walop_jax.data.user_tables import read_input_table, table_format, write_out
 from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import errors_naming
 from walop_jax.posterior.propagate import with_moments
-from walop_jax.science.apply import apply, not_carried_over
+from walop_jax.runs.left_out import KEY, left_out_cards, left_out_sentences
+from walop_jax.science.apply import apply
 from walop_jax.science.polarisation import ESTIMATORS
 from walop_jax.science.stokes_columns import header, stokes_columns
 
@@ -39,7 +40,8 @@ class StokesTable:
     """A catalogue that was written.
 
     `flags` counts the stars with each bit of FLAG; `product` is the content hash of the calibration, `trusted` what
-    it says of itself; `warnings` are sentences about both.
+    it says of itself; `not_carried_over` names effects of its model that cannot be undone in a catalogue; `warnings`
+    are sentences about all of that.
     """
 
     path: Path
@@ -50,6 +52,7 @@ class StokesTable:
     trusted: bool
     flags: Mapping[Quality, int]
     product: str
+    not_carried_over: tuple[str, ...]
     warnings: tuple[str, ...]
 
     def document(self) -> dict[str, Any]:
@@ -63,6 +66,7 @@ class StokesTable:
             "trusted": self.trusted,
             "flags": {str(int(bit)): count for bit, count in self.flags.items()},
             "product": self.product,
+            KEY: list(self.not_carried_over),
         }
 
 
@@ -94,7 +98,9 @@ def apply_to_catalogue(
     check_output(output, overwrite=overwrite)
     held = read_calibration(product)
     table = read_input_table(catalogue)
-    rows = read_catalogue(table, held.product.instrument, math.inf if saturation is None else saturation)
+    instrument = held.calibration.model.template.patched()
+    limit = math.inf if saturation is None else saturation
+    rows = read_catalogue(table, instrument, limit, always_in=held.calibration.always_in)
 
     tell("tabulating the analysis vectors")
     calibration = held.calibration if posterior is None else with_moments(held.calibration, posterior)
@@ -103,14 +109,11 @@ def apply_to_catalogue(
     tell("writing")
     columns = stokes_columns(stars, rows.star, estimator)
     content = held.product.content_hash()
-    cards = header(content, estimator, float(np.mean(np.isfinite(rows.rotator))))
+    lost = calibration.left_behind
+    cards = header(content, estimator, float(np.mean(np.isfinite(rows.rotator)))) | left_out_cards(lost)
     write_output_table(output, table, columns, overwrite=overwrite, header=cards)
 
     counts = {bit: int((stars.flag & bit > 0).sum()) for bit in BITS}
-    lost = [
-        f"{held.path}: {effect} of the calibration's exposures cannot be undone in a catalogue; it is left out"
-        for effect in not_carried_over(calibration)
-    ]
     said = (
         (Quality.NO_STOKES, "star(s) without a result (FLAG 16384)"),
         (Quality.BEYOND_FIELD, "star(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)"),
@@ -126,5 +129,6 @@ def apply_to_catalogue(
         trusted=held.product.verdict.trusted,
         flags=counts,
         product=content,
-        warnings=(*held.warnings, *lost, *flagged),
+        not_carried_over=lost,
+        warnings=(*held.warnings, *left_out_sentences(lost, held.path), *flagged),
     )

@@ -9,7 +9,8 @@ from typing import Any
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data import DEFAULT_FILTER, read_calibration_set
-from walop_jax.data.user_tables import new_table, true_matrices, write_output_table
+from walop_jax.data.field_points import true_matrices
+from walop_jax.data.user_tables import new_table, write_output_table
 from walop_jax.fit.model_builder import model_for
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import errors_naming
@@ -18,6 +19,7 @@ from walop_jax.io.text import json_text, read_text
 from walop_jax.model.instrument import Instrument
 from walop_jax.paper.comparison import Comparison, compare
 from walop_jax.reports import comparison_figures
+from walop_jax.runs.left_out import KEY, left_out_cards, left_out_sentences
 from walop_jax.science.star_errors import Truth
 
 DOCUMENT, TABLE = "comparison.json", "comparison.fits"
@@ -66,21 +68,23 @@ def compare_methods(
     check_folder(output, OUTPUTS, overwrite=overwrite)
     tell("reading")
     calset = read_calibration_set(*calsets)
-    known = None if truth is None else Truth(*true_matrices(truth, calset.instrument))
     design = None if instrument is None else Instrument.read(instrument)
     with errors_naming(model):
         chosen = model_for(calset, text, design)
+    known = None if truth is None else Truth(*true_matrices(truth, chosen.template.patched()))
     tell("fitting the joint model")
     result = refit(calset, chosen, progress=tell)
     if not result.converged:
         raise ValueError(f"the joint fit did not converge ({result.minimum.message})")
     tell("fitting and judging the polynomials")
-    found = compare(calset, Calibration.from_fit(result), known, filter_name, seed or 0)
-    document = found.document()
+    calibration = Calibration.from_fit(result)
+    found = compare(calset, calibration, known, filter_name, seed or 0)
+    lost = calibration.left_behind
+    document = found.document() | {KEY: list(lost)}
     with atomic_folder(output, OUTPUTS, overwrite=overwrite) as folder:
         (folder / DOCUMENT).write_text(json_text(document), encoding="utf-8")
-        write_output_table(folder / TABLE, new_table(found.columns()), {})
+        write_output_table(folder / TABLE, new_table(found.columns()), {}, header=left_out_cards(lost))
         for name, figure in FIGURES.items():
             figure(found).savefig(folder / name, dpi=130)
     warnings = () if result.trusted else ("the joint fit is not trusted: see walop-jax refit",)
-    return ComparedRun(found, document, warnings)
+    return ComparedRun(found, document, (*warnings, *left_out_sentences(lost)))

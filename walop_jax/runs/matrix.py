@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from walop_jax.calibration.from_file import read_calibration
-from walop_jax.calibration.matrix import Settings
 from walop_jax.calibration.matrix_table import matrix_columns
 from walop_jax.calibration.records import Quality
-from walop_jax.data.user_tables import field_points, read_input_table, table_format, write_output_table
+from walop_jax.data.field_points import field_points
+from walop_jax.data.user_tables import read_input_table, table_format, write_output_table
 from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import errors_naming
 from walop_jax.posterior.propagate import with_draws
+from walop_jax.runs.left_out import KEY, left_out_cards, left_out_sentences
 
 BITS = (Quality.HIGH_CROSSTALK, Quality.BEYOND_FIELD, Quality.BEYOND_SETTINGS)
 """Bits of FLAG that a row of a table of matrices can have."""
@@ -26,7 +27,8 @@ class MatrixTable:
     """A table that was written.
 
     `flags` counts the rows with each bit of FLAG; `product` is the content hash of the calibration, `trusted` what
-    it says of itself; `warnings` are sentences about both.
+    it says of itself; `not_carried_over` names effects of its model that no matrix can have; `warnings` are sentences
+    about all of that.
     """
 
     path: Path
@@ -34,6 +36,7 @@ class MatrixTable:
     trusted: bool
     flags: Mapping[Quality, int]
     product: str
+    not_carried_over: tuple[str, ...]
     warnings: tuple[str, ...]
 
     def document(self) -> dict[str, Any]:
@@ -44,6 +47,7 @@ class MatrixTable:
             "trusted": self.trusted,
             "flags": {str(int(bit)): count for bit, count in self.flags.items()},
             "product": self.product,
+            KEY: list(self.not_carried_over),
         }
 
 
@@ -56,7 +60,7 @@ def tabulate_matrix(
     overwrite: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> MatrixTable:
-    """Add M21 … M33, their errors and FLAG to the table `points`, and write it as `output`.
+    """Add M21, M22, …, their errors and FLAG to the table `points`, and write it as `output`.
 
     `product` is a calibration product or the folder of a run; with `posterior` (a `posterior.nc`) values and errors
     are those of its draws. `progress` is told what is being done. Raises `DataError` for files that cannot be read
@@ -66,27 +70,32 @@ def tabulate_matrix(
     check_output(output, overwrite=overwrite)
     held = read_calibration(product)
     table = read_input_table(points)
-    wanted = field_points(table, held.product.instrument)
+    instrument = held.calibration.model.template.patched()
+    wanted = field_points(table, instrument, held.calibration.always_in)
     if progress is not None:
         progress("working out the matrix")
     calibration = held.calibration if posterior is None else with_draws(held.calibration, posterior)
-    settings = Settings(wanted.filter, wanted.teff, wanted.chwp_angle, wanted.temp, wanted.ha)
     with errors_naming(points):
-        columns = matrix_columns(calibration, wanted.x, wanted.y, settings, wanted.outside)
-    write_output_table(output, table, columns, overwrite=overwrite)
+        columns = matrix_columns(calibration, wanted.x, wanted.y, wanted.settings, wanted.outside)
+    lost = calibration.left_behind
+    write_output_table(output, table, columns, overwrite=overwrite, header=left_out_cards(lost))
 
     flag = columns["FLAG"][0]
     counts = {bit: int((flag & bit > 0).sum()) for bit in BITS}
-    said = (
-        (Quality.BEYOND_FIELD, "point(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)"),
-        (Quality.BEYOND_SETTINGS, "row(s) with a filter or temperature not in the calibration (FLAG 64)"),
-    )
-    flagged = [f"{points}: {counts[bit]} {text}" for bit, text in said if counts[bit]]
+    warnings = [*held.warnings, *left_out_sentences(lost, held.path)]
+    said = {
+        Quality.BEYOND_FIELD: "point(s) beyond the calibrated field: extrapolated, or NaN",
+        Quality.BEYOND_SETTINGS: "row(s) with a filter or temperature not in the calibration",
+    }
+    warnings += [
+        f"{points}: {counts[bit]} {text} (FLAG {bit:d})" for bit, text in said.items() if counts[bit]
+    ]
     return MatrixTable(
         path=Path(output),
         rows=table.rows,
         trusted=held.product.verdict.trusted,
         flags=counts,
         product=held.product.content_hash(),
-        warnings=(*held.warnings, *flagged),
+        not_carried_over=lost,
+        warnings=tuple(warnings),
     )

@@ -14,16 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.calibration.analysis_vectors import COLOURS, AnalysisVectors, Setting
+from walop_jax.calibration.analysis_vectors import COLOURS, AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.field_series import COOLEST, colour_weights
-from walop_jax.calibration.matrix import Settings
+from walop_jax.calibration.colour import COOLEST, colour_weights
 from walop_jax.calibration.records import Quality
 from walop_jax.data.catalogue import Catalogue
+from walop_jax.data.settings import Settings
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood import limits
 from walop_jax.model import carried, light
-from walop_jax.model.dependence import needs
 from walop_jax.model.parameters import with_values
 from walop_jax.science.estimate import calibration_shift, estimate
 
@@ -31,7 +30,6 @@ MOST_SETTINGS = 200
 ILL_POSED = 10.0  # ratio of the errors of the two principal directions from which FLAG 16 is set
 COOL, HOT = 3500.0, 10000.0
 """Colour temperatures (K) between which stars without TEFF are taken to lie."""
-_NEUTRAL = Setting("")
 _ROUNDS = 16
 
 
@@ -69,7 +67,7 @@ def apply(
     for a catalogue with more optical settings than can be tabulated.
     """
     vectors = AnalysisVectors(calibration)
-    settings, setting_of = _settings(calibration, catalogue)
+    settings, setting_of = _settings(vectors, catalogue)
     counts = linearised(calibration, catalogue.counts)
     offset, slope = _rotator_zero(vectors)
     order = np.argsort(catalogue.star, kind="stable")
@@ -101,21 +99,21 @@ def _stars_of_rows(
     vectors: AnalysisVectors,
     catalogue: Catalogue,
     rows: Int[np.ndarray, " r"],
-    counts: Float[np.ndarray, "r 4"],
-    settings: list[Setting],
+    counts: Float[np.ndarray, "r k"],
+    settings: list[Settings],
     setting_of: Int[np.ndarray, " r"],
     offset: float,
-    slope: Float[np.ndarray, " k"],
+    slope: Float[np.ndarray, " n"],
 ) -> Stars:
     points, sigma = catalogue.points, catalogue.sigma[rows]
     _, star = np.unique(catalogue.star[rows], return_inverse=True)
     first = np.flatnonzero(np.diff(star, prepend=-1))
     outside = _outside(vectors, catalogue, rows)
     x, y = (np.where(outside, 0.0, values[rows]) for values in (points.x, points.y))
-    teff, sky = points.teff[rows], np.isfinite(catalogue.rotator[rows])
+    teff, sky = points.settings.teff[rows], np.isfinite(catalogue.rotator[rows])
     turn = 2.0 * np.where(sky, np.deg2rad(catalogue.rotator[rows]) + offset, 0.0)
 
-    spectra = np.empty((len(rows), COLOURS + 1, 4, 3))
+    spectra = np.empty((len(rows), COLOURS + 1, vectors.cameras, 3))
     for k, here in _rows_by_setting(setting_of):
         spectra[here] = vectors.at(settings[k], x[here], y[here])
     there = np.einsum("rc,rcks->rks", colour_weights(teff, COLOURS), spectra)
@@ -162,8 +160,8 @@ def _rows_by_setting(setting_of: Int[np.ndarray, " r"]) -> Iterator[tuple[int, I
 
 
 def _vectors_on_sky(
-    vectors: Float[np.ndarray, "r 4 3"], turn: Float[np.ndarray, " r"]
-) -> Float[np.ndarray, "r 4 3"]:
+    vectors: Float[np.ndarray, "r k 3"], turn: Float[np.ndarray, " r"]
+) -> Float[np.ndarray, "r k 3"]:
     """Analysis vectors for Stokes parameters on the sky; `turn` is twice the position angle of +X (rad).
 
     (q + iu) of the instrument = (q + iu) of the sky × exp(−i turn).
@@ -192,50 +190,35 @@ def _ignored_colour(teff: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r c"]:
 # ------------------------------------------------------------------------------------- settings and flags
 
 
-def _settings(calibration: Calibration, catalogue: Catalogue) -> tuple[list[Setting], Int[np.ndarray, " n"]]:
-    """The optical settings of a catalogue and which of them every row has.
-
-    Temperature and hour angle count only where an effect of the model makes the optics depend on them.
-    """
-    points = catalogue.points
-    depends = needs(calibration.model.template).conditions
-    temperature = points.temp if "temperature" in depends else np.full(len(catalogue), _NEUTRAL.temperature)
-    hours = points.ha if "hour_angle" in depends else np.zeros(len(catalogue))
-    plate = np.where(np.isnan(points.chwp_angle), np.inf, np.mod(points.chwp_angle, 180.0))
-    _, band = np.unique(points.filter, return_inverse=True)
-    key = np.stack([band.reshape(-1), plate, temperature, hours], axis=1)
-    _, first, of = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    if len(first) > MOST_SETTINGS:
+def _settings(vectors: AnalysisVectors, catalogue: Catalogue) -> tuple[list[Settings], Int[np.ndarray, " n"]]:
+    """The optical settings of a catalogue and which of them every row has."""
+    settings = vectors.reduced(catalogue.points.settings)
+    found = settings.optics()
+    if len(found) > MOST_SETTINGS:
+        columns = ", ".join(["TEMP", "HA", *(f"{prefix}_ANGLE" for prefix in settings.positions)])
         raise DataError(
-            f"TEMP, HA, CHWP_ANGLE: {len(first)} different optical settings, at most {MOST_SETTINGS} can be "
-            "tabulated; round TEMP to 0.1 Celsius and HA to 0.1 h, or take the catalogue in parts"
+            f"{columns}: {len(found)} different optical settings, at most {MOST_SETTINGS} can be tabulated; round "
+            "TEMP to 0.1 Celsius and HA to 0.1 h, or take the catalogue in parts"
         )
-    settings = [
-        Setting(
-            str(points.filter[k]),
-            None if np.isinf(plate[k]) else float(plate[k]),
-            float(temperature[k]),
-            float(hours[k]),
-        )
-        for k in first
-    ]
-    return settings, of.reshape(-1)
+    of = np.empty(len(catalogue), int)
+    for number, (_, rows) in enumerate(found):
+        of[rows] = number
+    return [setting for setting, _ in found], of
 
 
 def _flags(
     vectors: AnalysisVectors,
     catalogue: Catalogue,
     rows: Int[np.ndarray, " r"],
-    counts: Float[np.ndarray, "r 4"],
+    counts: Float[np.ndarray, "r k"],
     first: Int[np.ndarray, " s"],
     qu: Float[np.ndarray, "s 2"],
     condition: Float[np.ndarray, " s"],
 ) -> Int[np.ndarray, " s"]:
-    """Quality bits of every star: those of its rows and of the calibration, and 16 and 16384 of its own."""
+    """Quality bits of every star: those of its rows and of the calibration, and two that need all of its rows."""
     points = catalogue.points
-    settings = Settings(*(getattr(points, f.name)[rows] for f in dataclasses.fields(Settings)))
-    square = np.tile([0.0, 1.0, 0.0, 0.0, 0.0, 1.0], (len(rows), 1))  # 16 is decided below, for all rows
-    bits = vectors.calibration.flags(points.x[rows], points.y[rows], settings, square)
+    settings = points.settings[rows]
+    bits = vectors.calibration.flags(points.x[rows], points.y[rows], settings)
     bits[_outside(vectors, catalogue, rows)] |= Quality.BEYOND_FIELD
     bits[settings.teff < COOLEST] |= Quality.BEYOND_SETTINGS
     bits[~np.isfinite(counts * catalogue.sigma[rows]).all(axis=1)] |= Quality.CAMERA_MISSING
@@ -249,7 +232,7 @@ def _flags(
 # ---------------------------------------------------------------------------------- effects beyond the optics
 
 
-def linearised(calibration: Calibration, counts: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
+def linearised(calibration: Calibration, counts: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
     """Counts as linear detectors would report them, where the calibration has found out what they do to counts."""
     instrument = calibration.model.instrument(calibration.values)
     if light.is_linear(instrument):
@@ -260,12 +243,7 @@ def linearised(calibration: Calibration, counts: Float[np.ndarray, "n 4"]) -> Fl
     return true
 
 
-def not_carried_over(calibration: Calibration) -> tuple[str, ...]:
-    """Effects of the fitted model that belong to its exposures and cannot be undone in a catalogue."""
-    return carried.left_behind(calibration.model.template)
-
-
-def _rotator_zero(vectors: AnalysisVectors) -> tuple[float, Float[np.ndarray, " k"]]:
+def _rotator_zero(vectors: AnalysisVectors) -> tuple[float, Float[np.ndarray, " n"]]:
     """What the model adds to ROTATOR (rad), and its derivatives to `vectors.parameters`."""
     to_instrument = with_values(vectors.calibration.model.template)
 

@@ -20,10 +20,11 @@ import numpy as np
 from jax.scipy.special import gammaincc
 from jaxtyping import Float
 
-from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
+from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import effects_text, model_for
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
@@ -142,7 +143,20 @@ def _star_errors(old: Calibration, new: Calibration) -> dict[str, dict[str, floa
     x, y = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 200))
     low_x, high_x, low_y, high_y = new.field
     x, y = 0.5 * ((low_x + high_x) + (high_x - low_x) * x), 0.5 * ((low_y + high_y) + (high_y - low_y) * y)
-    setting = Setting(str(np.unique(new.exposures.filter)[-1]))
-    vectors = [AnalysisVectors(c).exact(setting, x, y, [np.nan])[:, 0] for c in (old, new)]
+    settings, pairs = _seen_through(new), new.model.template.cameras.pairs
+    vectors = []
+    for calibration in (old, new):
+        analysis = AnalysisVectors(calibration)
+        vectors.append(np.stack([analysis.exact(setting, x, y)[:, 0] for setting in settings], axis=1))
     errors = joint_errors(vectors[0], vectors[1], sample_stars())
-    return statistics(errors, np.abs(determinant(vectors[1])) >= SMALLEST_DETERMINANT)
+    return statistics(errors, determinant(vectors[1], pairs) >= SMALLEST_DETERMINANT)
+
+
+def _seen_through(calibration: Calibration) -> list[Settings]:
+    """The settings in which a star is seen: one exposure, or, with a single arm, one at each position of the set."""
+    name = str(np.unique(calibration.exposures.filter)[-1])
+    usual = calibration.usual_settings(filter_name=name)
+    if len(calibration.model.template.arms) > 1:
+        return [usual]
+    seen = Settings.of(calibration.exposures, calibration.model.template.patched().moving())
+    return [setting for setting, _ in usual[np.zeros(len(seen), int)].at(**seen.positions).layouts()]

@@ -2,7 +2,7 @@
 
     N_jk = F_j a_jk · s + noise of σ_jk,    s = (1, q, u)
 
-Row j is an exposure with four cameras k; its flux F_j is unknown, (q, u) is shared by all rows of a star.
+Row j is an exposure with cameras k; its flux F_j is unknown, (q, u) is shared by all rows of a star.
 
 Sufficient  With w = 1/σ² (0: camera not used), G_j = Σ_k w a aᵀ and b_j = Σ_k w a N are all that the likelihood
             needs: the best flux is F = b·s / sᵀG s, and χ²_j = Σ w N² − (b·s)² / sᵀG s.
@@ -24,6 +24,8 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from walop_jax.likelihood.flux import project_flux
 
 STEPS = 40
 CONVERGED = 1e-13  # of the largest step in q, u, or 1e-9 σ
@@ -48,16 +50,18 @@ class Estimate:
     chi2: Float[np.ndarray, " s"]
     dof: Int[np.ndarray, " s"]
     flux: Float[np.ndarray, " r"]
-    gain: Float[np.ndarray, "r 2 4"]
+    gain: Float[np.ndarray, "r 2 k"]
 
 
 def estimate(
-    vectors: Float[np.ndarray, "r 4 3"],
-    counts: Float[np.ndarray, "r 4"],
-    sigma: Float[np.ndarray, "r 4"],
+    vectors: Float[np.ndarray, "r k 3"],
+    counts: Float[np.ndarray, "r k"],
+    sigma: Float[np.ndarray, "r k"],
     star: Int[np.ndarray, " r"],
 ) -> Estimate:
-    """Stokes parameters of stars from rows of four intensities.
+    """Stokes parameters of stars from rows of intensities.
+
+    A row of two cameras holds one combination of q and u: such a star needs several settings, or is NaN.
 
     `vectors` (row, camera, Stokes) are the analysis vectors in the frame that (q, u) are wanted in; counts that
     are not finite, or whose `sigma` is not finite and above 0, are not used. `star` numbers the stars from 0
@@ -77,12 +81,10 @@ def estimate(
 
     s = _stokes(qu[star])
     model = np.einsum("rki,ri->rk", vectors, s)
-    along = np.einsum("rij,rj->ri", gram, s)
-    power = np.einsum("ri,ri->r", along, s)
-    along = along[:, 1:] / np.where(power > 0, power, 1.0)[:, None]
-    tangent = vectors[..., 1:] - model[..., None] * along[:, None]
+    root = np.sqrt(weight)
+    tangent = project_flux(np.moveaxis(vectors[..., 1:], -1, 0) * root, model * root)
     # F cancels between c = H Jᵀ w F with J = F tangent, so gain times δa·s is the shift of (q, u).
-    gain = np.einsum("rij,rkj,rk->rik", photon[star], tangent, weight * flux[:, None] ** 2, optimize=True)
+    gain = np.einsum("rij,jrk,rk->rik", photon[star], tangent, root * flux[:, None] ** 2, optimize=True)
     residual = np.einsum("rk,rk->r", weight, (data - flux[:, None] * model) ** 2)
     rows_used = used.any(axis=1)
     return Estimate(
@@ -97,8 +99,8 @@ def estimate(
 
 
 def calibration_shift(
-    gain: Float[np.ndarray, "r 2 4"],
-    change: Float[np.ndarray, "r 4 m"],
+    gain: Float[np.ndarray, "r 2 k"],
+    change: Float[np.ndarray, "r k m"],
     star: Int[np.ndarray, " r"],
 ) -> Float[np.ndarray, "s 2 m"]:
     """Shift of every star's (q, u) when the model counts per unit flux of its rows change by `change`.

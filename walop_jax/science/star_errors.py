@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from walop_jax.calibration.analysis_vectors import AnalysisVectors, Setting
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.data.settings import Settings
 from walop_jax.science.estimate import estimate
 
 STARS, LARGEST_P = 100, 0.05
@@ -21,8 +22,10 @@ GOAL = 0.001
 QUANTITIES = ("q", "u", "p")
 _ELECTRONS = 1e6  # of the stars; their photon noise does not enter
 
-Vectors = Float[np.ndarray, "p 4 3"]
+Vectors = Float[np.ndarray, "p *r k 3"]
+"""Analysis vectors at field points, of one exposure or of several (r) in which a star is seen."""
 QuPairs = Float[np.ndarray, "n 2"]
+CameraPairs = tuple[tuple[int, int], ...]
 
 
 def sample_stars(count: int = STARS, largest: float = LARGEST_P, seed: int = 0) -> QuPairs:
@@ -32,18 +35,18 @@ def sample_stars(count: int = STARS, largest: float = LARGEST_P, seed: int = 0) 
     return np.stack([p * np.cos(2 * angle), p * np.sin(2 * angle)], axis=1)
 
 
-def transmitted(vectors: Float[np.ndarray, "p 4 3"], stars: QuPairs) -> Float[np.ndarray, "p n 4"]:
+def transmitted(vectors: Vectors, stars: QuPairs) -> Float[np.ndarray, "p n *r k"]:
     """Counts (point, star, camera) of sources of unit flux."""
     s = np.concatenate([np.ones((len(stars), 1)), stars], axis=1)
-    return np.einsum("pks,ns->pnk", vectors, s)
+    return np.einsum("p...ks,ns->pn...k", vectors, s)
 
 
 class Truth(NamedTuple):
-    """True instrument matrices (m21 … m33) at field positions (deg), for the colour of the polariser's source."""
+    """True instrument matrices (m21, m22, …) at field positions (deg), for the colour of the polariser's source."""
 
     x: Float[np.ndarray, " p"]
     y: Float[np.ndarray, " p"]
-    matrix: Float[np.ndarray, "p 6"]
+    matrix: Float[np.ndarray, "p m"]
 
 
 Errors = Float[np.ndarray, "p 3"]
@@ -58,16 +61,16 @@ def star_errors(found: Float[np.ndarray, "p n 2"], stars: Float[np.ndarray, "n 2
 def joint_errors(vectors: Vectors, reference: Vectors, stars: Float[np.ndarray, "n 2"]) -> Errors:
     """Errors of stars seen through `reference` and recovered, noise-free, with the vectors of a calibration."""
     counts = _ELECTRONS * transmitted(reference, stars)
-    p, n = counts.shape[:2]
-    found = estimate(
-        np.repeat(vectors, n, axis=0), counts.reshape(-1, 4), np.sqrt(counts).reshape(-1, 4), np.arange(p * n)
-    )
+    p, n, cameras = *counts.shape[:2], counts.shape[-1]
+    rows = counts.reshape(-1, cameras)
+    star = np.repeat(np.arange(p * n), len(rows) // (p * n))
+    found = estimate(np.repeat(vectors, n, axis=0).reshape(-1, cameras, 3), rows, np.sqrt(rows), star)
     return star_errors(found.qu.reshape(p, n, 2), stars)
 
 
 def promised_errors(
     analysis: AnalysisVectors,
-    setting: Setting,
+    setting: Settings,
     x: Float[np.ndarray, " p"],
     y: Float[np.ndarray, " p"],
     stars: Float[np.ndarray, "n 2"],
@@ -75,11 +78,10 @@ def promised_errors(
     """Errors that the covariance of the calibration promises, rms over the stars."""
     vectors = analysis.coloured(setting, x, y)
     counts = _ELECTRONS * transmitted(vectors, stars)
-    n = len(stars)
-    repeat = np.repeat(vectors, n, axis=0)
-    found = estimate(repeat, counts.reshape(-1, 4), np.sqrt(counts).reshape(-1, 4), np.arange(len(repeat)))
+    n, rows = len(stars), counts.reshape(-1, counts.shape[-1])
+    found = estimate(np.repeat(vectors, n, axis=0), rows, np.sqrt(rows), np.arange(len(rows)))
     local = analysis.derivatives(setting, x, y, np.full(len(x), np.nan))
-    gain = found.gain.reshape(len(x), n, 2, 4)
+    gain = found.gain.reshape(len(x), n, 2, -1)
     s = np.concatenate([np.ones((n, 1)), stars], axis=1)
     total = np.zeros((len(x), 3))
     for k in range(n):
@@ -92,7 +94,7 @@ def promised_errors(
 
 def plate_errors(
     analysis: AnalysisVectors,
-    settings: Sequence[Setting],
+    settings: Sequence[Settings],
     x: Float[np.ndarray, " p"],
     y: Float[np.ndarray, " p"],
 ) -> Float[np.ndarray, " p"]:
@@ -104,21 +106,26 @@ def plate_errors(
     r, n = len(settings), len(x)
     rows = np.stack([analysis.coloured(s, x, y) for s in settings], axis=1)
     counts = _ELECTRONS * rows[..., 0]
-    found = estimate(
-        rows.reshape(-1, 4, 3),
-        counts.reshape(-1, 4),
-        np.sqrt(counts).reshape(-1, 4),
-        np.repeat(np.arange(n), r),
-    )
+    each, star = counts.reshape(n * r, -1), np.repeat(np.arange(n), r)
+    found = estimate(rows.reshape(n * r, -1, 3), each, np.sqrt(each), star)
     worst = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(found.photon, nan=np.inf))[:, 1])
-    # q = (N0 − N1)/(N0 + N1) with half of the electrons in its two cameras: σ² = 2 / all electrons.
+    # q from a normalised difference with half of the electrons: σ² = 2 / all electrons.
     return worst / np.sqrt(2.0 / counts.sum(axis=(1, 2)))
 
 
-def determinant(vectors: Vectors) -> Float[np.ndarray, " p"]:
-    """m22 m33 − m23 m32 at every point: what one exposure holds of (q, u)."""
-    rows = [(vectors[:, i] - vectors[:, i + 1]) / (vectors[:, i] + vectors[:, i + 1])[:, :1] for i in (0, 2)]
-    return rows[0][:, 1] * rows[1][:, 2] - rows[0][:, 2] * rows[1][:, 1]
+def determinant(vectors: Vectors, pairs: CameraPairs | None = None) -> Float[np.ndarray, " p"]:
+    """What the exposures hold of (q, u) at every point: |m22 m33 − m23 m32| for one exposure of two arms.
+
+    In general the root of det MᵀM, M having a row (m22, m23) for every arm and exposure: 0 where all see the same
+    direction. `pairs` are the cameras of the arms; None takes them two by two.
+    """
+    first, second = (vectors[..., cameras, :] for cameras in np.array(pairs or _two_by_two(vectors)).T)
+    rows = ((first - second)[..., 1:] / (first + second)[..., :1]).reshape(len(vectors), -1, 2)
+    return np.sqrt(np.maximum(np.linalg.det(rows.swapaxes(1, 2) @ rows), 0.0))
+
+
+def _two_by_two(vectors: Vectors) -> CameraPairs:
+    return tuple((k, k + 1) for k in range(0, vectors.shape[-2], 2))
 
 
 def statistics(errors: Errors, chosen: Bool[np.ndarray, " p"] | None = None) -> dict[str, dict[str, float]]:
@@ -156,14 +163,19 @@ class MethodErrors:
         return out
 
 
-def truth_vectors(joint: Vectors, matrix: Float[np.ndarray, "p 6"]) -> Vectors:
-    """Analysis vectors with true matrices (m21 … m33) and, what these do not hold, the sums of the joint model.
+def truth_vectors(
+    joint: Vectors, matrix: Float[np.ndarray, "p m"], pairs: CameraPairs | None = None
+) -> Vectors:
+    """Analysis vectors with true matrices (m21, m22, …) and, what these do not hold, the sums of the joint model.
 
-    a± = ½ (S ± S₀ m) with S the sum of a pair of cameras; an error of S is second order in p.
+    a± = ½ (S ± S₀ m) with S the sum of a pair of cameras; an error of S is second order in p. `pairs` as for
+    `determinant`.
     """
-    pairs = []
-    for i, rows in ((0, matrix[:, :3]), (2, matrix[:, 3:])):
-        total = joint[:, i] + joint[:, i + 1]
-        difference = total[:, :1] * rows
-        pairs += [0.5 * (total + difference), 0.5 * (total - difference)]
-    return np.stack(pairs, axis=1)
+    found = np.empty_like(joint)
+    for (i, j), row in zip(
+        pairs or _two_by_two(joint), matrix.reshape(len(matrix), -1, 3).swapaxes(0, 1), strict=True
+    ):
+        total = joint[:, i] + joint[:, j]
+        difference = total[:, :1] * row
+        found[:, i], found[:, j] = 0.5 * (total + difference), 0.5 * (total - difference)
+    return found

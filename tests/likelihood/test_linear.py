@@ -1,0 +1,92 @@
+"""Derivatives in pieces (optics, plain parameters, local throughputs) against plain forward differentiation."""
+
+from __future__ import annotations
+
+import builders
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from walop_jax.data.settings import Settings
+from walop_jax.likelihood import linear
+from walop_jax.model import light
+from walop_jax.model.effects import effect_by_name
+from walop_jax.model.effects.base import Context
+from walop_jax.model.parameters import leaves, values_of, with_values
+from walop_jax.model.planning import plan_for_settings
+
+X, Y = jnp.asarray(0.21), jnp.asarray(-0.13)
+# One acts in the optics, one at the telescope, one on the cameras, one in the optics and nowhere else.
+EFFECTS = (
+    ("hwp1_axis", {"angle": 0.3}), ("telescope_polarisation", {"q": 0.01, "u": -0.004}),
+    ("camera_leakage", {"share": 0.02}), ("hwp_temperature", {"coefficient": 0.7}),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def instrument():
+    context = Context(exposures=1, sources=("STD00",))
+    effects = [effect_by_name(name).of(context, **numbers) for name, numbers in EFFECTS]
+    return builders.south(np.random.default_rng(2), effects, standards=[("STD00", 0.01, 0.02)])
+
+
+@pytest.fixture(scope="module")
+def plan(instrument):
+    settings = Settings.default(2, "band").at(CHWP=np.array([np.nan, 22.5]))
+    return plan_for_settings(instrument, settings, {"band": builders.monochromatic(0.62)})
+
+
+def matrix_of(instrument, rows, throughput):
+    vectors = light.camera_vectors(instrument, rows, throughput, X, Y)
+    return light.instrument_matrix(vectors @ light.telescope(instrument), instrument.cameras.pairs)
+
+
+def test_derivatives_are_those_of_forward_differentiation(instrument, plan):
+    """Every parameter, whatever it acts on, and the value itself."""
+    to_instrument = with_values(instrument)
+
+    def whole(values):
+        there = to_instrument(values)
+        return matrix_of(there, light.band_rows(there, plan, X, Y), light.throughput_at(there, X, Y))
+
+    def quantity(rows, values, local):
+        return matrix_of(to_instrument(values), rows, local)
+
+    values = values_of(instrument)
+    rows, slopes = linear.rows_and_slopes(instrument, plan, X, Y)
+    found = linear.linearised(instrument, quantity, rows, slopes, light.throughput_at(instrument, X, Y))
+    derivative = linear.to_all(instrument, found.plain, found.local, instrument.throughput.basis(X, Y)[None])
+    expected = jax.jacfwd(whole)(values)
+    assert derivative.shape == (2, 2, 3, values.size)
+    np.testing.assert_allclose(found.value, whole(values), rtol=0, atol=1e-14)
+    scale = np.abs(expected).max(axis=(0, 1, 2))
+    np.testing.assert_allclose(
+        derivative / np.where(scale > 0, scale, 1.0), expected / np.where(scale > 0, scale, 1.0), atol=1e-11
+    )
+    # What the matrix does not depend on: the sky, the stars, the overall scale of the throughput.
+    still = [leaf.name for leaf, size in zip(leaves(instrument), scale, strict=True) if size == 0]
+    assert still == ["sky.depolarisation", "standard.STD00.q", "standard.STD00.u"]
+
+
+def test_positions_are_all_parameters_once(instrument):
+    plain, series = linear.plain_positions(instrument), linear.series_positions(instrument)
+    assert sorted([*plain, *series]) == list(range(values_of(instrument).size))
+    assert all(leaves(instrument)[i].name.startswith("throughput.n") for i in series)
+
+
+def test_local_derivatives_go_through_the_series():
+    """Σ over the sites, written out; numpy gives numpy, jax gives jax."""
+    rng = np.random.default_rng(3)
+    local, basis = rng.standard_normal((5, 2, 3)), rng.standard_normal((2, 6))
+    expected = np.zeros((5, 3, 6))
+    for site in range(2):
+        for camera in range(3):
+            for term in range(6):
+                expected[:, camera, term] += local[:, site, camera] * basis[site, term]
+    found = linear.through_series(local, basis)
+    assert isinstance(found, np.ndarray)
+    np.testing.assert_allclose(found, expected.reshape(5, 18), rtol=0, atol=1e-14)
+    same = linear.through_series(jnp.asarray(local), jnp.asarray(basis))
+    assert isinstance(same, jax.Array)
+    np.testing.assert_allclose(same, found, rtol=0, atol=1e-14)

@@ -1,0 +1,141 @@
+"""Optical settings: what the optics of an instrument are computed for, field point apart."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+
+from walop_jax.data.filters import DEFAULT_FILTER
+from walop_jax.data.records import CALIBRATION_PLATE, Exposures
+from walop_jax.io.errors import nearest
+
+Rows = slice | Int[np.ndarray, " r"] | Bool[np.ndarray, " n"]
+
+TEMPERATURE = 10.0
+"""Temperature of the instrument (Celsius) where nothing is said of it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Optical settings, one per row.
+
+    Filter name; colour temperature of the source (K; NaN: flat photon spectrum); temperature of the instrument
+    (Celsius); hour angle (h); `positions` of the moving elements behind the polariser by column prefix (deg; NaN: out).
+    An element that is not there is out. Raises ValueError for columns of different lengths.
+    """
+
+    filter: Shaped[np.ndarray, " n"]
+    teff: Float[np.ndarray, " n"]
+    temperature: Float[np.ndarray, " n"]
+    hour_angle: Float[np.ndarray, " n"]
+    positions: Mapping[str, Float[np.ndarray, " n"]] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        lengths = {len(values) for values in (*self._plain(), *self.positions.values())}
+        if len(lengths) > 1:
+            raise ValueError(
+                f"columns of {' and '.join(map(str, sorted(lengths)))} rows in one table of settings"
+            )
+
+    @classmethod
+    def default(cls, count: int, filter_name: str = DEFAULT_FILTER) -> Settings:
+        """SDSS-r, flat photon spectrum, all moving elements out, 10 °C, on the meridian."""
+        return cls(
+            filter=np.full(count, filter_name),
+            teff=np.full(count, np.nan),
+            temperature=np.full(count, TEMPERATURE),
+            hour_angle=np.zeros(count),
+        )
+
+    @classmethod
+    def of(cls, exposures: Exposures, moving: Iterable[str]) -> Settings:
+        """Those of exposures, of an instrument with the moving elements `moving` behind its polariser.
+
+        A temperature that is missing is that of `default`, an hour angle 0. Raises ValueError for a moving element of
+        which the exposures say nothing.
+        """
+        positions = {prefix: exposures.position(prefix) for prefix in moving}
+        return cls(
+            filter=exposures.filter,
+            teff=exposures.teff,
+            temperature=np.where(np.isfinite(exposures.temp), exposures.temp, TEMPERATURE),
+            hour_angle=np.nan_to_num(exposures.ha),
+            positions={p: np.where(entry.inside, entry.angle, np.nan) for p, entry in positions.items()},
+        )
+
+    def at(self, **positions: float | Float[np.ndarray, " n"] | None) -> Settings:
+        """The same with moving elements at these angles (deg, by column prefix; None or NaN: out)."""
+        there = {
+            prefix: np.broadcast_to(np.asarray(np.nan if angle is None else angle, float), len(self)).copy()
+            for prefix, angle in positions.items()
+        }
+        return dataclasses.replace(self, positions={**self.positions, **there})
+
+    def __len__(self) -> int:
+        return len(self.teff)
+
+    def __getitem__(self, rows: Rows) -> Settings:
+        return Settings(
+            filter=self.filter[rows],
+            teff=self.teff[rows],
+            temperature=self.temperature[rows],
+            hour_angle=self.hour_angle[rows],
+            positions={prefix: angle[rows] for prefix, angle in self.positions.items()},
+        )
+
+    def _plain(self) -> tuple[np.ndarray, ...]:
+        return self.filter, self.teff, self.temperature, self.hour_angle
+
+    def position(self, prefix: str) -> Float[np.ndarray, " n"]:
+        """Where a moving element stands (deg; NaN: out)."""
+        return self.positions.get(prefix, np.full(len(self), np.nan))
+
+    def further(self) -> dict[str, float]:
+        """Angles (deg) of the elements in the beam of a single row, calibration plate apart."""
+        (row,) = range(len(self))
+        angles = {prefix: float(angle[row]) for prefix, angle in self.positions.items()}
+        return {p: angle for p, angle in angles.items() if p != CALIBRATION_PLATE and np.isfinite(angle)}
+
+    def check_moving(self, moving: Iterable[str]) -> None:
+        """Raise ValueError, with the nearest names, for an element in the beam that is none of `moving`."""
+        known = tuple(moving)
+        for prefix, angle in self.positions.items():
+            if prefix not in known and np.isfinite(angle).any():
+                raise ValueError(f"the instrument has no moving element {prefix!r}; {nearest(prefix, known)}")
+
+    # ----------------------------------------------------------------------------------- rows that agree
+
+    def layouts(self) -> list[tuple[Settings, Int[np.ndarray, " r"]]]:
+        """One setting for each combination of filter and positions, and the rows that have it.
+
+        Only these decide how a computation is laid out; the rest are numbers that go into it.
+        """
+        return self._grouped([self.filter, *self.positions.values()])
+
+    def optics(self) -> list[tuple[Settings, Int[np.ndarray, " r"]]]:
+        """One setting for each that makes the optics differ, colour of the source apart, and the rows that have it."""
+        return self._grouped([self.filter, *self.positions.values(), self.temperature, self.hour_angle])
+
+    def distinct(self) -> list[tuple[Settings, Int[np.ndarray, " r"]]]:
+        """One setting for each that differs in anything, and the rows that have it."""
+        return self._grouped([*self._plain(), *self.positions.values()])
+
+    def _grouped(self, columns: list[np.ndarray]) -> list[tuple[Settings, Int[np.ndarray, " r"]]]:
+        number = np.zeros(len(self), int)
+        for column in columns:
+            values, code = np.unique(column, return_inverse=True)
+            _, number = np.unique(number * len(values) + code.reshape(-1), return_inverse=True)
+        order = np.argsort(number, kind="stable")
+        groups = np.split(order, np.flatnonzero(np.diff(number[order])) + 1) if len(self) else []
+        return [(self[rows[:1]], rows) for rows in groups]
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """What makes the optics of a single row differ from those of others; ValueError for several rows."""
+        if len(self) != 1:
+            raise ValueError(f"one setting is asked for, {len(self)} are given")
+        inside = sorted((p, float(a[0])) for p, a in self.positions.items() if np.isfinite(a[0]))
+        return (str(self.filter[0]), tuple(inside), float(self.temperature[0]), float(self.hour_angle[0]))

@@ -1,0 +1,123 @@
+"""Functions of the field as Chebyshev series, with an error that is measured every time.
+
+    f(x, y) ≈ Σ c_ij T_i(tx) T_j(ty),    tx, ty from −1 to 1 over a rectangle of the field
+
+The optics are analytic in the field, so a few hundred field points stand for every pixel: they are solved on n × n
+nodes, and a table is taken only if it gives what they are at other places as well. A series has all terms with
+i, j < n, which is the polynomial through the nodes, or half of them, i + j < n: as accurate with a few nodes more,
+and quicker to evaluate at many points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from walop_jax.likelihood import limits
+from walop_jax.model import chebyshev
+from walop_jax.model.chebyshev import Rectangle
+
+Vector = Float[np.ndarray, " p"]
+Tree = Any
+"""Arrays, or a tuple of them, with the field positions (or the terms of a series) along the first axis."""
+
+
+class FieldTable(eqx.Module):
+    """Series over a rectangle; `coefficients` is a tree of arrays whose first axis runs over the terms.
+
+    `count` is the number of nodes per side; `total` says that only terms with i + j < count are there.
+    """
+
+    rectangle: Rectangle
+    coefficients: Tree
+    count: int = eqx.field(static=True)
+    total: bool = eqx.field(static=True, default=False)
+
+    @classmethod
+    def through(cls, rectangle: Rectangle, count: int, values: Tree, *, total: bool = False) -> Self:
+        """The series through values at `chebyshev.grid`."""
+        to = chebyshev.to_coefficients(count)
+        i, j = _terms(count, total)
+
+        def series(leaf: np.ndarray) -> np.ndarray:
+            square = np.asarray(leaf).reshape(count, count, -1)
+            both = np.einsum("ai,bj,ijf->abf", to, to, square, optimize=True)
+            return both[i, j].reshape(-1, *np.shape(leaf)[1:])
+
+        return cls(rectangle, jax.tree.map(series, values), count, total)
+
+    def basis(self, x: Float[Any, "*p"], y: Float[Any, "*p"]) -> Float[Any, "*p t"]:
+        """Values of the terms at field positions (deg)."""
+        tx, ty = chebyshev.scaled(x, y, self.rectangle)
+        across, along = (chebyshev.polynomials(t, self.count) for t in (tx, ty))
+        if self.total:
+            i, j = _terms(self.count, total=True)
+            return across[..., i] * along[..., j]
+        return (across[..., :, None] * along[..., None, :]).reshape(*across.shape[:-1], -1)
+
+    def __call__(self, x: Float[Any, "*p"], y: Float[Any, "*p"]) -> Tree:
+        """The functions at field positions (deg); arrays of numpy give such."""
+        xp, basis = (jnp if isinstance(x, jax.Array) else np), self.basis(x, y)
+        return jax.tree.map(lambda leaf: xp.tensordot(basis, leaf, 1), self.coefficients)
+
+
+def _terms(count: int, total: bool) -> tuple[Int[np.ndarray, " t"], Int[np.ndarray, " t"]]:
+    i, j = np.indices((count, count)).reshape(2, -1)
+    kept = i + j < (count if total else 2 * count)
+    return i[kept], j[kept]
+
+
+def held_out(rectangle: Rectangle) -> tuple[Vector, Vector]:
+    """Places at which a table is checked: the corners, the middles of the sides, and a spread of others.
+
+    The others follow the sequence of Roberts 2018 (multiples of 1/φ and 1/φ², φ³ = φ + 1), which meets no grid.
+    """
+    corners = [(a, b) for a in (0.0, 0.5, 1.0) for b in (0.0, 0.5, 1.0)]
+    plastic = 1.324717957244746
+    number = np.arange(1, limits.CHECKED_PLACES - len(corners) + 1)[:, None]
+    unit = np.concatenate([corners, np.mod(number * np.array([1 / plastic, 1 / plastic**2]), 1.0)])
+    low, high = np.asarray(rectangle.low), np.asarray(rectangle.high)
+    x, y = (low + unit * (high - low)).T
+    return x, y
+
+
+def accurate_table(
+    exact: Callable[[Vector, Vector], Tree],
+    rectangle: Rectangle,
+    counts: Sequence[int],
+    tolerance: float,
+    error: Callable[[Tree, Tree], float],
+    *,
+    truth: Tree | None = None,
+    total: bool = False,
+) -> tuple[FieldTable | None, float]:
+    """The smallest table that is accurate where it has no node, and its error there.
+
+    `exact` gives the functions at field positions (deg); `counts` are tried in turn. `error` compares what a table
+    gives at the places of `held_out` with `truth` there (None: what `exact` gives). None where no number of nodes is
+    enough. An error that is not finite ends the search: functions that are not finite somewhere make such a table.
+    """
+    other_x, other_y = held_out(rectangle)
+    off = np.inf
+    for count in counts:
+        x, y = chebyshev.grid(rectangle, count)
+        if truth is None:
+            both = exact(np.append(x, other_x), np.append(y, other_y))
+            values, truth = (jax.tree.map(lambda leaf, cut=cut: leaf[cut], both) for cut in _parts(len(x)))
+        else:
+            values = exact(x, y)
+        table = FieldTable.through(rectangle, count, values, total=total)
+        off = error(table(other_x, other_y), truth)
+        if off <= tolerance or not np.isfinite(off):
+            return table, off
+    return None, off
+
+
+def _parts(first: int) -> tuple[slice, slice]:
+    return slice(0, first), slice(first, None)
