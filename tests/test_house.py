@@ -34,6 +34,7 @@ OWNERS = {
     "optimistix": {"fit"},
     "scipy": {"calibration", "diagnosis"},
     "emcee": {"posterior"},
+    "arviz": {"posterior"},
     "matplotlib": {"reports"},
     "jinja2": {"reports"},
     "typer": {"cli"},
