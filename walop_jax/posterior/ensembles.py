@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -39,7 +40,7 @@ class Ensembles:
         if not self.blocks:
             began = time.perf_counter()
             seeds = [(options.seed, number) for number in range(options.ensembles)]
-            self.states: list[State] = [sampler.start(density, seed) for seed in seeds]
+            self.states: list[State] = [_arrays(sampler.start(density, seed)) for seed in seeds]
             self.seconds = time.perf_counter() - began
 
     @property
@@ -67,7 +68,7 @@ class Ensembles:
         states, stretches = [], []
         for state in self.states:
             state, stretch = self.sampler.advance(self.density, state, options.interval)
-            states.append(state)
+            states.append(_arrays(state))
             stretches.append(self._stored(stretch))
         seconds = time.perf_counter() - began
         self.states, self.seconds = states, self.seconds + seconds
@@ -113,6 +114,11 @@ class Ensembles:
                 done = min(self.steps / max(goal, 1), 1.0)
                 report(Progress("sampling", done, *numbers_of(verdict)))
             self.go_on()
+
+
+def _arrays(state: Mapping[str, Any]) -> State:
+    """A state as it comes back from a checkpoint."""
+    return {name: np.asarray(value) for name, value in state.items()}
 
 
 def numbers_of(verdict: Convergence | None) -> tuple[float, float]:

@@ -93,6 +93,8 @@ def make_sampler(
             f"there is no sampler {sampler!r}",
             advice=f"choose one of {', '.join(SAMPLERS)}, or give your own as FILE.py:CLASS",
         )
+    if not isinstance(getattr(kind, "name", None), str):
+        raise fail(f"the sampler {sampler!r} has no name", advice='write name = "…" into its class')
     _check_settings(kind, settings)
     try:
         return kind(**settings)

@@ -44,18 +44,20 @@ def fingerprint(problem: Problem, target: Target, options: Options) -> dict[str,
     chain = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
     for name in ("maximum_steps", "draws", "checks"):  # how long, and what is made of it: free to change
         del chain[name]
-    for name in ("sampler", "walkers", "moves"):
+    for name in ("sampler", "walkers", "moves"):  # have an entry of their own
         del chain[name]
     sampler = options.make_sampler()
     versions = {name: _version(name) for name in (*SOFTWARE, *sampler.software)}
+    effects = [type(effect).__name__ for effect in model.template.effects]
     return {
-        "data": digest(*data, *plan, *exposures, problem.plan.settings), "model": digest(model.name,
-        parameters, [type(e).__name__ for e in model.template.effects], model.template.plates), "priors":
-        digest(priors), "fit": digest(np.round(target.centre, 12), target.noise_scale), "sampler":
-        _description(sampler), "settings":
-        digest(sorted(chain.items(), key=lambda item: item[0])), "versions": ", ".join(f"{name} {version}"
-        for name, version in versions.items()),
-    }  # fmt: skip
+        "data": digest(*data, *plan, *exposures, problem.plan.settings),
+        "model": digest(model.name, parameters, effects, model.template.plates),
+        "priors": digest(priors),
+        "fit": digest(np.round(target.centre, 12), target.noise_scale),
+        "sampler": _description(sampler),
+        "settings": digest(sorted(chain.items(), key=lambda item: item[0])),
+        "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
+    }
 
 
 def _version(name: str) -> str:
@@ -88,7 +90,7 @@ def sample(
 
     With `folder`, checkpoints are kept there; `resume` goes on from them, bit for bit as if there had been no
     interruption. Raises `DataError` for a folder that holds a run already while `resume` is False, or one of
-    other data, model, priors, settings or versions; ValueError where there is nothing to sample.
+    other data, model, priors, sampler, settings or versions; ValueError where there is nothing to sample.
     """
     options = options or Options()
     report = report or (lambda progress: None)
