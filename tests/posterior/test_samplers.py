@@ -10,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.io.errors import DataError
 from walop_jax.posterior import SAMPLERS, Density, Options, Sampler, Stretch, sample
 from walop_jax.posterior.checkpoint import Checkpoints
 from walop_jax.posterior.ensemble import Emcee
 from walop_jax.posterior.ensembles import Ensembles
 from walop_jax.posterior.output import inference_data, intervals, read_draws, report, write_posterior
+from walop_jax.posterior.propagate import with_moments
 from walop_jax.posterior.samplers import make_sampler
 
 from .conftest import Scene
@@ -139,7 +141,10 @@ def test_nuts_samples_the_exact_posterior_of_everything(scene: Scene, tmp_path: 
     write_posterior(
         tmp_path / "posterior.nc", dataclasses.replace(found, convergence=_converged(found.convergence))
     )
-    assert read_draws(tmp_path / "posterior.nc", found.names).shape == (80, len(found.names))
+    draws = read_draws(tmp_path / "posterior.nc", found.names)
+    assert draws.shape == (80, len(found.names))
+    moments = with_moments(Calibration.from_fit(result, problem), tmp_path / "posterior.nc")
+    np.testing.assert_allclose(moments.values, draws.mean(axis=0), rtol=1e-12)
 
 
 def _converged(verdict):

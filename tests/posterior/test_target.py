@@ -26,7 +26,9 @@ def test_it_is_the_objective_of_the_fit_in_whitened_coordinates(
     scene: Scene, density: Density, place: np.ndarray
 ) -> None:
     target = scene.target
-    np.testing.assert_allclose(target.root @ target.root.T, target.covariance, rtol=1e-10)
+    sigma = np.sqrt(np.diag(target.covariance))
+    again, given = (c / np.outer(sigma, sigma) for c in (target.root @ target.root.T, target.covariance))
+    np.testing.assert_allclose(again, given, atol=1e-11)
     for w in (np.zeros_like(place), place, -3.0 * place):
         expected = -0.5 * target.objective(target.centre + target.root @ w)
         assert density.log_density(w[None])[0] == pytest.approx(expected, rel=1e-12)

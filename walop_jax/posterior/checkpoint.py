@@ -80,7 +80,6 @@ class Checkpoints:
 
     def save_surrogate(self, surrogate: Surrogate, extra: Mapping[str, float]) -> None:
         """Write the surrogate and what was measured of it."""
-        self.folder.mkdir(parents=True, exist_ok=True)
         arrays = {f.name: getattr(surrogate, f.name) for f in dataclasses.fields(surrogate)}
         names = json.dumps(list(arrays.pop("names")))
         self._write(self.folder / SURROGATE, arrays, {"names": names, **extra})
@@ -122,6 +121,7 @@ class Checkpoints:
     # -------------------------------------------------------------------------------------------- the files
 
     def _write(self, path: Path, arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
             file.attrs["format"] = FORMAT
             file.attrs["fingerprint"] = json.dumps(self.fingerprint)
