@@ -35,6 +35,7 @@ OWNERS = {
     "optimistix": {"fit"},
     "scipy": {"calibration", "diagnosis"},
     "emcee": {"posterior"},
+    "arviz": {"posterior"},
     "matplotlib": {"reports"},
     "jinja2": {"reports"},
     "typer": {"cli"},

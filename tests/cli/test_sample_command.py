@@ -14,6 +14,8 @@ from walop_jax.calibration.product import read_product
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.posterior.output import read_draws
 
+OWN = f"{Path(__file__).resolve().parents[1] / 'posterior' / 'random_walk.py'}:Metropolis"
+
 
 @pytest.fixture(scope="module")
 def run_folder(call, calset_file: Path, tmp_path_factory) -> Path:
@@ -80,4 +82,53 @@ def test_sample_says_what_is_wrong(call, run_folder: Path, calset_file: Path, tm
     assert refused.exit_code == 1
     assert "another model" in refused.stderr
     assert "walks" in call("sample", run, "--moves", "walks").stderr
+    assert "choose one of emcee, nuts, or give" in call("sample", run, "--sampler", "walk").stderr
+    assert "no option" in call("sample", run, "--sampler", OWN, "--moves", "de").stderr
     assert not (run / "sampling").exists()
+
+
+def test_a_sampler_of_ones_own(call, run_folder: Path, tmp_path: Path):
+    """A file from outside the package: sampled, resumed, refused to another sampler, and on the page of the run."""
+    run = tmp_path / "RUN"
+    shutil.copytree(run_folder, run)
+    short = ("--sampler", OWN, "--interval", 250)
+    done = call("sample", run, *short, "--maximum-steps", 250)
+    assert done.exit_code == 1, done.stderr
+    assert "NOT converged" in done.stderr
+    assert json.loads((run / "sample.json").read_text())["sampler"] == "metropolis"
+    more = call("sample", run, *short, "--maximum-steps", 500, "--resume", "--json")
+    found = json.loads(more.stdout)
+    assert (found["sampler"], found["steps"], found["walkers"], found["ensembles"]) == (
+        "metropolis",
+        400,
+        1,
+        2,
+    )
+    assert found["surrogate"]["draws_checked"] > 0
+    refused = call("sample", run, "--interval", 250, "--resume")
+    assert refused.exit_code == 1
+    assert "other sampler (metropolis" in refused.stderr
+    assert call("report", run).exit_code == 0
+    assert "with metropolis" in (run / "report.html").read_text()
+
+
+@pytest.mark.long
+def test_nuts_from_the_command_line(call, run_folder: Path, tmp_path: Path):
+    """The exact posterior, converged: covariance into the product, matrices by draws, the page."""
+    pytest.importorskip("blackjax")
+    run = tmp_path / "RUN"
+    shutil.copytree(run_folder, run)
+    before = read_product(run / "calibration.fits")
+    done = call("sample", run, "--sampler", "nuts", "--json")
+    assert done.exit_code == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert (found["sampler"], found["trusted"], found["surrogate"]) == ("nuts", True, None)
+    assert found["sampler_counts"]["divergences"] == 0
+    product = read_product(run / "calibration.fits")
+    free = before.parameters.sigma > 0
+    np.testing.assert_allclose(product.parameters.sigma[free] / before.parameters.sigma[free], 1.0, atol=0.25)
+    points = tmp_path / "points.csv"
+    points.write_text("X,Y\n0.0,0.0\n0.2,-0.1\n")
+    options = ("--points", points, "-o", tmp_path / "drawn.ecsv", "--posterior", run / "posterior.nc")
+    assert call("matrix", run, *options).exit_code == 0
+    assert call("report", run).exit_code == 0

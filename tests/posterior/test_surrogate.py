@@ -21,7 +21,7 @@ def test_marginal_of_a_gaussian_is_the_block_of_its_covariance(gaussian: Surroga
     covariance = np.linalg.inv(precision)
     z = np.random.default_rng(1).standard_normal((50, 4))
     expected = -0.5 * np.einsum("ni,ij,nj->n", z, np.linalg.inv(covariance[:4, :4]), z)
-    np.testing.assert_allclose(gaussian.log_posterior()(z), expected, atol=1e-12)
+    np.testing.assert_allclose(gaussian.density().log_density(z), expected, atol=1e-12)
 
     draws = z[:1].repeat(40_000, axis=0)
     s = gaussian.draw(draws, np.random.default_rng(2))[:, 4:]
@@ -39,8 +39,8 @@ def test_marginal_of_a_gaussian_is_the_block_of_its_covariance(gaussian: Surroga
 def test_inflation_is_the_plain_posterior_at_f_1_and_the_integral_elsewhere(gaussian: Surrogate) -> None:
     inflated = dataclasses.replace(gaussian, inflate=True)
     z = np.random.default_rng(1).standard_normal((20, 4))
-    at_one = inflated.log_posterior()(np.column_stack([z, np.zeros(20)]))
-    np.testing.assert_allclose(at_one, gaussian.log_posterior()(z), atol=1e-12)
+    at_one = inflated.density().log_density(np.column_stack([z, np.zeros(20)]))
+    np.testing.assert_allclose(at_one, gaussian.density().log_density(z), atol=1e-12)
     # ∫ exp(−½ (χ²_data/f² + χ²_prior)) ds by brute force, up to a constant that f does not enter
     ln_f = np.array([-0.2, 0.0, 0.3])
     coordinates = np.column_stack([z[:3], ln_f / inflated.ln_f_unit])
@@ -54,7 +54,7 @@ def test_inflation_is_the_plain_posterior_at_f_1_and_the_integral_elsewhere(gaus
             np.linalg.slogdet(own)[1] - np.linalg.slogdet((gaussian.data + gaussian.prior)[-3:, -3:])[1]
         )
         values.append(-0.5 * (chi2 + log_determinant + log**2) - 1000 * log)
-    np.testing.assert_allclose(inflated.log_posterior()(coordinates), values, rtol=1e-10)
+    np.testing.assert_allclose(inflated.density().log_density(coordinates), values, rtol=1e-10)
 
 
 def test_physics_is_sampled_and_series_and_catalogue_are_not(scene: Scene) -> None:

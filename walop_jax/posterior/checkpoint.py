@@ -1,9 +1,9 @@
 """Checkpoints: a folder of HDF5 files, one per block of steps, each appearing whole or not at all.
 
-    surrogate.h5       the surrogate that is sampled, so that a resumed run samples the very same function
-    block-000001.h5    coordinates and ln p of all ensembles; walkers and random state at its end
+    surrogate.h5       the surrogate, where that is sampled, so that a resumed run samples the very same function
+    block-000001.h5    positions and ln p of all ensembles; the state of the sampler at its end
 
-Every file carries the fingerprint of data, model, priors, settings and versions. A file is written beside its
+Every file carries the fingerprint of data, model, priors, sampler, settings and versions. A file is written beside its
 place, flushed and renamed, and never touched again: a kill at any moment loses the block being computed.
 Nothing is ever overwritten by a run with another fingerprint.
 """
@@ -23,11 +23,13 @@ import numpy as np
 
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail
-from walop_jax.posterior.ensemble import Block, Walkers
+from walop_jax.posterior.samplers import State, Stretch
 from walop_jax.posterior.surrogate import Surrogate
 
-FORMAT = 1
+FORMAT = 2
 SURROGATE = "surrogate.h5"
+_STATE = "state."
+_ARRAYS = ("positions", "log_density", "acceptance")
 _ADVICE = "sample into another folder, or start anew with --overwrite"
 
 
@@ -78,7 +80,6 @@ class Checkpoints:
 
     def save_surrogate(self, surrogate: Surrogate, extra: Mapping[str, float]) -> None:
         """Write the surrogate and what was measured of it."""
-        self.folder.mkdir(parents=True, exist_ok=True)
         arrays = {f.name: getattr(surrogate, f.name) for f in dataclasses.fields(surrogate)}
         names = json.dumps(list(arrays.pop("names")))
         self._write(self.folder / SURROGATE, arrays, {"names": names, **extra})
@@ -93,38 +94,34 @@ class Checkpoints:
     # ------------------------------------------------------------------------------------------- the blocks
 
     def save_block(
-        self, number: int, walkers: Sequence[Walkers], blocks: Sequence[Block], seconds: float
+        self, number: int, states: Sequence[State], stretches: Sequence[Stretch], seconds: float
     ) -> None:
-        """Write one block of all ensembles."""
-        arrays: dict[str, Any] = {
-            "coordinates": np.stack([block.coordinates for block in blocks]),
-            "log_posterior": np.stack([block.log_posterior for block in blocks]),
-            "accepted": np.array([block.accepted for block in blocks]),
-            "walkers": np.stack([w.coordinates for w in walkers]),
-            "walkers_log_posterior": np.stack([w.log_posterior for w in walkers]),
-            "random_keys": np.stack([w.random[1] for w in walkers]),
-            "random_rest": np.array([w.random[2:] for w in walkers], float),
-        }
-        self._write(self.block_path(number), arrays, {"seconds": seconds})
+        """Write one block of all ensembles, with their states at its end."""
+        arrays = {name: np.stack([getattr(s, name) for s in stretches]) for name in _ARRAYS}
+        arrays |= {f"{_STATE}{name}": np.stack([state[name] for state in states]) for name in states[0]}
+        counts = json.dumps([dict(stretch.counts) for stretch in stretches])
+        self._write(self.block_path(number), arrays, {"seconds": seconds, "counts": counts})
 
-    def load_block(self, number: int) -> tuple[list[Walkers], list[Block], float]:
-        """One block of all ensembles, and the seconds that it took."""
-        a, extra = self._read(self.block_path(number))
-        walkers = [
-            Walkers(x, lnp, ("MT19937", keys, int(rest[0]), int(rest[1]), float(rest[2])))
-            for x, lnp, keys, rest in zip(
-                a["walkers"], a["walkers_log_posterior"], a["random_keys"], a["random_rest"], strict=True
-            )
+    def load_block(self, number: int) -> tuple[list[State], list[Stretch], float]:
+        """One block of all ensembles, their states at its end, and the seconds that it took."""
+        arrays, extra = self._read(self.block_path(number))
+        counts = json.loads(extra["counts"])
+        stretches = [
+            Stretch(*(arrays[name][i] for name in _ARRAYS), counts=counts[i]) for i in range(len(counts))
         ]
-        blocks = [
-            Block(x, lnp, float(accepted))
-            for x, lnp, accepted in zip(a["coordinates"], a["log_posterior"], a["accepted"], strict=True)
-        ]
-        return walkers, blocks, float(extra["seconds"])
+        kept = {name.removeprefix(_STATE): a for name, a in arrays.items() if name.startswith(_STATE)}
+        states: list[State] = [{name: array[i] for name, array in kept.items()} for i in range(len(counts))]
+        return states, stretches, float(extra["seconds"])
+
+    def check(self) -> None:
+        """Raise `DataError` if what is here was sampled from, or with, anything else."""
+        surrogate = self.folder / SURROGATE
+        self._read(surrogate if surrogate.exists() else self.block_path(1))
 
     # -------------------------------------------------------------------------------------------- the files
 
     def _write(self, path: Path, arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
             file.attrs["format"] = FORMAT
             file.attrs["fingerprint"] = json.dumps(self.fingerprint)

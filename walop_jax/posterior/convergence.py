@@ -1,10 +1,12 @@
-"""Whether an ensemble has run long enough, and if not, how far it has to go.
+"""Whether the ensembles of a sampler have run long enough, and if not, how far they have to go.
+
+An ensemble is an independent run of a sampler, of one walker or of many.
 
 Autocorrelation   τ per quantity, averaged over walkers of all ensembles (Goodman & Weare 2010, CAMCoS 5, 65;
-                  Sokal's window with c = 5). Walkers of one ensemble are not independent chains, so R-hat
-                  is taken between ensembles only.
-R-hat             √(1 + Var(means of half ensembles) / mean variance), of the values and of their distance
-                  from the median (Gelman & Rubin 1992; folded: Vehtari et al. 2021, Bayesian Anal. 16, 667).
+                  Sokal's window with c = 5).
+Effective samples for the mean of all walkers, by ArviZ (Vehtari et al. 2021, Bayesian Anal. 16, 667).
+R-hat             rank-normalised, split and folded, by ArviZ (as above). Walkers of one ensemble are not independent
+                  chains, so it is taken between halves of ensembles.
 Rules             N > 50 τ; τ the same within 25 % after N/4, N/2 and N steps; R-hat < 1.01.
 """
 
@@ -13,6 +15,8 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import warnings
+from typing import Any
 
 import numpy as np
 from emcee.autocorr import integrated_time
@@ -24,6 +28,9 @@ LENGTHS = 50.0  # in units of τ
 STABLE = 0.25  # allowed relative change of τ over each of two doublings
 LARGEST_RHAT = 1.01
 LEAST_STORED = 40  # steps, below which nothing is said
+RANKED = (
+    100_000  # positions per quantity that R-hat looks at: sorting more would take longer than sampling them
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,27 +83,35 @@ def autocorrelation(chains: Chains) -> Float[np.ndarray, " k"]:
     return tau
 
 
-def between(chains: Chains) -> Float[np.ndarray, " k"]:
-    """R̂ between the halves of all ensembles, worst of plain and folded.
+def r_hat(chains: Chains) -> Float[np.ndarray, " k"]:
+    """R-hat between the halves of all ensembles, per quantity; NaN for a quantity that never moved."""
+    e, k = chains.shape[0], chains.shape[-1]
+    parts = chains[:, :: max(1, chains[..., 0].size // RANKED)]
+    az = arviz()
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.array([float(az.rhat(parts[..., i].reshape(e, -1))) for i in range(k)])
 
-    NaN for a quantity that never moved.
-    """
+
+def effective_samples(chains: Chains) -> Float[np.ndarray, " k"]:
+    """Number of independent draws that would give means as good, per quantity."""
     e, n, w, k = chains.shape
-    half = n // 2
-    parts = chains[:, n - 2 * half :].reshape(2 * e, half * w, k)
-    folded = np.abs(parts - np.median(parts, axis=(0, 1)))
-    result = np.zeros(k)
-    for values in (parts, folded):
-        inside = values.var(axis=1, ddof=1).mean(axis=0)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = values.mean(axis=1).var(axis=0, ddof=1) / inside
-        result = np.maximum(result, np.sqrt(1.0 + ratio))
-    return result
+    walkers = np.moveaxis(chains, 2, 1).reshape(e * w, n, k)
+    az = arviz()
+    return np.array([float(az.ess(walkers[..., i], method="mean")) for i in range(k)])
+
+
+def arviz() -> Any:
+    """ArviZ, without the announcement that it makes when it is imported."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import arviz
+
+    return arviz
 
 
 def assess(chains: Chains, names: tuple[str, ...], thin: int = 1) -> Convergence:
     """Apply the rules to chains stored every `thin` steps, burn-in taken off."""
-    e, n, w, k = chains.shape
+    n, k = chains.shape[1], chains.shape[-1]
     steps = n * thin
     if n < LEAST_STORED:
         nothing = np.full(k, np.nan)
@@ -106,7 +121,7 @@ def assess(chains: Chains, names: tuple[str, ...], thin: int = 1) -> Convergence
             names, steps, nothing, (np.nan, np.nan, np.nan), np.zeros(k), nothing, needed, (reason,)
         )
     quarter, half, tau = (autocorrelation(chains[:, :m]) * thin for m in (n // 4, n // 2, n))
-    rhat = between(chains)
+    rhat = r_hat(chains)
     history = (float(np.max(quarter)), float(np.max(half)), float(np.max(tau)))
     reasons, needed = [], 0
     if not np.all(np.isfinite(tau)):
@@ -125,4 +140,5 @@ def assess(chains: Chains, names: tuple[str, ...], thin: int = 1) -> Convergence
         worst = int(np.argmax(rhat))
         reasons.append(f"R-hat between ensembles is {rhat[worst]:.3f} for {names[worst]}")
         needed = max(needed, steps)
-    return Convergence(names, steps, tau, history, e * w * steps / tau, rhat, needed, tuple(reasons))
+    ess = effective_samples(chains)
+    return Convergence(names, steps, tau, history, ess, rhat, needed, tuple(reasons))

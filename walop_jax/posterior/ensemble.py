@@ -1,4 +1,4 @@
-"""emcee ensembles that advance block by block and can be taken up again bit for bit.
+"""The sampler `emcee`: ensembles of walkers that can be taken up again bit for bit.
 
 Moves, in coordinates in which the Laplace approximation is the unit normal:
 
@@ -16,35 +16,78 @@ it.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, ClassVar
 
 import emcee
 import numpy as np
 from jaxtyping import Float
 
-LogPosterior = Callable[[Float[np.ndarray, "n k"]], Float[np.ndarray, " n"]]
+from walop_jax.posterior.density import Density
+from walop_jax.posterior.samplers import Sampler, State, Stretch
 
 MOVES = ("laplace", "de", "stretch")
 JUMPS = 0.1  # share of γ = 1 among differential evolution
 WIDER = 1.1  # than the Laplace approximation: its draws as proposals
-
-
-class Block(NamedTuple):
-    """What a stretch of steps gave: stored positions and ln p, and how many proposals were accepted."""
-
-    coordinates: Float[np.ndarray, "n w k"]
-    log_posterior: Float[np.ndarray, "n w"]
-    accepted: float
+LEAST_WALKERS = 64  # unless a number is asked for
 
 
 @dataclasses.dataclass(frozen=True)
-class Walkers:
-    """All there is to an ensemble between two steps; `random` is the state of a Mersenne twister."""
+class Emcee(Sampler):
+    """`walkers` 0 stands for twice the number of coordinates, at least 64."""
 
-    coordinates: Float[np.ndarray, "w k"]
-    log_posterior: Float[np.ndarray, " w"]
-    random: tuple[str, np.ndarray, int, int, float]
+    walkers: int = 0
+    moves: str = MOVES[0]
+
+    name: ClassVar[str] = "emcee"
+    software: ClassVar[tuple[str, ...]] = ("emcee",)
+    thin: ClassVar[int] = 2
+
+    def __post_init__(self) -> None:
+        mixture(self.moves)
+
+    def start(self, density: Density, seed: Sequence[int]) -> State:
+        """Walkers drawn from the Laplace approximation, which is the unit normal in the sampled coordinates."""
+        d = density.dimension
+        count = self.walkers or max(LEAST_WALKERS, 2 * d)
+        if count < 2 * d or count % 2:
+            raise ValueError(
+                f"{count} walkers for {d} sampled coefficients: an even number of at least {2 * d}"
+            )
+        random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed)))
+        positions = random.standard_normal((count, d))
+        value = density.log_density(positions)
+        if not np.all(np.isfinite(value)):
+            raise ValueError("the posterior is not finite around the fit")
+        return _state(positions, value, random.get_state(legacy=True))
+
+    def advance(self, density: Density, state: State, steps: int) -> tuple[State, Stretch]:
+        """Go on for that many steps of all walkers."""
+        count, dimension = state["positions"].shape
+        sampler = emcee.EnsembleSampler(
+            count, dimension, density.log_density, vectorize=True, moves=mixture(self.moves)
+        )
+        keys, (place, has_gauss, gauss) = state["random_keys"], state["random_rest"]
+        random = ("MT19937", keys, int(place), int(has_gauss), float(gauss))
+        now = emcee.State(state["positions"], log_prob=state["log_density"], random_state=random)
+        positions, value = np.empty((steps, count, dimension)), np.empty((steps, count))
+        accepted = np.zeros((steps + 1, count))
+        run = sampler.sample(now, iterations=steps, store=True, skip_initial_state_check=True)
+        for i, now in enumerate(run):
+            positions[i], value[i] = now.coords, now.log_prob
+            accepted[i + 1] = sampler.backend.accepted
+        last = _state(positions[-1].copy(), value[-1].copy(), sampler.random_state)
+        return last, Stretch(positions, value, np.diff(accepted, axis=0))
+
+
+def _state(positions: Float[np.ndarray, "w k"], value: Float[np.ndarray, " w"], random: Any) -> State:
+    """`random` is the state of a Mersenne twister."""
+    return {
+        "positions": positions,
+        "log_density": value,
+        "random_keys": random[1],
+        "random_rest": np.array(random[2:], float),
+    }
 
 
 def _laplace_draws(
@@ -54,48 +97,16 @@ def _laplace_draws(
     return proposal, 0.5 * np.sum(proposal**2 - coordinates**2, axis=1) / WIDER**2
 
 
-def moves(name: str) -> list[tuple[Any, float]]:
-    """The mixture of moves of that name; ValueError for another."""
+def mixture(moves: str) -> list[tuple[Any, float]]:
+    """Return emcee's moves with their shares; ValueError for an unknown name."""
     evolution = [(emcee.moves.DEMove(), 1.0 - JUMPS), (emcee.moves.DEMove(gamma0=1.0), JUMPS)]
-    if name == "laplace":
+    if moves == "laplace":
         return [
             (emcee.moves.MHMove(_laplace_draws), 0.5),
             *((move, 0.5 * share) for move, share in evolution),
         ]
-    if name == "de":
+    if moves == "de":
         return evolution
-    if name == "stretch":
+    if moves == "stretch":
         return [(emcee.moves.StretchMove(), 1.0)]
-    raise ValueError(f"unknown moves {name!r}: choose one of {', '.join(MOVES)}")
-
-
-def _state(state: Any) -> tuple[str, np.ndarray, int, int, float]:
-    assert isinstance(state, tuple), "the state of a Mersenne twister"
-    return state  # pyright: ignore[reportReturnType]
-
-
-def start(log_posterior: LogPosterior, count: int, dimension: int, seed: int, number: int) -> Walkers:
-    """Walkers drawn from the Laplace approximation, which is the unit normal in the sampled coordinates."""
-    sequence = np.random.SeedSequence([seed, number])
-    random = np.random.RandomState(np.random.MT19937(sequence))
-    coordinates = random.standard_normal((count, dimension))
-    value = log_posterior(coordinates)
-    if not np.all(np.isfinite(value)):
-        raise ValueError("the posterior is not finite around the fit")
-    return Walkers(coordinates, value, _state(random.get_state(legacy=True)))
-
-
-def advance(
-    log_posterior: LogPosterior, walkers: Walkers, stored: int, thin: int, move: str
-) -> tuple[Walkers, Block]:
-    """Go on for stored × thin steps."""
-    count, dimension = walkers.coordinates.shape
-    sampler = emcee.EnsembleSampler(count, dimension, log_posterior, vectorize=True, moves=moves(move))
-    state = emcee.State(walkers.coordinates, log_prob=walkers.log_posterior, random_state=walkers.random)
-    coordinates, values = np.empty((stored, count, dimension)), np.empty((stored, count))
-    run = sampler.sample(state, iterations=stored, thin_by=thin, store=True, skip_initial_state_check=True)
-    for i, state in enumerate(run):
-        coordinates[i], values[i] = state.coords, state.log_prob
-    accepted = float(np.mean(sampler.backend.accepted)) / stored  # emcee counts the steps that it stores
-    last = Walkers(coordinates[-1].copy(), values[-1].copy(), _state(sampler.random_state))
-    return last, Block(coordinates, values, accepted)
+    raise ValueError(f"unknown moves {moves!r}: choose one of {', '.join(MOVES)}")

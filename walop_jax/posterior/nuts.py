@@ -1,7 +1,7 @@
-"""The exact posterior of all coefficients by NUTS, the cross-check of everything else in this room.
+"""The sampler `nuts`: the exact posterior of all coefficients by the no-U-turn sampler of blackjax.
 
-In coordinates whitened by the covariance of the fit, x = x̂ + L w with L Lᵀ = C; no surrogate, nothing
-marginalised but the fluxes. Needs blackjax (`pip install walop-jax[nuts]`).
+No surrogate, nothing marginalised but the fluxes: the cross-check of everything else in this room, and the way out
+where the surrogate is not exact enough. Needs blackjax (`pip install 'walop-jax[nuts]'`).
 Trajectories are cut after 2³ − 1 leapfrogs: in whitened coordinates all directions oscillate with one period,
 and half a period, x → −x, which NUTS would like, moves means at once and widths not at all.
 
@@ -11,82 +11,110 @@ Source   Hoffman & Gelman 2014, JMLR 15, 1593; blackjax (Cabezas et al. 2024, ar
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
-import inspect
-import time
-from collections.abc import Callable
-from typing import Any
+import importlib.util
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from walop_jax.likelihood import engine
+from walop_jax.io.errors import fail
 from walop_jax.model.compiled import compiled
-from walop_jax.model.parameters import with_values
-from walop_jax.posterior.target import Target
+from walop_jax.posterior.density import Density
+from walop_jax.posterior.samplers import Sampler, State, Stretch
 
 TARGET_ACCEPTANCE = 0.8
 DOUBLINGS = 3
+FIRST_STEP = 0.4
 
 
 @dataclasses.dataclass(frozen=True)
-class NutsSample:
-    """Draws of the free parameters, one chain.
+class Nuts(Sampler):
+    """`warm_up` is the number of steps that settle the step size; they are not part of the chain."""
 
-    `seconds` without warm-up and compilation, which `preparation` took.
-    """
+    warm_up: int = 200
 
-    names: tuple[str, ...]
-    draws: Float[np.ndarray, "n f"]
-    divergences: int
-    gradients: int
-    step_size: float
-    seconds: float
-    preparation: float
+    name: ClassVar[str] = "nuts"
+    exact: ClassVar[bool] = True
+    software: ClassVar[tuple[str, ...]] = ("blackjax",)
+
+    def __post_init__(self) -> None:
+        if importlib.util.find_spec("blackjax") is None:
+            raise fail("nuts needs blackjax", advice="pip install 'walop-jax[nuts]'")
+
+    def start(self, density: Density, seed: Sequence[int]) -> State:
+        """One walker from a draw of the Laplace approximation, after the warm-up."""
+        first = np.random.default_rng(seed).standard_normal(density.dimension)
+        key, tuning = np.random.SeedSequence(seed).generate_state(1), _StepSize()
+        for chain, info in _chain(density, first, key, range(self.warm_up), lambda: tuning.trial):
+            tuning.learn(float(info.acceptance_rate))
+            first = np.asarray(chain.position)
+        return {
+            "position": first,
+            "key": key,
+            "step_size": np.array(tuning.settled),
+            "steps": np.array(self.warm_up),
+        }
+
+    def advance(self, density: Density, state: State, steps: int) -> tuple[State, Stretch]:
+        """Go on for that many trajectories."""
+        positions, values = np.empty((steps, 1, density.dimension)), np.empty((steps, 1))
+        acceptance, divergences, gradients = np.empty((steps, 1)), 0, 0
+        size, first = float(state["step_size"]), int(state["steps"])
+        numbers = range(first, first + steps)
+        run = _chain(density, state["position"], state["key"], numbers, lambda: size)
+        for i, (chain, info) in enumerate(run):
+            positions[i, 0], values[i, 0] = np.asarray(chain.position), float(chain.logdensity)
+            acceptance[i, 0] = float(info.acceptance_rate)
+            divergences += int(info.is_divergent)
+            gradients += int(info.num_integration_steps)
+        after = {**state, "position": positions[-1, 0].copy(), "steps": np.array(first + steps)}
+        counts = {"divergences": divergences, "gradients": gradients}
+        return after, Stretch(positions, values, acceptance, counts)
 
 
-def _kernel() -> Any:
-    try:
-        return importlib.import_module("blackjax")
-    except ImportError:
-        raise ImportError("NUTS needs blackjax: pip install 'walop-jax[nuts]'") from None
+def _chain(
+    density: Density, position: np.ndarray, key: np.ndarray, numbers: range, size: Callable[[], float]
+) -> Iterator[tuple[Any, Any]]:
+    """State and information after every step; the step with a given number has random numbers of its own."""
+    begin, step = _kernels(density.with_gradient)
+    state, random = begin(jnp.asarray(position), density.arrays), jax.random.key(int(key[0]))
+    one = jnp.ones(density.dimension)
+    for number in numbers:
+        here = jax.random.fold_in(random, number)
+        state, info = step(here, state, jnp.asarray(size()), one, density.arrays)
+        yield state, info
 
 
-def whitened(target: Target) -> tuple[Callable[..., Float[Array, ""]], tuple[Any, ...]]:
-    """ln p of whitened coordinates, and the arrays that it takes after them: none is compiled in."""
-    likelihood = target.likelihood
-    if len(likelihood.points) != 1:
-        raise ValueError(
-            "NUTS is a cross-check for sets that fit into one chunk: choose larger points_per_chunk"
-        )
-    template, scale = target.model.template, target.scale
-    root = scale[:, None] * np.linalg.cholesky(target.covariance / np.outer(scale, scale))
-    first, select = target.values(target.centre), target.model.selection()
-    offset = target.prior_rows(target.centre)
-    slope = np.stack([target.prior_rows(target.centre + column) - offset for column in root.T], axis=1)
-    arrays = (
-        template,
-        likelihood.plan,
-        likelihood.points.chunk(0),
-        *(jnp.asarray(a) for a in (first, select @ root, offset, slope)),
-    )
+@functools.lru_cache(maxsize=1)
+def _kernels(with_gradient: Callable[..., tuple[Array, Array]]) -> tuple[Callable[..., Any], ...]:
+    """Compiled functions that begin a chain and take a step, for one density."""
+    blackjax = importlib.import_module("blackjax")  # optional: what does not import it does not need it
 
-    residuals = inspect.unwrap(engine.residuals)  # to be compiled with the sampler, not on its own
+    def log_density(position: Array, arrays: tuple[Any, ...]) -> Array:
+        # Value and gradient are known together; this hands both to whoever differentiates.
+        here = jax.lax.stop_gradient(position)
+        value, gradient = with_gradient(here, *arrays)
+        return value + gradient @ (position - here)
 
-    def log_density(w: Array, template: Any, plan: Any, data: Any, *linear: Array) -> Float[Array, ""]:
-        first, along, offset, slope = linear
-        _, r = residuals(with_values(template)(first + along @ w), plan, data)
-        return -0.5 * (jnp.sum(r**2) / target.noise_scale**2 + jnp.sum((offset + slope @ w) ** 2))
+    def begin(position: Array, arrays: tuple[Any, ...]) -> Any:
+        return blackjax.nuts.init(position, lambda z: log_density(z, arrays))
 
-    return log_density, arrays
+    def step(key: Array, state: Any, size: Array, mass: Array, arrays: tuple[Any, ...]) -> tuple[Any, Any]:
+        kernel = blackjax.nuts(lambda z: log_density(z, arrays), size, mass, max_num_doublings=DOUBLINGS)
+        return kernel.step(key, state)
+
+    return compiled(begin), compiled(step)
 
 
 class _StepSize:
     """Dual averaging of the step size (Hoffman & Gelman 2014, section 3.2.1, their constants)."""
 
-    def __init__(self, first: float = 0.4) -> None:
+    def __init__(self, first: float = FIRST_STEP) -> None:
         self._centre = np.log(10 * first)
         self._log, self._mean, self._error, self._count = np.log(first), np.log(first), 0.0, 0
 
@@ -104,54 +132,3 @@ class _StepSize:
     @property
     def settled(self) -> float:
         return float(np.exp(self._mean))
-
-
-def sample_nuts(
-    target: Target,
-    draws: int = 1000,
-    warm_up: int = 200,
-    seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
-) -> NutsSample:
-    """One chain from the fit.
-
-    Raises ImportError without blackjax, ValueError for data in more than one chunk.
-    """
-    blackjax = _kernel()
-    log_density, arrays = whitened(target)
-    began = time.perf_counter()
-    one = jnp.ones(len(target.centre))
-
-    def start(position: Array, *arrays: Any) -> Any:
-        return blackjax.nuts.init(position, lambda w: log_density(w, *arrays))
-
-    def step(key: Array, state: Any, size: Array, *arrays: Any) -> tuple[Any, Any]:
-        return blackjax.nuts(lambda w: log_density(w, *arrays), size, one, max_num_doublings=DOUBLINGS).step(
-            key, state
-        )
-
-    key, go, tuning = jax.random.key(seed), compiled(step), _StepSize()
-    state = compiled(start)(jnp.zeros(len(one)), *arrays)
-    for i in range(warm_up):
-        state, info = go(jax.random.fold_in(key, i), state, jnp.asarray(tuning.trial), *arrays)
-        tuning.learn(float(info.acceptance_rate))
-    size = jnp.asarray(tuning.settled)
-    positions, divergences, gradients = np.empty((draws, len(one))), 0, 0
-    ready = time.perf_counter()
-    for i in range(draws):
-        state, info = go(jax.random.fold_in(key, warm_up + i), state, size, *arrays)
-        positions[i] = np.asarray(state.position)
-        divergences += int(info.is_divergent)
-        gradients += int(info.num_integration_steps)
-        if progress is not None:
-            progress(i + 1, draws)
-    along = np.asarray(arrays[4])[np.asarray(target.free)]
-    return NutsSample(
-        names=target.names,
-        draws=target.centre + positions @ along.T,
-        divergences=divergences,
-        gradients=gradients,
-        step_size=float(size),
-        seconds=time.perf_counter() - ready,
-        preparation=ready - began,
-    )

@@ -1,4 +1,4 @@
-"""A posterior as ArviZ InferenceData in a netCDF file, and as a table of intervals: all that knows ArviZ.
+"""A posterior as ArviZ InferenceData in a netCDF file, and as a table of intervals.
 
 Walkers of an ensemble are not independent chains, so a chain here is an ensemble: its draws are all walkers
 at steps spread evenly over the run. R-hat and effective sample sizes are those of `convergence`, kept as
@@ -17,7 +17,9 @@ from jaxtyping import Float
 
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail
-from walop_jax.posterior.result import INFLATION, PosteriorSample
+from walop_jax.posterior.convergence import arviz
+from walop_jax.posterior.result import PosteriorSample
+from walop_jax.posterior.target import INFLATION
 
 LEVELS = {"68": (0.1587, 0.8413), "95": (0.0228, 0.9772)}
 """Quantiles of the intervals: ± 1 and ± 2 standard deviations of a normal distribution."""
@@ -25,44 +27,39 @@ LEVELS = {"68": (0.1587, 0.8413), "95": (0.0228, 0.9772)}
 Column = tuple[np.ndarray, str, str]  # values, unit, description
 
 
-def _arviz() -> Any:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # its announcement of a refactoring
-        import arviz
-
-    return arviz
-
-
 def inference_data(sample: PosteriorSample) -> Any:
     """ArviZ InferenceData: one variable per coefficient that varies, under its name, with its unit."""
-    arviz = _arviz()
     varies = [i for i in range(len(sample.names)) if np.ptp(sample.draws[:, :, i]) > 0]
     posterior = {sample.names[i]: sample.draws[:, :, i] for i in varies}
     if sample.ln_f is not None:
         posterior[INFLATION] = sample.ln_f
-    data = arviz.from_dict(posterior=posterior, sample_stats={"lp": sample.log_posterior})
+    data = arviz().from_dict(posterior=posterior, sample_stats={"lp": sample.log_posterior})
     for i in varies:
         data.posterior[sample.names[i]].attrs["units"] = sample.units[i] or "1"
     v = sample.convergence
-    for k, name in enumerate(sample.sampled):
+    for k, name in enumerate(v.names):
+        if name not in data.posterior:  # it never moved
+            continue
         evidence = {"autocorrelation_steps": v.tau[k], "effective_samples": v.ess[k], "r_hat": v.rhat[k]}
         data.posterior[name].attrs.update({key: float(value) for key, value in evidence.items()})
-        data.posterior[name].attrs["sampled_by"] = "emcee"
+        data.posterior[name].attrs["sampled_by"] = sample.sampler
     data.posterior.attrs.update(
         {
+            "sampler": sample.sampler,
             "converged": int(v.converged),
             "trusted": int(sample.trusted),
             "verdict": v.message(),
             "steps": v.steps,
             "acceptance": sample.acceptance,
-            "surrogate_efficiency": sample.accuracy.efficiency,
-            "surrogate_spread": sample.accuracy.spread,
             "fingerprint": json.dumps(sample.fingerprint),
             "fixed": json.dumps(
                 {n: float(sample.draws[0, 0, i]) for i, n in enumerate(sample.names) if i not in varies}
             ),
         }
     )
+    if sample.accuracy is not None:
+        numbers = {"efficiency": sample.accuracy.efficiency, "spread": sample.accuracy.spread}
+        data.posterior.attrs.update({f"surrogate_{key}": value for key, value in numbers.items()})
     return data
 
 
@@ -84,11 +81,10 @@ def read_draws(path: str | os.PathLike[str], names: tuple[str, ...]) -> Float[np
 
     Raises `DataError` for a file that cannot be read, is of another model or may not be trusted.
     """
-    arviz = _arviz()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            data = arviz.from_netcdf(str(path), engine="h5netcdf")
+            data = arviz().from_netcdf(str(path), engine="h5netcdf")
         posterior = data.posterior
         fixed = json.loads(posterior.attrs["fixed"])
         trusted = bool(posterior.attrs["trusted"])
@@ -113,8 +109,8 @@ def read_draws(path: str | os.PathLike[str], names: tuple[str, ...]) -> Float[np
 def intervals(sample: PosteriorSample) -> dict[str, Column]:
     """Median, 68 and 95 % intervals of every coefficient that varies, as columns with unit and description.
 
-    τ, effective samples and R-hat are those of the sampled coefficients, NaN for those drawn from their
-    conditional distribution.
+    τ, effective samples and R-hat are NaN for coefficients that are not sampled but drawn from their conditional
+    distribution.
     """
     varies = [i for i in range(len(sample.names)) if np.ptp(sample.draws[:, :, i]) > 0]
     values = sample.draws.reshape(-1, len(sample.names))[:, varies]
@@ -140,7 +136,7 @@ def intervals(sample: PosteriorSample) -> dict[str, Column]:
         ("ESS", v.ess, "effective samples"),
         ("RHAT", v.rhat, "R-hat between ensembles"),
     ):
-        known = dict(zip(sample.sampled, numbers, strict=True))
+        known = dict(zip(v.names, numbers, strict=True))
         columns[name] = np.array([known.get(name_, np.nan) for name_ in names]), "", about
     return columns
 
@@ -149,6 +145,7 @@ def report(sample: PosteriorSample) -> dict[str, Any]:
     """What the run found, as plain data, for `sample.json`."""
     v, a = sample.convergence, sample.accuracy
     return {
+        "sampler": sample.sampler,
         "trusted": sample.trusted,
         "converged": v.converged,
         "message": v.message(sample.seconds_per_step),
@@ -157,11 +154,14 @@ def report(sample: PosteriorSample) -> dict[str, Any]:
         "walkers": int(sample.chains.shape[2]),
         "ensembles": int(sample.chains.shape[0]),
         "acceptance": sample.acceptance,
-        "autocorrelation_steps": {n: float(t) for n, t in zip(sample.sampled, v.tau, strict=True)},
+        "autocorrelation_steps": {n: float(t) for n, t in zip(v.names, v.tau, strict=True)},
         "autocorrelation_history": list(v.history),
-        "effective_samples": {n: float(t) for n, t in zip(sample.sampled, v.ess, strict=True)},
-        "r_hat": {n: float(t) for n, t in zip(sample.sampled, v.rhat, strict=True)},
-        "surrogate": {
+        "effective_samples": {n: float(t) for n, t in zip(v.names, v.ess, strict=True)},
+        "r_hat": {n: float(t) for n, t in zip(v.names, v.rhat, strict=True)},
+        "sampler_counts": dict(sample.counts),
+        "surrogate": None
+        if a is None
+        else {
             "draws_checked": a.count,
             "spread": a.spread,
             "efficiency": a.efficiency,

@@ -3,38 +3,40 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from walop_jax.posterior.convergence import Chains, Convergence
-from walop_jax.posterior.ensemble import MOVES
+from walop_jax.posterior.samplers import Sampler, make_sampler
 from walop_jax.posterior.surrogate_accuracy import Accuracy
 from walop_jax.posterior.target import LARGEST_SAMPLED
 
 Vector = Float[np.ndarray, " n"]
 
 BURN_IN = 0.2  # share of the steps that is not used
-INFLATION = "noise.ln_f"
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
     """How to sample. `interval` is the length of a block, hence of what a kill can lose, in steps.
 
-    `walkers` 0 stands for twice the number of sampled coefficients, at least 64. `parameters` names what is
-    sampled (None: the physics coefficients). `checks` is the number of draws compared with the exact
-    posterior.
+    `sampler` is a name (`emcee`, `nuts`), `FILE.py:CLASS`, or a `Sampler`; `walkers` and `moves` are options of emcee,
+    `walkers` 0 standing for twice the number of sampled coefficients, at least 64. `parameters` names what is
+    sampled (None: the physics coefficients); samplers of the exact posterior sample all and show these in figures.
+    Every `thin`-th step is stored (0: as is usual for the sampler). `checks` is the number of draws compared with the
+    exact posterior. Raises ValueError for what makes no sense.
     """
 
+    sampler: str | Sampler | type[Sampler] = "emcee"
     seed: int = 0
     walkers: int = 0
     interval: int = 500
     maximum_steps: int = 100_000
-    thin: int = 2
-    moves: str = MOVES[0]
+    thin: int = 0
+    moves: str = "laplace"
     order: int = 3
     inflate: bool = False
     draws: int = 4000
@@ -43,16 +45,22 @@ class Options:
     parameters: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        if self.moves not in MOVES:
-            raise ValueError(f"unknown moves {self.moves!r}: choose one of {', '.join(MOVES)}")
+        sampler = self.make_sampler()
         if self.ensembles < 2:
             raise ValueError("at least two independent ensembles are needed to judge convergence")
-        if min(self.interval, self.thin, self.draws, self.checks, self.maximum_steps) < 1:
-            raise ValueError("interval, thin, draws, checks and maximum_steps must be 1 or more")
-        if self.interval % self.thin:
-            raise ValueError(f"interval {self.interval} must be a multiple of thin {self.thin}")
+        if min(self.interval, self.draws, self.checks, self.maximum_steps) < 1 or self.thin < 0:
+            raise ValueError("interval, draws, checks and maximum_steps must be 1 or more, thin not negative")
+        thin = self.thin or sampler.thin
+        if self.interval % thin:
+            raise ValueError(f"interval {self.interval} must be a multiple of thin {thin}")
         if self.parameters is not None and len(self.parameters) > LARGEST_SAMPLED:
             raise ValueError(f"{len(self.parameters)} parameters to sample: at most {LARGEST_SAMPLED}")
+
+    def make_sampler(self) -> Sampler:
+        """Return the sampler that is asked for, with the options that are its own."""
+        default = {f.name: f.default for f in dataclasses.fields(self)}
+        own: dict[str, Any] = {name: getattr(self, name) for name in ("walkers", "moves")}
+        return make_sampler(self.sampler, {k: value for k, value in own.items() if value != default[k]})
 
 
 class Progress(NamedTuple):
@@ -72,9 +80,12 @@ class PosteriorSample:
     """The posterior of all coefficients.
 
     `draws` holds (ensemble, draw, parameter) of all parameters in tree order, tied and frozen ones
-    included; `mean` and `covariance` use every kept step. `trusted` needs convergence and a surrogate that
-    is exact enough.
+    included; `mean` and `covariance` use every kept step. `chains` are of the coefficients `sampled`, those that
+    figures show. `accuracy` is that of the surrogate, None where the exact posterior was sampled; `trusted` needs
+    convergence and a surrogate that is exact enough. `counts` are what the sampler counted.
     """
+
+    sampler: str
 
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -87,29 +98,45 @@ class PosteriorSample:
     sampled: tuple[str, ...]
     thin: int
     convergence: Convergence
-    accuracy: Accuracy
+    accuracy: Accuracy | None
     acceptance: float
+    counts: Mapping[str, int]
     seconds: float
     fingerprint: dict[str, str]
 
     @property
     def trusted(self) -> bool:
         """Whether the posterior may be believed."""
-        return self.convergence.converged and self.accuracy.exact_enough
+        return self.convergence.converged and (self.accuracy is None or self.accuracy.exact_enough)
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What does not hold, in words."""
         found = [] if self.convergence.converged else [self.convergence.message(self.seconds_per_step)]
-        if not self.accuracy.exact_enough:
-            a = self.accuracy
+        a = self.accuracy
+        if a is not None and not a.exact_enough:
             found.append(
                 f"the surrogate differs from the exact posterior: {a.shift[0]} by {a.shift[1]:+.2f} ± "
                 f"{a.shift[2]:.2f} σ, width of {a.width[0]} by a factor {a.width[1]:.2f} ± {a.width[2]:.2f}, "
                 f"weights {a.efficiency:.2f} effective; sample fewer or better determined coefficients, or "
-                "use NUTS"
+                "take the sampler nuts"
+            )
+        if self.counts.get("divergences", 0):
+            found.append(
+                f"{self.counts['divergences']} trajectories of the sampler diverged: tails may be missing"
             )
         return tuple(found)
+
+    @property
+    def comparison(self) -> str:
+        """How what was sampled compares with the exact posterior, in words."""
+        a = self.accuracy
+        if a is None:
+            return f"sampled with {self.sampler} from the exact posterior of all coefficients"
+        return (
+            f"against the exact posterior at {a.count} draws: means within {abs(a.shift[1]):.3f} σ, "
+            f"widths within {100 * abs(a.width[1] - 1):.1f} %"
+        )
 
     @property
     def seconds_per_step(self) -> float:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import os
 import time
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -14,9 +16,11 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import fail
 from walop_jax.io.software import versions_of
 from walop_jax.posterior.checkpoint import Checkpoints, digest
-from walop_jax.posterior.convergence import Chains, Convergence, assess
-from walop_jax.posterior.ensemble import Block, Walkers, advance, start
-from walop_jax.posterior.result import BURN_IN, INFLATION, Options, PosteriorSample, Progress, Report
+from walop_jax.posterior.convergence import Convergence
+from walop_jax.posterior.ensembles import Ensembles, numbers_of
+from walop_jax.posterior.exact import ExactPosterior
+from walop_jax.posterior.result import Options, PosteriorSample, Progress, Report
+from walop_jax.posterior.samplers import Sampler
 from walop_jax.posterior.surrogate import Surrogate
 from walop_jax.posterior.surrogate_accuracy import check
 from walop_jax.posterior.surrogate_builder import build_surrogate
@@ -24,7 +28,7 @@ from walop_jax.posterior.target import Target, choose_sampled
 
 Vector = Float[np.ndarray, " n"]
 
-SOFTWARE = ("walop-jax", "jax", "jaxlib", "numpy", "emcee")
+SOFTWARE = ("walop-jax", "jax", "jaxlib", "numpy")
 
 
 def fingerprint(target: Target, options: Options) -> dict[str, str]:
@@ -38,14 +42,30 @@ def fingerprint(target: Target, options: Options) -> dict[str, str]:
     chain = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
     for name in ("maximum_steps", "draws", "checks"):  # how long, and what is made of it: free to change
         del chain[name]
-    versions = versions_of(SOFTWARE)
+    for name in ("sampler", "walkers", "moves"):  # have an entry of their own
+        del chain[name]
+    sampler = options.make_sampler()
+    versions = versions_of((*SOFTWARE, *sampler.software))
+    effects = [type(effect).__name__ for effect in model.template.effects]
     return {
-        "data": digest(*data, *plan, *exposures, laid_out.settings), "model": digest(model.name,
-        parameters, [type(e).__name__ for e in model.template.effects], model.template.plates), "priors":
-        digest(priors), "fit": digest(np.round(target.centre, 12), target.noise_scale), "settings":
-        digest(sorted(chain.items(), key=lambda item: item[0])), "versions": ", ".join(f"{name} {version}"
-        for name, version in versions.items()),
-    }  # fmt: skip
+        "data": digest(*data, *plan, *exposures, laid_out.settings),
+        "model": digest(model.name, parameters, effects, model.template.plates),
+        "priors": digest(priors),
+        "fit": digest(np.round(target.centre, 12), target.noise_scale),
+        "sampler": _description(sampler),
+        "settings": digest(sorted(chain.items(), key=lambda item: item[0])),
+        "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
+    }
+
+
+def _description(sampler: Sampler) -> str:
+    """Name of a sampler, with a hash of its settings and, if it is not of this package, of the file that it is in."""
+    settings = dataclasses.asdict(sampler) if dataclasses.is_dataclass(sampler) else {}
+    code = b""
+    if type(sampler).__module__.split(".")[0] != __name__.split(".")[0]:
+        file = inspect.getsourcefile(type(sampler))
+        code = b"" if file is None or not Path(file).exists() else Path(file).read_bytes()
+    return f"{sampler.name} {digest(sorted(settings.items()), code)}"
 
 
 def sample(
@@ -60,31 +80,28 @@ def sample(
 
     With `folder`, checkpoints are kept there; `resume` goes on from them, bit for bit as if there had been no
     interruption. Raises `DataError` for a folder that holds a run already while `resume` is False, or one of
-    other data, model, priors, settings or versions; ValueError where there is nothing to sample.
+    other data, model, priors, sampler, settings or versions; ValueError where there is nothing to sample.
     """
     options = options or Options()
     report = report or (lambda progress: None)
-    target = Target(result)
+    sampler, target = options.make_sampler(), Target(result)
     checkpoints = None
     if folder is not None:
         checkpoints = Checkpoints(folder, fingerprint(target, options))
         if checkpoints.exists() and not resume:
             raise fail("holds a chain already", file=folder, advice="go on with --resume, or --overwrite it")
-    surrogate, build_seconds = _surrogate(target, options, checkpoints, report)
-    run = _Run(surrogate, options, checkpoints)
-    run.restore()
-    while True:
-        verdict = run.assess()
-        if verdict is not None and (verdict.converged or run.steps >= options.maximum_steps):
-            break
-        goal = options.maximum_steps if verdict is None else run.steps + verdict.needed
-        numbers = (np.nan, np.nan) if verdict is None else (verdict.history[2], float(np.min(verdict.ess)))
-        report(Progress("sampling", min(run.steps / max(goal, 1), 1.0), *numbers))
-        run.go_on()
-    report(
-        Progress("comparing with the exact posterior", 1.0, verdict.history[2], float(np.min(verdict.ess)))
-    )
-    return _finish(target, run, verdict, options, build_seconds)
+        if checkpoints.exists():
+            checkpoints.check()
+    if sampler.exact:
+        posterior = ExactPosterior(target, choose_sampled(target, options.parameters), options.inflate)
+        seconds = 0.0
+    else:
+        posterior, seconds = _surrogate(target, options, checkpoints, report)
+    report(Progress("starting", 0.0))
+    ensembles = Ensembles(sampler, posterior.density(), options, checkpoints)
+    verdict = ensembles.until_converged(posterior.quoted_names, posterior.quoted, report)
+    report(Progress("comparing with the exact posterior", 1.0, *numbers_of(verdict)))
+    return _finish(target, posterior, ensembles, verdict, seconds)
 
 
 def _surrogate(
@@ -108,105 +125,48 @@ def _surrogate(
     return surrogate, seconds
 
 
-class _Run:
-    """The ensembles of a run and what they have stored so far."""
-
-    def __init__(self, surrogate: Surrogate, options: Options, checkpoints: Checkpoints | None) -> None:
-        self.surrogate, self.options, self.checkpoints = surrogate, options, checkpoints
-        self.log_posterior = surrogate.log_posterior()
-        d = surrogate.dimension
-        count = options.walkers or max(64, 2 * d)
-        if count < 2 * d or count % 2:
-            raise ValueError(
-                f"{count} walkers for {d} sampled coefficients: an even number of at least {2 * d}"
-            )
-        self.walkers: list[Walkers] = []
-        for number in range(options.ensembles):
-            self.walkers.append(start(self.log_posterior, count, d, options.seed, number))
-        self.blocks: list[list[Block]] = []
-        self.seconds = 0.0
-
-    @property
-    def steps(self) -> int:
-        return len(self.blocks) * self.options.interval
-
-    def restore(self) -> None:
-        for number in range(1, 1 + (0 if self.checkpoints is None else self.checkpoints.count())):
-            assert self.checkpoints is not None
-            self.walkers, blocks, seconds = self.checkpoints.load_block(number)
-            self.blocks.append(blocks)
-            self.seconds += seconds
-
-    def go_on(self) -> None:
-        began, thin = time.perf_counter(), self.options.thin
-        blocks = []
-        for i, walkers in enumerate(self.walkers):
-            stored = self.options.interval // thin
-            self.walkers[i], block = advance(self.log_posterior, walkers, stored, thin, self.options.moves)
-            blocks.append(block)
-        seconds = time.perf_counter() - began
-        self.seconds += seconds
-        self.blocks.append(blocks)
-        if self.checkpoints is not None:
-            self.checkpoints.save_block(len(self.blocks), self.walkers, blocks, seconds)
-
-    def kept(self) -> tuple[Chains, Float[np.ndarray, "e t w"]]:
-        """Stored positions and ln p after burn-in."""
-        z = np.concatenate([np.stack([b.coordinates for b in blocks]) for blocks in self.blocks], axis=1)
-        lnp = np.concatenate([np.stack([b.log_posterior for b in blocks]) for blocks in self.blocks], axis=1)
-        first = int(BURN_IN * z.shape[1])
-        return z[:, first:], lnp[:, first:]
-
-    def quoted(self, z: Chains) -> Chains:
-        """The sampled coefficients themselves, as people quote them (and ln f)."""
-        s = self.surrogate
-        k = s.along.shape[1]
-        physical = s.centre[s.sampled] + z[..., :k] @ s.along[s.sampled].T
-        return np.concatenate([physical, z[..., k:] * s.ln_f_unit], axis=-1)
-
-    def names(self) -> tuple[str, ...]:
-        s = self.surrogate
-        return (*(s.names[i] for i in s.sampled), *((INFLATION,) if s.inflate else ()))
-
-    def assess(self) -> Convergence | None:
-        """The verdict on what there is; None before the first block."""
-        if not self.blocks:
-            return None
-        return assess(self.quoted(self.kept()[0]), self.names(), self.options.thin)
-
-
 def _evenly(count: int, wanted: int) -> Int[np.ndarray, " m"]:
     return np.unique(np.linspace(0, count - 1, min(wanted, count)).astype(int))
 
 
 def _finish(
-    target: Target, run: _Run, verdict: Convergence, options: Options, build_seconds: float
+    target: Target,
+    posterior: Surrogate | ExactPosterior,
+    ensembles: Ensembles,
+    verdict: Convergence,
+    seconds: float,
 ) -> PosteriorSample:
-    z, lnp = run.kept()
+    z, lnp = ensembles.kept()
     e, n, w, d = z.shape
-    surrogate, rng = run.surrogate, np.random.default_rng([options.seed, 99])
+    options, rng = ensembles.options, np.random.default_rng([ensembles.options.seed, 99])
     steps = _evenly(n, -(-options.draws // (e * w)))
     flat = z[:, steps].reshape(e, -1, d)
-    x = surrogate.draw(flat.reshape(-1, d), rng)
+    x = posterior.draw(flat.reshape(-1, d), rng)
     values = np.array([target.values(one) for one in x]).reshape(e, flat.shape[1], -1)
-    checked = z.reshape(-1, d)[_evenly(e * n * w, options.checks)]
-    accuracy = check(target, surrogate, checked, rng)
-    mean, covariance = surrogate.moments(z.reshape(-1, d)[:: max(1, e * n * w // 50_000)])
+    accuracy = None
+    if isinstance(posterior, Surrogate):
+        checked = z.reshape(-1, d)[_evenly(e * n * w, options.checks)]
+        accuracy = check(target, posterior, checked, rng)
+    mean, covariance = posterior.moments(z.reshape(-1, d)[:: max(1, e * n * w // 50_000)])
     select = target.model.selection()
+    shown = len(posterior.sampled) + int(posterior.inflate)
+    checkpoints = ensembles.checkpoints
     return PosteriorSample(
+        sampler=ensembles.sampler.name,
         names=target.model.names,
         units=tuple(p.unit for p in target.model.parameters),
         draws=values,
         log_posterior=lnp[:, steps].reshape(e, -1),
-        ln_f=flat[:, :, -1] * surrogate.ln_f_unit if surrogate.inflate else None,
+        ln_f=flat[:, :, -1] * posterior.ln_f_unit if posterior.inflate else None,
         mean=target.values(mean),
         covariance=select @ covariance @ select.T,
-        chains=run.quoted(z),
-        sampled=run.names(),
-        thin=options.thin,
+        chains=posterior.quoted(z)[..., :shown],
+        sampled=posterior.quoted_names[:shown],
+        thin=ensembles.thin,
         convergence=verdict,
         accuracy=accuracy,
-        acceptance=float(np.mean([[b.accepted for b in blocks] for blocks in run.blocks])),
-        seconds=build_seconds + run.seconds,
-        fingerprint={} if run.checkpoints is None else dict(run.checkpoints.fingerprint),
+        acceptance=ensembles.acceptance,
+        counts=ensembles.counts,
+        seconds=seconds + ensembles.seconds,
+        fingerprint={} if checkpoints is None else dict(checkpoints.fingerprint),
     )

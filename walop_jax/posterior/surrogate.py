@@ -28,19 +28,18 @@ Source   Laplace marginals: Tierney & Kadane 1986, JASA 81, 82. Compression as i
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from functools import partial
+import inspect
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.model.compiled import compiled
+from walop_jax.posterior.density import Density
+from walop_jax.posterior.target import INFLATION, LN_F_WIDTH
 
 Matrix = Float[np.ndarray, "..."]
 Draws = Float[np.ndarray, "n k"]
-
-LN_F_WIDTH = 1.0  # prior of ln f, the noise inflation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,25 +86,40 @@ class Surrogate:
         """h for every draw."""
         return np.asarray(features_of(jnp.asarray(z), jnp.asarray(self.pairs), jnp.asarray(self.triples)))
 
-    def log_posterior(self) -> Callable[[Draws], Float[np.ndarray, " n"]]:
-        """The jitted, batched marginal log-posterior of the sampled coordinates, for `vectorize=True`."""
+    def density(self) -> Density:
+        """The marginal density of the sampled coordinates, many positions at a time."""
         h = self.data.shape[0] - len(self.share)
         pairs, triples = jnp.asarray(self.pairs), jnp.asarray(self.triples)
         if self.inflate:
             mixed = [self.linear.T @ q[h:, :h] for q in (self.data, self.prior)]
             prior = self._tilted(self.prior[:h, :h])
             parts = (self.data[:h, :h], prior, *mixed, self.share, np.asarray(float(self.measured)))
-            function = partial(_inflated, pairs, triples, *(jnp.asarray(p) for p in parts))
+            function, arrays = _inflated, (pairs, triples, *(jnp.asarray(p) for p in parts))
         else:
             q = self.data + self.prior
             schur = q[:h, :h] - q[:h, h:] @ np.linalg.solve(q[h:, h:], q[h:, :h])
-            function = partial(_plain, pairs, triples, jnp.asarray(self._tilted(0.5 * (schur + schur.T))))
+            function = _plain
+            arrays = (pairs, triples, jnp.asarray(self._tilted(0.5 * (schur + schur.T))))
 
-        def log_posterior(z: Draws) -> Float[np.ndarray, " n"]:
-            value = np.asarray(function(jnp.asarray(z)), np.float64)
+        def one(z: Array, *arrays: Array) -> Array:
+            return inspect.unwrap(function)(*arrays, z[None])[0]
+
+        def many(z: Draws) -> Float[np.ndarray, " n"]:
+            value = np.asarray(function(*arrays, jnp.asarray(z)), np.float64)
             return np.where(np.isfinite(value), value, -np.inf)
 
-        return log_posterior
+        return Density(self.dimension, one, arrays, batch=many)
+
+    @property
+    def quoted_names(self) -> tuple[str, ...]:
+        """Names of what is sampled, as people quote it."""
+        return (*(self.names[i] for i in self.sampled), *((INFLATION,) if self.inflate else ()))
+
+    def quoted(self, z: Float[np.ndarray, "... k"]) -> Float[np.ndarray, "... q"]:
+        """The sampled coefficients themselves (and ln f) at sampled coordinates."""
+        k = self.along.shape[1]
+        physical = self.centre[self.sampled] + z[..., :k] @ self.along[self.sampled].T
+        return np.concatenate([physical, z[..., k:] * self.ln_f_unit], axis=-1)
 
     def _tilted(self, form: Matrix) -> Matrix:
         """A quadratic form in h with the linear term of the determinant added."""

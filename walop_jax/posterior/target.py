@@ -2,13 +2,16 @@
 
     −2 ln p(x) = χ²(data) / noise_scale² + priors + loose pulls          fluxes eliminated as in `engine`
 
-Sampled are the physics coefficients. The throughput series and the catalogue values of the standards are
-near-linear: they are marginalised in closed form (`surrogate`) and drawn afterwards.
+A sampler is given either this, in all free parameters (`exact_density`), or the surrogate in the physics coefficients
+alone: throughput series and catalogue values of the standards are near-linear, so that they can be marginalised in
+closed form (`surrogate`) and drawn afterwards.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +22,12 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import engine
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import unknown_name, with_values
+from walop_jax.posterior.density import Density
 
 Vector = Float[np.ndarray, " f"]
 LARGEST_SAMPLED = 20
+LN_F_WIDTH = 1.0  # prior of ln f, the noise inflation
+INFLATION = "noise.ln_f"
 NEAR_LINEAR = ("throughput", "standard")
 
 
@@ -60,6 +66,17 @@ class Target:
         per_row = np.where(self.likelihood.flux_known, 4, 3)
         return int(self.likelihood.used.sum(axis=0) @ per_row)
 
+    @property
+    def root(self) -> Float[np.ndarray, "f f"]:
+        """Lower triangular L with L Lᵀ the covariance of the fit: x = x̂ + L w has unit covariance in w."""
+        scale = self.scale
+        return scale[:, None] * np.linalg.cholesky(self.covariance / np.outer(scale, scale))
+
+    @property
+    def ln_f_unit(self) -> float:
+        """What ln f, the noise inflation, changes by per unit of its coordinate: about its standard error."""
+        return 1.0 / np.sqrt(2.0 * max(self.measured, 1))
+
     def values(self, x: Vector) -> Float[np.ndarray, " n"]:
         """All parameters, frozen and tied ones included."""
         return self._base + self._select @ (x - self.centre)
@@ -85,6 +102,60 @@ class Target:
     def objective(self, x: Vector) -> float:
         """−2 ln posterior, up to a constant."""
         return self.data(x) + float(np.sum(self.prior_rows(x) ** 2))
+
+
+def exact_density(target: Target, inflate: bool = False) -> Density:
+    """The exact posterior of all free parameters in w, where x = x̂ + L w and L Lᵀ is the covariance of the fit.
+
+    With `inflate` the errors of the data are times f; ln f has the prior N(0, 1) and ln f √(2n) is the last coordinate.
+    The data go through it chunk by chunk, however many there are: the memory of a gradient is that of one chunk.
+    """
+    likelihood = target.likelihood
+    offset = target.prior_rows(target.centre)
+    slope = np.stack([target.prior_rows(target.centre + column) - offset for column in target.root.T], axis=1)
+    linear = (target.values(target.centre), target.model.selection() @ target.root, offset, slope)
+    chunks = jax.tree.map(lambda *parts: jnp.stack(parts), *likelihood.points)
+    arrays = (target.model.template, likelihood.plan, chunks, *(jnp.asarray(a) for a in linear))
+    residuals = inspect.unwrap(engine.residuals)  # to be compiled with the density, not on its own
+    measured, free = float(target.measured), len(target.free)
+
+    def chi2_of(values: Array, template: Instrument, plan: Any, chunk: engine.PointData) -> Array:
+        _, r = residuals(with_values(template)(values), plan, chunk)
+        return jnp.sum(r**2) / target.noise_scale**2
+
+    def log_density(w: Array, chi2: Array, offset: Array, slope: Array) -> Array:
+        total = jnp.sum((offset + slope @ w[:free]) ** 2)
+        if not inflate:
+            return -0.5 * (chi2 + total)
+        ln_f = w[-1] * target.ln_f_unit
+        return -0.5 * (chi2 * jnp.exp(-2.0 * ln_f) + total + (ln_f / LN_F_WIDTH) ** 2) - measured * ln_f
+
+    def over_chunks(function: Callable[[engine.PointData], Any], chunks: engine.PointData) -> Any:
+        blank = jax.eval_shape(function, jax.tree.map(lambda v: v[0], chunks))
+        zero = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), blank)
+        return jax.lax.scan(
+            lambda total, chunk: (jax.tree.map(jnp.add, total, function(chunk)), None), zero, chunks
+        )[0]
+
+    def value(w: Array, template: Instrument, plan: Any, chunks: engine.PointData, *linear: Array) -> Array:
+        first, along, offset, slope = linear
+        values = first + along @ w[:free]
+        chi2 = over_chunks(lambda chunk: chi2_of(values, template, plan, chunk), chunks)
+        return log_density(w, chi2, offset, slope)
+
+    def with_gradient(
+        w: Array, template: Instrument, plan: Any, chunks: engine.PointData, *linear: Array
+    ) -> tuple[Array, Array]:
+        first, along, offset, slope = linear
+        values = first + along @ w[:free]
+        here = over_chunks(lambda chunk: jax.value_and_grad(chi2_of)(values, template, plan, chunk), chunks)
+        chi2, by_values = here
+        # χ² enters as the line that has its value and slope at w.
+        return jax.value_and_grad(
+            lambda z: log_density(z, chi2 + by_values @ (along @ (z - w)[:free]), offset, slope)
+        )(w)
+
+    return Density(free + int(inflate), value, arrays, gradient=with_gradient)
 
 
 def near_linear(target: Target) -> Int[np.ndarray, " s"]:

@@ -1,0 +1,78 @@
+"""The exact log density and its gradient: what the fit minimises, in however many chunks the data are."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.posterior.density import Density
+from walop_jax.posterior.target import Target, exact_density
+
+from .conftest import Scene
+
+
+@pytest.fixture(scope="module")
+def density(scene: Scene) -> Density:
+    return exact_density(scene.target)
+
+
+@pytest.fixture(scope="module")
+def place(scene: Scene) -> np.ndarray:
+    return np.random.default_rng(1).standard_normal(len(scene.target.free))
+
+
+def test_it_is_the_objective_of_the_fit_in_whitened_coordinates(
+    scene: Scene, density: Density, place: np.ndarray
+) -> None:
+    target = scene.target
+    sigma = np.sqrt(np.diag(target.covariance))
+    again, given = (c / np.outer(sigma, sigma) for c in (target.root @ target.root.T, target.covariance))
+    np.testing.assert_allclose(again, given, atol=1e-11)
+    for w in (np.zeros_like(place), place, -3.0 * place):
+        expected = -0.5 * target.objective(target.centre + target.root @ w)
+        assert density.log_density(w[None])[0] == pytest.approx(expected, rel=1e-12)
+        assert density.value_and_gradient(w)[0] == pytest.approx(expected, rel=1e-12)
+
+
+def test_its_gradient_is_that_of_finite_differences(
+    scene: Scene, density: Density, place: np.ndarray
+) -> None:
+    """Central differences along random directions; and zero at the fit, where the posterior has its mode."""
+    _, gradient = density.value_and_gradient(place)
+    for step in 1e-3 * np.random.default_rng(2).standard_normal((4, len(place))):
+        up, down = density.log_density(np.array([place + step, place - step]))
+        assert 0.5 * (up - down) == pytest.approx(gradient @ step, rel=1e-6, abs=1e-8)
+    at_the_fit = density.value_and_gradient(np.zeros_like(place))[1]
+    assert np.abs(at_the_fit).max() < 0.02 < np.abs(gradient).max()
+
+
+def test_chunks_make_no_difference(scene: Scene, density: Density, place: np.ndarray) -> None:
+    """Four chunks, the last of them padded, are the same as one."""
+    one = scene.result.likelihood
+    cut = Likelihood.of(one.calset, one.model, points_per_chunk=6)
+    several = Target(dataclasses.replace(scene.result, likelihood=cut))
+    assert (len(one.points), len(cut.points)) == (1, 4)
+    value, gradient = density.value_and_gradient(place)
+    again, its_gradient = exact_density(several).value_and_gradient(place)
+    assert again == pytest.approx(value, rel=1e-13)
+    np.testing.assert_allclose(its_gradient, gradient, rtol=1e-10, atol=1e-11)
+
+
+def test_inflation_divides_chi2_by_f_squared(scene: Scene, density: Density, place: np.ndarray) -> None:
+    """ln p = −½ (χ²/f² + priors + ln² f) − n ln f, by hand; its coordinate is ln f √(2n)."""
+    target, inflated = scene.target, exact_density(scene.target, inflate=True)
+    assert inflated.dimension == density.dimension + 1
+    x, n = target.centre + target.root @ place, target.measured
+    chi2, priors = target.data(x), float(np.sum(target.prior_rows(x) ** 2))
+    for ln_f in (-0.2, 0.0, 0.1):
+        w = np.append(place, ln_f * np.sqrt(2.0 * n))
+        expected = -0.5 * (chi2 * np.exp(-2.0 * ln_f) + priors + ln_f**2) - n * ln_f
+        value, gradient = inflated.value_and_gradient(w)
+        assert value == pytest.approx(expected, rel=1e-12)
+        slope = (chi2 * np.exp(-2.0 * ln_f) - ln_f - n) / np.sqrt(2.0 * n)
+        assert gradient[-1] == pytest.approx(slope, rel=1e-9)
+    at_one = inflated.value_and_gradient(np.append(place, 0.0))[1][:-1]
+    np.testing.assert_allclose(at_one, density.value_and_gradient(place)[1], rtol=1e-10, atol=1e-11)

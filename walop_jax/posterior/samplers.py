@@ -1,0 +1,134 @@
+"""What a sampler is, and which there are.
+
+A sampler is a class with a name and two methods. Independent ensembles of it (of one walker or of many) are started and
+taken further, stretch by stretch, by `Ensembles`, which also keeps checkpoints and judges convergence. A sampler of
+one's own is one file, given by its place (`my_sampler.py:MySampler`) or in Python (`Options(sampler=MySampler())`).
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import importlib
+import importlib.util
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.io.errors import fail, nearest
+from walop_jax.posterior.density import Density
+
+SAMPLERS = {
+    "emcee": "walop_jax.posterior.ensemble:Emcee",
+    "nuts": "walop_jax.posterior.nuts:Nuts",
+}
+"""One line for each sampler: its name, and module and class."""
+
+State = Mapping[str, np.ndarray]
+"""All there is to an ensemble between two steps, as named arrays: what a checkpoint keeps."""
+
+
+class Stretch(NamedTuple):
+    """What a number of steps gave: positions, their ln p, and the share of proposals accepted.
+
+    `counts` are numbers that the sampler wants to be reported, summed over all stretches.
+    """
+
+    positions: Float[np.ndarray, "n w k"]
+    log_density: Float[np.ndarray, "n w"]
+    acceptance: Float[np.ndarray, "n w"]
+    counts: Mapping[str, int] = {}
+
+
+class Sampler(abc.ABC):
+    """A way of drawing from a density.
+
+    Without `exact` it is given the surrogate, in which throughput coefficients and catalogue values are marginalised;
+    with it the exact posterior of all free parameters. `software` are the packages whose versions its draws depend on;
+    of its steps every `thin`-th is stored, unless something else is asked for.
+
+    The same state and number of steps must always give the same stretch, whatever has been computed before: random
+    numbers come from the state.
+    """
+
+    name: ClassVar[str]
+    exact: ClassVar[bool] = False
+    software: ClassVar[tuple[str, ...]] = ()
+    thin: ClassVar[int] = 1
+
+    @abc.abstractmethod
+    def start(self, density: Density, seed: Sequence[int]) -> State:
+        """Return an ensemble before its first step; `seed` as `numpy.random.default_rng` takes it."""
+
+    @abc.abstractmethod
+    def advance(self, density: Density, state: State, steps: int) -> tuple[State, Stretch]:
+        """Return the ensemble after `steps` more steps, and what they gave."""
+
+
+def make_sampler(
+    sampler: str | Sampler | type[Sampler], settings: Mapping[str, Any] | None = None
+) -> Sampler:
+    """Return a sampler by its name, its class or `FILE.py:CLASS`; a `Sampler` comes back as it is.
+
+    `settings` are arguments of its class. Raises `DataError` for a name or a file that does not exist, for a class that
+    is no `Sampler`, and for settings that the sampler does not have.
+    """
+    settings = settings or {}
+    if isinstance(sampler, Sampler):
+        _check_settings(type(sampler), settings, given=True)
+        return sampler
+    if isinstance(sampler, type):
+        kind = sampler
+    elif ".py:" in sampler:
+        kind = _from_file(*sampler.rsplit(":", 1))
+    elif sampler in SAMPLERS:
+        module, name = SAMPLERS[sampler].split(":")
+        kind = getattr(importlib.import_module(module), name)
+    else:
+        raise fail(
+            f"there is no sampler {sampler!r}",
+            advice=f"choose one of {', '.join(SAMPLERS)}, or give your own as FILE.py:CLASS",
+        )
+    if not isinstance(getattr(kind, "name", None), str):
+        raise fail(f"the sampler {sampler!r} has no name", advice='write name = "…" into its class')
+    _check_settings(kind, settings)
+    try:
+        return kind(**settings)
+    except TypeError as error:
+        raise fail(f"the sampler {sampler!r} cannot be made: {error}", advice="look at its class") from error
+
+
+def _check_settings(kind: type[Sampler], settings: Mapping[str, Any], given: bool = False) -> None:
+    known = {f.name for f in dataclasses.fields(kind)} if dataclasses.is_dataclass(kind) else set()
+    unknown = list(settings) if given else [name for name in settings if name not in known]
+    if unknown:
+        advice = "set it in the sampler that you give" if given else "leave it out"
+        raise fail(f"{unknown[0]!r} is no option of the sampler {kind.name!r}", advice=advice)
+
+
+def _from_file(file: str, name: str) -> type[Sampler]:
+    path = Path(file)
+    if not path.is_file():
+        raise fail("there is no such file", file=path, advice="give a sampler as FILE.py:CLASS")
+    module_name = f"walop_jax_sampler_{path.stem}"
+    specification = importlib.util.spec_from_file_location(module_name, path)
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[module_name] = module  # dataclasses look up their module
+    try:
+        specification.loader.exec_module(module)
+    except Exception as error:
+        raise fail(f"cannot be run: {type(error).__name__}: {error}", file=path) from error
+    kinds = {
+        key: value
+        for key, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, Sampler) and value is not Sampler
+    }
+    if name not in kinds:
+        raise fail(f"has no sampler {name!r}", file=path, advice=nearest(name, kinds))
+    return kinds[name]
