@@ -306,7 +306,7 @@ def test_model_errors(call, calset_file, tmp_path):
 def test_cite_lists_sources(call, run):
     for args in ((), (run,), (run / "calibration.fits",)):
         text = call("cite", *args).stdout
-        for name in ("Maharana et al. 2022", "Yeh 1982", "Ghosh 1999", "Dodge 1984", "Moré 1978"):
+        for name in ("Maharana et al. 2022", "Yeh 1980", "Ghosh 1999", "Dodge 1984", "Moré 1978"):
             assert name in text
         assert "contract" not in text
     assert json.loads(call("cite", "--json").stdout)[0]["what"] == "the instrument and its calibration"

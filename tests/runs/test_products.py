@@ -98,4 +98,4 @@ def test_light_is_traced_through_what_was_fitted(fitted: FittedSet):
 
 def test_the_base_model_and_a_run_have_the_same_sources(fitted: FittedSet):
     assert cite_run() == cite_run(fitted.run) == cite_run(fitted.run / "calibration.fits")
-    assert any("Yeh 1982" in entry.source for entry in cite_run())
+    assert any("Yeh 1980" in entry.source for entry in cite_run())

@@ -11,7 +11,7 @@ Matrix      is most of the work of a pass. A policy says when it is computed: `A
 Stop        scaled gradient ‖(JᵀJ)^(−½) Jᵀr‖ < `atol`: the distance to the minimum in units of the standard
             error. A solver's own "success" is not asked: it can be wrong on data that are not whitened, on NaN, or on
             a step of size zero.
-Source      Moré 1978, Lecture Notes in Mathematics 630, 105 (method); Conn, Gould & Toint 2000 (trust region).
+Source      `SOURCE`: the method and its trust region.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from walop_jax.model.compiled import compiled
+
+SOURCE = "Moré 1978, Lecture Notes in Mathematics 630, 105; Conn, Gould & Toint 2000, Trust Region Methods"
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]

@@ -1,7 +1,7 @@
 """Polynomials over the field: products of Legendre polynomials up to a total degree.
 
 Equation    f(x, y) = Σ_{i+j ≤ n} c_ij P_i(x/h) P_j(y/h), h the scale of the field, 0.3° for WALOP.
-Source      Abramowitz & Stegun 22.7.10: (k+1) P_{k+1} = (2k+1) t P_k − k P_{k−1}.
+Recursion   (k+1) P_{k+1} = (2k+1) t P_k − k P_{k−1}.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.model.conventions import FIELD_SCALE
+
+SOURCE = "Abramowitz & Stegun 1964, 22.7.10"
 
 
 def terms(degree: int) -> tuple[tuple[int, int], ...]:

@@ -3,10 +3,8 @@
 Equations   Sellmeier formula 1, n² = 1 + Σ B λ²/(λ² − C²) (Dodge), and formula 2, n² = A + Σ B λ²/(λ² − C)
             (Schott, Ghosh). Mixing the two up is the classic mistake; `FORMULA` says which is which.
 Symbols     λ vacuum wavelength [µm]; n refractive index; A, B dimensionless; C [µm] in formula 1, [µm²] in 2.
-Sources     N-BK7: Schott data sheet 2017, 0.3–2.5 µm, 20 °C. Quartz: Ghosh 1999, Opt. Commun. 163, 95,
-            0.198–2.05 µm. MgF2: Dodge 1984, Appl. Opt. 23, 1980, 0.2–7 µm, 19 °C. All three as transcribed in
-            the refractiveindex.info database. Birefringence against temperature: Etzel, Rose & Wang 2000,
-            Appl. Opt. 39, 5796.
+Sources     beside the numbers; the curves as transcribed in the refractiveindex.info database. They hold at 0.3–2.5 µm
+            and 20 °C (N-BK7), 0.198–2.05 µm (quartz), 0.2–7 µm and 19 °C (MgF2).
 """
 
 from __future__ import annotations
@@ -52,12 +50,21 @@ class Crystal(NamedTuple):
 
     ordinary: Sellmeier
     extraordinary: Sellmeier
-    thermal: float = 0.0
+    thermal: float
+    source: str
 
 
+class Glass(NamedTuple):
+    """An isotropic material."""
+
+    index: Sellmeier
+    source: str
+
+
+_ETZEL = "Etzel, Rose & Wang 2000, Appl. Opt. 39, 5796 (temperature)"
 CRYSTALS = {
-    "quartz": Crystal(QUARTZ_O, QUARTZ_E, QUARTZ_THERMAL),
-    "mgf2": Crystal(MGF2_O, MGF2_E, MGF2_THERMAL),
+    "quartz": Crystal(QUARTZ_O, QUARTZ_E, QUARTZ_THERMAL, f"Ghosh 1999, Opt. Commun. 163, 95; {_ETZEL}"),
+    "mgf2": Crystal(MGF2_O, MGF2_E, MGF2_THERMAL, f"Dodge 1984, Appl. Opt. 23, 1980; {_ETZEL}"),
 }
-GLASSES = {"BK7": BK7}
+GLASSES = {"BK7": Glass(BK7, "Schott 2017, data sheet of N-BK7")}
 """Materials that a description file may name."""

@@ -20,7 +20,7 @@ Cut axis    with c = (cos α cos χ, sin α cos χ, sin χ) the extraordinary wa
             a plate has a `cut`.
 
 Sources     Born & Wolf, Principles of Optics, ch. 15 (waves in uniaxial crystals) and 1.5 (continuity);
-            Yeh 1982, Surf. Sci. 96, 41 (the matrix form). Fixed axis: Paper II, appendix B.
+            Yeh 1980, Surf. Sci. 96, 41 (the matrix form). Fixed axis: Paper II, appendix B.
 Limits      At normal incidence a plate of air indices is the identity; 𝐄 of air is the carried frame of
             `conventions.py`, smooth through normal incidence, hence so is every derivative.
 """

@@ -6,8 +6,7 @@ discrete measure integrates polynomials of degree 2n − 1 exactly, so n nodes f
 plates as well as any n nodes can. n is the smallest that integrates the fringes of the plates (35 waves
 thick, so periods near 17 nm, half of that at second order, in all phases) to `tolerance`.
 
-Source      Golub & Welsch 1969, Math. Comp. 23, 221; discrete measures by the Lanczos process: Gautschi
-            2004, Orthogonal Polynomials, 2.2.3.
+Source      `SOURCE`; the discrete measure by the Lanczos process.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
+SOURCE = "Golub & Welsch 1969, Math. Comp. 23, 221; Gautschi 2004, Orthogonal Polynomials, 2.2.3"
 FINEST = 0.0005  # µm
 WAVES = 36.0  # of one plate at 0.62 µm: (n_e − n_o) d / λ
 MAXIMUM_NODES = 200

@@ -11,7 +11,7 @@ from walop_jax.fit import solver
 from walop_jax.fit.model_builder import model_without_data
 from walop_jax.io.errors import errors_naming
 from walop_jax.model.build import nominal_instrument
-from walop_jax.model.references import Reference, references, stated_source
+from walop_jax.model.references import Reference, references
 
 
 def cite_run(run: str | os.PathLike[str] | None = None) -> tuple[Reference, ...]:
@@ -25,4 +25,4 @@ def cite_run(run: str | os.PathLike[str] | None = None) -> tuple[Reference, ...]
         path = product_path(run)
         with errors_naming(path):
             model = model_of_product(read_product(path))
-    return (*references(model), Reference("fit", stated_source(solver.__doc__)))
+    return (*references(model), Reference("fit", solver.SOURCE))

@@ -3,8 +3,7 @@
 Equation    (X, Y) → (X + rate_x · HA, Y + rate_y · HA) ahead of the mapping from field to pupil
 Symbols     rate_x, rate_y [deg/h]; HA hour angle [h]
 Source      0.2 % in half an hour and 1 % between pointings were seen in
-            WIRC+Pol (Tinyanont et al. 2019, arXiv:1811.03138; Millar-Blanchaer et al. 2019,
-            arXiv:1908.10409).
+            WIRC+Pol (Tinyanont et al. 2019, arXiv:1811.03138 and arXiv:1908.10409).
 Neutral     rate_x = rate_y = 0
 Revealed by a pattern of cross-talk that moves over the field with hour angle. A missing HA counts as 0.
 """
@@ -20,7 +19,7 @@ from walop_jax.model.parameters import param
 if TYPE_CHECKING:
     from walop_jax.model.instrument import Instrument
 
-SOURCE = "Tinyanont et al. 2019, arXiv:1811.03138; Millar-Blanchaer et al. 2019, arXiv:1908.10409"
+SOURCE = "Tinyanont et al. 2019, arXiv:1811.03138; Tinyanont et al. 2019, arXiv:1908.10409"
 
 
 class Flexure(Effect):

@@ -23,7 +23,7 @@ from walop_jax.model.parameters import param
 if TYPE_CHECKING:
     from walop_jax.model.instrument import Instrument
 
-SOURCE = "Selbing 2005, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146"
+SOURCE = "Selbing 2010, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146"
 
 REFERENCE_RADIUS = 0.3  # degrees
 

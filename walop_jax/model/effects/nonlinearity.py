@@ -3,7 +3,7 @@
 Equation    N → N (1 + coefficient · N / 10⁶)
 Symbols     N counts [electron]; coefficient per camera
 Source      "small non-linearities in the CCD" were the major obstacle in
-            calibrating the Swedish solar telescope (Selbing 2005, arXiv:1010.4142); 1 % at full well is
+            calibrating the Swedish solar telescope (Selbing 2010, arXiv:1010.4142); 1 % at full well is
             typical.
 Neutral     coefficient = 0
 Revealed by a cos 4θ in the normalised intensities of polariser exposures, of opposite sign in the two
@@ -25,7 +25,7 @@ from walop_jax.model.sources import ExposureArrays
 if TYPE_CHECKING:
     from walop_jax.model.instrument import Instrument
 
-SOURCE = "Selbing 2005, arXiv:1010.4142"
+SOURCE = "Selbing 2010, arXiv:1010.4142"
 
 REFERENCE_COUNTS = 1e6  # electron
 

@@ -2,7 +2,7 @@
 
 Equation    α → α + angle for the optic axes of both crystals of the plate
 Symbols     α fast axis in the ICS (0° HWP1, 22.5° HWP2, CHWP_ANGLE); angle [deg]
-Source      1.8° was found in an instrument in use (NaCo, SPIE 9147, 87),
+Source      1.8° was found in an instrument in use (NaCo, de Boer et al. 2014),
             0.1° is the repeatability of good mounts.
 Neutral     angle = 0
 Revealed by an analyser turned by 2 angle, in one half (or behind the calibration plate) only, constant over
@@ -19,7 +19,7 @@ from walop_jax.model.parameters import param
 if TYPE_CHECKING:
     from walop_jax.model.instrument import Instrument
 
-SOURCE = "Girard et al. 2014, Proc. SPIE 9147, 87"
+SOURCE = "de Boer et al. 2014, Proc. SPIE 9147, 914787"
 
 
 class PlateAxis(Effect):

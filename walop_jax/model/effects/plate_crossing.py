@@ -2,7 +2,7 @@
 
 Equation    optic axis of MgF2 = α + 90° + angle, that of quartz stays at α
 Symbols     α fast axis of the plate; angle [deg]
-Source      0.1–0.2° of clocking between crystals (Harrington et al. 2023,
+Source      0.1–0.2° of clocking between crystals (Harrington 2023,
             JATIS 9, 038003), which makes 0.35–1.4 % of cross-talk.
 Neutral     angle = 0
 Revealed by cross-talk that oscillates fast with wavelength (35 waves), and by linear cross-talk of both
@@ -19,7 +19,7 @@ from walop_jax.model.parameters import param
 if TYPE_CHECKING:
     from walop_jax.model.instrument import Instrument
 
-SOURCE = "Harrington et al. 2023, JATIS 9, 038003"
+SOURCE = "Harrington 2023, JATIS 9, 038003"
 
 
 class PlateCrossing(Effect):

@@ -4,7 +4,7 @@ Equation    c = (cos α cos angle, sin α cos angle, sin angle) for one crystal 
 Symbols     c optic axis, along the light for 90°; α its azimuth; angle [deg]
 Source      to first order the retardance changes by 2π d Δn/(λ n) · 2
             angle · s·c, odd in the field angle: about 0.55° per degree of incidence for 0.1° in a plate of
-            36 waves. Cutting errors of large crystals: Harrington et al. 2023, JATIS 9, 038003.
+            36 waves. Cutting errors of large crystals: Harrington 2023, JATIS 9, 038003.
 Neutral     angle = 0 (the waves are then those of `plates.stack_jones`; the general solver gives the same)
 Revealed by a part of the cross-talk that is odd in the field angle and grows with the number of waves.
 
@@ -23,7 +23,7 @@ from walop_jax.model.parameters import param
 if TYPE_CHECKING:
     from walop_jax.model.instrument import Instrument
 
-SOURCE = "Harrington et al. 2023, JATIS 9, 038003"
+SOURCE = "Harrington 2023, JATIS 9, 038003"
 
 CRYSTALS = ("quartz", "mgf2")
 

@@ -28,7 +28,7 @@ from walop_jax.model.parameters import param
 if TYPE_CHECKING:
     from walop_jax.model.instrument import Instrument
 
-SOURCE = "Selbing 2005, arXiv:1010.4142"
+SOURCE = "Selbing 2010, arXiv:1010.4142"
 
 
 class UpstreamRetarder(Effect):

@@ -4,7 +4,7 @@ Equation    diattenuation (q, u) = c r² (cos 2φ, sin 2φ) + (c_q, c_u)
             retardance Δ = 2π delta (r/0.3°)², fast axis radial
 Symbols     r, φ polar coordinates of the field point [deg]; c [deg⁻²]; delta in waves at 0.3°
 Source      Fresnel transmission of curved surfaces and stress of mounted lenses, both ∝ r²: Paper II of WALOP-South
-            (Maharana et al. 2022); Selbing 2005, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146.
+            (Maharana et al. 2022); Selbing 2010, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146.
 Limits      nothing on the axis but (c_q, c_u). Written with (1 − cos Δ)/Δ² and sin Δ/Δ, both smooth at the centre of
             the field, Δ(cos 2φ, sin 2φ) being k (x² − y², 2xy).
 """
@@ -49,7 +49,7 @@ class RadialRetarder(Element):
     delta: Scalar = number(unit="wave", about="retardance at 0.3°")
 
     kind: ClassVar[str] = "radial_retarder"
-    reference: ClassVar[str] = "Selbing 2005, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146"
+    reference: ClassVar[str] = "Selbing 2010, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146"
 
     def mueller(self, ray: Ray) -> Mueller:
         """A linear retarder, smooth at the centre of the field."""

@@ -72,7 +72,7 @@ class WavePlate(Element):
     always_in: bool = eqx.field(static=True, default=False)
 
     kind: ClassVar[str] = "wave_plate"
-    reference: ClassVar[str] = "Born & Wolf, Principles of Optics, ch. 15; Yeh 1982, Surf. Sci. 96, 41"
+    reference: ClassVar[str] = "Born & Wolf, Principles of Optics, ch. 15; Yeh 1980, Surf. Sci. 96, 41"
 
     def position(self, angle: float | None) -> float | None:
         """At 0° where it always stands in the beam and the exposure says that it is out."""

@@ -68,13 +68,14 @@ class Source(Component):
     """Light of one KIND of exposures: its polarisation ahead of the instrument, per unit of flux.
 
     `kind` is what EXPOSURES says, `flux_known` whether its flux is one (KIND `flux`) or unknown, `from_sky` whether it
-    comes through the telescope.
+    comes through the telescope; `reference` says where what is assumed of it comes from.
     """
 
     name: ClassVar[str] = ""
     kind: ClassVar[str] = ""
     flux_known: ClassVar[bool] = False
     from_sky: ClassVar[bool] = True
+    reference: ClassVar[str] = ""
 
     def shines(self, sight: Sight) -> Bool[Array, " e"]:
         """The exposures that see it."""

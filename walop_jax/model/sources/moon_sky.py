@@ -45,6 +45,7 @@ class MoonSky(Source):
 
     name: ClassVar[str] = "sky"
     kind: ClassVar[str] = "moon"
+    reference: ClassVar[str] = f"{PAPER_II}, eq. 8"
 
     def shines(self, sight: Sight) -> Bool[Array, " e"]:
         """Moon exposures that are not taken through the polariser."""
