@@ -20,7 +20,7 @@ def tiles(figure) -> list[PatchCollection]:
 def test_residual_maps_share_one_symmetric_scale():
     data = handmade_run.figure_data()
     one = data.comparisons[1]
-    figure = figures.residual_maps(data.points, {"before": one.before, "after": one.after})
+    figure = figures.residual_maps(data.points, {"before": one.before, "after": one.after}, data.cameras)
     maps = tiles(figure)
     assert len(maps) == 8
     # The largest residual by hand: −6 in camera E2, without the effect.
@@ -38,9 +38,9 @@ def test_points_without_data_are_left_out():
     data = handmade_run.figure_data()
     before = data.comparisons[1].before.copy()
     before[4] = np.nan
-    shown = tiles(figures.residual_maps(data.points, {"": before}))[0]
+    shown = tiles(figures.residual_maps(data.points, {"": before}, data.cameras))[0]
     assert len(shown.get_array()) == 8
-    figures.residual_maps(data.points, {"": np.full((9, 4), np.nan)})
+    figures.residual_maps(data.points, {"": np.full((9, 4), np.nan)}, data.cameras)
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_signature_lies_beside_the_data(harmonic, abscissa):
     data = handmade_run.figure_data()
     out = dataclasses.replace(data.exposures, clp_angle=np.full(8, np.nan))
     one = dataclasses.replace(data.comparisons[1], harmonic=harmonic)
-    figure = figures.signature_figure(one, data.exposures if harmonic > 0 else out)
+    figure = figures.signature_figure(one, data.exposures if harmonic > 0 else out, data.cameras)
     assert figure.axes[4].get_xlabel() == abscissa
     for k, axis in enumerate(figure.axes[:4]):
         effect = next(line for line in axis.lines if line.get_label() == "effect")
@@ -65,12 +65,21 @@ def test_exposures_at_one_angle_are_averaged():
     data = handmade_run.figure_data()
     angle = np.repeat([0.0, 45.0, 90.0, 135.0], 2)
     figure = figures.signature_figure(
-        data.comparisons[1], dataclasses.replace(data.exposures, clp_angle=angle)
+        data.comparisons[1], dataclasses.replace(data.exposures, clp_angle=angle), data.cameras
     )
     dots = figure.axes[0].containers[0].lines[0]
     np.testing.assert_allclose(
         dots.get_ydata(), data.comparisons[1].curve_before[:, 0].reshape(4, 2).mean(axis=1)
     )
+
+
+def test_two_cameras_fill_two_columns():
+    data = handmade_run.figure_data()
+    one = data.comparisons[1]
+    figure = figures.residual_maps(data.points, {"before": one.before[:, :2]}, ("ordinary", "extraordinary"))
+    assert [axis.get_title() for axis in figure.axes[:2]] == ["camera ordinary", "camera extraordinary"]
+    assert len(tiles(figure)) == 2
+    assert len(figures.signature_figure(one, data.exposures, data.cameras[:2]).axes) == 4
 
 
 def test_ladder_shows_chi2_per_degree_of_freedom():
@@ -87,5 +96,7 @@ def test_maps_of_a_product_are_those_of_the_file():
     np.testing.assert_allclose(first.get_array(), 100.0 * maps.values[0])
     assert first.get_clim() == pytest.approx((-3.0, 3.0))  # −3 to 2 per cent, symmetric
     assert first.get_extent() == pytest.approx((-0.25, 0.25, -0.25, 0.25))
+    one_arm = dataclasses.replace(maps, values=maps.values[:3], errors=maps.errors[:3])
+    assert len([a for a in product_figures.matrix_maps_figure(one_arm).axes if a.get_title()]) == 3
     errors = product_figures.matrix_errors_figure(maps)
     np.testing.assert_allclose(errors.axes[5].images[0].get_array(), 0.02)

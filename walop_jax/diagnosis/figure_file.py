@@ -15,8 +15,9 @@
                  ERROR: standard error of BEFORE and AFTER, from the scatter over the field
 
 Columns of FIELD and CURVES without a unit are (data - model) in standard deviations of one intensity as N_ERR
-gives them, four values in a row: cameras O1, E1, O2, E2. NaN where there are no data. Values of FIELD in a
-combination, BEFORE and AFTER, have standard deviation 1 (0.87 where the flux is free) if there is noise alone.
+gives them, one value for each camera, in the order of SHARES. NaN where there are no data. Values of FIELD in a
+combination, BEFORE and AFTER, have standard deviation 1 (where the flux is free √(1 − 1/K) with K cameras, 0.87 of
+four) if there is noise alone.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ Vector = Float[np.ndarray, " _"]
 PointMap = Float[np.ndarray, "p k"]
 Curve = Float[np.ndarray, "e k"]
 
-_SIGMA = "(data - model) in standard deviations, cameras O1 E1 O2 E2"
+_SIGMA = "(data - model) in standard deviations, a value for each camera"
 _CAMERAS = Column("float", width=None)
 _TABLES: Mapping[str, Mapping[str, tuple[Column, str]]] = {
     "LADDER": {
@@ -84,7 +85,7 @@ _TABLES: Mapping[str, Mapping[str, tuple[Column, str]]] = {
     "CURVES": {
         "COMPARISON": (Column("int"), "row of COMPARISONS"),
         "EXPOSURE": (Column("int"), "exposure id"),
-        "KIND": (Column("str"), "clp, moon, standard or flux"),
+        "KIND": (Column("str"), "KIND of the exposure"),
         "MJD": (Column("float", "d"), "UTC mid-exposure"),
         "CLP_ANGLE": (Column("float", "deg"), "polariser angle; NaN: out"),
         "BEFORE": (_CAMERAS, f"weighted mean over the field: {_SIGMA}"),
@@ -169,6 +170,11 @@ class DiagnosisFigureData:
     ladder: Ladder
     shares: Shares
     comparisons: tuple[ResidualComparison, ...]
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras, in the order of the columns."""
+        return tuple(str(name) for name in self.shares.member[self.shares.group == "camera"])
 
 
 def write_figure_data(

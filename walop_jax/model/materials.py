@@ -57,7 +57,7 @@ class Crystal(NamedTuple):
 class Glass(NamedTuple):
     """An isotropic material."""
 
-    index: Sellmeier
+    dispersion: Sellmeier
     source: str
 
 

@@ -34,7 +34,6 @@ from walop_jax.reports.style import (
     outer_labels,
 )
 
-CAMERAS = ("O1", "E1", "O2", "E2")
 SIGN_BEYOND = 3.0  # σ beyond which a tile carries its sign
 MOST_MARKED = 400  # points above which signs would run into each other
 MOST_VECTOR = 2000  # points above which tiles are drawn as pixels
@@ -42,38 +41,45 @@ MOST_BINS = 48  # of polariser angle
 EXPLAINS = 5.0  # standard deviations of χ² within which a model counts as explaining the data
 
 
-def residual_maps(points: Points, maps: Mapping[str, PointMap]) -> Figure:
-    """Residuals of every field point in the four cameras: a row of maps for each entry, one colour scale for all.
+def residual_maps(points: Points, maps: Mapping[str, PointMap], cameras: Sequence[str]) -> Figure:
+    """Residuals of every field point in the cameras of those names: a row of maps for each entry, one colour scale.
 
     `maps` are (point, camera) by title, NaN where there is nothing. The scale is symmetric about 0; tiles beyond
     3 σ carry their sign, so that the maps can be read without colours.
     """
     far = max(largest_size(*maps.values()), SIGN_BEYOND)
     return _maps(
-        points, maps, Normalize(-far, far), DIVERGING, "residual (σ)", signs=len(points) <= MOST_MARKED
+        points, maps, cameras, Normalize(-far, far), DIVERGING, "residual (σ)", len(points) <= MOST_MARKED
     )
 
 
-def rms_maps(points: Points, maps: Mapping[str, PointMap]) -> Figure:
-    """Rms residual of every field point in the four cameras, rows and scale as in `residual_maps`.
+def rms_maps(points: Points, maps: Mapping[str, PointMap], cameras: Sequence[str]) -> Figure:
+    """Rms residual of every field point in the cameras, rows and scale as in `residual_maps`.
 
-    It shows all that is wrong at once, whatever exposures it sits in; noise alone gives 0.87 (flux free).
+    It shows all that is wrong at once, whatever exposures it sits in; noise alone gives √(1 − 1/K) with K cameras and
+    a free flux: 0.87 of four.
     """
     far = max(largest_size(*maps.values()), 1.5)
-    return _maps(points, maps, Normalize(0.5, far), "magma_r", "rms residual (σ)", signs=False)
+    return _maps(points, maps, cameras, Normalize(0.5, far), "magma_r", "rms residual (σ)", signs=False)
 
 
 def _maps(
-    points: Points, maps: Mapping[str, PointMap], norm: Normalize, colours: str, label: str, signs: bool
+    points: Points,
+    maps: Mapping[str, PointMap],
+    cameras: Sequence[str],
+    norm: Normalize,
+    colours: str,
+    label: str,
+    signs: bool,
 ) -> Figure:
     shown = np.any([np.isfinite(values).any(axis=1) for values in maps.values()], axis=0)
     shown = shown if shown.any() else np.ones(len(points), bool)
-    figure = empty_figure(8.6, 0.55 + 1.75 * len(maps))
-    axes = figure.subplots(len(maps), 4, sharex=True, sharey=True, squeeze=False)
+    figure = empty_figure(0.6 + 2.0 * len(cameras), 0.55 + 1.75 * len(maps))
+    axes = figure.subplots(len(maps), len(cameras), sharex=True, sharey=True, squeeze=False)
     tiles: Any = None
     for number, values in enumerate(maps.values()):
         for k, axis in enumerate(axes[number]):
-            field_axes(axis, f"camera {CAMERAS[k]}" if number == 0 else "")
+            field_axes(axis, f"camera {cameras[k]}" if number == 0 else "")
             axis.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10], prune="both"))
             axis.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], prune="both"))
             tiles = _tiles(axis, points, shown, values[:, k], norm, colours)
@@ -130,17 +136,21 @@ def _spacing(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> float:
     return float(np.median(nearest)) if nearest.size else 0.05
 
 
-def signature_figure(comparison: ResidualComparison, exposures: ExposureLabels) -> Figure:
+def signature_figure(
+    comparison: ResidualComparison, exposures: ExposureLabels, cameras: Sequence[str]
+) -> Figure:
     """Residuals averaged over the field, camera by camera: data as dots, what the effect explains as a line.
 
     Against the polariser angle where the comparison shows a harmonic of it, or most of its signal is behind the
     polariser; against time otherwise. Exposures at one angle are averaged. The lower panels hold what is left.
     """
     angular = _against_angle(comparison, exposures)
-    figure = empty_figure(8.6, 3.5)
-    upper, lower = figure.subplots(2, 4, sharex=True, sharey="row", height_ratios=(2.2, 1))
+    figure = empty_figure(0.6 + 2.0 * len(cameras), 3.5)
+    upper, lower = figure.subplots(
+        2, len(cameras), sharex=True, sharey="row", height_ratios=(2.2, 1), squeeze=False
+    )
     position, label = _abscissa(exposures, angular)
-    for k in range(4):
+    for k, camera in enumerate(cameras):
         known = np.isfinite(position) & np.isfinite(comparison.curve_before[:, k])
         columns = (
             comparison.curve_before,
@@ -155,7 +165,7 @@ def signature_figure(comparison: ResidualComparison, exposures: ExposureLabels) 
             axis.errorbar(x, dots, error, fmt="o", ms=3, lw=0.8, color="0.15", label="data", zorder=3)
             axis.tick_params(labelsize=SMALL)
         upper[k].plot(x, explained, color=BEFORE, lw=1.4, label="effect", zorder=2)
-        upper[k].set_title(f"camera {CAMERAS[k]}", fontsize=FONT)
+        upper[k].set_title(f"camera {camera}", fontsize=FONT)
         lower[k].set_xlabel(label, fontsize=FONT)
         if angular:
             lower[k].set_xticks(

@@ -17,34 +17,29 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.reports.matrix_panels import matrix_panels
 from walop_jax.reports.style import (
     FONT,
-    FROM_MINUS_ONE_TO_ONE,
-    MATRIX_SYMBOLS,
-    OFFSETS,
     empty_figure,
     field_axes,
     outer_labels,
 )
 
-Map = Float[np.ndarray, "y x"]
-
 PIXELS = 61  # along each axis of a map
 
 
 def matrix_figure(calibration: Calibration, settings: Settings | None = None) -> Figure:
-    """Maps of the six elements of the instrument matrix over the calibrated field.
+    """Maps of the elements of the instrument matrix over the calibrated field, as `matrix_panels` draws them.
 
-    `settings` has one row (default: SDSS-r, flat spectrum, calibration plate out). Lines in m32 and m33 bound
-    the zone where |m22 m33 − m23 m32| < 0.1: a single exposure holds hardly any u there.
+    `settings` has one row (default: SDSS-r, flat spectrum, calibration plate out).
     """
-    figure = empty_figure(7.4, 4.6)
-    axes = figure.subplots(2, 3, sharex=True, sharey=True)
+    arms = len(calibration.model.template.arms)
+    figure = empty_figure(7.4, 2.3 * arms)
+    axes = figure.subplots(arms, 3, sharex=True, sharey=True, squeeze=False)
     _matrix_maps(figure, axes, calibration, settings)
     return figure
 
@@ -80,12 +75,15 @@ def calibration_figure(
 
     `before` is a full vector of parameter values to compare with (default: the start values of the model).
     """
+    calibration, arms = Calibration.from_fit(result), len(result.model.template.arms)
     figure = empty_figure(10.2, 4.7)
-    grid = figure.subplots(2, 4)
-    _matrix_maps(figure, grid[:, :3], Calibration.from_fit(result), settings)
+    grid = figure.add_gridspec(max(2, arms), 4)
+    panels = [figure.add_subplot(grid[i, j]) for i in range(arms) for j in range(3)]
+    _matrix_maps(figure, panels, calibration, settings)
+    right = [figure.add_subplot(grid[i, 3]) for i in range(2)]
     start = result.model.start if before is None else before
     for axis, values, title in zip(
-        grid[:, 3],
+        right,
         (start, result.values),
         ("residuals, as designed", "residuals, as fitted"),
         strict=True,
@@ -100,7 +98,7 @@ def calibration_figure(
         bar = figure.colorbar(shown, ax=axis, pad=0.03, extend="neither" if far else "both")
         bar.set_label("rms residual (σ)", fontsize=8)
         bar.ax.tick_params(labelsize=7)
-    outer_labels(grid)
+    outer_labels(right)
     return figure
 
 
@@ -119,36 +117,8 @@ def _matrix_maps(figure: Figure, axes: Any, calibration: Calibration, settings: 
     low_x, high_x, low_y, high_y = calibration.field
     x, y = np.meshgrid(np.linspace(low_x, high_x, PIXELS), np.linspace(low_y, high_y, PIXELS))
     one = settings or calibration.usual_settings()
-    rows = one[np.zeros(x.size, int)]
-    matrix, _ = calibration.matrix(x.ravel(), y.ravel(), rows)
-    maps = matrix.T.reshape(6, *x.shape)
-    weak = np.abs(maps[1] * maps[5] - maps[2] * maps[4])
-    for i, axis in enumerate(np.ravel(axes)):
-        shown = maps[i] * (100.0 if i in OFFSETS else 1.0)
-        name = MATRIX_SYMBOLS[i] + (" (%)" if i in OFFSETS else "")
-        field_axes(axis, name)
-        image = _image(axis, shown, calibration.field, i)
-        if i >= 4:
-            axis.contour(x, y, weak, levels=[SMALLEST_DETERMINANT], colors="0.15", linewidths=0.7)
-        figure.colorbar(image, ax=axis, pad=0.03).ax.tick_params(labelsize=7)
-    outer_labels(axes)
-
-
-def _image(axis: Axes, values: Map, field: tuple[float, float, float, float], element: int) -> Any:
-    if element == 1:
-        norm, colours = Normalize(float(values.min()), float(values.max())), "viridis"
-    else:
-        far = 1.0 if element in FROM_MINUS_ONE_TO_ONE else float(np.abs(values).max())
-        norm, colours = Normalize(-far, far), "RdBu_r"
-    return axis.imshow(
-        values,
-        origin="lower",
-        extent=field,
-        norm=norm,
-        cmap=colours,
-        interpolation="bilinear",
-        aspect="equal",
-    )
+    matrix, _ = calibration.matrix(x.ravel(), y.ravel(), one[np.zeros(x.size, int)])
+    matrix_panels(figure, axes, matrix.T.reshape(-1, *x.shape), calibration.field, "bilinear")
 
 
 def _tiles(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " p"], norm: Normalize) -> Any:
@@ -185,20 +155,23 @@ def _histogram(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " n
 
 
 def modulation_figure(calset: CalibrationSet, points: Sequence[int]) -> Figure:
-    """Measured q_m and u_m behind the calibration polariser against its angle, at some field points.
+    """What the arms measure behind the calibration polariser against its angle, at some field points.
 
-    `points` are rows of `calset.points`. Only exposures with the polariser in and the calibration plate out
-    are shown; an ideal instrument would follow cos 2θ and sin 2θ, the grey lines.
+    `points` are rows of `calset.points`. Only exposures with the polariser in and the calibration plate out are shown.
+    Two arms measure q_m and u_m; an ideal instrument would follow cos 2θ and sin 2θ, the grey lines.
     """
     e = calset.exposures
     shown = np.flatnonzero(e.clp_in & ~e.chwp_in)
     block = calset.intensities.block(0, len(calset.points))
-    figure = empty_figure(8.2, 3.2)
+    arms = block.counts.shape[-1] // 2
+    figure = empty_figure(4.1 * arms, 3.2)
     angle = np.linspace(0.0, 360.0, 181)
-    for axis, pair, name, ideal in zip(
-        figure.subplots(1, 2, sharex=True, sharey=True), (0, 2), "qu", (np.cos, np.sin), strict=True
-    ):
-        axis.plot(angle, ideal(2 * np.deg2rad(angle)), color="0.8", lw=1.0, zorder=0)
+    row = figure.subplots(1, arms, sharex=True, sharey=True, squeeze=False)[0]
+    for arm, axis in enumerate(row):
+        pair, name = 2 * arm, f"(N{2 * arm} − N{2 * arm + 1}) / (N{2 * arm} + N{2 * arm + 1})"
+        if arms == 2:
+            name, ideal = (("$q_m$", np.cos), ("$u_m$", np.sin))[arm]
+            axis.plot(angle, ideal(2 * np.deg2rad(angle)), color="0.8", lw=1.0, zorder=0)
         for k, point in enumerate(points):
             rows = shown[block.used[point, shown]]
             first, second = block.counts[point, rows, pair], block.counts[point, rows, pair + 1]
@@ -207,7 +180,7 @@ def modulation_figure(calset: CalibrationSet, points: Sequence[int]) -> Figure:
                 e.clp_angle[rows], (first - second) / (first + second), "os^Dv"[k % 5], ms=4, label=where
             )
         axis.set_xlabel("polariser angle (deg)", fontsize=FONT)
-        axis.set_ylabel(f"${name}_m$", fontsize=FONT)
+        axis.set_ylabel(name, fontsize=FONT)
         axis.set_xticks(np.arange(0, 361, 90))
         axis.tick_params(labelsize=7)
     figure.axes[0].legend(frameon=False, fontsize=7, title="(X, Y)", title_fontsize=7)

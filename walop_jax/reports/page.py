@@ -100,11 +100,11 @@ def _drawn(run: RunContents, number: int) -> dict[str, str]:
     """The figures of one comparison of `diagnosis.fits` and its combination in words; empty without that."""
     if run.figure_data is None or number >= len(run.figure_data.comparisons):
         return {"maps": "", "signature": "", "combination": ""}
-    one, points = run.figure_data.comparisons[number], run.figure_data.points
+    data, one = run.figure_data, run.figure_data.comparisons[number]
     rows = {f"without\n{one.effect}": one.before, one.effect: one.explained, f"with\n{one.effect}": one.after}
     return {
-        "maps": embedded(diagnosis_figures.residual_maps(points, rows)),
-        "signature": embedded(diagnosis_figures.signature_figure(one, run.figure_data.exposures)),
+        "maps": embedded(diagnosis_figures.residual_maps(data.points, rows, data.cameras)),
+        "signature": embedded(diagnosis_figures.signature_figure(one, data.exposures, data.cameras)),
         "combination": in_greek(one.combination),
     }
 
@@ -181,7 +181,8 @@ def _figures(run: RunContents) -> dict[str, str]:
         whole = data.comparisons[0]
         made["shares"] = diagnosis_figures.shares_figure(data.shares)
         if len(data.comparisons) == 1:
-            made["residuals"] = diagnosis_figures.residual_maps(data.points, {"residuals": whole.before})
+            rows = {"residuals": whole.before}
+            made["residuals"] = diagnosis_figures.residual_maps(data.points, rows, data.cameras)
         else:
             made["ladder"] = diagnosis_figures.ladder_figure(data.ladder)
         if len(data.comparisons) > 2:
@@ -192,7 +193,7 @@ def _figures(run: RunContents) -> dict[str, str]:
                 "starting\nmodel": np.where(there, whole.rms_before, np.nan),
                 "final\nmodel": np.where(there, whole.rms_after, np.nan),
             }
-            made["rms"] = diagnosis_figures.rms_maps(data.points, rows)
+            made["rms"] = diagnosis_figures.rms_maps(data.points, rows, data.cameras)
     uris = {name: embedded(figure) for name, figure in made.items()}
     if run.corner is not None:
         uris["corner"] = "data:image/png;base64," + base64.b64encode(run.corner).decode("ascii")

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from walop_jax.calibration.records import SMALLEST_DETERMINANT, MatrixMaps, ResidualMap
+from walop_jax.calibration.records import MatrixMaps, ResidualMap
+from walop_jax.reports.matrix_panels import element_symbols, matrix_panels
 from walop_jax.reports.style import (
     DIVERGING,
-    FROM_MINUS_ONE_TO_ONE,
-    MATRIX_SYMBOLS,
-    OFFSETS,
     SMALL,
     empty_figure,
     field_axes,
@@ -21,43 +23,22 @@ from walop_jax.reports.style import (
 
 
 def matrix_maps_figure(maps: MatrixMaps) -> Figure:
-    """The six elements of the instrument matrix over the field, offsets in per cent.
-
-    Lines bound the zone where |m22 m33 − m23 m32| < 0.1: a single exposure holds hardly any u there.
-    """
-    figure = empty_figure(8.6, 4.9)
-    axes = figure.subplots(2, 3, sharex=True, sharey=True)
-    weak = np.abs(maps.values[1] * maps.values[5] - maps.values[2] * maps.values[4])
-    for i, axis in enumerate(axes.ravel()):
-        values = maps.values[i] * (100.0 if i in OFFSETS else 1.0)
-        far = 1.0 if i in FROM_MINUS_ONE_TO_ONE else largest_size(values)
-        norm, colours = Normalize(-far, far), DIVERGING
-        if i == 1:
-            norm, colours = Normalize(float(values.min()), float(values.max())), "viridis"
-        field_axes(axis, MATRIX_SYMBOLS[i] + (" (%)" if i in OFFSETS else ""))
-        image = axis.imshow(
-            values, origin="lower", extent=extent(maps), norm=norm, cmap=colours, interpolation="nearest"
-        )
-        if i in FROM_MINUS_ONE_TO_ONE and weak.min() < SMALLEST_DETERMINANT < weak.max():
-            axis.contour(
-                weak, levels=[SMALLEST_DETERMINANT], extent=extent(maps), colors="0.15", linewidths=0.7
-            )
-        figure.colorbar(image, ax=axis, pad=0.03).ax.tick_params(labelsize=SMALL)
-    outer_labels(axes)
+    """The elements of the instrument matrix over the field as `matrix_panels` draws them."""
+    figure, axes = _by_arm(maps.values, 8.6, 2.45)
+    matrix_panels(figure, axes, maps.values, extent(maps), "nearest")
     return figure
 
 
 def matrix_errors_figure(maps: MatrixMaps) -> Figure:
-    """The standard errors of the six elements of the instrument matrix over the field, in per cent, one scale.
+    """The standard errors of the elements of the instrument matrix over the field, in per cent, one scale.
 
     The scale is logarithmic over at most three decades: errors grow steeply at the edge of the field.
     """
-    figure = empty_figure(8.6, 4.6)
-    axes = figure.subplots(2, 3, sharex=True, sharey=True)
+    figure, axes = _by_arm(maps.errors, 8.6, 2.3)
     high = 100.0 * largest_size(maps.errors)
     norm = LogNorm(min(max(100.0 * float(maps.errors.min()), 1e-3 * high), 0.5 * high), high, clip=True)
     image = None
-    for axis, errors, name in zip(axes.ravel(), maps.errors, MATRIX_SYMBOLS, strict=True):
+    for axis, errors, name in zip(axes.ravel(), maps.errors, element_symbols(len(axes)), strict=True):
         field_axes(axis, f"error of {name}")
         image = axis.imshow(
             100.0 * errors,
@@ -76,30 +57,46 @@ def matrix_errors_figure(maps: MatrixMaps) -> Figure:
 
 
 def residual_map_figure(residuals: ResidualMap) -> Figure:
-    """What the smooth model leaves of the matrix and of the ratio of the pairs (%), and χ²/dof before that correction.
+    """What the smooth model leaves of the matrix and of the ratios of the arms (%), and χ²/dof before that correction.
 
-    The six elements share one scale, which the median error and the largest corrections but one in a hundred set.
+    A row for each arm. The elements share one scale, which the largest corrections but one in a hundred set.
     """
-    figure = empty_figure(9.4, 4.0)
-    axes = figure.subplots(2, 4, sharex=True, sharey=True)
-    titles = (*(f"$\\delta${name} (%)" for name in MATRIX_SYMBOLS), "N2, N3 / N0, N1 (%)", "χ²/dof")
-    # Row by row: the three elements of a pair, then the other quantity.
-    order = (0, 1, 2, 6, 3, 4, 5, 7)
-    matrix = 100.0 * np.abs(residuals.values[:6])
-    for axis, i in zip(axes.ravel(), order, strict=True):
-        values = residuals.chi2 if i == 7 else 100.0 * residuals.values[i]
-        shown = matrix if i < 6 else np.abs(values)
-        far = max(float(np.nanpercentile(shown, 99)), 1e-12) if np.isfinite(shown).any() else 1.0
-        norm, colours = Normalize(-far, far), DIVERGING
-        if i == 7:
-            norm, colours = Normalize(float(np.nanmin(values)), far), "viridis"
-        field_axes(axis, titles[i])
+    arms = (len(residuals.values) + 1) // 4
+    elements, ratios = residuals.values[: 3 * arms], residuals.values[3 * arms :]
+    figure = empty_figure(9.4, 2.0 * arms)
+    axes = figure.subplots(arms, 4, sharex=True, sharey=True, squeeze=False)
+
+    def draw(axis: Axes, title: str, values: Float[np.ndarray, "y x"], norm: Normalize, colours: str) -> None:
+        field_axes(axis, title)
         image = axis.imshow(
             values, origin="lower", extent=extent(residuals), norm=norm, cmap=colours, interpolation="nearest"
         )
         figure.colorbar(image, ax=axis, pad=0.03, shrink=0.8).ax.tick_params(labelsize=SMALL)
+
+    far = 100.0 * _almost_largest(elements)
+    for axis, values, name in zip(axes[:, :3].ravel(), elements, element_symbols(arms), strict=True):
+        draw(axis, f"$\\delta${name} (%)", 100.0 * values, Normalize(-far, far), DIVERGING)
+    low, high = float(np.nanmin(residuals.chi2)), _almost_largest(residuals.chi2)
+    draw(axes[-1, 3], "χ²/dof", residuals.chi2, Normalize(low, high), "viridis")
+    # The panels above that of χ² are free for the arms after the first.
+    for arm, (axis, ratio) in enumerate(zip(axes[:-1, 3], ratios, strict=True), start=1):
+        far = 100.0 * _almost_largest(ratio)
+        title = f"N{2 * arm}, N{2 * arm + 1} / N0, N1 (%)"
+        draw(axis, title, 100.0 * ratio, Normalize(-far, far), DIVERGING)
     outer_labels(axes)
     return figure
+
+
+def _almost_largest(values: Float[np.ndarray, ...]) -> float:
+    """The size that one value in a hundred exceeds."""
+    return max(float(np.nanpercentile(np.abs(values), 99)), 1e-14) if np.isfinite(values).any() else 1.0
+
+
+def _by_arm(values: Float[np.ndarray, "m y x"], width: float, height: float) -> tuple[Figure, Any]:
+    """A blank figure with a row of three panels for each arm; width, and height of a row, in inches."""
+    arms = len(values) // 3
+    figure = empty_figure(width, height * arms)
+    return figure, figure.subplots(arms, 3, sharex=True, sharey=True, squeeze=False)
 
 
 def extent(maps: MatrixMaps | ResidualMap) -> tuple[float, float, float, float]:

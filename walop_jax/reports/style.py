@@ -16,10 +16,6 @@ BEFORE = "#b2182b"  # dark enough to be told from AFTER in grey as well; both ar
 AFTER = "#2166ac"
 QUIET = "0.8"
 
-MATRIX_SYMBOLS = ("$m_{21}$", "$m_{22}$", "$m_{23}$", "$m_{31}$", "$m_{32}$", "$m_{33}$")
-OFFSETS = (0, 3)  # elements that are zero points: in per cent
-FROM_MINUS_ONE_TO_ONE = (4, 5)  # elements: cross-talk and efficiency in u
-
 
 def empty_figure(width: float, height: float) -> Figure:
     """An empty figure, sizes in inches."""

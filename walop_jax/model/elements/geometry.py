@@ -46,7 +46,7 @@ class Wedge(Element):
 
     def ray(self, ray: Ray) -> Ray:
         """The ray behind the wedge."""
-        index = materials.GLASSES[self.material].index.refractive_index(ray.wavelength)
+        index = materials.GLASSES[self.material].dispersion.refractive_index(ray.wavelength)
         return ray.toward(*optics.behind_wedge((ray.kx, ray.ky, ray.kz), self.angle, index))
 
 
