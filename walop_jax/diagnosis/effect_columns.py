@@ -19,9 +19,11 @@ from walop_jax.diagnosis.score import Candidate
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import light
-from walop_jax.model.dependence import needs, optical_indices
+from walop_jax.model.dependence import conditions_asked_by
 from walop_jax.model.effects import Context, Effect
-from walop_jax.model.parameters import field_declarations, leaves
+from walop_jax.model.elements import Element
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import field_declarations
 from walop_jax.model.specification import Model
 
 LEAST_SURVIVING = 1e-3  # a contrast of 1 % that the band reduces by this factor is 0.001 %: of no consequence
@@ -68,11 +70,26 @@ def probes(catalogue: Sequence[type[Effect]], context: Context) -> Iterator[Prob
                 yield probe
 
 
-def _kind_of_computation(model: Model, instance: Effect) -> tuple[object, ...]:
-    """What makes a computation costly: optics for every exposure, many nodes, derivatives of the optics."""
-    alone = dataclasses.replace(model.template, effects=(instance,))
-    first = len(leaves(dataclasses.replace(alone, effects=())))
-    return needs(alone), light.has_ghosts(alone), any(i >= first for i in optical_indices(alone))
+def _kind_of_computation(instrument: Instrument, effect: Effect) -> tuple[object, ...]:
+    """What makes a computation costly: derivatives of the optics, optics for every exposure, many nodes, ghosts.
+
+    It only sorts effects into batches, so it asks the elements that the effect changes, not the whole path.
+    """
+    bare = dataclasses.replace(instrument, effects=())
+    patched = effect.patch(bare)
+    before = {id(element) for element in _behind_polariser(bare)}
+    changed = [element for element in _behind_polariser(patched) if id(element) not in before]
+    asked = frozenset(name for element in changed for name in conditions_asked_by(element))
+    longest = max((element.path_difference for element in changed), default=0.0)
+    optics = bool(changed) or patched.filter_shift is not bare.filter_shift
+    return optics, asked, longest, bool(patched.cameras.ghosts)
+
+
+def _behind_polariser(instrument: Instrument) -> Iterator[Element]:
+    train = list(instrument.train())
+    yield from train[len(instrument.telescope()) + (instrument.polariser is not None) :]
+    for arm in instrument.arms:
+        yield from (*arm.train(), arm.analyser)
 
 
 def effect_candidates(
@@ -82,10 +99,13 @@ def effect_candidates(
     number = Counter(p.effect for p in wanted)
     several = {effect for effect, count in number.items() if count > limits.MANY_SHAPES}
     result: dict[str, Candidate] = {}
+    kinds: dict[type[Effect], tuple[object, ...]] = {}
     together: dict[tuple[object, ...], list[Probe]] = {}
     for probe in wanted:
         if probe.effect not in several:
-            together.setdefault(_kind_of_computation(model, probe.group[0]), []).append(probe)
+            if probe.effect not in kinds:
+                kinds[probe.effect] = _kind_of_computation(model.template, probe.group[0])
+            together.setdefault(kinds[probe.effect], []).append(probe)
     for batch in together.values():
         members = tuple(member for probe in batch for member in probe.group)
         columns = Likelihood.of(calset, model, members).effect_columns(values, members)

@@ -16,10 +16,11 @@ import numpy as np
 from jaxtyping import Array
 
 from walop_jax.model import light
+from walop_jax.model.elements.base import Element
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import leaves, parameter_places
 from walop_jax.model.plan import blank_plan
-from walop_jax.model.ray import NotPlannedError
+from walop_jax.model.ray import Conditions, NotPlannedError, Ray
 
 Shapes = tuple[tuple[tuple[int, ...], str], ...]
 
@@ -77,6 +78,26 @@ def _needs(structure: Any, shapes: Shapes) -> Needs:
     patched = jax.eval_shape(lambda i: i.patched(), instrument)
     parts = [*patched.elements, *(element for arm in patched.arms for element in arm.elements)]
     return Needs(frozenset(asked), median, max((part.path_difference for part in parts), default=0.0))
+
+
+def conditions_asked_by(element: Element) -> frozenset[str]:
+    """What an element asks for, by its name in `ray.CONDITIONS`; found by running it on shapes."""
+    asked: set[str] = set()
+
+    def run(element: Element) -> tuple[Any, Any]:
+        one, zero = jnp.ones(1), jnp.zeros(())
+        conditions = Conditions(band_width=0.1 * one, planned=dict.fromkeys(asked, one))
+        ray = Ray.entering(zero, zero, (0.62 * one, conditions))
+        return element.ray(ray), element.mueller(ray)
+
+    while True:
+        try:
+            jax.eval_shape(run, element)
+            return frozenset(asked)
+        except NotPlannedError as missing:
+            if missing.quantity in asked:
+                raise
+            asked.add(missing.quantity)
 
 
 def optical_indices(instrument: Instrument) -> tuple[int, ...]:
