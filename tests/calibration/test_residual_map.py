@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 
@@ -18,6 +17,7 @@ from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.model_builder import base_model
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.parameters import values_of
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
@@ -30,7 +30,7 @@ BROKEN = np.array([3e-4, -2e-4, 5e-4, -4e-4, 1e-4, 6e-4, 2e-3])
 
 
 def as_values(instrument):
-    return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(instrument)])
+    return np.asarray(values_of(instrument))
 
 
 def changed(calset, counts, sigma):

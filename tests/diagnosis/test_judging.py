@@ -98,7 +98,7 @@ def test_robust_errors_see_disturbances_of_whole_exposures(leaking):
 
 def test_patterns_do_not_know_the_noise(leaking):
     """Columns of two sets that differ by nothing but their noise differ by no more than their fits do."""
-    calset, base, *_ = leaking
+    calset, _, base, _ = leaking
     other, _ = simulate(
         PLAN,
         seed=8,

@@ -39,7 +39,7 @@ def plan(instrument):
 
 def matrix_of(instrument, rows, throughput):
     vectors = light.camera_vectors(instrument, rows, throughput, X, Y)
-    return light.instrument_matrix(vectors @ light.telescope(instrument), instrument.cameras.pairs)
+    return light.instrument_matrix(vectors @ light.telescope(instrument, X, Y), instrument.cameras.pairs)
 
 
 def test_derivatives_are_those_of_forward_differentiation(instrument, plan):
@@ -59,7 +59,8 @@ def test_derivatives_are_those_of_forward_differentiation(instrument, plan):
     derivative = linear.to_all(instrument, found.plain, found.local, instrument.throughput.basis(X, Y)[None])
     expected = jax.jacfwd(whole)(values)
     assert derivative.shape == (2, 2, 3, values.size)
-    np.testing.assert_allclose(found.value, whole(values), rtol=0, atol=1e-14)
+    # Phases of thousands of waves: what compilers may reorder is 10⁻¹² of the matrix.
+    np.testing.assert_allclose(found.value, whole(values), rtol=0, atol=1e-11)
     scale = np.abs(expected).max(axis=(0, 1, 2))
     np.testing.assert_allclose(
         derivative / np.where(scale > 0, scale, 1.0), expected / np.where(scale > 0, scale, 1.0), atol=1e-11

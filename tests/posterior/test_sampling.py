@@ -15,6 +15,7 @@ from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import write_columns
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.posterior import Options, PosteriorSample, sample, sampling
 from walop_jax.posterior.output import inference_data, intervals, read_draws, report, write_posterior
 from walop_jax.posterior.propagate import matrix_draws, with_draws, with_moments

@@ -22,7 +22,7 @@ OUTPUTS = {
 }
 
 
-def fail(*args: object) -> None:
+def fail(*args: object, **more: object) -> None:
     raise OSError("No space left on device")
 
 
