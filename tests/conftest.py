@@ -21,7 +21,9 @@ from walop_jax.data import read_calibration_set  # noqa: E402
 from walop_jax.fit.refit import FitResult, refit  # noqa: E402
 
 LEAST_COMPILED = 0.1  # seconds: what compiles faster is not worth a file
-QUICK_COMPILATION = "--xla_backend_optimization_level=0"  # half the time; results differ by 10⁻¹³ of the counts
+QUICK_COMPILATION = (
+    "--xla_backend_optimization_level=0"  # half the time; results differ by 10⁻¹³ of the counts
+)
 OPTIONS = {"long": "studies that take minutes", "benchmark": "timings"}
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 
-import equinox as eqx
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -18,6 +17,7 @@ from walop_jax.calibration.certify import certify, validity
 from walop_jax.calibration.product import write_product
 from walop_jax.cli import app
 from walop_jax.data import write_calibration_set
+from walop_jax.fit.model_builder import model_for
 from walop_jax.fit.refit import refit
 from walop_jax.science.epoch import chi2_of_change, chi2_tail, epoch
 from walop_jax.simulation.simulate import simulate
@@ -142,13 +142,41 @@ def test_an_instrument_that_has_not_changed_still_fits(first):
 def test_a_change_is_found_and_named(first):
     """A wedge that has yielded by half a milliradian."""
     truth, old = first
-    bent = eqx.tree_at(lambda i: i.half2.wedge, truth, truth.half2.wedge + 5e-4)
+    bent = truth.changed("half2.wedge", angle=lambda angle: angle + 5e-4)
     found, _ = epoch(old, simulate(SMALL, seed=200, instrument=bent).calset)
     assert not found.fits
     assert found.moved[0].name == "half2.wedge"
     assert found.moved[0].new - found.moved[0].old == pytest.approx(5e-4, abs=4 * found.moved[0].error)
     assert found.chi2_old > found.chi2_new + 100
     assert found.star_errors["u"]["max"] > 0.05
+
+
+def test_the_new_set_is_fitted_with_the_old_model(first):
+    """Not with its effects alone: plates, degree, choices, priors and what was held are the old model's."""
+    truth, old = first
+    text = """
+    [model]
+    plates = "fixed_axis"
+    throughput_degree = 1
+    effects = ["blemish"]
+    [effects.blemish]
+    camera = 2
+    [parameters."half1.wedge"]
+    free = false
+    [parameters."blemish.depth"]
+    prior = [0.0, 0.001]
+    """
+    earlier = dataclasses.replace(SMALL, grid=4, moon_patches=0)
+    model = model_for(simulate(earlier, seed=5).calset, text)
+    size = len(model.names)
+    assumed = dataclasses.replace(old, model=model, values=model.start, covariance=1e-12 * np.eye(size))
+    _, new = epoch(assumed, simulate(earlier, seed=6, instrument=truth).calset)
+    assert new.model.template.plates == "fixed_axis"
+    assert new.model.template.throughput.degree == 1
+    assert new.model.template.effect("blemish").camera == 2
+    assert not new.model["half1.wedge"].free
+    assert new.model["blemish.depth"].prior == (0.0, 0.001)
+    assert new.model.names == model.names
 
 
 def test_epoch_from_the_command_line(product, first, tmp_path):

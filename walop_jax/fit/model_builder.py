@@ -5,12 +5,13 @@ The scale of the throughput is a gauge unless a flux is known: the constant of c
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from walop_jax.data.records import CalibrationSet, Sources
-from walop_jax.fit.model_file import Header, parse
+from walop_jax.fit.model_file import Header, header_of, parse
 from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood import limits
@@ -20,6 +21,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import Model, effect_context, make_model, with_effects
 
 GAUGE = "throughput.n0.p00"
+SKY_AND_STARS = ("sky.", "standard.")  # parameters of the sky and of stars, not of the instrument
 LEVEL = 0.5  # of a throughput whose scale is a gauge
 
 
@@ -115,6 +117,24 @@ def model_for(calset: CalibrationSet, text: str = "", instrument: Instrument | N
         return _with_effects(model, header, context)
 
     return parse(text, build)
+
+
+def model_like(calset: CalibrationSet, old: Model) -> Model:
+    """The model `old` for another calibration set: its plates, effects, priors, ties and what it holds.
+
+    Sky and standards are those of the new set. Raises ValueError for a set of another instrument.
+    """
+    header = header_of(old)
+    model = base_model(calset, old.template, plates=header.plates, throughput_degree=header.throughput_degree)
+    model = _with_effects(model, header, effect_context(model.template, calset.exposures))
+    kept = {p.name: p for p in old.parameters if p.name != GAUGE and not p.name.startswith(SKY_AND_STARS)}
+    parameters = tuple(
+        dataclasses.replace(p, free=kept[p.name].free, prior=kept[p.name].prior, tie=kept[p.name].tie)
+        if p.name in kept
+        else p
+        for p in model.parameters
+    )
+    return dataclasses.replace(model, parameters=parameters)
 
 
 def model_without_data(

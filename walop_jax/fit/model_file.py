@@ -47,22 +47,35 @@ class Header:
     choices: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
 
 
+def header_of(model: Model) -> Header:
+    """What decides which parameters a model has."""
+    instrument = model.template
+    choices = {effect.name: effect.choices() for effect in instrument.effects}
+    return Header(
+        instrument=model.name,
+        plates=instrument.plates,
+        throughput_degree=instrument.throughput.degree,
+        effects=model.effect_names,
+        choices={name: values for name, values in choices.items() if values},
+    )
+
+
 def render(model: Model) -> str:
     """The TOML text of a model."""
+    header = header_of(model)
     document = tomlkit.document()
     document.add(
         tomlkit.comment(f"Model of {model.name}. Change what you need; delete the rest if you like.")
     )
     table = tomlkit.table()
-    table["instrument"] = model.name
-    if model.template.plates is not None:
-        table["plates"] = model.template.plates
-    table["throughput_degree"] = model.template.throughput.degree
-    table["effects"] = list(model.effect_names)
+    table["instrument"] = header.instrument
+    if header.plates is not None:
+        table["plates"] = header.plates
+    table["throughput_degree"] = header.throughput_degree
+    table["effects"] = list(header.effects)
     document["model"] = table
-    choices = {effect.name: effect.choices() for effect in model.template.effects}
-    if any(choices.values()):
-        document["effects"] = {name: values for name, values in choices.items() if values}
+    if header.choices:
+        document["effects"] = dict(header.choices)
     parameters = tomlkit.table(is_super_table=True)
     for p in model.parameters:
         entry = tomlkit.table()

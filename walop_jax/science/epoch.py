@@ -1,8 +1,8 @@
 """Does an old calibration still fit new data, and what has moved?
 
-The new set is fitted with the effects of the old model. What both fits have in common, the instrument's parameters, is
-compared: Δ = new − old with the covariance V, z = Δ/√V_ii, and over all directions T = Δᵀ V⁻¹ Δ, which is χ² for an
-instrument that has not changed.
+The new set is fitted with the old model: plates, effects, priors and what is held. What both fits have in common, the
+instrument's parameters, is compared: Δ = new − old with the covariance V, z = Δ/√V_ii, and over all directions
+T = Δᵀ V⁻¹ Δ, which is χ² for an instrument that has not changed.
 
     V = C_old + C_new − C_old P C_new − C_new P C_old
 
@@ -25,13 +25,12 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
-from walop_jax.fit.model_builder import effects_text, model_for
+from walop_jax.fit.model_builder import SKY_AND_STARS, model_like
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import Model
 from walop_jax.science.star_errors import determinant, joint_errors, sample_stars, statistics
 
-SKY_AND_STARS = ("sky.", "standard.")  # parameters of the sky and of stars, not of the instrument
 CHANCE = 0.01
 _KNOWN = 1e-7  # share of the largest eigenvalue below which a direction was measured by neither
 
@@ -79,7 +78,7 @@ def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]
     """
     if calset.instrument != old.model.name:
         raise ValueError(f"the new set is of {calset.instrument}, the calibration of {old.model.name}")
-    model = model_for(calset, effects_text(old.model.effect_names))
+    model = model_like(calset, old.model)
     result = fit(Likelihood.of(calset, model))
     if not result.converged:
         raise RuntimeError(f"the fit of the new set did not converge: {result.minimum.message}")
