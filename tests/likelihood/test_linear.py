@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import builders
 import jax
 import jax.numpy as jnp
@@ -34,6 +36,7 @@ def instrument():
 @pytest.fixture(scope="module")
 def plan(instrument):
     settings = Settings.default(2, "band").at(CHWP=np.array([np.nan, 22.5]))
+    settings = dataclasses.replace(settings, temperature=np.full(2, 4.0))
     return plan_for_settings(instrument, settings, {"band": builders.monochromatic(0.62)})
 
 

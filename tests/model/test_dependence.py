@@ -200,8 +200,8 @@ def test_optics_that_ask_for_the_temperature_get_it():
 
     with_window = scenes.observe(Fixed(rate=jnp.asarray(0.0)))
     assert np.abs(with_window[:, 0] - plain[:, 0]).max() > 1e-3 * scenes.FLUX
-    np.testing.assert_allclose(found[:, 0], with_window[:, 0], rtol=1e-12)
-    np.testing.assert_allclose(found[:, 1:], plain[:, 1:], rtol=1e-12)
+    np.testing.assert_allclose(found[:, 0], with_window[:, 0], rtol=1e-11)
+    np.testing.assert_allclose(found[:, 1:], plain[:, 1:], rtol=1e-11)
 
 
 def test_what_the_optics_ask_for_has_derivatives():

@@ -41,7 +41,7 @@ def test_an_interrupted_run_goes_on_as_if_nothing_had_been(
 
     with pytest.raises(KeyboardInterrupt):
         sample_run(caller, OPTIONS, progress=interrupt)
-    assert {entry.stage for entry in told} == {"tabulating the model", "sampling"}
+    assert {entry.stage for entry in told} == {"tabulating the model", "starting", "sampling"}
     assert [np.isfinite(entry.tau) for entry in told][-1]
     assert not any((caller / name).exists() for name in OUTPUTS)
     assert len(list((caller / "sampling").glob("block-*.h5"))) == 2

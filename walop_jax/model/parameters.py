@@ -66,7 +66,7 @@ def param(
     """Declare a parameter of an Equinox module; values become float64 arrays."""
     declaration = Declaration(unit, about, source, width, scale, loose)
     extra: dict[str, Any] = {} if default is None else {"default": default}
-    return eqx.field(metadata={PARAMETER: declaration}, converter=jnp.asarray, **extra)
+    return eqx.field(metadata={PARAMETER: declaration}, converter=_array, **extra)
 
 
 def number(*, unit: str, about: str, default: float | None = 0.0) -> Any:
@@ -75,6 +75,7 @@ def number(*, unit: str, about: str, default: float | None = 0.0) -> Any:
 
 
 def _array(value: Any) -> Any:
+    # With its type said: numbers of weak type would be compiled anew beside arrays.
     return None if value is None else jnp.asarray(value, float)
 
 

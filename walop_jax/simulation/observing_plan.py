@@ -74,6 +74,8 @@ class ObservingPlan:
     lamps: int = 0
 
     def __post_init__(self) -> None:
+        if isinstance(self.instrument, str):
+            described(self.instrument)  # an unknown name is an error here
         if np.isnan(self.field):
             object.__setattr__(self, "field", self._raster[1])
         for prefix in self.moving:
@@ -122,7 +124,10 @@ class ObservingPlan:
     def document(self) -> dict[str, Any]:
         """The plan as plain data."""
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return {**fields, "instrument": self.name, "moving": dict(self.moving)}
+        degree = self.design.throughput.degree if self.throughput_degree is None else self.throughput_degree
+        fields |= {"instrument": self.name, "throughput_degree": degree, "moving": dict(self.moving)}
+        # Named only where there are any: plans of other instruments read as they always did.
+        return {key: value for key, value in fields.items() if value or key not in ("moving", "lamps")}
 
     @property
     def site(self) -> Site:

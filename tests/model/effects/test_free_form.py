@@ -28,7 +28,7 @@ def test_it_is_found_by_name_but_is_no_candidate():
 
 
 def test_neutral_changes_nothing():
-    np.testing.assert_array_equal(scenes.observe(FreeForm.neutral(scenes.CONTEXT)), scenes.observe())
+    np.testing.assert_allclose(scenes.observe(FreeForm.neutral(scenes.CONTEXT)), scenes.observe(), rtol=1e-12)
 
 
 @pytest.mark.parametrize("blocks", [(), *((b,) for b in BLOCKS), BLOCKS])
@@ -71,7 +71,7 @@ def test_exposure_and_fine_structure_add_a_share_of_the_unpolarised_counts():
     )
     pattern = legval(scenes.X / FIELD, np.eye(6)[5])
     np.testing.assert_allclose(fine[:, 8, 1], 0.01 * pattern * unpolarised()[:, 1], rtol=1e-9)
-    assert not np.any(fine[..., [0, 2, 3]])
+    assert np.abs(fine[..., [0, 2, 3]]).max() < 1e-7  # rounding of 10⁵ electrons
 
 
 def test_a_harmonic_follows_the_polariser_and_nothing_else():
@@ -87,14 +87,14 @@ def test_a_harmonic_follows_the_polariser_and_nothing_else():
     np.testing.assert_allclose(
         cosine[:, :4, 0] / flat[:, :4, 0], (scenes.X / FIELD)[:, None] * np.ones(4), rtol=1e-6
     )
-    assert not np.any(sine[:, 4:])
-    assert not np.any(sine[..., 1:])
+    assert np.abs(sine[:, 4:]).max() < 1e-7
+    assert np.abs(sine[..., 1:]).max() < 1e-7
 
 
 def test_a_vector_changes_what_polarised_light_gives():
     effect = place(FreeForm.of(scenes.CONTEXT, blocks=("vectors",)), "vectors.n3.u.p00")
     change = scenes.observe(effect) - scenes.observe()
-    assert not np.any(change[:, 8])  # unpolarised
+    assert np.abs(change[:, 8]).max() < 1e-7  # unpolarised
     star = change[:, 6, 3] / unpolarised()[:, 3]
     turned = (STAR_Q + 1j * STAR_U) * np.exp(-2j * np.deg2rad(40.0))
     np.testing.assert_allclose(star, 0.01 * turned.imag, rtol=0.05)
