@@ -11,6 +11,7 @@ import pytest
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 LONG = (
+    "hidden_effect",
     "paper_versus_joint",
     "your_own_effect",
 )  # minutes each; the rooms that they call have tests of their own

@@ -124,6 +124,7 @@ def test_a_changed_map_is_found_out(finished, tmp_path):
         read_product(tmp_path / "changed.fits")
 
 
+@pytest.mark.long
 def test_a_killed_fit_goes_on_where_it_was(frames, finished, tmp_path):
     run = tmp_path / "run"
     process = start("refit", frames, "-o", run)

@@ -87,6 +87,7 @@ def test_sample_says_what_is_wrong(call, run_folder: Path, calset_file: Path, tm
     assert not (run / "sampling").exists()
 
 
+@pytest.mark.long
 def test_a_sampler_of_ones_own(call, run_folder: Path, tmp_path: Path):
     """A file from outside the package: sampled, resumed, refused to another sampler, and on the page of the run."""
     run = tmp_path / "RUN"

@@ -55,6 +55,7 @@ def strong():
     return found
 
 
+@pytest.mark.long
 def test_a_strong_effect_is_explained_to_within_the_noise(strong):
     """The prior of an amplitude that lies thirty widths away neither counts as a misfit nor pulls at the value."""
     assert strong.verdict == "effect_found"
@@ -66,11 +67,13 @@ def test_a_strong_effect_is_explained_to_within_the_noise(strong):
     assert "clp_wobble.amplitude (30 widths)" in strong.caution
 
 
+@pytest.mark.long
 def test_after_a_drop_the_steps_tell_of_models_without_the_dropped_name(strong):
     assert [step.effect for step in strong.steps] == ["clp_wobble"]
     assert lead_from_the_first_fit_to_the_last(strong)
 
 
+@pytest.mark.long
 def test_a_dropped_effect_is_one_of_those_not_found(strong):
     assert "clp_zero" in {limit.effect for limit in strong.limits}
     assert "clp_zero" in strong.steps[0].separation
