@@ -1,9 +1,12 @@
 """Analysers: where an arm ends and the beams of its cameras begin.
 
 Equation    beams of an arm ½ (1, ±η cos 2α, ±η sin 2α, 0), first camera +
-Symbols     η efficiency, close to 1; α axis of the first beam, from +X toward +Y
+            with a dispersion κ the first camera sees the band at λ (1 + κ), the second at λ (1 − κ), to first order:
+            M → M ± κ λ ∂M/∂λ, M the train ahead of the analyser
+Symbols     η efficiency, close to 1; α axis of the first beam, from +X toward +Y; κ half the relative difference of the
+            wavelengths of the two beams
 Source      Wollaston prism as a pair of crossed analysers: Goldstein 2003, Polarized Light, ch. 9.
-Limits      η = 1, α = 0 are ideal analysers along +X and +Y.
+Limits      η = 1, α = 0 are ideal analysers along +X and +Y; κ = 0: both see the filter as it is.
 """
 
 from __future__ import annotations
@@ -29,6 +32,9 @@ class Analyser(Element):
 
     efficiency: Scalar = number(unit="", about="η of the analysers ½(1, ±η, 0, 0)", default=1.0)
     angle: Scalar | None = number(unit="deg", about="rotation of the analysers", default=None)
+    dispersion: Scalar | None = number(
+        unit="", about="κ, first beam at λ (1 + κ), second at λ (1 − κ)", default=None
+    )
     cameras: tuple[str, ...] = eqx.field(static=True, default=())
 
     kind: ClassVar[str] = "analyser"
@@ -49,3 +55,8 @@ class Analyser(Element):
         half = 0.5 * jnp.ones_like(self.efficiency)
         along = 0.5 * self.efficiency
         return jnp.stack([jnp.stack([half, along]), jnp.stack([half, -along])])
+
+    def shares_of_slopes(self) -> Float[Array, "k 2"]:
+        """What each beam takes of λ ∂/∂λ of `seen`."""
+        kappa = jnp.zeros_like(self.efficiency) if self.dispersion is None else self.dispersion
+        return self.shares() * jnp.stack([kappa, -kappa])[:, None]
