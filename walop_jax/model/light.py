@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.model import fold
-from walop_jax.model.elements import Element
+from walop_jax.model.elements import Analyser, Element
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 from walop_jax.model.ray import NotPlannedError, Ray
@@ -135,11 +135,18 @@ def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float
     else:
         rows = at(wavelength)
     weights = band_weights(instrument, plan)
-    return jnp.concatenate(
+    bands = jnp.concatenate(
         [
             jnp.einsum("bn,nrs->brs", weights[first:last], rows[i])
             for i, (_, first, last) in enumerate(plan.settings)
         ]
+    )
+    analysers, mean = [arm.analyser for arm in instrument.arms], weights @ wavelength
+    if all(analyser.balance is None and analyser.loss is None for analyser in analysers):
+        return bands
+    parts = jnp.split(bands, bands.shape[1] // Analyser.rows, axis=1)
+    return jnp.concatenate(
+        [analysers[i % len(analysers)].in_band(part, mean) for i, part in enumerate(parts)], axis=1
     )
 
 
