@@ -99,6 +99,11 @@ def test_matrix_by_hand():
     by_hand[1:] *= 1 - lost
     np.testing.assert_allclose(element.mueller(ray([0.6, 2.0])), [by_hand, by_hand], atol=1e-14)
     assert SpectralElement().mueller(ray([0.6])) is None
+    turn = SpectralElement(rotation=[10.0], rotation_at=(1.0,)).mueller(ray([0.6]))[0]
+    up = np.deg2rad(2 * np.array([25.0, 35.0]))
+    np.testing.assert_allclose(
+        turn @ [1, np.cos(up[0]), np.sin(up[0]), 0.2], [1, np.cos(up[1]), np.sin(up[1]), 0.2]
+    )
 
 
 def test_a_description_gives_curves_and_their_parameters(tmp_path):

@@ -1,9 +1,11 @@
 """An element whose polarisation is a curve over wavelength: mirrors, derotators, coatings, what has no closed form.
 
-Equation    M = depolariser(loss) · [diattenuator(D) retarder(δ), both along `axis`]; they commute
-            each of δ(λ), D(λ), loss(λ) is the natural cubic spline through its values at its own wavelengths, continued
-            as a straight line beyond the first and the last; one value: constant
-Symbols     δ retardance [rad], of the fast axis; D diattenuation along `axis`; loss share of q, u, v that is lost
+Equation    M = depolariser(loss) · R(ρ) · [diattenuator(D) retarder(δ), both along `axis`]; the two commute
+            each of δ(λ), D(λ), ρ(λ), loss(λ) is the natural cubic spline through its values at its own wavelengths,
+            continued as a straight line beyond the first and the last; one value: constant
+Symbols     δ retardance [rad], of the fast axis; D diattenuation along `axis`; ρ angle [deg] by which it turns the
+            polarisation from +X toward +Y, a circular retardance of 2ρ (skew mirrors, optical activity);
+            loss share of q, u, v that is lost
 Sources     mirrors as diattenuating retarders: van Harten, Snik & Keller 2009, PASP 121, 377; form of M: Lu & Chipman
             1996, JOSA A 13, 1106; spline: de Boor 1978, A Practical Guide to Splines, ch. IV.
 Limits      no values: the identity. A spline with as many knots as bands takes up anything that has no
@@ -27,7 +29,7 @@ from walop_jax.model.spline import check_curve, spline
 
 Scalar = Float[Array, ""]
 Curve = Float[Array, " k"]
-CURVES = ("delta", "diattenuation", "loss")
+CURVES = ("delta", "diattenuation", "rotation", "loss")
 
 
 class SpectralElement(Element):
@@ -37,12 +39,16 @@ class SpectralElement(Element):
     diattenuation: Curve | None = number(
         unit="", about="diattenuation along the axis at `diattenuation_at`", default=None, several=True
     )
+    rotation: Curve | None = number(
+        unit="deg", about="turn of the polarisation at `rotation_at`", default=None, several=True
+    )
     loss: Curve | None = number(
         unit="", about="share of the polarisation lost at `loss_at`", default=None, several=True
     )
     axis: Scalar = number(unit="deg", about="fast axis, from +X toward +Y")
     delta_at: tuple[float, ...] = eqx.field(static=True, default=())
     diattenuation_at: tuple[float, ...] = eqx.field(static=True, default=())
+    rotation_at: tuple[float, ...] = eqx.field(static=True, default=())
     loss_at: tuple[float, ...] = eqx.field(static=True, default=())
 
     kind: ClassVar[str] = "spectral"
@@ -75,6 +81,9 @@ class SpectralElement(Element):
         if self.diattenuation is not None:
             d = self.curve("diattenuation", ray.wavelength)
             own = mueller.diattenuator(d * jnp.cos(2.0 * axis), d * jnp.sin(2.0 * axis))
+            matrix = own if matrix is None else own @ matrix
+        if self.rotation is not None:
+            own = mueller.rotation(-jnp.deg2rad(self.curve("rotation", ray.wavelength)))
             matrix = own if matrix is None else own @ matrix
         if self.loss is not None:
             kept = 1.0 - self.curve("loss", ray.wavelength)
