@@ -28,6 +28,7 @@ from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import effects_text, model_for
 from walop_jax.fit.refit import fit, with_honest_errors
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.build import as_designed
 from walop_jax.model.specification import Model
 from walop_jax.science.star_errors import determinant, joint_errors, sample_stars, statistics
 
@@ -79,7 +80,7 @@ def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]
     """
     if calset.instrument != old.model.name:
         raise ValueError(f"the new set is of {calset.instrument}, the calibration of {old.model.name}")
-    model = model_for(calset, effects_text(old.model.effect_names))
+    model = _model_as_before(old, calset)
     result = with_honest_errors(fit(Likelihood.of(calset, model)))
     if not result.converged:
         raise RuntimeError(f"the fit of the new set did not converge: {result.minimum.message}")
@@ -114,6 +115,21 @@ def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]
         star_errors=_star_errors(old, new),
     )
     return verdict, new
+
+
+def _model_as_before(old: Calibration, calset: CalibrationSet) -> Model:
+    """The model of a calibration for a new set: its instrument and effects, priors and what is frozen, from its values.
+
+    The sky and the stars are those of the new set.
+    """
+    model = model_for(calset, effects_text(old.model.effect_names), as_designed(old.model.template))
+    for name, value in zip(old.model.names, old.values, strict=True):
+        if name in model.names and not name.startswith(SKY_AND_STARS):
+            before = old.model[name]
+            model = model.change(
+                name, start=float(value), prior=before.prior, free=before.free, tie=before.tie
+            )
+    return model
 
 
 def shared_parameters(old: Model, new: Model) -> list[str]:

@@ -1,4 +1,4 @@
-"""The measured table as a calibration set: what the notebook does, in a form that tests can call."""
+"""What a user of a polarimeter of his own writes: an importer of his table, and the yardstick he is used to."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from astropy.table import Table
+from scipy.optimize import least_squares
 
 from walop_jax.data.records import CalibrationSet, Exposures, FilterCurve, Points, Position, Site, Sources
 from walop_jax.data.table_intensities import TableIntensities
@@ -78,3 +79,48 @@ def charis_set(table: Table | str | Path, floor: float = 1e-3, mjd: float = 6000
             used=always,
         ),
     )
+
+
+def asymmetry(left, right):
+    """(N0 - N1)/(N0 + N1)."""
+    return (left - right) / (left + right)
+
+
+def left_over(result, values=None):
+    """Measured minus predicted (N0 - N1)/(N0 + N1), bin by plate angle by derotator angle (bins, 8, 8).
+
+    `values` are those of another fit of the same model, e.g. to a part of the set.
+    """
+    likelihood = result.likelihood
+    _, residual = likelihood.residuals(result.values if values is None else values)
+    counts, weight = (likelihood.points.gathered(name)[0] for name in ("counts", "weight"))
+    model = counts - residual[0] / weight
+    return (asymmetry(*counts.T) - asymmetry(*model.T)).reshape(-1, 8, 8)
+
+
+def bin_by_bin(measured, plate, derotator, left_out=None):
+    """The yardstick: two retardances, three angles and an efficiency for each bin, fitted by least squares.
+
+    `measured` is (N0 - N1)/(N0 + N1) of one bin (8, 8), the angles in degrees; `left_out` is a column of it that is
+    predicted only. Returns measured minus predicted.
+    """
+    h, d = np.meshgrid(np.deg2rad(plate), np.deg2rad(derotator), indexing="ij")
+    used = np.arange(8) != (-1 if left_out is None else left_out)
+
+    def retarded(q, u, v, delta, axis):
+        c, s = np.cos(2 * axis), np.sin(2 * axis)
+        along, across = c * q + s * u, c * u - s * q
+        across, v = np.cos(delta) * across + np.sin(delta) * v, np.cos(delta) * v - np.sin(delta) * across
+        return c * along - s * across, s * along + c * across, v
+
+    def off(p):
+        light = retarded(np.cos(2 * p[4]), np.sin(2 * p[4]), 0.0, p[0], h + p[2])
+        return measured - p[5] * retarded(*light, p[1], d + p[3])[0]
+
+    starts = [
+        (plates, turn, 0.0, 0.0, 0.0, 1.0)
+        for plates in (2.95, 3.35)
+        for turn in (0.5, 1.5, 2.5, 3.2, 4.0, 5.0)
+    ]
+    fits = [least_squares(lambda p: off(p)[:, used].ravel(), start, method="lm") for start in starts]
+    return off(min(fits, key=lambda fit: fit.cost).x)
