@@ -244,12 +244,9 @@ class _Maker:
         if isinstance(value, Given):
             if value.parameter:
                 raise DataError(f"{what} cannot be a parameter")
-            several = isinstance(value.value, tuple)
-            value = (
-                type(default)(value.value)
-                if isinstance(default, int | float) and not several
-                else value.value
-            )  # pyright: ignore
+            inner = value.value
+            whole = isinstance(default, int | float) and not isinstance(inner, tuple)
+            value = type(default)(inner) if whole else inner
         if isinstance(default, str | tuple) and not isinstance(value, type(default)):
             raise DataError(f"{what} = {value!r} must be a {'name' if isinstance(default, str) else 'list'}")
         return value
