@@ -65,6 +65,7 @@ def robust_errors(likelihood: Likelihood, values: Vector, posterior: Posterior) 
         meat = count / (count - 1) * gradients.T @ gradients + prior
         covariance = larger(covariance, bread @ (meat * np.outer(unit, unit)) @ bread)
         ways.append(f"{count} {name}")
+    # A FITS card has room for 68 characters.
     made_from = f"residuals: chi2/dof = {square:.4g}" + "".join(f", {way}" for way in ways)
     return RobustErrors(covariance * np.outer(unit, unit), made_from)
 
@@ -108,7 +109,7 @@ def _gradients(likelihood: Likelihood, values: Vector) -> Iterator[tuple[str, Fl
         grouped = np.zeros((int(labels.max(initial=0)) + 1, select.shape[1]))
         np.add.at(grouped, labels, by_exposure)
         yield name, share * grouped
-    yield "cells of the field", share * by_cell
+    yield "cells", share * by_cell
 
 
 def states(calset: CalibrationSet) -> Int[np.ndarray, " e"]:
