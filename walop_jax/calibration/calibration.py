@@ -81,6 +81,7 @@ class Calibration:
             trusted=result.trusted,
             quality=quality(result),
             warnings=result.warnings,
+            errors_from=result.errors_from,
         )
         return cls(
             model=result.model,

@@ -91,7 +91,8 @@ def _covariance(product: CalibrationProduct) -> Check:
     lopsided = float(np.abs(correlation - correlation.T).max())
     differing = float(np.abs(product.parameters.sigma - sigma).max(initial=0.0) / scale.max())
     good = lowest > -1e-8 and lopsided < 1e-10 and differing < 1e-10
-    return Check("covariance", good, f"smallest eigenvalue of the correlation {lowest:.1e}")
+    found = f"smallest eigenvalue of the correlation {lowest:.1e}; made from {product.verdict.errors_from}"
+    return Check("covariance", good, found)
 
 
 def _validity(product: CalibrationProduct) -> Check:

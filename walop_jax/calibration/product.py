@@ -59,6 +59,7 @@ from walop_jax.data.write import exposures_hdu, filter_columns, grid_cards, sign
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.fits_reading import UNREADABLE, OpenFile, one_line, open_fits
+from walop_jax.likelihood.expansion import STATED
 
 __all__ = [
     "PRODVERS",
@@ -207,6 +208,7 @@ def _from_hdus(opened: OpenFile) -> CalibrationProduct:
             quality=int(header.number("QUALITY")),
             warnings=() if warnings is None else tuple(warnings["TEXT"].tolist()),
             covariance_from=header.text("COVFROM") or "fit",
+            errors_from=header.text("ERRFROM") or STATED,
         ),
         parameters=parameters,
         covariance=covariance,

@@ -73,6 +73,7 @@ def primary_hdu(product: CalibrationProduct, version: int) -> fits.PrimaryHDU:
         "NOISESCL": (verdict.noise_scale, "factor on the errors of the data"),
         "QUALITY": (int(verdict.quality), "bit mask, 0 is good"),
         "COVFROM": (verdict.covariance_from, "what COVARIANCE is of"),
+        "ERRFROM": (verdict.errors_from, ""),
         "MAPFILT": (product.maps.filter, f"filter of the maps M21...{product.maps.names[-1]}"),
         **{
             f"FIELD{side}": (value, "[deg] extent of the field points used")

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import Exposures, FilterCurve, InputFile, Site, Sources
+from walop_jax.likelihood.expansion import STATED
 
 SMALLEST_DETERMINANT = 0.1
 """|m22 m33 − m23 m32| below which a single exposure holds hardly any u."""
@@ -188,7 +189,8 @@ class Verdict:
     """How far a product can be trusted; `quality` are bits of `Quality`.
 
     `noise_scale` multiplied the errors of the data in the fit (1: as given); `covariance_from` says what the
-    covariance is of ("fit" or "posterior").
+    covariance is of ("fit" or "posterior"), `errors_from` what that was made from: the stated errors of the data, or
+    what what a fit left (`fit.robust`).
     """
 
     chi2: float
@@ -200,6 +202,7 @@ class Verdict:
     quality: int
     warnings: tuple[str, ...] = ()
     covariance_from: str = "fit"
+    errors_from: str = STATED
 
 
 @dataclasses.dataclass(frozen=True)
@@ -247,6 +250,7 @@ class CalibrationProduct:
             *(str(value) for value in (verdict.dof, verdict.n_data, verdict.converged, verdict.trusted)),
             *(str(int(verdict.quality)), *(f"{value:.11e}" for value in numbers)),
             *(entry.sha256 for entry in self.inputs),
+            *((verdict.errors_from,) if verdict.errors_from != STATED else ()),
             *_texts(self.maps.positions),
             *(_texts(self.residuals.positions) if self.residuals is not None else ()),
         ]

@@ -50,6 +50,7 @@ def summary(
         "effects": list(result.model.effect_names),
         "free_parameters": len(result.model.free),
         "noise_scale": result.noise_scale,
+        "errors_from": result.errors_from,
         "steps": result.minimum.steps,
         "starts": result.starts,
         "seconds_fit": result.seconds,

@@ -16,9 +16,10 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.minimise import Minimum
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.model_file import render
+from walop_jax.fit.robust import robust_errors
 from walop_jax.fit.search import find_minimum, free_scales
 from walop_jax.io.software import software_versions
-from walop_jax.likelihood.expansion import Posterior
+from walop_jax.likelihood.expansion import STATED, Posterior
 from walop_jax.likelihood.journal import Journal, fingerprint
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.processes import Processes
@@ -37,7 +38,8 @@ class FitResult:
     """A fit, the likelihood that it maximises, and how far it can be trusted.
 
     `values` and `covariance` are of all parameters in tree order, frozen ones with zero variance. `trusted` needs a
-    converged fit that explains the data; `warnings` says in words what does not hold.
+    converged fit that explains the data; `warnings` says in words what does not hold; `errors_from` what the
+    covariance was made from, the stated errors of the data (`STATED`) or residuals.
     """
 
     likelihood: Likelihood
@@ -48,6 +50,7 @@ class FitResult:
     starts: int
     seconds: float
     warnings: tuple[str, ...]
+    errors_from: str = STATED
 
     @property
     def model(self) -> Model:
@@ -171,6 +174,23 @@ def fit(
     return dataclasses.replace(result, warnings=tuple(_warnings(result)))
 
 
+def with_honest_errors(result: FitResult) -> FitResult:
+    """The fit with errors from its residuals where it does not explain the data (`robust`); as it is where it does.
+
+    Nothing but the covariance changes. For what leaves the program: evidence is weighed with errors as stated.
+    """
+    if result.explains_data or result.errors_from != STATED or result.dof <= 0 or not result.converged:
+        return result
+    found = robust_errors(result.likelihood, result.values, result.posterior)
+    select = result.model.selection()
+    return dataclasses.replace(
+        result,
+        covariance=select @ found.covariance @ select.T,
+        errors_from=found.made_from,
+        warnings=(*result.warnings, f"standard errors are made from the {found.made_from}"),
+    )
+
+
 def _warnings(result: FitResult) -> Iterator[str]:
     if not result.converged:
         yield result.minimum.message
@@ -206,14 +226,15 @@ def refit(
     `progress` is told in a line what is being done. Of large sets (more than `limits.LARGE_ABOVE` points): `memory`
     (bytes, default 2 GB) is what their data may take; `processes` are those that share the work and make the same
     call (`processes.join`); finished slabs are kept in `folder`, where the same call goes on after an interruption, to
-    the same last bit. The folder may go when the fit is done. Raises what `fit` raises.
+    the same last bit. The folder may go when the fit is done. Errors
+    are those of `with_honest_errors`. Raises what `fit` raises.
     """
     model, crew = model or base_model(calset), processes or Processes()
     journal = None if folder is None else _journal(Path(folder), calset, model, crew)
     runner = Runner(processes=crew, progress=progress, journal=journal)
     likelihood = Likelihood.of(calset, model, memory=memory, runner=runner)
     runner.tell(f"preparing the fit; data will take {likelihood.layout.memory / 1e9:.2g} GB")
-    return fit(likelihood)
+    return with_honest_errors(fit(likelihood))
 
 
 def _journal(folder: Path, calset: CalibrationSet, model: Model, processes: Processes) -> Journal:

@@ -161,12 +161,16 @@ def check_identifiable(likelihood: Likelihood) -> None:
     e = likelihood.calset.exposures
     through = e.clp_in & (likelihood.census.rows > 0)
     angles = np.unique(np.round(np.mod(e.clp_angle[through], 180.0), 3))
-    if len(angles) < 3:
+    turning = [e.position(prefix).angle for prefix in likelihood.plan.moving]
+    states = len(
+        np.unique(np.nan_to_num(np.stack([np.zeros(len(e)), *turning], axis=1)[through], nan=-1.0), axis=0)
+    )
+    if len(angles) < 3 and (len(angles) == 0 or states < 3):
         raise ValueError(
             f"{len(angles)} distinct polariser angle(s) modulo 180° with usable data: a fit of the instrument needs "
             "at least 3, better 8 or more spread over 360°"
         )
-    if likelihood.layout.points < 2:
+    if likelihood.layout.points < 2 and likelihood.model.template.throughput.degree > 0:
         raise ValueError("a single field point: the joint fit over the field needs several points")
 
 

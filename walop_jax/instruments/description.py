@@ -51,10 +51,11 @@ class Given:
     """A number of a description: fixed, or a parameter if the file gives more than its value.
 
     `sigma` is the scatter expected of what was built (the width of the prior, None: no prior), `scale` the step of a
-    solver, `loose` the width of a weak pull; `name` replaces the name of the parameter.
+    solver, `loose` the width of a weak pull; `name` replaces the name of the parameter. A number that an element has at
+    several wavelengths is a tuple; what else is said of it holds for each.
     """
 
-    value: float
+    value: float | tuple[float, ...]
     parameter: bool = False
     sigma: float | None = None
     unit: str | None = None
@@ -258,6 +259,9 @@ class _Reader:
             raise self.fault(place, f"{key} = {shown} must be a finite number")
         return float(value)
 
+    def floats(self, value: list[Any], key: str, place: str) -> tuple[float, ...]:
+        return tuple(self.float(entry, f"{key}[{i}]", place) for i, entry in enumerate(value))
+
     def positive(self, value: Any, key: str, place: str) -> float:
         number = self.float(value, key, place)
         if number <= 0:
@@ -271,7 +275,10 @@ class _Reader:
         self.known(value, NUMBER_KEYS, here)
         if "value" not in value:
             raise self.fault(here, "has no value")
-        given: dict[str, Any] = {"value": self.float(value["value"], "value", here), "parameter": True}
+        content = value["value"]
+        several = isinstance(content, list) and bool(content)
+        checked = self.floats(content, "value", here) if several else self.float(content, "value", here)
+        given: dict[str, Any] = {"value": checked, "parameter": True}
         for name in ("sigma", "scale", "loose"):
             if name in value:
                 given[name] = self.float(value[name], name, here)
@@ -309,9 +316,11 @@ class _Reader:
         return ElementText(name, self.text(table["kind"], "kind", place), moves, values, made)
 
     def value(self, value: Any, key: str, place: str) -> Any:
-        """A number, a name or a list of names."""
+        """A number, a name, or a list of either."""
         if isinstance(value, str):
             return self.text(value, key, place)
+        if isinstance(value, list) and value and not isinstance(value[0], str):
+            return Given(self.floats(value, key, place))
         if isinstance(value, list):
             return self.words(value, key, place)
         return self.number(value, key, place)

@@ -11,6 +11,9 @@ from jaxtyping import Float, Int
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
 
+STATED = "N_ERR"
+"""What errors of a fit are made from where it explains the data: the stated errors."""
+
 
 class Census(NamedTuple):
     """Number of points used in each exposure; smallest and largest x, then y (deg), of those used in any; cameras."""

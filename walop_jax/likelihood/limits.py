@@ -68,6 +68,8 @@ LEVEL_POINTS = 256
 
 MISFIT_POINTS = 65536
 """Field points whose residuals are grouped to describe a misfit: their cube then takes 50 MB at 25 exposures."""
+ROBUST_POINTS = 4096
+"""Field points whose residuals give the errors of a fit that does not explain its data."""
 POINTS_PER_CELL = 64
 """Field points of a cell of the residual map: its errors are an eighth of those of a point."""
 MOST_CELLS = 128

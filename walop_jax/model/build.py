@@ -168,7 +168,10 @@ class _Maker:
         if kind is Wedge and fields.get("material", Wedge.material) not in materials.GLASSES:
             glass = str(fields["material"])
             raise DataError(f"[{place}] unknown glass {glass!r}; {nearest(glass, materials.GLASSES)}")
-        made = kind(name=text.name, moves=text.moves, declared=declared, **fields)
+        try:
+            made = kind(name=text.name, moves=text.moves, declared=declared, **fields)
+        except ValueError as error:
+            raise DataError(f"[{place}] {error}") from None
         self.check_moves(made, place)
         return made
 
@@ -222,6 +225,9 @@ class _Maker:
                 continue
             if not isinstance(value, Given):
                 raise DataError(f"[{place}] {key} = {value!r} must be a number")
+            if known[key].several is not isinstance(value.value, tuple):
+                wanted = "a list of numbers" if known[key].several else "one number"
+                raise DataError(f"[{place}] {key} = {value.value!r} must be {wanted}")
             if value.unit is not None and value.unit != known[key].unit:
                 raise DataError(
                     f"[{place}] {key} is in {known[key].unit!r}, not in {value.unit!r}; convert it"
@@ -238,11 +244,11 @@ class _Maker:
         if isinstance(value, Given):
             if value.parameter:
                 raise DataError(f"{what} cannot be a parameter")
-            value = type(default)(value.value) if isinstance(default, int | float) else value.value
+            inner = value.value
+            whole = isinstance(default, int | float) and not isinstance(inner, tuple)
+            value = type(default)(inner) if whole else inner
         if isinstance(default, str | tuple) and not isinstance(value, type(default)):
-            raise DataError(
-                f"{what} = {value!r} must be a {'name' if isinstance(default, str) else 'list of names'}"
-            )
+            raise DataError(f"{what} = {value!r} must be a {'name' if isinstance(default, str) else 'list'}")
         return value
 
     def declaration(self, given: Given, unit: str, about: str) -> Declaration:

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.model import fold
-from walop_jax.model.elements import Element
+from walop_jax.model.elements import Analyser, Element
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 from walop_jax.model.ray import NotPlannedError, Ray
@@ -121,11 +121,42 @@ def ray_at(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Ray:
 def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b r 4"]:
     """Band-integrated Mueller rows (band, row, Stokes): all the optics there is at a field point.
 
-    Rows are what the analysers see, arm by arm: S0, then what is analysed. Columns are the light behind the leading
-    elements.
+    Rows are what the analysers see, arm by arm: S0, then what is analysed; where the beams of an analyser differ in
+    wavelength, λ ∂/∂λ of all of these behind them. Columns are the light behind the leading elements.
     """
     instrument = instrument.patched()
-    train, ray = divided(instrument), ray_at(instrument, plan, x, y)
+    wavelength = node_wavelengths(instrument, plan)
+
+    def at(wavelength: Float[Array, " n"]) -> Float[Array, "c n r 4"]:
+        return _node_rows(instrument, plan, Ray.entering(x, y, (wavelength, plan.conditions)))
+
+    if _dispersed(instrument):
+        rows = jnp.concatenate(jax.jvp(at, (wavelength,), (wavelength,)), axis=2)
+    else:
+        rows = at(wavelength)
+    weights = band_weights(instrument, plan)
+    bands = jnp.concatenate(
+        [
+            jnp.einsum("bn,nrs->brs", weights[first:last], rows[i])
+            for i, (_, first, last) in enumerate(plan.settings)
+        ]
+    )
+    analysers, mean = [arm.analyser for arm in instrument.arms], weights @ wavelength
+    if all(analyser.balance is None and analyser.loss is None for analyser in analysers):
+        return bands
+    parts = jnp.split(bands, bands.shape[1] // Analyser.rows, axis=1)
+    return jnp.concatenate(
+        [analysers[i % len(analysers)].in_band(part, mean) for i, part in enumerate(parts)], axis=1
+    )
+
+
+def _dispersed(instrument: Instrument) -> bool:
+    return any(arm.analyser.dispersion is not None for arm in instrument.arms)
+
+
+def _node_rows(instrument: Instrument, plan: Plan, ray: Ray) -> Float[Array, "c n r 4"]:
+    """Rows that the analysers see at every node, in every state."""
+    train = divided(instrument)
     for element in train.leading:
         ray = element.ray(ray)
     common, ray = fold.stations(train.banded, ray)
@@ -133,14 +164,7 @@ def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float
     states = [state for state, _, _ in plan.settings]
     matrices = fold.solved([*common, *(station for arm in arms for station in arm)], plan.moving, states)
     analysers = [arm.analyser for arm in instrument.arms]
-    rows = fold.backward(common, arms, analysers, matrices, plan.moving, states, len(plan.wavelength))
-    weights = band_weights(instrument, plan)
-    return jnp.concatenate(
-        [
-            jnp.einsum("bn,nrs->brs", weights[first:last], rows[i])
-            for i, (_, first, last) in enumerate(plan.settings)
-        ]
-    )
+    return fold.backward(common, arms, analysers, matrices, plan.moving, states, len(plan.wavelength))
 
 
 def throughput_at(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, " k"]:
@@ -175,6 +199,12 @@ def _beams(instrument: Instrument) -> tuple[Int[np.ndarray, "k j"], Float[Array,
         index[cameras, : analyser.rows] = first + np.arange(analyser.rows)
         shares = shares.at[cameras, : analyser.rows].set(analyser.shares())
         first += analyser.rows
+    if _dispersed(instrument):
+        slopes = jnp.zeros_like(shares)
+        for arm in instrument.arms:
+            cameras = np.array([instrument.cameras.names.index(name) for name in arm.analyser.cameras])
+            slopes = slopes.at[cameras].set(arm.analyser.shares_of_slopes())
+        index, shares = np.concatenate([index, first + index], 1), jnp.concatenate([shares, slopes], 1)
     return index, shares
 
 

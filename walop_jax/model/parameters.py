@@ -47,10 +47,11 @@ class Declaration:
 
 
 class Number(NamedTuple):
-    """Unit and meaning of a number that an instrument may leave fixed."""
+    """Unit and meaning of a number that an instrument may leave fixed; `several`: a row of them, at wavelengths."""
 
     unit: str
     about: str
+    several: bool = False
 
 
 def param(
@@ -69,9 +70,9 @@ def param(
     return eqx.field(metadata={PARAMETER: declaration}, converter=_array, **extra)
 
 
-def number(*, unit: str, about: str, default: float | None = 0.0) -> Any:
+def number(*, unit: str, about: str, default: float | None = 0.0, several: bool = False) -> Any:
     """Declare a number of an Equinox module; values become float64 arrays, None stays: nothing of the kind."""
-    return eqx.field(metadata={NUMBER: Number(unit, about)}, converter=_array, default=default)
+    return eqx.field(metadata={NUMBER: Number(unit, about, several)}, converter=_array, default=default)
 
 
 def _array(value: Any) -> Any:

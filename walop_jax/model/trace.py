@@ -102,7 +102,10 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
         ahead.append(mean)
         cameras = np.array([instrument.cameras.names.index(name) for name in arm.analyser.cameras])
         # The rows that the beams are made of, of a matrix whose columns are this light and nothing else.
-        seen = arm.analyser.seen(jnp.zeros((4, 4)).at[:, 0].set(mean))[:, 0]
+        seen = arm.analyser.seen(jnp.zeros((4, 4)).at[:, 0].set(mean))
+        seen = arm.analyser.in_band(seen[None], (weight @ light.node_wavelengths(instrument, plan))[None])[
+            0, :, 0
+        ]
         beams = beams.at[cameras].set(arm.analyser.shares() @ seen)
     names = tuple(arm.name for arm in instrument.arms)
     stages.append(Stage("arms", "ahead of the analysers", names, STOKES, np.asarray(jnp.stack(ahead))))

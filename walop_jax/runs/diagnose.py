@@ -20,6 +20,7 @@ from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.misfit import describe
 from walop_jax.fit.model_builder import model_for
+from walop_jax.fit.refit import with_honest_errors
 from walop_jax.io.errors import errors_naming
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
@@ -67,10 +68,11 @@ def diagnose_sets(
         chosen = model_for(calset, text, design)
     found = diagnose(calset, chosen, seed=seed or 0, progress=tell)
     tell("mapping the field")
-    product = Calibration.from_fit(found.after).to_product()
-    misfit = None if found.after.explains_data else describe(found.after)
+    after = with_honest_errors(found.after)
+    product = Calibration.from_fit(after).to_product()
+    misfit = None if after.explains_data else describe(after)
     content = document(found)
-    fitted = summary(found.after, seconds=time.perf_counter() - began, misfit=misfit) | {"seed": seed}
+    fitted = summary(after, seconds=time.perf_counter() - began, misfit=misfit) | {"seed": seed}
     drawn_from = figure_data(found)
     with atomic_folder(Path(output), OUTPUTS, overwrite=overwrite) as folder:
         write_product(folder / PRODUCT, product)

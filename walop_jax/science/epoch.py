@@ -26,7 +26,7 @@ from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import SKY_AND_STARS, model_like
-from walop_jax.fit.refit import fit
+from walop_jax.fit.refit import fit, with_honest_errors
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import Model
 from walop_jax.science.star_errors import determinant, joint_errors, sample_stars, statistics
@@ -79,7 +79,7 @@ def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]
     if calset.instrument != old.model.name:
         raise ValueError(f"the new set is of {calset.instrument}, the calibration of {old.model.name}")
     model = model_like(calset, old.model)
-    result = fit(Likelihood.of(calset, model))
+    result = with_honest_errors(fit(Likelihood.of(calset, model)))
     if not result.converged:
         raise RuntimeError(f"the fit of the new set did not converge: {result.minimum.message}")
     new = Calibration.from_fit(result)

@@ -6,6 +6,7 @@ from walop_jax.model.elements.collimator import Collimator, RadialRetarder
 from walop_jax.model.elements.geometry import FieldShift, PupilMapping, Wedge
 from walop_jax.model.elements.polariser import EncoderError, Polariser
 from walop_jax.model.elements.simple import AddedPolarisation, Depolariser, Diattenuator, Retarder
+from walop_jax.model.elements.spectral import SpectralElement
 from walop_jax.model.elements.wave_plate import AirGap, Layer, WavePlate
 
 ELEMENTS: tuple[type[Element], ...] = (
@@ -20,6 +21,7 @@ ELEMENTS: tuple[type[Element], ...] = (
     Diattenuator,
     Depolariser,
     AddedPolarisation,
+    SpectralElement,
     Analyser,
 )
 
@@ -39,6 +41,7 @@ __all__ = [
     "PupilMapping",
     "RadialRetarder",
     "Retarder",
+    "SpectralElement",
     "WavePlate",
     "Wedge",
 ]

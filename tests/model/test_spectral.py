@@ -1,0 +1,161 @@
+"""The spectral element against scipy's splines and Mueller matrices by hand; beams that differ in wavelength."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import builders
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+from walop_jax.data.records import FilterCurve, Position
+from walop_jax.io.errors import DataError
+from walop_jax.model.elements import SpectralElement
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import leaves
+from walop_jax.model.planning import plan_for
+from walop_jax.model.ray import Conditions, Ray
+from walop_jax.model.spline import spline
+
+KNOTS = (1.1, 1.3, 1.45, 2.0, 2.4)
+VALUES = np.array([0.3, -0.2, 1.1, 0.9, 2.5])
+TEXT = """
+name = "CURVES"
+path = ["polariser", "mirrors"]
+[field]
+limit = 0.2
+[cameras]
+names = ["left", "right"]
+[throughput]
+degree = 0
+[elements.polariser]
+kind = "polariser"
+moves = "CLP"
+[elements.mirrors]
+kind = "spectral"
+moves = "DEROT"
+axis = 20.0
+delta_at = [1.1, 1.3, 1.45, 2.0, 2.4]
+delta = { value = [0.3, -0.2, 1.1, 0.9, 2.5], sigma = 0.1, unit = "rad" }
+diattenuation_at = [1.6]
+diattenuation = [0.05]
+[arms.main]
+path = ["analyser"]
+[arms.main.elements.analyser]
+kind = "analyser"
+cameras = ["left", "right"]
+efficiency = 0.9
+"""
+
+
+def ray(wavelength) -> Ray:
+    wavelength = jnp.asarray(wavelength)
+    return Ray.entering(
+        jnp.zeros(()), jnp.zeros(()), (wavelength, Conditions(jnp.zeros_like(wavelength), {}))
+    )
+
+
+def test_spline_is_the_natural_one():
+    at = np.linspace(1.1, 2.4, 101)
+    expected = CubicSpline(KNOTS, VALUES, bc_type="natural")
+    np.testing.assert_allclose(spline(KNOTS, jnp.asarray(VALUES), jnp.asarray(at)), expected(at), atol=1e-12)
+    for end in (1.1, 2.4):
+        off = 0.3 * np.sign(end - 1.5)
+        straight = expected(end) + off * expected(end, 1)
+        np.testing.assert_allclose(spline(KNOTS, jnp.asarray(VALUES), jnp.asarray([end + off]))[0], straight)
+
+
+def test_spline_of_one_and_two_values():
+    at = jnp.asarray([1.0, 1.5, 3.0])
+    np.testing.assert_allclose(spline((1.5,), jnp.asarray([0.7]), at), 0.7)
+    np.testing.assert_allclose(spline((1.0, 2.0), jnp.asarray([0.0, 2.0]), at), [0.0, 1.0, 4.0])
+
+
+def test_slope_of_the_spline_is_exact():
+    at = jnp.linspace(0.9, 2.6, 37)
+    slope = jax.vmap(jax.grad(lambda w: spline(KNOTS, jnp.asarray(VALUES), w[None])[0]))(at)
+    inside = (at > 1.1) & (at < 2.4)
+    expected = CubicSpline(KNOTS, VALUES, bc_type="natural")(np.asarray(at), 1)
+    np.testing.assert_allclose(slope[inside], expected[np.asarray(inside)], atol=1e-10)
+
+
+def test_matrix_by_hand():
+    """A diattenuating retarder along +X (k = √(1 − D²)), then a loss."""
+    delta, d, lost = 0.8, 0.3, 0.1
+    element = SpectralElement(
+        delta=[delta],
+        delta_at=(1.0,),
+        diattenuation=[d],
+        diattenuation_at=(1.0,),
+        loss=[lost],
+        loss_at=(1.0,),
+    )
+    k, c, s = np.sqrt(1 - d**2), np.cos(delta), np.sin(delta)
+    by_hand = np.array([[1, d, 0, 0], [d, 1, 0, 0], [0, 0, k * c, k * s], [0, 0, -k * s, k * c]])
+    by_hand[1:] *= 1 - lost
+    np.testing.assert_allclose(element.mueller(ray([0.6, 2.0])), [by_hand, by_hand], atol=1e-14)
+    assert SpectralElement().mueller(ray([0.6])) is None
+    turn = SpectralElement(rotation=[10.0], rotation_at=(1.0,)).mueller(ray([0.6]))[0]
+    up = np.deg2rad(2 * np.array([25.0, 35.0]))
+    np.testing.assert_allclose(
+        turn @ [1, np.cos(up[0]), np.sin(up[0]), 0.2], [1, np.cos(up[1]), np.sin(up[1]), 0.2]
+    )
+
+
+def test_a_description_gives_curves_and_their_parameters(tmp_path):
+    instrument = read(tmp_path, TEXT)
+    assert [name for name in names(instrument) if name.startswith("mirrors")] == [
+        f"mirrors.delta{i}" for i in range(1, 6)
+    ]
+
+
+def names(instrument: Instrument) -> list[str]:
+    return [leaf.name for leaf in leaves(instrument)]
+
+
+def read(folder: Path, text: str) -> Instrument:
+    path = folder / "curves.toml"
+    path.write_text(text)
+    return Instrument.read(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "what"),
+    [
+        ("delta_at = [1.1, 1.3, 1.45, 2.0, 2.4]", "delta_at = [1.1, 1.3]", "5 values for 2 wavelengths"),
+        ("delta_at = [1.1, 1.3, 1.45, 2.0, 2.4]", "", "delta_at is missing"),
+        ("diattenuation_at = [1.6]", "diattenuation_at = [1.6, 1.5]", "increase"),
+        ("diattenuation = [0.05]", "diattenuation = 0.05", "a list of numbers"),
+        ("axis = 20.0", "axis = [20.0]", "one number"),
+    ],
+)
+def test_a_description_that_does_not_fit(tmp_path, old, new, what):
+    with pytest.raises(DataError, match=what):
+        read(tmp_path, TEXT.replace(old, new))
+
+
+# ----------------------------------------------------------------------------- beams of different wavelength
+
+
+def vectors(instrument: Instrument, stretch: float = 1.0) -> np.ndarray:
+    wavelength = np.linspace(1.41, 1.59, 181)
+    curve = FilterCurve("band", stretch * wavelength, np.exp(-0.5 * ((wavelength - 1.5) / 0.025) ** 2))
+    moving = {"DEROT": Position(np.array([True]), np.array([12.0]))}
+    exposures = dataclasses.replace(builders.exposures({"kind": "flux"}), moving=moving)
+    plan = plan_for(instrument, exposures, {"band": curve})
+    return builders.vectors(instrument, plan, 0.0, 0.0)[0, 0]
+
+
+def test_each_beam_sees_its_own_wavelength(tmp_path):
+    """Against instruments without dispersion behind a filter displaced by ±κ: the same to second order in κ."""
+    plain, kappa = read(tmp_path, TEXT), 1e-3
+    both = vectors(plain.changed("main.analyser", dispersion=jnp.asarray(kappa)))
+    first, second = vectors(plain, 1 + kappa)[0], vectors(plain, 1 - kappa)[1]
+    assert np.abs(first - vectors(plain)[0]).max() > 1e-3
+    np.testing.assert_allclose(both, [first, second], atol=1e-5)
+    none = vectors(plain.changed("main.analyser", dispersion=jnp.asarray(0.0)))
+    np.testing.assert_allclose(none, vectors(plain), atol=1e-14)

@@ -1,0 +1,92 @@
+"""An element whose polarisation is a curve over wavelength: mirrors, derotators, coatings, what has no closed form.
+
+Equation    M = depolariser(loss) · R(ρ) · [diattenuator(D) retarder(δ), both along `axis`]; the two commute
+            each of δ(λ), D(λ), ρ(λ), loss(λ) is the natural cubic spline through its values at its own wavelengths,
+            continued as a straight line beyond the first and the last; one value: constant
+Symbols     δ retardance [rad], of the fast axis; D diattenuation along `axis`; ρ angle [deg] by which it turns the
+            polarisation from +X toward +Y, a circular retardance of 2ρ (skew mirrors, optical activity);
+            loss share of q, u, v that is lost
+Sources     mirrors as diattenuating retarders: van Harten, Snik & Keller 2009, PASP 121, 377; form of M: Lu & Chipman
+            1996, JOSA A 13, 1106; spline: de Boor 1978, A Practical Guide to Splines, ch. IV.
+Limits      no values: the identity. A spline with as many knots as bands takes up anything that has no
+            curvature within a band; with fewer it is a smooth curve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from walop_jax.model import mueller
+from walop_jax.model.elements.base import Element, Mueller
+from walop_jax.model.parameters import number
+from walop_jax.model.ray import Ray
+from walop_jax.model.spline import check_curve, spline
+
+Scalar = Float[Array, ""]
+Curve = Float[Array, " k"]
+CURVES = ("delta", "diattenuation", "rotation", "loss")
+
+
+class SpectralElement(Element):
+    """A retarder, diattenuator and depolariser on one axis, each a smooth curve over wavelength."""
+
+    delta: Curve | None = number(unit="rad", about="retardance at `delta_at`", default=None, several=True)
+    diattenuation: Curve | None = number(
+        unit="", about="diattenuation along the axis at `diattenuation_at`", default=None, several=True
+    )
+    rotation: Curve | None = number(
+        unit="deg", about="turn of the polarisation at `rotation_at`", default=None, several=True
+    )
+    loss: Curve | None = number(
+        unit="", about="share of the polarisation lost at `loss_at`", default=None, several=True
+    )
+    axis: Scalar = number(unit="deg", about="fast axis, from +X toward +Y")
+    delta_at: tuple[float, ...] = eqx.field(static=True, default=())
+    diattenuation_at: tuple[float, ...] = eqx.field(static=True, default=())
+    rotation_at: tuple[float, ...] = eqx.field(static=True, default=())
+    loss_at: tuple[float, ...] = eqx.field(static=True, default=())
+
+    kind: ClassVar[str] = "spectral"
+    reference: ClassVar[str] = "van Harten, Snik & Keller 2009, PASP 121, 377"
+
+    def __check_init__(self) -> None:
+        for name in CURVES:
+            check_curve(name, getattr(self, name), getattr(self, f"{name}_at"))
+
+    def labels(self, field: str) -> Sequence[str]:
+        """Values of a curve are numbered from 1, by wavelength."""
+        if field not in CURVES:
+            return (field,)
+        return tuple(f"{field}{i + 1}" for i in range(len(getattr(self, f"{field}_at"))))
+
+    def curve(self, name: str, wavelength: Float[Array, " n"]) -> Float[Array, " n"]:
+        """One of the curves at wavelengths (µm), 0 where there is none."""
+        values = getattr(self, name)
+        return (
+            jnp.zeros_like(wavelength)
+            if values is None
+            else spline(getattr(self, f"{name}_at"), values, wavelength)
+        )
+
+    def mueller(self, ray: Ray) -> Mueller | None:
+        """The element at every wavelength."""
+        matrix, axis = None, jnp.deg2rad(self.axis)
+        if self.delta is not None:
+            matrix = mueller.retarder(self.curve("delta", ray.wavelength), axis)
+        if self.diattenuation is not None:
+            d = self.curve("diattenuation", ray.wavelength)
+            own = mueller.diattenuator(d * jnp.cos(2.0 * axis), d * jnp.sin(2.0 * axis))
+            matrix = own if matrix is None else own @ matrix
+        if self.rotation is not None:
+            own = mueller.rotation(-jnp.deg2rad(self.curve("rotation", ray.wavelength)))
+            matrix = own if matrix is None else own @ matrix
+        if self.loss is not None:
+            kept = 1.0 - self.curve("loss", ray.wavelength)
+            own = jnp.stack([jnp.ones_like(kept), kept, kept, kept], axis=-1)[:, :, None] * jnp.eye(4)
+            matrix = own if matrix is None else own @ matrix
+        return matrix
