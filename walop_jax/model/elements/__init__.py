@@ -5,7 +5,7 @@ from walop_jax.model.elements.base import Element
 from walop_jax.model.elements.collimator import Collimator, RadialRetarder
 from walop_jax.model.elements.geometry import FieldShift, PupilMapping, Wedge
 from walop_jax.model.elements.polariser import EncoderError, Polariser
-from walop_jax.model.elements.simple import AddedPolarisation, Depolariser, Diattenuator, Retarder
+from walop_jax.model.elements.simple import AddedPolarisation, Depolariser, Diattenuator, Retarder, Rotator
 from walop_jax.model.elements.wave_plate import AirGap, Layer, WavePlate
 
 ELEMENTS: tuple[type[Element], ...] = (
@@ -17,6 +17,7 @@ ELEMENTS: tuple[type[Element], ...] = (
     Wedge,
     WavePlate,
     Retarder,
+    Rotator,
     Diattenuator,
     Depolariser,
     AddedPolarisation,
@@ -39,6 +40,7 @@ __all__ = [
     "PupilMapping",
     "RadialRetarder",
     "Retarder",
+    "Rotator",
     "WavePlate",
     "Wedge",
 ]
