@@ -21,7 +21,9 @@ def measured(shared_data):
         pytest.skip(f"{NAME} is not there")
     with fits.open(path) as hdus:
         exposures, points, rows, filters = (hdus[i].data for i in (1, 2, 3, 4))
-        curve = {name.strip(): float(np.ravel(w)[0]) for name, w in zip(filters["FILTER"], filters["WAVELENGTH"])}
+        curve = {
+            name.strip(): float(np.ravel(w)[0]) for name, w in zip(filters["FILTER"], filters["WAVELENGTH"])
+        }
         wavelength = np.array([curve[name.strip()] for name in exposures["FILTER"]])
         counts = np.zeros((len(exposures), len(points), 4))
         number = {int(e): i for i, e in enumerate(exposures["EXPOSURE"])}
@@ -67,7 +69,7 @@ def predicted(x, y, colours):
 
     def rows(x, y):
         ray = Ray.entering(x, y, (jnp.array(colours), None))
-        common, ray = through(north.train()[1:], ray, jnp.eye(4))
+        common, ray = through(list(north.train())[1:], ray, jnp.eye(4))
         parts = []
         for arm in north.arms:
             matrix, _ = through(arm.train(), ray, common)

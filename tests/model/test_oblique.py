@@ -92,7 +92,9 @@ def test_skew_is_that_of_the_axes_of_a_crystal_prism(along, sign):
     assert -turn(axes) == pytest.approx(angle, rel=2e-3)
     # light vibrating along the turned axis is light along +X of the turned axes
     light = np.array([1.0, np.cos(0.2), np.sin(0.2), 0.0])
-    assert np.asarray(Rotator(angle=np.rad2deg(0.1)).mueller(ray(0.0, 0.0))) @ light == pytest.approx([1, 1, 0, 0])
+    assert np.asarray(Rotator(angle=np.rad2deg(0.1)).mueller(ray(0.0, 0.0))) @ light == pytest.approx(
+        [1, 1, 0, 0]
+    )
 
 
 def test_dispersion_changes_the_retardance_by_its_polynomial():
@@ -101,9 +103,14 @@ def test_dispersion_changes_the_retardance_by_its_polynomial():
     changed = dataclasses.replace(layer, slope=jnp.array(0.1), bend=jnp.array(-2.0), twist=jnp.array(3.0))
     index = [materials.CRYSTALS["quartz"].ordinary, materials.CRYSTALS["quartz"].extraordinary]
     difference = [np.asarray(n.refractive_index(wavelength)) for n in index]
-    for made, factor in ((layer, np.ones(3)), (changed, [1 - 0.008 - 0.0128 - 0.001536, 1, 1 + 0.008 - 0.0128 + 0.001536])):
+    for made, factor in (
+        (layer, np.ones(3)),
+        (changed, [1 - 0.008 - 0.0128 - 0.001536, 1, 1 + 0.008 - 0.0128 + 0.001536]),
+    ):
         matrix = np.asarray(WavePlate(layers=(made,)).mueller(ray(0.0, 0.0, wavelength)))
-        delta = 2 * np.pi * 100.0 * (difference[1] - difference[0]) * np.array(factor) / np.asarray(wavelength)
+        delta = (
+            2 * np.pi * 100.0 * (difference[1] - difference[0]) * np.array(factor) / np.asarray(wavelength)
+        )
         assert matrix[:, 3, 3] / matrix[:, 0, 0] == pytest.approx(np.cos(delta), abs=2e-4)  # faces: 1e-5
 
 
@@ -125,5 +132,13 @@ def test_aspect_stretches_the_pupil_along_y():
 
 def test_north_has_these_elements():
     north = nominal_instrument("WALOP-NORTH")
-    assert [e.kind for e in north.elements] == ["polariser", "collimator", "radial_retarder", "pupil_mapping", "wave_plate"]
-    assert [[e.kind for e in arm.elements] for arm in north.arms] == [["wedge", "wave_plate", "rotator", "analyser"]] * 2
+    assert [e.kind for e in north.elements] == [
+        "polariser",
+        "collimator",
+        "radial_retarder",
+        "pupil_mapping",
+        "wave_plate",
+    ]
+    assert [[e.kind for e in arm.elements] for arm in north.arms] == [
+        ["wedge", "wave_plate", "rotator", "analyser"]
+    ] * 2

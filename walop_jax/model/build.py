@@ -170,9 +170,7 @@ class _Maker:
             glass = str(fields["material"])
             raise DataError(f"[{place}] unknown glass {glass!r}; {nearest(glass, materials.GLASSES)}")
         if kind is Wedge and fields.get("frame", FRAMES[0]) not in FRAMES:
-            raise DataError(
-                f"[{place}] frame = {fields['frame']!r} of a wedge must be {' or '.join(FRAMES)}"
-            )
+            raise DataError(f"[{place}] frame = {fields['frame']!r} of a wedge must be {' or '.join(FRAMES)}")
         made = kind(name=text.name, moves=text.moves, declared=declared, **fields)
         self.check_moves(made, place)
         return made
