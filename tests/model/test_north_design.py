@@ -7,6 +7,7 @@ squares; the description must give their ratios without a fit.
 import numpy as np
 import pytest
 from astropy.io import fits
+
 from walop_jax.model.build import nominal_instrument
 
 NAME = "walop_north_design.fits"
@@ -22,7 +23,8 @@ def measured(shared_data):
     with fits.open(path) as hdus:
         exposures, points, rows, filters = (hdus[i].data for i in (1, 2, 3, 4))
         curve = {
-            name.strip(): float(np.ravel(w)[0]) for name, w in zip(filters["FILTER"], filters["WAVELENGTH"])
+            name.strip(): float(np.ravel(w)[0])
+            for name, w in zip(filters["FILTER"], filters["WAVELENGTH"], strict=True)
         }
         wavelength = np.array([curve[name.strip()] for name in exposures["FILTER"]])
         counts = np.zeros((len(exposures), len(points), 4))
@@ -55,6 +57,7 @@ def predicted(x, y, colours):
     """m22, m23, m32, m33 (point, wavelength, 4) of the description, with the calibration plate in at 0 deg."""
     import jax
     import jax.numpy as jnp
+
     from walop_jax.model.compiled import compiled
     from walop_jax.model.ray import Ray
 

@@ -1,4 +1,4 @@
-"""What tilted rays do to the plane of vibration: wedges that turn it, axes of prisms; and numbers that depend on colour.
+"""What tilted rays do to the plane of vibration: wedges that turn it, axes of prisms; numbers that depend on colour.
 
 Outside truth: vectors turned by hand, face by face, and the closed forms of the docstrings.
 """
@@ -8,6 +8,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
 from walop_jax.instruments.description import described
 from walop_jax.io.errors import DataError
 from walop_jax.model import materials
@@ -48,7 +49,7 @@ def turn(matrix):
     return 0.5 * np.arctan2(matrix[2, 1], matrix[1, 1])
 
 
-@pytest.mark.parametrize("kx, ky, angle", [(0.03, 0.08, 0.24), (-0.1, 0.05, -0.24), (0.0, -0.08, 0.1)])
+@pytest.mark.parametrize(("kx", "ky", "angle"), [(0.03, 0.08, 0.24), (-0.1, 0.05, -0.24), (0.0, -0.08, 0.1)])
 def test_wedge_turns_light_as_faces_do_one_by_one(kx, ky, angle):
     wedge = Wedge(angle=angle, frame="turned")
     matrix = np.asarray(wedge.mueller(ray(kx, ky)))[0]
@@ -76,7 +77,7 @@ def test_wedge_keeps_the_frame_unless_told():
         build(parsed(text, "here"))
 
 
-@pytest.mark.parametrize("along, sign", [((0.0, 1.0), 1.0), ((1.0, 0.0), -1.0)])
+@pytest.mark.parametrize(("along", "sign"), [((0.0, 1.0), 1.0), ((1.0, 0.0), -1.0)])
 def test_skew_is_that_of_the_axes_of_a_crystal_prism(along, sign):
     index, kx, ky = 1.6, 0.02, 0.03
     inside = np.array([kx, ky, 0.0]) / index

@@ -59,7 +59,7 @@ class Wedge(Element):
         """The ray behind the wedge."""
         return ray.toward(*optics.behind_wedge((ray.kx, ray.ky, ray.kz), self.angle, self.index(ray)))
 
-    def index(self, ray: Ray) -> Float[Array, "..."]:
+    def index(self, ray: Ray) -> Float[Array, ...]:
         """Refractive index of the glass at the wavelengths of a ray."""
         return materials.GLASSES[self.material].dispersion.refractive_index(ray.wavelength)
 

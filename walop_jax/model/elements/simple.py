@@ -1,4 +1,4 @@
-"""Elements that are one Mueller matrix: retarder, rotator, diattenuator, depolariser, polarisation added by a telescope.
+"""Elements that are one Mueller matrix: retarder, rotator, diattenuator, depolariser, polarisation of a telescope.
 
 Sources     retarder: Paper II of WALOP-South, appendix B; diattenuator: Lu & Chipman 1996, JOSA A 13, 1106, eq. 18;
             depolariser: ibid., eq. 32, diagonal.
