@@ -22,10 +22,8 @@ def measured(shared_data):
         pytest.skip(f"{NAME} is not there")
     with fits.open(path) as hdus:
         exposures, points, rows, filters = (hdus[i].data for i in (1, 2, 3, 4))
-        curve = {
-            name.strip(): float(np.ravel(w)[0])
-            for name, w in zip(filters["FILTER"], filters["WAVELENGTH"], strict=True)
-        }
+        names = [name.strip() for name in filters["FILTER"]]
+        curve = dict(zip(names, (float(np.ravel(w)[0]) for w in filters["WAVELENGTH"]), strict=True))
         wavelength = np.array([curve[name.strip()] for name in exposures["FILTER"]])
         counts = np.zeros((len(exposures), len(points), 4))
         number = {int(e): i for i, e in enumerate(exposures["EXPOSURE"])}
@@ -59,7 +57,7 @@ def predicted(x, y, colours):
     import jax.numpy as jnp
 
     from walop_jax.model.compiled import compiled
-    from walop_jax.model.ray import Ray
+    from walop_jax.model.ray import Conditions, Ray
 
     north = nominal_instrument("WALOP-NORTH")
 
@@ -71,7 +69,7 @@ def predicted(x, y, colours):
         return matrix, ray
 
     def rows(x, y):
-        ray = Ray.entering(x, y, (jnp.array(colours), None))
+        ray = Ray.entering(x, y, (jnp.array(colours), Conditions(jnp.zeros(()), {})))
         common, ray = through(list(north.train())[1:], ray, jnp.eye(4))
         parts = []
         for arm in north.arms:
