@@ -38,7 +38,6 @@ SOUTH = {
     "half2.plate.mgf2": (1930.0, 1.0, "um"),
     "half2.efficiency": (0.999, 0.0003, ""),
 }
-NORTH = SOUTH | {"pupil.magnification": (19.5, 0.05, "")}
 QUARTZ = 582.484539824296  # µm: with 474 µm of MgF2 half a wave at 0.62 µm
 LAB = SOUTH | {
     "collimator.diattenuation": (0.0, 0.003, "deg-2"),
@@ -48,7 +47,8 @@ LAB = SOUTH | {
     **{f"{p}.quartz": (QUARTZ, 1.0, "um") for p in ("chwp", "half1.plate", "half2.plate")},
     **{f"{p}.mgf2": (474.0, 1.0, "um") for p in ("chwp", "half1.plate", "half2.plate")},
 }
-DESIGNS = {"WALOP-SOUTH": SOUTH, "WALOP-NORTH": NORTH, "WALOP-LAB": LAB}
+DESIGNS = {"WALOP-SOUTH": SOUTH, "WALOP-LAB": LAB}
+SHIPPED = ("WALOP-LAB", "WALOP-NORTH", "WALOP-SOUTH")
 SITES = {
     "WALOP-SOUTH": (-32.3795, 20.8107, 1798.0),
     "WALOP-NORTH": (35.2120, 24.8982, 1750.0),
@@ -66,7 +66,7 @@ def table(instrument: Instrument) -> dict[str, tuple[float, float | None, str]]:
 
 
 def test_these_are_shipped():
-    assert shipped() == tuple(sorted(DESIGNS))
+    assert shipped() == SHIPPED
 
 
 @pytest.mark.parametrize("name", DESIGNS)
@@ -102,12 +102,20 @@ def test_what_is_fixed_is_that_of_the_design(name):
 
 
 def test_sources_of_the_numbers_are_said():
-    for name in DESIGNS:
+    for name in SHIPPED:
         assert all(leaf.declaration.source for leaf in leaves(nominal_instrument(name)))
         assert all(leaf.declaration.about for leaf in leaves(nominal_instrument(name)))
 
 
-@pytest.mark.parametrize("name", DESIGNS)
+def test_names_of_the_family_stay_where_more_are_known():
+    """WALOP-NORTH has every parameter of WALOP-SOUTH, its columns, cameras and place."""
+    north, south = nominal_instrument("WALOP-NORTH"), nominal_instrument("WALOP-SOUTH")
+    assert set(table(south)) < set(table(north))
+    assert (north.moving(), north.cameras) == (south.moving(), south.cameras)
+    assert described("WALOP-NORTH").place[1:4] == SITES["WALOP-NORTH"]
+
+
+@pytest.mark.parametrize("name", SHIPPED)
 def test_a_shipped_name_may_be_written_small(name):
     assert Instrument.read(name.lower()).name == name
 

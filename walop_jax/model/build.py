@@ -23,6 +23,7 @@ from walop_jax.io.errors import DataError, nearest
 from walop_jax.model import legendre, materials
 from walop_jax.model.cameras import Cameras, Throughput
 from walop_jax.model.elements import ELEMENTS, Analyser, Element, Layer, Polariser, WavePlate, Wedge
+from walop_jax.model.elements.geometry import FRAMES
 from walop_jax.model.elements.wave_plate import MODELS
 from walop_jax.model.instrument import Arm, Instrument
 from walop_jax.model.parameters import Component, Declaration, numbers_of, unknown_name
@@ -168,6 +169,8 @@ class _Maker:
         if kind is Wedge and fields.get("material", Wedge.material) not in materials.GLASSES:
             glass = str(fields["material"])
             raise DataError(f"[{place}] unknown glass {glass!r}; {nearest(glass, materials.GLASSES)}")
+        if kind is Wedge and fields.get("frame", FRAMES[0]) not in FRAMES:
+            raise DataError(f"[{place}] frame = {fields['frame']!r} of a wedge must be {' or '.join(FRAMES)}")
         try:
             made = kind(name=text.name, moves=text.moves, declared=declared, **fields)
         except ValueError as error:

@@ -5,7 +5,7 @@ from walop_jax.model.elements.base import Element
 from walop_jax.model.elements.collimator import Collimator, RadialRetarder
 from walop_jax.model.elements.geometry import FieldShift, PupilMapping, Wedge
 from walop_jax.model.elements.polariser import EncoderError, Polariser
-from walop_jax.model.elements.simple import AddedPolarisation, Depolariser, Diattenuator, Retarder
+from walop_jax.model.elements.simple import AddedPolarisation, Depolariser, Diattenuator, Retarder, Rotator
 from walop_jax.model.elements.spectral import SpectralElement
 from walop_jax.model.elements.wave_plate import AirGap, Layer, WavePlate
 
@@ -18,6 +18,7 @@ ELEMENTS: tuple[type[Element], ...] = (
     Wedge,
     WavePlate,
     Retarder,
+    Rotator,
     Diattenuator,
     Depolariser,
     AddedPolarisation,
@@ -41,6 +42,7 @@ __all__ = [
     "PupilMapping",
     "RadialRetarder",
     "Retarder",
+    "Rotator",
     "SpectralElement",
     "WavePlate",
     "Wedge",

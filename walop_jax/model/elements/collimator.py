@@ -1,7 +1,7 @@
 """Lenses that polarise weakly: diattenuation and retardance growing with the square of the field radius.
 
 Equation    diattenuation (q, u) = c r² (cos 2φ, sin 2φ) + (c_q, c_u)
-            retardance Δ = 2π delta (r/0.3°)², fast axis radial
+            retardance Δ = 2π (delta + slope u + bend u²) (r/0.3°)², fast axis radial, u = λ − 0.62 µm (coatings)
 Symbols     r, φ polar coordinates of the field point [deg]; c [deg⁻²]; delta in waves at 0.3°
 Source      Fresnel transmission of curved surfaces and stress of mounted lenses, both ∝ r²: Paper II of WALOP-South
             (Maharana et al. 2022); Selbing 2010, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146.
@@ -23,6 +23,7 @@ from walop_jax.model.ray import Ray
 
 Scalar = Float[Array, ""]
 REFERENCE_RADIUS = 0.3  # degrees
+REFERENCE_WAVELENGTH = 0.62  # µm
 PAPER_II = "Maharana et al. 2022, Paper II"
 
 
@@ -46,15 +47,21 @@ class Collimator(Element):
 class RadialRetarder(Element):
     """Retardance with a radial fast axis, growing with the square of the field radius."""
 
-    delta: Scalar = number(unit="wave", about="retardance at 0.3°")
+    delta: Scalar = number(unit="wave", about="retardance at 0.3° (and 0.62 µm)")
+    slope: Scalar | None = number(unit="wave/um", about="change of it with wavelength", default=None)
+    bend: Scalar | None = number(unit="wave/um2", about="the same, per square of λ − 0.62 µm", default=None)
 
     kind: ClassVar[str] = "radial_retarder"
     reference: ClassVar[str] = "Selbing 2010, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146"
 
     def mueller(self, ray: Ray) -> Mueller:
         """A linear retarder, smooth at the centre of the field."""
-        x, y = ray.x, ray.y
-        k = 2.0 * jnp.pi * self.delta / REFERENCE_RADIUS**2
+        x, y, delta = ray.x, ray.y, self.delta
+        if self.slope is not None:
+            delta = delta + self.slope * (ray.wavelength - REFERENCE_WAVELENGTH)
+        if self.bend is not None:
+            delta = delta + self.bend * (ray.wavelength - REFERENCE_WAVELENGTH) ** 2
+        k = 2.0 * jnp.pi * delta / REFERENCE_RADIUS**2
         a, b, total = k * (x**2 - y**2), k * 2.0 * x * y, k * (x**2 + y**2)
         sine = jnp.sinc(total / jnp.pi)  # sin Δ / Δ
         bend = 0.5 * jnp.sinc(0.5 * total / jnp.pi) ** 2  # (1 − cos Δ) / Δ²

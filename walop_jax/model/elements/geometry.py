@@ -8,12 +8,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from walop_jax.model import materials, optics
-from walop_jax.model.elements.base import Element
+from walop_jax.model import materials, mueller, optics
+from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.parameters import number
 from walop_jax.model.ray import Ray
 
 Scalar = Float[Array, ""]
+FRAMES = ("kept", "turned")
 
 
 class PupilMapping(Element):
@@ -21,21 +22,31 @@ class PupilMapping(Element):
 
     magnification: Scalar = number(unit="", about="field-to-pupil magnification", default=1.0)
     distortion: Scalar = number(unit="deg-2", about="cubic distortion")
+    aspect: Scalar | None = number(
+        unit="", about="magnification along Y over that along X, minus 1", default=None
+    )
 
     kind: ClassVar[str] = "pupil_mapping"
     reference: ClassVar[str] = "Maharana et al. 2022, Paper II, appendix B"
 
     def ray(self, ray: Ray) -> Ray:
         """The collimated ray."""
-        kx, ky, _ = optics.pupil_direction(ray.x, ray.y, self.magnification, self.distortion)
+        kx, ky, _ = optics.pupil_direction(
+            ray.x, ray.y, self.magnification, self.distortion, 0.0 if self.aspect is None else self.aspect
+        )
         return ray.toward(kx, ky)
 
 
 class Wedge(Element):
-    """A glass wedge: exact refraction, no rotation of the frame, no loss."""
+    """A glass wedge: exact refraction, no loss.
+
+    `frame` says what becomes of the plane of vibration: `kept` in the carried axes of the rays (no rotation), or
+    `turned` with the ray at each face, as it is for light (see `optics.wedge_rotation`).
+    """
 
     angle: Scalar = number(unit="rad", about="wedge angle")
     material: str = eqx.field(static=True, default="BK7")
+    frame: str = eqx.field(static=True, default=FRAMES[0])
 
     kind: ClassVar[str] = "wedge"
     reference: ClassVar[str] = "Born & Wolf, Principles of Optics, 1.5.1"
@@ -46,8 +57,18 @@ class Wedge(Element):
 
     def ray(self, ray: Ray) -> Ray:
         """The ray behind the wedge."""
-        index = materials.GLASSES[self.material].dispersion.refractive_index(ray.wavelength)
-        return ray.toward(*optics.behind_wedge((ray.kx, ray.ky, ray.kz), self.angle, index))
+        return ray.toward(*optics.behind_wedge((ray.kx, ray.ky, ray.kz), self.angle, self.index(ray)))
+
+    def index(self, ray: Ray) -> Float[Array, ...]:
+        """Refractive index of the glass at the wavelengths of a ray."""
+        return materials.GLASSES[self.material].dispersion.refractive_index(ray.wavelength)
+
+    def mueller(self, ray: Ray) -> Mueller | None:
+        """Rotation of the plane of vibration against the carried axes; None where it is kept."""
+        if self.frame == "kept":
+            return None
+        direction = (ray.kx, ray.ky, ray.kz)
+        return mueller.rotation(-optics.wedge_rotation(direction, self.angle, self.index(ray)))
 
 
 class FieldShift(Element):

@@ -1,4 +1,4 @@
-"""Elements that are one Mueller matrix: retarder, diattenuator, depolariser, polarisation added by a telescope.
+"""Elements that are one Mueller matrix: retarder, rotator, diattenuator, depolariser, polarisation of a telescope.
 
 Sources     retarder: Paper II of WALOP-South, appendix B; diattenuator: Lu & Chipman 1996, JOSA A 13, 1106, eq. 18;
             depolariser: ibid., eq. 32, diagonal.
@@ -36,6 +36,25 @@ class Retarder(Element):
         """The retarder."""
         delta = self.delta if self.wavelength is None else self.delta * self.wavelength / ray.wavelength
         return mueller.retarder(delta, jnp.deg2rad(self.axis))
+
+
+class Rotator(Element):
+    """Stokes parameters referred to turned axes: by a constant, and more for oblique rays.
+
+    Equation: angle + skew · k_x k_y (rad), from +X toward +Y, k the direction in air. Ahead of an analyser it turns the
+    analyser: beams of a crystal prism are polarised along n × k for an optic axis n. To second order that is skew
+    = 1/(2 N²) for an optic axis along Y and −1/(2 N²) along X, in a medium of index N.
+    """
+
+    angle: Scalar = number(unit="deg", about="rotation, from +X toward +Y")
+    skew: Scalar = number(unit="", about="rotation (rad) of oblique rays, per unit of k_x k_y")
+
+    kind: ClassVar[str] = "rotator"
+    reference: ClassVar[str] = "Chipman, Lam & Young 2018, Polarized Light and Optical Systems, ch. 17"
+
+    def mueller(self, ray: Ray) -> Mueller:
+        """The rotation."""
+        return mueller.rotation(jnp.deg2rad(self.angle) + self.skew * ray.kx * ray.ky)
 
 
 class Diattenuator(Element):

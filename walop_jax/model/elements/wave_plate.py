@@ -1,6 +1,8 @@
 """Wave plates: crystal layers in contact, solved as plane waves (equations: `plates`).
 
 Layers      optic axis of a layer at fast axis + axis, out of its surface by cut.
+Dispersion  n_e − n_o → (n_e − n_o) (1 + a u + b u² + c u³), u = λ − 0.62 µm: what a crystal, or the catalogue of a
+            design program, differs from the published curve; its part at 0.62 µm is a matter of thickness.
 Thermal     n_e − n_o → (n_e − n_o) (1 − thermal · b · (T − 10 °C)), b the published change per kelvin.
 Air gap     diattenuator D = contrast · cos(4π gap cos ϑ / λ) along the fast axis, directly ahead of the plate;
             ϑ angle of the ray in air.
@@ -25,6 +27,7 @@ from walop_jax.model.ray import Ray
 
 Scalar = Float[Array, ""]
 Real = Float[Array, "..."]
+REFERENCE_WAVELENGTH = 0.62  # µm
 # Inlined: the operations are those of the plain functions, but they are traced once for all plates of a kind.
 MODELS = {
     name: jax.jit(function, inline=True)
@@ -40,6 +43,9 @@ class Layer(Component):
     thickness: Scalar = number(unit="um", about="thickness")
     axis: Scalar = number(unit="deg", about="optic axis, from the fast axis of the plate")
     cut: Scalar | None = number(unit="deg", about="optic axis out of the surface", default=None)
+    slope: Scalar | None = number(unit="um-1", about="dispersion: a of n_e − n_o", default=None)
+    bend: Scalar | None = number(unit="um-2", about="dispersion: b of n_e − n_o", default=None)
+    twist: Scalar | None = number(unit="um-3", about="dispersion: c of n_e − n_o", default=None)
     declared: tuple[tuple[str, Declaration], ...] = eqx.field(static=True, default=())
 
     def declarations(self) -> Mapping[str, Declaration]:
@@ -90,6 +96,11 @@ class WavePlate(Element):
             crystal = materials.CRYSTALS[layer.material]
             ordinary = crystal.ordinary.refractive_index(ray.wavelength)
             extraordinary = crystal.extraordinary.refractive_index(ray.wavelength)
+            changes = (layer.slope, layer.bend, layer.twist)
+            if any(change is not None for change in changes):
+                u = ray.wavelength - REFERENCE_WAVELENGTH
+                factor = 1.0 + sum(c * u**k for k, c in enumerate(changes, start=1) if c is not None)
+                extraordinary = ordinary + (extraordinary - ordinary) * factor
             if self.thermal is not None:
                 warmer = self.thermal * (ray.conditions.temperature - materials.REFERENCE_TEMPERATURE)
                 extraordinary = ordinary + (extraordinary - ordinary) * (1.0 - crystal.thermal * warmer)
