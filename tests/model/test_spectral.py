@@ -102,7 +102,8 @@ def test_matrix_by_hand():
     turn = SpectralElement(rotation=[10.0], rotation_at=(1.0,)).mueller(ray([0.6]))[0]
     up = np.deg2rad(2 * np.array([25.0, 35.0]))
     np.testing.assert_allclose(
-        turn @ [1, np.cos(up[0]), np.sin(up[0]), 0.2], [1, np.cos(up[1]), np.sin(up[1]), 0.2]
+        np.asarray(turn) @ np.array([1, np.cos(up[0]), np.sin(up[0]), 0.2]),
+        [1, np.cos(up[1]), np.sin(up[1]), 0.2],
     )
 
 
