@@ -13,6 +13,7 @@ NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 LONG = (
     "hidden_effect",
     "paper_versus_joint",
+    "posteriors",
     "your_own_effect",
 )  # minutes each; the rooms that they call have tests of their own
 TIMEOUT = 900  # seconds per cell, on a machine that does other things as well
