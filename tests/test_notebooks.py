@@ -14,6 +14,7 @@ LONG = (
     "charis",
     "hidden_effect",
     "paper_versus_joint",
+    "posteriors",
     "your_own_effect",
 )  # minutes each; the rooms that they call have tests of their own
 NOT_OURS = {"charis": ("CHARIS_TABLE", "charis_internal.ecsv")}

@@ -43,6 +43,7 @@ def test_a_fit(call, fitted: FittedSet, tmp_path: Path, monkeypatch):
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.long
 def test_a_diagnosis(spoilt: Path, tmp_path: Path, monkeypatch):
     told: list[str] = []
     found = diagnose.diagnose_sets([spoilt], tmp_path / "caller", seed=3, progress=told.append)

@@ -90,6 +90,7 @@ def test_a_run_that_is_interrupted_goes_on_where_it_was(frames, large, tmp_path)
     assert not (tmp_path / "cut" / "partial").exists()
 
 
+@pytest.mark.long
 def test_a_fit_in_python_is_resumed_as_well(frames, large, tmp_path):
     calset = read_calibration_set(frames)
     folder, stop = tmp_path / "kept", Interrupting(3)

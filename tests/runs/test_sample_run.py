@@ -25,6 +25,7 @@ def copied(fitted: FittedSet, folder: Path) -> Path:
     return Path(shutil.copytree(fitted.run, folder))
 
 
+@pytest.mark.long
 def test_an_interrupted_run_goes_on_as_if_nothing_had_been(
     call, fitted: FittedSet, tmp_path: Path, monkeypatch
 ):
