@@ -247,9 +247,11 @@ class _Maker:
         if isinstance(value, Given):
             if value.parameter:
                 raise DataError(f"{what} cannot be a parameter")
-            inner = value.value
-            whole = isinstance(default, int | float) and not isinstance(inner, tuple)
-            value = type(default)(inner) if whole else inner
+            value = value.value
+        if isinstance(default, int | float):
+            if not isinstance(value, int | float):
+                raise DataError(f"{what} = {value!r} must be one number")
+            return type(default)(value)
         if isinstance(default, str | tuple) and not isinstance(value, type(default)):
             raise DataError(f"{what} = {value!r} must be a {'name' if isinstance(default, str) else 'list'}")
         return value
