@@ -293,7 +293,7 @@ def test_model_is_a_file_that_refit_takes(call, calset_file, tmp_path):
     north = ("model", "--instrument", "WALOP-NORTH", "-o", path)
     assert "exists already" in one_line(call(*north))
     told = json.loads(call(*north, "--overwrite", "--json").stdout)
-    assert told["parameters"]["pupil.magnification"]["start"] == 19.5
+    assert told["parameters"]["pupil.magnification"]["start"] == pytest.approx(20.371, abs=0.003)
     assert tomllib.loads(path.read_text())["model"]["instrument"] == "WALOP-NORTH"
 
 
