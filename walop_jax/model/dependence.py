@@ -7,7 +7,6 @@ parameter through the operations of `light.band_rows`: those that reach the resu
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -44,29 +43,39 @@ def _of_shapes(structure: Any, shapes: Shapes) -> Instrument:
 
 def needs(instrument: Instrument) -> Needs:
     """What the light path of an instrument, effects included, asks for; found by running it on shapes alone."""
-    return _needs(*_shapes(instrument))
+    return _followed(*_shapes(instrument))[0]
+
+
+def optical_indices(instrument: Instrument) -> tuple[int, ...]:
+    """Positions of the parameters that enter before the band integral."""
+    _, reached = _followed(*_shapes(instrument))
+    flags = [reached[place] for place, count in parameter_places(instrument) for _ in range(count)]
+    assert len(flags) == len(leaves(instrument))
+    return tuple(i for i, flag in enumerate(flags) if flag)
 
 
 @functools.lru_cache(maxsize=256)
-def _needs(structure: Any, shapes: Shapes) -> Needs:
-    instrument = _of_shapes(structure, shapes)
+def _followed(structure: Any, shapes: Shapes) -> tuple[Needs, tuple[bool, ...]]:
+    """What the light path asks for, and which arrays of the instrument reach the rows of its bands: in one go."""
     asked: set[str] = set()
     median = False
 
-    def run(instrument: Instrument) -> tuple[Array, Array]:
+    def run(*arrays: Array) -> tuple[Array, Array]:
+        instrument = jax.tree_util.tree_unflatten(structure, arrays)
         plan = blank_plan(instrument, asked, median)
-        zero = jnp.zeros(())
-        rows = light.band_rows(instrument, plan, zero, zero)
+        # Off the axis and at an odd place: a dependence must not vanish by symmetry in the operations that are written.
+        x, y = jnp.asarray(0.11), jnp.asarray(0.07)
+        rows = light.band_rows(instrument, plan, x, y)
         each = jnp.zeros_like(plan.exposures.kind)
         counts = light.counts(
-            instrument, plan, rows, light.throughput_at(instrument, zero, zero), zero, zero,
+            instrument, plan, rows, light.throughput_at(instrument, x, y), x, y,
             jnp.zeros((*each.shape, 2)), each - 1, each,
         )  # fmt: skip
         return rows, light.detected(instrument, plan.exposures, counts)
 
     while True:
         try:
-            jax.eval_shape(run, instrument)
+            program = jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(s, d) for s, d in shapes))
             break
         except NotPlannedError as missing:
             if missing.quantity in asked or (missing.quantity == "median" and median):
@@ -75,9 +84,11 @@ def _needs(structure: Any, shapes: Shapes) -> Needs:
                 median = True
             else:
                 asked.add(missing.quantity)
-    patched = jax.eval_shape(lambda i: i.patched(), instrument)
+    patched = jax.eval_shape(lambda i: i.patched(), _of_shapes(structure, shapes))
     parts = [*patched.elements, *(element for arm in patched.arms for element in arm.elements)]
-    return Needs(frozenset(asked), median, max((part.path_difference for part in parts), default=0.0))
+    longest = max((part.path_difference for part in parts), default=0.0)
+    rows, _ = program.jaxpr.outvars
+    return Needs(frozenset(asked), median, longest), _reaching(program, rows)
 
 
 def conditions_asked_by(element: Element) -> frozenset[str]:
@@ -100,32 +111,10 @@ def conditions_asked_by(element: Element) -> frozenset[str]:
             asked.add(missing.quantity)
 
 
-def optical_indices(instrument: Instrument) -> tuple[int, ...]:
-    """Positions of the parameters that enter before the band integral."""
-    return _optical(*_shapes(instrument))
-
-
-@functools.lru_cache(maxsize=256)
-def _optical(structure: Any, shapes: Shapes) -> tuple[int, ...]:
-    instrument = _of_shapes(structure, shapes)
-    asked = _needs(structure, shapes)
-
-    def rows(*arrays: Array) -> Array:
-        whole = jax.tree_util.tree_unflatten(structure, arrays)
-        plan = blank_plan(whole, asked.conditions, asked.median)
-        # Off the axis and at an odd place: a dependence must not vanish by symmetry in the operations that are written.
-        return light.band_rows(whole, plan, jnp.asarray(0.11), jnp.asarray(0.07))
-
-    reached = _reaching(jax.make_jaxpr(rows)(*jax.tree_util.tree_leaves(instrument)))
-    flags = [reached[place] for place, count in parameter_places(instrument) for _ in range(count)]
-    assert len(flags) == len(leaves(instrument))
-    return tuple(i for i, flag in enumerate(flags) if flag)
-
-
-def _reaching(program: Any) -> Sequence[bool]:
-    """Which inputs of a traced program reach its outputs; an inner program counts as using all it is given."""
-    needed = {id(v) for v in program.jaxpr.outvars}
+def _reaching(program: Any, result: Any) -> tuple[bool, ...]:
+    """Which inputs of a traced program reach one of its results; an inner program counts as using all it is given."""
+    needed = {id(result)}
     for equation in reversed(program.jaxpr.eqns):
         if any(id(v) in needed for v in equation.outvars):
             needed |= {id(v) for v in equation.invars}
-    return [id(v) in needed for v in program.jaxpr.invars]
+    return tuple(id(v) in needed for v in program.jaxpr.invars)
