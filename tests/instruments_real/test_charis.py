@@ -20,6 +20,7 @@ NOTEBOOKS = Path(__file__).resolve().parents[2] / "notebooks"
 sys.path.insert(0, str(NOTEBOOKS))
 from charis import asymmetry, bin_by_bin, charis_set, left_over  # noqa: E402
 
+pytestmark = pytest.mark.long  # ten minutes
 LEFT_OUT = 3  # derotator angle
 
 
