@@ -6,7 +6,7 @@ import dataclasses
 import math
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,8 @@ from walop_jax.data.user_tables import read_input_table, table_format, write_out
 from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import errors_naming
 from walop_jax.posterior.propagate import with_moments
-from walop_jax.runs.left_out import KEY, left_out_cards, left_out_sentences
+from walop_jax.runs.left_out import left_out_cards, left_out_sentences
+from walop_jax.runs.written_table import WrittenTable
 from walop_jax.science.apply import apply
 from walop_jax.science.polarisation import ESTIMATORS
 from walop_jax.science.stokes_columns import header, stokes_columns
@@ -36,38 +37,17 @@ BITS = (
 
 
 @dataclasses.dataclass(frozen=True)
-class StokesTable:
-    """A catalogue that was written.
+class StokesTable(WrittenTable):
+    """A catalogue that was written: its stars, the estimator of p, and the time it took."""
 
-    `flags` counts the stars with each bit of FLAG; `product` is the content hash of the calibration, `trusted` what
-    it says of itself; `not_carried_over` names effects of its model that cannot be undone in a catalogue; `warnings`
-    are sentences about all of that.
-    """
-
-    path: Path
-    rows: int
     stars: int
     seconds: float
     estimator: str
-    trusted: bool
-    flags: Mapping[Quality, int]
-    product: str
-    not_carried_over: tuple[str, ...]
-    warnings: tuple[str, ...]
 
     def document(self) -> dict[str, Any]:
         """Everything but the warnings as plain data."""
-        return {
-            "output": str(self.path),
-            "rows": self.rows,
-            "stars": self.stars,
-            "seconds": self.seconds,
-            "estimator": self.estimator,
-            "trusted": self.trusted,
-            "flags": {str(int(bit)): count for bit, count in self.flags.items()},
-            "product": self.product,
-            KEY: list(self.not_carried_over),
-        }
+        own = {"stars": self.stars, "seconds": self.seconds, "estimator": self.estimator}
+        return super().document() | own
 
 
 def apply_to_catalogue(

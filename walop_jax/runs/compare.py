@@ -8,17 +8,15 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.data import DEFAULT_FILTER, read_calibration_set
+from walop_jax.data import DEFAULT_FILTER
 from walop_jax.data.field_points import true_matrices
 from walop_jax.data.user_tables import new_table, write_output_table
-from walop_jax.fit.model_builder import model_for
 from walop_jax.fit.refit import refit
-from walop_jax.io.errors import errors_naming
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
-from walop_jax.model.instrument import Instrument
 from walop_jax.paper.comparison import Comparison, compare
 from walop_jax.reports import comparison_figures
+from walop_jax.runs.inputs import sets_and_model
 from walop_jax.runs.left_out import KEY, left_out_cards, left_out_sentences
 from walop_jax.science.star_errors import Truth
 
@@ -67,10 +65,7 @@ def compare_methods(
     text = "" if model is None else read_text(model)
     check_folder(output, OUTPUTS, overwrite=overwrite)
     tell("reading")
-    calset = read_calibration_set(*calsets)
-    design = None if instrument is None else Instrument.read(instrument)
-    with errors_naming(model):
-        chosen = model_for(calset, text, design)
+    calset, chosen = sets_and_model(calsets, text, model, instrument)
     known = None if truth is None else Truth(*true_matrices(truth, chosen.template.patched()))
     tell("fitting the joint model")
     result = refit(calset, chosen, progress=tell)

@@ -12,19 +12,16 @@ from typing import Any
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import write_product
 from walop_jax.calibration.summary import PRODUCT, SUMMARY, summary
-from walop_jax.data import read_calibration_set
 from walop_jax.diagnosis.document import DIAGNOSIS, document
 from walop_jax.diagnosis.figure_data import figure_data
 from walop_jax.diagnosis.figure_file import FIGURE_DATA, write_figure_data
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.misfit import describe
-from walop_jax.fit.model_builder import model_for
 from walop_jax.fit.refit import with_honest_errors
-from walop_jax.io.errors import errors_naming
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
-from walop_jax.model.instrument import Instrument
+from walop_jax.runs.inputs import sets_and_model
 
 OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, FIGURE_DATA)
 
@@ -62,10 +59,7 @@ def diagnose_sets(
     text = "" if model is None else read_text(model)
     check_folder(output, OUTPUTS, overwrite=overwrite)
     tell("reading")
-    calset = read_calibration_set(*calsets)
-    design = None if instrument is None else Instrument.read(instrument)
-    with errors_naming(model):
-        chosen = model_for(calset, text, design)
+    calset, chosen = sets_and_model(calsets, text, model, instrument)
     found = diagnose(calset, chosen, seed=seed or 0, progress=tell)
     tell("mapping the field")
     after = with_honest_errors(found.after)

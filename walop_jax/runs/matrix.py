@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from walop_jax.calibration.from_file import read_calibration
 from walop_jax.calibration.matrix_table import matrix_columns
@@ -16,39 +14,11 @@ from walop_jax.data.user_tables import read_input_table, table_format, write_out
 from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import errors_naming
 from walop_jax.posterior.propagate import with_draws
-from walop_jax.runs.left_out import KEY, left_out_cards, left_out_sentences
+from walop_jax.runs.left_out import left_out_cards, left_out_sentences
+from walop_jax.runs.written_table import WrittenTable
 
 BITS = (Quality.HIGH_CROSSTALK, Quality.BEYOND_FIELD, Quality.BEYOND_SETTINGS)
 """Bits of FLAG that a row of a table of matrices can have."""
-
-
-@dataclasses.dataclass(frozen=True)
-class MatrixTable:
-    """A table that was written.
-
-    `flags` counts the rows with each bit of FLAG; `product` is the content hash of the calibration, `trusted` what
-    it says of itself; `not_carried_over` names effects of its model that no matrix can have; `warnings` are sentences
-    about all of that.
-    """
-
-    path: Path
-    rows: int
-    trusted: bool
-    flags: Mapping[Quality, int]
-    product: str
-    not_carried_over: tuple[str, ...]
-    warnings: tuple[str, ...]
-
-    def document(self) -> dict[str, Any]:
-        """Everything but the warnings as plain data."""
-        return {
-            "output": str(self.path),
-            "rows": self.rows,
-            "trusted": self.trusted,
-            "flags": {str(int(bit)): count for bit, count in self.flags.items()},
-            "product": self.product,
-            KEY: list(self.not_carried_over),
-        }
 
 
 def tabulate_matrix(
@@ -59,7 +29,7 @@ def tabulate_matrix(
     posterior: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
     progress: Callable[[str], None] | None = None,
-) -> MatrixTable:
+) -> WrittenTable:
     """Add M21, M22, …, their errors and FLAG to the table `points`, and write it as `output`.
 
     `product` is a calibration product or the folder of a run; with `posterior` (a `posterior.nc`) values and errors
@@ -90,7 +60,7 @@ def tabulate_matrix(
     warnings += [
         f"{points}: {counts[bit]} {text} (FLAG {bit:d})" for bit, text in said.items() if counts[bit]
     ]
-    return MatrixTable(
+    return WrittenTable(
         path=Path(output),
         rows=table.rows,
         trusted=held.product.verdict.trusted,

@@ -15,16 +15,13 @@ from walop_jax.calibration.product import write_product
 from walop_jax.calibration.records import ResidualMap
 from walop_jax.calibration.residual_map import residual_map
 from walop_jax.calibration.summary import FAILED, PARTIAL, PRODUCT, SUMMARY, summary
-from walop_jax.data import read_calibration_set
 from walop_jax.fit.misfit import Misfit, describe
-from walop_jax.fit.model_builder import model_for
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.io.atomic import atomic_path
-from walop_jax.io.errors import errors_naming
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
 from walop_jax.likelihood.processes import Processes
-from walop_jax.model.instrument import Instrument
+from walop_jax.runs.inputs import sets_and_model
 
 OUTPUTS = (PRODUCT, SUMMARY)
 
@@ -81,10 +78,7 @@ def refit_sets(
         check_folder(output, OUTPUTS, overwrite=overwrite)
     folder = Path(output)
     tell("reading")
-    calset = read_calibration_set(*calsets)
-    design = None if instrument is None else Instrument.read(instrument)
-    with errors_naming(model):
-        chosen = model_for(calset, text, design)
+    calset, chosen = sets_and_model(calsets, text, model, instrument)
     result = refit(calset, chosen, folder=folder / PARTIAL, progress=tell, memory=memory, processes=processes)
     residuals = residual_map(result) if result.likelihood.layout.large and result.converged else None
     misfit = None

@@ -1,0 +1,30 @@
+"""What every run of a fit begins with: its sets, and the model to fit to them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+from walop_jax.data import read_calibration_set
+from walop_jax.data.records import CalibrationSet
+from walop_jax.fit.model_builder import model_for
+from walop_jax.io.errors import errors_naming
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.specification import Model
+
+
+def sets_and_model(
+    calsets: Sequence[str | os.PathLike[str]],
+    text: str,
+    model: str | os.PathLike[str] | None,
+    instrument: str | os.PathLike[str] | None,
+) -> tuple[CalibrationSet, Model]:
+    """Read calibration sets, and make the model that `text`, the content of the file `model`, asks for.
+
+    `instrument` is a shipped one by name or a description file (None: what the sets say). Raises `DataError` for files
+    that cannot be read, and ValueError, naming the file, for a model that does not fit.
+    """
+    calset = read_calibration_set(*calsets)
+    design = None if instrument is None else Instrument.read(instrument)
+    with errors_naming(model):
+        return calset, model_for(calset, text, design)
