@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 
 from walop_jax.data.records import FilterCurve, Position
 from walop_jax.io.errors import DataError
-from walop_jax.model.elements import SpectralElement
+from walop_jax.model.elements import Analyser, SpectralElement
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import leaves
 from walop_jax.model.planning import plan_for
@@ -160,3 +160,21 @@ def test_each_beam_sees_its_own_wavelength(tmp_path):
     np.testing.assert_allclose(both, [first, second], atol=1e-5)
     none = vectors(plain.changed("main.analyser", dispersion=jnp.asarray(0.0)))
     np.testing.assert_allclose(none, vectors(plain), atol=1e-14)
+
+
+def test_beams_of_a_band_by_hand():
+    """½ (1 ± g)(S0 ± (1 − l) q) with g = 0.1, l = 0.2: 0.55 (1 + 0.8 · 0.5) and 0.45 (1 − 0.8 · 0.5)."""
+    analyser = Analyser(
+        balance=np.array([0.1]), balance_at=(1.0,), loss=np.array([0.2]), loss_at=(1.0,), cameras=("a", "b")
+    )
+    seen = np.zeros((1, 2, 4))
+    seen[0, :, 0] = 1.0, 0.5
+    rows = analyser.in_band(jnp.asarray(seen), jnp.array([1.3]))[0, :, 0]
+    np.testing.assert_allclose(analyser.shares() @ rows, [0.77, 0.27], rtol=1e-14)
+
+
+def test_beams_see_neighbouring_wavelengths():
+    """First beam ½ (1 + κ λ∂)(S0 + q), second ½ (1 − κ λ∂)(S0 − q)."""
+    analyser = Analyser(dispersion=0.01, cameras=("a", "b"))
+    expected = [[0.005, 0.005], [-0.005, 0.005]]
+    np.testing.assert_allclose(analyser.shares_of_slopes(), expected, rtol=1e-14)
