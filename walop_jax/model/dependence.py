@@ -11,17 +11,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from walop_jax.model import light
 from walop_jax.model.elements.base import Element
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import leaves, parameter_places
+from walop_jax.model.parameters import Shapes, leaves, of_shapes, parameter_places, shapes_of
 from walop_jax.model.plan import blank_plan
 from walop_jax.model.ray import Conditions, NotPlannedError, Ray
-
-Shapes = tuple[tuple[tuple[int, ...], str], ...]
 
 
 class Needs(NamedTuple):
@@ -32,23 +29,14 @@ class Needs(NamedTuple):
     path_difference: float  # µm
 
 
-def _shapes(instrument: Instrument) -> tuple[Any, Shapes]:
-    arrays, structure = jax.tree_util.tree_flatten(instrument)
-    return structure, tuple((tuple(np.shape(a)), jnp.result_type(a).name) for a in arrays)
-
-
-def _of_shapes(structure: Any, shapes: Shapes) -> Instrument:
-    return jax.tree_util.tree_unflatten(structure, [jax.ShapeDtypeStruct(s, d) for s, d in shapes])
-
-
 def needs(instrument: Instrument) -> Needs:
     """What the light path of an instrument, effects included, asks for; found by running it on shapes alone."""
-    return _followed(*_shapes(instrument))[0]
+    return _followed(*shapes_of(instrument))[0]
 
 
 def optical_indices(instrument: Instrument) -> tuple[int, ...]:
     """Positions of the parameters that enter before the band integral."""
-    _, reached = _followed(*_shapes(instrument))
+    _, reached = _followed(*shapes_of(instrument))
     flags = [reached[place] for place, count in parameter_places(instrument) for _ in range(count)]
     assert len(flags) == len(leaves(instrument))
     return tuple(i for i, flag in enumerate(flags) if flag)
@@ -84,7 +72,7 @@ def _followed(structure: Any, shapes: Shapes) -> tuple[Needs, tuple[bool, ...]]:
                 median = True
             else:
                 asked.add(missing.quantity)
-    patched = jax.eval_shape(lambda i: i.patched(), _of_shapes(structure, shapes))
+    patched = jax.eval_shape(lambda i: i.patched(), of_shapes(structure, shapes))
     parts = [*patched.elements, *(element for arm in patched.arms for element in arm.elements)]
     longest = max((part.path_difference for part in parts), default=0.0)
     rows, _ = program.jaxpr.outvars

@@ -14,7 +14,8 @@ Units       counts per unit of unpolarised light at unit throughput; angles rad;
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import functools
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +25,7 @@ from jaxtyping import Array, Float, Int
 from walop_jax.model import fold
 from walop_jax.model.elements import Analyser, Element
 from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import Shapes, of_shapes, shapes_of
 from walop_jax.model.plan import Plan
 from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import ExposureArrays, Sight, Source, turned
@@ -52,17 +54,30 @@ def divided(instrument: Instrument) -> Train:
     """
     elements, telescope = tuple(instrument.train()), instrument.telescope()
     start = len(telescope) + (instrument.polariser is not None)
-    ray, stop = Ray.entering(jnp.zeros(()), jnp.zeros(())), start
-    for element in elements[start:]:
-        if element.moves:
-            break
-        try:
-            element.mueller(ray)
-            ray = element.ray(ray)
-        except NotPlannedError:
-            break
-        stop += 1
+    stop = start + _leading(*shapes_of(elements[start:]))
     return Train(telescope, elements[start:stop], elements[stop:])
+
+
+@functools.lru_cache(maxsize=256)
+def _leading(structure: Any, shapes: Shapes) -> int:
+    """How many elements lead; asked once for all numbers that the elements may take."""
+    count = 0
+
+    def follow(elements: tuple[Element, ...]) -> None:
+        nonlocal count
+        ray = Ray.entering(jnp.zeros(()), jnp.zeros(()))
+        for element in elements:
+            if element.moves:
+                return
+            try:
+                element.mueller(ray)
+                ray = element.ray(ray)
+            except NotPlannedError:
+                return
+            count += 1
+
+    jax.eval_shape(follow, of_shapes(structure, shapes))
+    return count
 
 
 def _product(elements: tuple[Element, ...], ray: Ray) -> Float[Array, "4 4"] | None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
@@ -24,6 +25,7 @@ PARAMETER = "walop_jax.parameter"
 NUMBER = "walop_jax.number"
 
 Vector = Float[Array, " n"]
+Shapes = tuple[tuple[tuple[int, ...], str], ...]
 AnyComponent = TypeVar("AnyComponent", bound="Component")
 
 
@@ -155,11 +157,17 @@ def numbers_of(kind: type[Component]) -> dict[str, Number]:
 # -------------------------------------------------------------------------------- the tree and the vector
 
 
-def parameter_places(component: Component) -> list[tuple[int, int]]:
+def parameter_places(component: Component) -> tuple[tuple[int, int], ...]:
     """For every parameter array its position among the leaves of the flattened tree, and its size."""
+    return _places(*shapes_of(component))
+
+
+@functools.lru_cache(maxsize=256)
+def _places(structure: Any, shapes: Shapes) -> tuple[tuple[int, int], ...]:
+    component = of_shapes(structure, shapes)
     flat, _ = jax.tree_util.tree_flatten_with_path(component)
     position = {tuple(_key(entry) for entry in path): i for i, (path, _) in enumerate(flat)}
-    return [(position[array[0].holder], len(array)) for array in _arrays(component, "", ()) if array]
+    return tuple((position[array[0].holder], len(array)) for array in _arrays(component, "", ()) if array)
 
 
 def _key(entry: Any) -> str:
@@ -171,6 +179,17 @@ def values_of(component: Component) -> Vector:
     arrays = jax.tree_util.tree_leaves(component)
     chosen = [jnp.ravel(arrays[i]) for i, _ in parameter_places(component)]
     return jnp.concatenate(chosen) if chosen else jnp.zeros(0)
+
+
+def shapes_of(tree: Any) -> tuple[Any, Shapes]:
+    """Structure of a tree and the shapes and types of its arrays: what two programs have in common."""
+    arrays, structure = jax.tree_util.tree_flatten(tree)
+    return structure, tuple((tuple(np.shape(a)), jnp.result_type(a).name) for a in arrays)
+
+
+def of_shapes(structure: Any, shapes: Shapes) -> Any:
+    """The tree with shapes in the place of arrays, for `jax.eval_shape`."""
+    return jax.tree_util.tree_unflatten(structure, [jax.ShapeDtypeStruct(s, d) for s, d in shapes])
 
 
 def with_values(component: AnyComponent) -> Callable[[Vector], AnyComponent]:

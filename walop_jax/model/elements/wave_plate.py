@@ -28,11 +28,7 @@ from walop_jax.model.ray import Ray
 Scalar = Float[Array, ""]
 Real = Float[Array, "..."]
 REFERENCE_WAVELENGTH = 0.62  # µm
-# Inlined: the operations are those of the plain functions, but they are traced once for all plates of a kind.
-MODELS = {
-    name: jax.jit(function, inline=True)
-    for name, function in (("waves", plates.stack_mueller), ("fixed_axis", plates.fixed_axis_mueller))
-}
+MODELS = {"waves": plates.stack_mueller, "fixed_axis": plates.fixed_axis_mueller}
 
 
 class Layer(Component):
