@@ -19,9 +19,8 @@ from walop_jax.diagnosis.score import Candidate
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import light
-from walop_jax.model.dependence import conditions_asked_by
+from walop_jax.model.dependence import changed_elements, conditions_asked_by
 from walop_jax.model.effects import Context, Effect
-from walop_jax.model.elements import Element
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations
 from walop_jax.model.specification import Model
@@ -76,20 +75,11 @@ def _kind_of_computation(instrument: Instrument, effect: Effect) -> tuple[object
     It only sorts effects into batches, so it asks the elements that the effect changes, not the whole path.
     """
     bare = dataclasses.replace(instrument, effects=())
-    patched = effect.patch(bare)
-    before = {id(element) for element in _behind_polariser(bare)}
-    changed = [element for element in _behind_polariser(patched) if id(element) not in before]
+    patched, changed = effect.patch(bare), changed_elements(bare, effect)
     asked = frozenset(name for element in changed for name in conditions_asked_by(element))
     longest = max((element.path_difference for element in changed), default=0.0)
     optics = bool(changed) or patched.filter_shift is not bare.filter_shift
     return optics, asked, longest, bool(patched.cameras.ghosts)
-
-
-def _behind_polariser(instrument: Instrument) -> Iterator[Element]:
-    train = list(instrument.train())
-    yield from train[len(instrument.telescope()) + (instrument.polariser is not None) :]
-    for arm in instrument.arms:
-        yield from (*arm.train(), arm.analyser)
 
 
 def effect_candidates(

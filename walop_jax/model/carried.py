@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.model.cameras import DetectorPart
-from walop_jax.model.dependence import needs
+from walop_jax.model.dependence import changed_elements, conditions_asked_by
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.ray import NotPlannedError
 from walop_jax.model.sources import ExposureArrays
@@ -51,7 +51,8 @@ def left_behind(instrument: Instrument) -> tuple[str, ...]:
     for effect in instrument.effects:
         cameras = effect.patch(bare).cameras
         kept = all(is_undone(part, len(cameras)) for part in cameras.detectors)
-        unknown = needs(dataclasses.replace(bare, effects=(effect,))).conditions - KNOWN
+        asked = {name for element in changed_elements(bare, effect) for name in conditions_asked_by(element)}
+        unknown = asked - KNOWN
         if cameras.ghosts or cameras.exposures or not kept or unknown:
             names.append(effect.name)
     return tuple(names)

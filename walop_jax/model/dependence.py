@@ -7,6 +7,7 @@ parameter through the operations of `light.band_rows`: those that reach the resu
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from walop_jax.model import light
+from walop_jax.model.effects.base import Effect
 from walop_jax.model.elements.base import Element
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Shapes, leaves, of_shapes, parameter_places, shapes_of
@@ -77,6 +79,19 @@ def _followed(structure: Any, shapes: Shapes) -> tuple[Needs, tuple[bool, ...]]:
     longest = max((part.path_difference for part in parts), default=0.0)
     rows, _ = program.jaxpr.outvars
     return Needs(frozenset(asked), median, longest), _reaching(program, rows)
+
+
+def changed_elements(bare: Instrument, effect: Effect) -> tuple[Element, ...]:
+    """The elements behind the polariser that an effect puts into an instrument or changes."""
+    before = {id(element) for element in _behind_polariser(bare)}
+    return tuple(element for element in _behind_polariser(effect.patch(bare)) if id(element) not in before)
+
+
+def _behind_polariser(instrument: Instrument) -> Iterator[Element]:
+    train = list(instrument.train())
+    yield from train[len(instrument.telescope()) + (instrument.polariser is not None) :]
+    for arm in instrument.arms:
+        yield from (*arm.train(), arm.analyser)
 
 
 def conditions_asked_by(element: Element) -> frozenset[str]:
