@@ -19,10 +19,11 @@ if TYPE_CHECKING:
     from walop_jax.data.calset import read_calibration_set
     from walop_jax.data.settings import Settings
     from walop_jax.data.write import write_calibration_set
+    from walop_jax.diagnosis.trust import refit
     from walop_jax.diagnosis.workflow import diagnose as find_effects
     from walop_jax.fit.misfit import describe as describe_misfit
     from walop_jax.fit.model_builder import base_model
-    from walop_jax.fit.refit import FitResult, refit
+    from walop_jax.fit.refit import FitResult
     from walop_jax.io.errors import DataError
     from walop_jax.likelihood.likelihood import Likelihood
     from walop_jax.model.build import nominal_instrument
@@ -76,7 +77,7 @@ _HOME = {
     "find_effects": ("diagnosis.workflow", "diagnose"),
     "nominal_instrument": ("model.build", "nominal_instrument"),
     "read_calibration_set": ("data.calset", "read_calibration_set"),
-    "refit": ("fit.refit", "refit"),
+    "refit": ("diagnosis.trust", "refit"),
     "residual_map": ("calibration.residual_map", "residual_map"),
     "simulate": ("simulation.simulate", "simulate"),
     "trace": ("model.trace", "trace"),

@@ -11,7 +11,7 @@ from between_points import WORST, between_points
 from science.truth import TrueInstrument, chance
 from small_run import WITH_PLATE, small_fit_with_plate
 
-from walop_jax.calibration.calibration import Calibration, at_prior_edge, quality
+from walop_jax.calibration.calibration import Calibration, quality
 from walop_jax.calibration.matrix_table import matrix_columns
 from walop_jax.calibration.product import ParameterTable, read_product, write_product
 from walop_jax.data import DataError
@@ -253,7 +253,7 @@ def test_quality_bits_follow_the_fit(result):
     values[index] += 5 * result.model.parameters[index].prior[1]
     bad = dataclasses.replace(result, minimum=minimum, posterior=posterior, values=values)
     assert quality(bad) == 1 | 2 | 4 | 8 | 8192
-    assert at_prior_edge(bad) == ("pupil.magnification",)
+    assert bad.at_prior_edge == ("pupil.magnification",)
     slightly = dataclasses.replace(result.posterior, data=result.dof * 1.0 + 20.0 * np.sqrt(result.dof))
     assert quality(dataclasses.replace(result, posterior=slightly)) & ~8 == 8192
 

@@ -23,7 +23,7 @@ from walop_jax.data.records import CALIBRATION_PLATE, Exposures, FilterCurve, In
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import model_without_data, standard_names
 from walop_jax.fit.model_file import render
-from walop_jax.fit.refit import PRIOR_EDGE, FitResult
+from walop_jax.fit.refit import FitResult
 from walop_jax.instruments.description import parsed
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.software import software_versions
@@ -301,17 +301,10 @@ def quality(result: FitResult) -> Quality:
     held_against = {
         Quality.NOT_CONVERGED: not result.converged,
         Quality.ILL_CONDITIONED: result.minimum.condition > ILL_CONDITIONED * result.n_data,
-        Quality.AT_PRIOR_EDGE: len(at_prior_edge(result)) > 0,
+        Quality.AT_PRIOR_EDGE: len(result.at_prior_edge) > 0,
         Quality.EXCESS_NOISE: max(ratio, result.noise_scale**2) > 1.0 + EXCESS_NOISE**2,
-        Quality.UNEXPLAINED: not result.explains_data,
+        Quality.UNEXPLAINED: not (result.explains_data or result.noise_only),
+        Quality.DOUBTED: len(result.doubts) > 0,
+        Quality.ERRORS_TOO_LARGE: result.errors_too_large,
     }
     return functools.reduce(operator.or_, (bit for bit, holds in held_against.items() if holds), Quality(0))
-
-
-def at_prior_edge(result: FitResult) -> tuple[str, ...]:
-    """Names of the parameters that lie more than 4 prior widths from their prior."""
-    return tuple(
-        p.name
-        for p, value in zip(result.model.parameters, result.values, strict=True)
-        if p.free and p.prior is not None and abs(value - p.prior[0]) > PRIOR_EDGE * p.prior[1]
-    )

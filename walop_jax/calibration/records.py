@@ -50,6 +50,8 @@ class Quality(enum.IntFlag):
     NON_PHYSICAL = 4096
     UNEXPLAINED = 8192
     NO_STOKES = 16384
+    DOUBTED = 32768
+    ERRORS_TOO_LARGE = 65536
 
     @property
     def meanings(self) -> tuple[str, ...]:
@@ -72,6 +74,8 @@ _MEANINGS = {
     Quality.VALIDITY_FORCED: "validity forced",
     Quality.NON_PHYSICAL: "non-physical Mueller matrix within tolerance",
     Quality.UNEXPLAINED: "the model does not explain the data",
+    Quality.DOUBTED: "the residuals hold more than noise, or differ between parts of the data",
+    Quality.ERRORS_TOO_LARGE: "the stated errors are far larger than the scatter of the data",
     Quality.NO_STOKES: "no Stokes parameters: too few cameras, too little light, or no u in the rows there are",
 }
 

@@ -45,6 +45,7 @@ def summary(
         "inputs": [{"path": str(entry.path), "sha256": entry.sha256} for entry in result.calset.inputs],
         "trusted": result.trusted,
         "quality": int(quality(result)),
+        "doubts": list(result.doubts) if result.examined else None,
         "warnings": list(result.warnings),
         "instrument": result.model.name,
         "effects": list(result.model.effect_names),

@@ -68,6 +68,10 @@ OutputTable = Annotated[
 ]
 
 
+UNTRUSTED = 3
+"""Exit code of a command that has written a result which is not to be trusted."""
+
+
 class CommandError(Exception):
     """A command failed for a reason that its one line of message states."""
 

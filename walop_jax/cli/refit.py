@@ -5,7 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import typer
+
 from walop_jax.cli.common import (
+    UNTRUSTED,
     CalsetFiles,
     CommandError,
     InstrumentOption,
@@ -46,7 +49,9 @@ def refit(
     these two files are replaced and others stay.
 
     A fit that does not converge leaves RUN/summary.failed.json, no calibration, and exit code 1. One that
-    converges without explaining the data is written with TRUSTED = F and warnings, exit code 0.
+    converges but is not to be trusted (it does not explain the data, a parameter lies far from its prior, the
+    residuals hold patterns or differ between parts of the data) is written with TRUSTED = F and warnings, exit
+    code 3.
 
     Sets of more than 65536 points (whole frames) are read in slabs, anew on every pass. Finished slabs
     are kept in RUN/partial until the end: the same command goes on where it was interrupted. The
@@ -79,6 +84,8 @@ def refit(
         warn(sentence)
     if not (json or quiet):
         _show(found, output)
+    if not found.result.trusted:
+        raise typer.Exit(UNTRUSTED)
 
 
 def _show(found: RefitRun, output: Path) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from walop_jax.cli.common import (
+    UNTRUSTED,
     CommandError,
     JsonOption,
     ModelOption,
@@ -78,10 +79,10 @@ def sample(
         warn(sentence)
     if not (json or quiet):
         _show(found.posterior)
+    if not found.posterior.sampled_well:
+        raise CommandError(f"{run}: the posterior has not converged; calibration.fits keeps its covariance")
     if not found.posterior.trusted:
-        raise CommandError(
-            f"{run}: the posterior is not to be believed yet; calibration.fits keeps its covariance"
-        )
+        raise typer.Exit(UNTRUSTED)
 
 
 @contextlib.contextmanager

@@ -77,18 +77,18 @@ class Projector:
     """Removes from columns everything that the base parameters could absorb.
 
     `eliminated` counts the directions that are gone from residuals and columns already: one for every flux that
-    was solved for. `free` is what is left for noise.
+    was solved for. `free` is what is left for noise, `basis` an orthonormal basis of what is removed.
     """
 
     def __init__(self, jacobian: Matrix, eliminated: int = 0) -> None:
         norm = np.linalg.norm(jacobian, axis=0)
-        self._q, _ = np.linalg.qr(jacobian / np.where(norm > 0, norm, 1.0))
+        self.basis, _ = np.linalg.qr(jacobian / np.where(norm > 0, norm, 1.0))
         self.free = jacobian.shape[0] - jacobian.shape[1] - eliminated
 
     def __call__(self, columns: np.ndarray) -> np.ndarray:
         """Project columns (twice: the second pass removes the rounding of the first)."""
         for _ in range(2):
-            columns = columns - self._q @ (self._q.T @ columns)
+            columns = columns - self.basis @ (self.basis.T @ columns)
         return columns
 
 

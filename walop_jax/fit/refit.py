@@ -30,6 +30,8 @@ Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
 
 SUSPECT_SIGMA = 5.0  # excess of χ² over its expectation, in its own standard deviations
+NEARLY = 1.15  # χ²/dof that errors stated seven per cent too small give
+TOO_LOW = 0.8  # χ²/dof below which the stated errors are those of something else
 PRIOR_EDGE = 4.0  # standard deviations
 
 
@@ -38,8 +40,9 @@ class FitResult:
     """A fit, the likelihood that it maximises, and how far it can be trusted.
 
     `values` and `covariance` are of all parameters in tree order, frozen ones with zero variance. `trusted` needs a
-    converged fit that explains the data; `warnings` says in words what does not hold; `errors_from` what the
-    covariance was made from, the stated errors of the data (`STATED`) or residuals.
+    converged fit that explains the data within its priors, and no doubts: `doubts` is what the residuals say against
+    it, once they were `examined` (`diagnosis.trust`). `errors_from` is what the covariance was made from, the stated
+    errors of the data (`STATED`) or residuals.
     """
 
     likelihood: Likelihood
@@ -49,8 +52,9 @@ class FitResult:
     minimum: Minimum
     starts: int
     seconds: float
-    warnings: tuple[str, ...]
     errors_from: str = STATED
+    examined: bool = False
+    doubts: tuple[str, ...] = ()
 
     @property
     def model(self) -> Model:
@@ -108,9 +112,39 @@ class FitResult:
         return self.dof > 0 and bool(self.excess < SUSPECT_SIGMA)
 
     @property
+    def nearly_explains_data(self) -> bool:
+        """Whether χ² is so little too large that the stated errors may be all that is wrong."""
+        return self.dof > 0 and not self.explains_data and bool(self.chi2 < NEARLY * self.dof)
+
+    @property
+    def noise_only(self) -> bool:
+        """Whether χ² is a few per cent too large while the residuals, once examined, show nothing but noise."""
+        return self.examined and not self.doubts and self.nearly_explains_data
+
+    @property
+    def errors_too_large(self) -> bool:
+        """Whether χ² is far smaller than noise of the stated size would make it."""
+        return bool(self.excess < -SUSPECT_SIGMA and self.chi2 < TOO_LOW * self.dof)
+
+    @property
+    def at_prior_edge(self) -> tuple[str, ...]:
+        """Names of the parameters that lie more than `PRIOR_EDGE` prior widths from their prior."""
+        return tuple(
+            p.name
+            for p, value in zip(self.model.parameters, self.values, strict=True)
+            if p.free and p.prior is not None and abs(value - p.prior[0]) > PRIOR_EDGE * p.prior[1]
+        )
+
+    @property
     def trusted(self) -> bool:
         """Whether the result may be used without a second thought."""
-        return self.converged and self.explains_data
+        explained = (self.explains_data or self.noise_only) and not self.errors_too_large
+        return self.converged and explained and not self.doubts and not self.at_prior_edge
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What does not hold, in sentences."""
+        return tuple(_warnings(self))
 
     def value(self, name: str) -> tuple[float, float]:
         """Value and standard error of a parameter."""
@@ -161,7 +195,7 @@ def fit(
     first = model.start if start is None else np.asarray(start, float)
     found = find_minimum(likelihood, first, noise_scale, worth)
     check_constrained(model, found.posterior)
-    result = FitResult(
+    return FitResult(
         likelihood=likelihood,
         values=found.values,
         covariance=covariance(model, found.posterior),
@@ -169,9 +203,7 @@ def fit(
         minimum=found.minimum,
         starts=found.starts,
         seconds=time.perf_counter() - began,
-        warnings=(),
     )
-    return dataclasses.replace(result, warnings=tuple(_warnings(result)))
 
 
 def with_honest_errors(result: FitResult) -> FitResult:
@@ -187,29 +219,40 @@ def with_honest_errors(result: FitResult) -> FitResult:
         result,
         covariance=select @ found.covariance @ select.T,
         errors_from=found.made_from,
-        warnings=(*result.warnings, f"standard errors are made from the {found.made_from}"),
     )
 
 
 def _warnings(result: FitResult) -> Iterator[str]:
+    ratio = result.chi2 / max(result.dof, 1)
     if not result.converged:
         yield result.minimum.message
     if result.dof <= 0:
         yield f"{result.n_data} intensities for {len(result.model.free)} free parameters: nothing is left to test"
+    elif result.noise_only:
+        yield (
+            f"χ²/dof = {ratio:.4g} with nothing but noise in the residuals: the stated errors N_ERR are "
+            f"{100 * (np.sqrt(ratio) - 1):.2g} % too small"
+        )
     elif not result.explains_data:
         yield (
-            f"χ²/dof = {result.chi2 / result.dof:.4g} lies {result.excess:.3g} standard deviations above 1: the model "
-            "does not explain the data; do not trust the calibration (walop-jax diagnose looks for what is missing)"
+            f"χ²/dof = {ratio:.4g} lies {result.excess:.3g} standard deviations above 1: the model does not explain "
+            "the data; do not trust the calibration (walop-jax diagnose looks for what is missing)"
         )
-    elif result.excess < -SUSPECT_SIGMA:
-        yield f"χ²/dof = {result.chi2 / result.dof:.4g}: the stated errors N_ERR are too large (gain or units?)"
+    elif result.errors_too_large:
+        yield (
+            f"χ²/dof = {ratio:.4g}: N_ERR is not the standard error of N; check the gain, and whether N_ERR holds "
+            "variances or other units"
+        )
     if result.noise_scale > 1.0:
         yield f"the errors of the data were multiplied by {result.noise_scale:.3g} to fit at all: the model is far off"
-    for i in result.model.free:
-        p = result.model.parameters[i]
-        if p.prior is not None and abs(result.values[i] - p.prior[0]) > PRIOR_EDGE * p.prior[1]:
-            pull = (result.values[i] - p.prior[0]) / p.prior[1]
-            yield f"{p.name} = {result.values[i]:.6g} {p.unit} lies {pull:+.1f} prior widths from {p.prior[0]:g}"
+    for name in result.at_prior_edge:
+        p, value = result.model[name], result.value(name)[0]
+        assert p.prior is not None
+        pull = (value - p.prior[0]) / p.prior[1]
+        yield f"{name} = {value:.6g} {p.unit} lies {pull:+.1f} prior widths from {p.prior[0]:g}"
+    yield from result.doubts
+    if result.errors_from != STATED:
+        yield f"standard errors are made from the {result.errors_from}"
 
 
 def refit(

@@ -84,6 +84,8 @@ VECTOR_POINTS = 100
 
 DIAGNOSED_ROWS = 100_000
 """(Exposure, point) pairs that a diagnosis looks at: 800 columns of four cameras each take 2.5 GB."""
+TRUST_ROWS = 20_000
+"""(Exposure, point) pairs whose residuals are searched for patterns after every fit: a second, and half a GB."""
 PROJECTED_COLUMNS = 128
 """Columns that are projected together: a copy of them is small beside all."""
 NULL_DRAWS = 10_000

@@ -48,7 +48,7 @@ def inference_data(sample: PosteriorSample) -> Any:
             "sampler": sample.sampler,
             "converged": int(v.converged),
             "trusted": int(sample.trusted),
-            "verdict": v.message(),
+            "verdict": v.message() if sample.of_trusted_fit else "the fit is not trusted",
             "steps": v.steps,
             "acceptance": sample.acceptance,
             "fingerprint": json.dumps(sample.fingerprint),
@@ -100,7 +100,9 @@ def read_draws(path: str | os.PathLike[str], names: tuple[str, ...]) -> Float[np
     if not trusted:
         verdict = posterior.attrs["verdict"]
         raise fail(
-            f"is not to be trusted: {verdict}", file=path, advice="go on with walop-jax sample --resume"
+            f"is not to be trusted: {verdict}",
+            file=path,
+            advice="see the warnings of the fit, or go on with walop-jax sample --resume",
         )
     count = len(next(iter(held.values())))
     return np.stack([held.get(name, np.full(count, fixed.get(name, np.nan))) for name in names], axis=1)

@@ -82,7 +82,8 @@ class PosteriorSample:
     `draws` holds (ensemble, draw, parameter) of all parameters in tree order, tied and frozen ones
     included; `mean` and `covariance` use every kept step. `chains` are of the coefficients `sampled`, those that
     figures show. `accuracy` is that of the surrogate, None where the exact posterior was sampled; `trusted` needs
-    convergence and a surrogate that is exact enough. `counts` are what the sampler counted.
+    convergence, a surrogate that is exact enough, and a fit that is trusted (`of_trusted_fit`). `counts` are what the
+    sampler counted.
     """
 
     sampler: str
@@ -103,16 +104,26 @@ class PosteriorSample:
     counts: Mapping[str, int]
     seconds: float
     fingerprint: dict[str, str]
+    of_trusted_fit: bool = True
 
     @property
     def trusted(self) -> bool:
         """Whether the posterior may be believed."""
+        return self.of_trusted_fit and self.sampled_well
+
+    @property
+    def sampled_well(self) -> bool:
+        """Whether the draws are of the posterior, whatever that is worth."""
         return self.convergence.converged and (self.accuracy is None or self.accuracy.exact_enough)
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What does not hold, in words."""
         found = [] if self.convergence.converged else [self.convergence.message(self.seconds_per_step)]
+        if not self.of_trusted_fit:
+            found.insert(
+                0, "the fit is not trusted, and neither is its posterior: see the warnings of the fit"
+            )
         a = self.accuracy
         if a is not None and not a.exact_enough:
             found.append(

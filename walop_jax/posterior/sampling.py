@@ -101,7 +101,8 @@ def sample(
     ensembles = Ensembles(sampler, posterior.density(), options, checkpoints)
     verdict = ensembles.until_converged(posterior.quoted_names, posterior.quoted, report)
     report(Progress("comparing with the exact posterior", 1.0, *numbers_of(verdict)))
-    return _finish(target, posterior, ensembles, verdict, seconds)
+    finished = _finish(target, posterior, ensembles, verdict, seconds)
+    return dataclasses.replace(finished, of_trusted_fit=result.trusted)
 
 
 def _surrogate(

@@ -11,7 +11,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data import DEFAULT_FILTER
 from walop_jax.data.field_points import true_matrices
 from walop_jax.data.user_tables import new_table, write_output_table
-from walop_jax.fit.refit import refit
+from walop_jax.diagnosis.trust import refit
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
 from walop_jax.paper.comparison import Comparison, compare
@@ -75,11 +75,11 @@ def compare_methods(
     calibration = Calibration.from_fit(result)
     found = compare(calset, calibration, known, filter_name, seed or 0)
     lost = calibration.left_behind
-    document = found.document() | {KEY: list(lost)}
+    document = found.document() | {"trusted": result.trusted, KEY: list(lost)}
     with atomic_folder(output, OUTPUTS, overwrite=overwrite) as folder:
         (folder / DOCUMENT).write_text(json_text(document), encoding="utf-8")
         write_output_table(folder / TABLE, new_table(found.columns()), {}, header=left_out_cards(lost))
         for name, figure in FIGURES.items():
             figure(found).savefig(folder / name, dpi=130)
-    warnings = () if result.trusted else ("the joint fit is not trusted: see walop-jax refit",)
+    warnings = () if result.trusted else tuple(f"the joint fit: {text}" for text in result.warnings)
     return ComparedRun(found, document, (*warnings, *left_out_sentences(lost)))

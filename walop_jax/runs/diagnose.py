@@ -16,6 +16,7 @@ from walop_jax.diagnosis.document import DIAGNOSIS, document
 from walop_jax.diagnosis.figure_data import figure_data
 from walop_jax.diagnosis.figure_file import FIGURE_DATA, write_figure_data
 from walop_jax.diagnosis.findings import Diagnosis
+from walop_jax.diagnosis.trust import examined
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.misfit import describe
 from walop_jax.fit.refit import with_honest_errors
@@ -62,7 +63,7 @@ def diagnose_sets(
     calset, chosen = sets_and_model(calsets, text, model, instrument)
     found = diagnose(calset, chosen, seed=seed or 0, progress=tell)
     tell("mapping the field")
-    after = with_honest_errors(found.after)
+    after = examined(with_honest_errors(found.after))
     product = Calibration.from_fit(after).to_product()
     misfit = None if after.explains_data else describe(after)
     content = document(found)

@@ -71,6 +71,7 @@ def sample_run(
     if overwrite and not resume:
         Checkpoints(folder / CHAINS, {}).clear()
     posterior = sample(result, options, folder=folder / CHAINS, resume=resume, report=progress)
+    posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted)
     summary = report(posterior)
     _write(folder, product, posterior, summary)
     return SampledRun(posterior, summary)

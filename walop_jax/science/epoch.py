@@ -26,7 +26,7 @@ from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import SKY_AND_STARS, model_like
-from walop_jax.fit.refit import fit, with_honest_errors
+from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import Model
 from walop_jax.science.star_errors import determinant, joint_errors, sample_stars, statistics
@@ -53,7 +53,8 @@ class Epoch:
 
     `moved` sorts parameters by |z|; `chi2_old` is of the new data with the old instrument; `star_errors` are
     statistics (per cent) of what stars would be off, outside the zone without u, if the old calibration
-    were used and the new one true.
+    were used and the new one true. `new_trusted` and `warnings` are what the fit of the new set is worth: where it is
+    not to be trusted, neither are the parameters that seem to have moved.
     """
 
     fits: bool
@@ -65,24 +66,35 @@ class Epoch:
     dof: int
     moved: tuple[MovedParameter, ...]
     star_errors: dict[str, dict[str, float]]
+    new_trusted: bool
+    warnings: tuple[str, ...]
+
+    @property
+    def holds(self) -> bool:
+        """Whether the old calibration may be used on: nothing has moved, and a fit to be trusted says so."""
+        return self.fits and self.new_trusted
 
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
         return dataclasses.asdict(self)
 
 
-def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]:
-    """Fit a new set and compare with an old calibration; gives the comparison and the new calibration.
+def fit_like(old: Calibration, calset: CalibrationSet) -> FitResult:
+    """Fit a new set with the model of an old calibration.
 
-    Raises ValueError for a set of another instrument and RuntimeError if the new fit does not converge.
+    Raises ValueError for a set of another instrument and RuntimeError if the fit does not converge.
     """
     if calset.instrument != old.model.name:
         raise ValueError(f"the new set is of {calset.instrument}, the calibration of {old.model.name}")
-    model = model_like(calset, old.model)
-    result = with_honest_errors(fit(Likelihood.of(calset, model)))
+    result = with_honest_errors(fit(Likelihood.of(calset, model_like(calset, old.model))))
     if not result.converged:
         raise RuntimeError(f"the fit of the new set did not converge: {result.minimum.message}")
-    new = Calibration.from_fit(result)
+    return result
+
+
+def epoch(old: Calibration, result: FitResult) -> Epoch:
+    """Compare an old calibration with the fit of a new set (`fit_like`, examined)."""
+    new, model = Calibration.from_fit(result), result.model
     names = shared_parameters(old.model, model)
     a = np.array([old.model.index(name) for name in names])
     b = np.array([model.index(name) for name in names])
@@ -101,7 +113,7 @@ def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]
         if s > 0
     ]
     p_value = chi2_tail(test, directions)
-    verdict = Epoch(
+    return Epoch(
         fits=p_value > CHANCE,
         p_value=p_value,
         test=test,
@@ -111,8 +123,9 @@ def epoch(old: Calibration, calset: CalibrationSet) -> tuple[Epoch, Calibration]
         dof=result.dof,
         moved=tuple(sorted(moved, key=lambda entry: -abs(entry.z))),
         star_errors=_star_errors(old, new),
+        new_trusted=result.trusted,
+        warnings=result.warnings,
     )
-    return verdict, new
 
 
 def shared_parameters(old: Model, new: Model) -> list[str]:

@@ -1,0 +1,159 @@
+"""Fits that converge with a fine χ² and are wrong: what the residuals say against them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.records import Quality
+from walop_jax.data.records import Block, CalibrationSet
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.trust import examined, group_scores, refit
+from walop_jax.fit.refit import FitResult
+from walop_jax.simulation.observing_plan import ObservingPlan
+from walop_jax.simulation.simulate import simulate
+
+PLAN = ObservingPlan(grid=8)
+
+
+def block(calset: CalibrationSet) -> Block:
+    return calset.intensities.block(0, len(calset.points))
+
+
+def with_data(calset: CalibrationSet, **changed: np.ndarray) -> CalibrationSet:
+    table = TableIntensities.dense(calset.points, dataclasses.replace(block(calset), **changed))
+    return dataclasses.replace(calset, intensities=table)
+
+
+def background(calset: CalibrationSet) -> CalibrationSet:
+    """2000 electrons that nobody has taken away."""
+    return with_data(calset, counts=block(calset).counts + 2000.0)
+
+
+def displaced(calset: CalibrationSet) -> CalibrationSet:
+    """The centre of the field 36 arcsec from where it is said to be."""
+    points = dataclasses.replace(calset.points, x=calset.points.x + 0.01)
+    seen = dataclasses.replace(block(calset), x=points.x)
+    return dataclasses.replace(calset, points=points, intensities=TableIntensities.dense(points, seen))
+
+
+def dark(calset: CalibrationSet) -> CalibrationSet:
+    """One camera that was never read."""
+    counts = block(calset).counts.copy()
+    counts[..., 2] = 0.0
+    return with_data(calset, counts=counts)
+
+
+def hundredfold(calset: CalibrationSet) -> CalibrationSet:
+    """Errors in another unit."""
+    return with_data(calset, sigma=100.0 * block(calset).sigma)
+
+
+def variances(calset: CalibrationSet) -> CalibrationSet:
+    """The variance where the standard error belongs."""
+    return with_data(calset, sigma=block(calset).sigma ** 2)
+
+
+def noisy_camera(calset: CalibrationSet) -> CalibrationSet:
+    """One camera of half the stated errors, another of more, so that χ² of all is what it should be."""
+    seen = block(calset)
+    sigma = seen.sigma.copy()
+    sigma[..., 0] *= 2.0
+    sigma[..., 1] /= np.sqrt(4.0 / 3.0)
+    sigma[..., 3] /= np.sqrt(4.0 / 3.0)
+    sigma[..., 2] /= np.sqrt(4.0 / 3.0)
+    return with_data(calset, sigma=sigma)
+
+
+@pytest.fixture(scope="module")
+def calset() -> CalibrationSet:
+    return simulate(PLAN, seed=7).calset
+
+
+@pytest.fixture(scope="module")
+def clean(calset) -> FitResult:
+    return refit(calset)
+
+
+def test_a_fit_of_what_the_model_describes_is_trusted(clean):
+    assert (clean.examined, clean.doubts, clean.trusted, clean.warnings) == (True, (), True, ())
+
+
+def test_a_lamp_of_another_temperature(calset):
+    """3200 K given as 5772 K: χ²/dof stays at 1, the matrix is off by half a per cent."""
+    plan = dataclasses.replace(PLAN, teff=3200.0)
+    warm = simulate(plan, seed=7).calset
+    said = np.where(warm.exposures.kind == "clp", 5772.0, warm.exposures.teff)
+    found = refit(dataclasses.replace(warm, exposures=dataclasses.replace(warm.exposures, teff=said)))
+    assert found.explains_data
+    assert not found.trusted
+    assert "patterns" in found.doubts[0]
+
+
+@pytest.mark.parametrize(
+    ("mistake", "says"),
+    [
+        (background, "does not explain the data"),
+        (displaced, "patterns that noise does not make"),
+        (dark, "camera O2"),
+        (hundredfold, "N_ERR is not the standard error"),
+        (variances, "N_ERR is not the standard error"),
+        (noisy_camera, "camera"),
+    ],
+)
+def test_a_mistake_in_the_data_is_not_trusted(
+    calset, mistake: Callable[[CalibrationSet], CalibrationSet], says: str
+):
+    found = refit(mistake(calset))
+    assert found.converged
+    assert not found.trusted
+    assert says in "; ".join(found.warnings)
+
+
+def test_errors_a_few_per_cent_off_are_no_matter_of_the_model(calset, clean):
+    found = refit(with_data(calset, sigma=0.93 * block(calset).sigma))
+    assert not found.explains_data
+    assert found.noise_only
+    assert found.trusted
+    assert found.doubts == ()
+    assert "% too small" in found.warnings[0]
+    ratio = np.median(found.sigma[found.sigma > 0] / clean.sigma[clean.sigma > 0])
+    assert 1.0 < ratio < 1.5
+
+
+def test_squares_of_groups_follow_their_distribution(clean):
+    """Over draws of noise the p of every group is uniform: its moments are those of projected noise."""
+    design = Design.of(clean)
+    rng, p = np.random.default_rng(3), []
+    used = design.measured.used
+    unit = design.measured.model[used]
+    unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
+    for _ in range(40):
+        noise = rng.normal(size=unit.shape)
+        noise -= np.sum(noise * unit, axis=1, keepdims=True) * unit
+        rows = design.residual.copy()
+        rows[: design.rows] = noise.reshape(-1)
+        rows[design.rows :] = rng.normal(size=len(rows) - design.rows)
+        p += [(s.name, s.p_value) for s in group_scores(dataclasses.replace(design, residual=rows))]
+    for kind in ("camera", "exposure"):
+        assert stats.kstest([v for name, v in p if name.startswith(kind)], "uniform").pvalue > 1e-3
+
+
+def test_the_product_says_what_the_fit_does(calset):
+    found = refit(dark(calset))
+    verdict = Calibration.from_fit(found).verdict
+    assert not verdict.trusted
+    assert Quality.DOUBTED in Quality(verdict.quality)
+    assert verdict.warnings == found.warnings
+
+
+def test_an_examination_changes_no_value(calset, clean):
+    again = examined(dataclasses.replace(clean, examined=False))
+    np.testing.assert_array_equal(again.values, clean.values)
+    np.testing.assert_array_equal(again.covariance, clean.covariance)

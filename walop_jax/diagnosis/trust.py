@@ -1,0 +1,181 @@
+"""Is a fit to be trusted? What its residuals say against it, whatever the total χ² says.
+
+χ² of everything hides what is small beside all the noise, or what is made up for elsewhere. Here the residuals
+are asked in smaller questions, each with a known answer under the model that was fitted:
+
+Patterns    the efficient score of every free-form pattern (`freeform`) with one global p for all of them: structure
+            over the field, angle, time, flux, kinds, filters and single exposures that noise does not make.
+Groups      the squared residuals of each camera, kind, filter and exposure. Behind the fluxes and parameters that
+            were fitted, r has the covariance P = 1 − Σ w wᵀ − QQᵀ, so that
+                E Σ r² = tr P_gg,   cov(Σ_g r², Σ_h r²) = 2 ‖P_gh‖²
+            for groups g, h. The mean square of a group over that of the rest of the data has mean 1 and the variance
+            that follows from these; its p is that of a scaled χ² with these two moments.
+Errors      χ²/dof far below 1 says that N_ERR is not the error of N; a few per cent off is no matter of the model.
+
+Symbols     w = expected counts / errors of an exposure at a point, of unit length, where its flux was fitted (0 where
+            that is known); Q orthonormal basis of the derivatives with respect to the free parameters.
+Sources     Rao 1948; Satterthwaite 1946, Biometrics Bull. 2, 110 (χ² with two moments); Šidák 1967 (many questions).
+Limits      Noise alone raises a doubt in about one fit of 200. Of a large set a sample of the points is looked at:
+            what is smaller than its noise shows in χ² and in the residual map.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import stats
+
+from walop_jax.data.records import CalibrationSet
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.examination import ALARM
+from walop_jax.diagnosis.freeform import strata
+from walop_jax.diagnosis.score import Scorer, ScoreSpace, ScoreTable
+from walop_jax.fit.refit import FitResult, with_honest_errors
+from walop_jax.fit.refit import refit as fit_refit
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.processes import Processes
+from walop_jax.likelihood.runner import Progress
+from walop_jax.likelihood.thinning import thinned
+from walop_jax.model.specification import Model
+
+UNEVEN = 1.25
+"""Factor between the squared residuals of a group and those of all below which it is a matter of the stated errors."""
+_SHOWN = 3
+
+Cube = Float[np.ndarray, "p e k"]
+
+
+def examined(result: FitResult, seed: int = 0) -> FitResult:
+    """The fit with what its residuals say against it (`doubts`); as it is where it is not to be trusted anyway.
+
+    `seed` is that of the Monte Carlo p. Of a set with more than `limits.TRUST_ROWS` (exposure, point) pairs, points
+    spread over the field are looked at. A χ² that is a few per cent too large while nothing else is wrong is put down
+    to the stated errors (`FitResult.noise_only`), and the standard errors are made from the residuals.
+    """
+    if not (result.converged and (result.explains_data or result.nearly_explains_data)):
+        return dataclasses.replace(result, examined=True)
+    design = Design.of(_sample(result))
+    table = pattern_scores(design, seed)
+    doubts = (*_patterns(table), *_groups(design))
+    return with_honest_errors(dataclasses.replace(result, examined=True, doubts=doubts))
+
+
+def refit(
+    calset: CalibrationSet,
+    model: Model | None = None,
+    *,
+    folder: str | os.PathLike[str] | None = None,
+    progress: Progress | None = None,
+    memory: float | None = None,
+    processes: Processes | None = None,
+) -> FitResult:
+    """Fit a calibration set with `model` (default: the base model), and examine what it leaves.
+
+    Arguments, and what is raised, are those of `fit.refit.refit`.
+    """
+    return examined(
+        fit_refit(calset, model, folder=folder, progress=progress, memory=memory, processes=processes)
+    )
+
+
+def _sample(result: FitResult) -> FitResult:
+    most = max(1, limits.TRUST_ROWS // max(len(result.calset.exposures), 1))
+    if len(result.calset.points) <= most:
+        return result
+    calset = thinned(result.calset, most, neighbours=1)
+    return dataclasses.replace(result, likelihood=Likelihood.of(calset, result.model))
+
+
+def pattern_scores(design: Design, seed: int = 0) -> ScoreTable:
+    """The scores of all patterns that the exposures allow, against a fit."""
+    candidates = list(strata(design.measured))
+    names, widths = [c.name for c in candidates], [c.widths for c in candidates]
+    columns = design.stacked([candidates.pop(0).columns for _ in names])
+    space = ScoreSpace.projected(design.projector, names, widths, columns)
+    residual = design.projector(design.residual)
+    scorer = Scorer(space, np.random.default_rng(seed))
+    return scorer(columns.T @ residual, float(residual @ residual))
+
+
+def _patterns(table: ScoreTable) -> Iterator[str]:
+    if table.p_global >= ALARM:
+        return
+    names = [score.name for score in table.ranked if table.corrected(score) < ALARM][:_SHOWN]
+    yield (
+        f"the residuals hold patterns that noise does not make (p = {table.p_global:.2g}: {', '.join(names)}): "
+        "walop-jax diagnose looks for the cause"
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class GroupScore:
+    """Squared residuals of a group of the data beside those of the rest.
+
+    `ratio` is 1 where the group scatters as the rest does; `p_value` that of a ratio so far from 1, on either side.
+    """
+
+    name: str
+    ratio: float
+    p_value: float
+
+
+def group_scores(design: Design) -> list[GroupScore]:
+    """Every camera, kind, filter and exposure of a fit by itself."""
+    measured = design.measured
+    residual = design.cube(design.projector(design.residual))
+    w = np.where(measured.known[..., None], 0.0, _unit(measured.model)) ** 2
+    absorbed = design.cube(np.sum(design.projector.basis**2, axis=1))
+    expected = np.where(measured.used[..., None], np.clip(1.0 - w - absorbed, 0.0, None), 0.0)
+    found = []
+    for name, chosen in _groups_of(design).items():
+        group = np.broadcast_to(chosen, residual.shape) & measured.used[..., None]
+        rest = ~group & measured.used[..., None]
+        means = [float(expected[part].sum()) for part in (group, rest)]
+        if min(means) <= 0:
+            continue
+        # ‖P‖² exposure by exposure at every point; what the parameters couple beyond that is small beside it.
+        taken = [np.where(part, w, 0.0).sum(axis=-1) for part in (group, rest)]
+        own = [
+            np.where(part, (1.0 - w) ** 2 - w**2, 0.0).sum() + np.sum(sums**2)
+            for part, sums in zip((group, rest), taken, strict=True)
+        ]
+        variance = 2.0 * (own[0] / means[0] ** 2 + own[1] / means[1] ** 2)
+        variance -= 4.0 * np.sum(taken[0] * taken[1]) / (means[0] * means[1])
+        squares = [float(np.sum(residual[part] ** 2)) for part in (group, rest)]
+        ratio = squares[0] / means[0] / max(squares[1] / means[1], 1e-300)
+        degrees = 2.0 / variance
+        above = float(stats.chi2.sf(ratio * degrees, degrees))
+        found.append(GroupScore(name, ratio, 2.0 * min(above, 1.0 - above)))
+    return found
+
+
+def _unit(model: Cube) -> Cube:
+    norm = np.linalg.norm(model, axis=-1, keepdims=True)
+    return model / np.where(norm > 0, norm, 1.0)
+
+
+def _groups_of(design: Design) -> Mapping[str, Bool[np.ndarray, "1 e k"]]:
+    e, cameras = design.fit.calset.exposures, design.fit.model.template.cameras.names
+    every = np.ones((1, len(e), len(cameras)), bool)
+    groups = {f"camera {name}": every & (np.arange(len(cameras)) == k) for k, name in enumerate(cameras)}
+    for what, labels in (("kind", e.kind), ("filter", e.filter), ("exposure", e.exposure)):
+        for label in np.unique(labels):
+            groups[f"{what} {label}"] = every & (labels == label)[None, :, None]
+    return groups
+
+
+def _groups(design: Design) -> Iterator[str]:
+    scores = group_scores(design)
+    # A part of the data so small that chance moves it by a quarter is held to a far smaller p by the number of groups.
+    limit = -np.expm1(np.log1p(-ALARM) / max(len(scores), 1))
+    odd = [s for s in scores if s.p_value < limit and not 1.0 / UNEVEN < s.ratio < UNEVEN]
+    if odd:
+        odd.sort(key=lambda s: -abs(np.log(max(s.ratio, 1e-12))))
+        listed = ", ".join(f"{s.name} {s.ratio:.3g}" for s in odd[:_SHOWN])
+        more = f" and {len(odd) - _SHOWN} more" if len(odd) > _SHOWN else ""
+        yield f"squared residuals differ between parts of the data, beside those of the rest: {listed}{more}"
