@@ -31,11 +31,12 @@ def _point_vectors(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> 
     return light.camera_vectors(instrument, rows, light.throughput_at(instrument, x, y), x, y)
 
 
-def _point_sky_vectors(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
+def point_sky_vectors(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
+    """Analysis vectors (band, camera, Stokes) at a field point for light from the sky, inside a computation."""
     return _point_vectors(instrument, plan, x, y) @ light.telescope(instrument, x, y)
 
 
-def _point_matrix(
+def point_matrix(
     instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
 ) -> tuple[Float[Array, "b a 3"], Float[Array, "b a 3 n"]]:
     """Instrument matrices of a field point and their derivatives with respect to all parameters."""
@@ -61,7 +62,7 @@ def _matrices_with_covariance(
     """At rows of x, y (deg), colour temperature (0: flat), temperature and hour angle; the plan has one band."""
 
     def one(x: Scalar, y: Scalar, *numbers: Scalar) -> tuple[Float[Array, "b a 3"], Float[Array, "b a 3 n"]]:
-        return _point_matrix(instrument, with_numbers(plan, *numbers), x, y)
+        return point_matrix(instrument, with_numbers(plan, *numbers), x, y)
 
     m, derivative = jax.vmap(one)(*columns)
     flat = derivative[:, 0].reshape(len(m), m.shape[2] * 3, -1)
@@ -70,7 +71,7 @@ def _matrices_with_covariance(
 
 _matrices = compiled(_matrices_with_covariance)
 _vectors = compiled(jax.vmap(_point_vectors, in_axes=(None, None, 0, 0)))
-_sky_vectors = compiled(jax.vmap(_point_sky_vectors, in_axes=(None, None, 0, 0)))
+_sky_vectors = compiled(jax.vmap(point_sky_vectors, in_axes=(None, None, 0, 0)))
 
 
 def analysis_vectors(

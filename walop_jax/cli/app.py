@@ -17,6 +17,7 @@ COMMANDS = (
     "refit",
     "sample",
     "diagnose",
+    "limits",
     "matrix",
     "apply",
     "compare",

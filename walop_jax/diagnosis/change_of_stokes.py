@@ -30,17 +30,24 @@ def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p a 3"]:
     return np.asarray(light.instrument_matrix(jnp.asarray(vectors), instrument.cameras.pairs))
 
 
-def largest_change(
+def change_of_qu(
     assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
-) -> float:
-    """Largest error of q and u over the field for stars polarised by up to `p`; NaN when no point holds both."""
+) -> Float[np.ndarray, " p"]:
+    """Largest error of q and u at each field point for stars polarised by up to `p`; NaN where not measured."""
+    found = np.full(len(assumed), np.nan)
     if assumed.shape[1] != 2:  # one exposure of one arm, or of three, does not give q and u and nothing else
-        return float("nan")
+        return found
     good = np.abs(np.linalg.det(assumed[:, :, 1:])) > SMALLEST_DETERMINANT
-    if not good.any():
-        return float("nan")
     inverse = np.linalg.inv(assumed[good, :, 1:])
     change = (true - assumed)[good]
     offset = np.linalg.norm(inverse @ change[:, :, :1], axis=(1, 2))
-    scale = np.linalg.norm(inverse @ change[:, :, 1:], ord=2, axis=(1, 2))
-    return float(np.max(offset + p * scale))
+    found[good] = offset + p * np.linalg.norm(inverse @ change[:, :, 1:], ord=2, axis=(1, 2))
+    return found
+
+
+def largest_change(
+    assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
+) -> float:
+    """Largest of `change_of_qu` over the field; NaN when no point holds both q and u."""
+    found = change_of_qu(assumed, true, p)
+    return float(np.nanmax(found)) if np.isfinite(found).any() else float("nan")

@@ -46,6 +46,11 @@ class Probe:
                 yield from [name] * np.size(getattr(member, name))
 
     @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that the amplitudes belong to, one for each."""
+        return tuple(self._fields())
+
+    @property
     def widths(self) -> Vector:
         """Prior widths of the amplitudes, member by member."""
         declared = field_declarations(self.effect)

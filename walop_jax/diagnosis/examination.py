@@ -15,7 +15,7 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.effect_columns import Probe, effect_candidates
 from walop_jax.diagnosis.findings import Limit
 from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, strata
-from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable, separations
+from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable, separations, whitening
 from walop_jax.fit.refit import FitResult
 from walop_jax.model.effects import Effect
 from walop_jax.model.parameters import field_declarations
@@ -96,6 +96,20 @@ class Examination:
         points = np.repeat(self.design.measured.used.sum(axis=0), self.design.measured.cameras - 1)
         square = np.where(self.space.before[at] > 0, self.space.before[at], np.inf)
         return np.maximum(COMMON_MODE * np.sqrt(points / square), 1e-30)
+
+    @property
+    def scored_space(self) -> ScoreSpace:
+        """The space in which everything is scored: behind the nuisance that single exposures may have."""
+        return self._scored[0]
+
+    @cached_property
+    def whitened(self) -> dict[str, Matrix]:
+        """By candidate, the rows that turn its elements of `space.gram` into uncorrelated ones."""
+        alive, found = self.space.alive(), {}
+        for name, at in self.space.places().items():
+            mask = np.outer(alive[at], alive[at])
+            found[name] = whitening(np.where(mask, self.space.gram[at, at], 0.0)).T
+        return found
 
     def patterns_needed(self) -> list[tuple[str, float]]:
         """Patterns that together leave nothing significant, with corrected p: the most probable first, one by one."""

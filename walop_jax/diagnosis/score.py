@@ -222,6 +222,10 @@ class Scorer:
         self._all = whitening(gram)
         self._smallest = self._smallest_p(gram, rng, draws)
 
+    def threshold(self, p: float) -> float:
+        """ln of the local p that the smallest of all candidates undercuts with probability `p` under the base."""
+        return float(np.quantile(self._smallest, p)) if len(self._smallest) else float(np.log(p))
+
     def __call__(self, scores: Vector, square: float) -> ScoreTable:
         """The table from s = C̃ᵀr and r·r, both behind the projection."""
         explained = self._all.T @ np.where(self._alive, scores, 0.0)

@@ -59,7 +59,7 @@ def examined(result: FitResult, seed: int = 0) -> FitResult:
     """
     if not (result.converged and (result.explains_data or result.nearly_explains_data)):
         return dataclasses.replace(result, examined=True)
-    design = Design.of(_sample(result))
+    design = Design.of(sampled(result, limits.TRUST_ROWS))
     table = pattern_scores(design, seed)
     doubts = (*_patterns(table), *_groups(design))
     return with_honest_errors(dataclasses.replace(result, examined=True, doubts=doubts))
@@ -83,8 +83,9 @@ def refit(
     )
 
 
-def _sample(result: FitResult) -> FitResult:
-    most = max(1, limits.TRUST_ROWS // max(len(result.calset.exposures), 1))
+def sampled(result: FitResult, rows: int) -> FitResult:
+    """The fit seen at points spread over the field, with no more than `rows` (exposure, point) pairs."""
+    most = max(1, rows // max(len(result.calset.exposures), 1))
     if len(result.calset.points) <= most:
         return result
     calset = thinned(result.calset, most, neighbours=1)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
@@ -13,7 +11,7 @@ from walop_jax.likelihood import limits
 from walop_jax.likelihood.engine import PointData, best_flux, point_prediction, real_counts
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.model.compiled import compiled
-from walop_jax.model.effects.base import Effect
+from walop_jax.model.effects.base import Effect, with_amplitudes
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 
@@ -21,21 +19,13 @@ from walop_jax.model.plan import Plan
 def _point_effect_columns(
     instrument: Instrument, plan: Plan, probes: tuple[Effect, ...], point: PointData
 ) -> Float[Array, "a d"]:
-    names = [(i, name) for i, probe in enumerate(probes) for name in probe.amplitudes()]
-    neutral = [getattr(probes[i], name) for i, name in names]
-
-    def with_amplitudes(amplitudes: list[Float[Array, ...]]) -> Instrument:
-        changed = list(probes)
-        for (i, name), value in zip(names, amplitudes, strict=True):
-            changed[i] = dataclasses.replace(changed[i], **{name: value})
-        return dataclasses.replace(instrument, effects=(*instrument.effects, *changed))
-
-    at_neutral = with_amplitudes(neutral)
+    neutral, put = with_amplitudes(instrument, probes)
+    at_neutral = put(neutral)
     unit = point_prediction(at_neutral, plan, point)
     flux = best_flux(at_neutral, plan, unit, point)
 
     def counts(amplitudes: list[Float[Array, ...]]) -> Float[Array, "e k"]:
-        active = with_amplitudes(amplitudes)
+        active = put(amplitudes)
         return real_counts(active, plan, point_prediction(active, plan, point), flux)
 
     _, push = jax.linearize(counts, neutral)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import jax
@@ -149,6 +149,21 @@ class Effect(Component):
         except NoSuchPlaceError:
             return False
         return True
+
+
+def with_amplitudes(
+    instrument: Instrument, effects: Sequence[Effect]
+) -> tuple[list[Float[Array, ...]], Callable[[list[Float[Array, ...]]], Instrument]]:
+    """The amplitudes of effects, one after the other, and the function that adds the effects with other ones."""
+    names = [(i, name) for i, effect in enumerate(effects) for name in effect.amplitudes()]
+
+    def put(amplitudes: list[Float[Array, ...]]) -> Instrument:
+        changed = list(effects)
+        for (i, name), value in zip(names, amplitudes, strict=True):
+            changed[i] = dataclasses.replace(changed[i], **{name: value})
+        return dataclasses.replace(instrument, effects=(*instrument.effects, *changed))
+
+    return [getattr(effects[i], name) for i, name in names], put
 
 
 def check_camera(effect: Effect, camera: int, names: Sequence[str]) -> int:

@@ -1,0 +1,137 @@
+"""Limits by linear algebra, held against draws of noise and against sets in which the effect is put."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from walop_jax.calibration.matrix import matrices
+from walop_jax.data.settings import Settings
+from walop_jax.diagnosis.detection_limits import (
+    PROBABILITY,
+    DetectionLimits,
+    detection_limits,
+)
+from walop_jax.diagnosis.effect_columns import probes
+from walop_jax.diagnosis.examination import ALARM, Examination
+from walop_jax.diagnosis.score import Scorer
+from walop_jax.fit.refit import FitResult, refit
+from walop_jax.model.effects import effect_by_name
+from walop_jax.model.specification import effect_context
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
+
+PLAN = ObservingPlan(grid=6, standard_grid=3, polariser_angles=polariser_turn(9), moon_patches=6, standards=6)
+CHOSEN = (
+    "clp_zero",
+    "wollaston_axis",
+    "telescope_polarisation",
+    "upstream_retarder",
+    "pedestal",
+    "hwp1_axis",
+)
+CATALOGUE = tuple(effect_by_name(name) for name in CHOSEN)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> FitResult:
+    return refit(simulate(PLAN, seed=5).calset)
+
+
+@pytest.fixture(scope="module")
+def found(fitted) -> DetectionLimits:
+    return detection_limits(fitted, catalogue=CATALOGUE)
+
+
+@pytest.fixture(scope="module")
+def examination(fitted) -> Examination:
+    context = effect_context(fitted.model.template, fitted.calset.exposures)
+    return Examination(fitted, list(probes(CATALOGUE, context)), np.random.default_rng(1))
+
+
+def test_every_effect_has_a_limit_or_is_named_as_beyond_these_data(found):
+    assert {entry.effect for entry in found.limits} | set(found.untestable) == set(CHOSEN)
+    for entry in found.limits:
+        assert 0 < entry.detected[0] <= entry.detected[1] <= entry.named
+
+
+def test_the_alarm_is_raised_with_the_stated_probability(found, examination):
+    """Scores drawn with each effect at its limit: 99 % of the draws raise the alarm, at 90 % of it clearly fewer."""
+    space = examination.scored_space
+    scorer = Scorer(space, np.random.default_rng(2))
+    value, vector = np.linalg.eigh(space.gram)
+    root = vector * np.sqrt(np.clip(value, 0.0, None))
+    threshold = scorer.threshold(ALARM)
+    places, draws = space.places(), 1200
+    noise = np.random.default_rng(3).standard_normal((draws, root.shape[1])) @ root.T
+    checked = 0
+    for probe in examination.probes:
+        limit = next(
+            e for e in found.limits if e.effect == probe.effect.name and e.parameter == probe.parameters[0]
+        )
+        at = places[probe.name]
+        if limit.detected[1] > 1.001 * limit.detected[0]:
+            continue
+        rates = []
+        for share in (1.0, 0.9):
+            scores = noise - share * limit.detected[0] * space.gram[:, at.start]
+            rates.append(np.mean([_alarm(scorer, s, threshold) for s in scores]))
+        # Other candidates raise the alarm as well, so that it is rather more probable than the effect alone makes it.
+        assert rates[0] > PROBABILITY - 4 * np.sqrt(0.01 * 0.99 / draws), probe.name
+        assert rates[1] < 0.985, probe.name
+        checked += 1
+    assert checked >= 3
+
+
+def _alarm(scorer: Scorer, scores: np.ndarray, threshold: float) -> bool:
+    table = scorer(scores, float(scorer.space.free))
+    return any(score.testable and score.log_p < threshold for score in table.scores)
+
+
+def test_what_goes_unnoticed_is_what_a_fit_without_the_effect_gets_wrong(fitted, found):
+    """The matrix of a fit to noiseless data with the effect in them, against the true one: to first order the same."""
+    name = "telescope_polarisation"
+    entry = next(e for e in found.limits if e.effect == name)
+    context = effect_context(fitted.model.template, fitted.calset.exposures)
+    truth = fitted.model.instrument(fitted.values)
+    small = effect_by_name(name).of(context, **{entry.parameter: entry.detected[0]})
+    pair = [simulate(PLAN, seed=5, instrument=truth, effects=e, noiseless=True) for e in ((), (small,))]
+    fits = [refit(one.calset) for one in pair]
+    x, y = fitted.calset.points.x, fitted.calset.points.y
+    setting = Settings.default(len(x), str(fitted.calset.exposures.filter[0]))
+    nothing = np.zeros((len(fitted.values), len(fitted.values)))
+
+    def matrix(result: FitResult) -> np.ndarray:
+        instrument = result.model.instrument(result.values)
+        return matrices(instrument, setting, result.calset.filters, x, y, nothing)[0].reshape(-1, 2, 3)
+
+    # The telescope's own part of the star's light is in the truth, and not in the calibration.
+    with_effect = dataclasses.replace(truth, effects=(small,))
+    more = nothing[0].size + len(small.amplitudes())
+    true = matrices(with_effect, setting, pair[1].calset.filters, x, y, np.zeros((more, more)))[0].reshape(
+        -1, 2, 3
+    )
+    wrong = matrix(fits[1]) - matrix(fits[0]) - (true - matrix(fits[0]))
+    inverse = np.linalg.inv(matrix(fits[0])[:, :, 1:])
+    error = np.linalg.norm(inverse @ wrong[:, :, :1], axis=(1, 2))
+    error += 0.05 * np.linalg.norm(inverse @ wrong[:, :, 1:], ord=2, axis=(1, 2))
+    assert error.max() == pytest.approx(entry.error_of_qu, rel=0.05)
+
+
+def test_without_rivals_what_is_detected_is_named(fitted):
+    found = detection_limits(fitted, catalogue=CATALOGUE[:1])
+    assert found.limits[0].named == found.limits[0].detected[1]
+    assert found.separation.shape == (1, 1)
+
+
+def test_twice_the_light_shows_effects_of_half_the_variance(fitted, found):
+    """Photon noise alone: four times the electrons halve every amplitude that is detected (read noise aside)."""
+    brighter = refit(simulate(dataclasses.replace(PLAN, electrons=4e6), seed=5).calset)
+    again = detection_limits(brighter, catalogue=CATALOGUE)
+    before = {(e.effect, e.parameter): e.detected[0] for e in found.limits}
+    after = {(e.effect, e.parameter): e.detected[0] for e in again.limits}
+    for key in ("wollaston_axis", "angle"), ("hwp1_axis", "angle"):
+        if key in before:
+            assert 0.45 < after[key] / before[key] < 0.75

@@ -1,0 +1,308 @@
+"""What a calibration set can show before anything is found in it: the sizes at which effects are detected and named.
+
+Everything is linear algebra on the columns of the score test (`score`), at a fit or at a plan without noise.
+
+Detected    An effect of amplitude ε has the statistic T ~ χ'²_k(λ) with λ = ε² G (G the Gram element of its column
+            behind the projection). The alarm is raised where the smallest p of all candidates undercuts p*, which noise
+            does with probability `ALARM`; ε is that for which T does so with probability `PROBABILITY`.
+Named       A rival that does its best to follow the effect stays √S ε from it (`score.separations`). The effect is
+            named alone where the amplitude found, ε ± 1/√G, leaves every rival `SEPARATION` or more away with
+            probability `PROBABILITY`: ε ≥ SEPARATION/√S + z/√G; below that it is told with those for which it may be
+            taken.
+Protection  A calibration without the effect takes up a part of it: δθ = (JᵀJ)⁻¹JᵀC ε. Stars are seen through
+            m + ε ∂m/∂ε and calibrated with m + δθ ∂m/∂θ; the difference at the amplitude that is just detected is the
+            largest error of q and u that the effect can make without being noticed.
+
+Symbols     J, C derivatives of the whitened residuals with respect to parameters and amplitude; m instrument matrix;
+            z the normal quantile of `PROBABILITY`.
+Sources     Baarda 1968 (reliability: what a test finds, and what an error that it misses does to the result); Teunissen
+            2018, J. Geod. 92, 59 (detection, identification, adaptation); Atkinson & Fedorov 1975, Biometrika 62, 57.
+Limits      One effect at a time, to first order in its amplitude, for the shapes that the search starts from.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy import optimize, stats
+
+from walop_jax.calibration.matrix_slopes import effect_slopes, matrix_slopes
+from walop_jax.data.settings import Settings
+from walop_jax.diagnosis.change_of_stokes import change_of_qu
+from walop_jax.diagnosis.effect_columns import Probe
+from walop_jax.diagnosis.effect_columns import probes as all_probes
+from walop_jax.diagnosis.examination import ALARM, Examination
+from walop_jax.diagnosis.naming import SEPARATION
+from walop_jax.diagnosis.score import Scorer, ScoreSpace, whitening
+from walop_jax.diagnosis.trust import sampled
+from walop_jax.fit.refit import FitResult
+from walop_jax.likelihood import limits
+from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.parameters import field_declarations
+from walop_jax.model.specification import effect_context
+
+PROBABILITY = 0.99
+_ABSORBED = 1e-9  # share of the square of a column that a rival leaves below which the two are the same
+
+Vector = Float[np.ndarray, " _"]
+Matrix = Float[np.ndarray, "_ _"]
+
+
+@dataclasses.dataclass(frozen=True)
+class DetectionLimit:
+    """The amplitudes of one parameter of an effect that are detected and named, in its unit.
+
+    `detected` holds the smallest and the largest over the shapes that the effect may have, `named` the largest
+    (infinite where some rival does exactly the same). `taken_for` are the effects for which it may be taken when it is
+    just detected, nearest first. `error_of_qu` is the largest error over the field that q and u of a star polarised by
+    up to 5 % have from it, at the amplitude that is just detected; NaN where one exposure does not give both.
+    """
+
+    effect: str
+    parameter: str
+    unit: str
+    detected: tuple[float, float]
+    named: float
+    taken_for: tuple[str, ...]
+    error_of_qu: float
+
+
+@dataclasses.dataclass(frozen=True)
+class DetectionLimits:
+    """What a set can show of every effect, and what the effects that it cannot show may do.
+
+    `separation` (row, column) is how far (σ) the effect of the column stays from that of the row when this is just
+    detected. `protection` is, by field point (`x`, `y`, degrees), the largest error of q and u that a single effect
+    can make without being detected, `caused_by` the effect. `untestable` effects leave no trace in these data.
+    """
+
+    limits: tuple[DetectionLimit, ...]
+    effects: tuple[str, ...]
+    separation: Matrix
+    x: Vector
+    y: Vector
+    protection: Vector
+    caused_by: tuple[str, ...]
+    untestable: tuple[str, ...]
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {
+            "probability": PROBABILITY,
+            "alarm": ALARM,
+            "limits": [dataclasses.asdict(entry) for entry in self.limits],
+            "effects": list(self.effects),
+            "separation": self.separation.tolist(),
+            "protection": {
+                "x": self.x.tolist(),
+                "y": self.y.tolist(),
+                "error_of_qu": self.protection.tolist(),
+                "caused_by": list(self.caused_by),
+            },
+            "untestable": list(self.untestable),
+        }
+
+
+def detection_limits(
+    result: FitResult,
+    *,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> DetectionLimits:
+    """Amplitudes at which the data behind a fit show each effect of `catalogue`, and what they cannot show.
+
+    The residuals of the fit are not used: a fit to noiseless counts of a plan serves as well. `seed` is that of the
+    Monte Carlo threshold. Of a large set points spread over the field are looked at, as in `diagnose`.
+    """
+    tell = progress or (lambda text: None)
+    result = sampled(result, limits.DIAGNOSED_ROWS)
+    context = effect_context(result.model.template, result.calset.exposures)
+    fitting = [kind for kind in catalogue if kind.neutral(context).fits(result.model.template)]
+    tell("differentiating every effect")
+    rng = np.random.default_rng(seed)
+    examination = Examination(result, list(all_probes(fitting, context)), rng)
+    space = examination.scored_space
+    noncentrality = _Noncentrality(Scorer(space, rng).threshold(ALARM))
+    tell("comparing the effects")
+    columns = [c for probe in examination.probes for c in _columns(examination, space, probe, noncentrality)]
+    tell("finding what goes unnoticed")
+    return _collected(examination, columns, _errors(examination, columns), fitting)
+
+
+class _Noncentrality:
+    """λ for which χ'²_k(λ) undercuts a local p with `PROBABILITY`."""
+
+    def __init__(self, log_p: float) -> None:
+        self._p, self._known = float(np.exp(log_p)), dict[int, float]()
+
+    def __call__(self, rank: int) -> float:
+        if rank not in self._known:
+            least = stats.chi2.isf(self._p, rank)
+            found = optimize.root_scalar(
+                lambda value: stats.ncx2.sf(least, rank, value) - PROBABILITY,
+                bracket=(1e-6, 10.0 * least + 100.0),
+            )
+            self._known[rank] = float(found.root)
+        return self._known[rank]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Column:
+    """One amplitude of one probe: where it is detected and named, and who stays how far from it then."""
+
+    probe: Probe
+    number: int
+    parameter: str
+    detected: float
+    named: float
+    rivals: Mapping[str, float]
+
+
+def _columns(
+    examination: Examination, space: ScoreSpace, probe: Probe, noncentrality: _Noncentrality
+) -> list[_Column]:
+    at, alive = space.places()[probe.name], space.alive()
+    inside = np.arange(at.start, at.stop)
+    rank = whitening(np.where(np.outer(alive[at], alive[at]), space.gram[at, at], 0.0)).shape[1]
+    found = []
+    for number, place in enumerate(inside):
+        if not alive[place]:
+            continue
+        detected = float(np.sqrt(noncentrality(rank) / space.gram[place, place]))
+        full = examination.space
+        square = float(full.gram[place, place])
+        apart = _separations(full, examination, probe, place)
+        nearest = min(apart.values(), default=np.inf)
+        named = detected
+        if nearest <= np.sqrt(_ABSORBED * square):
+            named = np.inf
+        elif np.isfinite(nearest):
+            named = max(detected, SEPARATION / nearest + stats.norm.ppf(PROBABILITY) / np.sqrt(square))
+        rivals = {name: value * detected for name, value in apart.items()}
+        found.append(_Column(probe, number, probe.parameters[number], detected, float(named), rivals))
+    return found
+
+
+def _separations(space: ScoreSpace, examination: Examination, probe: Probe, place: int) -> dict[str, float]:
+    """How far every other effect stays from one column, for an amplitude of one."""
+    found: dict[str, float] = {}
+    square = float(space.gram[place, place])
+    for rival in examination.probes:
+        if rival.effect is probe.effect:
+            continue
+        along = examination.whitened[rival.name] @ space.gram[space.places()[rival.name], place]
+        left = float(np.sqrt(max(square - float(along @ along), 0.0)))
+        found[rival.effect.name] = min(left, found.get(rival.effect.name, np.inf))
+    return found
+
+
+def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.ndarray, "c p"]:
+    """Error of q and u at every field point from each column, at the amplitude that is just detected.
+
+    Of an effect with many shapes that of the median amplitude stands for all; the others are NaN.
+    """
+    design, result = examination.design, examination.result
+    instrument, calset = result.model.instrument(result.values), result.calset
+    first = Settings.of(calset.exposures[:1], instrument.patched().moving())
+    setting = Settings.default(1, str(first.filter[0])).at(**first.positions)
+    x, y = calset.points.x, calset.points.y
+    matrix, slopes = matrix_slopes(instrument, setting, calset.filters, x, y)
+    slopes = slopes @ result.model.selection()
+    chosen = _representative(columns)
+    probes = [probe for probe in examination.probes if probe.name in chosen]
+    members = tuple(member for probe in probes for member in probe.group)
+    changes = effect_slopes(instrument, setting, calset.filters, x, y, members)
+    starts = np.cumsum([0, *(len(probe.widths) for probe in probes)])
+    place = {probe.name: int(start) for probe, start in zip(probes, starts, strict=False)}
+    norm = np.linalg.norm(design.jacobian, axis=0)
+    scaled = design.jacobian / np.where(norm > 0, norm, 1.0)
+    inverse = np.linalg.pinv(scaled.T @ scaled, hermitian=True)
+    found = np.full((len(columns), len(x)), np.nan)
+    for i, column in enumerate(columns):
+        if column.probe.name not in chosen:
+            continue
+        raw = examination.named[column.probe.name].columns[:, column.number] / result.noise_scale
+        taken_up = inverse @ (scaled[: design.rows].T @ raw) / np.where(norm > 0, norm, 1.0)
+        own = changes[..., place[column.probe.name] + column.number]
+        found[i] = change_of_qu(matrix, matrix + column.detected * (own - slopes @ taken_up))
+    return found
+
+
+def _representative(columns: Sequence[_Column]) -> set[str]:
+    """Names of the probes whose effect on the matrix is worked out."""
+    by_effect: dict[type[Effect], dict[str, float]] = {}
+    for column in columns:
+        by_effect.setdefault(column.probe.effect, {}).setdefault(column.probe.name, column.detected)
+    chosen: set[str] = set()
+    for shapes in by_effect.values():
+        names = sorted(shapes, key=shapes.__getitem__)
+        chosen.update(names if len(names) <= limits.MANY_SHAPES else [names[len(names) // 2]])
+    return chosen
+
+
+def _collected(
+    examination: Examination,
+    columns: Sequence[_Column],
+    errors: Float[np.ndarray, "c p"],
+    catalogue: Sequence[type[Effect]],
+) -> DetectionLimits:
+    groups: dict[tuple[type[Effect], str], list[int]] = {}
+    for i, column in enumerate(columns):
+        groups.setdefault((column.probe.effect, column.parameter), []).append(i)
+    entries = []
+    for (effect, parameter), members in groups.items():
+        mine = [columns[i] for i in members]
+        near = _nearest(mine)
+        entries.append(
+            DetectionLimit(
+                effect=effect.name,
+                parameter=parameter,
+                unit=field_declarations(effect)[parameter].unit,
+                detected=(min(c.detected for c in mine), max(c.detected for c in mine)),
+                named=max(c.named for c in mine),
+                taken_for=tuple(
+                    name for name in sorted(near, key=near.__getitem__) if near[name] < SEPARATION
+                ),
+                error_of_qu=_largest(errors[members]),
+            )
+        )
+    names = tuple(dict.fromkeys(effect.name for effect, _ in groups))
+    separation = np.full((len(names), len(names)), np.nan)
+    for row, name in enumerate(names):
+        near = _nearest([c for c in columns if c.probe.effect.name == name])
+        separation[row] = [near.get(other, np.nan) for other in names]
+    points = examination.result.calset.points
+    worst = np.where(np.isfinite(errors), errors, -1.0)
+    largest = worst.argmax(axis=0) if len(columns) else np.zeros(len(points), int)
+    protection = worst[largest, np.arange(len(points))] if len(columns) else np.full(len(points), np.nan)
+    known = protection >= 0
+    return DetectionLimits(
+        limits=tuple(sorted(entries, key=lambda e: -np.nan_to_num(e.error_of_qu, nan=-1.0))),
+        effects=names,
+        separation=separation,
+        x=points.x,
+        y=points.y,
+        protection=np.where(known, protection, np.nan),
+        caused_by=tuple(
+            columns[i].probe.effect.name if k else "" for i, k in zip(largest, known, strict=True)
+        ),
+        untestable=examination.untestable(catalogue),
+    )
+
+
+def _nearest(columns: Sequence[_Column]) -> dict[str, float]:
+    """How far each rival stays from the amplitude and shape that it follows best."""
+    found: dict[str, float] = {}
+    for column in columns:
+        for name, value in column.rivals.items():
+            found[name] = min(value, found.get(name, np.inf))
+    return found
+
+
+def _largest(errors: np.ndarray) -> float:
+    return float(np.nanmax(errors)) if np.isfinite(errors).any() else float("nan")

@@ -1,0 +1,72 @@
+"""What calibration sets can show: the sizes at which effects are detected and named, and what goes unnoticed."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from walop_jax.diagnosis.detection_limits import DetectionLimits, detection_limits
+from walop_jax.diagnosis.trust import refit
+from walop_jax.io.folder import atomic_folder, check_folder
+from walop_jax.io.text import json_text, read_text
+from walop_jax.reports.limits_figures import protection_figure, separation_figure
+from walop_jax.runs.inputs import sets_and_model
+
+DOCUMENT, PROTECTION, SEPARATION = "limits.json", "limits_protection.png", "limits_separation.png"
+OUTPUTS = (DOCUMENT, PROTECTION, SEPARATION)
+
+
+@dataclasses.dataclass(frozen=True)
+class LimitsRun:
+    """The limits of a set, the content of `limits.json`, and what to bear in mind."""
+
+    found: DetectionLimits
+    document: dict[str, Any]
+    warnings: tuple[str, ...]
+
+
+def limits_of_sets(
+    calsets: Sequence[str | os.PathLike[str]],
+    output: str | os.PathLike[str] | None = None,
+    *,
+    model: str | os.PathLike[str] | None = None,
+    instrument: str | os.PathLike[str] | None = None,
+    seed: int | None = None,
+    overwrite: bool = False,
+    progress: Callable[[str], None] | None = None,
+) -> LimitsRun:
+    """Fit calibration sets and find what they can show; write the folder `output`, if given.
+
+    A set that was simulated from a plan says what the plan is worth. `instrument` is a shipped one by name or a
+    description file (default: what the sets say), `model` a TOML file (default: the base model); `seed` (None: 0) is
+    that of the Monte Carlo. `progress` is told what is being done.
+
+    Raises `DataError` for files that cannot be read or written, ValueError for a model file that does not fit and a fit
+    that does not converge, and what `refit` raises.
+    """
+    tell = progress or (lambda text: None)
+    text = "" if model is None else read_text(model)
+    if output is not None:
+        check_folder(output, OUTPUTS, overwrite=overwrite)
+    tell("reading")
+    calset, chosen = sets_and_model(calsets, text, model, instrument)
+    result = refit(calset, chosen, progress=tell)
+    if not result.converged:
+        raise ValueError(f"the fit did not converge ({result.minimum.message})")
+    found = detection_limits(result, seed=seed or 0, progress=tell)
+    document = found.document() | {
+        "instrument": result.model.name,
+        "effects_of_the_model": list(result.model.effect_names),
+        "inputs": [{"path": str(entry.path), "sha256": entry.sha256} for entry in calset.inputs],
+        "trusted": result.trusted,
+        "seed": seed,
+    }
+    if output is not None:
+        with atomic_folder(Path(output), OUTPUTS, overwrite=overwrite) as folder:
+            (folder / DOCUMENT).write_text(json_text(document), encoding="utf-8")
+            protection_figure(found).savefig(folder / PROTECTION, dpi=130)
+            separation_figure(found).savefig(folder / SEPARATION, dpi=130)
+    return LimitsRun(found, document, tuple(f"the fit: {text}" for text in result.warnings))
