@@ -54,6 +54,10 @@ def _cameras(count: int) -> list[str]:
     return [f"n{k}" for k in range(count)]
 
 
+def _fine(coefficients: Float[Array, "k f"], x: Scalar, y: Scalar) -> Float[Array, " k"]:
+    return coefficients @ legendre.basis(x, y, FINE)[len(_SMOOTH_TERMS) :]
+
+
 class Pattern(Mixing):
     """Smooth changes of q and u elements, fine changes of the response to unpolarised light."""
 
@@ -67,9 +71,7 @@ class Pattern(Mixing):
             change = self.smooth @ legendre.basis(x, y, SMOOTH)
             vectors = vectors.at[:, :, 1:3].add(plain[..., None] * change)
         if self.fine.size:
-            vectors = vectors.at[:, :, 0].add(
-                plain * (self.fine @ legendre.basis(x, y, FINE)[len(_SMOOTH_TERMS) :])
-            )
+            vectors = vectors.at[:, :, 0].add(plain * _fine(self.fine, x, y))
         return vectors
 
 
@@ -78,6 +80,7 @@ class Shares(ExposurePart):
 
     harmonics: Float[Array, "c h 2 g"]
     exposures: Float[Array, "e k"]  # one of the two may be empty
+    fine: Float[Array, "c f"]  # structure that the response is told without
 
     @property
     def exposures_known(self) -> int | None:
@@ -94,7 +97,7 @@ class Shares(ExposurePart):
             found += jnp.where(exposures.clp_in[:, None], jnp.einsum("ehw,khw->ek", waves, size), 0.0)
         if self.exposures.size:
             found += self.exposures
-        return found
+        return found / (1.0 + _fine(self.fine, x, y)) if self.fine.size else found
 
 
 class FreeForm(Effect):
@@ -169,5 +172,5 @@ class FreeForm(Effect):
         if self.vectors.size or self.fine.size:
             instrument = instrument.with_part("mixing", Pattern(self.vectors, self.fine))
         if self.harmonics.size or self.exposures.size:
-            instrument = instrument.with_part("exposures", Shares(self.harmonics, self.exposures))
+            instrument = instrument.with_part("exposures", Shares(self.harmonics, self.exposures, self.fine))
         return instrument
