@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from walop_jax.calibration.matrix import matrices
 from walop_jax.data.settings import Settings
@@ -16,9 +17,11 @@ from walop_jax.diagnosis.detection_limits import (
 )
 from walop_jax.diagnosis.effect_columns import probes
 from walop_jax.diagnosis.examination import ALARM, Examination
-from walop_jax.diagnosis.score import Scorer
+from walop_jax.diagnosis.score import Scorer, ScoreSpace
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.model.effects import effect_by_name
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import effect_context
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
@@ -64,60 +67,65 @@ def test_the_alarm_is_raised_with_the_stated_probability(found, examination):
     value, vector = np.linalg.eigh(space.gram)
     root = vector * np.sqrt(np.clip(value, 0.0, None))
     threshold = scorer.threshold(ALARM)
-    places, draws = space.places(), 1200
+    places, draws = space.places(), 2000
     noise = np.random.default_rng(3).standard_normal((draws, root.shape[1])) @ root.T
     checked = 0
     for probe in examination.probes:
         limit = next(
-            e for e in found.limits if e.effect == probe.effect.name and e.parameter == probe.parameters[0]
+            e for e in found.limits if (e.effect, e.parameter) == (probe.effect.name, probe.parameters[0])
         )
-        at = places[probe.name]
         if limit.detected[1] > 1.001 * limit.detected[0]:
             continue
-        rates = []
-        for share in (1.0, 0.9):
-            scores = noise - share * limit.detected[0] * space.gram[:, at.start]
-            rates.append(np.mean([_alarm(scorer, s, threshold) for s in scores]))
+        whole = limit.detected[0] * space.gram[:, places[probe.name].start]
+        at_limit, below = (alarms(space, noise - share * whole, threshold) for share in (1.0, 0.9))
         # Other candidates raise the alarm as well, so that it is rather more probable than the effect alone makes it.
-        assert rates[0] > PROBABILITY - 4 * np.sqrt(0.01 * 0.99 / draws), probe.name
-        assert rates[1] < 0.985, probe.name
+        assert at_limit > PROBABILITY - 4 * np.sqrt(0.01 * 0.99 / draws), probe.name
+        assert below < 0.985, probe.name
         checked += 1
     assert checked >= 3
 
 
-def _alarm(scorer: Scorer, scores: np.ndarray, threshold: float) -> bool:
-    table = scorer(scores, float(scorer.space.free))
-    return any(score.testable and score.log_p < threshold for score in table.scores)
+def alarms(space: ScoreSpace, scores: np.ndarray, threshold: float) -> float:
+    """Share of draws (rows) in which some candidate undercuts the threshold, from its own definition."""
+    alive, smallest = space.alive(), np.zeros(len(scores))
+    for at in space.places().values():
+        chosen = np.arange(at.start, at.stop)[alive[at]]
+        if len(chosen):
+            inverse = np.linalg.pinv(space.gram[np.ix_(chosen, chosen)], rcond=1e-8, hermitian=True)
+            rank = np.linalg.matrix_rank(space.gram[np.ix_(chosen, chosen)], rtol=1e-8, hermitian=True)
+            statistic = np.einsum("di,ij,dj->d", scores[:, chosen], inverse, scores[:, chosen])
+            smallest = np.minimum(smallest, stats.chi2.logsf(statistic, rank))
+    return float(np.mean(smallest < threshold))
 
 
-def test_what_goes_unnoticed_is_what_a_fit_without_the_effect_gets_wrong(fitted, found):
+@pytest.mark.parametrize(
+    ("name", "carried"), [("telescope_polarisation", True), ("camera_leakage", True), ("ghost", False)]
+)
+def test_what_goes_unnoticed_is_what_a_fit_without_the_effect_gets_wrong(fitted, name: str, carried: bool):
     """The matrix of a fit to noiseless data with the effect in them, against the true one: to first order the same."""
-    name = "telescope_polarisation"
-    entry = next(e for e in found.limits if e.effect == name)
+    found = detection_limits(fitted, catalogue=(effect_by_name(name),))
+    entry = found.limits[0]
     context = effect_context(fitted.model.template, fitted.calset.exposures)
     truth = fitted.model.instrument(fitted.values)
     small = effect_by_name(name).of(context, **{entry.parameter: entry.detected[0]})
     pair = [simulate(PLAN, seed=5, instrument=truth, effects=e, noiseless=True) for e in ((), (small,))]
-    fits = [refit(one.calset) for one in pair]
     x, y = fitted.calset.points.x, fitted.calset.points.y
     setting = Settings.default(len(x), str(fitted.calset.exposures.filter[0]))
-    nothing = np.zeros((len(fitted.values), len(fitted.values)))
 
-    def matrix(result: FitResult) -> np.ndarray:
-        instrument = result.model.instrument(result.values)
-        return matrices(instrument, setting, result.calset.filters, x, y, nothing)[0].reshape(-1, 2, 3)
+    def matrix(instrument: Instrument) -> np.ndarray:
+        count = values_of(instrument).size
+        found, _ = matrices(instrument, setting, fitted.calset.filters, x, y, np.zeros((count, count)))
+        return found.reshape(-1, 2, 3)
 
-    # The telescope's own part of the star's light is in the truth, and not in the calibration.
-    with_effect = dataclasses.replace(truth, effects=(small,))
-    more = nothing[0].size + len(small.amplitudes())
-    true = matrices(with_effect, setting, pair[1].calset.filters, x, y, np.zeros((more, more)))[0].reshape(
-        -1, 2, 3
-    )
-    wrong = matrix(fits[1]) - matrix(fits[0]) - (true - matrix(fits[0]))
-    inverse = np.linalg.inv(matrix(fits[0])[:, :, 1:])
+    without, with_effect = (refit(one.calset) for one in pair)
+    assumed, reference = (matrix(r.model.instrument(r.values)) for r in (with_effect, without))
+    # What acts on the light of the star as well is in the truth, and not in the calibration.
+    true = matrix(dataclasses.replace(truth, effects=(small,))) - matrix(truth) if carried else 0.0
+    wrong = assumed - reference - true
+    inverse = np.linalg.inv(reference[:, :, 1:])
     error = np.linalg.norm(inverse @ wrong[:, :, :1], axis=(1, 2))
     error += 0.05 * np.linalg.norm(inverse @ wrong[:, :, 1:], ord=2, axis=(1, 2))
-    assert error.max() == pytest.approx(entry.error_of_qu, rel=0.05)
+    assert (np.median(error), error.max()) == pytest.approx(entry.error_of_qu, rel=0.05)
 
 
 def test_without_rivals_what_is_detected_is_named(fitted):

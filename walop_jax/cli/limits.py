@@ -75,7 +75,7 @@ def _show(found: DetectionLimits) -> None:
     for entry in found.limits:
         table.add_row(
             entry.effect, entry.parameter, entry.unit, _range(entry), f"{entry.named:.2g}",
-            "" if np.isnan(entry.error_of_qu) else f"{100 * entry.error_of_qu:.3f}", ", ".join(entry.taken_for),
+            " to ".join(f"{100 * e:.3f}" for e in entry.error_of_qu if np.isfinite(e)), ", ".join(entry.taken_for),
         )  # fmt: skip
     console = Console(highlight=False)
     console.print(table)

@@ -58,8 +58,9 @@ class DetectionLimit:
 
     `detected` holds the smallest and the largest over the shapes that the effect may have, `named` the largest
     (infinite where some rival does exactly the same). `taken_for` are the effects for which it may be taken when it is
-    just detected, nearest first. `error_of_qu` is the largest error over the field that q and u of a star polarised by
-    up to 5 % have from it, at the amplitude that is just detected; NaN where one exposure does not give both.
+    just detected, nearest first. `error_of_qu` is the error that q and u of a star polarised by up to 5 % have from it
+    at the amplitude that is just detected: median and largest over the field; NaN where one exposure does not give
+    both.
     """
 
     effect: str
@@ -68,7 +69,7 @@ class DetectionLimit:
     detected: tuple[float, float]
     named: float
     taken_for: tuple[str, ...]
-    error_of_qu: float
+    error_of_qu: tuple[float, float]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,7 +171,7 @@ def _columns(
     inside = np.arange(at.start, at.stop)
     rank = whitening(np.where(np.outer(alive[at], alive[at]), space.gram[at, at], 0.0)).shape[1]
     found = []
-    for number, place in enumerate(inside):
+    for number, place in enumerate(inside.tolist()):
         if not alive[place]:
             continue
         detected = float(np.sqrt(noncentrality(rank) / space.gram[place, place]))
@@ -268,7 +269,7 @@ def _collected(
                 taken_for=tuple(
                     name for name in sorted(near, key=near.__getitem__) if near[name] < SEPARATION
                 ),
-                error_of_qu=_largest(errors[members]),
+                error_of_qu=_over_field(errors[members]),
             )
         )
     names = tuple(dict.fromkeys(effect.name for effect, _ in groups))
@@ -282,7 +283,7 @@ def _collected(
     protection = worst[largest, np.arange(len(points))] if len(columns) else np.full(len(points), np.nan)
     known = protection >= 0
     return DetectionLimits(
-        limits=tuple(sorted(entries, key=lambda e: -np.nan_to_num(e.error_of_qu, nan=-1.0))),
+        limits=tuple(sorted(entries, key=lambda e: -np.nan_to_num(e.error_of_qu[1], nan=-1.0))),
         effects=names,
         separation=separation,
         x=points.x,
@@ -304,5 +305,9 @@ def _nearest(columns: Sequence[_Column]) -> dict[str, float]:
     return found
 
 
-def _largest(errors: np.ndarray) -> float:
-    return float(np.nanmax(errors)) if np.isfinite(errors).any() else float("nan")
+def _over_field(errors: Float[np.ndarray, "c p"]) -> tuple[float, float]:
+    """Median and largest over the field, of the worst shape."""
+    known = errors[np.isfinite(errors).any(axis=1)]
+    if not known.size:
+        return float("nan"), float("nan")
+    return float(np.nanmedian(known, axis=1).max()), float(np.nanmax(known))
