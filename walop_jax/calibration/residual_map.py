@@ -57,11 +57,11 @@ def _point_sums(
     elements = 0.5 * jnp.einsum("ea,es,ak->eask", total, stokes, signs).reshape(len(unit), -1, unit.shape[-1])
     later = unit[:, None] * np.abs(signs[1:])
     weight = point.weight * chosen[:, None]
-    change = jnp.concatenate([elements, later], axis=1) * (flux[:, None] * weight)[:, None]
+    change = jnp.concatenate([elements, later], axis=1) * (flux * weight)[:, None]
     known = plan.exposures.flux_known
-    change = project_flux(change, (unit * weight)[:, None], known[:, None])
+    change = project_flux(change, (unit * weight)[:, None], known[:, None], instrument.cameras.together)
     seen = (point.weight[:, 0] > 0) & chosen
-    freedom = jnp.sum(jnp.where(seen, unit.shape[-1] - jnp.where(known, 0.0, 1.0), 0.0))
+    freedom = jnp.sum(jnp.where(seen, unit.shape[-1] - jnp.where(known, 0.0, instrument.cameras.fluxes), 0.0))
     chi2 = jnp.sum(jnp.where(chosen[:, None], residual, 0.0) ** 2)
     right = jnp.einsum("edk,ek->d", change, residual)
     left = jnp.einsum("edk,efk->df", change, change)[np.triu_indices(len(right))]

@@ -27,6 +27,7 @@ from numpy.polynomial.legendre import legvander
 
 from walop_jax.data.records import POLARISER, Exposures
 from walop_jax.diagnosis.score import Candidate
+from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
 from walop_jax.model.effects.free_form import FINE, HARMONICS, SMOOTH, WIDTH
@@ -49,7 +50,7 @@ class Measured:
         # Weighted model at unit flux, from data = flux · model + residual.
         flux = np.where(self.flux == 0, 1.0, self.flux)[..., None]
         self.model: Cube = (self.counts * self.weight - self.residual) / flux
-        self.known = likelihood.flux_known
+        self.known, self.together = likelihood.flux_known, likelihood.model.template.cameras.together
         self.cameras = likelihood.cameras
         # Of the model, not of the counts: patterns that know the noise would find it in the residuals.
         unit = self.model / np.where(self.weight > 0, self.weight, 1.0)
@@ -59,26 +60,27 @@ class Measured:
     def column(self, pattern: Cube) -> Float[np.ndarray, " _"]:
         """Derivative of the residuals with respect to the amplitude of N_k → N_k + F · level_k · pattern."""
         change = self.flux[..., None] * pattern * self.level[:, None, :] * self.weight
-        power = np.sum(self.model**2, axis=-1)
-        along = np.sum(change * self.model, axis=-1) / np.where(power > 0, power, 1.0)
-        along = np.where(self.known, 0.0, along)
-        return -(change - along[..., None] * self.model)[self.used].reshape(-1)
+        return -project_flux(change, self.model, self.known, self.together)[self.used].reshape(-1)
 
     def gains(self) -> Float[np.ndarray, "_ _"]:
-        """Columns of the gain of all cameras but the last in every exposure (that one is the flux)."""
+        """Columns of the gains of the cameras in every exposure, but the last of each flux (that one is the flux)."""
         change = self.flux[..., None] * self.level[:, None, :] * self.weight
-        power = np.sum(self.model**2, axis=-1, keepdims=True)
-        share = np.where(self.known[:, None], 0.0, change * self.model / np.where(power > 0, power, 1.0))
-        each = change[..., None] * np.eye(self.cameras) - share[..., None] * self.model[..., None, :]
+        alone = change[..., None] * np.eye(self.cameras)
+        each = project_flux(alone, self.model[..., None, :], self.known[:, None], self.together)
         row = np.cumsum(self.used).reshape(self.used.shape) - 1
         points, exposures = np.nonzero(self.used)
-        free = self.cameras - 1
-        columns = np.zeros((self.cameras * len(points), free * self.used.shape[1]))
-        for k in range(free):
+        columns = np.zeros((self.cameras * len(points), len(self.gained) * self.used.shape[1]))
+        for i, k in enumerate(self.gained):
             for channel in range(self.cameras):
                 rows = self.cameras * row[points, exposures] + channel
-                columns[rows, free * exposures + k] = -each[points, exposures, k, channel]
+                columns[rows, len(self.gained) * exposures + i] = -each[points, exposures, k, channel]
         return columns
+
+    @property
+    def gained(self) -> list[int]:
+        """Cameras that have a gain beside the flux."""
+        shared = np.ones((self.cameras, self.cameras)) if self.together is None else self.together
+        return [k for k in range(self.cameras) if shared[k, k + 1 :].any()]
 
     def candidate(self, name: str, patterns: list[Cube], block: str | None = None) -> Candidate:
         """A stratum of patterns, and the block of the free-form term that can take it up."""
@@ -173,5 +175,5 @@ def strata(measured: Measured) -> Iterator[Candidate]:
     if sky_gradients:
         yield measured.candidate("kind, over the field", sky_gradients)
     yield Candidate(
-        SINGLE_EXPOSURES, measured.gains(), np.full((len(names) - 1) * len(e), WIDTH), "exposures"
+        SINGLE_EXPOSURES, measured.gains(), np.full(len(measured.gained) * len(e), WIDTH), "exposures"
     )

@@ -42,7 +42,9 @@ def _point_effect_columns(
     flat, to_tree = ravel_pytree(neutral)
     change = jax.vmap(lambda one: push(to_tree(one)))(jnp.eye(flat.size)) * point.weight
     _, along = jax.jvp(lambda f: real_counts(at_neutral, plan, unit, f), (flux,), (jnp.ones_like(flux),))
-    projected = project_flux(change, along * point.weight, plan.exposures.flux_known)
+    projected = project_flux(
+        change, along * point.weight, plan.exposures.flux_known, instrument.cameras.together
+    )
     return -projected.reshape(flat.size, -1)
 
 

@@ -50,7 +50,8 @@ def plan_for(
         table[of_stars, 1:] = band[len(each) :].reshape(of_stars.size, stars)
         return table
 
-    known = [source.kind for source in instrument.sources if source.flux_known]
+    split = instrument.cameras.split
+    known = [source.kind for source in instrument.sources if source.flux_known and not split]
     arrays = exposure_arrays(exposures, instrument.kinds, known)
     return _plan(instrument, settings, hours_of(exposures)[row], filters, arrays, band_of)
 
