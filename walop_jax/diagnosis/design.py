@@ -64,7 +64,7 @@ class Design:
     def eliminated(self) -> int:
         """Rows that carry no noise: one for every flux that was solved for, one for every weak pull."""
         likelihood = self.fit.likelihood
-        fluxes = int(self.measured.used.sum(axis=0) @ (likelihood.cameras - likelihood.data_per_row))
+        fluxes = round(float(self.measured.used.sum(axis=0) @ (likelihood.cameras - likelihood.data_per_row)))
         return fluxes + int((~self.fit.likelihood.priors.known).sum())
 
     def _columns_of(self, name: str) -> Bool[np.ndarray, " f"]:

@@ -27,7 +27,7 @@ from numpy.polynomial.legendre import legvander
 
 from walop_jax.data.records import POLARISER, Exposures
 from walop_jax.diagnosis.score import Candidate
-from walop_jax.likelihood.flux import project_flux
+from walop_jax.likelihood.flux import Sharing, project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
 from walop_jax.model.effects.free_form import FINE, HARMONICS, SMOOTH, WIDTH
@@ -36,6 +36,14 @@ RINGS = (3, 4, 5, 6, 7, 8)
 SINGLE_EXPOSURES = "single exposures"
 
 Cube = Float[np.ndarray, "p e k"]
+
+
+def numpy_sharing(likelihood: Likelihood) -> Sharing:
+    """What has a flux in common, in arrays of numpy."""
+    groups = likelihood.plan.exposures.shared
+    return Sharing(
+        likelihood.model.template.cameras.together, None if groups is None else np.asarray(groups)
+    )
 
 
 class Measured:
@@ -50,7 +58,7 @@ class Measured:
         # Weighted model at unit flux, from data = flux · model + residual.
         flux = np.where(self.flux == 0, 1.0, self.flux)[..., None]
         self.model: Cube = (self.counts * self.weight - self.residual) / flux
-        self.known, self.together = likelihood.flux_known, likelihood.model.template.cameras.together
+        self.known, self.shared = likelihood.flux_known, numpy_sharing(likelihood)
         self.cameras = likelihood.cameras
         # Of the model, not of the counts: patterns that know the noise would find it in the residuals.
         unit = self.model / np.where(self.weight > 0, self.weight, 1.0)
@@ -60,13 +68,15 @@ class Measured:
     def column(self, pattern: Cube) -> Float[np.ndarray, " _"]:
         """Derivative of the residuals with respect to the amplitude of N_k → N_k + F · level_k · pattern."""
         change = self.flux[..., None] * pattern * self.level[:, None, :] * self.weight
-        return -project_flux(change, self.model, self.known, self.together)[self.used].reshape(-1)
+        return -project_flux(change, self.model, self.known, self.shared)[self.used].reshape(-1)
 
     def gains(self) -> Float[np.ndarray, "_ _"]:
         """Columns of the gains of the cameras in every exposure, but the last of each flux (that one is the flux)."""
+        if self.shared.exposures is not None:
+            return self._gains_of_groups()
         change = self.flux[..., None] * self.level[:, None, :] * self.weight
-        alone = change[..., None] * np.eye(self.cameras)
-        each = project_flux(alone, self.model[..., None, :], self.known[:, None], self.together)
+        alone = np.moveaxis(change[..., None] * np.eye(self.cameras), 2, 0)
+        each = np.moveaxis(project_flux(alone, self.model, self.known, self.shared), 0, 2)
         row = np.cumsum(self.used).reshape(self.used.shape) - 1
         points, exposures = np.nonzero(self.used)
         columns = np.zeros((self.cameras * len(points), len(self.gained) * self.used.shape[1]))
@@ -76,10 +86,20 @@ class Measured:
                 columns[rows, len(self.gained) * exposures + i] = -each[points, exposures, k, channel]
         return columns
 
+    def _gains_of_groups(self) -> Float[np.ndarray, "_ _"]:
+        """The same where exposures have a flux in common: a gain of one changes what is left of the others."""
+        columns = []
+        for exposure in range(self.used.shape[1]):
+            for k in self.gained:
+                pattern = np.zeros((1, self.used.shape[1], self.cameras))
+                pattern[0, exposure, k] = 1.0
+                columns.append(self.column(pattern))
+        return np.column_stack(columns)
+
     @property
     def gained(self) -> list[int]:
         """Cameras that have a gain beside the flux."""
-        shared = np.ones((self.cameras, self.cameras)) if self.together is None else self.together
+        shared = self.shared.cameras if self.shared.cameras is not None else np.ones((self.cameras,) * 2)
         return [k for k in range(self.cameras) if shared[k, k + 1 :].any()]
 
     def candidate(self, name: str, patterns: list[Cube], block: str | None = None) -> Candidate:

@@ -31,7 +31,7 @@ from jaxtyping import Array, Float, Int
 
 from walop_jax.likelihood import limits, linear
 from walop_jax.likelihood.field_table import FieldTable
-from walop_jax.likelihood.flux import eliminate_flux, project_flux
+from walop_jax.likelihood.flux import eliminate_flux, project_flux, sharing
 from walop_jax.likelihood.linear import rows_and_slopes
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
@@ -136,15 +136,15 @@ def best_flux(
     instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], point: PointData
 ) -> Float[Array, "e f"]:
     """Flux that fits best: in closed form, refined by Newton steps where detectors are not linear in it."""
-    known, together = plan.exposures.flux_known, instrument.cameras.together
-    flux, _ = eliminate_flux(point.counts * point.weight, unit * point.weight, known, together)
+    known, shared = plan.exposures.flux_known, sharing(instrument, plan)
+    flux, _ = eliminate_flux(point.counts * point.weight, unit * point.weight, known, shared)
     if not light.is_linear(instrument):
         for _ in range(NEWTON_STEPS):
             counts, slope = jax.jvp(
                 lambda f: real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),)
             )
             missing = (point.counts - counts) * point.weight
-            step, _ = eliminate_flux(missing, slope * point.weight, known, together)
+            step, _ = eliminate_flux(missing, slope * point.weight, known, shared)
             flux = jnp.where(known[:, None], flux, flux + step)
     return flux
 
@@ -200,7 +200,7 @@ def _point_jacobian(
         d_counts * point.weight,
         along * point.weight,
         plan.exposures.flux_known,
-        instrument.cameras.together,
+        sharing(instrument, plan),
     )
     return ((point.counts - counts) * point.weight).reshape(-1), -projected.reshape(d_counts.shape[0], -1)
 

@@ -10,7 +10,7 @@ from functools import cached_property
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.likelihood import effect_columns, engine
@@ -100,9 +100,11 @@ class Likelihood:
         return np.asarray(self.plan.exposures.flux_known)
 
     @property
-    def data_per_row(self) -> Int[np.ndarray, " e"]:
-        """Independent data of a used row: an intensity for each camera, less the fluxes that are unknown."""
-        return self.cameras - np.where(self.flux_known, 0, self.model.template.cameras.fluxes)
+    def data_per_row(self) -> Float[np.ndarray, " e"]:
+        """Independent data of a used row: an intensity for each camera, less its part of the fluxes that are unknown."""
+        groups = self.plan.exposures.shared
+        size = np.ones(len(self.flux_known)) if groups is None else np.asarray(groups @ groups.sum(axis=0))
+        return self.cameras - np.where(self.flux_known, 0.0, self.model.template.cameras.fluxes / size)
 
     @cached_property
     def priors(self) -> PriorRows:
@@ -193,7 +195,7 @@ class Likelihood:
         )
 
     def _degrees_of_freedom(self, census: Census) -> int:
-        return int(census.rows @ self.data_per_row) + int(self.priors.known.sum()) - len(self.model.free)
+        return round(float(census.rows @ self.data_per_row)) + int(self.priors.known.sum()) - len(self.model.free)
 
     # ----------------------------------------------------------------------------------- a pass over the points
 

@@ -28,7 +28,7 @@ Vector = Float[np.ndarray, " n"]
 class PointReader:
     """Turns blocks of measurements into point data; `mirrored` with the sky at the opposite points, for ghosts.
 
-    `floor`, a share of the mean counts of a row, is added to the stated errors in quadrature (`Cameras.floor`).
+    No error is taken to be smaller than `floor`, a share of the mean counts of its row (`Cameras.floor`).
     """
 
     calset: CalibrationSet
@@ -47,7 +47,7 @@ class PointReader:
         band = np.take_along_axis(self.plan.band_of[None], block.source[:, :, None] + 1, axis=2)[:, :, 0]
         sigma = block.sigma
         if self.floor > 0.0:
-            sigma = np.hypot(sigma, self.floor * block.counts.mean(axis=2, keepdims=True))
+            sigma = np.maximum(sigma, self.floor * block.counts.mean(axis=2, keepdims=True))
         weight = np.where(block.used[:, :, None], 1.0 / np.where(sigma > 0, sigma, 1.0), 0.0)
         opposite = self.sky_polarisation(-block.x, -block.y) if self.mirrored else None
         return PointData(

@@ -105,7 +105,7 @@ class Cameras(Component):
     """Names of the cameras and what is known of them beyond their throughput.
 
     `split`: the share of the light that an arm gets is not smooth over the field and unknown, so that every arm has a
-    flux of its own. `floor` is what the model of the instrument is good to, as a share of the mean counts of a row.
+    flux of its own (`likelihood.flux`). `floor`: no error is smaller than this share of the mean counts of a row.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.likelihood.expansion import STATED
 from walop_jax.posterior.convergence import Chains, Convergence
 from walop_jax.posterior.samplers import Sampler, make_sampler
 from walop_jax.posterior.surrogate_accuracy import Accuracy
@@ -82,7 +83,8 @@ class PosteriorSample:
     `draws` holds (ensemble, draw, parameter) of all parameters in tree order, tied and frozen ones
     included; `mean` and `covariance` use every kept step. `chains` are of the coefficients `sampled`, those that
     figures show. `accuracy` is that of the surrogate, None where the exact posterior was sampled; `trusted` needs
-    convergence and a surrogate that is exact enough. `counts` are what the sampler counted.
+    convergence and a surrogate that is exact enough. `errors_from` says what their spread was made from: the stated
+    errors of the data, or, as for the fit, what it leaves (`adjusted`). `counts` are what the sampler counted.
     """
 
     sampler: str
@@ -103,6 +105,7 @@ class PosteriorSample:
     counts: Mapping[str, int]
     seconds: float
     fingerprint: dict[str, str]
+    errors_from: str = STATED
 
     @property
     def trusted(self) -> bool:

@@ -108,7 +108,7 @@ def point_residuals(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> 
     NaN where a point has no data.
     """
     _, residual = likelihood.residuals(values)
-    freedom = (likelihood.used * likelihood.data_per_row.astype(float)).sum(axis=1)
+    freedom = (likelihood.used * likelihood.data_per_row).sum(axis=1)
     square = (residual**2).sum(axis=(1, 2))
     return np.sqrt(np.where(freedom > 0, square / np.maximum(freedom, 1.0), np.nan))
 
