@@ -25,12 +25,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.polynomial.legendre import legvander
 
-from walop_jax.data.records import POLARISER, Exposures
+from walop_jax.data.records import POLARISER, CalibrationSet, Exposures
 from walop_jax.diagnosis.score import Candidate
 from walop_jax.likelihood.flux import Sharing, project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
 from walop_jax.model.effects.free_form import FINE, HARMONICS, SMOOTH, WIDTH
+from walop_jax.model.instrument import Instrument
 
 RINGS = (3, 4, 5, 6, 7, 8)
 SINGLE_EXPOSURES = "single exposures"
@@ -106,6 +107,19 @@ class Measured:
         """A stratum of patterns, and the block of the free-form term that can take it up."""
         columns = np.column_stack([self.column(p) for p in patterns])
         return Candidate(name, columns, np.full(columns.shape[1], WIDTH), block)
+
+
+def number_of_columns(calset: CalibrationSet, instrument: Instrument) -> int:
+    """Number of columns of all strata together, or a few more."""
+    e, cameras = calset.exposures, len(instrument.cameras)
+    turning = 1 + len(instrument.patched().moving())
+    of_camera = 2 * len(legendre.terms(SMOOTH)) + len(legendre.terms(FINE)) + len(RINGS)
+    of_camera += 6 * len(HARMONICS) * turning + 3  # time, temperature, flux
+    of_camera += 5 * (len(np.unique(e.kind)) - 1) + 3 * (len(np.unique(e.filter)) - 1)
+    for prefix in instrument.patched().moving():
+        of_camera += 3 * (len(np.unique(_positions(e, prefix))) - 1)
+    gains = len(e) * (cameras - instrument.cameras.fluxes)
+    return cameras * of_camera + gains
 
 
 def _positions(e: Exposures, prefix: str) -> np.ndarray:

@@ -18,6 +18,7 @@ from walop_jax.calibration.summary import FAILED, PARTIAL, PRODUCT, SUMMARY, sum
 from walop_jax.fit.misfit import Misfit, describe
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.io.atomic import atomic_path
+from walop_jax.io.heartbeat import repeated
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
 from walop_jax.likelihood.processes import Processes
@@ -79,7 +80,10 @@ def refit_sets(
     folder = Path(output)
     tell("reading")
     calset, chosen = sets_and_model(calsets, text, model, instrument)
-    result = refit(calset, chosen, folder=folder / PARTIAL, progress=tell, memory=memory, processes=processes)
+    with repeated(tell) as say:
+        result = refit(
+            calset, chosen, folder=folder / PARTIAL, progress=say, memory=memory, processes=processes
+        )
     residuals = residual_map(result) if result.likelihood.layout.large and result.converged else None
     misfit = None
     if first and not result.explains_data:

@@ -98,7 +98,9 @@ class SpectralElement(Element):
 class FieldDiattenuator(Element):
     """A diattenuator on one axis that changes smoothly over field and wavelength: oblique faces, beams of a prism.
 
-    Directly ahead of an analyser, with its axis, it is a ratio of the two beams: ½ (1 ± D) (1, ±1, 0, 0).
+    Directly ahead of an analyser, with its axis, it is a ratio of the two beams: ½ (1 ± D) (1, ±1, 0, 0). The cameras have
+    such a ratio too, in their throughput, the same at all wavelengths: with `none_at` (µm) the terms vanish there, and are
+    what changes with colour.
     """
 
     p00: Curve | None = number(unit="", about="constant part at `at`", default=None, several=True)
@@ -109,6 +111,7 @@ class FieldDiattenuator(Element):
     p02: Curve | None = number(unit="", about="term P₂(y/h) at `at`", default=None, several=True)
     axis: Scalar = number(unit="deg", about="axis, from +X toward +Y")
     at: tuple[float, ...] = eqx.field(static=True, default=())
+    none_at: float = eqx.field(static=True, default=0.0)  # µm; 0: nowhere
     scale: float = eqx.field(static=True, default=FIELD_SCALE)  # h, degrees
 
     kind: ClassVar[str] = "field_diattenuator"
@@ -118,6 +121,8 @@ class FieldDiattenuator(Element):
         for name in FIELD_TERMS:
             if (values := getattr(self, name)) is not None:
                 check_curve(name, values, self.at)
+        if self.none_at in self.at:
+            raise ValueError(f"none_at = {self.none_at:g} um is in `at` as well: leave it out there")
 
     def labels(self, field: str) -> Sequence[str]:
         """Values of a term are numbered from 1, by wavelength."""
@@ -126,8 +131,12 @@ class FieldDiattenuator(Element):
     def mueller(self, ray: Ray) -> Mueller | None:
         """The diattenuator at every wavelength; the identity without terms."""
         terms = legendre.basis(ray.x, ray.y, 2, self.scale)
+        knots, gap = self.at, len(self.at)
+        if self.none_at > 0.0:
+            gap = sum(knot < self.none_at for knot in knots)
+            knots = (*knots[:gap], self.none_at, *knots[gap:])
         parts = [
-            terms[..., n] * spline(self.at, values, ray.wavelength)
+            terms[..., n] * spline(knots, _with_zero(values, gap, len(knots)), ray.wavelength)
             for name, n in FIELD_TERMS.items()
             if (values := getattr(self, name)) is not None
         ]
@@ -135,3 +144,8 @@ class FieldDiattenuator(Element):
             return None
         d, twice = sum(parts[1:], parts[0]), 2.0 * jnp.deg2rad(self.axis)
         return mueller.diattenuator(d * jnp.cos(twice), d * jnp.sin(twice))
+
+
+def _with_zero(values: Curve, at: int, count: int) -> Curve:
+    """Values of a curve with a zero put in, if it has one value less than `count`."""
+    return values if len(values) == count else jnp.concatenate([values[:at], jnp.zeros(1), values[at:]])
