@@ -22,7 +22,9 @@ from walop_jax.cli.common import (
     warn,
 )
 
-MinutesOption = Annotated[float, typer.Option(min=0.0, help="Begin no search for a further name after so long.")]
+MinutesOption = Annotated[
+    float, typer.Option(min=0.0, help="Begin no search for a further name after so long.")
+]
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -23,7 +23,7 @@ _SINGLE = re.compile(r"MONO-(\d{3,6}(?:\.\d+)?)")
 
 
 def single_wavelength(name: str) -> float | None:
-    """Wavelength (µm) of light called MONO-<Ångström>, as exports of optical design programs are; None: another name."""
+    """Wavelength (µm) of light called MONO-<Ångström>, as `import-zemax` names it; None: another name."""
     found = _SINGLE.fullmatch(name)
     return None if found is None else 1e-4 * float(found[1])
 
@@ -34,7 +34,8 @@ def builtin_filter(name: str) -> FilterCurve:
     `SDSS-r` is the r curve of the SDSS camera as measured by Doi et al. 2010, AJ 139, 1628, Table 4, for an
     airmass of 1.3. The curve counts photons: it is the share of the photons at each wavelength that is detected.
 
-    `MONO-6500` is light of 6500 Å alone, and so on. Raises `DataError` with the nearest names if there is no such filter.
+    `MONO-6500` is light of 6500 Å alone, and so on. Raises `DataError` with the nearest names if there is no such
+    filter.
     """
     wavelength = single_wavelength(name)
     if wavelength is not None:

@@ -42,9 +42,7 @@ Cube = Float[np.ndarray, "p e k"]
 def numpy_sharing(likelihood: Likelihood) -> Sharing:
     """What has a flux in common, in arrays of numpy."""
     groups = likelihood.plan.exposures.shared
-    return Sharing(
-        likelihood.model.template.cameras.together, None if groups is None else np.asarray(groups)
-    )
+    return Sharing(likelihood.model.template.cameras.together, None if groups is None else np.asarray(groups))
 
 
 class Measured:

@@ -23,19 +23,8 @@ from walop_jax.io.errors import DataError, fail, nearest
 Table = Mapping[str, Any]
 
 KEYS = (
-    "name",
-    "default",
-    "like",
-    "about",
-    "source",
-    "path",
-    "site",
-    "field",
-    "cameras",
-    "throughput",
-    "elements",
-    "arms",
-)
+    "name", "default", "like", "about", "source", "path", "site", "field", "cameras", "throughput", "elements", "arms",
+)  # fmt: skip
 REQUIRED = ("name", "path", "field", "cameras", "throughput", "elements", "arms")
 NUMBER_KEYS = ("value", "sigma", "unit", "source", "name", "scale", "loose", "tie")
 SITE_KEYS = ("telescope", "latitude", "longitude", "elevation", "full_moon")
@@ -92,7 +81,8 @@ class ArmText:
 class Description:
     """An instrument as described; `path` names the elements ahead of the arms in the order light meets them.
 
-    `field_limit`, `field_scale` and `edge` in degrees; `split` and `floor` as in `model.cameras.Cameras`; `raster` is how the field points of a simulated run lie.
+    `field_limit`, `field_scale` and `edge` in degrees; `split` and `floor` as in `model.cameras.Cameras`; `raster` is
+    how the field points of a simulated run lie.
     """
 
     name: str

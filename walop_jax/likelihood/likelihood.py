@@ -101,7 +101,7 @@ class Likelihood:
 
     @property
     def data_per_row(self) -> Float[np.ndarray, " e"]:
-        """Independent data of a used row: an intensity for each camera, less its part of the fluxes that are unknown."""
+        """Independent data of a used row: an intensity for each camera, less its part of the unknown fluxes."""
         groups = self.plan.exposures.shared
         size = np.ones(len(self.flux_known)) if groups is None else np.asarray(groups @ groups.sum(axis=0))
         return self.cameras - np.where(self.flux_known, 0.0, self.model.template.cameras.fluxes / size)
@@ -195,7 +195,11 @@ class Likelihood:
         )
 
     def _degrees_of_freedom(self, census: Census) -> int:
-        return round(float(census.rows @ self.data_per_row)) + int(self.priors.known.sum()) - len(self.model.free)
+        return (
+            round(float(census.rows @ self.data_per_row))
+            + int(self.priors.known.sum())
+            - len(self.model.free)
+        )
 
     # ----------------------------------------------------------------------------------- a pass over the points
 

@@ -1,8 +1,8 @@
 """Draws with errors from what a fit leaves, for data that scatter by more than the errors that they state.
 
 Equation    θ' = m + Ω (θ − m),  Ω = L_C L_H⁻¹,  L_C L_Cᵀ = C,  L_H L_Hᵀ = H⁻¹
-Symbols     θ draws under the stated errors, m their mean; H⁻¹ covariance of the fit under the stated errors; C that from
-            residuals (`fit.robust`)
+Symbols     θ draws under the stated errors, m their mean; H⁻¹ covariance of the fit under the stated errors; C that
+            from residuals (`fit.robust`)
 Source      open-faced sandwich: Shaby 2014, Journal of Computational and Graphical Statistics 23, 853
 Limits      C = H⁻¹: nothing changes. Ω is not the symmetric root of that paper but lower triangular; both give draws of
             covariance C where those of the sampler have H⁻¹, and what is skew in them stays skew.
@@ -37,4 +37,3 @@ def with_errors_of(
     draws = sample.mean + away @ ties.T
     covariance = ties @ omega @ sample.covariance[at] @ omega.T @ ties.T
     return dataclasses.replace(sample, draws=draws, covariance=covariance, errors_from=made_from)
-

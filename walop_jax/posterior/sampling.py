@@ -94,9 +94,7 @@ def sample(
             result, covariance=covariance(result.model, result.posterior), errors_from=STATED
         )
         found = sample(stated, options, folder=folder, resume=resume, report=report)
-        return with_errors_of(
-            found, result.model, stated.covariance, result.covariance, result.errors_from
-        )
+        return with_errors_of(found, result.model, stated.covariance, result.covariance, result.errors_from)
     sampler, target = options.make_sampler(), Target(result)
     checkpoints = None
     if folder is not None:

@@ -19,8 +19,8 @@ from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.workflow import MINUTES, diagnose
 from walop_jax.fit.misfit import describe
 from walop_jax.fit.refit import with_honest_errors
-from walop_jax.io.heartbeat import repeated
 from walop_jax.io.folder import atomic_folder, check_folder
+from walop_jax.io.heartbeat import repeated
 from walop_jax.io.text import json_text, read_text
 from walop_jax.runs.inputs import sets_and_model
 

@@ -18,8 +18,8 @@ from walop_jax.calibration.summary import FAILED, PARTIAL, PRODUCT, SUMMARY, sum
 from walop_jax.fit.misfit import Misfit, describe
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.io.atomic import atomic_path
-from walop_jax.io.heartbeat import repeated
 from walop_jax.io.folder import atomic_folder, check_folder
+from walop_jax.io.heartbeat import repeated
 from walop_jax.io.text import json_text, read_text
 from walop_jax.likelihood.processes import Processes
 from walop_jax.runs.inputs import sets_and_model

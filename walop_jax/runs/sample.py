@@ -108,5 +108,7 @@ def _sampled_draws(posterior: PosteriorSample) -> np.ndarray:
 def _with_covariance(product: CalibrationProduct, posterior: PosteriorSample) -> CalibrationProduct:
     """The product with the covariance of the posterior in place of that of the fit."""
     calibration = Calibration.from_product(product)
-    verdict = dataclasses.replace(calibration.verdict, covariance_from="posterior", errors_from=posterior.errors_from)
+    verdict = dataclasses.replace(
+        calibration.verdict, covariance_from="posterior", errors_from=posterior.errors_from
+    )
     return dataclasses.replace(calibration, covariance=posterior.covariance, verdict=verdict).to_product()

@@ -41,7 +41,8 @@ class Wedge(Element):
     """A glass wedge: exact refraction, no loss.
 
     `frame` says what becomes of the plane of vibration: `kept` in the carried axes of the rays (no rotation), or
-    `turned` with the ray at each face, as it is for light (see `optics.wedge_rotation`). `sense` −1: the other way round.
+    `turned` with the ray at each face, as it is for light (see `optics.wedge_rotation`). `sense` −1: the other
+    way round.
     """
 
     angle: Scalar = number(unit="rad", about="wedge angle")

@@ -8,7 +8,8 @@ Symbols     δ retardance [rad], of the fast axis; D diattenuation along `axis`;
             polarisation from +X toward +Y, a circular retardance of 2ρ (skew mirrors, optical activity);
             loss share of q, u, v that is lost
 Sources     mirrors as diattenuating retarders: van Harten, Snik & Keller 2009, PASP 121, 377; form of M: Lu & Chipman
-            1996, JOSA A 13, 1106; diattenuation of oblique faces: Fresnel's equations, Born & Wolf 1999, § 1.5; spline: de Boor 1978, A Practical Guide to Splines, ch. IV.
+            1996, JOSA A 13, 1106; diattenuation of oblique faces (Fresnel): Born & Wolf 1999, § 1.5;
+            spline: de Boor 1978, A Practical Guide to Splines, ch. IV.
 Limits      no values: the identity. A spline with as many knots as bands takes up anything that has no
             curvature within a band; with fewer it is a smooth curve.
 """
@@ -98,9 +99,9 @@ class SpectralElement(Element):
 class FieldDiattenuator(Element):
     """A diattenuator on one axis that changes smoothly over field and wavelength: oblique faces, beams of a prism.
 
-    Directly ahead of an analyser, with its axis, it is a ratio of the two beams: ½ (1 ± D) (1, ±1, 0, 0). The cameras have
-    such a ratio too, in their throughput, the same at all wavelengths: with `none_at` (µm) the terms vanish there, and are
-    what changes with colour.
+    Directly ahead of an analyser, with its axis, it is a ratio of the two beams: ½ (1 ± D) (1, ±1, 0, 0). The cameras
+    have such a ratio too, in their throughput, the same at all wavelengths: with `none_at` (µm) the terms vanish there,
+    and are what changes with colour.
     """
 
     p00: Curve | None = number(unit="", about="constant part at `at`", default=None, several=True)
