@@ -40,7 +40,7 @@ LARGEST_CONDITION = 1e14
 ROUNDING = 1e-12  # of an objective: near the end two of them differ by less
 STALE = 0.05  # of the distance left by a step
 SMALLEST_STEP = 1e-14  # of the trust region
-# Share of the predicted reduction above which λ falls. With 0.99 a problem that is a little curved keeps its λ, and with
+# Share of the predicted reduction above which λ falls. With 0.99 a problem that is a little curved keeps its λ and with
 # it a slow end: directions that the data hardly see then take forty steps.
 WELL_PREDICTED = 0.75
 

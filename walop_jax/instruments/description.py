@@ -111,9 +111,6 @@ class Description:
         return str(self.site.get("telescope", "")), latitude, longitude, elevation, moon
 
 
-# ------------------------------------------------------------------------------------------------ shipped ones
-
-
 @functools.cache
 def shipped() -> tuple[str, ...]:
     """Names of the instruments that come with the package."""
@@ -195,7 +192,7 @@ def merged(old: Table, new: Table) -> Table:
         before = result.get(key)
         if isinstance(before, Mapping) and isinstance(value, Mapping) and "value" not in value:
             result[key] = merged(before, value)
-        elif _named(before) and _named(value) and _names(before) == _names(value):
+        elif _named(before) and _named(value) and [t["name"] for t in before] == [t["name"] for t in value]:
             result[key] = [merged(old_one, new_one) for old_one, new_one in zip(before, value, strict=True)]
         else:
             result[key] = value
@@ -204,10 +201,6 @@ def merged(old: Table, new: Table) -> Table:
 
 def _named(value: Any) -> TypeGuard[list[Table]]:
     return isinstance(value, list) and all(isinstance(entry, Mapping) and "name" in entry for entry in value)
-
-
-def _names(tables: list[Table]) -> list[str]:
-    return [table["name"] for table in tables]
 
 
 # ------------------------------------------------------------------------------------------------ checking
@@ -256,6 +249,14 @@ class _Reader:
 
     def floats(self, value: list[Any], key: str, place: str) -> tuple[float, ...]:
         return tuple(self.float(entry, f"{key}[{i}]", place) for i, entry in enumerate(value))
+
+    def split_and_floor(self, cameras: Table) -> tuple[bool, float]:
+        split, floor = cameras.get("split", False), self.float(cameras.get("floor", 0.0), "floor", "cameras")
+        if not isinstance(split, bool) or not 0.0 <= floor < 1.0:
+            raise self.fault(
+                "cameras", "split must be true or false, floor a share of the light from 0 to below 1"
+            )
+        return split, floor
 
     def positive(self, value: Any, key: str, place: str) -> float:
         number = self.float(value, key, place)
@@ -362,11 +363,7 @@ class _Reader:
         level = self.positive(series.get("level", 0.5), "level", "throughput")
         cameras = self.table(table, "cameras")
         self.known(cameras, CAMERA_KEYS, "cameras")
-        split, floor = cameras.get("split", False), self.float(cameras.get("floor", 0.0), "floor", "cameras")
-        if not isinstance(split, bool):
-            raise self.fault("cameras", f"split = {split!r} must be true or false")
-        if not 0.0 <= floor < 1.0:
-            raise self.fault("cameras", f"floor = {floor:g} must be a share of the light from 0 to below 1")
+        split, floor = self.split_and_floor(cameras)
         path = tuple(self.words(table["path"], "path", "")) if table["path"] else ()
         raster = field.get("raster", RASTERS[0])
         if raster not in RASTERS:

@@ -5,7 +5,7 @@ Equation    beams of an arm ½ (1, ±η cos 2α, ±η sin 2α, 0), first camera 
             M → M ± κ λ ∂M/∂λ, M the train ahead of the analyser
             with balance g and loss l, curves over wavelength taken at the mean wavelength of a band, the beams of η = 1
             are ½ (1 ± g) (1, ±(1 − l) cos 2α, ±(1 − l) sin 2α, 0): what differs from band to band
-Symbols     η efficiency, close to 1, ξ half its difference between the beams; α axis of the first beam, from +X toward +Y;
+Symbols     η efficiency, near 1, ξ half its difference between the beams; α axis of the first beam, from +X toward +Y;
             κ half the relative difference of the wavelengths of the two beams
 Source      Wollaston prism as a pair of crossed analysers: Goldstein 2003, Polarized Light, ch. 9.
 Limits      no balance, no loss: as if g = l = 0
