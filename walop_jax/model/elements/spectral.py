@@ -147,6 +147,6 @@ class FieldDiattenuator(Element):
         return mueller.diattenuator(d * jnp.cos(twice), d * jnp.sin(twice))
 
 
-def _with_zero(values: Curve, at: int, count: int) -> Curve:
+def _with_zero(values: Curve, at: int, count: int) -> Float[Array, " n"]:
     """Values of a curve with a zero put in, if it has one value less than `count`."""
     return values if len(values) == count else jnp.concatenate([values[:at], jnp.zeros(1), values[at:]])
