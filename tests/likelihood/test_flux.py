@@ -55,7 +55,9 @@ GROUPS = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # the first two exposur
 
 def test_every_arm_has_a_flux_of_its_own():
     counts = np.array([[2.0, 4.0, 30.0, 60.0]])
-    flux, left = eliminate_flux(counts, np.array([[1.0, 2.0, 1.0, 2.0]]), np.array([False]), Sharing(TOGETHER))
+    flux, left = eliminate_flux(
+        counts, np.array([[1.0, 2.0, 1.0, 2.0]]), np.array([False]), Sharing(TOGETHER)
+    )
     np.testing.assert_allclose(flux, [[2.0, 2.0, 30.0, 30.0]], rtol=1e-14)
     np.testing.assert_allclose(left, 0.0, atol=1e-13)
 
