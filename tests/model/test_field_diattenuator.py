@@ -1,4 +1,4 @@
-"""A diattenuator over field and colour, beams of unequal efficiency, ties and choices of descriptions: numbers by hand."""
+"""A diattenuator over field and colour, beams of unequal efficiency, ties and choices of descriptions, by hand."""
 
 from __future__ import annotations
 

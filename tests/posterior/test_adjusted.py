@@ -1,4 +1,4 @@
-"""Draws spread as a covariance wants them: numbers by hand, ties included; and a fit whose errors come from residuals."""
+"""Draws spread as a covariance wants them: numbers by hand, ties included."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ def sample(draws: np.ndarray, covariance: np.ndarray) -> PosteriorSample:
     one = np.ones(1)
     return PosteriorSample(
         sampler="emcee", names=("a", "b", "c"), units=("",) * 3, draws=draws, log_posterior=draws[..., 0], ln_f=None,
-        mean=draws.mean(axis=(0, 1)), covariance=covariance, chains=np.zeros((len(draws), 1, 1, 1)), sampled=("a",), thin=1,
+        mean=draws.mean(axis=(0, 1)), covariance=covariance, chains=np.zeros((len(draws), 1, 1, 1)),
+        sampled=("a",), thin=1,
         convergence=Convergence(("a",), 1, one, (1.0, 1.0, 1.0), one, one, 0, ()), accuracy=None, acceptance=0.5,
         counts={}, seconds=0.0, fingerprint={},
     )  # fmt: skip
