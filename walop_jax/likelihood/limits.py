@@ -85,7 +85,7 @@ VECTOR_POINTS = 100
 DIAGNOSED_ROWS = 100_000
 """(Exposure, point) pairs that a diagnosis looks at: 800 columns of four cameras each take 2.5 GB."""
 DIAGNOSED_NUMBERS = 120_000_000
-"""Numbers that the columns of a diagnosis may hold: 1 GB, of which there are four copies at most, with what compiles."""
+"""Numbers that the columns of a diagnosis may hold: 1 GB, of which there are four copies at most."""
 FREE_EXPOSURES = 100
 """Exposures of a set up to which a free-form term may have a number for each camera in each of them."""
 PROJECTED_COLUMNS = 128
