@@ -12,6 +12,7 @@ import numpy as np
 from walop_jax.data import read_calibration_set
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
+from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.runs.import_zemax import import_folder
 
 REPOSITORY = "https://github.com/HeisenbergK/NewWALOPCalibrate2Dens"
@@ -133,6 +134,7 @@ def part(
 ) -> CalibrationSet:
     """The set without the points where `points` is False, or without a wavelength (um)."""
     rows = calset.intensities
+    assert isinstance(rows, TableIntensities)
     used = np.ones(len(rows.point), bool)
     if points is not None:
         used &= points[rows.point]
