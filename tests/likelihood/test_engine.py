@@ -319,7 +319,7 @@ def test_eliminated_flux_is_the_least_squares_one():
     flux, residual = eliminate_flux(jnp.asarray(y), jnp.asarray(a), jnp.asarray(known))
     for i in (0, 1, 4):
         expected, rest, *_ = np.linalg.lstsq(a[i][:, None], y[i], rcond=None)
-        assert float(flux[i]) == pytest.approx(expected[0], rel=1e-12)
+        assert float(flux[i, 0]) == pytest.approx(expected[0], rel=1e-12)
         assert float(jnp.sum(residual[i] ** 2)) == pytest.approx(rest[0], rel=1e-10)
     np.testing.assert_array_equal(residual[2], y[2] - a[2])
     np.testing.assert_array_equal(residual[3], y[3])

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from walop_jax.likelihood.flux import eliminate_flux, project_flux
+from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
 
 
 @pytest.mark.parametrize("cameras", [2, 4, 5])
@@ -47,3 +47,40 @@ def test_at_a_perfect_fit_it_is_the_derivative_of_the_residual():
     none = jnp.zeros(5, bool)
     exact = jax.jacfwd(lambda t: eliminate_flux(data, model + t * slope, none)[1])(0.0)
     np.testing.assert_allclose(-project_flux(3.0 * slope, model, none), exact, rtol=0, atol=1e-13)
+
+
+TOGETHER = np.kron(np.eye(2), np.ones((2, 2)))  # two arms of two cameras
+GROUPS = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # the first two exposures have their fluxes in common
+
+
+def test_every_arm_has_a_flux_of_its_own():
+    counts = np.array([[2.0, 4.0, 30.0, 60.0]])
+    flux, left = eliminate_flux(
+        counts, np.array([[1.0, 2.0, 1.0, 2.0]]), np.array([False]), Sharing(TOGETHER)
+    )
+    np.testing.assert_allclose(flux, [[2.0, 2.0, 30.0, 30.0]], rtol=1e-14)
+    np.testing.assert_allclose(left, 0.0, atol=1e-13)
+
+
+def test_exposures_of_a_group_share_the_flux_of_an_arm():
+    """Arm 1 of exposures 1 and 2: F = (1·1 + 0·1 + 3·2 + 1·0) / (1 + 1 + 4 + 0) = 7/6."""
+    model = np.array([[1.0, 1.0, 1.0, 1.0], [2.0, 0.0, 1.0, 3.0], [1.0, 1.0, 2.0, 2.0]])
+    counts = np.array([[1.0, 0.0, 2.0, 2.0], [3.0, 1.0, 2.0, 6.0], [5.0, 5.0, 1.0, 3.0]])
+    shared = Sharing(TOGETHER, GROUPS)
+    flux, left = eliminate_flux(counts, model, np.zeros(3, bool), shared)
+    np.testing.assert_allclose(flux[:, 0], [7 / 6, 7 / 6, 5.0], rtol=1e-14)
+    np.testing.assert_allclose(flux[:, 2], [2.0, 2.0, 1.0], rtol=1e-14)
+    np.testing.assert_allclose(left[0], [1 - 7 / 6, -7 / 6, 0.0, 0.0], atol=1e-14)
+
+
+def test_what_a_shared_flux_can_follow_is_taken_out_and_nothing_else():
+    """The projector is 1 − A A⁺ with a column of A for each flux: numpy's pseudo-inverse makes it."""
+    rng = np.random.default_rng(5)
+    along, columns = rng.uniform(0.5, 2.0, (3, 4)), rng.standard_normal((2, 3, 4))
+    fluxes = [
+        (along * GROUPS[:, group, None] * TOGETHER[2 * arm]).ravel() for group in (0, 1) for arm in (0, 1)
+    ]
+    a = np.stack(fluxes, axis=1)
+    expected = columns.reshape(2, -1) @ (np.eye(12) - a @ np.linalg.pinv(a))
+    found = project_flux(columns, along, np.zeros(3, bool), Sharing(TOGETHER, GROUPS))
+    np.testing.assert_allclose(found.reshape(2, -1), expected, rtol=0, atol=1e-13)

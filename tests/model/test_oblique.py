@@ -147,5 +147,5 @@ def test_north_has_these_elements():
         "wave_plate",
     ]
     assert [[e.kind for e in arm.elements] for arm in north.arms] == [
-        ["wedge", "wave_plate", "rotator", "analyser"]
+        ["wedge", "wave_plate", "rotator", "field_diattenuator", "analyser"]
     ] * 2

@@ -93,6 +93,18 @@ def test_effects_are_followed(name: str):
     np.testing.assert_allclose(last.value[0], counts_of(instrument, sightline), rtol=0, atol=1e-14)
 
 
+def test_beams_that_differ_in_wavelength_are_followed():
+    instrument = built()
+    for arm in instrument.arms:
+        instrument = instrument.changed(f"{arm.name}.analyser", dispersion=jnp.asarray(0.004))
+    sightline = SIGHTLINES["polariser"]
+    stages = trace(instrument, builders.broad_band(), sightline)
+    plain = trace(built(), builders.broad_band(), sightline)[-1].value[0]
+    found = stages[-1].value[0]
+    assert np.max(np.abs(found - plain)) > 1e-4
+    np.testing.assert_allclose(found, counts_of(instrument, sightline), rtol=1e-12)
+
+
 def test_unpolarised_light_is_shared_equally_by_the_nominal_instrument():
     stages = trace(nominal_instrument(), builtin_filter("SDSS-r"), Sightline())
     np.testing.assert_allclose(named(stages, "source"), [[1, 0, 0, 0]])

@@ -11,8 +11,11 @@ import pytest
 
 import walop_jax.runs.sample
 from walop_jax.calibration.product import read_product
+from walop_jax.fit.refit import FitResult, covariance
 from walop_jax.io.errors import DataError
 from walop_jax.posterior import Options, Progress
+from walop_jax.posterior.from_run import fit_of_run
+from walop_jax.runs.refit import refit_sets
 from walop_jax.runs.sample import OUTPUTS, sample_run
 
 from .conftest import FittedSet, assert_same_files
@@ -75,6 +78,28 @@ def test_an_interrupted_run_goes_on_as_if_nothing_had_been(
     product = read_product(caller / "calibration.fits")
     assert product.verdict.covariance_from == "posterior"
     np.testing.assert_array_equal(product.covariance, found.posterior.covariance)
+
+
+@pytest.mark.long
+def test_a_posterior_has_the_errors_of_a_fit_that_leaves_too_much(spoilt: Path, tmp_path: Path):
+    refit_sets([spoilt], tmp_path / "RUN")
+    before = read_product(tmp_path / "RUN" / "calibration.fits")
+    assert before.verdict.errors_from.startswith("residuals")
+    found = sample_run(tmp_path / "RUN", dataclasses.replace(OPTIONS, maximum_steps=100_000))
+    assert found.posterior.trusted
+    after = read_product(tmp_path / "RUN" / "calibration.fits")
+    assert after.verdict.errors_from == before.verdict.errors_from == found.summary["errors_from"]
+    free = before.parameters.sigma > 0
+    ratio = after.parameters.sigma[free] / before.parameters.sigma[free]
+    assert np.all(np.abs(ratio - 1.0) < 0.15)
+    # The stated errors are smaller by √(χ²/dof) at least.
+    stated = np.sqrt(np.diag(stated_covariance(fit_of_run(before, tmp_path / "RUN"))))[free]
+    assert np.median(after.parameters.sigma[free] / stated) > 1.5
+
+
+def stated_covariance(result: FitResult) -> np.ndarray:
+    """The covariance of a fit with the errors that its data state."""
+    return covariance(result.model, result.posterior)
 
 
 def test_what_is_no_run_is_refused(fitted: FittedSet, tmp_path: Path):

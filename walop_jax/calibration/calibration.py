@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from walop_jax.calibration.matrix import matrices
 from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, ParameterTable, Verdict, in_ascii
 from walop_jax.calibration.records import Quality, ResidualMap
-from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter
+from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter, single_wavelength
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import CALIBRATION_PLATE, Exposures, FilterCurve, InputFile, Site, Sources
 from walop_jax.data.settings import Settings
@@ -116,7 +116,9 @@ class Calibration:
         settings = settings or self.usual_settings(len(x))
         filters = {str(name): self.filter_curve(str(name)) for name in np.unique(settings.filter)}
         instrument = self.model.instrument(self.values)
-        return matrices(instrument, settings, filters, np.asarray(x), np.asarray(y), self.covariance)
+        return matrices(
+            instrument, settings, filters, np.asarray(x, float), np.asarray(y, float), self.covariance
+        )
 
     def usual_settings(self, count: int = 1, filter_name: str = DEFAULT_FILTER) -> Settings:
         """Flat photon spectrum, 10 °C, on the meridian, moving elements out.
@@ -144,7 +146,7 @@ class Calibration:
         """The curve of a filter; `DataError` with the nearest names when there is none."""
         if name in self.filters:
             return self.filters[name]
-        if name in BUILTIN_FILTERS:
+        if name in BUILTIN_FILTERS or single_wavelength(name) is not None:
             return builtin_filter(name)
         known = (*self.filters, *BUILTIN_FILTERS)
         raise DataError(f"FILTER: the calibration has no filter {name!r}; {nearest(name, known)}")

@@ -27,7 +27,7 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.expansion import Census, Posterior
 from walop_jax.likelihood.field_table import FieldTable
-from walop_jax.likelihood.flux import project_flux
+from walop_jax.likelihood.flux import project_flux, sharing
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.runner import SlabSums
 from walop_jax.model import light
@@ -57,11 +57,12 @@ def _point_sums(
     elements = 0.5 * jnp.einsum("ea,es,ak->eask", total, stokes, signs).reshape(len(unit), -1, unit.shape[-1])
     later = unit[:, None] * np.abs(signs[1:])
     weight = point.weight * chosen[:, None]
-    change = jnp.concatenate([elements, later], axis=1) * (flux[:, None] * weight)[:, None]
+    change = jnp.concatenate([elements, later], axis=1) * (flux * weight)[:, None]
     known = plan.exposures.flux_known
-    change = project_flux(change, (unit * weight)[:, None], known[:, None])
+    change = jnp.moveaxis(change, 1, 0)  # exposures next to cameras
+    change = jnp.moveaxis(project_flux(change, unit * weight, known, sharing(instrument, plan)), 0, 1)
     seen = (point.weight[:, 0] > 0) & chosen
-    freedom = jnp.sum(jnp.where(seen, unit.shape[-1] - jnp.where(known, 0.0, 1.0), 0.0))
+    freedom = jnp.sum(jnp.where(seen, unit.shape[-1] - jnp.where(known, 0.0, instrument.cameras.fluxes), 0.0))
     chi2 = jnp.sum(jnp.where(chosen[:, None], residual, 0.0) ** 2)
     right = jnp.einsum("edk,ek->d", change, residual)
     left = jnp.einsum("edk,efk->df", change, change)[np.triu_indices(len(right))]

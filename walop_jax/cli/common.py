@@ -6,6 +6,7 @@ import contextlib
 import functools
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 CACHE_VARIABLE = "WALOP_JAX_CACHE"
 DEBUG_VARIABLE = "WALOP_JAX_DEBUG"
+LINE_EVERY = 10.0  # s, of progress that is no terminal's
 
 CalsetFiles = Annotated[
     list[Path], typer.Argument(metavar="CALSET...", help="Calibration sets (FITS), fitted as one.")
@@ -125,12 +127,27 @@ def print_json(value: Any) -> None:
 
 @contextlib.contextmanager
 def progress(quiet: bool) -> Iterator[Callable[[str], None]]:
-    """Give a function that shows what is being done: on a terminal only, on stderr, gone at the end."""
+    """Give a function that shows what is being done on stderr: on a terminal in one line that is gone at the end.
+
+    Elsewhere a line is printed when there has been none for `LINE_EVERY` seconds.
+    """
     from rich.console import Console
 
     console = Console(stderr=True)
-    if quiet or not console.is_terminal:
+    if quiet:
         yield lambda message: None
+        return
+    if not console.is_terminal:
+        began = told = time.monotonic()
+
+        def line(message: str) -> None:
+            nonlocal told
+            now = time.monotonic()
+            if now - told >= LINE_EVERY:
+                told = now
+                typer.echo(f"{now - began:.0f} s: {message}", err=True)
+
+        yield line
         return
     with console.status("") as status:
         yield status.update

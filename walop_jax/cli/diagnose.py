@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from walop_jax.cli.common import (
     CalsetFiles,
@@ -20,6 +22,10 @@ from walop_jax.cli.common import (
     warn,
 )
 
+MinutesOption = Annotated[
+    float, typer.Option(min=0.0, help="Begin no search for a further name after so long.")
+]
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -33,6 +39,7 @@ def diagnose(
     instrument: InstrumentOption = None,
     overwrite: OverwriteOption = False,
     seed: SeedOption = None,
+    minutes: MinutesOption = 20.0,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -47,8 +54,9 @@ def diagnose(
 
     with progress(quiet or json) as tell:
         found = diagnose_sets(
-            calsets, output, model=model, instrument=instrument, seed=seed, overwrite=overwrite, progress=tell
-        )
+            calsets, output, model=model, instrument=instrument, seed=seed, minutes=minutes,
+            overwrite=overwrite, progress=tell,
+        )  # fmt: skip
     if json:
         print_json(found.document)
     for sentence in found.diagnosis.after.warnings:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,15 @@ _TABLES = {"SDSS-r": "sdss_r.csv"}
 """Files beside this one. The WALOP filters are custom: the survey's curve is where one starts."""
 
 BUILTIN_FILTERS = tuple(_TABLES)
-"""Names that `builtin_filter` knows."""
+"""Names that `builtin_filter` knows, single wavelengths (`single_wavelength`) apart."""
+
+_SINGLE = re.compile(r"MONO-(\d{3,6}(?:\.\d+)?)")
+
+
+def single_wavelength(name: str) -> float | None:
+    """Wavelength (µm) of light called MONO-<Ångström>, as `import-zemax` names it; None: another name."""
+    found = _SINGLE.fullmatch(name)
+    return None if found is None else 1e-4 * float(found[1])
 
 
 def builtin_filter(name: str) -> FilterCurve:
@@ -25,8 +34,12 @@ def builtin_filter(name: str) -> FilterCurve:
     `SDSS-r` is the r curve of the SDSS camera as measured by Doi et al. 2010, AJ 139, 1628, Table 4, for an
     airmass of 1.3. The curve counts photons: it is the share of the photons at each wavelength that is detected.
 
-    Raises `DataError` with the nearest names if there is no such filter.
+    `MONO-6500` is light of 6500 Å alone, and so on. Raises `DataError` with the nearest names if there is no such
+    filter.
     """
+    wavelength = single_wavelength(name)
+    if wavelength is not None:
+        return FilterCurve(name=name, wavelength=np.array([wavelength]), throughput=np.ones(1))
     if name not in _TABLES:
         raise fail(
             f"no built-in filter is called {name!r}",

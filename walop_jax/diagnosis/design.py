@@ -63,7 +63,8 @@ class Design:
     @property
     def eliminated(self) -> int:
         """Rows that carry no noise: one for every flux that was solved for, one for every weak pull."""
-        fluxes = int(self.measured.used[:, ~self.measured.known].sum())
+        likelihood = self.fit.likelihood
+        fluxes = round(float(self.measured.used.sum(axis=0) @ (likelihood.cameras - likelihood.data_per_row)))
         return fluxes + int((~self.fit.likelihood.priors.known).sum())
 
     def _columns_of(self, name: str) -> Bool[np.ndarray, " f"]:

@@ -93,7 +93,7 @@ class Examination:
     def _common_mode(self) -> Vector:
         """Prior widths of the gains of single exposures that amount to `COMMON_MODE` per intensity."""
         at = self.space.places()[SINGLE_EXPOSURES]
-        points = np.repeat(self.design.measured.used.sum(axis=0), self.design.measured.cameras - 1)
+        points = np.repeat(self.design.measured.used.sum(axis=0), len(self.design.measured.gained))
         square = np.where(self.space.before[at] > 0, self.space.before[at], np.inf)
         return np.maximum(COMMON_MODE * np.sqrt(points / square), 1e-30)
 

@@ -174,9 +174,9 @@ def _ladder(diagnosis: Diagnosis) -> Ladder:
 
 def _shares(likelihood: Likelihood, before: Cube, after: Cube) -> Shares:
     """Sums of squared residuals by camera, kind, filter and exposure."""
-    e, known = likelihood.calset.exposures, likelihood.flux_known
+    e = likelihood.calset.exposures
     names = likelihood.model.template.cameras.names
-    share = np.where(known, 1.0, 1.0 - 1.0 / len(names))
+    share = likelihood.data_per_row / len(names)
     expected = (likelihood.used.sum(axis=0) * share)[:, None] * np.ones(len(names))
     squares = [expected, (before**2).sum(axis=0), (after**2).sum(axis=0)]  # (exposure, camera)
     members: list[tuple[str, str]] = []

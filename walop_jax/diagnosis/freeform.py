@@ -25,16 +25,24 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.polynomial.legendre import legvander
 
-from walop_jax.data.records import POLARISER, Exposures
+from walop_jax.data.records import POLARISER, CalibrationSet, Exposures
 from walop_jax.diagnosis.score import Candidate
+from walop_jax.likelihood.flux import Sharing, project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
 from walop_jax.model.effects.free_form import FINE, HARMONICS, SMOOTH, WIDTH
+from walop_jax.model.instrument import Instrument
 
 RINGS = (3, 4, 5, 6, 7, 8)
 SINGLE_EXPOSURES = "single exposures"
 
 Cube = Float[np.ndarray, "p e k"]
+
+
+def numpy_sharing(likelihood: Likelihood) -> Sharing:
+    """What has a flux in common, in arrays of numpy."""
+    groups = likelihood.plan.exposures.shared
+    return Sharing(likelihood.model.template.cameras.together, None if groups is None else np.asarray(groups))
 
 
 class Measured:
@@ -49,7 +57,7 @@ class Measured:
         # Weighted model at unit flux, from data = flux · model + residual.
         flux = np.where(self.flux == 0, 1.0, self.flux)[..., None]
         self.model: Cube = (self.counts * self.weight - self.residual) / flux
-        self.known = likelihood.flux_known
+        self.known, self.shared = likelihood.flux_known, numpy_sharing(likelihood)
         self.cameras = likelihood.cameras
         # Of the model, not of the counts: patterns that know the noise would find it in the residuals.
         unit = self.model / np.where(self.weight > 0, self.weight, 1.0)
@@ -59,31 +67,57 @@ class Measured:
     def column(self, pattern: Cube) -> Float[np.ndarray, " _"]:
         """Derivative of the residuals with respect to the amplitude of N_k → N_k + F · level_k · pattern."""
         change = self.flux[..., None] * pattern * self.level[:, None, :] * self.weight
-        power = np.sum(self.model**2, axis=-1)
-        along = np.sum(change * self.model, axis=-1) / np.where(power > 0, power, 1.0)
-        along = np.where(self.known, 0.0, along)
-        return -(change - along[..., None] * self.model)[self.used].reshape(-1)
+        return -project_flux(change, self.model, self.known, self.shared)[self.used].reshape(-1)
 
     def gains(self) -> Float[np.ndarray, "_ _"]:
-        """Columns of the gain of all cameras but the last in every exposure (that one is the flux)."""
+        """Columns of the gains of the cameras in every exposure, but the last of each flux (that one is the flux)."""
+        if self.shared.exposures is not None:
+            return self._gains_of_groups()
         change = self.flux[..., None] * self.level[:, None, :] * self.weight
-        power = np.sum(self.model**2, axis=-1, keepdims=True)
-        share = np.where(self.known[:, None], 0.0, change * self.model / np.where(power > 0, power, 1.0))
-        each = change[..., None] * np.eye(self.cameras) - share[..., None] * self.model[..., None, :]
+        alone = np.moveaxis(change[..., None] * np.eye(self.cameras), 2, 0)
+        each = np.moveaxis(project_flux(alone, self.model, self.known, self.shared), 0, 2)
         row = np.cumsum(self.used).reshape(self.used.shape) - 1
         points, exposures = np.nonzero(self.used)
-        free = self.cameras - 1
-        columns = np.zeros((self.cameras * len(points), free * self.used.shape[1]))
-        for k in range(free):
+        columns = np.zeros((self.cameras * len(points), len(self.gained) * self.used.shape[1]))
+        for i, k in enumerate(self.gained):
             for channel in range(self.cameras):
                 rows = self.cameras * row[points, exposures] + channel
-                columns[rows, free * exposures + k] = -each[points, exposures, k, channel]
+                columns[rows, len(self.gained) * exposures + i] = -each[points, exposures, k, channel]
         return columns
+
+    def _gains_of_groups(self) -> Float[np.ndarray, "_ _"]:
+        """The same where exposures have a flux in common: a gain of one changes what is left of the others."""
+        columns = []
+        for exposure in range(self.used.shape[1]):
+            for k in self.gained:
+                pattern = np.zeros((1, self.used.shape[1], self.cameras))
+                pattern[0, exposure, k] = 1.0
+                columns.append(self.column(pattern))
+        return np.column_stack(columns)
+
+    @property
+    def gained(self) -> list[int]:
+        """Cameras that have a gain beside the flux."""
+        shared = self.shared.cameras if self.shared.cameras is not None else np.ones((self.cameras,) * 2)
+        return [k for k in range(self.cameras) if shared[k, k + 1 :].any()]
 
     def candidate(self, name: str, patterns: list[Cube], block: str | None = None) -> Candidate:
         """A stratum of patterns, and the block of the free-form term that can take it up."""
         columns = np.column_stack([self.column(p) for p in patterns])
         return Candidate(name, columns, np.full(columns.shape[1], WIDTH), block)
+
+
+def number_of_columns(calset: CalibrationSet, instrument: Instrument) -> int:
+    """Number of columns of all strata together, or a few more."""
+    e, cameras = calset.exposures, len(instrument.cameras)
+    turning = 1 + len(instrument.patched().moving())
+    of_camera = 2 * len(legendre.terms(SMOOTH)) + len(legendre.terms(FINE)) + len(RINGS)
+    of_camera += 6 * len(HARMONICS) * turning + 3  # time, temperature, flux
+    of_camera += 5 * (len(np.unique(e.kind)) - 1) + 3 * (len(np.unique(e.filter)) - 1)
+    for prefix in instrument.patched().moving():
+        of_camera += 3 * (len(np.unique(_positions(e, prefix))) - 1)
+    gains = len(e) * (cameras - instrument.cameras.fluxes)
+    return cameras * of_camera + gains
 
 
 def _positions(e: Exposures, prefix: str) -> np.ndarray:
@@ -173,5 +207,5 @@ def strata(measured: Measured) -> Iterator[Candidate]:
     if sky_gradients:
         yield measured.candidate("kind, over the field", sky_gradients)
     yield Candidate(
-        SINGLE_EXPOSURES, measured.gains(), np.full((len(names) - 1) * len(e), WIDTH), "exposures"
+        SINGLE_EXPOSURES, measured.gains(), np.full(len(measured.gained) * len(e), WIDTH), "exposures"
     )

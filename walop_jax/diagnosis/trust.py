@@ -12,8 +12,8 @@ Groups      the squared residuals of each camera, kind, filter and exposure. Beh
             that follows from these; its p is that of a scaled χ² with these two moments.
 Errors      χ²/dof far below 1 says that N_ERR is not the error of N; a few per cent off is no matter of the model.
 
-Symbols     w = expected counts / errors of an exposure at a point, of unit length, where its flux was fitted (0 where
-            that is known); Q orthonormal basis of the derivatives with respect to the free parameters.
+Symbols     w = expected counts / errors of what has a flux in common (an exposure at a point), of unit length, where
+            that was fitted (0 where it is known); Q orthonormal basis of the derivatives with respect to the free parameters.
 Sources     Rao 1948; Satterthwaite 1946, Biometrics Bull. 2, 110 (χ² with two moments); Šidák 1967 (many questions).
 Limits      Noise alone raises a doubt in about one fit of 200. Of a large set a sample of the points is looked at:
             what is smaller than its noise shows in χ² and in the residual map.
@@ -37,6 +37,7 @@ from walop_jax.diagnosis.score import Scorer, ScoreSpace, ScoreTable
 from walop_jax.fit.refit import FitResult, with_honest_errors
 from walop_jax.fit.refit import refit as fit_refit
 from walop_jax.likelihood import limits
+from walop_jax.likelihood.flux import sharing
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.processes import Processes
 from walop_jax.likelihood.runner import Progress
@@ -129,7 +130,9 @@ def group_scores(design: Design) -> list[GroupScore]:
     """Every camera, kind, filter and exposure of a fit by itself."""
     measured = design.measured
     residual = design.cube(design.projector(design.residual))
-    w = np.where(measured.known[..., None], 0.0, _unit(measured.model)) ** 2
+    shared = sharing(measured.likelihood.model.template, measured.likelihood.plan)
+    power = np.asarray(shared.summed(measured.model**2))
+    w = np.where(measured.known[..., None], 0.0, measured.model**2 / np.where(power > 0, power, 1.0))
     absorbed = design.cube(np.sum(design.projector.basis**2, axis=1))
     expected = np.where(measured.used[..., None], np.clip(1.0 - w - absorbed, 0.0, None), 0.0)
     found = []
@@ -139,25 +142,21 @@ def group_scores(design: Design) -> list[GroupScore]:
         means = [float(expected[part].sum()) for part in (group, rest)]
         if min(means) <= 0:
             continue
-        # ‖P‖² exposure by exposure at every point; what the parameters couple beyond that is small beside it.
-        taken = [np.where(part, w, 0.0).sum(axis=-1) for part in (group, rest)]
+        # ‖P‖² among what has a flux in common; what the parameters couple beyond that is small beside it.
+        taken = [np.where(part, w, 0.0) for part in (group, rest)]
+        sums = [np.asarray(shared.summed(part)) for part in taken]
         own = [
-            np.where(part, (1.0 - w) ** 2 - w**2, 0.0).sum() + np.sum(sums**2)
-            for part, sums in zip((group, rest), taken, strict=True)
+            np.where(part, (1.0 - w) ** 2 - w**2, 0.0).sum() + np.sum(t * s)
+            for part, t, s in zip((group, rest), taken, sums, strict=True)
         ]
         variance = 2.0 * (own[0] / means[0] ** 2 + own[1] / means[1] ** 2)
-        variance -= 4.0 * np.sum(taken[0] * taken[1]) / (means[0] * means[1])
+        variance -= 4.0 * np.sum(taken[0] * sums[1]) / (means[0] * means[1])
         squares = [float(np.sum(residual[part] ** 2)) for part in (group, rest)]
         ratio = squares[0] / means[0] / max(squares[1] / means[1], 1e-300)
         degrees = 2.0 / variance
         above = float(stats.chi2.sf(ratio * degrees, degrees))
         found.append(GroupScore(name, ratio, 2.0 * min(above, 1.0 - above)))
     return found
-
-
-def _unit(model: Cube) -> Cube:
-    norm = np.linalg.norm(model, axis=-1, keepdims=True)
-    return model / np.where(norm > 0, norm, 1.0)
 
 
 def _groups_of(design: Design) -> Mapping[str, Bool[np.ndarray, "1 e k"]]:

@@ -26,6 +26,7 @@ from walop_jax.diagnosis.effect_columns import Probe
 from walop_jax.diagnosis.effect_columns import probes as all_probes
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.findings import Diagnosis, Outcome, Step, Unexplained
+from walop_jax.diagnosis.freeform import number_of_columns
 from walop_jax.diagnosis.score import Score
 from walop_jax.diagnosis.step_summary import before_and_after, refitted_in_order
 from walop_jax.fit.model_builder import base_model
@@ -39,6 +40,7 @@ from walop_jax.model.specification import Model, effect_context
 
 MOST_STEPS = 6
 LEAST_EVIDENCE = 1.0  # ln B that an effect must be worth to the final model to stay in it
+MINUTES = 20.0  # after which no further name is sought
 POOR_FIT = 1.5  # χ²/dof above which effects that cannot be differentiated are tried
 
 
@@ -48,18 +50,28 @@ def diagnose(
     *,
     catalogue: Sequence[type[Effect]] = EFFECTS,
     seed: int = 0,
+    minutes: float = MINUTES,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Find what `model` (default: the base model) lacks to explain a calibration set.
 
     `catalogue` are the effects that may be named. Of a set with more than `limits.DIAGNOSED_ROWS` (exposure, point)
-    pairs,
-    points spread over the field are looked at. Raises what `fit` raises.
+    pairs, or whose columns would be more than `limits.DIAGNOSED_NUMBERS`, points spread over the field are looked at.
+    The search for a further name, or for a free-form term, does not begin after `minutes`; what is left then has no
+    name. Raises what `fit` raises.
     """
     began = time.perf_counter()
     tell = progress or (lambda text: None)
-    some = thinned(calset, max(1, limits.DIAGNOSED_ROWS // len(calset.exposures)), neighbours=1)
-    found = _Diagnosing(some, model or base_model(calset), catalogue, seed, tell).run(began)
+    model = model or base_model(calset)
+    context = effect_context(model.template, calset.exposures)
+    amplitudes = sum(len(probe.widths) for probe in all_probes(tuple(catalogue), context))
+    columns = amplitudes + number_of_columns(calset, model.template)
+    each = len(calset.exposures) * calset.cameras * columns
+    most = min(limits.DIAGNOSED_ROWS // len(calset.exposures), limits.DIAGNOSED_NUMBERS // each)
+    some = thinned(calset, max(1, most), neighbours=1)
+    if len(some.points) < len(calset.points):
+        tell(f"looking at {len(some.points)} of {len(calset.points)} field points: {columns} columns each")
+    found = _Diagnosing(some, model, catalogue, seed, tell, began + 60.0 * minutes).run(began)
     return dataclasses.replace(found, points=len(calset.points))
 
 
@@ -73,8 +85,9 @@ class _Diagnosing:
         catalogue: Sequence[type[Effect]],
         seed: int,
         tell: Callable[[str], None],
+        until: float,
     ) -> None:
-        self.calset, self.tell = calset, tell
+        self.calset, self.tell, self.until = calset, tell, until
         self.rng = np.random.default_rng(seed)
         self.context: Context = effect_context(model.template, calset.exposures)
         fitting = [kind for kind in catalogue if kind.neutral(self.context).fits(model.template)]
@@ -113,7 +126,7 @@ class _Diagnosing:
 
     def _add_names(self, examination: Examination) -> Examination:
         """Add names until nothing is missing or none is found; the examination of what they leave."""
-        while examination.alarm and len(self.steps) < MOST_STEPS:
+        while examination.alarm and len(self.steps) < MOST_STEPS and self._time_left():
             self.tell(f"p = {examination.table.p_global:.2g}: something is missing; trying names")
             added = self._add_best(examination)
             if added is None:
@@ -122,13 +135,20 @@ class _Diagnosing:
             examination = self._examine(examination)
         return examination
 
+    def _time_left(self) -> bool:
+        return time.perf_counter() < self.until
+
     def _trials(self, examination: Examination) -> Iterator[naming.Trial]:
         for item in naming.leaders(examination.significant) if examination.significant else ():
+            if not self._time_left():
+                return
+            self.tell(f"trying {item.effect.name}")
             shapes = sum(probe.effect is item.effect for probe in examination.probes)
             yield naming.try_shapes(self.fit, item, self.context, shapes)
         if self.fit.chi2 > POOR_FIT * self.fit.dof:
             for effect in self.catalogue:
                 if effect.is_structural() and effect.name not in self.fit.model.effect_names:
+                    self.tell(f"trying {effect.name}")
                     yield naming.try_effect(self.fit, effect.neutral(self.context), self.context)
 
     def _add_best(self, examination: Examination) -> str | None:
@@ -205,7 +225,10 @@ class _Diagnosing:
             dict.fromkeys(b for name, _ in patterns if (b := examination.blocks[name]) is not None)
         )
         there = FreeForm.name in self.fit.model.effect_names
-        return self._with_free_form(examination, found, blocks) if blocks and not there else found
+        if len(self.calset.exposures) > limits.FREE_EXPOSURES:
+            blocks = tuple(block for block in blocks if block != "exposures")
+        ready = bool(blocks) and not there and self._time_left()
+        return self._with_free_form(examination, found, blocks) if ready else found
 
     def _with_free_form(
         self, examination: Examination, found: Unexplained, blocks: tuple[str, ...]

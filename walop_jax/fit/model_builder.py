@@ -1,6 +1,7 @@
 """Models from data, from a model file, or from neither: the one place where the three come together.
 
-The scale of the throughput is a gauge unless a flux is known: the constant of camera N0 is held then.
+The scale of the throughput is a gauge unless a flux is known: the constant of camera N0 is held then. Where every arm
+has a flux of its own, the whole series of its first camera is.
 """
 
 from __future__ import annotations
@@ -65,11 +66,20 @@ def base_model(
     for i in model.positions("throughput"):
         p = model.parameters[i]
         model = model.change(p.name, scale=p.scale * level / LEVEL, loose=level)
-    if not has_known_flux(calset):
-        model = model.change(GAUGE, free=False)
+    for name in _gauges(model, has_known_flux(calset)):
+        model = model.change(name, free=False)
     if not ((calset.exposures.kind == "moon") & ~calset.exposures.clp_in).any():
         model = model.change("sky.depolarisation", free=False)
     return model
+
+
+def _gauges(model: Model, flux_known: bool) -> list[str]:
+    """What the fluxes take up: the scale of the throughput, or all that the cameras of an arm have in common."""
+    cameras = model.template.cameras
+    if cameras.split:
+        first = tuple(f"throughput.n{a}." for a, _ in cameras.pairs)
+        return [name for name in model.names if name.startswith(first)]
+    return [] if flux_known else [GAUGE]
 
 
 def instrument_of(calset: CalibrationSet) -> Instrument:

@@ -137,7 +137,7 @@ def _minimum_from_afar(
     found = _search(likelihood, "fit", first, given, maximum_steps=FIRST_STEPS)
     promising = found.posterior.objective < worth if worth is not None else found.misfit < FAR_OFF
     if not found.minimum.converged and promising:
-        found = _search(likelihood, "fit, continued", found.values, given, found.posterior)
+        found = _search(likelihood, "fit, continued", found.values, given, found.posterior, damping=0.0)
     if noise_scale is not None:
         return found
     for _ in range(MAXIMUM_RESCALINGS):

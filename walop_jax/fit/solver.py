@@ -40,6 +40,9 @@ LARGEST_CONDITION = 1e14
 ROUNDING = 1e-12  # of an objective: near the end two of them differ by less
 STALE = 0.05  # of the distance left by a step
 SMALLEST_STEP = 1e-14  # of the trust region
+# Share of the predicted reduction above which λ falls. With 0.99 a problem that is a little curved keeps its λ and with
+# it a slow end: directions that the data hardly see then take forty steps.
+WELL_PREDICTED = 0.75
 
 
 # --------------------------------------------------------------------------------------- what is minimised
@@ -125,7 +128,9 @@ class TrustRegion(optx.AbstractSearch):
     """optimistix' classical trust region with any first step size (1/λ), for objectives that are rounded."""
 
     first: float
-    region: optx.ClassicalTrustRegion = eqx.field(default_factory=optx.ClassicalTrustRegion)
+    region: optx.ClassicalTrustRegion = eqx.field(
+        default_factory=lambda: optx.ClassicalTrustRegion(high_cutoff=WELL_PREDICTED)
+    )
 
     def init(self, y: Any, f_info_struct: Any) -> Any:
         """The region before the first step."""

@@ -23,26 +23,16 @@ from walop_jax.io.errors import DataError, fail, nearest
 Table = Mapping[str, Any]
 
 KEYS = (
-    "name",
-    "default",
-    "like",
-    "about",
-    "source",
-    "path",
-    "site",
-    "field",
-    "cameras",
-    "throughput",
-    "elements",
-    "arms",
-)
+    "name", "default", "like", "about", "source", "path", "site", "field", "cameras", "throughput", "elements", "arms",
+)  # fmt: skip
 REQUIRED = ("name", "path", "field", "cameras", "throughput", "elements", "arms")
-NUMBER_KEYS = ("value", "sigma", "unit", "source", "name", "scale", "loose")
+NUMBER_KEYS = ("value", "sigma", "unit", "source", "name", "scale", "loose", "tie")
 SITE_KEYS = ("telescope", "latitude", "longitude", "elevation", "full_moon")
 FIELD_KEYS = ("limit", "scale", "raster", "edge")
 RASTERS = ("square", "line")
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 LARGEST = 1e300
+CAMERA_KEYS = ("names", "split", "floor")
 THROUGHPUT_KEYS = ("degree", "level", "scale", "loose")
 
 
@@ -51,7 +41,8 @@ class Given:
     """A number of a description: fixed, or a parameter if the file gives more than its value.
 
     `sigma` is the scatter expected of what was built (the width of the prior, None: no prior), `scale` the step of a
-    solver, `loose` the width of a weak pull; `name` replaces the name of the parameter. A number that an element has at
+    solver, `loose` the width of a weak pull; `name` replaces the name of the parameter, `tie` names the parameter that
+    has the same value. A number that an element has at
     several wavelengths is a tuple; what else is said of it holds for each.
     """
 
@@ -63,6 +54,7 @@ class Given:
     name: str | None = None
     scale: float | None = None
     loose: float | None = None
+    tie: str | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +81,8 @@ class ArmText:
 class Description:
     """An instrument as described; `path` names the elements ahead of the arms in the order light meets them.
 
-    `field_limit`, `field_scale` and `edge` in degrees; `raster` is how the field points of a simulated run lie.
+    `field_limit`, `field_scale` and `edge` in degrees; `split` and `floor` as in `model.cameras.Cameras`; `raster` is
+    how the field points of a simulated run lie.
     """
 
     name: str
@@ -106,6 +99,8 @@ class Description:
     site: Mapping[str, Any]
     raster: str = "square"
     edge: float = 0.0
+    split: bool = False
+    floor: float = 0.0
     default: bool = False
     text: str = ""
 
@@ -114,9 +109,6 @@ class Description:
         """Telescope, latitude and longitude (deg, east positive), elevation (m), MJD of a full Moon; NaN: not said."""
         latitude, longitude, elevation, moon = (float(self.site.get(key, math.nan)) for key in SITE_KEYS[1:])
         return str(self.site.get("telescope", "")), latitude, longitude, elevation, moon
-
-
-# ------------------------------------------------------------------------------------------------ shipped ones
 
 
 @functools.cache
@@ -200,7 +192,7 @@ def merged(old: Table, new: Table) -> Table:
         before = result.get(key)
         if isinstance(before, Mapping) and isinstance(value, Mapping) and "value" not in value:
             result[key] = merged(before, value)
-        elif _named(before) and _named(value) and _names(before) == _names(value):
+        elif _named(before) and _named(value) and [t["name"] for t in before] == [t["name"] for t in value]:
             result[key] = [merged(old_one, new_one) for old_one, new_one in zip(before, value, strict=True)]
         else:
             result[key] = value
@@ -209,10 +201,6 @@ def merged(old: Table, new: Table) -> Table:
 
 def _named(value: Any) -> TypeGuard[list[Table]]:
     return isinstance(value, list) and all(isinstance(entry, Mapping) and "name" in entry for entry in value)
-
-
-def _names(tables: list[Table]) -> list[str]:
-    return [table["name"] for table in tables]
 
 
 # ------------------------------------------------------------------------------------------------ checking
@@ -262,6 +250,14 @@ class _Reader:
     def floats(self, value: list[Any], key: str, place: str) -> tuple[float, ...]:
         return tuple(self.float(entry, f"{key}[{i}]", place) for i, entry in enumerate(value))
 
+    def split_and_floor(self, cameras: Table) -> tuple[bool, float]:
+        split, floor = cameras.get("split", False), self.float(cameras.get("floor", 0.0), "floor", "cameras")
+        if not isinstance(split, bool) or not 0.0 <= floor < 1.0:
+            raise self.fault(
+                "cameras", "split must be true or false, floor a share of the light from 0 to below 1"
+            )
+        return split, floor
+
     def positive(self, value: Any, key: str, place: str) -> float:
         number = self.float(value, key, place)
         if number <= 0:
@@ -286,7 +282,7 @@ class _Reader:
                     raise self.fault(
                         here, f"{name} = {given[name]:g} must be above 0; leave it out where there is none"
                     )
-        for name in ("unit", "source", "name"):
+        for name in ("unit", "source", "name", "tie"):
             if name in value:
                 pure = name == "unit" and value[name] == ""
                 given[name] = "" if pure else self.text(value[name], name, here)
@@ -316,7 +312,9 @@ class _Reader:
         return ElementText(name, self.text(table["kind"], "kind", place), moves, values, made)
 
     def value(self, value: Any, key: str, place: str) -> Any:
-        """A number, a name, or a list of either."""
+        """A number, a name, a list of either, or true or false."""
+        if isinstance(value, bool):
+            return value
         if isinstance(value, str):
             return self.text(value, key, place)
         if isinstance(value, list) and value and not isinstance(value[0], str):
@@ -364,7 +362,8 @@ class _Reader:
             raise self.fault("throughput", f"degree = {degree!r} must be a whole number from 0 to 12")
         level = self.positive(series.get("level", 0.5), "level", "throughput")
         cameras = self.table(table, "cameras")
-        self.known(cameras, ("names",), "cameras")
+        self.known(cameras, CAMERA_KEYS, "cameras")
+        split, floor = self.split_and_floor(cameras)
         path = tuple(self.words(table["path"], "path", "")) if table["path"] else ()
         raster = field.get("raster", RASTERS[0])
         if raster not in RASTERS:
@@ -392,6 +391,8 @@ class _Reader:
             site=dict(site),
             raster=raster,
             edge=self.float(field.get("edge", 0.0), "edge", "field"),
+            split=split,
+            floor=floor,
             default=table.get("default") is True and "default" in text,
             text=text,
         )

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.engine import PointData, best_flux, point_prediction, real_counts
-from walop_jax.likelihood.flux import project_flux
+from walop_jax.likelihood.flux import project_flux, sharing
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects.base import Effect, with_amplitudes
 from walop_jax.model.instrument import Instrument
@@ -32,7 +32,9 @@ def _point_effect_columns(
     flat, to_tree = ravel_pytree(neutral)
     change = jax.vmap(lambda one: push(to_tree(one)))(jnp.eye(flat.size)) * point.weight
     _, along = jax.jvp(lambda f: real_counts(at_neutral, plan, unit, f), (flux,), (jnp.ones_like(flux),))
-    projected = project_flux(change, along * point.weight, plan.exposures.flux_known)
+    projected = project_flux(
+        change, along * point.weight, plan.exposures.flux_known, sharing(instrument, plan)
+    )
     return -projected.reshape(flat.size, -1)
 
 

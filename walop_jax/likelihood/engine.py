@@ -31,7 +31,7 @@ from jaxtyping import Array, Float, Int
 
 from walop_jax.likelihood import limits, linear
 from walop_jax.likelihood.field_table import FieldTable
-from walop_jax.likelihood.flux import eliminate_flux, project_flux
+from walop_jax.likelihood.flux import eliminate_flux, project_flux, sharing
 from walop_jax.likelihood.linear import rows_and_slopes
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
@@ -134,31 +134,31 @@ def vectors_at(
 
 def best_flux(
     instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], point: PointData
-) -> Float[Array, " e"]:
+) -> Float[Array, "e f"]:
     """Flux that fits best: in closed form, refined by Newton steps where detectors are not linear in it."""
-    known = plan.exposures.flux_known
-    flux, _ = eliminate_flux(point.counts * point.weight, unit * point.weight, known)
+    known, shared = plan.exposures.flux_known, sharing(instrument, plan)
+    flux, _ = eliminate_flux(point.counts * point.weight, unit * point.weight, known, shared)
     if not light.is_linear(instrument):
         for _ in range(NEWTON_STEPS):
             counts, slope = jax.jvp(
                 lambda f: real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),)
             )
             missing = (point.counts - counts) * point.weight
-            step, _ = eliminate_flux(missing, slope * point.weight, known)
-            flux = jnp.where(known, flux, flux + step)
+            step, _ = eliminate_flux(missing, slope * point.weight, known, shared)
+            flux = jnp.where(known[:, None], flux, flux + step)
     return flux
 
 
 def real_counts(
-    instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], flux: Float[Array, " e"]
+    instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], flux: Float[Array, "e f"]
 ) -> Float[Array, "e k"]:
     """What the detectors report for light of a flux, `unit` being the counts for light of unit flux."""
-    return light.detected(instrument, plan.exposures, flux[:, None] * unit)
+    return light.detected(instrument, plan.exposures, flux * unit)
 
 
 def point_residuals(
     instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None = None
-) -> tuple[Float[Array, " e"], Float[Array, "e k"]]:
+) -> tuple[Float[Array, "e f"], Float[Array, "e k"]]:
     """Best flux of every exposure of one point and the normalised residuals data − model."""
     unit = point_prediction(instrument, plan, point, nodes)
     flux = best_flux(instrument, plan, unit, point)
@@ -185,8 +185,8 @@ def _point_jacobian(
     unit, d_plain, d_local = linear.linearised(instrument, unit_counts, rows, slopes, throughput)
     # From unit flux to counts: `along` is the derivative with respect to the flux itself.
     flux = best_flux(instrument, plan, unit, point)
-    counts, along = flux[:, None] * unit, unit
-    d_counts = flux[:, None] * jnp.concatenate([d_plain, d_local])
+    counts, along = flux * unit, unit
+    d_counts = flux * jnp.concatenate([d_plain, d_local])
     if not light.is_linear(instrument):
         values = values_of(instrument)
         counts, push_detector = jax.linearize(
@@ -196,7 +196,12 @@ def _point_jacobian(
         all_values = jnp.concatenate([each, jnp.zeros((throughput.size, values.size))])
         d_counts = jax.vmap(push_detector)(all_values, d_counts)
         along = push_detector(jnp.zeros_like(values), unit)
-    projected = project_flux(d_counts * point.weight, along * point.weight, plan.exposures.flux_known)
+    projected = project_flux(
+        d_counts * point.weight,
+        along * point.weight,
+        plan.exposures.flux_known,
+        sharing(instrument, plan),
+    )
     return ((point.counts - counts) * point.weight).reshape(-1), -projected.reshape(d_counts.shape[0], -1)
 
 
@@ -290,7 +295,7 @@ def _slope_equations(
 
 def _residuals(
     instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None = None
-) -> tuple[Float[Array, "p e"], Float[Array, "p e k"]]:
+) -> tuple[Float[Array, "p e f"], Float[Array, "p e k"]]:
     return jax.vmap(point_residuals, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
 
 

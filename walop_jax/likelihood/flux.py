@@ -5,37 +5,75 @@ Equation    For the cameras of one exposure at one field point, with y = N/σ an
 Symbols     d a derivative of F a, the flux held; behind detectors that are not linear a is ∂(model)/∂F over σ
 Source      Kaufman's form of variable projection (Golub & Pereyra 2003, Inverse Problems 19, R1): the gradient
             is exact, and JᵀJ is the Fisher information with the flux marginalised
-Limit       where the flux is known, F = 1 and nothing is projected
+Limits      where the flux is known, F = 1 and nothing is projected; where the shares of the arms are unknown
+            (`Cameras.split`), y·a and a·a run over the cameras and exposures that have a flux in common (`Sharing`)
 """
 
 from __future__ import annotations
 
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.plan import Plan
+
 
 def _namespace(array: Any) -> ModuleType:
     return jnp if isinstance(array, jax.Array) else np
 
 
+class Sharing(NamedTuple):
+    """What has a flux in common: `cameras` is 1 where two of them have, `exposures` where one is of a group.
+
+    None: all cameras; every exposure for itself.
+    """
+
+    cameras: Float[Any, "k k"] | None = None
+    exposures: Float[Any, "e s"] | None = None
+
+    def summed(self, values: Float[Any, "... e k"]) -> Float[Any, "... e f"]:
+        """Sums over what has a flux in common, once for all cameras (f = 1) or camera by camera (f = k)."""
+        each = values.sum(axis=-1, keepdims=True) if self.cameras is None else values @ self.cameras
+        if self.exposures is None:
+            return each
+        xp = _namespace(values)
+        groups = xp.einsum("...ek,es->...sk", each, self.exposures)
+        return xp.einsum("...sk,es->...ek", groups, self.exposures)
+
+
+ALONE = Sharing()
+"""A flux for every exposure, of all cameras."""
+
+
+def sharing(instrument: Instrument, plan: Plan) -> Sharing:
+    """What has a flux in common in the exposures of a plan."""
+    return Sharing(instrument.cameras.together, plan.exposures.shared)
+
+
 def eliminate_flux(
-    weighted_counts: Float[Any, "*e k"], weighted_model: Float[Any, "*e k"], flux_known: Bool[Any, ...]
-) -> tuple[Float[Any, "*e"], Float[Any, "*e k"]]:
-    """Best flux of every exposure and the normalised residuals data − model."""
+    weighted_counts: Float[Any, "... k"],
+    weighted_model: Float[Any, "... k"],
+    flux_known: Bool[Any, ...],
+    shared: Sharing = ALONE,
+) -> tuple[Float[Any, "... f"], Float[Any, "... k"]]:
+    """Best flux of every exposure and the normalised residuals data − model; f as in `Sharing.summed`."""
     xp = _namespace(weighted_model)
-    power = (weighted_model**2).sum(axis=-1)
-    best = (weighted_counts * weighted_model).sum(axis=-1) / xp.where(power > 0, power, 1.0)
-    flux = xp.where(flux_known, 1.0, best)
-    return flux, weighted_counts - flux[..., None] * weighted_model
+    power = shared.summed(weighted_model**2)
+    best = shared.summed(weighted_counts * weighted_model) / xp.where(power > 0, power, 1.0)
+    flux = xp.where(xp.asarray(flux_known)[..., None], 1.0, best)
+    return flux, weighted_counts - flux * weighted_model
 
 
 def project_flux(
-    columns: Float[Any, "... k"], along: Float[Any, "... k"], flux_known: Bool[Any, ...] | bool = False
+    columns: Float[Any, "... k"],
+    along: Float[Any, "... k"],
+    flux_known: Bool[Any, ...] | bool = False,
+    shared: Sharing = ALONE,
 ) -> Float[Any, "... k"]:
     """Derivatives of weighted counts, `columns`, without what a change of the flux can take up.
 
@@ -43,6 +81,6 @@ def project_flux(
     numpy stay so.
     """
     xp = _namespace(columns)
-    power = (along**2).sum(axis=-1)
-    share = (columns * along).sum(axis=-1) / xp.where(power > 0, power, 1.0)
-    return columns - xp.where(flux_known, 0.0, share)[..., None] * along
+    power = shared.summed(along**2)
+    share = shared.summed(columns * along) / xp.where(power > 0, power, 1.0)
+    return columns - xp.where(xp.asarray(flux_known)[..., None], 0.0, share) * along

@@ -76,7 +76,8 @@ class Likelihood:
             points_per_chunk=points_per_chunk,
             interpolate=interpolate,
         )
-        return cls(layout, measured_points(calset, layout), runner if layout.large else runner.alone(), model)
+        points = measured_points(calset, layout, model.template.cameras.floor)
+        return cls(layout, points, runner if layout.large else runner.alone(), model)
 
     @property
     def calset(self) -> CalibrationSet:
@@ -97,6 +98,13 @@ class Likelihood:
     def flux_known(self) -> Bool[np.ndarray, " e"]:
         """Exposures of sources whose flux is known."""
         return np.asarray(self.plan.exposures.flux_known)
+
+    @property
+    def data_per_row(self) -> Float[np.ndarray, " e"]:
+        """Independent data of a used row: an intensity for each camera, less its part of the unknown fluxes."""
+        groups = self.plan.exposures.shared
+        size = np.ones(len(self.flux_known)) if groups is None else np.asarray(groups @ groups.sum(axis=0))
+        return self.cameras - np.where(self.flux_known, 0.0, self.model.template.cameras.fluxes / size)
 
     @cached_property
     def priors(self) -> PriorRows:
@@ -187,8 +195,11 @@ class Likelihood:
         )
 
     def _degrees_of_freedom(self, census: Census) -> int:
-        per_row = np.where(self.flux_known, self.cameras, self.cameras - 1)
-        return int(census.rows @ per_row) + int(self.priors.known.sum()) - len(self.model.free)
+        return (
+            round(float(census.rows @ self.data_per_row))
+            + int(self.priors.known.sum())
+            - len(self.model.free)
+        )
 
     # ----------------------------------------------------------------------------------- a pass over the points
 
@@ -224,7 +235,7 @@ class Likelihood:
 
     @property
     def dof(self) -> int:
-        """Per used row one less than cameras (all where the flux is known), one per prior, less the free parameters."""
+        """Per used row its independent data (`data_per_row`), one per prior, less the free parameters."""
         return self._degrees_of_freedom(self.census)
 
     @cached_property
@@ -239,13 +250,15 @@ class Likelihood:
     def residuals(self, values: Vector) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e k"]]:
         """Best flux and normalised residuals (data − model)/σ of every (point, exposure); 0 where unused.
 
+        The flux is the mean over the arms where each has its own.
+
         All of them at once: for whole frames take a sample (`thinning.thinned`).
         """
         instrument = self.model.instrument(values)
         nodes, _ = self.nodes(instrument)
         parts = [engine.residuals(instrument, self.plan, chunk, nodes) for chunk in self.points]
         flux, residual = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
-        return flux[: self.layout.points], residual[: self.layout.points]
+        return flux[: self.layout.points].mean(axis=-1), residual[: self.layout.points]
 
     def jacobian(self, values: Vector) -> Float[np.ndarray, "d f"]:
         """Derivatives of the used residuals with respect to the free parameters, dense: for tables, not frames.

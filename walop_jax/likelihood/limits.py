@@ -86,6 +86,10 @@ DIAGNOSED_ROWS = 100_000
 """(Exposure, point) pairs that a diagnosis looks at: 800 columns of four cameras each take 2.5 GB."""
 TRUST_ROWS = 20_000
 """(Exposure, point) pairs whose residuals are searched for patterns after every fit: a second, and half a GB."""
+DIAGNOSED_NUMBERS = 120_000_000
+"""Numbers that the columns of a diagnosis may hold: 1 GB, of which there are four copies at most."""
+FREE_EXPOSURES = 100
+"""Exposures of a set up to which a free-form term may have a number for each camera in each of them."""
 PROJECTED_COLUMNS = 128
 """Columns that are projected together: a copy of them is small beside all."""
 NULL_DRAWS = 10_000

@@ -26,11 +26,15 @@ Vector = Float[np.ndarray, " n"]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PointReader:
-    """Turns blocks of measurements into point data; `mirrored` with the sky at the opposite points, for ghosts."""
+    """Turns blocks of measurements into point data; `mirrored` with the sky at the opposite points, for ghosts.
+
+    No error is taken to be smaller than `floor`, a share of the mean counts of its row (`Cameras.floor`).
+    """
 
     calset: CalibrationSet
     plan: Plan
     mirrored: bool = False
+    floor: float = 0.0
 
     def chunks(self, start: int, stop: int, size: int) -> list[PointData]:
         """The points `start:stop` in chunks of `size`, the last one padded with points of weight 0."""
@@ -41,7 +45,10 @@ class PointReader:
     def point_data(self, block: Block) -> PointData:
         """A block of measurements as the engine wants it."""
         band = np.take_along_axis(self.plan.band_of[None], block.source[:, :, None] + 1, axis=2)[:, :, 0]
-        weight = np.where(block.used[:, :, None], 1.0 / np.where(block.sigma > 0, block.sigma, 1.0), 0.0)
+        sigma = block.sigma
+        if self.floor > 0.0:
+            sigma = np.maximum(sigma, self.floor * block.counts.mean(axis=2, keepdims=True))
+        weight = np.where(block.used[:, :, None], 1.0 / np.where(sigma > 0, sigma, 1.0), 0.0)
         opposite = self.sky_polarisation(-block.x, -block.y) if self.mirrored else None
         return PointData(
             x=jnp.asarray(block.x),
@@ -136,9 +143,9 @@ class StreamedPoints(MeasuredPoints):
         return self.reader.chunks(number * size, (number + 1) * size, self.layout.chunk)
 
 
-def measured_points(calset: CalibrationSet, layout: Layout) -> MeasuredPoints:
+def measured_points(calset: CalibrationSet, layout: Layout, floor: float = 0.0) -> MeasuredPoints:
     """The measurements of a set, kept in memory or not as its layout says."""
-    reader = PointReader(calset, layout.plan, layout.mirrored)
+    reader = PointReader(calset, layout.plan, layout.mirrored, floor)
     return (PointsInMemory if layout.kept else StreamedPoints)(reader, layout)
 
 

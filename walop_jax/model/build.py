@@ -32,7 +32,7 @@ from walop_jax.model.well_formed import check
 
 PLATE_MODELS = tuple(MODELS)
 STAR = tuple[str, float, float]
-OWN = ("name", "moves", "declared", "model", "always_in")  # what a file says otherwise, or not at all
+OWN = ("name", "moves", "declared", "model")  # what a file says otherwise, or not at all
 SERIES = "Legendre coefficient P_i(x/h) P_j(y/h)"
 FREE = "smooth vignetting and coatings: free"
 
@@ -134,7 +134,7 @@ def _cameras(description: Description, arms: Sequence[Arm]) -> Cameras:
     seen = [camera for pair in pairs for camera in pair]
     if sorted(seen) != list(range(len(names))):
         raise DataError(f"[cameras] every camera must stand behind one analyser: {', '.join(names)}")
-    return Cameras(names=names, pairs=tuple(pairs))
+    return Cameras(names=names, pairs=tuple(pairs), split=description.split, floor=description.floor)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -248,6 +248,9 @@ class _Maker:
             if value.parameter:
                 raise DataError(f"{what} cannot be a parameter")
             value = value.value
+        if isinstance(value, bool) is not isinstance(default, bool):
+            kind = "true or false" if isinstance(default, bool) else "no truth value"
+            raise DataError(f"{what} = {value!r} must be {kind}")
         if isinstance(default, int | float):
             if not isinstance(value, int | float):
                 raise DataError(f"{what} = {value!r} must be one number")
@@ -265,4 +268,5 @@ class _Maker:
             scale=given.scale,
             loose=given.loose,
             name=given.name,
+            tie=given.tie,
         )

@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from walop_jax.model import legendre
@@ -101,7 +102,11 @@ class DetectorPart(Component):
 
 
 class Cameras(Component):
-    """Names of the cameras and what is known of them beyond their throughput."""
+    """Names of the cameras and what is known of them beyond their throughput.
+
+    `split`: the share of the light that an arm gets is not smooth over the field and unknown, so that every arm has a
+    flux of its own (`likelihood.flux`). `floor`: no error is smaller than this share of the mean counts of a row.
+    """
 
     names: tuple[str, ...] = eqx.field(static=True)
     transmission: tuple[Transmission, ...] = ()
@@ -110,9 +115,26 @@ class Cameras(Component):
     exposures: tuple[ExposurePart, ...] = ()
     detectors: tuple[DetectorPart, ...] = ()
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
+    split: bool = eqx.field(static=True, default=False)
+    floor: float = eqx.field(static=True, default=0.0)
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def fluxes(self) -> int:
+        """Number of fluxes of a row, where they are unknown."""
+        return len(self.pairs) if self.split else 1
+
+    @property
+    def together(self) -> Float[np.ndarray, "k k"] | None:
+        """1 where two cameras have a flux in common; None: all have."""
+        if not self.split:
+            return None
+        arm = np.zeros(len(self.names), int)
+        for number, pair in enumerate(self.pairs):
+            arm[list(pair)] = number
+        return (arm[:, None] == arm).astype(float)
 
     @property
     def orthogonal(self) -> tuple[int, ...]:

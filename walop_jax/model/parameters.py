@@ -36,7 +36,7 @@ class Declaration:
     `width` is the standard deviation of the as-built value (None: no prior), `scale` the step a solver should think
     in (the width where there is one). `loose` is the width of a very weak pull toward the start value that keeps
     combinations which the data hardly see from running away; it is no prior knowledge and is not counted as such.
-    `name` replaces the name that follows from the tree.
+    `name` replaces the name that follows from the tree; `tie` is the name of the parameter whose value it takes.
     """
 
     unit: str
@@ -46,6 +46,7 @@ class Declaration:
     scale: float | None = None
     loose: float | None = None
     name: str | None = None
+    tie: str | None = None
 
 
 class Number(NamedTuple):

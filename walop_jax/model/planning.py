@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -52,7 +53,26 @@ def plan_for(
 
     known = [source.kind for source in instrument.sources if source.flux_known]
     arrays = exposure_arrays(exposures, instrument.kinds, known)
+    if instrument.cameras.split:
+        arrays = _without_shares(arrays, own)
     return _plan(instrument, settings, hours_of(exposures)[row], filters, arrays, band_of)
+
+
+def _without_shares(exposures: ExposureArrays, settings: Settings) -> ExposureArrays:
+    """Exposures whose light is divided between the arms in unknown shares.
+
+    Where the flux is known the shares are the same in all exposures of a filter with everything in the same place.
+    """
+    known = np.asarray(exposures.flux_known)
+    group = np.arange(len(known))
+    for _, rows in settings.layouts():
+        group[rows[known[rows]]] = rows[0]
+    _, number = np.unique(group, return_inverse=True)
+    return dataclasses.replace(
+        exposures,
+        flux_known=jnp.zeros(len(known), bool),
+        shared=jax.nn.one_hot(number, number.max() + 1, dtype=float) if known.any() else None,
+    )
 
 
 def plan_for_settings(instrument: Instrument, settings: Settings, filters: Mapping[str, FilterCurve]) -> Plan:

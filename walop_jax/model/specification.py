@@ -166,10 +166,12 @@ def make_model(
         parameters.append(
             Parameter(
                 name=leaf.name, unit=d.unit, about=d.about, source=d.source, start=float(value), prior=prior,
-                free=leaf.name not in frozen, scale=scale, loose=d.loose,
+                free=leaf.name not in frozen, scale=scale, loose=d.loose, tie=d.tie,
             )
         )  # fmt: skip
     names = [p.name for p in parameters]
+    for master in [p.tie for p in parameters if p.tie is not None and p.tie not in names]:
+        raise unknown_name("parameter to tie to", master, names)
     for missing in [*priors, *(f for f in frozen if f not in names)]:
         raise unknown_name("parameter", missing, names)
     return Model(name=name, template=make_template(instrument), parameters=tuple(parameters))

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -18,10 +19,11 @@ from jaxtyping import Array, Float
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.model import fold, light
-from walop_jax.model.elements import Element
+from walop_jax.model.elements import Analyser, Element
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for_settings
+from walop_jax.model.ray import Ray
 from walop_jax.model.sources import Standards
 
 STOKES = ("I", "Q", "U", "V")
@@ -92,21 +94,25 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
         nodes, about = _through(element, matrices, number, nodes, plan)
         if about is not None:
             stages.append(_one(element.name, about, weight @ nodes))
-    ahead, beams, number = [], jnp.zeros(len(instrument.cameras)), len(common)
-    for arm, own in zip(instrument.arms, arms, strict=True):
+    ahead, number = [], len(common)
+    for own in arms:
         here = nodes
         for element, _ in own:
             here, _ = _through(element, matrices, number, here, plan)
             number += 1
-        mean = weight @ here
-        ahead.append(mean)
+        ahead.append(weight @ here)
+    # Where the beams of an analyser differ in wavelength, they see what λ ∂/∂λ of the light there adds as well.
+    slopes = [None] * len(ahead)
+    if any(arm.analyser.dispersion is not None for arm in instrument.arms):
+        slopes = [weight @ slope for slope in _slopes_ahead(instrument, plan, beam, x, y)]
+    wavelength = weight @ light.node_wavelengths(instrument, plan)
+    beams = jnp.zeros(len(instrument.cameras))
+    for arm, mean, slope in zip(instrument.arms, ahead, slopes, strict=True):
         cameras = np.array([instrument.cameras.names.index(name) for name in arm.analyser.cameras])
-        # The rows that the beams are made of, of a matrix whose columns are this light and nothing else.
-        seen = arm.analyser.seen(jnp.zeros((4, 4)).at[:, 0].set(mean))
-        seen = arm.analyser.in_band(seen[None], (weight @ light.node_wavelengths(instrument, plan))[None])[
-            0, :, 0
-        ]
-        beams = beams.at[cameras].set(arm.analyser.shares() @ seen)
+        seen = arm.analyser.shares() @ _seen(arm.analyser, mean, wavelength)
+        if slope is not None:
+            seen = seen + arm.analyser.shares_of_slopes() @ _seen(arm.analyser, slope, wavelength)
+        beams = beams.at[cameras].set(seen)
     names = tuple(arm.name for arm in instrument.arms)
     stages.append(Stage("arms", "ahead of the analysers", names, STOKES, np.asarray(jnp.stack(ahead))))
     stages.append(_cameras(instrument, "analysers", "share of the light in each beam of its arm", beams))
@@ -123,6 +129,38 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
         vectors = part.vectors(vectors, x, y)
     stages.append(_cameras(instrument, "counts", "electrons per electron of flux", vectors[0, :, 0]))
     return tuple(stages)
+
+
+def _seen(analyser: Analyser, light: Float[Array, " 4"], wavelength: Float[Array, ""]) -> Float[Array, " 2"]:
+    """The rows that the beams are made of, of a matrix whose columns are this light and nothing else."""
+    seen = analyser.seen(jnp.zeros((4, 4)).at[:, 0].set(light))
+    return analyser.in_band(seen[None], wavelength[None])[0, :, 0]
+
+
+def _slopes_ahead(
+    instrument: Instrument, plan: Plan, beam: Float[Array, " 4"], x: Float[Array, ""], y: Float[Array, ""]
+) -> list[Float[Array, "n 4"]]:
+    """λ ∂/∂λ of the light ahead of the analyser of each arm, at every node."""
+    train, state = light.divided(instrument), [plan.settings[0][0]]
+
+    def ahead(wavelength: Float[Array, " n"]) -> list[Float[Array, "n 4"]]:
+        ray = Ray.entering(x, y, (wavelength, plan.conditions))
+        common, ray = fold.stations((*train.leading, *train.banded), ray)
+        arms = [fold.stations(tuple(arm.train()), ray)[0] for arm in instrument.arms]
+        matrices = fold.solved([*common, *(one for arm in arms for one in arm)], plan.moving, state)
+        nodes, number, found = jnp.broadcast_to(beam, (len(wavelength), 4)), len(common), []
+        for n, (element, _) in enumerate(common):
+            nodes, _ = _through(element, matrices, n, nodes, plan)
+        for arm in arms:
+            here = nodes
+            for element, _ in arm:
+                here, _ = _through(element, matrices, number, here, plan)
+                number += 1
+            found.append(here)
+        return found
+
+    wavelength = light.node_wavelengths(instrument, plan)
+    return jax.jvp(ahead, (wavelength,), (wavelength,))[1]
 
 
 def _through(

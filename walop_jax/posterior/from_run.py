@@ -9,12 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import CalibrationProduct
 from walop_jax.data import read_calibration_set
 from walop_jax.fit.model_builder import model_for
-from walop_jax.fit.refit import FitResult, fit
+from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.io.errors import fail
 from walop_jax.likelihood import limits
+from walop_jax.likelihood.expansion import STATED
 from walop_jax.likelihood.likelihood import Likelihood
 
 SAME_FIT = 0.05  # standard errors
@@ -31,7 +33,8 @@ def fit_of_run(product: CalibrationProduct, run: Path, model_text: str | None = 
     """The fit behind a calibration product in the folder `run`.
 
     Raises `DataError` when the data are missing, not those of the fit or too many to be sampled, and when the fit does
-    not come out as the product says (another model, or another version of the physics).
+    not come out as the product says (another model, or another version of the physics). Errors are made as those of
+    the product were.
     """
     if not product.inputs:
         raise fail("does not say what it was fitted to", file=run, advice="make it with walop-jax refit")
@@ -39,7 +42,7 @@ def fit_of_run(product: CalibrationProduct, run: Path, model_text: str | None = 
     if sorted(entry.sha256 for entry in calset.inputs) != sorted(entry.sha256 for entry in product.inputs):
         raise fail("the data have changed since the fit", file=product.inputs[0].path, advice="refit them")
     text = "\n".join(product.model) if model_text is None else model_text
-    model = model_for(calset, text)
+    model = model_for(calset, text, Calibration.from_product(product).model.template)
     if model.names != tuple(str(name) for name in product.parameters.name):
         raise fail(
             "was fitted with another model", file=run, advice="run walop-jax refit with this model first"
@@ -60,4 +63,4 @@ def fit_of_run(product: CalibrationProduct, run: Path, model_text: str | None = 
             f"fitted again, {name} moves by {np.max(away):.2g} standard errors", file=run,
             advice="run walop-jax refit with this model and version first",
         )  # fmt: skip
-    return result
+    return result if product.verdict.errors_from == STATED else with_honest_errors(result)

@@ -148,6 +148,7 @@ def report(sample: PosteriorSample) -> dict[str, Any]:
     v, a = sample.convergence, sample.accuracy
     return {
         "sampler": sample.sampler,
+        "errors_from": sample.errors_from,
         "trusted": sample.trusted,
         "converged": v.converged,
         "message": v.message(sample.seconds_per_step),

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.likelihood.expansion import STATED
 from walop_jax.posterior.convergence import Chains, Convergence
 from walop_jax.posterior.samplers import Sampler, make_sampler
 from walop_jax.posterior.surrogate_accuracy import Accuracy
@@ -82,8 +83,9 @@ class PosteriorSample:
     `draws` holds (ensemble, draw, parameter) of all parameters in tree order, tied and frozen ones
     included; `mean` and `covariance` use every kept step. `chains` are of the coefficients `sampled`, those that
     figures show. `accuracy` is that of the surrogate, None where the exact posterior was sampled; `trusted` needs
-    convergence, a surrogate that is exact enough, and a fit that is trusted (`of_trusted_fit`). `counts` are what the
-    sampler counted.
+    convergence, a surrogate that is exact enough, and a fit that is trusted (`of_trusted_fit`). `errors_from` says
+    what their spread was made from: the stated errors of the data, or, as for the fit, what it leaves (`adjusted`).
+    `counts` are what the sampler counted.
     """
 
     sampler: str
@@ -105,6 +107,7 @@ class PosteriorSample:
     seconds: float
     fingerprint: dict[str, str]
     of_trusted_fit: bool = True
+    errors_from: str = STATED
 
     @property
     def trusted(self) -> bool:

@@ -12,9 +12,11 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from walop_jax.fit.refit import FitResult
+from walop_jax.fit.refit import FitResult, covariance
 from walop_jax.io.errors import fail
 from walop_jax.io.software import versions_of
+from walop_jax.likelihood.expansion import STATED
+from walop_jax.posterior.adjusted import with_errors_of
 from walop_jax.posterior.checkpoint import Checkpoints, digest
 from walop_jax.posterior.convergence import Convergence
 from walop_jax.posterior.ensembles import Ensembles, numbers_of
@@ -81,9 +83,18 @@ def sample(
     With `folder`, checkpoints are kept there; `resume` goes on from them, bit for bit as if there had been no
     interruption. Raises `DataError` for a folder that holds a run already while `resume` is False, or one of
     other data, model, priors, sampler, settings or versions; ValueError where there is nothing to sample.
+
+    Around a fit whose errors come from what it leaves (`errors_from`), chains are those of the stated errors, and draws
+    and covariance are spread as the errors of the fit are (`adjusted`).
     """
     options = options or Options()
     report = report or (lambda progress: None)
+    if result.errors_from != STATED:
+        stated = dataclasses.replace(
+            result, covariance=covariance(result.model, result.posterior), errors_from=STATED
+        )
+        found = sample(stated, options, folder=folder, resume=resume, report=report)
+        return with_errors_of(found, result.model, stated.covariance, result.covariance, result.errors_from)
     sampler, target = options.make_sampler(), Target(result)
     checkpoints = None
     if folder is not None:
@@ -148,7 +159,7 @@ def _finish(
     if isinstance(posterior, Surrogate):
         checked = z.reshape(-1, d)[_evenly(e * n * w, options.checks)]
         accuracy = check(target, posterior, checked, rng)
-    mean, covariance = posterior.moments(z.reshape(-1, d)[:: max(1, e * n * w // 50_000)])
+    mean, spread = posterior.moments(z.reshape(-1, d)[:: max(1, e * n * w // 50_000)])
     select = target.model.selection()
     shown = len(posterior.sampled) + int(posterior.inflate)
     checkpoints = ensembles.checkpoints
@@ -160,7 +171,7 @@ def _finish(
         log_posterior=lnp[:, steps].reshape(e, -1),
         ln_f=flat[:, :, -1] * posterior.ln_f_unit if posterior.inflate else None,
         mean=target.values(mean),
-        covariance=select @ covariance @ select.T,
+        covariance=select @ spread @ select.T,
         chains=posterior.quoted(z)[..., :shown],
         sampled=posterior.quoted_names[:shown],
         thin=ensembles.thin,

@@ -63,8 +63,7 @@ class Target:
     @property
     def measured(self) -> int:
         """Independent data: three per used row of four intensities, four where the flux is known."""
-        per_row = np.where(self.likelihood.flux_known, 4, 3)
-        return int(self.likelihood.used.sum(axis=0) @ per_row)
+        return round(float(self.likelihood.used.sum(axis=0) @ self.likelihood.data_per_row))
 
     @property
     def root(self) -> Float[np.ndarray, "f f"]:

@@ -108,7 +108,7 @@ def point_residuals(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> 
     NaN where a point has no data.
     """
     _, residual = likelihood.residuals(values)
-    freedom = (likelihood.used * np.where(likelihood.flux_known, 4.0, 3.0)).sum(axis=1)
+    freedom = (likelihood.used * likelihood.data_per_row).sum(axis=1)
     square = (residual**2).sum(axis=(1, 2))
     return np.sqrt(np.where(freedom > 0, square / np.maximum(freedom, 1.0), np.nan))
 
@@ -141,7 +141,7 @@ def _histogram(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " n
     """All residuals of a fit beside what noise alone would give."""
     _, residual = likelihood.residuals(values)
     used = residual[likelihood.used].ravel()
-    width = np.sqrt(np.mean(np.where(likelihood.flux_known, 1.0, 0.75)[np.nonzero(likelihood.used)[1]]))
+    width = np.sqrt(np.mean(likelihood.data_per_row[np.nonzero(likelihood.used)[1]]) / likelihood.cameras)
     edges = np.linspace(-4.0, 4.0, 41)
     axis.hist(
         np.clip(used / width, -4.0, 4.0), bins=edges.tolist(), density=True, color="0.75", label="residuals"

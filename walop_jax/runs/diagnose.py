@@ -17,10 +17,11 @@ from walop_jax.diagnosis.figure_data import figure_data
 from walop_jax.diagnosis.figure_file import FIGURE_DATA, write_figure_data
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.trust import examined
-from walop_jax.diagnosis.workflow import diagnose
+from walop_jax.diagnosis.workflow import MINUTES, diagnose
 from walop_jax.fit.misfit import describe
 from walop_jax.fit.refit import with_honest_errors
 from walop_jax.io.folder import atomic_folder, check_folder
+from walop_jax.io.heartbeat import repeated
 from walop_jax.io.text import json_text, read_text
 from walop_jax.runs.inputs import sets_and_model
 
@@ -42,6 +43,7 @@ def diagnose_sets(
     model: str | os.PathLike[str] | None = None,
     instrument: str | os.PathLike[str] | None = None,
     seed: int | None = None,
+    minutes: float = MINUTES,
     overwrite: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> DiagnosedRun:
@@ -50,7 +52,8 @@ def diagnose_sets(
     `calibration.fits` and `summary.json` are of the extended model, `diagnosis.json` is what was found and
     `diagnosis.fits` what figures of it need: all four appear, or none. `instrument` is a shipped one by name or a
     description file (default: what the sets say), `model` a TOML file (default: the base model); `seed` (None: 0) is
-    that of the Monte Carlo. `progress` is told what is being done.
+    that of the Monte Carlo. No name is tried for after `minutes`. `progress` is told what is being done, at least every
+    `heartbeat.EVERY` seconds.
 
     Raises `DataError` for files that cannot be read or written, ValueError for a model file that does not fit, and
     what `diagnose` raises.
@@ -61,7 +64,8 @@ def diagnose_sets(
     check_folder(output, OUTPUTS, overwrite=overwrite)
     tell("reading")
     calset, chosen = sets_and_model(calsets, text, model, instrument)
-    found = diagnose(calset, chosen, seed=seed or 0, progress=tell)
+    with repeated(tell) as say:
+        found = diagnose(calset, chosen, seed=seed or 0, minutes=minutes, progress=say)
     tell("mapping the field")
     after = examined(with_honest_errors(found.after))
     product = Calibration.from_fit(after).to_product()

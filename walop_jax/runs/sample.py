@@ -16,7 +16,6 @@ from walop_jax.io.errors import fail
 from walop_jax.io.folder import atomic_folder
 from walop_jax.io.plain_tables import write_columns
 from walop_jax.io.text import json_text, read_text
-from walop_jax.likelihood.expansion import STATED
 from walop_jax.posterior import Options, PosteriorSample, sample
 from walop_jax.posterior.checkpoint import Checkpoints
 from walop_jax.posterior.from_run import fit_of_run
@@ -110,5 +109,7 @@ def _sampled_draws(posterior: PosteriorSample) -> np.ndarray:
 def _with_covariance(product: CalibrationProduct, posterior: PosteriorSample) -> CalibrationProduct:
     """The product with the covariance of the posterior in place of that of the fit."""
     calibration = Calibration.from_product(product)
-    verdict = dataclasses.replace(calibration.verdict, covariance_from="posterior", errors_from=STATED)
+    verdict = dataclasses.replace(
+        calibration.verdict, covariance_from="posterior", errors_from=posterior.errors_from
+    )
     return dataclasses.replace(calibration, covariance=posterior.covariance, verdict=verdict).to_product()

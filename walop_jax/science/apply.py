@@ -24,7 +24,7 @@ from walop_jax.io.errors import DataError
 from walop_jax.likelihood import limits
 from walop_jax.model import carried, light
 from walop_jax.model.parameters import with_values
-from walop_jax.science.estimate import calibration_shift, estimate
+from walop_jax.science.estimate import calibration_shift, estimate, estimate_by_arm
 
 MOST_SETTINGS = 200
 ILL_POSED = 10.0  # ratio of the errors of the two principal directions from which FLAG 16 is set
@@ -118,7 +118,11 @@ def _stars_of_rows(
         spectra[here] = vectors.at(settings[k], x[here], y[here])
     there = np.einsum("rc,rcks->rks", colour_weights(teff, COLOURS), spectra)
     used = np.where(outside[:, None], np.nan, counts)
-    found = estimate(_vectors_on_sky(there, turn), used, sigma, star)
+    on_sky, cameras = _vectors_on_sky(there, turn), vectors.instrument.cameras
+    if cameras.split:
+        found = estimate_by_arm(on_sky, used, sigma, star, cameras.pairs)
+    else:
+        found = estimate(on_sky, used, sigma, star)
 
     s = _instrument_stokes(found.qu[star], turn)
     derivative = np.empty((len(rows), 2, len(vectors.parameters)))

@@ -21,6 +21,7 @@ Bias        Of order 1/N, as for any ratio: below 1e-5 from 10⁵ electrons a ca
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -95,6 +96,31 @@ def estimate(
         dof=np.add.reduceat(used.sum(axis=1) - rows_used, first) - 2,
         flux=flux,
         gain=gain,
+    )
+
+
+def estimate_by_arm(
+    vectors: Float[np.ndarray, "r k 3"],
+    counts: Float[np.ndarray, "r k"],
+    sigma: Float[np.ndarray, "r k"],
+    star: Int[np.ndarray, " r"],
+    pairs: Sequence[tuple[int, int]],
+) -> Estimate:
+    """As `estimate`, with a flux of its own in every row for each arm; `pairs` are the cameras of the arms.
+
+    The flux of a row is then the mean of those of its arms.
+    """
+    arms, cameras = len(pairs), counts.shape[1]
+    mine = np.zeros((arms, cameras), bool)
+    for arm, pair in enumerate(pairs):
+        mine[arm, list(pair)] = True
+    seen = np.where(mine, counts[:, None], np.nan).reshape(-1, cameras)
+    row = np.repeat(np.arange(len(counts)), arms)
+    found = estimate(vectors[row], seen, sigma[row], star[row])
+    return dataclasses.replace(
+        found,
+        flux=found.flux.reshape(-1, arms).mean(axis=1),
+        gain=found.gain.reshape(-1, arms, 2, cameras).sum(axis=1),
     )
 
 

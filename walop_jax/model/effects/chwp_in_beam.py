@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 from walop_jax.model.effects.base import Effect
+from walop_jax.model.elements import WavePlate
 
 if TYPE_CHECKING:
     from walop_jax.model.instrument import Instrument
@@ -27,6 +28,11 @@ class ChwpInBeam(Effect):
     separated_by: ClassVar[str] = (
         "exposures with the plate at 45°: a wrong sign of u in the polariser is the same in all"
     )
+
+    def fits(self, instrument: Instrument) -> bool:
+        """Whether there is a calibration plate that can be out."""
+        plate = next((e for e in instrument.elements if e.name == "chwp"), None)
+        return isinstance(plate, WavePlate) and not plate.always_in
 
     def patch(self, instrument: Instrument) -> Instrument:
         """Put the plate in at 0°."""

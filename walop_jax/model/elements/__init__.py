@@ -6,7 +6,7 @@ from walop_jax.model.elements.collimator import Collimator, RadialRetarder
 from walop_jax.model.elements.geometry import FieldShift, PupilMapping, Wedge
 from walop_jax.model.elements.polariser import EncoderError, Polariser
 from walop_jax.model.elements.simple import AddedPolarisation, Depolariser, Diattenuator, Retarder, Rotator
-from walop_jax.model.elements.spectral import SpectralElement
+from walop_jax.model.elements.spectral import FieldDiattenuator, SpectralElement
 from walop_jax.model.elements.wave_plate import AirGap, Layer, WavePlate
 
 ELEMENTS: tuple[type[Element], ...] = (
@@ -23,6 +23,7 @@ ELEMENTS: tuple[type[Element], ...] = (
     Depolariser,
     AddedPolarisation,
     SpectralElement,
+    FieldDiattenuator,
     Analyser,
 )
 
@@ -36,6 +37,7 @@ __all__ = [
     "Diattenuator",
     "Element",
     "EncoderError",
+    "FieldDiattenuator",
     "FieldShift",
     "Layer",
     "Polariser",

@@ -1,12 +1,12 @@
 """Analysers: where an arm ends and the beams of its cameras begin.
 
-Equation    beams of an arm ½ (1, ±η cos 2α, ±η sin 2α, 0), first camera +
+Equation    beams of an arm ½ (1, ±η cos 2α, ±η sin 2α, 0), first camera +, with η ± ξ in the place of η
             with a dispersion κ the first camera sees the band at λ (1 + κ), the second at λ (1 − κ), to first order:
             M → M ± κ λ ∂M/∂λ, M the train ahead of the analyser
             with balance g and loss l, curves over wavelength taken at the mean wavelength of a band, the beams of η = 1
             are ½ (1 ± g) (1, ±(1 − l) cos 2α, ±(1 − l) sin 2α, 0): what differs from band to band
-Symbols     η efficiency, close to 1; α axis of the first beam, from +X toward +Y; κ half the relative difference of the
-            wavelengths of the two beams
+Symbols     η efficiency, near 1, ξ half its difference between the beams; α axis of the first beam, from +X toward +Y;
+            κ half the relative difference of the wavelengths of the two beams
 Source      Wollaston prism as a pair of crossed analysers: Goldstein 2003, Polarized Light, ch. 9.
 Limits      no balance, no loss: as if g = l = 0
             η = 1, α = 0 are ideal analysers along +X and +Y; κ = 0: both see the filter as it is.
@@ -36,6 +36,9 @@ class Analyser(Element):
     """
 
     efficiency: Scalar = number(unit="", about="η of the analysers ½(1, ±η, 0, 0)", default=1.0)
+    contrast: Scalar | None = number(
+        unit="", about="ξ, half the difference of the efficiencies", default=None
+    )
     angle: Scalar | None = number(unit="deg", about="rotation of the analysers", default=None)
     dispersion: Scalar | None = number(
         unit="", about="κ, first beam at λ (1 + κ), second at λ (1 − κ)", default=None
@@ -85,8 +88,9 @@ class Analyser(Element):
     def shares(self) -> Float[Array, "k 2"]:
         """What each beam takes of `seen`."""
         half = 0.5 * jnp.ones_like(self.efficiency)
+        extra = jnp.zeros_like(half) if self.contrast is None else 0.5 * self.contrast
         along = 0.5 * self.efficiency
-        return jnp.stack([jnp.stack([half, along]), jnp.stack([half, -along])])
+        return jnp.stack([jnp.stack([half, along + extra]), jnp.stack([half, extra - along])])
 
     def shares_of_slopes(self) -> Float[Array, "k 2"]:
         """What each beam takes of λ ∂/∂λ of `seen`."""

@@ -41,12 +41,14 @@ class Wedge(Element):
     """A glass wedge: exact refraction, no loss.
 
     `frame` says what becomes of the plane of vibration: `kept` in the carried axes of the rays (no rotation), or
-    `turned` with the ray at each face, as it is for light (see `optics.wedge_rotation`).
+    `turned` with the ray at each face, as it is for light (see `optics.wedge_rotation`). `sense` −1: the other
+    way round.
     """
 
     angle: Scalar = number(unit="rad", about="wedge angle")
     material: str = eqx.field(static=True, default="BK7")
     frame: str = eqx.field(static=True, default=FRAMES[0])
+    sense: float = eqx.field(static=True, default=1.0)
 
     kind: ClassVar[str] = "wedge"
     reference: ClassVar[str] = "Born & Wolf, Principles of Optics, 1.5.1"
@@ -57,7 +59,12 @@ class Wedge(Element):
 
     def ray(self, ray: Ray) -> Ray:
         """The ray behind the wedge."""
-        return ray.toward(*optics.behind_wedge((ray.kx, ray.ky, ray.kz), self.angle, self.index(ray)))
+        return ray.toward(*optics.behind_wedge((ray.kx, ray.ky, ray.kz), self.turn, self.index(ray)))
+
+    @property
+    def turn(self) -> Scalar:
+        """The angle with its sign."""
+        return self.angle if self.sense == 1.0 else self.sense * self.angle
 
     def index(self, ray: Ray) -> Float[Array, ...]:
         """Refractive index of the glass at the wavelengths of a ray."""
@@ -68,7 +75,7 @@ class Wedge(Element):
         if self.frame == "kept":
             return None
         direction = (ray.kx, ray.ky, ray.kz)
-        return mueller.rotation(-optics.wedge_rotation(direction, self.angle, self.index(ray)))
+        return mueller.rotation(-optics.wedge_rotation(direction, self.turn, self.index(ray)))
 
 
 class FieldShift(Element):

@@ -1,13 +1,15 @@
-"""An element whose polarisation is a curve over wavelength: mirrors, derotators, coatings, what has no closed form.
+"""Elements whose polarisation is a curve over wavelength: mirrors, derotators, coatings, what has no closed form.
 
 Equation    M = depolariser(loss) · R(ρ) · [diattenuator(D) retarder(δ), both along `axis`]; the two commute
             each of δ(λ), D(λ), ρ(λ), loss(λ) is the natural cubic spline through its values at its own wavelengths,
             continued as a straight line beyond the first and the last; one value: constant
+            `FieldDiattenuator`: D(x, y, λ) = Σ c_ij(λ) P_i(x/h) P_j(y/h), i + j ≤ 2, along `axis`, c_ij(λ) such splines
 Symbols     δ retardance [rad], of the fast axis; D diattenuation along `axis`; ρ angle [deg] by which it turns the
             polarisation from +X toward +Y, a circular retardance of 2ρ (skew mirrors, optical activity);
             loss share of q, u, v that is lost
 Sources     mirrors as diattenuating retarders: van Harten, Snik & Keller 2009, PASP 121, 377; form of M: Lu & Chipman
-            1996, JOSA A 13, 1106; spline: de Boor 1978, A Practical Guide to Splines, ch. IV.
+            1996, JOSA A 13, 1106; diattenuation of oblique faces (Fresnel): Born & Wolf 1999, § 1.5;
+            spline: de Boor 1978, A Practical Guide to Splines, ch. IV.
 Limits      no values: the identity. A spline with as many knots as bands takes up anything that has no
             curvature within a band; with fewer it is a smooth curve.
 """
@@ -21,7 +23,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from walop_jax.model import mueller
+from walop_jax.model import legendre, mueller
+from walop_jax.model.conventions import FIELD_SCALE
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.parameters import number
 from walop_jax.model.ray import Ray
@@ -30,6 +33,7 @@ from walop_jax.model.spline import check_curve, spline
 Scalar = Float[Array, ""]
 Curve = Float[Array, " k"]
 CURVES = ("delta", "diattenuation", "rotation", "loss")
+FIELD_TERMS = {f"p{i}{j}": n for n, (i, j) in enumerate(legendre.terms(2))}
 
 
 class SpectralElement(Element):
@@ -90,3 +94,59 @@ class SpectralElement(Element):
             own = jnp.stack([jnp.ones_like(kept), kept, kept, kept], axis=-1)[:, :, None] * jnp.eye(4)
             matrix = own if matrix is None else own @ matrix
         return matrix
+
+
+class FieldDiattenuator(Element):
+    """A diattenuator on one axis that changes smoothly over field and wavelength: oblique faces, beams of a prism.
+
+    Directly ahead of an analyser, with its axis, it is a ratio of the two beams: ½ (1 ± D) (1, ±1, 0, 0). The cameras
+    have such a ratio too, in their throughput, the same at all wavelengths: with `none_at` (µm) the terms vanish there,
+    and are what changes with colour.
+    """
+
+    p00: Curve | None = number(unit="", about="constant part at `at`", default=None, several=True)
+    p10: Curve | None = number(unit="", about="term P₁(x/h) at `at`", default=None, several=True)
+    p01: Curve | None = number(unit="", about="term P₁(y/h) at `at`", default=None, several=True)
+    p20: Curve | None = number(unit="", about="term P₂(x/h) at `at`", default=None, several=True)
+    p11: Curve | None = number(unit="", about="term P₁(x/h) P₁(y/h) at `at`", default=None, several=True)
+    p02: Curve | None = number(unit="", about="term P₂(y/h) at `at`", default=None, several=True)
+    axis: Scalar = number(unit="deg", about="axis, from +X toward +Y")
+    at: tuple[float, ...] = eqx.field(static=True, default=())
+    none_at: float = eqx.field(static=True, default=0.0)  # µm; 0: nowhere
+    scale: float = eqx.field(static=True, default=FIELD_SCALE)  # h, degrees
+
+    kind: ClassVar[str] = "field_diattenuator"
+    reference: ClassVar[str] = "Born & Wolf 1999, Principles of Optics, 1.5"
+
+    def __check_init__(self) -> None:
+        for name in FIELD_TERMS:
+            if (values := getattr(self, name)) is not None:
+                check_curve(name, values, self.at)
+        if self.none_at in self.at:
+            raise ValueError(f"none_at = {self.none_at:g} um is in `at` as well: leave it out there")
+
+    def labels(self, field: str) -> Sequence[str]:
+        """Values of a term are numbered from 1, by wavelength."""
+        return tuple(f"{field}_{i + 1}" for i in range(len(self.at))) if field in FIELD_TERMS else (field,)
+
+    def mueller(self, ray: Ray) -> Mueller | None:
+        """The diattenuator at every wavelength; the identity without terms."""
+        terms = legendre.basis(ray.x, ray.y, 2, self.scale)
+        knots, gap = self.at, len(self.at)
+        if self.none_at > 0.0:
+            gap = sum(knot < self.none_at for knot in knots)
+            knots = (*knots[:gap], self.none_at, *knots[gap:])
+        parts = [
+            terms[..., n] * spline(knots, _with_zero(values, gap, len(knots)), ray.wavelength)
+            for name, n in FIELD_TERMS.items()
+            if (values := getattr(self, name)) is not None
+        ]
+        if not parts:
+            return None
+        d, twice = sum(parts[1:], parts[0]), 2.0 * jnp.deg2rad(self.axis)
+        return mueller.diattenuator(d * jnp.cos(twice), d * jnp.sin(twice))
+
+
+def _with_zero(values: Curve, at: int, count: int) -> Float[Array, " n"]:
+    """Values of a curve with a zero put in, if it has one value less than `count`."""
+    return values if len(values) == count else jnp.concatenate([values[:at], jnp.zeros(1), values[at:]])

@@ -18,7 +18,8 @@ class ExposureArrays(eqx.Module):
     """What the light path needs to know of the exposures, one element each; `median` only where it is asked for.
 
     `kind` counts the kinds of `kinds`. Angles in radians; `clp_angle` is 0 when the polariser is out, `rotator`
-    where it has no meaning. `hours` since the first exposure, temperature in Celsius, hour angle in h.
+    where it has no meaning; `shared` is 1 where an exposure belongs to a group that has its fluxes in common, None: no
+    exposures have. `hours` since the first exposure, temperature in Celsius, hour angle in h.
     """
 
     kind: Int[Array, " e"]
@@ -30,6 +31,7 @@ class ExposureArrays(eqx.Module):
     temperature: Float[Array, " e"]
     hour_angle: Float[Array, " e"]
     median_counts: Float[Array, "e k"] | None = None
+    shared: Float[Array, "e s"] | None = None
     kinds: tuple[str, ...] = eqx.field(static=True, default=())
 
     def of_kind(self, kind: str) -> Bool[Array, " e"]:
