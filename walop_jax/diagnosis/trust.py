@@ -13,7 +13,8 @@ Groups      the squared residuals of each camera, kind, filter and exposure. Beh
 Errors      χ²/dof far below 1 says that N_ERR is not the error of N; a few per cent off is no matter of the model.
 
 Symbols     w = expected counts / errors of what has a flux in common (an exposure at a point), of unit length, where
-            that was fitted (0 where it is known); Q orthonormal basis of the derivatives with respect to the free parameters.
+            that was fitted (0 where it is known); Q orthonormal basis of the derivatives with respect to the free
+            parameters.
 Sources     Rao 1948; Satterthwaite 1946, Biometrics Bull. 2, 110 (χ² with two moments); Šidák 1967 (many questions).
 Limits      Noise alone raises a doubt in about one fit of 200. Of a large set a sample of the points is looked at:
             what is smaller than its noise shows in χ² and in the residual map.
