@@ -12,9 +12,10 @@ import pytest
 
 from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import write_columns
+from walop_jax.io.rounding import value_and_error, with_error
 from walop_jax.reports.page import render
 from walop_jax.reports.run import read_run
-from walop_jax.reports.wording import probability, value_and_error, verdict_of_diagnosis
+from walop_jax.reports.wording import effect_in_words, probability, verdict_of_diagnosis
 
 VOID = {"meta", "img", "br", "link", "hr", "input"}
 
@@ -319,3 +320,16 @@ def test_limits_and_consequences(tmp_path):
     text = " ".join(page.text.split())
     assert "by at most 0.002 %, which hardly matters." in text
     assert "are 2.5 times as large" in text
+
+
+def test_every_effect_has_words_of_its_own():
+    from walop_jax.model.effects import EFFECTS
+
+    words = [effect_in_words(effect.name) for effect in EFFECTS]
+    assert len(set(words)) == len(EFFECTS)
+    assert [text for text in words if len(text) < 15 or "=" in text] == []
+
+
+def test_error_that_rounds_up_to_the_next_decade_keeps_two_digits():
+    assert with_error(1.23456, 0.0996) == "1.23 ± 0.10"
+    assert with_error(123456.0, 1234.0) == "123500 ± 1200"

@@ -9,7 +9,8 @@ import dataclasses
 import datetime
 import functools
 import operator
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,13 +24,16 @@ from walop_jax.data.records import CALIBRATION_PLATE, Exposures, FilterCurve, In
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import model_without_data, standard_names
 from walop_jax.fit.model_file import render
+from walop_jax.fit.parameter_table import HEAD, parameter_notes, parameter_rows, parameter_table
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult
 from walop_jax.instruments.description import parsed
+from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.software import software_versions
 from walop_jax.model import carried
 from walop_jax.model.build import adapted, build, nominal_instrument
 from walop_jax.model.dependence import needs
+from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import Model, effect_context
 
@@ -45,8 +49,8 @@ HIGH_CROSSTALK = 10.0  # condition number of the local 2 × 2 inverse
 TEMPERATURE_MARGIN = 2.0  # K beyond the temperatures of the exposures
 
 
-@dataclasses.dataclass(frozen=True)
-class Calibration:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Calibration(Displayed):
     """An instrument as fitted: model, values and covariance of all parameters, and where they come from.
 
     `field` is (smallest x, largest x, smallest y, largest y) in degrees of the points that were used.
@@ -102,6 +106,28 @@ class Calibration:
     def sigma(self) -> Vector:
         """Standard errors of all parameters."""
         return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
+
+    def to_table(self) -> Any:
+        """All parameters as an astropy table: value, error, unit, start, prior, and whether it was free."""
+        return parameter_table(self.model, self.values, self.sigma)
+
+    def display(self) -> Display:
+        """What it is good for, and the parameters."""
+        v, (low_x, high_x, low_y, high_y) = self.verdict, self.field
+        facts = {
+            "χ²/dof": f"{v.chi2:.1f} / {v.dof} = {v.chi2 / max(v.dof, 1):.4g}",
+            "field": f"X {low_x:+.3f} … {high_x:+.3f}°, Y {low_y:+.3f} … {high_y:+.3f}°",
+            "filters": ", ".join(sorted({str(name) for name in self.exposures.filter})),
+            "effects": ", ".join(self.model.effect_names) or "none beyond the base model",
+            "errors from": f"covariance of the {v.covariance_from}, {v.errors_from}",
+        }
+        return Display(
+            title=f"Calibration of {self.model.name}: {'trusted' if v.trusted else 'not trusted'}",
+            facts=tuple(facts.items()),
+            head=HEAD,
+            rows=parameter_rows(self.model, self.values, self.sigma),
+            notes=(*parameter_notes(self.model, self.sigma), *v.warnings),
+        )
 
     # ------------------------------------------------------------------------------- asking for the matrix
 
@@ -237,13 +263,16 @@ class Calibration:
         )
 
     @classmethod
-    def from_product(cls, product: CalibrationProduct) -> Calibration:
+    def from_product(
+        cls, product: CalibrationProduct, catalogue: Sequence[type[Effect]] = EFFECTS
+    ) -> Calibration:
         """The calibration that a product holds; parameters go by name, whatever their order there.
 
+        `catalogue` are the effects that its model may have.
         Raises ValueError if the model of the product cannot be rebuilt, or has other parameters than it
         lists.
         """
-        model = model_of_product(product)
+        model = model_of_product(product, catalogue)
         names = [str(name) for name in product.parameters.name]
         if sorted(model.names) != sorted(names):
             odd = sorted(set(model.names) ^ set(names)) or ["one of them twice"]
@@ -285,14 +314,15 @@ def instrument_as_designed(product: CalibrationProduct) -> Instrument:
     )
 
 
-def model_of_product(product: CalibrationProduct) -> Model:
+def model_of_product(product: CalibrationProduct, catalogue: Sequence[type[Effect]] = EFFECTS) -> Model:
     """The model of a product from its lines of TOML, its standards and its exposures."""
     sources = product.sources
     names = standard_names(sources)
     standards = list(zip(names, sources.q.tolist(), sources.u.tolist(), strict=True))
     design = instrument_as_designed(product)
     context = effect_context(adapted(design, standards=standards), product.exposures)
-    return model_without_data(design, "\n".join(product.model), standards=standards, context=context)
+    text = "\n".join(product.model)
+    return model_without_data(design, text, standards=standards, context=context, catalogue=catalogue)
 
 
 def quality(result: FitResult) -> Quality:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from walop_jax.cli.common import (
+    EffectsOption,
     JsonOption,
     OutputTable,
     OverwriteOption,
@@ -42,6 +43,7 @@ def apply(
     debias: DebiasOption = "MAS",
     saturation: SaturationOption = None,
     posterior: PosteriorOption = None,
+    effects: EffectsOption = None,
     overwrite: OverwriteOption = False,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -61,6 +63,7 @@ def apply(
     """
     del seed  # nothing is random here
     switch_on_jax()
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.apply import apply_to_catalogue
     from walop_jax.science.polarisation import ESTIMATORS
 
@@ -78,6 +81,7 @@ def apply(
             posterior=posterior,
             overwrite=overwrite,
             progress=tell,
+            effects=catalogue_with(effects),
         )
     for sentence in found.warnings:
         warn(sentence)

@@ -6,6 +6,7 @@ import typer
 
 from walop_jax.cli.common import (
     CommandError,
+    EffectsOption,
     JsonOption,
     Product,
     QuietOption,
@@ -16,7 +17,11 @@ from walop_jax.cli.common import (
 
 
 def certify(
-    product: Product, json: JsonOption = False, quiet: QuietOption = False, seed: SeedOption = None
+    product: Product,
+    effects: EffectsOption = None,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
+    seed: SeedOption = None,
 ) -> None:
     """Check a calibration product from its checksums to its physics; exit code 1 if anything does not hold.
 
@@ -25,9 +30,10 @@ def certify(
     """
     del seed  # nothing is random
     switch_on_jax()
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.certify import certify_product
 
-    found = certify_product(product)
+    found = certify_product(product, catalogue_with(effects))
     if json:
         print_json(found.document())
     elif not quiet:

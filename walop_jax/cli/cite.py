@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from walop_jax.cli.common import (
+    EffectsOption,
     JsonOption,
     QuietOption,
     SeedOption,
@@ -22,14 +23,19 @@ Run = Annotated[
 
 
 def cite(
-    run: Run = None, json: JsonOption = False, quiet: QuietOption = False, seed: SeedOption = None
+    run: Run = None,
+    effects: EffectsOption = None,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
+    seed: SeedOption = None,
 ) -> None:
     """List the sources of the physics in a fitted model, effects included."""
     del quiet, seed  # the list is all there is, and nothing is random
     switch_on_jax()
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.cite import cite_run
 
-    found = cite_run(run)
+    found = cite_run(run, catalogue_with(effects))
     if json:
         print_json([{"what": entry.what, "source": entry.source} for entry in found])
         return

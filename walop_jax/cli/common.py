@@ -41,6 +41,14 @@ InstrumentOption = Annotated[
         help="An instrument that comes with the package, or a description file; see walop-jax instrument.",
     ),
 ]
+EffectsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--effects",
+        metavar="FILE.py",
+        help="Effects of your own beside those of the catalogue; see walop-jax docs adding-an-effect.",
+    ),
+]
 ProcessesOption = Annotated[
     str | None,
     typer.Option(

@@ -9,6 +9,7 @@ import typer
 
 from walop_jax.cli.common import (
     CalsetFiles,
+    EffectsOption,
     InstrumentOption,
     JsonOption,
     ModelOption,
@@ -36,6 +37,7 @@ def compare(
     filter_name: FilterOption = "SDSS-r",
     model: ModelOption = None,
     instrument: InstrumentOption = None,
+    effects: EffectsOption = None,
     overwrite: OverwriteOption = False,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -49,6 +51,7 @@ def compare(
     the spectral appendix and the full-Moon scheme.
     """
     switch_on_jax()
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.compare import compare_methods
 
     with progress(quiet or json) as tell:
@@ -62,6 +65,7 @@ def compare(
             seed=seed,
             overwrite=overwrite,
             progress=tell,
+            catalogue=catalogue_with(effects),
         )
     for sentence in found.warnings:
         warn(sentence)

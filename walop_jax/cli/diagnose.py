@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from walop_jax.cli.common import (
     CalsetFiles,
+    EffectsOption,
     InstrumentOption,
     JsonOption,
     ModelOption,
@@ -31,6 +32,7 @@ def diagnose(
     output: RunFolder,
     model: ModelOption = None,
     instrument: InstrumentOption = None,
+    effects: EffectsOption = None,
     overwrite: OverwriteOption = False,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -43,11 +45,19 @@ def diagnose(
     RUN/summary.json hold the extended model; RUN/diagnosis.fits what the pictures of `walop-jax report` need.
     """
     switch_on_jax()
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.diagnose import diagnose_sets
 
     with progress(quiet or json) as tell:
         found = diagnose_sets(
-            calsets, output, model=model, instrument=instrument, seed=seed, overwrite=overwrite, progress=tell
+            calsets,
+            output,
+            model=model,
+            instrument=instrument,
+            seed=seed,
+            overwrite=overwrite,
+            catalogue=catalogue_with(effects),
+            progress=tell,
         )
     if json:
         print_json(found.document)

@@ -9,6 +9,7 @@ import typer
 
 from walop_jax.cli.common import (
     CalsetFiles,
+    EffectsOption,
     JsonOption,
     QuietOption,
     SeedOption,
@@ -29,6 +30,7 @@ _SHOWN = 8
 def epoch(
     old: OldProduct,
     calsets: CalsetFiles,
+    effects: EffectsOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
     seed: SeedOption = None,
@@ -40,10 +42,11 @@ def epoch(
     """
     del seed  # nothing is random
     switch_on_jax()
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.epoch import compare_epochs
 
     with progress(quiet or json) as tell:
-        compared = compare_epochs(old, calsets, progress=tell)
+        compared = compare_epochs(old, calsets, progress=tell, catalogue=catalogue_with(effects))
     if json:
         print_json(compared.document())
     elif not quiet:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from walop_jax.cli.common import (
+    EffectsOption,
     JsonOption,
     OutputTable,
     OverwriteOption,
@@ -31,6 +32,7 @@ def matrix(
     points: PointsOption,
     output: OutputTable,
     posterior: PosteriorOption = None,
+    effects: EffectsOption = None,
     overwrite: OverwriteOption = False,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -48,11 +50,18 @@ def matrix(
     del seed  # nothing is random here
     switch_on_jax()
     from walop_jax.calibration.records import Quality
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.matrix import tabulate_matrix
 
     with progress(quiet or json) as tell:
         found = tabulate_matrix(
-            product, points, output, posterior=posterior, overwrite=overwrite, progress=tell
+            product,
+            points,
+            output,
+            posterior=posterior,
+            overwrite=overwrite,
+            progress=tell,
+            catalogue=catalogue_with(effects),
         )
     for sentence in found.warnings:
         warn(sentence)

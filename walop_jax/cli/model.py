@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from walop_jax.cli.common import (
+    EffectsOption,
     InstrumentOption,
     JsonOption,
     OverwriteOption,
@@ -34,6 +35,7 @@ def model(
     output: OutputOption = None,
     instrument: InstrumentOption = None,
     effect: EffectOption = None,
+    own: EffectsOption = None,
     overwrite: OverwriteOption = False,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -46,10 +48,16 @@ def model(
     """
     del seed  # nothing is random here
     switch_on_jax()
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.model import write_model
 
     made = write_model(
-        output, calsets or (), instrument=instrument, effects=effect or (), overwrite=overwrite
+        output,
+        calsets or (),
+        instrument=instrument,
+        effects=effect or (),
+        overwrite=overwrite,
+        catalogue=catalogue_with(own),
     )
     if json:
         print_json(made.document())

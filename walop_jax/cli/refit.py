@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from walop_jax.cli.common import (
     CalsetFiles,
     CommandError,
+    EffectsOption,
     InstrumentOption,
     JsonOption,
     MemoryOption,
@@ -25,6 +26,7 @@ from walop_jax.cli.common import (
 )
 
 if TYPE_CHECKING:
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.refit import RefitRun
 
 
@@ -33,6 +35,7 @@ def refit(
     output: RunFolder,
     model: ModelOption = None,
     instrument: InstrumentOption = None,
+    effects: EffectsOption = None,
     overwrite: OverwriteOption = False,
     memory: MemoryOption = 2.0,
     processes: ProcessesOption = None,
@@ -66,6 +69,7 @@ def refit(
             memory=memory * 1e9,
             processes=crew,
             progress=tell,
+            catalogue=catalogue_with(effects),
         )
     if crew.index > 0:
         return

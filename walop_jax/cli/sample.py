@@ -11,6 +11,7 @@ import typer
 
 from walop_jax.cli.common import (
     CommandError,
+    EffectsOption,
     JsonOption,
     ModelOption,
     OverwriteOption,
@@ -40,6 +41,7 @@ def sample(
     run: RunArgument,
     resume: ResumeOption = False,
     model: ModelOption = None,
+    effects: EffectsOption = None,
     sampler: SamplerOption = "emcee",
     inflate: InflateOption = False,
     maximum_steps: MaximumOption = 100_000,
@@ -58,6 +60,7 @@ def sample(
     marked so, with exit code 1; the covariance of the fit then stays in calibration.fits.
     """
     switch_on_jax()
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.posterior import Options
     from walop_jax.runs.sample import sample_run
 
@@ -71,7 +74,15 @@ def sample(
         inflate=inflate,
     )
     with _bar(quiet or json) as progress:
-        found = sample_run(run, options, model=model, resume=resume, overwrite=overwrite, progress=progress)
+        found = sample_run(
+            run,
+            options,
+            model=model,
+            resume=resume,
+            overwrite=overwrite,
+            progress=progress,
+            catalogue=catalogue_with(effects),
+        )
     if json:
         print_json(found.summary)
     for sentence in found.posterior.warnings:

@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -16,8 +17,10 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.minimise import Minimum
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.model_file import render
+from walop_jax.fit.parameter_table import HEAD, parameter_notes, parameter_rows, parameter_table
 from walop_jax.fit.robust import robust_errors
 from walop_jax.fit.search import find_minimum, free_scales
+from walop_jax.io.display import Display, Displayed
 from walop_jax.io.software import software_versions
 from walop_jax.likelihood.expansion import STATED, Posterior
 from walop_jax.likelihood.journal import Journal, fingerprint
@@ -33,8 +36,8 @@ SUSPECT_SIGMA = 5.0  # excess of χ² over its expectation, in its own standard 
 PRIOR_EDGE = 4.0  # standard deviations
 
 
-@dataclasses.dataclass(frozen=True)
-class FitResult:
+@dataclasses.dataclass(frozen=True, repr=False)
+class FitResult(Displayed):
     """A fit, the likelihood that it maximises, and how far it can be trusted.
 
     `values` and `covariance` are of all parameters in tree order, frozen ones with zero variance. `trusted` needs a
@@ -116,6 +119,28 @@ class FitResult:
         """Value and standard error of a parameter."""
         i = self.model.index(name)
         return float(self.values[i]), float(self.sigma[i])
+
+    def to_table(self) -> Any:
+        """All parameters as an astropy table: value, error, unit, start, prior, and whether it was free."""
+        return parameter_table(self.model, self.values, self.sigma)
+
+    def display(self) -> Display:
+        """The verdict and the parameters."""
+        verdict = "trusted" if self.trusted else "not trusted"
+        facts = {
+            "χ²/dof": f"{self.chi2:.1f} / {self.dof} = {self.chi2 / max(self.dof, 1):.4g}",
+            "intensities": str(self.n_data),
+            "free parameters": str(len(self.model.free)),
+            "effects": ", ".join(self.model.effect_names) or "none beyond the base model",
+            "errors from": self.errors_from,
+        }
+        return Display(
+            title=f"Fit of {self.model.name}: {verdict}",
+            facts=tuple(facts.items()),
+            head=HEAD,
+            rows=parameter_rows(self.model, self.values, self.sigma),
+            notes=(*parameter_notes(self.model, self.sigma), *self.warnings),
+        )
 
 
 def check_constrained(model: Model, posterior: Posterior) -> None:

@@ -5,10 +5,12 @@ The data are found, checked and fitted once more from where it ended.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from walop_jax.calibration.calibration import instrument_as_designed
 from walop_jax.calibration.product import CalibrationProduct
 from walop_jax.data import read_calibration_set
 from walop_jax.fit.model_builder import model_for
@@ -16,6 +18,7 @@ from walop_jax.fit.refit import FitResult, fit
 from walop_jax.io.errors import fail
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects import EFFECTS, Effect
 
 SAME_FIT = 0.05  # standard errors
 
@@ -27,8 +30,13 @@ def _locate(path: Path, run: Path) -> Path:
     raise fail("the data of this run are not there any more", file=path, advice="put them back, or refit")
 
 
-def fit_of_run(product: CalibrationProduct, run: Path, model_text: str | None = None) -> FitResult:
-    """The fit behind a calibration product in the folder `run`.
+def fit_of_run(
+    product: CalibrationProduct,
+    run: Path,
+    model_text: str | None = None,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
+) -> FitResult:
+    """The fit behind a calibration product in the folder `run`; `catalogue` are the effects that it may have.
 
     Raises `DataError` when the data are missing, not those of the fit or too many to be sampled, and when the fit does
     not come out as the product says (another model, or another version of the physics).
@@ -39,7 +47,8 @@ def fit_of_run(product: CalibrationProduct, run: Path, model_text: str | None = 
     if sorted(entry.sha256 for entry in calset.inputs) != sorted(entry.sha256 for entry in product.inputs):
         raise fail("the data have changed since the fit", file=product.inputs[0].path, advice="refit them")
     text = "\n".join(product.model) if model_text is None else model_text
-    model = model_for(calset, text)
+    design = instrument_as_designed(product)
+    model = model_for(calset, text, design, catalogue)
     if model.names != tuple(str(name) for name in product.parameters.name):
         raise fail(
             "was fitted with another model", file=run, advice="run walop-jax refit with this model first"

@@ -43,7 +43,7 @@ def matrix_draws(
     return result
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class DrawnCalibration(Calibration):
     """A calibration whose matrices, and their covariance, are means over draws of the posterior."""
 

@@ -16,18 +16,15 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from walop_jax.calibration.records import Quality
+from walop_jax.io.rounding import rounded, value_and_error, with_error, with_minus_sign
 from walop_jax.reports import diagnosis_figures, product_figures
 from walop_jax.reports.run import RunContents
 from walop_jax.reports.wording import (
     UNNAMED,
     effect_in_words,
     probability,
-    rounded,
-    value_and_error,
     verdict_of_diagnosis,
     verdict_of_fit,
-    with_error,
-    with_minus_sign,
 )
 
 TEMPLATES = Path(__file__).parent / "templates"

@@ -21,6 +21,7 @@ from walop_jax.fit.misfit import describe
 from walop_jax.fit.refit import with_honest_errors
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
+from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.runs.inputs import sets_and_model
 
 OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, FIGURE_DATA)
@@ -42,6 +43,7 @@ def diagnose_sets(
     instrument: str | os.PathLike[str] | None = None,
     seed: int | None = None,
     overwrite: bool = False,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
     progress: Callable[[str], None] | None = None,
 ) -> DiagnosedRun:
     """Find what is missing from the model of calibration sets, add it, fit again, and write the folder `output`.
@@ -49,7 +51,7 @@ def diagnose_sets(
     `calibration.fits` and `summary.json` are of the extended model, `diagnosis.json` is what was found and
     `diagnosis.fits` what figures of it need: all four appear, or none. `instrument` is a shipped one by name or a
     description file (default: what the sets say), `model` a TOML file (default: the base model); `seed` (None: 0) is
-    that of the Monte Carlo. `progress` is told what is being done.
+    that of the Monte Carlo. `catalogue` are the effects that a model may have. `progress` is told what is being done.
 
     Raises `DataError` for files that cannot be read or written, ValueError for a model file that does not fit, and
     what `diagnose` raises.
@@ -59,8 +61,8 @@ def diagnose_sets(
     text = "" if model is None else read_text(model)
     check_folder(output, OUTPUTS, overwrite=overwrite)
     tell("reading")
-    calset, chosen = sets_and_model(calsets, text, model, instrument)
-    found = diagnose(calset, chosen, seed=seed or 0, progress=tell)
+    calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
+    found = diagnose(calset, chosen, catalogue=catalogue, seed=seed or 0, progress=tell)
     tell("mapping the field")
     after = with_honest_errors(found.after)
     product = Calibration.from_fit(after).to_product()

@@ -12,6 +12,7 @@ from walop_jax.calibration.from_file import product_path
 from walop_jax.calibration.product import read_product
 from walop_jax.data import read_calibration_set
 from walop_jax.io.errors import errors_naming
+from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.science.epoch import Epoch, epoch
 
 
@@ -32,12 +33,13 @@ def compare_epochs(
     old: str | os.PathLike[str],
     calsets: Sequence[str | os.PathLike[str]],
     *,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
     progress: Callable[[str], None] | None = None,
 ) -> EpochComparison:
     """Fit new calibration sets and compare with the calibration `old` (a product, or the folder of a run).
 
-    `progress` is told what is being done. Raises `DataError` for files that cannot be read, and what
-    `science.epoch` raises.
+    `catalogue` are the effects that a model may have. `progress` is told what is being done. Raises `DataError` for
+    files that cannot be read, and what `science.epoch` raises.
     """
     path = product_path(old)
     product = read_product(path)
@@ -45,5 +47,5 @@ def compare_epochs(
     if progress is not None:
         progress("fitting the new set")
     with errors_naming(path):
-        found, _ = epoch(Calibration.from_product(product), calset)
+        found, _ = epoch(Calibration.from_product(product, catalogue), calset)
     return EpochComparison(found, product.content_hash(), tuple(entry.sha256 for entry in calset.inputs))

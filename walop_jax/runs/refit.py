@@ -21,6 +21,7 @@ from walop_jax.io.atomic import atomic_path
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
 from walop_jax.likelihood.processes import Processes
+from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.runs.inputs import sets_and_model
 
 OUTPUTS = (PRODUCT, SUMMARY)
@@ -56,16 +57,18 @@ def refit_sets(
     overwrite: bool = False,
     memory: float | None = None,
     processes: Processes | None = None,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
     progress: Callable[[str], None] | None = None,
 ) -> RefitRun:
     """Fit all field points of calibration sets jointly, and write the folder `output`.
 
     A fit that has converged leaves `calibration.fits` and `summary.json` there, one that has not
     `summary.failed.json` alone. `instrument` is a shipped one by name or a description file (default: what the sets
-    say), `model` a TOML file (default: the base model); `seed` is recorded, nothing is drawn. `progress` is told in a
-    line what is being done. Of large sets: `memory` (bytes) is what their data may take; finished parts are kept in
-    `output`/partial until the end, and the same call goes on from them; `processes` share the work
-    (`likelihood.processes.join`), each making this call, and the first one writes.
+    say), `model` a TOML file (default: the base model); `seed` is recorded, nothing is drawn. `catalogue` are the
+    effects that a model may have. `progress` is told in a line what is being done. Of large sets: `memory` (bytes)
+    is what their data may take; finished parts are kept in `output`/partial until the end, and the same call goes
+    on from them; `processes` share the work (`likelihood.processes.join`), each making this call, and the first one
+    writes.
 
     Raises `DataError` for files that cannot be read or written, ValueError for a model file that does not fit, and
     what `refit` raises.
@@ -78,7 +81,7 @@ def refit_sets(
         check_folder(output, OUTPUTS, overwrite=overwrite)
     folder = Path(output)
     tell("reading")
-    calset, chosen = sets_and_model(calsets, text, model, instrument)
+    calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
     result = refit(calset, chosen, folder=folder / PARTIAL, progress=tell, memory=memory, processes=processes)
     residuals = residual_map(result) if result.likelihood.layout.large and result.converged else None
     misfit = None
