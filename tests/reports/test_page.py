@@ -124,7 +124,7 @@ def test_verdict_and_what_was_found(diagnosed):
     assert "Would be separated by: polariser angles over a full turn." in text
     assert "caused by" not in text
     assert "cos(3θ − 57°), θ the polariser angle" in text
-    assert "chwp_axis – fast axes of the half-wave plates" in text
+    assert "chwp_axis – fast axis of the calibration plate" in text
 
 
 def test_numbers_are_those_of_the_files(diagnosed):

@@ -53,6 +53,9 @@ def test_a_diagnosis(spoilt: Path, tmp_path: Path, monkeypatch):
     written = read_run(tmp_path / "caller")
     assert written.missing == ()
     assert written.diagnosis == json.loads(json.dumps(found.document))
+    again = refit.refit_sets([spoilt], tmp_path / "again", model=tmp_path / "caller" / diagnose.MODEL)
+    assert again.result.model.effect_names == ("clp_wobble",)
+    np.testing.assert_allclose(again.result.chi2, found.diagnosis.after.chi2, rtol=1e-6)
     assert written.summary["seed"] == 3
     assert read_product(tmp_path / "caller" / "calibration.fits").verdict.trusted
 

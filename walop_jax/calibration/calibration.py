@@ -20,6 +20,7 @@ from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, Parame
 from walop_jax.calibration.records import Quality, ResidualMap
 from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter
 from walop_jax.data.frames import Grid
+from walop_jax.data.quantities import in_unit
 from walop_jax.data.records import CALIBRATION_PLATE, Exposures, FilterCurve, InputFile, Site, Sources
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import model_without_data, standard_names
@@ -132,17 +133,36 @@ class Calibration(Displayed):
     # ------------------------------------------------------------------------------- asking for the matrix
 
     def matrix(
-        self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings | None = None
-    ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
-        """m21, m22, m23, m31, … and their covariance at field positions (deg), a setting for each.
+        self, x: Any, y: Any, settings: Settings | None = None
+    ) -> tuple[Float[np.ndarray, "*p m"], Float[np.ndarray, "*p m m"]]:
+        """m21, m22, m23, m31, … and their covariance at field positions (deg, or quantities), a setting for each.
 
-        Without `settings` those of `usual_settings`. Raises `DataError` for a filter that neither the calibration
-        nor the package knows, and ValueError for a moving element that the instrument does not have.
+        Without `settings` those of `usual_settings`; a single one serves all positions. Beyond the field of the
+        instrument all is NaN. Raises `DataError` for a unit that is none of angles, a position that is not finite and a
+        filter that neither the calibration nor the package knows, ValueError for a moving element that the instrument
+        does not have.
         """
-        settings = settings or self.usual_settings(len(x))
+        x, y = np.broadcast_arrays(in_unit(x, "deg", "x"), in_unit(y, "deg", "y"))
+        if not np.all(np.isfinite(x) & np.isfinite(y)):
+            raise DataError("x, y: a position is not finite; leave it out")
+        count, shape = x.size, x.shape
+        settings = settings or self.usual_settings(count)
+        if len(settings) == 1:
+            settings = settings[np.zeros(count, int)]
+        x, y = x.ravel(), y.ravel()
+        inside = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) <= self.model.template.field_limit)
+        size = 3 * len(self.model.template.arms)
+        m, covariance = np.full((count, size), np.nan), np.full((count, size, size), np.nan)
+        if inside.size:
+            m[inside], covariance[inside] = self._elements(x[inside], y[inside], settings[inside])
+        return m.reshape(*shape, size), covariance.reshape(*shape, size, size)
+
+    def _elements(
+        self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings
+    ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
         filters = {str(name): self.filter_curve(str(name)) for name in np.unique(settings.filter)}
         instrument = self.model.instrument(self.values)
-        return matrices(instrument, settings, filters, np.asarray(x), np.asarray(y), self.covariance)
+        return matrices(instrument, settings, filters, x, y, self.covariance)
 
     def usual_settings(self, count: int = 1, filter_name: str = DEFAULT_FILTER) -> Settings:
         """Flat photon spectrum, 10 °C, on the meridian, moving elements out.
@@ -219,7 +239,7 @@ class Calibration(Displayed):
         grid = Grid(size, size, (centre, centre), (0.0, 0.0), ((step, 0.0), (0.0, step)))
         points = grid.points
         settings = self.usual_settings(size * size, name)
-        values, covariance = self.matrix(points.x, points.y, settings)
+        values, covariance = self._elements(points.x, points.y, settings)
         errors = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
         planes = (-1, size, size)
         return MatrixMaps(

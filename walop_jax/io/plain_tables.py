@@ -23,6 +23,8 @@ FORMATS = {
     ".fits.gz": "fits",
     ".csv": "ascii.csv",
     ".ecsv": "ascii.ecsv",
+    ".vot": "votable",
+    ".votable": "votable",
 }
 """Extensions of tables that are read, and what astropy calls the format."""
 

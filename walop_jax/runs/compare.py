@@ -17,11 +17,12 @@ from walop_jax.io.text import json_text, read_text
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.paper.comparison import Comparison, compare
 from walop_jax.reports import comparison_figures
+from walop_jax.reports.run import COMPARISON
 from walop_jax.runs.inputs import sets_and_model
 from walop_jax.runs.left_out import KEY, left_out_cards, left_out_sentences
 from walop_jax.science.star_errors import Truth
 
-DOCUMENT, TABLE = "comparison.json", "comparison.fits"
+DOCUMENT, TABLE = COMPARISON, "comparison.fits"
 FIGURES: Mapping[str, Callable[[Comparison], Any]] = {
     "comparison_histogram.png": comparison_figures.histogram_figure,
     "comparison_map.png": comparison_figures.map_figure,

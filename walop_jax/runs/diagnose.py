@@ -18,13 +18,15 @@ from walop_jax.diagnosis.figure_file import FIGURE_DATA, write_figure_data
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.misfit import describe
+from walop_jax.fit.model_file import render
 from walop_jax.fit.refit import with_honest_errors
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.runs.inputs import sets_and_model
 
-OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, FIGURE_DATA)
+MODEL = "model.toml"
+OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, FIGURE_DATA, MODEL)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,8 +50,8 @@ def diagnose_sets(
 ) -> DiagnosedRun:
     """Find what is missing from the model of calibration sets, add it, fit again, and write the folder `output`.
 
-    `calibration.fits` and `summary.json` are of the extended model, `diagnosis.json` is what was found and
-    `diagnosis.fits` what figures of it need: all four appear, or none. `instrument` is a shipped one by name or a
+    `calibration.fits` and `summary.json` are of the extended model, `diagnosis.json` is what was found, `diagnosis.fits`
+    what figures of it need, and `model.toml` the extended model for other commands: all of them appear, or none. `instrument` is a shipped one by name or a
     description file (default: what the sets say), `model` a TOML file (default: the base model); `seed` (None: 0) is
     that of the Monte Carlo. `catalogue` are the effects that a model may have. `progress` is told what is being done.
 
@@ -75,4 +77,5 @@ def diagnose_sets(
         (folder / SUMMARY).write_text(json_text(fitted), encoding="utf-8")
         (folder / DIAGNOSIS).write_text(json_text(content), encoding="utf-8")
         write_figure_data(folder / FIGURE_DATA, drawn_from)
+        (folder / MODEL).write_text(render(after.model), encoding="utf-8")
     return DiagnosedRun(found, content)
