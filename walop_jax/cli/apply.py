@@ -15,7 +15,6 @@ from walop_jax.cli.common import (
     PosteriorOption,
     Product,
     QuietOption,
-    SeedOption,
     print_json,
     progress,
     switch_on_jax,
@@ -45,7 +44,6 @@ def apply(
     posterior: PosteriorOption = None,
     effects: EffectsOption = None,
     overwrite: OverwriteOption = False,
-    seed: SeedOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -61,7 +59,6 @@ def apply(
     filter, temperature or colour that the calibration has not seen, 128 a camera is missing, 256 flagged or
     saturated counts, 16384 no result; bits of the calibration itself are added to all rows.
     """
-    del seed  # nothing is random here
     switch_on_jax()
     from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.apply import apply_to_catalogue

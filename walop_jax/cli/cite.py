@@ -11,7 +11,6 @@ from walop_jax.cli.common import (
     EffectsOption,
     JsonOption,
     QuietOption,
-    SeedOption,
     print_json,
     switch_on_jax,
 )
@@ -22,15 +21,18 @@ Run = Annotated[
 ]
 
 
+BibtexOption = Annotated[bool, typer.Option("--bibtex", help="As BibTeX entries.")]
+
+
 def cite(
     run: Run = None,
+    bibtex: BibtexOption = False,
     effects: EffectsOption = None,
     json: JsonOption = False,
     quiet: QuietOption = False,
-    seed: SeedOption = None,
 ) -> None:
     """List the sources of the physics in a fitted model, effects included."""
-    del quiet, seed  # the list is all there is, and nothing is random
+    del quiet  # the list is all there is
     switch_on_jax()
     from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.cite import cite_run
@@ -38,6 +40,12 @@ def cite(
     found = cite_run(run, catalogue_with(effects))
     if json:
         print_json([{"what": entry.what, "source": entry.source} for entry in found])
+        return
+    if bibtex:
+        from walop_jax import __version__
+        from walop_jax.model.bibtex import bibtex as entries
+
+        typer.echo(entries(found, __version__), nl=False)
         return
     for entry in found:
         typer.echo(f"{entry.what}: {entry.source}")

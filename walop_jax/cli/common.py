@@ -6,7 +6,7 @@ import contextlib
 import functools
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,9 +26,7 @@ CalsetFiles = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable result to stdout, nothing else.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors.")]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace outputs that exist.")]
-SeedOption = Annotated[
-    int | None, typer.Option("--seed", help="Seed of random numbers; recorded where none are drawn.")
-]
+SeedOption = Annotated[int | None, typer.Option("--seed", help="Seed of random numbers (default: 0).")]
 ModelOption = Annotated[
     Path | None,
     typer.Option("--model", metavar="MODEL.toml", help="Model file: what is free, tied, known, added."),
@@ -58,7 +56,7 @@ ProcessesOption = Annotated[
     ),
 ]
 MemoryOption = Annotated[
-    float, typer.Option("--memory", metavar="GB", min=0.1, help="What the data of field points may take.")
+    float, typer.Option("--memory", metavar="GB", min=0.1, help="Memory for the data, in GB.")
 ]
 
 RunFolder = Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the results.")]
@@ -128,16 +126,37 @@ def print_json(value: Any) -> None:
 
 
 @contextlib.contextmanager
-def progress(quiet: bool) -> Iterator[Callable[[str], None]]:
-    """Give a function that shows what is being done: on a terminal only, on stderr, gone at the end."""
+def progress(quiet: bool, stages: Sequence[str] = ()) -> Iterator[Callable[[str], None]]:
+    """Give a function that shows what is being done and for how long: on a terminal only, on stderr, gone at the end.
+
+    `stages` are the beginnings of the messages that open a new step; they are numbered.
+    """
     from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     console = Console(stderr=True)
     if quiet or not console.is_terminal:
         yield lambda message: None
         return
-    with console.status("") as status:
-        yield status.update
+    numbered = step_counter(stages)
+    columns = (SpinnerColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False))
+    with Progress(*columns, console=console, transient=True) as shown:
+        task = shown.add_task("", total=None)
+        yield lambda message: shown.update(task, description=numbered(message))
+
+
+def step_counter(stages: Sequence[str]) -> Callable[[str], str]:
+    """Give a function that puts "step n of m" ahead of messages, n being that of the last stage that has begun."""
+    reached = 0
+
+    def numbered(message: str) -> str:
+        nonlocal reached
+        for number, stage in enumerate(stages, start=1):
+            if message.startswith(stage):
+                reached = max(reached, number)
+        return f"step {reached} of {len(stages)}: {message}" if reached else message
+
+    return numbered
 
 
 def cache_folder() -> Path | None:

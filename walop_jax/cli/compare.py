@@ -28,6 +28,7 @@ TruthOption = Annotated[
     typer.Option("--truth", metavar="TABLE", help="True X, Y, M21 … M33 (FITS, CSV), for simulated sets."),
 ]
 FilterOption = Annotated[str, typer.Option("--filter", metavar="NAME", help="Filter to compare in.")]
+STAGES = ("reading", "fitting the joint model", "fitting and judging")
 
 
 def compare(
@@ -54,7 +55,7 @@ def compare(
     from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.compare import compare_methods
 
-    with progress(quiet or json) as tell:
+    with progress(quiet or json, STAGES) as tell:
         found = compare_methods(
             calsets,
             output,

@@ -20,11 +20,14 @@ from walop_jax.cli.common import (
     switch_on_jax,
     warn,
 )
+from walop_jax.io.rounding import with_error
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from walop_jax.diagnosis.findings import Diagnosis, Step
+
+STAGES = ("reading", "fitting the model", "scoring every", "p = ", "mapping the field")
 
 
 def diagnose(
@@ -41,14 +44,15 @@ def diagnose(
     """Say what is missing from the model, add it, and fit again: RUN/diagnosis.json and RUN/calibration.fits.
 
     The verdict is consistent, effect_found or unexplained. Effects that the data cannot tell apart are listed
-    together; effects that the data cannot show at all are listed as such. RUN/calibration.fits and
-    RUN/summary.json hold the extended model; RUN/diagnosis.fits what the pictures of `walop-jax report` need.
+    together; effects that the data cannot show at all are listed as such. RUN/calibration.fits and RUN/summary.json
+    are of the extended model, and RUN/model.toml is that model, for `refit --model` and `compare --model`;
+    `walop-jax report` draws its figures from RUN/diagnosis.fits.
     """
     switch_on_jax()
     from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.diagnose import diagnose_sets
 
-    with progress(quiet or json) as tell:
+    with progress(quiet or json, STAGES) as tell:
         found = diagnose_sets(
             calsets,
             output,
@@ -98,7 +102,7 @@ def _show(found: Diagnosis, output: Path) -> None:
 
 def _about(step: Step) -> Iterator[str]:
     values = [f"{name} = {value}" for name, value in step.choices.items()]
-    values += [f"{n} = {v:.4g} ± {s:.2g} {unit}".rstrip() for n, (v, s, unit) in step.parameters.items()]
+    values += [f"{n} = {with_error(v, s)} {unit}".rstrip() for n, (v, s, unit) in step.parameters.items()]
     if values:
         yield ", ".join(values)
     for other in step.alternatives:

@@ -15,7 +15,6 @@ from walop_jax.cli.common import (
     PosteriorOption,
     Product,
     QuietOption,
-    SeedOption,
     print_json,
     progress,
     switch_on_jax,
@@ -34,7 +33,6 @@ def matrix(
     posterior: PosteriorOption = None,
     effects: EffectsOption = None,
     overwrite: OverwriteOption = False,
-    seed: SeedOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -47,7 +45,6 @@ def matrix(
     points of the calibration, 64 filter or temperature that the calibration has not seen. Beyond the field
     of the instrument (0.35 degrees for the WALOPs) there is no value: NaN and FLAG 32.
     """
-    del seed  # nothing is random here
     switch_on_jax()
     from walop_jax.calibration.records import Quality
     from walop_jax.model.effects.own import catalogue_with

@@ -13,7 +13,6 @@ from walop_jax.cli.common import (
     JsonOption,
     OverwriteOption,
     QuietOption,
-    SeedOption,
     print_json,
     switch_on_jax,
 )
@@ -37,7 +36,6 @@ def model(
     effect: EffectOption = None,
     own: EffectsOption = None,
     overwrite: OverwriteOption = False,
-    seed: SeedOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -46,7 +44,6 @@ def model(
     With calibration sets, the model that `refit` would fit to them. Change the file and give it to
     `refit --model`.
     """
-    del seed  # nothing is random here
     switch_on_jax()
     from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.model import write_model

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import typer
 
 from walop_jax.cli.common import (
     CalsetFiles,
@@ -17,7 +20,6 @@ from walop_jax.cli.common import (
     ProcessesOption,
     QuietOption,
     RunFolder,
-    SeedOption,
     print_json,
     progress,
     shared,
@@ -26,8 +28,9 @@ from walop_jax.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.refit import RefitRun
+
+STAGES = ("reading", "preparing the fit", "mapping the field")
 
 
 def refit(
@@ -39,24 +42,24 @@ def refit(
     overwrite: OverwriteOption = False,
     memory: MemoryOption = 2.0,
     processes: ProcessesOption = None,
-    seed: SeedOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
     """Fit all field points of calibration sets jointly: RUN/calibration.fits and RUN/summary.json.
 
-    RUN is made if need be. A RUN that holds a calibration is left alone unless --overwrite is given; then
-    these two files are replaced and others stay.
+    RUN is created if necessary. If it holds a calibration already, the command stops unless --overwrite is given;
+    then these two files are replaced and all others stay.
 
-    A fit that does not converge leaves RUN/summary.failed.json, no calibration, and exit code 1. One that
-    converges without explaining the data is written with TRUSTED = F and warnings, exit code 0.
+    A fit that does not converge leaves RUN/summary.failed.json, no calibration, and exit code 1. A fit that converges
+    but does not explain the data is written with TRUSTED = F and a warning; the exit code is 0.
 
-    Sets of more than 65536 points (whole frames) are read in slabs, anew on every pass. Finished slabs
-    are kept in RUN/partial until the end: the same command goes on where it was interrupted. The
-    calibration holds a map of what the smooth model leaves.
+    Sets of more than 65536 points (whole frames) are read in slabs on every pass. Finished slabs are kept in
+    RUN/partial until the end, so that the same command resumes an interrupted fit. The calibration then holds a map of
+    what the smooth model leaves.
     """
     switch_on_jax()
-    with shared(processes) as crew, progress(quiet or json or crew.index > 0) as tell:
+    with shared(processes) as crew, progress(quiet or json or crew.index > 0, STAGES) as tell:
+        from walop_jax.model.effects.own import catalogue_with
         from walop_jax.runs.refit import refit_sets
 
         found = refit_sets(
@@ -64,7 +67,6 @@ def refit(
             output,
             model=model,
             instrument=instrument,
-            seed=seed,
             overwrite=overwrite,
             memory=memory * 1e9,
             processes=crew,
@@ -86,25 +88,6 @@ def refit(
 
 
 def _show(found: RefitRun, output: Path) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    result = found.result
-    table = Table("parameter", "value", "error", "unit", "from its prior")
-    series = set(result.model.positions("throughput").tolist())
-    for i, (p, value, sigma) in enumerate(
-        zip(result.model.parameters, result.values, result.sigma, strict=True)
-    ):
-        if i in series or sigma == 0:
-            continue
-        pull = "" if p.prior is None else f"{(value - p.prior[0]) / p.prior[1]:+.2f} σ"
-        table.add_row(p.name, f"{value:.7g}", f"{sigma:.2g}", p.unit, pull)
-    console = Console(highlight=False)
-    console.print(table)
-    console.print(
-        f"χ² = {result.chi2:.6g} for {result.dof} degrees of freedom "
-        f"({result.chi2 / max(result.dof, 1):.4f}), {result.n_data} intensities, "
-        f"{len(result.model.free)} free parameters, {found.seconds:.1f} s",
-        soft_wrap=True,
-    )
-    console.print(f"{'trusted' if result.trusted else 'NOT trusted'}: {output}", markup=False, soft_wrap=True)
+    typer.echo(dataclasses.replace(found.result.display(), notes=found.result.notes).text())
+    verdict = "trusted" if found.result.trusted else "NOT trusted"
+    typer.echo(f"{verdict}: {output}   ({found.seconds:.1f} s)")

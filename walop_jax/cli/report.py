@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from walop_jax.cli.common import JsonOption, OverwriteOption, QuietOption, SeedOption, print_json, progress
+from walop_jax.cli.common import JsonOption, OverwriteOption, QuietOption, print_json, progress
 
 RunArgument = Annotated[
     Path, typer.Argument(metavar="RUN", help="Folder of `walop-jax refit` or `diagnose`.")
@@ -16,13 +16,13 @@ OutputOption = Annotated[
     Path | None,
     typer.Option("--output", "-o", metavar="FILE", help="Page to write (default: RUN/report.html)."),
 ]
+STAGES = ("reading", "drawing")
 
 
 def report(
     run: RunArgument,
     output: OutputOption = None,
     overwrite: OverwriteOption = False,
-    seed: SeedOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -31,10 +31,9 @@ def report(
     The verdict, what was found, residuals before and after, maps of the matrix and of its errors, pulls from the
     priors, all parameters, warnings, inputs and versions: what of it lies in RUN. The page says what is missing.
     """
-    del seed  # nothing is random here
     from walop_jax.runs.report import write_report
 
-    with progress(quiet or json) as tell:
+    with progress(quiet or json, STAGES) as tell:
         page = write_report(run, output, overwrite=overwrite, progress=tell)
     if json:
         print_json(page.document())

@@ -53,7 +53,7 @@ def sample(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Sample the posterior: RUN/posterior.nc, a intervals, figures; covariance into calibration.fits.
+    """Sample the posterior: RUN/posterior.nc, intervals and figures; the covariance goes into calibration.fits.
 
     Checkpoints lie in RUN/sampling: an interrupted run goes on with --resume, bit for bit, and refuses if
     data, model, priors, sampler, settings or versions have changed. A chain that has not converged is written and
@@ -90,9 +90,7 @@ def sample(
     if not (json or quiet):
         _show(found.posterior)
     if not found.posterior.trusted:
-        raise CommandError(
-            f"{run}: the posterior is not to be believed yet; calibration.fits keeps its covariance"
-        )
+        raise CommandError(f"{run}: the posterior has not converged; calibration.fits keeps its covariance")
 
 
 @contextlib.contextmanager
@@ -123,23 +121,5 @@ def _bar(quiet: bool) -> Iterator[Callable[[Progress], None]]:
 
 
 def _show(found: PosteriorSample) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    from walop_jax.posterior.output import intervals
-
-    columns = {name: values for name, (values, _, _) in intervals(found).items()}
-    table = Table("coefficient", "median", "68 %", "95 %", "unit", "ESS")
-    for i, name in enumerate(columns["NAME"]):
-        if name not in found.sampled:
-            continue
-        spans = [
-            f"{columns['LOW' + level][i]:.7g} … {columns['HIGH' + level][i]:.7g}" for level in ("68", "95")
-        ]
-        table.add_row(
-            name, f"{columns['MEDIAN'][i]:.7g}", *spans, columns["UNIT"][i], f"{columns['ESS'][i]:.0f}"
-        )
-    console = Console(highlight=False)
-    console.print(table)
-    console.print(found.convergence.message(), soft_wrap=True)
-    console.print(f"{found.comparison}; {found.seconds:.0f} s", soft_wrap=True)
+    typer.echo(found.display().text())
+    typer.echo(f"{found.seconds:.0f} s")

@@ -35,6 +35,7 @@ TruthOption = Annotated[
     Path | None, typer.Option("--truth", metavar="FILE.json", help="Write the true parameters here.")
 ]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="The same seed gives the same set.")]
+STAGES = ("following", "writing")
 
 
 def simulate(
@@ -99,7 +100,7 @@ def simulate(
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
 
-    with progress(quiet or json) as tell:
+    with progress(quiet or json, STAGES) as tell:
         made = simulate_set(
             output, plan, seed=seed, effects=hidden, truth=truth, overwrite=overwrite, progress=tell
         )

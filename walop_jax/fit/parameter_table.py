@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.rounding import rounded, value_and_error, with_minus_sign
+from walop_jax.io.rounding import value_and_error, with_error, with_minus_sign
 from walop_jax.model.specification import Model, Parameter
 
 Vector = Float[np.ndarray, " n"]
@@ -48,14 +48,15 @@ def parameter_table(model: Model, values: Vector, sigma: Vector) -> Any:
 
 
 def parameter_rows(model: Model, values: Vector, sigma: Vector) -> tuple[tuple[str, ...], ...]:
-    """Rows below `HEAD`, without the terms of the throughput."""
+    """Rows below `HEAD`, without the terms of the throughput; no start where it is the mean of the prior."""
     idle = unconstrained(model, sigma)
     rows = []
     for p, value, s in zip(model.parameters, values, sigma, strict=True):
         if p.name.startswith(HIDDEN):
             continue
-        prior = "" if p.prior is None else f"{rounded(p.prior[0] + 0.0, '.6g')} ± {p.prior[1]:.2g}"
-        start = with_minus_sign(f"{p.start + 0.0:.6g}")
+        prior = "" if p.prior is None else with_error(p.prior[0] + 0.0, p.prior[1])
+        same = p.prior is not None and p.prior[0] == p.start
+        start = "" if same else with_minus_sign(f"{p.start + 0.0:.6g}")
         texts = value_and_error(float(value), float(s))
         rows.append((p.name, *texts, p.unit, start, prior, _state(p, idle)))
     return tuple(rows)

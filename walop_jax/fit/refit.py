@@ -124,6 +124,11 @@ class FitResult(Displayed):
         """All parameters as an astropy table: value, error, unit, start, prior, and whether it was free."""
         return parameter_table(self.model, self.values, self.sigma)
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What its table of parameters leaves out, and which of them the data do not constrain."""
+        return parameter_notes(self.model, self.sigma)
+
     def display(self) -> Display:
         """The verdict and the parameters."""
         verdict = "trusted" if self.trusted else "not trusted"
@@ -139,7 +144,7 @@ class FitResult(Displayed):
             facts=tuple(facts.items()),
             head=HEAD,
             rows=parameter_rows(self.model, self.values, self.sigma),
-            notes=(*parameter_notes(self.model, self.sigma), *self.warnings),
+            notes=(*self.notes, *self.warnings),
         )
 
 

@@ -50,10 +50,11 @@ def diagnose_sets(
 ) -> DiagnosedRun:
     """Find what is missing from the model of calibration sets, add it, fit again, and write the folder `output`.
 
-    `calibration.fits` and `summary.json` are of the extended model, `diagnosis.json` is what was found, `diagnosis.fits`
-    what figures of it need, and `model.toml` the extended model for other commands: all of them appear, or none. `instrument` is a shipped one by name or a
-    description file (default: what the sets say), `model` a TOML file (default: the base model); `seed` (None: 0) is
-    that of the Monte Carlo. `catalogue` are the effects that a model may have. `progress` is told what is being done.
+    `calibration.fits` and `summary.json` are of the extended model, `diagnosis.json` is what was found,
+    `diagnosis.fits` what figures of it need, and `model.toml` the extended model for other commands: all of them
+    appear, or none. `instrument` is a shipped one by name or a description file (default: what the sets say),
+    `model` a TOML file (default: the base model); `seed` (None: 0) is that of the Monte Carlo. `catalogue` are the
+    effects that a model may have. `progress` is told what is being done.
 
     Raises `DataError` for files that cannot be read or written, ValueError for a model file that does not fit, and
     what `diagnose` raises.

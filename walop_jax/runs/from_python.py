@@ -18,7 +18,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify as check_product
 from walop_jax.calibration.certify import validity
 from walop_jax.calibration.from_file import read_calibration
-from walop_jax.calibration.matrix_table import matrix_columns
+from walop_jax.calibration.matrix_table import matrix_columns, provenance
 from walop_jax.data import DEFAULT_FILTER, read_calibration_set
 from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.field_points import field_points
@@ -154,7 +154,8 @@ def matrix(
     chosen = there if posterior is None else with_draws(there, posterior)
     with errors_naming(table.path):
         added = matrix_columns(chosen, wanted.x, wanted.y, wanted.settings, wanted.outside)
-    return extended(table, added)
+    cards = provenance(there.to_product().content_hash(), there, drawn=posterior is not None)
+    return extended(table, added, cards)
 
 
 def apply(

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from walop_jax.calibration.from_file import read_calibration
-from walop_jax.calibration.matrix_table import matrix_columns
+from walop_jax.calibration.matrix_table import matrix_columns, provenance
 from walop_jax.calibration.records import Quality
 from walop_jax.data.field_points import field_points
 from walop_jax.data.user_tables import read_input_table, table_format, write_output_table
@@ -51,7 +51,9 @@ def tabulate_matrix(
     with errors_naming(points):
         columns = matrix_columns(calibration, wanted.x, wanted.y, wanted.settings, wanted.outside)
     lost = calibration.left_behind
-    write_output_table(output, table, columns, overwrite=overwrite, header=left_out_cards(lost))
+    content = held.product.content_hash()
+    cards = provenance(content, calibration, drawn=posterior is not None) | left_out_cards(lost)
+    write_output_table(output, table, columns, overwrite=overwrite, header=cards)
 
     flag = columns["FLAG"][0]
     counts = {bit: int((flag & bit > 0).sum()) for bit in BITS}
@@ -68,7 +70,7 @@ def tabulate_matrix(
         rows=table.rows,
         trusted=held.product.verdict.trusted,
         flags=counts,
-        product=held.product.content_hash(),
+        product=content,
         not_carried_over=lost,
         warnings=tuple(warnings),
     )

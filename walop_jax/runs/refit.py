@@ -53,7 +53,6 @@ def refit_sets(
     *,
     model: str | os.PathLike[str] | None = None,
     instrument: str | os.PathLike[str] | None = None,
-    seed: int | None = None,
     overwrite: bool = False,
     memory: float | None = None,
     processes: Processes | None = None,
@@ -64,7 +63,7 @@ def refit_sets(
 
     A fit that has converged leaves `calibration.fits` and `summary.json` there, one that has not
     `summary.failed.json` alone. `instrument` is a shipped one by name or a description file (default: what the sets
-    say), `model` a TOML file (default: the base model); `seed` is recorded, nothing is drawn. `catalogue` are the
+    say), `model` a TOML file (default: the base model); `catalogue` are the
     effects that a model may have. `progress` is told in a line what is being done. Of large sets: `memory` (bytes)
     is what their data may take; finished parts are kept in `output`/partial until the end, and the same call goes
     on from them; `processes` share the work (`likelihood.processes.join`), each making this call, and the first one
@@ -89,7 +88,7 @@ def refit_sets(
         tell("looking at the misfit")
         misfit = describe(result)
     seconds = time.perf_counter() - began
-    found = summary(result, seconds=seconds, misfit=misfit, residuals=residuals) | {"seed": seed}
+    found = summary(result, seconds=seconds, misfit=misfit, residuals=residuals)
     if first:
         tell("mapping the field")
         _write(folder, result, residuals, found, overwrite=overwrite)
