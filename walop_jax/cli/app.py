@@ -26,6 +26,7 @@ COMMANDS = (
     "certify",
     "epoch",
     "report",
+    "plot",
     "model",
     "instrument",
     "import-zemax",

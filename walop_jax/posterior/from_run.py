@@ -23,7 +23,9 @@ from walop_jax.model.effects import EFFECTS, Effect
 SAME_FIT = 0.05  # standard errors
 
 
-def _locate(path: Path, run: Path) -> Path:
+def locate(path: Path, run: Path) -> Path:
+    """Where the data of a run lie: as they were named, in the folder of the run, or beside it; `DataError` if
+    nowhere."""
     for folder in (Path(), run, run.parent):
         if (folder / path).exists():
             return folder / path
@@ -43,7 +45,7 @@ def fit_of_run(
     """
     if not product.inputs:
         raise fail("does not say what it was fitted to", file=run, advice="make it with walop-jax refit")
-    calset = read_calibration_set(*(_locate(Path(entry.path), run) for entry in product.inputs))
+    calset = read_calibration_set(*(locate(Path(entry.path), run) for entry in product.inputs))
     if sorted(entry.sha256 for entry in calset.inputs) != sorted(entry.sha256 for entry in product.inputs):
         raise fail("the data have changed since the fit", file=product.inputs[0].path, advice="refit them")
     text = "\n".join(product.model) if model_text is None else model_text

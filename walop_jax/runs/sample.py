@@ -24,7 +24,8 @@ from walop_jax.posterior.checkpoint import Checkpoints
 from walop_jax.posterior.from_run import fit_of_run
 from walop_jax.posterior.output import intervals, report, write_posterior
 from walop_jax.posterior.result import Report
-from walop_jax.reports.posterior_figures import corner_figure, save_figure, trace_figure
+from walop_jax.reports.named import MOST_IN_CORNER
+from walop_jax.reports.posterior_figures import corner_figure, informed, save_figure, trace_figure
 from walop_jax.reports.run import CORNER, INTERVALS, POSTERIOR, SAMPLE
 
 CHAINS = "sampling"
@@ -94,7 +95,8 @@ def _write(
         write_posterior(folder / POSTERIOR, posterior)
         for name in (INTERVALS_FITS, INTERVALS):
             write_columns(folder / name, intervals(posterior), notes)
-        save_figure(folder / CORNER, corner_figure(_sampled_draws(posterior), posterior.sampled, sampled))
+        shown, draws = _in_corner(posterior, product)
+        save_figure(folder / CORNER, corner_figure(draws, shown, [units.get(name, "") for name in shown]))
         trace = trace_figure(
             posterior.chains, posterior.sampled, sampled, posterior.thin, posterior.convergence.tau
         )
@@ -102,6 +104,16 @@ def _write(
         (folder / SAMPLE).write_text(json_text(summary), encoding="utf-8")
         if posterior.trusted:
             write_product(folder / PRODUCT, _with_covariance(product, posterior, catalogue))
+
+
+def _in_corner(posterior: PosteriorSample, product: CalibrationProduct) -> tuple[tuple[str, ...], np.ndarray]:
+    """Names and draws of the sampled coefficients that the data constrain best, as many as a figure can label."""
+    draws = _sampled_draws(posterior)
+    spread = dict(zip(posterior.sampled, draws.std(axis=0).tolist(), strict=True))
+    table = product.parameters
+    prior = dict(zip(table.name.tolist(), table.prior_width.tolist(), strict=True))
+    shown = informed(posterior.sampled, spread, prior)[:MOST_IN_CORNER] or posterior.sampled[:MOST_IN_CORNER]
+    return shown, draws[:, [posterior.sampled.index(name) for name in shown]]
 
 
 def _sampled_draws(posterior: PosteriorSample) -> np.ndarray:
