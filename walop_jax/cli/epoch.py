@@ -11,6 +11,7 @@ from walop_jax.cli.common import (
     CalsetFiles,
     EffectsOption,
     JsonOption,
+    OverwriteOption,
     QuietOption,
     print_json,
     progress,
@@ -25,10 +26,18 @@ OldProduct = Annotated[
 ]
 
 
+OutputOption = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", metavar="RUN", help="Folder for the new calibration and what was found."),
+]
+
+
 def epoch(
     old: OldProduct,
     calsets: CalsetFiles,
+    output: OutputOption = None,
     effects: EffectsOption = None,
+    overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -42,7 +51,9 @@ def epoch(
     from walop_jax.runs.epoch import compare_epochs
 
     with progress(quiet or json) as tell:
-        compared = compare_epochs(old, calsets, progress=tell, catalogue=catalogue_with(effects))
+        compared = compare_epochs(
+            old, calsets, output=output, overwrite=overwrite, progress=tell, catalogue=catalogue_with(effects)
+        )
     if json:
         print_json(compared.document())
     elif not quiet:
