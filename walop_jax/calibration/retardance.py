@@ -55,7 +55,7 @@ def retardance(mueller: Float[np.ndarray, "*s 4 4"], axis: Float[np.ndarray, 2])
     turn = 0.5 * np.stack([r[..., 1, 2] - r[..., 2, 1], r[..., 2, 0] - r[..., 0, 2]], axis=-1)
     size = np.sqrt(np.sum(turn**2, axis=-1) + 0.25 * (r[..., 0, 1] - r[..., 1, 0]) ** 2)
     sine = np.where(turn @ axis < 0, -size, size)
-    return np.mod(np.rad2deg(np.arctan2(sine, cosine)), 360.0)
+    return np.asarray(np.mod(np.rad2deg(np.arctan2(sine, cosine)), 360.0))
 
 
 def plate_retardances(

@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.retardance import plate_names, plate_retardances
 from walop_jax.data.records import CalibrationSet
+from walop_jax.io.errors import DataError
 from walop_jax.paper.polynomial import (
     fit_paper,
     fit_transmissions,
-    polariser_exposures,
     polariser_states,
 )
 from walop_jax.reports.style import DIVERGING, FONT, SMALL, empty_figure, field_axes, outer_labels
@@ -98,7 +98,12 @@ def transmission_figure(
 
     With the model of Paper II, a constant plus terms in q and u of the polariser, and what it leaves below.
     """
-    rows = polariser_exposures(calset, filter_name)
+    e = calset.exposures
+    rows = np.flatnonzero(e.clp_in & ~e.chwp_in & (e.filter == filter_name))
+    if len(np.unique(np.mod(e.clp_angle[rows], 180.0))) < 3:
+        raise DataError(
+            f"EXPOSURES: fewer than 3 polariser angles in {filter_name}: nothing to draw a curve through"
+        )
     block = calset.intensities.block(0, len(calset.points))
     whole = np.flatnonzero(block.used[:, rows].all(axis=1))
     point = whole[np.argmin(np.hypot(block.x[whole] - place[0], block.y[whole] - place[1]))]

@@ -144,7 +144,7 @@ def corner_figure(
         for j in range(i + 1):
             axes = panels[i, j]
             axes.tick_params(
-                labelsize=5, length=2, labelbottom=few and i == k - 1, labelleft=few and 0 == j < i
+                labelsize=6.5 if few else 5, length=2, labelbottom=few and i == k - 1, labelleft=few and 0 == j < i
             )
             axes.tick_params(axis="x", labelrotation=45)
             for axis in (axes.xaxis, axes.yaxis) if i != j else (axes.xaxis,):
