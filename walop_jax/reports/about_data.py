@@ -74,7 +74,8 @@ def _range(values: Float[np.ndarray, " e"], unit: str) -> str:
     known = values[np.isfinite(values)]
     if known.size == 0:
         return "not recorded"
-    return with_minus_sign(f"{known.min():.1f} to {known.max():.1f} {unit}")
+    low, high = f"{known.min():.1f}", f"{known.max():.1f}"
+    return with_minus_sign(f"{low} {unit}" if low == high else f"{low} to {high} {unit}")
 
 
 def model_entries(product: CalibrationProduct) -> dict[str, dict[str, str]]:

@@ -24,8 +24,6 @@ from walop_jax.reports import accuracy_figures, figures, paper_figures, posterio
 from walop_jax.reports.run import POSTERIOR
 from walop_jax.science.field_accuracy import field_accuracy
 
-MOST_IN_CORNER = 6  # coefficients whose axes can carry numbers
-
 
 @dataclasses.dataclass(frozen=True)
 class Source:
@@ -102,7 +100,7 @@ def _corner(source: Source) -> Figure:
         table = source.product.parameters
         prior = dict(zip(table.name.tolist(), table.prior_width.tolist(), strict=True))
         spread = {name: float(held[name].std()) for name in shown}
-        shown = posterior_figures.informed(shown, spread, prior)[:MOST_IN_CORNER]
+        shown = posterior_figures.informed(shown, spread, prior)[: posterior_figures.MOST_IN_CORNER]
     draws = np.stack([held[name].ravel() for name in shown], axis=1)
     return posterior_figures.corner_figure(draws, shown, [units[name] for name in shown])
 

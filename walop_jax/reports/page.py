@@ -20,6 +20,7 @@ from walop_jax.io.rounding import rounded, value_and_error, with_error, with_min
 from walop_jax.reports import diagnosis_figures, product_figures
 from walop_jax.reports.about_data import data_in_words, model_entries, symbols_in_words
 from walop_jax.reports.accuracy_figures import accuracy_figure
+from walop_jax.reports.posterior_figures import MOST_IN_CORNER, informed
 from walop_jax.reports.run import RunContents
 from walop_jax.reports.wording import (
     UNNAMED,
@@ -95,7 +96,7 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         "versions": summary["versions"],
         "accuracy": None if accuracy is None else _accuracy_in_words(accuracy),
         "data": [] if run.product is None else data_in_words(run.product),
-        "symbols": "" if run.corner is None else symbols_in_words([str(r["NAME"]) for r in run.intervals]),
+        "symbols": "" if run.corner is None else symbols_in_words(_in_corner(run)),
     }
 
 
@@ -179,6 +180,14 @@ def _interval(row: Mapping[str, Any]) -> dict[str, str]:
     value, sigma = value_and_error(median, half)
     names = {"name": str(row["NAME"]), "unit": str(row["UNIT"]), "ess": f"{float(row['ESS']):.0f}"}
     return names | ends | {"median": value, "sigma": sigma}
+
+
+def _in_corner(run: RunContents) -> tuple[str, ...]:
+    """The coefficients of the corner plot, as `sample` chooses them."""
+    spread = {str(r["NAME"]): 0.5 * float(r["HIGH68"] - r["LOW68"]) for r in run.intervals}
+    table = None if run.product is None else run.product.parameters
+    prior = {} if table is None else dict(zip(table.name.tolist(), table.prior_width.tolist(), strict=True))
+    return informed(tuple(spread), spread, prior)[:MOST_IN_CORNER]
 
 
 def _figures(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, str]:

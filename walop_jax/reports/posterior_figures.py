@@ -16,6 +16,7 @@ from walop_jax.io.rounding import with_error
 
 SHARES = (0.393, 0.865)  # of the draws: inside 1 and 2 σ of a normal distribution of two coefficients
 BINS = 30  # of a histogram, along each axis
+MOST_IN_CORNER = 6  # coefficients whose axes can carry numbers
 PRIOR_ONLY = 0.9  # of the prior width: a wider posterior is a picture of the prior
 POINTS = 500  # draws shown as points
 LABELS = {
@@ -144,7 +145,10 @@ def corner_figure(
         for j in range(i + 1):
             axes = panels[i, j]
             axes.tick_params(
-                labelsize=6.5 if few else 5, length=2, labelbottom=few and i == k - 1, labelleft=few and 0 == j < i
+                labelsize=6.5 if few else 5,
+                length=2,
+                labelbottom=few and i == k - 1,
+                labelleft=few and 0 == j < i,
             )
             axes.tick_params(axis="x", labelrotation=45)
             for axis in (axes.xaxis, axes.yaxis) if i != j else (axes.xaxis,):

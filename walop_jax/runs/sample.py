@@ -24,8 +24,13 @@ from walop_jax.posterior.checkpoint import Checkpoints
 from walop_jax.posterior.from_run import fit_of_run
 from walop_jax.posterior.output import intervals, report, write_posterior
 from walop_jax.posterior.result import Report
-from walop_jax.reports.named import MOST_IN_CORNER
-from walop_jax.reports.posterior_figures import corner_figure, informed, save_figure, trace_figure
+from walop_jax.reports.posterior_figures import (
+    MOST_IN_CORNER,
+    corner_figure,
+    informed,
+    save_figure,
+    trace_figure,
+)
 from walop_jax.reports.run import CORNER, INTERVALS, POSTERIOR, SAMPLE
 
 CHAINS = "sampling"
