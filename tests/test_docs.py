@@ -24,6 +24,7 @@ TOPICS = (
     "effects",
     "files",
     "model",
+    "recipes",
     "sources",
     "vocabulary",
 )

@@ -56,11 +56,11 @@ def test_refit_writes_product_and_summary(run, calset_file):
 def test_refit_says_what_it_found(call, calset_file, tmp_path):
     shown = call("refit", calset_file, "-o", tmp_path / "run")
     assert "half2.plate.mgf2" in shown.stdout
-    assert "degrees of freedom" in shown.stdout
+    assert "χ²/dof" in shown.stdout
+    assert all(len(line) < 100 for line in shown.stdout.splitlines())
     assert shown.stderr == ""
-    told = call("refit", calset_file, "-o", tmp_path / "run", "--json", "--overwrite", "--seed", 7)
+    told = call("refit", calset_file, "-o", tmp_path / "run", "--json", "--overwrite")
     summary = json.loads(told.stdout)
-    assert summary["seed"] == 7
     assert summary == json.loads((tmp_path / "run" / "summary.json").read_text())
     silent = call("refit", calset_file, "-o", tmp_path / "run", "--quiet", "--overwrite")
     assert silent.output == ""
@@ -156,7 +156,7 @@ def test_missing_and_alien_inputs(call, run, calset_file, tmp_path):
     assert "no such file" in one_line(call("refit", tmp_path / "none.fits", "-o", tmp_path / "run"))
     missing = one_line(call("refit", calset_file, "-o", tmp_path / "run", "--model", tmp_path / "none.toml"))
     assert "none.toml: cannot be read" in missing
-    assert "CALVERS" in one_line(call("refit", run / "calibration.fits", "-o", tmp_path / "run"))
+    assert "calibration product" in one_line(call("refit", run / "calibration.fits", "-o", tmp_path / "run"))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -167,7 +167,7 @@ def test_missing_and_alien_inputs(call, run, calset_file, tmp_path):
         ("refit", "x.fits"),
         ("refti", "x"),
         ("matrix", "x", "--pionts", "y"),
-        ("cite", "--seed", "x"),
+        ("cite", "--seed", "1"),
     ],
 )
 def test_wrong_usage(call, args):

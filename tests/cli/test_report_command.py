@@ -15,11 +15,13 @@ def one_line(result) -> str:
     return errors[0]
 
 
-def test_page_appears_in_the_run_and_is_not_replaced(call, tmp_path):
+def test_page_appears_in_the_run_and_replaces_nothing_but_itself(call, tmp_path):
     folder = handmade_run.make_refit(tmp_path / "run")
     assert "report.html" in call("report", folder).stdout
     first = (folder / "report.html").read_text()
     assert first.startswith("<!DOCTYPE html>")
+    assert call("report", folder, "--quiet").output == ""  # its own page is made anew
+    (folder / "report.html").write_text("a letter")
     assert "exists already" in one_line(call("report", folder))
     assert call("report", folder, "--overwrite", "--quiet").output == ""
     assert sorted(entry.name for entry in folder.iterdir()) == [
@@ -55,7 +57,7 @@ def test_a_real_diagnosis_has_its_pictures_and_its_page(call, spoilt_file, tmp_p
     folder = tmp_path / "run"
     assert call("diagnose", spoilt_file, "-o", folder, "--quiet").exit_code == 0
     assert sorted(entry.name for entry in folder.iterdir()) == [
-        "calibration.fits", "diagnosis.fits", "diagnosis.json", "summary.json",
+        "calibration.fits", "diagnosis.fits", "diagnosis.json", "model.toml", "summary.json",
     ]  # fmt: skip
     assert json.loads(call("report", folder, "--json").stdout)["missing"] == []
     assert "consistent with clp_wobble" in (folder / "report.html").read_text()

@@ -157,3 +157,9 @@ def test_an_examination_changes_no_value(calset, clean):
     again = examined(dataclasses.replace(clean, examined=False))
     np.testing.assert_array_equal(again.values, clean.values)
     np.testing.assert_array_equal(again.covariance, clean.covariance)
+
+
+def test_a_plan_without_noise_is_not_held_against_its_errors(clean):
+    found = refit(simulate(PLAN, seed=7, noiseless=True).calset)
+    assert (found.noiseless, found.trusted, found.warnings) == (True, True, ())
+    np.testing.assert_allclose(found.sigma[found.sigma > 0], clean.sigma[clean.sigma > 0], rtol=0.1)

@@ -12,9 +12,12 @@ import pytest
 
 from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import write_columns
+from walop_jax.io.rounding import value_and_error, with_error
+from walop_jax.reports.other_pages import kind_of_run, render_other
 from walop_jax.reports.page import render
 from walop_jax.reports.run import read_run
-from walop_jax.reports.wording import probability, value_and_error, verdict_of_diagnosis
+from walop_jax.reports.wording import effect_in_words, probability, verdict_of_diagnosis
+from walop_jax.science.field_accuracy import FieldAccuracy
 
 VOID = {"meta", "img", "br", "link", "hr", "input"}
 
@@ -102,14 +105,14 @@ def test_every_section_is_there(diagnosed, refitted):
         "Inputs and versions",
     ]
     page = Page(refitted)
-    assert page.headings == ["What this page lacks", *both]
+    assert page.headings == ["The data", "What this page lacks", *both]
     assert len(page.images) == 2
     page = Page(diagnosed)
     assert [heading for heading in page.headings if heading in both] == both
     wanted = {"What was found", "Residuals before and after", "Candidates", "What these data cannot test",
               "What is unexplained", "Where clp_wobble sits"}  # fmt: skip
     assert wanted <= set(page.headings)
-    assert len(page.images) == 6  # maps, curves, ladder, shares, matrix, errors
+    assert len(page.images) == 5  # maps, curves, shares, matrix, errors; two rungs are a sentence
     assert "What this page lacks" not in page.headings
 
 
@@ -123,7 +126,7 @@ def test_verdict_and_what_was_found(diagnosed):
     assert "Would be separated by: polariser angles over a full turn." in text
     assert "caused by" not in text
     assert "cos(3θ − 57°), θ the polariser angle" in text
-    assert "chwp_axis – fast axes of the half-wave plates" in text
+    assert "chwp_axis – fast axis of the calibration plate" in text
 
 
 def test_numbers_are_those_of_the_files(diagnosed):
@@ -137,8 +140,9 @@ def test_numbers_are_those_of_the_files(diagnosed):
             else number(row[2]) == pytest.approx(entry["sigma"], rel=0.05)
         )
         assert row[3] == entry["unit"]
-    assert [number(v) for v in page.row("+ clp_wobble")[1:]] == [1234.5, 1200, 1.029, 715.8]
-    assert number(page.row("starting model")[1]) == pytest.approx(1950.25, abs=0.06)
+    assert "With clp_wobble χ² goes from 1950.2 (1200 degrees of freedom) to 1234.5 (1200)" in page.text
+    assert "χ²/dof from 1.625 to 1.029" in page.text
+    assert "noise alone gives about 0.75" in page.text
     assert page.row("ghost")[2:] == ["4.75", "0.64"]
     # (15.7512 − 15.63) / 0.05 and (−0.23012 + 0.23) / 0.001, the farthest first
     pulls = [row for row in page.rows if len(row) == 5 and row[4].startswith(("+", "−"))]
@@ -273,7 +277,7 @@ def test_a_free_form_term_is_shown_as_what_it_is(tmp_path):
         in text
     )
     assert "by at most 0.12 %" in text
-    assert len(page.images) == 6
+    assert len(page.images) == 5
 
 
 def test_a_sampled_run_shows_its_posterior(tmp_path):
@@ -293,9 +297,11 @@ def test_a_sampled_run_shows_its_posterior(tmp_path):
     columns |= {name: (values, "", "") for name, values in zip(names, numbers.T, strict=True)}
     write_columns(run / "posterior.ecsv", columns)
     page = Page(render(read_run(run)))
-    shown = ["pupil.magnification", "15.751", "15.730 … 15.772", "15.709 … 15.793", "", "812"]
+    shown = ["pupil.magnification", "15.751", "0.021", "", "15.709", "15.793", "812"]
     assert shown in page.rows
-    assert not any(row[0] == "throughput.n0.p00" and len(row) == 6 for row in page.rows)  # not sampled
+    assert (
+        sum(row[0] == "throughput.n0.p00" for row in page.rows) == 1
+    )  # not sampled: with the parameters only
     assert "converged after 5000 steps – trusted." in " ".join(page.text.split())
     assert page.images[-1]["src"] == "data:image/png;base64,iVBORw=="
 
@@ -319,3 +325,61 @@ def test_limits_and_consequences(tmp_path):
     text = " ".join(page.text.split())
     assert "by at most 0.002 %, which hardly matters." in text
     assert "are 2.5 times as large" in text
+
+
+def test_every_effect_has_words_of_its_own():
+    from walop_jax.model.effects import EFFECTS
+
+    words = [effect_in_words(effect.name) for effect in EFFECTS]
+    assert len(set(words)) == len(EFFECTS)
+    assert [text for text in words if len(text) < 15 or "=" in text] == []
+
+
+def test_error_that_rounds_up_to_the_next_decade_keeps_two_digits():
+    assert with_error(1.23456, 0.0996) == "1.23 ± 0.10"
+    assert with_error(123456.0, 1234.0) == "123500 ± 1200"
+
+
+def test_accuracy_comes_first_and_says_its_share(tmp_path):
+    error = np.array([[2e-4, 5e-4], [9e-4, 0.02]])
+    accuracy = FieldAccuracy(error, (-0.2, 0.2, -0.2, 0.2), "SDSS-r")
+    page = Page(render(read_run(handmade_run.make_refit(tmp_path / "run")), accuracy))
+    assert page.headings[:2] == ["Accuracy of p over the field", "The data"]
+    text = " ".join(page.text.split())
+    assert "uncertain by 0.07 % in the median of the field" in text  # of 0.02, 0.05, 0.09 and 2 %
+    assert "over 75 % of the field" in text
+
+
+def test_the_data_are_told_of(tmp_path):
+    text = " ".join(Page(render(read_run(handmade_run.make_refit(tmp_path / "run")))).text.split())
+    assert "Exposures 2 (2 clp)" in text
+    assert "Polariser angles 2 modulo 180°, widest gap 135°" in text
+    assert "Standards none" in text
+
+
+def test_page_of_a_comparison(tmp_path):
+    numbers = {"median": 0.0123, "rms": 0.02, "p95": 0.03, "max": 0.04, "share_below_goal": 0.875}
+    methods = {m: {"all": dict.fromkeys("qup", numbers)} for m in ("paper", "joint")}
+    document = {"on_grid": methods, "between": methods, "joint_errors_from": "covariance"}
+    (tmp_path / "comparison.json").write_text(json.dumps(document))
+    (tmp_path / "comparison_map.png").write_bytes(b"\x89PNG")
+    assert kind_of_run(tmp_path) == "comparison"
+    text, missing = render_other(tmp_path, "comparison")
+    page = Page(text)
+    assert page.row("on the grid points")[2:] == ["Paper II", "0.012", "0.02", "0.03", "0.04", "87.5 %"]
+    assert len(page.images) == 1
+    assert len(missing) == 3
+    (tmp_path / "comparison.json").write_text("{}")
+    with pytest.raises(DataError, match="has no 'on_grid'"):
+        render_other(tmp_path, "comparison")
+
+
+def test_page_of_an_epoch(tmp_path):
+    moved = {"name": "half1.wedge", "unit": "rad", "old": -0.23, "new": -0.2289, "error": 0.00021, "z": 5.2}
+    document = {"fits": False, "p_value": 1e-5, "test": 60.0, "directions": 20, "moved": [moved],
+                "star_errors": {"p": {"median": 0.012, "max": 0.2}}}  # fmt: skip
+    (tmp_path / "epoch.json").write_text(json.dumps(document))
+    assert kind_of_run(tmp_path) == "epoch"
+    page = Page(render_other(tmp_path, "epoch")[0])
+    assert page.row("half1.wedge") == ["half1.wedge", "−0.23000", "−0.22890", "+5.2", "rad"]
+    assert "The instrument has changed" in page.text

@@ -28,12 +28,12 @@ def fail(*args: object, **more: object) -> None:
 
 def test_a_fit(call, fitted: FittedSet, tmp_path: Path, monkeypatch):
     told: list[str] = []
-    found = refit.refit_sets([fitted.calset], tmp_path / "caller", seed=3, progress=told.append)
+    found = refit.refit_sets([fitted.calset], tmp_path / "caller", progress=told.append)
     assert told[0] == "reading"
     assert told[-1] == "mapping the field"
     assert (found.residuals, found.misfit, found.warnings) == (None, None, ())
     np.testing.assert_allclose(found.result.values, fitted.calibration.values, rtol=1e-12)
-    assert call("refit", fitted.calset, "-o", tmp_path / "command", "--seed", 3, "-q").exit_code == 0
+    assert call("refit", fitted.calset, "-o", tmp_path / "command", "-q").exit_code == 0
     assert_same_files(tmp_path / "command", tmp_path / "caller")
 
     monkeypatch.setattr(refit, "refit", lambda *args, **more: found.result)
@@ -53,6 +53,9 @@ def test_a_diagnosis(spoilt: Path, tmp_path: Path, monkeypatch):
     written = read_run(tmp_path / "caller")
     assert written.missing == ()
     assert written.diagnosis == json.loads(json.dumps(found.document))
+    again = refit.refit_sets([spoilt], tmp_path / "again", model=tmp_path / "caller" / diagnose.MODEL)
+    assert again.result.model.effect_names == ("clp_wobble",)
+    np.testing.assert_allclose(again.result.chi2, found.diagnosis.after.chi2, rtol=1e-6)
     assert written.summary["seed"] == 3
     assert read_product(tmp_path / "caller" / "calibration.fits").verdict.trusted
 

@@ -42,7 +42,7 @@ def test_a_certificate_fails_closed(fitted: FittedSet, tmp_path: Path):
     assert found.document()["valid"] is False
 
 
-def test_epochs_of_one_and_the_same_set(call, fitted: FittedSet):
+def test_epochs_of_one_and_the_same_set(call, fitted: FittedSet, tmp_path: Path):
     told: list[str] = []
     found = compare_epochs(fitted.run, [fitted.calset], progress=told.append)
     assert told
@@ -52,6 +52,10 @@ def test_epochs_of_one_and_the_same_set(call, fitted: FittedSet):
     assert found.new == tuple(entry.sha256 for entry in fitted.calibration.inputs)
     told_by_command = json.loads(call("epoch", fitted.run, fitted.calset, "--json").stdout)
     assert told_by_command == json.loads(json.dumps(found.document()))
+    compare_epochs(fitted.run, [fitted.calset], output=tmp_path / "EPOCH")
+    assert json.loads((tmp_path / "EPOCH" / "epoch.json").read_text())["fits"] is True
+    assert write_report(tmp_path / "EPOCH").missing == ()
+    assert "still fits" in (tmp_path / "EPOCH" / "report.html").read_text()
     with pytest.raises(DataError, match="no such file"):
         compare_epochs(fitted.run / "other.fits", [fitted.calset])
 
@@ -61,9 +65,12 @@ def test_a_report(call, fitted: FittedSet, tmp_path: Path):
     found = write_report(fitted.run, tmp_path / "page.html", progress=told.append)
     assert call("report", fitted.run, "-o", tmp_path / "command.html").exit_code == 0
     assert (tmp_path / "page.html").read_bytes() == (tmp_path / "command.html").read_bytes()
-    assert told == ["reading", "drawing"]
+    assert told == ["reading", "working out the accuracy of p", "drawing"]
+    assert "Accuracy of p over the field" in (tmp_path / "page.html").read_text()
     assert found.length == (tmp_path / "page.html").stat().st_size
     assert "walop-jax diagnose" in found.missing[0]
+    write_report(fitted.run, tmp_path / "page.html")  # its own page is made anew
+    (tmp_path / "page.html").write_text("a letter")
     with pytest.raises(DataError, match="exists already"):
         write_report(fitted.run, tmp_path / "page.html")
 
@@ -75,7 +82,7 @@ def test_a_report_that_fails_leaves_the_old_one(fitted: FittedSet, tmp_path: Pat
         path.write_bytes(b"<!DOCTYPE")
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(walop_jax.runs.report, "render", lambda run: "<!DOCTYPE html>")
+    monkeypatch.setattr(walop_jax.runs.report, "render", lambda *args: "<!DOCTYPE html>")
     monkeypatch.setattr(Path, "write_text", half)
     with pytest.raises(DataError, match="what stood there before is untouched"):
         write_report(fitted.run, tmp_path / "page.html", overwrite=True)

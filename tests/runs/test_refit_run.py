@@ -66,18 +66,18 @@ class Interrupting:
 
 
 def test_a_run_that_is_interrupted_goes_on_where_it_was(frames, large, tmp_path):
-    whole = refit_sets([frames], tmp_path / "whole", seed=5)
+    whole = refit_sets([frames], tmp_path / "whole")
     assert whole.result.converged
     assert whole.residuals is not None
     assert read_product(tmp_path / "whole" / "calibration.fits").residuals is not None
     stop = Interrupting(12)
     with pytest.raises(StopError):
-        refit_sets([frames], tmp_path / "cut", seed=5, progress=stop)
+        refit_sets([frames], tmp_path / "cut", progress=stop)
     assert stop.told[0] == "reading"
     assert stop.told[1].startswith("preparing the fit; data will take ")
     assert [entry.name for entry in (tmp_path / "cut").iterdir()] == ["partial"]
     told: list[str] = []
-    again = refit_sets([frames], tmp_path / "cut", seed=5, progress=told.append)
+    again = refit_sets([frames], tmp_path / "cut", progress=told.append)
     # The sample is not fitted a second time, and the slabs that were done are not done again.
     assert not any(line.startswith("fit: ") for line in told)
     passes = [line for line in told if "points/s" in line]
@@ -133,7 +133,7 @@ def test_the_map_of_a_caller_is_that_of_the_run(frames, large, tmp_path):
 
 def test_a_small_set(call, fitted: FittedSet, tmp_path):
     told: list[str] = []
-    found = refit_sets([fitted.calset], tmp_path / "caller", seed=3, progress=told.append)
+    found = refit_sets([fitted.calset], tmp_path / "caller", progress=told.append)
     assert told[0] == "reading"
     assert told[-1] == "mapping the field"
     assert [line for line in told if line.startswith("fit: step")] == told[2:-1]
@@ -141,7 +141,7 @@ def test_a_small_set(call, fitted: FittedSet, tmp_path):
     assert json.loads((tmp_path / "caller" / "summary.json").read_text()) == json.loads(
         json.dumps(found.summary)
     )
-    assert call("refit", fitted.calset, "-o", tmp_path / "command", "--seed", 3, "-q").exit_code == 0
+    assert call("refit", fitted.calset, "-o", tmp_path / "command", "-q").exit_code == 0
     assert_same_files(tmp_path / "command", tmp_path / "caller")
 
 

@@ -9,7 +9,8 @@ import dataclasses
 import datetime
 import functools
 import operator
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,17 +20,21 @@ from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, Parame
 from walop_jax.calibration.records import Quality, ResidualMap
 from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter, single_wavelength
 from walop_jax.data.frames import Grid
+from walop_jax.data.quantities import in_unit
 from walop_jax.data.records import CALIBRATION_PLATE, Exposures, FilterCurve, InputFile, Site, Sources
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import model_without_data, standard_names
 from walop_jax.fit.model_file import render
+from walop_jax.fit.parameter_table import HEAD, parameter_notes, parameter_rows, parameter_table
 from walop_jax.fit.refit import FitResult
 from walop_jax.instruments.description import parsed
+from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.software import software_versions
 from walop_jax.model import carried
 from walop_jax.model.build import adapted, build, nominal_instrument
 from walop_jax.model.dependence import needs
+from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import Model, effect_context
 
@@ -45,8 +50,8 @@ HIGH_CROSSTALK = 10.0  # condition number of the local 2 × 2 inverse
 TEMPERATURE_MARGIN = 2.0  # K beyond the temperatures of the exposures
 
 
-@dataclasses.dataclass(frozen=True)
-class Calibration:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Calibration(Displayed):
     """An instrument as fitted: model, values and covariance of all parameters, and where they come from.
 
     `field` is (smallest x, largest x, smallest y, largest y) in degrees of the points that were used.
@@ -103,22 +108,61 @@ class Calibration:
         """Standard errors of all parameters."""
         return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
 
+    def to_table(self) -> Any:
+        """All parameters as an astropy table: value, error, unit, start, prior, and whether it was free."""
+        return parameter_table(self.model, self.values, self.sigma)
+
+    def display(self) -> Display:
+        """What it is good for, and the parameters."""
+        v, (low_x, high_x, low_y, high_y) = self.verdict, self.field
+        facts = {
+            "χ²/dof": f"{v.chi2:.1f} / {v.dof} = {v.chi2 / max(v.dof, 1):.4g}",
+            "field": f"X {low_x:+.3f} … {high_x:+.3f}°, Y {low_y:+.3f} … {high_y:+.3f}°",
+            "filters": ", ".join(sorted({str(name) for name in self.exposures.filter})),
+            "effects": ", ".join(self.model.effect_names) or "none beyond the base model",
+            "errors from": f"covariance of the {v.covariance_from}, {v.errors_from}",
+        }
+        return Display(
+            title=f"Calibration of {self.model.name}: {'trusted' if v.trusted else 'not trusted'}",
+            facts=tuple(facts.items()),
+            head=HEAD,
+            rows=parameter_rows(self.model, self.values, self.sigma),
+            notes=(*parameter_notes(self.model, self.sigma), *v.warnings),
+        )
+
     # ------------------------------------------------------------------------------- asking for the matrix
 
     def matrix(
-        self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings | None = None
-    ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
-        """m21, m22, m23, m31, … and their covariance at field positions (deg), a setting for each.
+        self, x: Any, y: Any, settings: Settings | None = None
+    ) -> tuple[Float[np.ndarray, "*p m"], Float[np.ndarray, "*p m m"]]:
+        """m21, m22, m23, m31, … and their covariance at field positions (deg, or quantities), a setting for each.
 
-        Without `settings` those of `usual_settings`. Raises `DataError` for a filter that neither the calibration
-        nor the package knows, and ValueError for a moving element that the instrument does not have.
+        Without `settings` those of `usual_settings`; a single one serves all positions. Beyond the field of the
+        instrument all is NaN. Raises `DataError` for a unit that is none of angles, a position that is not finite and a
+        filter that neither the calibration nor the package knows, ValueError for a moving element that the instrument
+        does not have.
         """
-        settings = settings or self.usual_settings(len(x))
+        x, y = np.broadcast_arrays(in_unit(x, "deg", "x"), in_unit(y, "deg", "y"))
+        if not np.all(np.isfinite(x) & np.isfinite(y)):
+            raise DataError("x, y: a position is not finite; leave it out")
+        count, shape = x.size, x.shape
+        settings = settings or self.usual_settings(count)
+        if len(settings) == 1:
+            settings = settings[np.zeros(count, int)]
+        x, y = x.ravel(), y.ravel()
+        inside = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) <= self.model.template.field_limit)
+        size = 3 * len(self.model.template.arms)
+        m, covariance = np.full((count, size), np.nan), np.full((count, size, size), np.nan)
+        if inside.size:
+            m[inside], covariance[inside] = self._elements(x[inside], y[inside], settings[inside])
+        return m.reshape(*shape, size), covariance.reshape(*shape, size, size)
+
+    def _elements(
+        self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings
+    ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
         filters = {str(name): self.filter_curve(str(name)) for name in np.unique(settings.filter)}
         instrument = self.model.instrument(self.values)
-        return matrices(
-            instrument, settings, filters, np.asarray(x, float), np.asarray(y, float), self.covariance
-        )
+        return matrices(instrument, settings, filters, x, y, self.covariance)
 
     def usual_settings(self, count: int = 1, filter_name: str = DEFAULT_FILTER) -> Settings:
         """Flat photon spectrum, 10 °C, on the meridian, moving elements out.
@@ -195,7 +239,7 @@ class Calibration:
         grid = Grid(size, size, (centre, centre), (0.0, 0.0), ((step, 0.0), (0.0, step)))
         points = grid.points
         settings = self.usual_settings(size * size, name)
-        values, covariance = self.matrix(points.x, points.y, settings)
+        values, covariance = self._elements(points.x, points.y, settings)
         errors = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
         planes = (-1, size, size)
         return MatrixMaps(
@@ -239,13 +283,16 @@ class Calibration:
         )
 
     @classmethod
-    def from_product(cls, product: CalibrationProduct) -> Calibration:
+    def from_product(
+        cls, product: CalibrationProduct, catalogue: Sequence[type[Effect]] = EFFECTS
+    ) -> Calibration:
         """The calibration that a product holds; parameters go by name, whatever their order there.
 
+        `catalogue` are the effects that its model may have.
         Raises ValueError if the model of the product cannot be rebuilt, or has other parameters than it
         lists.
         """
-        model = model_of_product(product)
+        model = model_of_product(product, catalogue)
         names = [str(name) for name in product.parameters.name]
         if sorted(model.names) != sorted(names):
             odd = sorted(set(model.names) ^ set(names)) or ["one of them twice"]
@@ -287,14 +334,15 @@ def instrument_as_designed(product: CalibrationProduct) -> Instrument:
     )
 
 
-def model_of_product(product: CalibrationProduct) -> Model:
+def model_of_product(product: CalibrationProduct, catalogue: Sequence[type[Effect]] = EFFECTS) -> Model:
     """The model of a product from its lines of TOML, its standards and its exposures."""
     sources = product.sources
     names = standard_names(sources)
     standards = list(zip(names, sources.q.tolist(), sources.u.tolist(), strict=True))
     design = instrument_as_designed(product)
     context = effect_context(adapted(design, standards=standards), product.exposures)
-    return model_without_data(design, "\n".join(product.model), standards=standards, context=context)
+    text = "\n".join(product.model)
+    return model_without_data(design, text, standards=standards, context=context, catalogue=catalogue)
 
 
 def quality(result: FitResult) -> Quality:

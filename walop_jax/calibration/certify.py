@@ -7,6 +7,7 @@ to find out is whether it says what its own parameters say, and whether that is 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import CalibrationProduct
 from walop_jax.calibration.records import Quality
 from walop_jax.data.filters import BUILTIN_FILTERS
+from walop_jax.model.effects import EFFECTS, Effect
 
 MAP_TOLERANCE = 1e-7  # between maps in the file and maps of its parameters, on another machine
 DARKEST = 1e-4  # of the response to unpolarised light: what "less than no light" may be
@@ -50,11 +52,11 @@ def _range(values: Float[np.ndarray, " e"]) -> tuple[float, float]:
     return (float(known.min()), float(known.max())) if known.size else (float("nan"), float("nan"))
 
 
-def certify(product: CalibrationProduct) -> list[Check]:
+def certify(product: CalibrationProduct, catalogue: Sequence[type[Effect]] = EFFECTS) -> list[Check]:
     """All checks of a product that could be read, in a fixed order; those behind a failed one may be missing."""
     checks = [*_verdict(product), _covariance(product), _validity(product), _parents(product)]
     try:
-        calibration = Calibration.from_product(product)
+        calibration = Calibration.from_product(product, catalogue)
     except ValueError as error:
         return [*checks, Check("model", False, f"cannot be rebuilt: {error}")]
     checks.append(Check("model", True, f"{len(calibration.model.names)} parameters rebuilt by name"))

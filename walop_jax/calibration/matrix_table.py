@@ -10,6 +10,20 @@ from walop_jax.calibration.records import Quality, matrix_names
 from walop_jax.data.settings import Settings
 
 
+def provenance(content: str, calibration: Calibration, *, drawn: bool = False) -> dict[str, str]:
+    """Cards of a table of matrices: the calibration (hash of its content), and what the errors are made from.
+
+    `drawn` where values and errors are those of draws of a posterior.
+    """
+    verdict = calibration.verdict
+    made_from = "draws of the posterior" if drawn else f"covariance of the {verdict.covariance_from}"
+    return {
+        "CALHASH": content,
+        "ERRFROM": f"{made_from}, {verdict.errors_from}",
+        "TRUSTED": str(verdict.trusted)[0],
+    }
+
+
 def matrix_columns(
     calibration: Calibration,
     x: Float[np.ndarray, " p"],

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import inspect
 import os
+import re
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -24,6 +27,7 @@ COMMANDS = (
     "certify",
     "epoch",
     "report",
+    "plot",
     "model",
     "instrument",
     "import-zemax",
@@ -33,11 +37,19 @@ COMMANDS = (
 )
 """In the order of the help; `import-zemax` is the function `import_zemax` of `import_zemax.py`, and so on."""
 
+HELP = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
+EXIT_CODES = (
+    "Exit codes: 0 done; 1 not done, or a check that does not hold, with one line on stderr; 2 wrong usage; 130 "
+    "interrupted."
+)
+
 app = typer.Typer(
     name="walop-jax",
     help="Calibrate the WALOP imaging polarimeters with one differentiable model of the instrument.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings=HELP,
+    epilog=EXIT_CODES,
+    rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
 
@@ -63,13 +75,26 @@ def _program(
     pass
 
 
+def _paragraphs(function: Callable[..., None]) -> str:
+    """The docstring of a command without its line ends: the terminal wraps paragraphs, not the source."""
+    text = inspect.cleandoc(function.__doc__ or "")
+    return "\n\n".join(" ".join(part.split()) for part in text.split("\n\n"))
+
+
+def _in_short(function: Callable[..., None]) -> str:
+    """The first sentence of a command's docstring, up to a colon or semicolon: its line in the list."""
+    return re.split(r"[:;.](?:\s|$)", _paragraphs(function))[0] + "."
+
+
 def _register() -> None:
     for name in COMMANDS:
         identifier = name.replace("-", "_")
         path = f"walop_jax.cli.{identifier}"
         if importlib.util.find_spec(path) is not None:
             function = getattr(importlib.import_module(path), identifier)
-            app.command(name)(guarded(function))
+            app.command(
+                name, context_settings=HELP, help=_paragraphs(function), short_help=_in_short(function)
+            )(guarded(function))
 
 
 _register()

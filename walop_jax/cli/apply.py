@@ -8,13 +8,13 @@ from typing import Annotated
 import typer
 
 from walop_jax.cli.common import (
+    EffectsOption,
     JsonOption,
     OutputTable,
     OverwriteOption,
     PosteriorOption,
     Product,
     QuietOption,
-    SeedOption,
     print_json,
     progress,
     switch_on_jax,
@@ -42,8 +42,8 @@ def apply(
     debias: DebiasOption = "MAS",
     saturation: SaturationOption = None,
     posterior: PosteriorOption = None,
+    effects: EffectsOption = None,
     overwrite: OverwriteOption = False,
-    seed: SeedOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -59,8 +59,8 @@ def apply(
     filter, temperature or colour that the calibration has not seen, 128 a camera is missing, 256 flagged or
     saturated counts, 16384 no result; bits of the calibration itself are added to all rows.
     """
-    del seed  # nothing is random here
     switch_on_jax()
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.apply import apply_to_catalogue
     from walop_jax.science.polarisation import ESTIMATORS
 
@@ -78,6 +78,7 @@ def apply(
             posterior=posterior,
             overwrite=overwrite,
             progress=tell,
+            effects=catalogue_with(effects),
         )
     for sentence in found.warnings:
         warn(sentence)

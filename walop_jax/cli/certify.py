@@ -6,28 +6,34 @@ import typer
 
 from walop_jax.cli.common import (
     CommandError,
+    EffectsOption,
     JsonOption,
     Product,
     QuietOption,
-    SeedOption,
     print_json,
+    progress,
     switch_on_jax,
 )
 
 
 def certify(
-    product: Product, json: JsonOption = False, quiet: QuietOption = False, seed: SeedOption = None
+    product: Product,
+    effects: EffectsOption = None,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Check a calibration product from its checksums to its physics; exit code 1 if anything does not hold.
 
     Version, content hash, convergence, covariance, validity (dates, filters, temperatures), hashes of the
     calibration sets it was made from, maps against parameters, and that no camera sees less than no light.
     """
-    del seed  # nothing is random
     switch_on_jax()
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.certify import certify_product
 
-    found = certify_product(product)
+    with progress(quiet or json) as tell:
+        tell("checking")
+        found = certify_product(product, catalogue_with(effects))
     if json:
         print_json(found.document())
     elif not quiet:

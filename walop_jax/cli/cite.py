@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 from walop_jax.cli.common import (
+    EffectsOption,
     JsonOption,
     QuietOption,
-    SeedOption,
     print_json,
     switch_on_jax,
 )
@@ -21,17 +21,31 @@ Run = Annotated[
 ]
 
 
+BibtexOption = Annotated[bool, typer.Option("--bibtex", help="As BibTeX entries.")]
+
+
 def cite(
-    run: Run = None, json: JsonOption = False, quiet: QuietOption = False, seed: SeedOption = None
+    run: Run = None,
+    bibtex: BibtexOption = False,
+    effects: EffectsOption = None,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """List the sources of the physics in a fitted model, effects included."""
-    del quiet, seed  # the list is all there is, and nothing is random
+    del quiet  # the list is all there is
     switch_on_jax()
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.cite import cite_run
 
-    found = cite_run(run)
+    found = cite_run(run, catalogue_with(effects))
     if json:
         print_json([{"what": entry.what, "source": entry.source} for entry in found])
+        return
+    if bibtex:
+        from walop_jax import __version__
+        from walop_jax.model.bibtex import bibtex as entries
+
+        typer.echo(entries(found, __version__), nl=False)
         return
     for entry in found:
         typer.echo(f"{entry.what}: {entry.source}")

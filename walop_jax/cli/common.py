@@ -7,7 +7,7 @@ import functools
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,9 +28,7 @@ CalsetFiles = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable result to stdout, nothing else.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors.")]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace outputs that exist.")]
-SeedOption = Annotated[
-    int | None, typer.Option("--seed", help="Seed of random numbers; recorded where none are drawn.")
-]
+SeedOption = Annotated[int | None, typer.Option("--seed", help="Seed of random numbers (default: 0).")]
 ModelOption = Annotated[
     Path | None,
     typer.Option("--model", metavar="MODEL.toml", help="Model file: what is free, tied, known, added."),
@@ -43,6 +41,14 @@ InstrumentOption = Annotated[
         help="An instrument that comes with the package, or a description file; see walop-jax instrument.",
     ),
 ]
+EffectsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--effects",
+        metavar="FILE.py",
+        help="Effects of your own beside those of the catalogue; see walop-jax docs adding-an-effect.",
+    ),
+]
 ProcessesOption = Annotated[
     str | None,
     typer.Option(
@@ -52,7 +58,7 @@ ProcessesOption = Annotated[
     ),
 ]
 MemoryOption = Annotated[
-    float, typer.Option("--memory", metavar="GB", min=0.1, help="What the data of field points may take.")
+    float, typer.Option("--memory", metavar="GB", min=0.1, help="Memory for the data, in GB.")
 ]
 
 RunFolder = Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the results.")]
@@ -126,31 +132,50 @@ def print_json(value: Any) -> None:
 
 
 @contextlib.contextmanager
-def progress(quiet: bool) -> Iterator[Callable[[str], None]]:
-    """Give a function that shows what is being done on stderr: on a terminal in one line that is gone at the end.
+def progress(quiet: bool, stages: Sequence[str] = ()) -> Iterator[Callable[[str], None]]:
+    """Give a function that shows on stderr what is being done and for how long: on a terminal in a line that goes.
 
-    Elsewhere a line is printed when there has been none for `LINE_EVERY` seconds.
+    Elsewhere a line is printed when there has been none for `LINE_EVERY` seconds. `stages` are the beginnings of the
+    messages that open a new step; they are numbered.
     """
     from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     console = Console(stderr=True)
     if quiet:
         yield lambda message: None
         return
+    numbered = step_counter(stages)
     if not console.is_terminal:
         began = told = time.monotonic()
 
         def line(message: str) -> None:
             nonlocal told
-            now = time.monotonic()
+            now, text = time.monotonic(), numbered(message)
             if now - told >= LINE_EVERY:
                 told = now
-                typer.echo(f"{now - began:.0f} s: {message}", err=True)
+                typer.echo(f"{now - began:.0f} s: {text}", err=True)
 
         yield line
         return
-    with console.status("") as status:
-        yield status.update
+    columns = (SpinnerColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False))
+    with Progress(*columns, console=console, transient=True) as shown:
+        task = shown.add_task("", total=None)
+        yield lambda message: shown.update(task, description=numbered(message))
+
+
+def step_counter(stages: Sequence[str]) -> Callable[[str], str]:
+    """Give a function that puts "step n of m" ahead of messages, n being that of the last stage that has begun."""
+    reached = 0
+
+    def numbered(message: str) -> str:
+        nonlocal reached
+        for number, stage in enumerate(stages, start=1):
+            if message.startswith(stage):
+                reached = max(reached, number)
+        return f"step {reached} of {len(stages)}: {message}" if reached else message
+
+    return numbered
 
 
 def cache_folder() -> Path | None:

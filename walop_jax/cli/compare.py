@@ -9,6 +9,7 @@ import typer
 
 from walop_jax.cli.common import (
     CalsetFiles,
+    EffectsOption,
     InstrumentOption,
     JsonOption,
     ModelOption,
@@ -27,6 +28,7 @@ TruthOption = Annotated[
     typer.Option("--truth", metavar="TABLE", help="True X, Y, M21 … M33 (FITS, CSV), for simulated sets."),
 ]
 FilterOption = Annotated[str, typer.Option("--filter", metavar="NAME", help="Filter to compare in.")]
+STAGES = ("reading", "fitting the joint model", "fitting and judging")
 
 
 def compare(
@@ -36,6 +38,7 @@ def compare(
     filter_name: FilterOption = "SDSS-r",
     model: ModelOption = None,
     instrument: InstrumentOption = None,
+    effects: EffectsOption = None,
     overwrite: OverwriteOption = False,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -49,9 +52,10 @@ def compare(
     the spectral appendix and the full-Moon scheme.
     """
     switch_on_jax()
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.compare import compare_methods
 
-    with progress(quiet or json) as tell:
+    with progress(quiet or json, STAGES) as tell:
         found = compare_methods(
             calsets,
             output,
@@ -62,6 +66,7 @@ def compare(
             seed=seed,
             overwrite=overwrite,
             progress=tell,
+            catalogue=catalogue_with(effects),
         )
     for sentence in found.warnings:
         warn(sentence)

@@ -9,6 +9,7 @@ import typer
 
 from walop_jax.cli.common import (
     CalsetFiles,
+    EffectsOption,
     InstrumentOption,
     JsonOption,
     ModelOption,
@@ -21,6 +22,7 @@ from walop_jax.cli.common import (
     switch_on_jax,
     warn,
 )
+from walop_jax.io.rounding import with_error
 
 MinutesOption = Annotated[
     float, typer.Option(min=0.0, help="Begin no search for a further name after so long.")
@@ -31,12 +33,15 @@ if TYPE_CHECKING:
 
     from walop_jax.diagnosis.findings import Diagnosis, Step
 
+STAGES = ("reading", "fitting the model", "scoring every", "p = ", "mapping the field")
+
 
 def diagnose(
     calsets: CalsetFiles,
     output: RunFolder,
     model: ModelOption = None,
     instrument: InstrumentOption = None,
+    effects: EffectsOption = None,
     overwrite: OverwriteOption = False,
     seed: SeedOption = None,
     minutes: MinutesOption = 20.0,
@@ -46,17 +51,26 @@ def diagnose(
     """Say what is missing from the model, add it, and fit again: RUN/diagnosis.json and RUN/calibration.fits.
 
     The verdict is consistent, effect_found or unexplained. Effects that the data cannot tell apart are listed
-    together; effects that the data cannot show at all are listed as such. RUN/calibration.fits and
-    RUN/summary.json hold the extended model; RUN/diagnosis.fits what the pictures of `walop-jax report` need.
+    together; effects that the data cannot show at all are listed as such. RUN/calibration.fits and RUN/summary.json
+    are of the extended model, and RUN/model.toml is that model, for `refit --model` and `compare --model`;
+    `walop-jax report` draws its figures from RUN/diagnosis.fits.
     """
     switch_on_jax()
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.diagnose import diagnose_sets
 
-    with progress(quiet or json) as tell:
+    with progress(quiet or json, STAGES) as tell:
         found = diagnose_sets(
-            calsets, output, model=model, instrument=instrument, seed=seed, minutes=minutes,
-            overwrite=overwrite, progress=tell,
-        )  # fmt: skip
+            calsets,
+            output,
+            model=model,
+            instrument=instrument,
+            seed=seed,
+            minutes=minutes,
+            overwrite=overwrite,
+            catalogue=catalogue_with(effects),
+            progress=tell,
+        )
     if json:
         print_json(found.document)
     for sentence in found.diagnosis.after.warnings:
@@ -96,7 +110,7 @@ def _show(found: Diagnosis, output: Path) -> None:
 
 def _about(step: Step) -> Iterator[str]:
     values = [f"{name} = {value}" for name, value in step.choices.items()]
-    values += [f"{n} = {v:.4g} ± {s:.2g} {unit}".rstrip() for n, (v, s, unit) in step.parameters.items()]
+    values += [f"{n} = {with_error(v, s)} {unit}".rstrip() for n, (v, s, unit) in step.parameters.items()]
     if values:
         yield ", ".join(values)
     for other in step.alternatives:

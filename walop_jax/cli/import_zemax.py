@@ -11,7 +11,6 @@ from walop_jax.cli.common import (
     JsonOption,
     OverwriteOption,
     QuietOption,
-    SeedOption,
     print_json,
     progress,
     warn,
@@ -46,7 +45,6 @@ def import_zemax(
     cameras: CamerasOption = "1,3,2,4",
     error: ErrorOption = 1e-3,
     overwrite: OverwriteOption = False,
-    seed: SeedOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -57,7 +55,6 @@ def import_zemax(
 
     Rows that lack a camera are left out, transmissions of 0 are flagged, with a warning in both cases.
     """
-    del seed  # nothing is random here
     try:
         configurations = tuple(int(part) for part in cameras.split(","))
     except ValueError:

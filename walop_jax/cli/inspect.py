@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from walop_jax.cli.common import CommandError, JsonOption, QuietOption, SeedOption, print_json
+from walop_jax.cli.common import CommandError, JsonOption, QuietOption, print_json
 
 if TYPE_CHECKING:
     from walop_jax.data.inspection import Inspection
@@ -16,14 +16,11 @@ if TYPE_CHECKING:
 Files = Annotated[list[Path], typer.Argument(metavar="CALSET...", help="Calibration sets (FITS).")]
 
 
-def inspect(
-    calsets: Files, json: JsonOption = False, quiet: QuietOption = False, seed: SeedOption = None
-) -> None:
+def inspect(calsets: Files, json: JsonOption = False, quiet: QuietOption = False) -> None:
     """Say what is in calibration sets and what is wrong with them.
 
     Each file by itself; then whether they can be fitted as one. Exit code 1 if any cannot be read or fitted.
     """
-    del seed  # nothing is random here
     from walop_jax.runs.inspect import inspect_sets
 
     found = inspect_sets(calsets, progress=None if json or quiet else _show)

@@ -9,6 +9,7 @@ import typer
 
 from walop_jax.cli.common import (
     CalsetFiles,
+    EffectsOption,
     InstrumentOption,
     JsonOption,
     ModelOption,
@@ -33,6 +34,7 @@ def limits(
     ] = None,
     model: ModelOption = None,
     instrument: InstrumentOption = None,
+    effects: EffectsOption = None,
     overwrite: OverwriteOption = False,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -44,6 +46,7 @@ def limits(
     the field without being detected. A set made by walop-jax simulate says what an observing plan is worth.
     """
     switch_on_jax()
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.limits import limits_of_sets
 
     with progress(quiet or json) as tell:
@@ -54,6 +57,7 @@ def limits(
             instrument=instrument,
             seed=seed,
             overwrite=overwrite,
+            catalogue=catalogue_with(effects),
             progress=tell,
         )
     if json:

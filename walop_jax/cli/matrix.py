@@ -8,13 +8,13 @@ from typing import Annotated
 import typer
 
 from walop_jax.cli.common import (
+    EffectsOption,
     JsonOption,
     OutputTable,
     OverwriteOption,
     PosteriorOption,
     Product,
     QuietOption,
-    SeedOption,
     print_json,
     progress,
     switch_on_jax,
@@ -31,8 +31,8 @@ def matrix(
     points: PointsOption,
     output: OutputTable,
     posterior: PosteriorOption = None,
+    effects: EffectsOption = None,
     overwrite: OverwriteOption = False,
-    seed: SeedOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -45,14 +45,20 @@ def matrix(
     points of the calibration, 64 filter or temperature that the calibration has not seen. Beyond the field
     of the instrument (0.35 degrees for the WALOPs) there is no value: NaN and FLAG 32.
     """
-    del seed  # nothing is random here
     switch_on_jax()
     from walop_jax.calibration.records import Quality
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.matrix import tabulate_matrix
 
     with progress(quiet or json) as tell:
         found = tabulate_matrix(
-            product, points, output, posterior=posterior, overwrite=overwrite, progress=tell
+            product,
+            points,
+            output,
+            posterior=posterior,
+            overwrite=overwrite,
+            progress=tell,
+            catalogue=catalogue_with(effects),
         )
     for sentence in found.warnings:
         warn(sentence)

@@ -8,11 +8,11 @@ from typing import Annotated
 import typer
 
 from walop_jax.cli.common import (
+    EffectsOption,
     InstrumentOption,
     JsonOption,
     OverwriteOption,
     QuietOption,
-    SeedOption,
     print_json,
     switch_on_jax,
 )
@@ -34,8 +34,8 @@ def model(
     output: OutputOption = None,
     instrument: InstrumentOption = None,
     effect: EffectOption = None,
+    own: EffectsOption = None,
     overwrite: OverwriteOption = False,
-    seed: SeedOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -44,12 +44,17 @@ def model(
     With calibration sets, the model that `refit` would fit to them. Change the file and give it to
     `refit --model`.
     """
-    del seed  # nothing is random here
     switch_on_jax()
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.model import write_model
 
     made = write_model(
-        output, calsets or (), instrument=instrument, effects=effect or (), overwrite=overwrite
+        output,
+        calsets or (),
+        instrument=instrument,
+        effects=effect or (),
+        overwrite=overwrite,
+        catalogue=catalogue_with(own),
     )
     if json:
         print_json(made.document())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ from walop_jax.cli.common import (
     UNTRUSTED,
     CalsetFiles,
     CommandError,
+    EffectsOption,
     InstrumentOption,
     JsonOption,
     MemoryOption,
@@ -19,7 +21,6 @@ from walop_jax.cli.common import (
     ProcessesOption,
     QuietOption,
     RunFolder,
-    SeedOption,
     print_json,
     progress,
     shared,
@@ -30,35 +31,38 @@ from walop_jax.cli.common import (
 if TYPE_CHECKING:
     from walop_jax.runs.refit import RefitRun
 
+STAGES = ("reading", "preparing the fit", "mapping the field")
+
 
 def refit(
     calsets: CalsetFiles,
     output: RunFolder,
     model: ModelOption = None,
     instrument: InstrumentOption = None,
+    effects: EffectsOption = None,
     overwrite: OverwriteOption = False,
     memory: MemoryOption = 2.0,
     processes: ProcessesOption = None,
-    seed: SeedOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
     """Fit all field points of calibration sets jointly: RUN/calibration.fits and RUN/summary.json.
 
-    RUN is made if need be. A RUN that holds a calibration is left alone unless --overwrite is given; then
-    these two files are replaced and others stay.
+    RUN is created if necessary. If it holds a calibration already, the command stops unless --overwrite is given;
+    then these two files are replaced and all others stay.
 
     A fit that does not converge leaves RUN/summary.failed.json, no calibration, and exit code 1. One that
     converges but is not to be trusted (it does not explain the data, a parameter lies far from its prior, the
     residuals hold patterns or differ between parts of the data) is written with TRUSTED = F and warnings, exit
     code 3.
 
-    Sets of more than 65536 points (whole frames) are read in slabs, anew on every pass. Finished slabs
-    are kept in RUN/partial until the end: the same command goes on where it was interrupted. The
-    calibration holds a map of what the smooth model leaves.
+    Sets of more than 65536 points (whole frames) are read in slabs on every pass. Finished slabs are kept in
+    RUN/partial until the end, so that the same command resumes an interrupted fit. The calibration then holds a map of
+    what the smooth model leaves.
     """
     switch_on_jax()
-    with shared(processes) as crew, progress(quiet or json or crew.index > 0) as tell:
+    with shared(processes) as crew, progress(quiet or json or crew.index > 0, STAGES) as tell:
+        from walop_jax.model.effects.own import catalogue_with
         from walop_jax.runs.refit import refit_sets
 
         found = refit_sets(
@@ -66,11 +70,11 @@ def refit(
             output,
             model=model,
             instrument=instrument,
-            seed=seed,
             overwrite=overwrite,
             memory=memory * 1e9,
             processes=crew,
             progress=tell,
+            catalogue=catalogue_with(effects),
         )
     if crew.index > 0:
         return
@@ -89,25 +93,6 @@ def refit(
 
 
 def _show(found: RefitRun, output: Path) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    result = found.result
-    table = Table("parameter", "value", "error", "unit", "from its prior")
-    series = set(result.model.positions("throughput").tolist())
-    for i, (p, value, sigma) in enumerate(
-        zip(result.model.parameters, result.values, result.sigma, strict=True)
-    ):
-        if i in series or sigma == 0:
-            continue
-        pull = "" if p.prior is None else f"{(value - p.prior[0]) / p.prior[1]:+.2f} σ"
-        table.add_row(p.name, f"{value:.7g}", f"{sigma:.2g}", p.unit, pull)
-    console = Console(highlight=False)
-    console.print(table)
-    console.print(
-        f"χ² = {result.chi2:.6g} for {result.dof} degrees of freedom "
-        f"({result.chi2 / max(result.dof, 1):.4f}), {result.n_data} intensities, "
-        f"{len(result.model.free)} free parameters, {found.seconds:.1f} s",
-        soft_wrap=True,
-    )
-    console.print(f"{'trusted' if result.trusted else 'NOT trusted'}: {output}", markup=False, soft_wrap=True)
+    typer.echo(dataclasses.replace(found.result.display(), notes=found.result.notes).text())
+    verdict = "trusted" if found.result.trusted else "NOT trusted"
+    typer.echo(f"{verdict}: {output}   ({found.seconds:.1f} s)")

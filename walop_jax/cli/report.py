@@ -7,7 +7,15 @@ from typing import Annotated
 
 import typer
 
-from walop_jax.cli.common import JsonOption, OverwriteOption, QuietOption, SeedOption, print_json, progress
+from walop_jax.cli.common import (
+    EffectsOption,
+    JsonOption,
+    OverwriteOption,
+    QuietOption,
+    print_json,
+    progress,
+    switch_on_jax,
+)
 
 RunArgument = Annotated[
     Path, typer.Argument(metavar="RUN", help="Folder of `walop-jax refit` or `diagnose`.")
@@ -16,26 +24,33 @@ OutputOption = Annotated[
     Path | None,
     typer.Option("--output", "-o", metavar="FILE", help="Page to write (default: RUN/report.html)."),
 ]
+STAGES = ("reading", "drawing")
 
 
 def report(
     run: RunArgument,
     output: OutputOption = None,
+    effects: EffectsOption = None,
     overwrite: OverwriteOption = False,
-    seed: SeedOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Write one HTML page about a run, figures inside: no network, nothing beside it, ready to be mailed or printed.
+    """Write one HTML page about a run, figures inside: it needs no network and no other file, and can be mailed or
+    printed.
 
-    The verdict, what was found, residuals before and after, maps of the matrix and of its errors, pulls from the
-    priors, all parameters, warnings, inputs and versions: what of it lies in RUN. The page says what is missing.
+    The verdict, the accuracy of p over the field, what the data were, what was found, residuals before and after, maps
+    of the matrix and of its errors, pulls from the priors, all parameters, warnings, inputs and versions, as far as RUN
+    holds them; the page says what is missing. It also reads the RUN of compare and of epoch. A page that exists is made
+    anew; another file of that name is left alone unless --overwrite is given.
     """
-    del seed  # nothing is random here
+    switch_on_jax()
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.report import write_report
 
-    with progress(quiet or json) as tell:
-        page = write_report(run, output, overwrite=overwrite, progress=tell)
+    with progress(quiet or json, STAGES) as tell:
+        page = write_report(
+            run, output, overwrite=overwrite, catalogue=catalogue_with(effects), progress=tell
+        )
     if json:
         print_json(page.document())
     elif not quiet:

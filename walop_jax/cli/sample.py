@@ -12,6 +12,7 @@ import typer
 from walop_jax.cli.common import (
     UNTRUSTED,
     CommandError,
+    EffectsOption,
     JsonOption,
     ModelOption,
     OverwriteOption,
@@ -41,6 +42,7 @@ def sample(
     run: RunArgument,
     resume: ResumeOption = False,
     model: ModelOption = None,
+    effects: EffectsOption = None,
     sampler: SamplerOption = "emcee",
     inflate: InflateOption = False,
     maximum_steps: MaximumOption = 100_000,
@@ -52,13 +54,14 @@ def sample(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Sample the posterior: RUN/posterior.nc, a intervals, figures; covariance into calibration.fits.
+    """Sample the posterior: RUN/posterior.nc, intervals and figures; the covariance goes into calibration.fits.
 
     Checkpoints lie in RUN/sampling: an interrupted run goes on with --resume, bit for bit, and refuses if
     data, model, priors, sampler, settings or versions have changed. A chain that has not converged is written and
     marked so, with exit code 1; the covariance of the fit then stays in calibration.fits.
     """
     switch_on_jax()
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.posterior import Options
     from walop_jax.runs.sample import sample_run
 
@@ -72,7 +75,15 @@ def sample(
         inflate=inflate,
     )
     with _bar(quiet or json) as progress:
-        found = sample_run(run, options, model=model, resume=resume, overwrite=overwrite, progress=progress)
+        found = sample_run(
+            run,
+            options,
+            model=model,
+            resume=resume,
+            overwrite=overwrite,
+            progress=progress,
+            catalogue=catalogue_with(effects),
+        )
     if json:
         print_json(found.summary)
     for sentence in found.posterior.warnings:
@@ -113,23 +124,5 @@ def _bar(quiet: bool) -> Iterator[Callable[[Progress], None]]:
 
 
 def _show(found: PosteriorSample) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    from walop_jax.posterior.output import intervals
-
-    columns = {name: values for name, (values, _, _) in intervals(found).items()}
-    table = Table("coefficient", "median", "68 %", "95 %", "unit", "ESS")
-    for i, name in enumerate(columns["NAME"]):
-        if name not in found.sampled:
-            continue
-        spans = [
-            f"{columns['LOW' + level][i]:.7g} … {columns['HIGH' + level][i]:.7g}" for level in ("68", "95")
-        ]
-        table.add_row(
-            name, f"{columns['MEDIAN'][i]:.7g}", *spans, columns["UNIT"][i], f"{columns['ESS'][i]:.0f}"
-        )
-    console = Console(highlight=False)
-    console.print(table)
-    console.print(found.convergence.message(), soft_wrap=True)
-    console.print(f"{found.comparison}; {found.seconds:.0f} s", soft_wrap=True)
+    typer.echo(found.display().text())
+    typer.echo(f"{found.seconds:.0f} s")

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from walop_jax.cli.common import (
+    EffectsOption,
     InstrumentOption,
     JsonOption,
     OverwriteOption,
@@ -34,12 +35,14 @@ TruthOption = Annotated[
     Path | None, typer.Option("--truth", metavar="FILE.json", help="Write the true parameters here.")
 ]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="The same seed gives the same set.")]
+STAGES = ("following", "writing")
 
 
 def simulate(
     output: OutputOption,
     instrument: InstrumentOption = None,
     effect: EffectOption = None,
+    effects: EffectsOption = None,
     seed: SeedOption = 0,
     grid: Annotated[int, typer.Option(min=1, help="Field points along each axis.")] = 12,
     standard_grid: Annotated[int, typer.Option(min=1, help="Places of a standard along each axis.")] = 5,
@@ -67,11 +70,13 @@ def simulate(
     """
     switch_on_jax()
     from walop_jax.model.build import nominal_instrument
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.model.instrument import Instrument
     from walop_jax.runs.simulate import simulate_set
     from walop_jax.simulation.effect_text import effect_from_text
     from walop_jax.simulation.observing_plan import NARROW_BANDS, ObservingPlan, polariser_turn
 
+    catalogue = catalogue_with(effects)
     turn = polariser_turn(angles, full_turn=full_turn)
     try:
         design = Instrument.read(instrument) if instrument else nominal_instrument()
@@ -91,19 +96,19 @@ def simulate(
                 plate=(None, 0.0, 45.0) if plate else (None,),
                 filters=("SDSS-r", *NARROW_BANDS) if narrow_bands else ("SDSS-r",),
             )
-        effects = [effect_from_text(text, plan.context()) for text in effect or ()]
+        hidden = [effect_from_text(text, plan.context(), catalogue) for text in effect or ()]
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
 
-    with progress(quiet or json) as tell:
+    with progress(quiet or json, STAGES) as tell:
         made = simulate_set(
-            output, plan, seed=seed, effects=effects, truth=truth, overwrite=overwrite, progress=tell
+            output, plan, seed=seed, effects=hidden, truth=truth, overwrite=overwrite, progress=tell
         )
     if json:
         print_json(made.document())
     elif not quiet:
-        hidden = ", ".join(made.effects) or "nothing"
+        listed = ", ".join(made.effects) or "nothing"
         typer.echo(
             f"{output}: {made.instrument}, {made.exposures} exposures of {made.points} points; "
-            f"{hidden} beyond the base model"
+            f"{listed} beyond the base model"
         )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from walop_jax.cli.common import InstrumentOption, JsonOption, print_json, switch_on_jax, warn
+from walop_jax.cli.common import EffectsOption, InstrumentOption, JsonOption, print_json, switch_on_jax, warn
 
 if TYPE_CHECKING:
     from walop_jax.model.trace import Stage
@@ -41,6 +41,7 @@ TeffOption = Annotated[
 def trace(
     product: ProductArgument = None,
     instrument: InstrumentOption = None,
+    effects: EffectsOption = None,
     x: Annotated[float, typer.Option("--x", help="Field position X (deg).")] = 0.0,
     y: Annotated[float, typer.Option("--y", help="Field position Y (deg).")] = 0.0,
     q: Annotated[float, typer.Option("--q", help="Stokes q of the source, a fraction.")] = 0.0,
@@ -59,6 +60,7 @@ def trace(
     nan = float("nan")
     switch_on_jax()
     from walop_jax.data.settings import Settings
+    from walop_jax.model.effects.own import catalogue_with
     from walop_jax.model.trace import Sightline
     from walop_jax.runs.trace import trace_source
 
@@ -70,7 +72,7 @@ def trace(
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
     try:
-        found = trace_source(ray, product, instrument=instrument)
+        found = trace_source(ray, product, instrument=instrument, catalogue=catalogue_with(effects))
     except ValueError as error:
         if product is not None:
             raise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
 from collections.abc import Collection
@@ -38,6 +39,7 @@ from walop_jax.io.errors import DataError, fail, nearest
 from walop_jax.io.fits_reading import UNREADABLE, OpenFile, one_line, open_fits
 
 _IMAGE = re.compile(r"[NE](0|[1-9][0-9]{0,2})")  # of one camera: counts or errors
+_NO_SETS = (".csv", ".ecsv", ".txt", ".dat", ".vot", ".xml", ".json", ".toml", ".nc", ".npz", ".h5")
 _SAMPLE = 8  # image rows looked at when frames are opened; every block is checked again as it is read
 
 
@@ -54,7 +56,7 @@ def read_calibration_set(*paths: str | os.PathLike[str], kinds: Collection[str] 
         raise fail("no file was given", advice="name at least one calibration set")
     sets: list[CalibrationSet] = []
     for path in paths:
-        one = _read_one(Path(path), (*KINDS, *kinds))
+        one = _read_one(Path(path), kinds)
         known = {entry.inputs[0].sha256: entry.inputs[0].path for entry in sets}
         if one.inputs[0].sha256 in known:
             raise fail(
@@ -67,15 +69,26 @@ def read_calibration_set(*paths: str | os.PathLike[str], kinds: Collection[str] 
 
 
 def _read_one(path: Path, kinds: Collection[str]) -> CalibrationSet:
+    if path.is_dir():
+        raise fail("is a folder", file=path, advice="a calibration set is a FITS file; a RUN holds results")
+    if path.suffix.lower() in _NO_SETS:
+        advice = "it is a FITS file (walop-jax docs files); walop_jax.from_arrays makes a set of arrays"
+        raise fail("is no calibration set", file=path, advice=advice)
     with open_fits(path) as opened:
         try:
-            return _from_hdus(opened, kinds)
+            found = _from_hdus(opened, (*KINDS, *kinds))
         except DataError:
             raise
         except UNREADABLE as error:
             raise fail(
                 f"cannot be read: {one_line(error)}", file=path, advice="write the file again"
             ) from error
+    return dataclasses.replace(found, inputs=(InputFile(path, opened.sha256),))
+
+
+def set_from_hdus(opened: OpenFile, kinds: Collection[str] = ()) -> CalibrationSet:
+    """A calibration set from HDUs in memory, checked as a file is; `kinds` as for `read_calibration_set`."""
+    return _from_hdus(opened, (*KINDS, *kinds))
 
 
 def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
@@ -120,7 +133,6 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
         sources=sources,
         filters=with_builtins(filters, exposures),
         intensities=intensities,
-        inputs=(InputFile(path, opened.sha256),),
         remarks=tuple(remarks),
     )
 
@@ -129,7 +141,13 @@ def _header(header: Any, path: Path) -> tuple[int, str, Site]:
     place = Place(path, "PRIMARY")
     version = header.get("CALVERS")
     if version is None:
-        raise place.fail("is missing", "CALVERS", "is this a calibration set?")
+        what = "a calibration product of a fit" if "PRODVERS" in header else "a calibration set"
+        advice = (
+            f"this is {what}: give the set that it was made from"
+            if "PRODVERS" in header
+            else f"is this {what}?"
+        )
+        raise place.fail("is missing", "CALVERS", advice)
     if isinstance(version, bool) or not isinstance(version, int) or not 1 <= version <= CALVERS:
         what = f"is {version!r}, this program reads up to {CALVERS}"
         raise place.fail(what, "CALVERS", "use a newer walop-jax")

@@ -5,13 +5,17 @@ from __future__ import annotations
 import dataclasses
 import enum
 import re
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
+from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import nearest
+from walop_jax.io.plain_tables import astropy_table
 
 KINDS = ("clp", "moon", "standard", "flux", "lamp")
 """Kinds of exposures: through the polariser, full-Moon sky, standard star, known throughput, lamp."""
@@ -220,8 +224,8 @@ class InputFile:
     sha256: str
 
 
-@dataclasses.dataclass(frozen=True)
-class CalibrationSet:
+@dataclasses.dataclass(frozen=True, repr=False)
+class CalibrationSet(Displayed):
     """A calibration set, read, checked and free of units.
 
     `intensities` gives the data of a slice of the points; whole frames are read from disk only then.
@@ -242,6 +246,31 @@ class CalibrationSet:
     def cameras(self) -> int:
         """Number of cameras."""
         return self.intensities.cameras
+
+    def display(self) -> Display:
+        """What was observed, without reading frames."""
+        e, points = self.exposures, self.points
+        kinds = ", ".join(f"{number} {kind}" for kind, number in Counter(e.kind.tolist()).items())
+        facts = {
+            "from": ", ".join(str(entry.path) for entry in self.inputs) or self.origin or "memory",
+            "exposures": f"{len(e)} ({kinds})",
+            "field points": f"{len(points)}, X {points.x.min():+.3f} … {points.x.max():+.3f}°, "
+            f"Y {points.y.min():+.3f} … {points.y.max():+.3f}°",
+            "cameras": str(self.cameras),
+            "filters": ", ".join(sorted({str(name) for name in e.filter})),
+            "standards": ", ".join(str(name) for name in self.sources.name) or "none",
+        }
+        return Display(f"Calibration set of {self.instrument}", tuple(facts.items()), notes=self.remarks)
+
+    def to_table(self) -> Any:
+        """The exposures as an astropy table, with the columns of EXPOSURES."""
+        units = {"MJD": "d", "EXPTIME": "s", "TEMP": "Celsius", "HA": "h", "TEFF": "K"}
+        angles = ("RA", "DEC", "ROTATOR")
+        columns = {
+            name: (values, "deg" if name in angles or name.endswith("_ANGLE") else units.get(name, ""), "")
+            for name, values in self.exposures.columns().items()
+        }
+        return astropy_table(columns)
 
 
 class Intensities:

@@ -76,6 +76,29 @@ def read_input_table(path: str | os.PathLike[str]) -> InputTable:
     return InputTable(path, len(table), table)
 
 
+def in_memory(columns: Any, name: str = "the table") -> InputTable:
+    """A table given in memory: an astropy table, or columns by name (arrays, lists, scalars, quantities).
+
+    `name` is what errors call it. Raises `DataError` if it has no rows, or columns of different lengths.
+    """
+    from astropy.table import Table
+
+    try:
+        if isinstance(columns, Table):
+            table = Table(columns, copy=False)  # quantities become columns with a unit
+        else:
+            arrays = {str(key): np.atleast_1d(values) for key, values in dict(columns).items()}
+            rows = max((len(values) for values in arrays.values()), default=0)
+            table = Table({k: np.repeat(v, rows, axis=0) if len(v) == 1 else v for k, v in arrays.items()})
+    except (TypeError, ValueError) as error:
+        raise fail(
+            f"is no table: {one_line(error)}", file=name, advice="give columns of one length"
+        ) from error
+    if len(table) == 0:
+        raise fail("has no rows", file=name, advice="nothing to be done")
+    return InputTable(Path(name), len(table), table)
+
+
 def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
     """A column as an array in the unit, and of the kind, that `rule` asks for.
 
@@ -103,14 +126,17 @@ def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
 def vector_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
     """A column with `rule.width` numbers in a row, or that many columns `name`0, `name`1, … side by side.
 
-    Text formats have no vectors, hence the second form; N_ERR is N0_ERR, N1_ERR, … there. Raises `DataError`
-    as `numeric_column` does, and for a row of another width.
+    Text formats have no vectors, hence the second form; N_ERR is N0_ERR, N1_ERR, … or N_ERR0, N_ERR1, … there. Raises
+    `DataError` as `numeric_column` does, and for a row of another width.
     """
     place = Place(source.path, "")
     width = rule.width or 1
     if name not in source.names:
         head, _, tail = name.partition("_")
         parts = [f"{head}{k}{'_' + tail if tail else ''}" for k in range(width)]
+        behind = [f"{name}{k}" for k in range(width)]
+        if any(part in source.names for part in behind):
+            parts = behind
         if not any(part in source.names for part in parts):
             if rule.missing is not None:
                 return np.full((source.rows, width), rule.missing)
@@ -190,6 +216,17 @@ def write_output_table(
     """
     kind = table_format(path)
     check_output(path, overwrite=overwrite)
+    table = extended(source, added, header)
+    with atomic_path(path, overwrite=overwrite) as temporary, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            table.write(temporary, format=kind, overwrite=True)
+        except (ValueError, TypeError) as error:
+            raise fail(f"cannot be written: {one_line(error)}", file=path, advice="try .ecsv") from error
+
+
+def extended(source: InputTable, added: Mapping[str, Any], header: Mapping[str, Any] | None = None) -> Any:
+    """A copy of a table with columns added as for `write_output_table`, an astropy table."""
     table = source.table.copy(copy_data=False)
     for key in [key for key in table.meta if key.upper() in ("CHECKSUM", "DATASUM", "EXTNAME")]:
         del table.meta[key]
@@ -202,9 +239,4 @@ def write_output_table(
         table[name] = values
         if description:
             table[name].description = description
-    with atomic_path(path, overwrite=overwrite) as temporary, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            table.write(temporary, format=kind, overwrite=True)
-        except (ValueError, TypeError) as error:
-            raise fail(f"cannot be written: {one_line(error)}", file=path, advice="try .ecsv") from error
+    return table

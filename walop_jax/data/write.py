@@ -35,11 +35,25 @@ def write_calibration_set(
     Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only,
     for fewer than two cameras, and if a name cannot be written in FITS (ASCII only).
     """
-    intensities = calset.intensities
-    if not isinstance(intensities, TableIntensities):
-        intensities = TableIntensities.dense(calset.points, intensities.block(0, len(calset.points)))
+    intensities = _as_table(calset)
     with atomic_path(path, overwrite=overwrite) as temporary:
-        sign_and_write([*_head(calset, path), *_body(calset, intensities, path)], temporary)
+        sign_and_write(_table_hdus(calset, intensities, path), temporary)
+
+
+def set_hdus(calset: CalibrationSet, path: object) -> list[Any]:
+    """The HDUs of a calibration set as tables; errors name `path`."""
+    return _table_hdus(calset, _as_table(calset), path)
+
+
+def _as_table(calset: CalibrationSet) -> TableIntensities:
+    intensities = calset.intensities
+    if isinstance(intensities, TableIntensities):
+        return intensities
+    return TableIntensities.dense(calset.points, intensities.block(0, len(calset.points)))
+
+
+def _table_hdus(calset: CalibrationSet, intensities: TableIntensities, path: object) -> list[Any]:
+    return [*_head(calset, path), *_body(calset, intensities, path)]
 
 
 def sign_and_write(hdus: list[Any], path: Path) -> None:

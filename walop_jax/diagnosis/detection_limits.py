@@ -40,6 +40,7 @@ from walop_jax.diagnosis.naming import SEPARATION
 from walop_jax.diagnosis.score import Scorer, ScoreSpace, whitening
 from walop_jax.diagnosis.trust import sampled
 from walop_jax.fit.refit import FitResult
+from walop_jax.io.plain_tables import astropy_table
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.parameters import field_declarations
@@ -89,6 +90,29 @@ class DetectionLimits:
     protection: Vector
     caused_by: tuple[str, ...]
     untestable: tuple[str, ...]
+
+    def to_table(self) -> Any:
+        """A row for each effect and parameter, the largest error of q and u first, as an astropy table."""
+        rows, nothing = self.limits, ("", "")
+        return astropy_table(
+            {
+                "EFFECT": (np.array([r.effect for r in rows], "U32"), *nothing),
+                "PARAMETER": (np.array([r.parameter for r in rows], "U32"), *nothing),
+                "UNIT": (np.array([r.unit for r in rows], "U16"), "", "of DETECTED and NAMED"),
+                "DETECTED": (
+                    np.array([r.detected for r in rows]).reshape(-1, 2),
+                    "",
+                    "over the shapes: least, most",
+                ),
+                "NAMED": (np.array([r.named for r in rows], float), "", "named alone with 99 % probability"),
+                "QU_ERROR": (
+                    np.array([r.error_of_qu for r in rows]).reshape(-1, 2),
+                    "",
+                    "median, largest over field",
+                ),
+                "TAKEN_FOR": (np.array([", ".join(r.taken_for) for r in rows], "U128"), *nothing),
+            }
+        )
 
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""

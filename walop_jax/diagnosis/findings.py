@@ -10,6 +10,9 @@ from jaxtyping import Float
 
 from walop_jax.diagnosis.design import HeldOut
 from walop_jax.fit.refit import FitResult
+from walop_jax.io.display import Display, Displayed
+from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.rounding import value_and_error
 
 Outcome = Literal["consistent", "effect_found", "unexplained"]
 Cube = Float[np.ndarray, "p e k"]
@@ -103,8 +106,8 @@ class Unexplained:
     change_of_qu: float = float("nan")
 
 
-@dataclasses.dataclass(frozen=True)
-class Diagnosis:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Diagnosis(Displayed):
     """What is missing from a model, according to one calibration set.
 
     `candidates` are (effect, score, corrected p) in the first examination; `before` is the fit of the model given,
@@ -151,3 +154,46 @@ class Diagnosis:
                 "exposures have disturbances of their own"
             )
         return "; ".join(parts)
+
+    def to_table(self) -> Any:
+        """The parameters of all effects that were found, as an astropy table."""
+        found = [(s, name, *entry) for s in self.steps for name, entry in s.parameters.items()]
+        return astropy_table(
+            {
+                "EFFECT": (np.array([s.effect for s, *_ in found], "U32"), "", "effect"),
+                "PARAMETER": (np.array([name for _, name, *_ in found], "U32"), "", "its parameter"),
+                "VALUE": (np.array([v for _, _, v, _, _ in found], float), "", "fitted value"),
+                "SIGMA": (np.array([s for _, _, _, s, _ in found], float), "", "standard error"),
+                "UNIT": (np.array([u for *_, u in found], "U16"), "", "unit of the numbers of this row"),
+                "P_VALUE": (np.array([s.p_value for s, *_ in found], float), "", "corrected for all tried"),
+            },
+            {"VERDICT": self.verdict},
+        )
+
+    def display(self) -> Display:
+        """The verdict, and what was found."""
+        rows = []
+        for step in self.steps:
+            entries: dict[str, Any] = {name: (value, 0.0, "") for name, value in step.choices.items()}
+            for name, (value, sigma, unit) in (entries | step.parameters).items():
+                texts = value_and_error(value, sigma)
+                rows.append((step.effect, name, *texts, unit, f"{step.p_value:.1g}"))
+        before, after = (fit.chi2 / max(fit.dof, 1) for fit in (self.before, self.after))
+        notes = [
+            f"{s.effect}: these data cannot tell it from {', '.join(s.equivalent)}"
+            for s in self.steps
+            if s.equivalent
+        ]
+        notes += [self.unexplained.description] if self.unexplained is not None else []
+        notes += [self.caution] if self.caution else []
+        return Display(
+            title=f"Diagnosis: {self.verdict}",
+            facts=(
+                ("χ²/dof", f"{before:.4g} → {after:.4g}"),
+                ("p of the starting model", f"{self.p_value:.2g}"),
+                ("field points", str(self.points)),
+            ),
+            head=("effect", "parameter", ">value", ">error", "unit", ">p"),
+            rows=tuple(rows),
+            notes=tuple(notes),
+        )

@@ -59,7 +59,8 @@ def examined(result: FitResult, seed: int = 0) -> FitResult:
     spread over the field are looked at. A χ² that is a few per cent too large while nothing else is wrong is put down
     to the stated errors (`FitResult.noise_only`), and the standard errors are made from the residuals.
     """
-    if not (result.converged and (result.explains_data or result.nearly_explains_data)):
+    explained = result.explains_data or result.nearly_explains_data
+    if not result.converged or result.noiseless or not explained:
         return dataclasses.replace(result, examined=True)
     design = Design.of(sampled(result, limits.TRUST_ROWS))
     table = pattern_scores(design, seed)

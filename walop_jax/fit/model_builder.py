@@ -17,9 +17,11 @@ from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood import limits
 from walop_jax.model.build import adapted, as_designed, nominal_instrument
-from walop_jax.model.effects import Context, effect_by_name
+from walop_jax.model.effects import EFFECTS, Context, Effect, effect_by_name
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import Model, effect_context, make_model, with_effects
+
+Catalogue = Sequence[type[Effect]]
 
 GAUGE = "throughput.n0.p00"
 SKY_AND_STARS = ("sky.", "standard.")  # parameters of the sky and of stars, not of the instrument
@@ -113,9 +115,15 @@ def _throughput_level(calset: CalibrationSet) -> float:
     return float(2.0 * block.counts[rows].mean())
 
 
-def model_for(calset: CalibrationSet, text: str = "", instrument: Instrument | None = None) -> Model:
+def model_for(
+    calset: CalibrationSet,
+    text: str = "",
+    instrument: Instrument | None = None,
+    catalogue: Catalogue = EFFECTS,
+) -> Model:
     """The base model of a calibration set, changed as a model file (TOML text) says; `instrument` as for `base_model`.
 
+    `catalogue` are the effects that the file may name.
     Raises ValueError for anything in the text that does not exist or does not fit the data.
     """
 
@@ -124,7 +132,7 @@ def model_for(calset: CalibrationSet, text: str = "", instrument: Instrument | N
             calset, instrument, plates=header.plates, throughput_degree=header.throughput_degree
         )
         context = effect_context(model.template, calset.exposures)
-        return _with_effects(model, header, context)
+        return _with_effects(model, header, context, catalogue)
 
     return parse(text, build)
 
@@ -136,7 +144,8 @@ def model_like(calset: CalibrationSet, old: Model) -> Model:
     """
     header = header_of(old)
     model = base_model(calset, old.template, plates=header.plates, throughput_degree=header.throughput_degree)
-    model = _with_effects(model, header, effect_context(model.template, calset.exposures))
+    own = tuple(type(effect) for effect in old.template.effects)
+    model = _with_effects(model, header, effect_context(model.template, calset.exposures), own)
     kept = {p.name: p for p in old.parameters if p.name != GAUGE and not p.name.startswith(SKY_AND_STARS)}
     parameters = tuple(
         dataclasses.replace(p, free=kept[p.name].free, prior=kept[p.name].prior, tie=kept[p.name].tie)
@@ -153,12 +162,13 @@ def model_without_data(
     *,
     standards: Sequence[tuple[str, float, float]] = (),
     context: Context | None = None,
+    catalogue: Catalogue = EFFECTS,
 ) -> Model:
     """The model of an instrument as designed, for no data in particular.
 
     `instrument` is one that comes with the package, by name, or any other; `standards` are (name, q, u); `context`
-    says what effects that grow with the data need to know of them. Raises `DataError` for an unknown instrument and
-    ValueError as `model_for` does.
+    says what effects that grow with the data need to know of them; `catalogue` are those the text may name. Raises
+    `DataError` for an unknown instrument and ValueError as `model_for` does.
     """
     design = nominal_instrument(instrument) if isinstance(instrument, str) else as_designed(instrument)
 
@@ -167,17 +177,18 @@ def model_without_data(
             design, standards=standards, plates=header.plates, throughput_degree=header.throughput_degree
         )
         model = make_model(nominal.name, nominal, frozen=(GAUGE,))
-        return _with_effects(model, header, context or Context(sources=nominal.standard.names))
+        known = context or Context(sources=nominal.standard.names)
+        return _with_effects(model, header, known, catalogue)
 
     return parse(text, build)
 
 
-def _with_effects(model: Model, header: Header, context: Context) -> Model:
+def _with_effects(model: Model, header: Header, context: Context, catalogue: Catalogue) -> Model:
     effects: list[Any] = []
     for name in header.effects:
         choices: Mapping[str, Any] = header.choices.get(name, {})
-        kind = effect_by_name(name)
-        effects.append(kind.of(context, **choices) if choices else name)
+        kind = effect_by_name(name, catalogue)
+        effects.append(kind.of(context, **choices) if choices else kind)
     return with_effects(model, effects, context) if effects else model
 
 

@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -16,8 +17,10 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.minimise import Minimum
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.model_file import render
+from walop_jax.fit.parameter_table import HEAD, parameter_notes, parameter_rows, parameter_table
 from walop_jax.fit.robust import robust_errors
 from walop_jax.fit.search import find_minimum, free_scales
+from walop_jax.io.display import Display, Displayed
 from walop_jax.io.software import software_versions
 from walop_jax.likelihood.expansion import STATED, Posterior
 from walop_jax.likelihood.journal import Journal, fingerprint
@@ -31,12 +34,13 @@ Matrix = Float[np.ndarray, "n n"]
 
 SUSPECT_SIGMA = 5.0  # excess of χ² over its expectation, in its own standard deviations
 NEARLY = 1.15  # χ²/dof that errors stated seven per cent too small give
+NOISELESS = 1e-8  # χ²/dof of data that differ from the model by rounding and by the rest of a search
 TOO_LOW = 0.8  # χ²/dof below which the stated errors are those of something else
 PRIOR_EDGE = 4.0  # standard deviations
 
 
-@dataclasses.dataclass(frozen=True)
-class FitResult:
+@dataclasses.dataclass(frozen=True, repr=False)
+class FitResult(Displayed):
     """A fit, the likelihood that it maximises, and how far it can be trusted.
 
     `values` and `covariance` are of all parameters in tree order, frozen ones with zero variance. `trusted` needs a
@@ -124,7 +128,12 @@ class FitResult:
     @property
     def errors_too_large(self) -> bool:
         """Whether χ² is far smaller than noise of the stated size would make it."""
-        return bool(self.excess < -SUSPECT_SIGMA and self.chi2 < TOO_LOW * self.dof)
+        return not self.noiseless and bool(self.excess < -SUSPECT_SIGMA and self.chi2 < TOO_LOW * self.dof)
+
+    @property
+    def noiseless(self) -> bool:
+        """Whether the data are expected counts, with the errors that noise would give them: a plan, not data."""
+        return self.dof > 0 and bool(self.chi2 < NOISELESS * self.dof)
 
     @property
     def at_prior_edge(self) -> tuple[str, ...]:
@@ -150,6 +159,33 @@ class FitResult:
         """Value and standard error of a parameter."""
         i = self.model.index(name)
         return float(self.values[i]), float(self.sigma[i])
+
+    def to_table(self) -> Any:
+        """All parameters as an astropy table: value, error, unit, start, prior, and whether it was free."""
+        return parameter_table(self.model, self.values, self.sigma)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What its table of parameters leaves out, and which of them the data do not constrain."""
+        return parameter_notes(self.model, self.sigma)
+
+    def display(self) -> Display:
+        """The verdict and the parameters."""
+        verdict = "trusted" if self.trusted else "not trusted"
+        facts = {
+            "χ²/dof": f"{self.chi2:.1f} / {self.dof} = {self.chi2 / max(self.dof, 1):.4g}",
+            "intensities": str(self.n_data),
+            "free parameters": str(len(self.model.free)),
+            "effects": ", ".join(self.model.effect_names) or "none beyond the base model",
+            "errors from": self.errors_from,
+        }
+        return Display(
+            title=f"Fit of {self.model.name}: {verdict}",
+            facts=tuple(facts.items()),
+            head=HEAD,
+            rows=parameter_rows(self.model, self.values, self.sigma),
+            notes=(*self.notes, *self.warnings),
+        )
 
 
 def check_constrained(model: Model, posterior: Posterior) -> None:

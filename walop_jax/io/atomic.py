@@ -30,7 +30,11 @@ def check_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> Pa
         if target.is_symlink():
             raise fail("is a symbolic link that leads back to itself", file=path, advice="remove the link")
         if target.exists() and not overwrite:
-            raise fail("exists already", file=path, advice="choose another name, or ask for overwriting")
+            raise fail(
+                "exists already",
+                file=path,
+                advice="choose another name, or give --overwrite (overwrite=True in Python)",
+            )
     except OSError as error:
         raise fail(f"cannot be written: {error}", file=path, advice="choose another place") from error
     if not os.access(folder, os.W_OK | os.X_OK):

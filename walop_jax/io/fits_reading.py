@@ -93,6 +93,16 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[OpenFile]:
         yield OpenFile(path, sha256, units, compressed, remarks)
 
 
+def primary_keywords(path: str | os.PathLike[str]) -> tuple[str, ...]:
+    """Keywords of the primary header, unchecked, to see what a file is; none if it is no FITS file."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return tuple(fits.getheader(path))
+    except UNREADABLE:
+        return ()
+
+
 def one_line(message: object) -> str:
     """Put a message of another library on one line, shortened."""
     return " ".join(str(message).split())[:300] or type(message).__name__

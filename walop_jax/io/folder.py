@@ -31,7 +31,9 @@ def check_folder(path: str | os.PathLike[str], names: Sequence[str] = (), *, ove
         raise fail(f"cannot be written: {error}", file=path, advice="choose another place") from error
     if found and not overwrite:
         raise fail(
-            f"holds {found[0]} already", file=path, advice="choose another folder, or ask for overwriting"
+            f"holds {found[0]} already",
+            file=path,
+            advice="choose another folder, or give --overwrite (overwrite=True in Python)",
         )
     if not os.access(folder, os.W_OK | os.X_OK):
         raise fail("the folder is read-only", file=path, advice="choose another folder")

@@ -23,6 +23,8 @@ FORMATS = {
     ".fits.gz": "fits",
     ".csv": "ascii.csv",
     ".ecsv": "ascii.ecsv",
+    ".vot": "votable",
+    ".votable": "votable",
 }
 """Extensions of tables that are read, and what astropy calls the format."""
 
@@ -39,6 +41,20 @@ def table_format(path: str | os.PathLike[str]) -> str:
     raise fail("is no table that can be read", file=path, advice=f"use {', '.join(FORMATS)}")
 
 
+def astropy_table(
+    columns: Mapping[str, tuple[np.ndarray, str, str]],
+    notes: Mapping[str, str | int | float | bool] | None = None,
+) -> Table:
+    """An astropy table of columns given as (values, unit, description), with notes in `meta`."""
+    return Table(
+        [
+            AstropyColumn(values, name=name, unit=unit or None, description=about)
+            for name, (values, unit, about) in columns.items()
+        ],
+        meta=dict(notes or {}),
+    )
+
+
 def write_columns(
     path: str | os.PathLike[str],
     columns: Mapping[str, tuple[np.ndarray, str, str]],
@@ -51,13 +67,7 @@ def write_columns(
     The format follows the name. Raises `DataError` as `atomic_path` does, and for an unknown extension.
     """
     kind = table_format(path)
-    table = Table(
-        [
-            AstropyColumn(values, name=name, unit=unit or None, description=about)
-            for name, (values, unit, about) in columns.items()
-        ],
-        meta=dict(notes or {}),
-    )
+    table = astropy_table(columns, notes)
     with atomic_path(path, overwrite=overwrite) as temporary, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:

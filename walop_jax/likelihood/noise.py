@@ -38,7 +38,7 @@ class PhotonNoise:
         Raises ValueError for expected counts that are negative or not finite.
         """
         if not (np.isfinite(expected).all() and np.all(expected >= 0.0)):
-            raise ValueError("expected counts must be finite and not negative: no light is darker than none")
+            raise ValueError("expected counts must be finite and non-negative")
         # Read noise first: how many random numbers a Poisson draw takes depends on what is expected.
         read = self.read_noise * rng.standard_normal(expected.shape)
         counts = rng.poisson(expected) + read

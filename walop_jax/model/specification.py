@@ -190,18 +190,18 @@ def effect_context(instrument: Instrument, exposures: Exposures) -> Context:
     )
 
 
-def with_effects(model: Model, effects: Sequence[str | Effect], context: Context) -> Model:
+def with_effects(model: Model, effects: Sequence[str | type[Effect] | Effect], context: Context) -> Model:
     """The model with effects added, in the order light meets them; what it had stays as it was.
 
-    A name adds the effect at its neutral value, at the shape of its first probe; an instance starts where it
+    A name or a class adds the effect at its neutral value, at the shape of its first probe; an instance starts where it
     stands. Priors are centred on neutral, with the widths of the declarations. Raises ValueError for a name
     that does not exist and for an effect that is there already.
     """
     active = list(model.template.effects)
     starts = {}
     for effect in effects:
-        if isinstance(effect, str):
-            kind = effect_by_name(effect)
+        if not isinstance(effect, Effect):
+            kind = effect_by_name(effect) if isinstance(effect, str) else effect
             effect = next((group[0] for group in kind.probes(context)), kind.neutral(context))
         if effect.name in (other.name for other in active):
             raise ValueError(f"effect {effect.name!r} is in the model already")

@@ -5,6 +5,7 @@ The data are found, checked and fitted once more from where it ended.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,19 +19,27 @@ from walop_jax.io.errors import fail
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.expansion import STATED
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects import EFFECTS, Effect
 
 SAME_FIT = 0.05  # standard errors
 
 
-def _locate(path: Path, run: Path) -> Path:
+def locate(path: Path, run: Path) -> Path:
+    """Where the data of a run lie: as they were named, in the folder of the run, or beside it; `DataError` if
+    nowhere."""
     for folder in (Path(), run, run.parent):
         if (folder / path).exists():
             return folder / path
     raise fail("the data of this run are not there any more", file=path, advice="put them back, or refit")
 
 
-def fit_of_run(product: CalibrationProduct, run: Path, model_text: str | None = None) -> FitResult:
-    """The fit behind a calibration product in the folder `run`.
+def fit_of_run(
+    product: CalibrationProduct,
+    run: Path,
+    model_text: str | None = None,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
+) -> FitResult:
+    """The fit behind a calibration product in the folder `run`; `catalogue` are the effects that it may have.
 
     Raises `DataError` when the data are missing, not those of the fit or too many to be sampled, and when the fit does
     not come out as the product says (another model, or another version of the physics). Errors are made as those of
@@ -38,11 +47,12 @@ def fit_of_run(product: CalibrationProduct, run: Path, model_text: str | None = 
     """
     if not product.inputs:
         raise fail("does not say what it was fitted to", file=run, advice="make it with walop-jax refit")
-    calset = read_calibration_set(*(_locate(Path(entry.path), run) for entry in product.inputs))
+    calset = read_calibration_set(*(locate(Path(entry.path), run) for entry in product.inputs))
     if sorted(entry.sha256 for entry in calset.inputs) != sorted(entry.sha256 for entry in product.inputs):
         raise fail("the data have changed since the fit", file=product.inputs[0].path, advice="refit them")
     text = "\n".join(product.model) if model_text is None else model_text
-    model = model_for(calset, text, Calibration.from_product(product).model.template)
+    design = Calibration.from_product(product, catalogue).model.template
+    model = model_for(calset, text, design, catalogue)
     if model.names != tuple(str(name) for name in product.parameters.name):
         raise fail(
             "was fitted with another model", file=run, advice="run walop-jax refit with this model first"

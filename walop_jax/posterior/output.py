@@ -76,15 +76,23 @@ def write_posterior(
         data.to_netcdf(str(temporary), engine="h5netcdf")
 
 
+def read_inference_data(path: str | os.PathLike[str]) -> Any:
+    """A `posterior.nc` as ArviZ InferenceData; `DataError` if it cannot be read."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return arviz().from_netcdf(str(path), engine="h5netcdf")
+    except Exception as error:
+        raise fail(f"cannot be read: {error}", file=path, advice="run walop-jax sample again") from error
+
+
 def read_draws(path: str | os.PathLike[str], names: tuple[str, ...]) -> Float[np.ndarray, "d n"]:
     """Draws of the parameters `names`, all chains one after the other; fixed ones keep their value.
 
     Raises `DataError` for a file that cannot be read, is of another model or may not be trusted.
     """
+    data = read_inference_data(path)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            data = arviz().from_netcdf(str(path), engine="h5netcdf")
         posterior = data.posterior
         fixed = json.loads(posterior.attrs["fixed"])
         trusted = bool(posterior.attrs["trusted"])

@@ -43,19 +43,17 @@ def matrix_draws(
     return result
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class DrawnCalibration(Calibration):
     """A calibration whose matrices, and their covariance, are means over draws of the posterior."""
 
     draws: Float[np.ndarray, "d n"] = dataclasses.field(default_factory=lambda: np.empty((0, 0)))
 
-    def matrix(
-        self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings | None = None
+    def _elements(
+        self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings
     ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
-        """As `Calibration.matrix`, by draws."""
-        settings = settings or self.usual_settings(len(x))
         filters = {str(name): self.filter_curve(str(name)) for name in np.unique(settings.filter)}
-        m = matrix_draws(self.model, self.draws, settings, filters, np.asarray(x), np.asarray(y))
+        m = matrix_draws(self.model, self.draws, settings, filters, x, y)
         mean = m.mean(axis=0)
         away = m - mean
         return mean, np.einsum("dpi,dpj->pij", away, away) / (len(m) - 1)

@@ -9,6 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.io.display import Display, Displayed
+from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.rounding import value_and_error
 from walop_jax.likelihood.expansion import STATED
 from walop_jax.posterior.convergence import Chains, Convergence
 from walop_jax.posterior.samplers import Sampler, make_sampler
@@ -76,8 +79,8 @@ class Progress(NamedTuple):
 Report = Callable[[Progress], None]
 
 
-@dataclasses.dataclass(frozen=True)
-class PosteriorSample:
+@dataclasses.dataclass(frozen=True, repr=False)
+class PosteriorSample(Displayed):
     """The posterior of all coefficients.
 
     `draws` holds (ensemble, draw, parameter) of all parameters in tree order, tied and frozen ones
@@ -161,3 +164,26 @@ class PosteriorSample:
         """Mean and standard deviation of a coefficient."""
         i = self.names.index(name)
         return float(self.mean[i]), float(np.sqrt(self.covariance[i, i]))
+
+    def to_table(self) -> Any:
+        """Median, error, 68 and 95 % intervals of every coefficient that varies, as an astropy table."""
+        from walop_jax.posterior.output import intervals  # which writes what stands here
+
+        return astropy_table(intervals(self), {"TRUSTED": self.trusted})
+
+    def display(self) -> Display:
+        """The verdict on the chains and the sampled coefficients."""
+        table = self.to_table()
+        rows = []
+        for row in table[np.isin(np.asarray(table["NAME"]), self.sampled)]:
+            half = 0.5 * float(row["HIGH68"] - row["LOW68"])
+            ends = [value_and_error(float(row[f"{side}95"]), half)[0] for side in ("LOW", "HIGH")]
+            texts = value_and_error(float(row["MEDIAN"]), half)
+            rows.append((str(row["NAME"]), *texts, str(row["UNIT"]), " … ".join(ends), f"{row['ESS']:.0f}"))
+        return Display(
+            title=f"Posterior: {'trusted' if self.trusted else 'not converged, or not exact enough'}",
+            facts=(("sampler", self.sampler), ("chains", self.convergence.message())),
+            head=("coefficient", ">median", ">error", "unit", ">95 %", ">effective samples"),
+            rows=tuple(rows),
+            notes=(self.comparison, *self.warnings),
+        )

@@ -10,16 +10,14 @@ from __future__ import annotations
 import abc
 import dataclasses
 import importlib
-import importlib.util
-import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from walop_jax.io.errors import fail, nearest
+from walop_jax.io.own_code import classes_of
 from walop_jax.posterior.density import Density
 
 SAMPLERS = {
@@ -111,24 +109,7 @@ def _check_settings(kind: type[Sampler], settings: Mapping[str, Any], given: boo
 
 
 def _from_file(file: str, name: str) -> type[Sampler]:
-    path = Path(file)
-    if not path.is_file():
-        raise fail("there is no such file", file=path, advice="give a sampler as FILE.py:CLASS")
-    module_name = f"walop_jax_sampler_{path.stem}"
-    specification = importlib.util.spec_from_file_location(module_name, path)
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    sys.modules[module_name] = module  # dataclasses look up their module
-    try:
-        specification.loader.exec_module(module)
-    except Exception as error:
-        raise fail(f"cannot be run: {type(error).__name__}: {error}", file=path) from error
-    kinds = {
-        key: value
-        for key, value in vars(module).items()
-        if isinstance(value, type) and issubclass(value, Sampler) and value is not Sampler
-    }
+    kinds = classes_of(file, Sampler, "give a sampler as FILE.py:CLASS")
     if name not in kinds:
-        raise fail(f"has no sampler {name!r}", file=path, advice=nearest(name, kinds))
+        raise fail(f"has no sampler {name!r}", file=file, advice=nearest(name, kinds))
     return kinds[name]

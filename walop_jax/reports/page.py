@@ -16,19 +16,20 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from walop_jax.calibration.records import Quality
+from walop_jax.io.rounding import rounded, value_and_error, with_error, with_minus_sign
 from walop_jax.reports import diagnosis_figures, product_figures
+from walop_jax.reports.about_data import data_in_words, model_entries, symbols_in_words
+from walop_jax.reports.accuracy_figures import accuracy_figure
+from walop_jax.reports.posterior_figures import MOST_IN_CORNER, informed
 from walop_jax.reports.run import RunContents
 from walop_jax.reports.wording import (
     UNNAMED,
     effect_in_words,
     probability,
-    rounded,
-    value_and_error,
     verdict_of_diagnosis,
     verdict_of_fit,
-    with_error,
-    with_minus_sign,
 )
+from walop_jax.science.field_accuracy import FieldAccuracy
 
 TEMPLATES = Path(__file__).parent / "templates"
 MOST_PULLS = 8
@@ -37,25 +38,30 @@ SHOWN_CANDIDATES = 10
 MANY = 24  # parameters of an effect above which its table is folded
 
 
-def render(run: RunContents) -> str:
-    """The HTML text of the page about a run."""
-    environment = jinja2.Environment(
+def render(run: RunContents, accuracy: FieldAccuracy | None = None) -> str:
+    """The HTML text of the page about a run; `accuracy` is that of p over the field, if it is known."""
+    return environment().get_template("report.html").render(_context(run, accuracy))
+
+
+def environment() -> jinja2.Environment:
+    """The templates of all pages, and the functions that they use."""
+    made = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals.update(
+    made.globals.update(
         effect_in_words=effect_in_words,
         value_and_error=value_and_error,
         rounded=rounded,
         probability=probability,
     )
-    return environment.get_template("report.html").render(_context(run))
+    return made
 
 
-def _context(run: RunContents) -> dict[str, Any]:
+def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]:
     summary, diagnosis = run.summary, run.diagnosis
     label, sentence = verdict_of_fit(summary) if diagnosis is None else verdict_of_diagnosis(diagnosis)
     good = diagnosis is None or diagnosis["verdict"] != "unexplained"
@@ -86,7 +92,19 @@ def _context(run: RunContents) -> dict[str, Any]:
         "other_parameters": rest,
         "many": MANY,
         "intervals": [_interval(row) for row in run.intervals],
-        "figures": _figures(run),
+        "figures": _figures(run, accuracy),
+        "versions": summary["versions"],
+        "accuracy": None if accuracy is None else _accuracy_in_words(accuracy),
+        "data": [] if run.product is None else data_in_words(run.product),
+        "symbols": "" if run.corner is None else symbols_in_words(_in_corner(run)),
+    }
+
+
+def _accuracy_in_words(accuracy: FieldAccuracy) -> dict[str, str]:
+    return {
+        "median": f"{100 * accuracy.median:.2g}",
+        "share": f"{100 * accuracy.share:.0f}",
+        "filter": accuracy.filter,
     }
 
 
@@ -123,9 +141,13 @@ def _ladder(run: RunContents) -> list[dict[str, Any]]:
 def _parameters(run: RunContents) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Rows of the fitted coefficients of the instrument; rows of throughputs and of what was not fitted."""
     main, rest = [], []
+    known = {} if run.product is None else model_entries(run.product)
     for name, entry in run.summary["parameters"].items():
         value, sigma = value_and_error(entry["value"], entry["sigma"])
         row = {"name": name, "value": value, "sigma": sigma or "fixed", "unit": entry["unit"]}
+        row |= known.get(name, {"start": "", "prior": "", "state": ""})
+        if row["state"].startswith("tied"):
+            row["sigma"] = sigma or "tied"
         (rest if name.startswith("throughput.") or not sigma else main).append(row)
     return main, rest
 
@@ -154,23 +176,25 @@ def _pulls(run: RunContents) -> list[dict[str, Any]]:
 def _interval(row: Mapping[str, Any]) -> dict[str, str]:
     median, low, high = (float(row[name]) for name in ("MEDIAN", "LOW68", "HIGH68"))
     half = 0.5 * (high - low)
-    spans = {
-        level: [value_and_error(float(row[f"{end}{level}"]), half)[0] for end in ("LOW", "HIGH")]
-        for level in (68, 95)
-    }
-    return {
-        "name": str(row["NAME"]),
-        "unit": str(row["UNIT"]),
-        "median": value_and_error(median, half)[0],
-        "span68": " … ".join(spans[68]),
-        "span95": " … ".join(spans[95]),
-        "ess": f"{float(row['ESS']):.0f}",
-    }
+    ends = {end.lower(): value_and_error(float(row[f"{end}95"]), half)[0] for end in ("LOW", "HIGH")}
+    value, sigma = value_and_error(median, half)
+    names = {"name": str(row["NAME"]), "unit": str(row["UNIT"]), "ess": f"{float(row['ESS']):.0f}"}
+    return names | ends | {"median": value, "sigma": sigma}
 
 
-def _figures(run: RunContents) -> dict[str, str]:
+def _in_corner(run: RunContents) -> tuple[str, ...]:
+    """The coefficients of the corner plot, as `sample` chooses them."""
+    spread = {str(r["NAME"]): 0.5 * float(r["HIGH68"] - r["LOW68"]) for r in run.intervals}
+    table = None if run.product is None else run.product.parameters
+    prior = {} if table is None else dict(zip(table.name.tolist(), table.prior_width.tolist(), strict=True))
+    return informed(tuple(spread), spread, prior)[:MOST_IN_CORNER]
+
+
+def _figures(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, str]:
     """The figures of the run as a whole, as data URIs."""
     made: dict[str, Figure] = {}
+    if accuracy is not None:
+        made["accuracy"] = accuracy_figure(accuracy)
     if run.product is not None:
         made["matrix"] = product_figures.matrix_maps_figure(run.product.maps)
         made["errors"] = product_figures.matrix_errors_figure(run.product.maps)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -12,10 +12,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from walop_jax.io.atomic import atomic_path
-from walop_jax.reports.wording import with_error
+from walop_jax.io.rounding import with_error
 
 SHARES = (0.393, 0.865)  # of the draws: inside 1 and 2 σ of a normal distribution of two coefficients
 BINS = 30  # of a histogram, along each axis
+MOST_IN_CORNER = 6  # coefficients whose axes can carry numbers
+PRIOR_ONLY = 0.9  # of the prior width: a wider posterior is a picture of the prior
 POINTS = 500  # draws shown as points
 LABELS = {
     "sky.depolarisation": "δ",
@@ -43,6 +45,19 @@ def label(name: str, unit: str = "") -> str:
     """Symbol of a coefficient, with its unit."""
     text = LABELS.get(name, name)
     return f"{text} [{unit}]" if unit else text
+
+
+def informed(
+    names: Sequence[str], spread: Mapping[str, float], prior: Mapping[str, float]
+) -> tuple[str, ...]:
+    """The names of which the data say something, most first: posterior narrower than the prior, where there is one.
+
+    `spread` holds standard deviations of the posterior, `prior` those of the prior (NaN: none).
+    """
+    share = {
+        name: spread[name] / prior[name] if np.isfinite(prior.get(name, np.nan)) else 0.0 for name in names
+    }
+    return tuple(sorted((n for n in names if share[n] < PRIOR_ONLY), key=lambda n: share[n]))
 
 
 def _edges(values: Float[np.ndarray, " d"]) -> Float[np.ndarray, " b"]:
@@ -130,7 +145,10 @@ def corner_figure(
         for j in range(i + 1):
             axes = panels[i, j]
             axes.tick_params(
-                labelsize=5, length=2, labelbottom=few and i == k - 1, labelleft=few and 0 == j < i
+                labelsize=6.5 if few else 5,
+                length=2,
+                labelbottom=few and i == k - 1,
+                labelleft=few and 0 == j < i,
             )
             axes.tick_params(axis="x", labelrotation=45)
             for axis in (axes.xaxis, axes.yaxis) if i != j else (axes.xaxis,):
@@ -174,6 +192,8 @@ def trace_figure(
             )
         axes.set_ylabel(label(names[i], units[i]), fontsize=6, rotation=0, ha="right", va="center")
         axes.tick_params(labelsize=5)
+        axes.yaxis.set_major_locator(MaxNLocator(3))
+        axes.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
     panels[-1].set_xlabel("step after burn-in", fontsize=7)
     return figure
 

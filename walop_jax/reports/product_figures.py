@@ -11,7 +11,12 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from walop_jax.calibration.records import MatrixMaps, ResidualMap
-from walop_jax.reports.matrix_panels import element_symbols, matrix_panels
+from walop_jax.reports.matrix_panels import (
+    element_kind,
+    element_panel,
+    element_symbols,
+    matrix_panels,
+)
 from walop_jax.reports.style import (
     DIVERGING,
     SMALL,
@@ -24,8 +29,21 @@ from walop_jax.reports.style import (
 
 def matrix_maps_figure(maps: MatrixMaps) -> Figure:
     """The elements of the instrument matrix over the field as `matrix_panels` draws them."""
-    figure, axes = _by_arm(maps.values, 8.6, 2.45)
+    figure, axes = _by_arm(maps.values, 8.6, 2.65)
     matrix_panels(figure, axes, maps.values, extent(maps), "nearest")
+    return figure
+
+
+def element_maps_figure(maps: MatrixMaps, kind: int) -> Figure:
+    """The elements that Paper II calls by one name (`PAPER_NAMES`): zero offsets, efficiencies or cross-talk."""
+    arms = len(maps.values) // 3
+    chosen = [i for i in range(len(maps.values)) if element_kind(i, arms) == kind]
+    figure = empty_figure(4.0 * max(len(chosen), 1), 3.4)
+    axes = figure.subplots(1, max(len(chosen), 1), squeeze=False)
+    symbols = element_symbols(arms)
+    for axis, i in zip(axes[0], chosen, strict=True):
+        element_panel(figure, axis, i, maps.values, extent(maps), "nearest", symbols[i])
+    outer_labels(axes)
     return figure
 
 

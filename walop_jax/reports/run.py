@@ -19,6 +19,7 @@ from walop_jax.diagnosis.figure_file import FIGURE_DATA, DiagnosisFigureData, re
 from walop_jax.io.errors import DataError, fail
 
 POSTERIOR, INTERVALS, CORNER, SAMPLE = "posterior.nc", "posterior.ecsv", "posterior_corner.png", "sample.json"
+COMPARISON, EPOCH = "comparison.json", "epoch.json"
 SUMMARY_KEYS = ("chi2", "dof", "n_data", "parameters", "converged", "message", "versions", "inputs")
 DIAGNOSIS_KEYS = ("verdict", "steps", "candidates", "unexplained")
 DEFAULTS: dict[str, Any] = {"warnings": [], "remarks": [], "misfit": None}  # what a summary may lack

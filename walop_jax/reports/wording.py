@@ -6,48 +6,17 @@ An agreement is "consistent with" a cause, never proof of one.
 from __future__ import annotations
 
 import math
-import re
-import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from walop_jax.diagnosis.figure_data import UNNAMED
+from walop_jax.io.rounding import rounded, value_and_error
 from walop_jax.model.effects import EFFECTS
 
 TINY = 1e-15  # probabilities below are not to be taken at their word
 MOST_PARAMETERS = 6  # of an effect, in a sentence
 _PROPER = ("Wollaston", "Moon", "Stokes")
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-def with_error(value: float, sigma: float) -> str:
-    """Value and error, two digits of the error: 0.23227 ± 0.00024."""
-    return " ± ".join(value_and_error(value, sigma)) if sigma > 0 else value_and_error(value, sigma)[0]
-
-
-def value_and_error(value: float | str | None, sigma: float | None) -> tuple[str, str]:
-    """Value and error as two texts, both to the second digit of the error; the error is empty where there is none."""
-    if isinstance(value, str):
-        return value, ""
-    if value is None or not math.isfinite(value):
-        return "–", ""
-    if sigma is None or not 0 < sigma < math.inf:
-        return with_minus_sign(f"{value:.7g}"), ""
-    places = max(0, 1 - math.floor(math.log10(sigma)))
-    if places > 8:
-        more = max(0, places + math.floor(math.log10(abs(value) or sigma)))
-        return with_minus_sign(f"{value:.{more}e}"), with_minus_sign(f"{sigma:.1e}")
-    return with_minus_sign(f"{value:.{places}f}"), f"{sigma:.{places}f}"
-
-
-def with_minus_sign(text: str) -> str:
-    """A number with a true minus sign."""
-    return text.replace("-", "−")
-
-
-def rounded(value: float | None, form: str = ".4g") -> str:
-    """A number, or a dash where there is none."""
-    return "–" if value is None or not math.isfinite(value) else with_minus_sign(format(value, form))
 
 
 def probability(p: float | None) -> str:
@@ -73,9 +42,12 @@ def effect_in_words(effect: str) -> str:
     known = next((entry for entry in EFFECTS if entry.name == effect), None)
     if known is None:
         return ""
-    head = (sys.modules[known.__module__].__doc__ or "").strip().splitlines()[0]
-    head = re.sub(r":\s*`.*", "", head).rstrip(".")  # a file of several effects goes on to list them
-    return head if head.startswith(_PROPER) else head[:1].lower() + head[1:]
+    return in_a_sentence((known.__doc__ or "").strip().splitlines()[0].rstrip("."))
+
+
+def in_a_sentence(text: str) -> str:
+    """A heading as it stands inside a sentence: its first letter small, unless it begins with a name."""
+    return text if text.startswith(_PROPER) else text[:1].lower() + text[1:]
 
 
 def listed(items: Sequence[str]) -> str:

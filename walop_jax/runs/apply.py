@@ -6,7 +6,7 @@ import dataclasses
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.user_tables import read_input_table, table_format, write_output_table
 from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import errors_naming
+from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.posterior.propagate import with_moments
 from walop_jax.runs.left_out import left_out_cards, left_out_sentences
 from walop_jax.runs.written_table import WrittenTable
@@ -59,14 +60,16 @@ def apply_to_catalogue(
     saturation: float | None = None,
     posterior: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
+    effects: Sequence[type[Effect]] = EFFECTS,
     progress: Callable[[str], None] | None = None,
 ) -> StokesTable:
     """Add Q, U, P, EVPA, their errors and FLAG to the table `catalogue`, and write it as `output`.
 
-    `product` is a calibration product or the folder of a run; `estimator` is one of `ESTIMATORS`; counts (electrons)
-    from `saturation` on are not used; with `posterior` (a `posterior.nc`) mean and covariance are those of its
-    draws. `progress` is told what is being done. Raises `DataError` for files that cannot be read or written and as
-    `science.apply` does; ValueError for an unknown estimator and a saturation that is not above 0.
+    `product` is a calibration product or the folder of a run; `estimator` is one of `ESTIMATORS`; counts
+    (electrons) from `saturation` on are not used; with `posterior` (a `posterior.nc`) mean and covariance are those
+    of its draws. `effects` are those that its model may have. `progress` is told what is being done. Raises
+    `DataError` for files that cannot be read or written and as `science.apply` does; ValueError for an unknown
+    estimator and a saturation that is not above 0.
     """
     began = time.perf_counter()
     tell = progress or (lambda text: None)
@@ -76,7 +79,7 @@ def apply_to_catalogue(
         raise ValueError(f"saturation {saturation} must be above 0 electrons")
     table_format(output)
     check_output(output, overwrite=overwrite)
-    held = read_calibration(product)
+    held = read_calibration(product, effects)
     table = read_input_table(catalogue)
     instrument = held.calibration.model.template.patched()
     limit = math.inf if saturation is None else saturation

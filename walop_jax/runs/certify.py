@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from walop_jax.calibration.certify import Check, Validity, certify, validity
 from walop_jax.calibration.from_file import product_path
 from walop_jax.calibration.product import PRODVERS, read_product
 from walop_jax.io.errors import errors_naming
+from walop_jax.model.effects import EFFECTS, Effect
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +43,9 @@ class Certificate:
         }
 
 
-def certify_product(product: str | os.PathLike[str]) -> Certificate:
+def certify_product(
+    product: str | os.PathLike[str], catalogue: Sequence[type[Effect]] = EFFECTS
+) -> Certificate:
     """Check a calibration product, or that in the folder of a run, from its checksums to its physics.
 
     Raises `DataError` for a file that cannot be read, that has been changed or is of another version.
@@ -49,6 +53,6 @@ def certify_product(product: str | os.PathLike[str]) -> Certificate:
     path = product_path(product)
     held = read_product(path)
     with errors_naming(path):
-        checks = certify(held)
+        checks = certify(held, catalogue)
     parents = tuple(entry.sha256 for entry in held.inputs)
     return Certificate(path, tuple(checks), validity(held), held.content_hash(), parents)

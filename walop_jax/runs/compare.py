@@ -14,13 +14,15 @@ from walop_jax.data.user_tables import new_table, write_output_table
 from walop_jax.diagnosis.trust import refit
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
+from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.paper.comparison import Comparison, compare
 from walop_jax.reports import comparison_figures
+from walop_jax.reports.run import COMPARISON
 from walop_jax.runs.inputs import sets_and_model
 from walop_jax.runs.left_out import KEY, left_out_cards, left_out_sentences
 from walop_jax.science.star_errors import Truth
 
-DOCUMENT, TABLE = "comparison.json", "comparison.fits"
+DOCUMENT, TABLE = COMPARISON, "comparison.fits"
 FIGURES: Mapping[str, Callable[[Comparison], Any]] = {
     "comparison_histogram.png": comparison_figures.histogram_figure,
     "comparison_map.png": comparison_figures.map_figure,
@@ -50,13 +52,15 @@ def compare_methods(
     instrument: str | os.PathLike[str] | None = None,
     seed: int | None = None,
     overwrite: bool = False,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
     progress: Callable[[str], None] | None = None,
 ) -> ComparedRun:
     """Calibrate with a polynomial per point and with the joint model, judge both, and write the folder `output`.
 
-    `truth` is a table of true X, Y, M21 … M33; without it the reference is the joint model. `instrument` is a shipped
-    one by name or a description file (default: what the sets say), `model` a TOML file (default: the base model);
-    `seed` (None: 0) is that of the stars. `progress` is told what is being done.
+    `truth` is a table of true X, Y, M21 … M33; without it the reference is the joint model. `instrument` is a
+    shipped one by name or a description file (default: what the sets say), `model` a TOML file (default: the base
+    model); `seed` (None: 0) is that of the stars. `catalogue` are the effects that a model may have. `progress` is
+    told what is being done.
 
     Raises `DataError` for files that cannot be read or written, ValueError for a model file that does not fit, if
     the joint fit does not converge, and as `compare` does.
@@ -65,7 +69,7 @@ def compare_methods(
     text = "" if model is None else read_text(model)
     check_folder(output, OUTPUTS, overwrite=overwrite)
     tell("reading")
-    calset, chosen = sets_and_model(calsets, text, model, instrument)
+    calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
     known = None if truth is None else Truth(*true_matrices(truth, chosen.template.patched()))
     tell("fitting the joint model")
     result = refit(calset, chosen, progress=tell)

@@ -19,13 +19,16 @@ from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.trust import examined
 from walop_jax.diagnosis.workflow import MINUTES, diagnose
 from walop_jax.fit.misfit import describe
+from walop_jax.fit.model_file import render
 from walop_jax.fit.refit import with_honest_errors
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.heartbeat import repeated
 from walop_jax.io.text import json_text, read_text
+from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.runs.inputs import sets_and_model
 
-OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, FIGURE_DATA)
+MODEL = "model.toml"
+OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, FIGURE_DATA, MODEL)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,15 +48,17 @@ def diagnose_sets(
     seed: int | None = None,
     minutes: float = MINUTES,
     overwrite: bool = False,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
     progress: Callable[[str], None] | None = None,
 ) -> DiagnosedRun:
     """Find what is missing from the model of calibration sets, add it, fit again, and write the folder `output`.
 
-    `calibration.fits` and `summary.json` are of the extended model, `diagnosis.json` is what was found and
-    `diagnosis.fits` what figures of it need: all four appear, or none. `instrument` is a shipped one by name or a
-    description file (default: what the sets say), `model` a TOML file (default: the base model); `seed` (None: 0) is
-    that of the Monte Carlo. No name is tried for after `minutes`. `progress` is told what is being done, at least every
-    `heartbeat.EVERY` seconds.
+    `calibration.fits` and `summary.json` are of the extended model, `diagnosis.json` is what was found,
+    `diagnosis.fits` what figures of it need, and `model.toml` the extended model for other commands: all of them
+    appear, or none. `instrument` is a shipped one by name or a description file (default: what the sets say),
+    `model` a TOML file (default: the base model); `seed` (None: 0) is that of the Monte Carlo. `catalogue` are the
+    effects that a model may have. No name is tried for after `minutes`. `progress` is told what is being done, at
+    least every `heartbeat.EVERY` seconds.
 
     Raises `DataError` for files that cannot be read or written, ValueError for a model file that does not fit, and
     what `diagnose` raises.
@@ -63,9 +68,9 @@ def diagnose_sets(
     text = "" if model is None else read_text(model)
     check_folder(output, OUTPUTS, overwrite=overwrite)
     tell("reading")
-    calset, chosen = sets_and_model(calsets, text, model, instrument)
+    calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
     with repeated(tell) as say:
-        found = diagnose(calset, chosen, seed=seed or 0, minutes=minutes, progress=say)
+        found = diagnose(calset, chosen, catalogue=catalogue, seed=seed or 0, minutes=minutes, progress=say)
     tell("mapping the field")
     after = examined(with_honest_errors(found.after))
     product = Calibration.from_fit(after).to_product()
@@ -78,4 +83,5 @@ def diagnose_sets(
         (folder / SUMMARY).write_text(json_text(fitted), encoding="utf-8")
         (folder / DIAGNOSIS).write_text(json_text(content), encoding="utf-8")
         write_figure_data(folder / FIGURE_DATA, drawn_from)
+        (folder / MODEL).write_text(render(after.model), encoding="utf-8")
     return DiagnosedRun(found, content)

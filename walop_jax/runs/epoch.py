@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.from_file import product_path
-from walop_jax.calibration.product import read_product
+from walop_jax.calibration.product import read_product, write_product
+from walop_jax.calibration.summary import PRODUCT
 from walop_jax.data import read_calibration_set
 from walop_jax.diagnosis.document import document as diagnosis_document
 from walop_jax.diagnosis.findings import Diagnosis
@@ -18,9 +18,13 @@ from walop_jax.diagnosis.trust import examined
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import errors_naming
-from walop_jax.io.folder import check_folder
-from walop_jax.runs.refit import OUTPUTS, write_fit
+from walop_jax.io.folder import atomic_folder, check_folder
+from walop_jax.io.text import json_text
+from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.reports.run import EPOCH
 from walop_jax.science.epoch import Epoch, epoch, fit_like
+
+OUTPUTS = (PRODUCT, EPOCH)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,15 +52,17 @@ def compare_epochs(
     output: str | os.PathLike[str] | None = None,
     *,
     overwrite: bool = False,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
     progress: Callable[[str], None] | None = None,
 ) -> EpochComparison:
     """Fit new calibration sets and compare with the calibration `old` (a product, or the folder of a run).
 
-    Where the new fit is not to be trusted, what it lacks is looked for as `diagnose` does. The new fit is kept in the
-    folder `output`, if given. `progress` is told what is being done. Raises `DataError` for files that cannot be read
-    or written, and what `science.epoch` raises.
+    Where the new fit is not to be trusted, what it lacks is looked for as `diagnose` does. With `output` a folder is
+    written that holds the new calibration and `epoch.json`. `catalogue` are the effects that a model may have.
+    `progress` is told what is being done. Raises `DataError` for files that cannot be read or written, and what
+    `science.epoch` raises.
     """
-    began, tell = time.perf_counter(), progress or (lambda text: None)
+    tell = progress or (lambda text: None)
     if output is not None:
         check_folder(output, OUTPUTS, overwrite=overwrite)
     path = product_path(old)
@@ -64,12 +70,16 @@ def compare_epochs(
     calset = read_calibration_set(*calsets)
     tell("fitting the new set")
     with errors_naming(path):
-        calibration = Calibration.from_product(product)
+        calibration = Calibration.from_product(product, catalogue)
         result = examined(fit_like(calibration, calset))
         found = epoch(calibration, result)
+    lacking = None
+    if not found.new_trusted:
+        lacking = diagnose(calset, result.model, catalogue=catalogue, progress=tell)
+    parents = tuple(entry.sha256 for entry in calset.inputs)
+    compared = EpochComparison(found, product.content_hash(), parents, result, lacking)
     if output is not None:
-        write_fit(output, result, seconds=time.perf_counter() - began, overwrite=overwrite)
-    lacking = None if found.new_trusted else diagnose(calset, result.model, progress=tell)
-    return EpochComparison(
-        found, product.content_hash(), tuple(entry.sha256 for entry in calset.inputs), result, lacking
-    )
+        with atomic_folder(output, OUTPUTS, overwrite=overwrite) as folder:
+            write_product(folder / PRODUCT, Calibration.from_fit(result).to_product())
+            (folder / EPOCH).write_text(json_text(compared.document()), encoding="utf-8")
+    return compared

@@ -12,6 +12,7 @@ from walop_jax.diagnosis.detection_limits import DetectionLimits, detection_limi
 from walop_jax.diagnosis.trust import refit
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
+from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.reports.limits_figures import protection_figure, separation_figure
 from walop_jax.runs.inputs import sets_and_model
 
@@ -36,13 +37,14 @@ def limits_of_sets(
     instrument: str | os.PathLike[str] | None = None,
     seed: int | None = None,
     overwrite: bool = False,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
     progress: Callable[[str], None] | None = None,
 ) -> LimitsRun:
     """Fit calibration sets and find what they can show; write the folder `output`, if given.
 
     A set that was simulated from a plan says what the plan is worth. `instrument` is a shipped one by name or a
     description file (default: what the sets say), `model` a TOML file (default: the base model); `seed` (None: 0) is
-    that of the Monte Carlo. `progress` is told what is being done.
+    that of the Monte Carlo. `catalogue` are the effects that are looked at. `progress` is told what is being done.
 
     Raises `DataError` for files that cannot be read or written, ValueError for a model file that does not fit and a fit
     that does not converge, and what `refit` raises.
@@ -52,11 +54,11 @@ def limits_of_sets(
     if output is not None:
         check_folder(output, OUTPUTS, overwrite=overwrite)
     tell("reading")
-    calset, chosen = sets_and_model(calsets, text, model, instrument)
+    calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
     result = refit(calset, chosen, progress=tell)
     if not result.converged:
         raise ValueError(f"the fit did not converge ({result.minimum.message})")
-    found = detection_limits(result, seed=seed or 0, progress=tell)
+    found = detection_limits(result, catalogue=catalogue, seed=seed or 0, progress=tell)
     document = found.document() | {
         "instrument": result.model.name,
         "effects_of_the_model": list(result.model.effect_names),

@@ -13,6 +13,7 @@ from walop_jax.fit.model_builder import effects_text, model_for, model_without_d
 from walop_jax.fit.model_file import render
 from walop_jax.io.atomic import atomic_path, check_output
 from walop_jax.model.build import nominal_instrument
+from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import Model
 
@@ -51,10 +52,11 @@ def write_model(
     *,
     instrument: str | os.PathLike[str] | None = None,
     effects: Sequence[str] = (),
+    catalogue: Sequence[type[Effect]] = EFFECTS,
     overwrite: bool = False,
 ) -> ModelFile:
-    """The base model with `effects` added by name, for `calsets` or else for `instrument` (a shipped one by name or a
-    description file; None: the first of the family).
+    """The base model with `effects` of `catalogue` added by name, for `calsets` or else for `instrument` (a shipped
+    one by name or a description file; None: the first of the family).
 
     It is written as `output`, if that is given. Raises `DataError` for files that cannot be read or written, and
     ValueError, with the nearest names, for an unknown instrument or effect, and for an instrument that is not the
@@ -65,9 +67,9 @@ def write_model(
     changes = effects_text(effects)
     design = Instrument.read(instrument) if instrument is not None else None
     if calsets:
-        model = model_for(read_calibration_set(*calsets), changes, design)
+        model = model_for(read_calibration_set(*calsets), changes, design, catalogue)
     else:
-        model = model_without_data(design or nominal_instrument(), changes)
+        model = model_without_data(design or nominal_instrument(), changes, catalogue=catalogue)
     text = render(model)
     if output is not None:
         with atomic_path(output, overwrite=overwrite) as temporary:

@@ -23,6 +23,7 @@ from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.heartbeat import repeated
 from walop_jax.io.text import json_text, read_text
 from walop_jax.likelihood.processes import Processes
+from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.runs.inputs import sets_and_model
 
 OUTPUTS = (PRODUCT, SUMMARY)
@@ -54,20 +55,21 @@ def refit_sets(
     *,
     model: str | os.PathLike[str] | None = None,
     instrument: str | os.PathLike[str] | None = None,
-    seed: int | None = None,
     overwrite: bool = False,
     memory: float | None = None,
     processes: Processes | None = None,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
     progress: Callable[[str], None] | None = None,
 ) -> RefitRun:
     """Fit all field points of calibration sets jointly, and write the folder `output`.
 
     A fit that has converged leaves `calibration.fits` and `summary.json` there, one that has not
     `summary.failed.json` alone. `instrument` is a shipped one by name or a description file (default: what the sets
-    say), `model` a TOML file (default: the base model); `seed` is recorded, nothing is drawn. `progress` is told in a
-    line what is being done. Of large sets: `memory` (bytes) is what their data may take; finished parts are kept in
-    `output`/partial until the end, and the same call goes on from them; `processes` share the work
-    (`likelihood.processes.join`), each making this call, and the first one writes.
+    say), `model` a TOML file (default: the base model); `catalogue` are the
+    effects that a model may have. `progress` is told in a line what is being done. Of large sets: `memory` (bytes)
+    is what their data may take; finished parts are kept in `output`/partial until the end, and the same call goes
+    on from them; `processes` share the work (`likelihood.processes.join`), each making this call, and the first one
+    writes.
 
     Raises `DataError` for files that cannot be read or written, ValueError for a model file that does not fit, and
     what `refit` raises.
@@ -80,7 +82,7 @@ def refit_sets(
         check_folder(output, OUTPUTS, overwrite=overwrite)
     folder = Path(output)
     tell("reading")
-    calset, chosen = sets_and_model(calsets, text, model, instrument)
+    calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
     with repeated(tell) as say:
         result = refit(
             calset, chosen, folder=folder / PARTIAL, progress=say, memory=memory, processes=processes
@@ -88,7 +90,7 @@ def refit_sets(
     residuals = residual_map(result) if result.likelihood.layout.large and result.converged else None
     misfit = describe(result) if first and not result.explains_data else None
     seconds = time.perf_counter() - began
-    found = summary(result, seconds=seconds, misfit=misfit, residuals=residuals) | {"seed": seed}
+    found = summary(result, seconds=seconds, misfit=misfit, residuals=residuals)
     if first:
         tell("mapping the field")
         _write(folder, result, residuals, found, overwrite=overwrite)

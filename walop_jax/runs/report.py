@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.io.atomic import atomic_path, check_output
+from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.reports.other_pages import kind_of_run, render_other
 from walop_jax.reports.page import render
-from walop_jax.reports.run import read_run
+from walop_jax.reports.run import RunContents, read_run
+from walop_jax.science.field_accuracy import FieldAccuracy, field_accuracy
 
 PAGE = "report.html"
+GENERATOR = '<meta name="generator" content="walop-jax'
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,19 +38,55 @@ def write_report(
     output: str | os.PathLike[str] | None = None,
     *,
     overwrite: bool = False,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
     progress: Callable[[str], None] | None = None,
 ) -> Page:
     """Write an HTML page about the folder `run`, figures inside, as `output` (default: `run`/report.html).
 
-    `progress` is told what is being done. Raises `DataError` as `read_run` does, and if the page cannot be written.
+    `run` is that of a refit, diagnose, sample, compare or epoch. A page of this program is made anew; any other
+    file is left alone unless `overwrite`. `catalogue` are the effects that the model may have. `progress` is told
+    what is being done. Raises `DataError` as `read_run` does, and if the page cannot be written.
     """
     tell = progress or (lambda text: None)
-    target = Path(run) / PAGE if output is None else Path(output)
+    folder = Path(run)
+    target = folder / PAGE if output is None else Path(output)
     tell("reading")
-    found = read_run(Path(run))
+    kind = kind_of_run(folder)
+    found = read_run(folder) if kind == "fit" else None
+    overwrite = overwrite or _is_page(target)
     check_output(target, overwrite=overwrite)
-    tell("drawing")
-    text = render(found)
+    if found is None:
+        tell("drawing")
+        text, missing = render_other(folder, kind)
+    else:
+        tell("working out the accuracy of p")
+        accuracy, lacking = _accuracy(found, catalogue)
+        tell("drawing")
+        missing = (*found.missing, *lacking)
+        text = render(dataclasses.replace(found, missing=missing), accuracy)
     with atomic_path(target, overwrite=overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")
-    return Page(target, len(text.encode()), found.missing)
+    return Page(target, len(text.encode()), missing)
+
+
+def _is_page(path: Path) -> bool:
+    """Whether a file is a page that this program has written: then it is made anew without asking."""
+    try:
+        with path.open(encoding="utf-8") as stream:
+            return GENERATOR in stream.read(1000)
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _accuracy(
+    run: RunContents, catalogue: Sequence[type[Effect]]
+) -> tuple[FieldAccuracy | None, tuple[str, ...]]:
+    """The accuracy of p over the field, or in words why it is not known."""
+    if run.product is None:
+        return None, ()
+    try:
+        found = field_accuracy(Calibration.from_product(run.product, catalogue))
+    except ValueError as error:
+        return None, (f"The accuracy of p over the field is not known: {error}.",)
+    lacking = ("The instrument has a single arm: the accuracy of p depends on how stars are observed.",)
+    return found, () if found is not None else lacking

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,19 @@ from walop_jax.io.errors import fail
 from walop_jax.io.folder import atomic_folder
 from walop_jax.io.plain_tables import write_columns
 from walop_jax.io.text import json_text, read_text
+from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.posterior import Options, PosteriorSample, sample
 from walop_jax.posterior.checkpoint import Checkpoints
 from walop_jax.posterior.from_run import fit_of_run
 from walop_jax.posterior.output import intervals, report, write_posterior
 from walop_jax.posterior.result import Report
-from walop_jax.reports.posterior_figures import corner_figure, save_figure, trace_figure
+from walop_jax.reports.posterior_figures import (
+    MOST_IN_CORNER,
+    corner_figure,
+    informed,
+    save_figure,
+    trace_figure,
+)
 from walop_jax.reports.run import CORNER, INTERVALS, POSTERIOR, SAMPLE
 
 CHAINS = "sampling"
@@ -46,6 +54,7 @@ def sample_run(
     model: str | os.PathLike[str] | None = None,
     resume: bool = False,
     overwrite: bool = False,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
     progress: Report | None = None,
 ) -> SampledRun:
     """Sample the posterior around the fit in the folder `run`, and write it there.
@@ -54,9 +63,9 @@ def sample_run(
     the TOML file of the fit, by default the model that `calibration.fits` holds. A posterior that is to be trusted
     puts its covariance into `calibration.fits`; another is written and marked so, and `calibration.fits` stays.
 
-    `progress` is told what is done, how much of it, τ and the effective sample size. Raises `DataError` if `run` is
-    no folder of a fit, holds a posterior already (neither `resume` nor `overwrite`), or does not fit its data any
-    more; and as `posterior.sample` does.
+    `catalogue` are the effects that the model may have; `progress` is told what is done, how much of it, τ and the
+    effective sample size. Raises `DataError` if `run` is no folder of a fit, holds a posterior already (neither
+    `resume` nor `overwrite`), or does not fit its data any more; and as `posterior.sample` does.
     """
     folder = Path(run)
     if not folder.is_dir():
@@ -66,18 +75,22 @@ def sample_run(
     found = [name for name in OUTPUTS if (folder / name).exists()]
     if found and not (overwrite or resume):
         raise fail(f"holds {found[0]} already", file=folder, advice="go on with --resume, or --overwrite it")
-    result = fit_of_run(product, folder, text)
+    result = fit_of_run(product, folder, text, catalogue)
     if overwrite and not resume:
         Checkpoints(folder / CHAINS, {}).clear()
     posterior = sample(result, options, folder=folder / CHAINS, resume=resume, report=progress)
     posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted)
     summary = report(posterior)
-    _write(folder, product, posterior, summary)
+    _write(folder, product, posterior, summary, catalogue)
     return SampledRun(posterior, summary)
 
 
 def _write(
-    run: Path, product: CalibrationProduct, posterior: PosteriorSample, summary: dict[str, Any]
+    run: Path,
+    product: CalibrationProduct,
+    posterior: PosteriorSample,
+    summary: dict[str, Any],
+    catalogue: Sequence[type[Effect]],
 ) -> None:
     units = dict(zip(posterior.names, posterior.units, strict=True))
     sampled = [units.get(name, "") for name in posterior.sampled]
@@ -87,14 +100,25 @@ def _write(
         write_posterior(folder / POSTERIOR, posterior)
         for name in (INTERVALS_FITS, INTERVALS):
             write_columns(folder / name, intervals(posterior), notes)
-        save_figure(folder / CORNER, corner_figure(_sampled_draws(posterior), posterior.sampled, sampled))
+        shown, draws = _in_corner(posterior, product)
+        save_figure(folder / CORNER, corner_figure(draws, shown, [units.get(name, "") for name in shown]))
         trace = trace_figure(
             posterior.chains, posterior.sampled, sampled, posterior.thin, posterior.convergence.tau
         )
         save_figure(folder / TRACE, trace)
         (folder / SAMPLE).write_text(json_text(summary), encoding="utf-8")
         if posterior.trusted:
-            write_product(folder / PRODUCT, _with_covariance(product, posterior))
+            write_product(folder / PRODUCT, _with_covariance(product, posterior, catalogue))
+
+
+def _in_corner(posterior: PosteriorSample, product: CalibrationProduct) -> tuple[tuple[str, ...], np.ndarray]:
+    """Names and draws of the sampled coefficients that the data constrain best, as many as a figure can label."""
+    draws = _sampled_draws(posterior)
+    spread = dict(zip(posterior.sampled, draws.std(axis=0).tolist(), strict=True))
+    table = product.parameters
+    prior = dict(zip(table.name.tolist(), table.prior_width.tolist(), strict=True))
+    shown = informed(posterior.sampled, spread, prior)[:MOST_IN_CORNER] or posterior.sampled[:MOST_IN_CORNER]
+    return shown, draws[:, [posterior.sampled.index(name) for name in shown]]
 
 
 def _sampled_draws(posterior: PosteriorSample) -> np.ndarray:
@@ -106,9 +130,11 @@ def _sampled_draws(posterior: PosteriorSample) -> np.ndarray:
     return np.concatenate([draws, posterior.ln_f.reshape(-1, 1)], axis=1)
 
 
-def _with_covariance(product: CalibrationProduct, posterior: PosteriorSample) -> CalibrationProduct:
+def _with_covariance(
+    product: CalibrationProduct, posterior: PosteriorSample, catalogue: Sequence[type[Effect]]
+) -> CalibrationProduct:
     """The product with the covariance of the posterior in place of that of the fit."""
-    calibration = Calibration.from_product(product)
+    calibration = Calibration.from_product(product, catalogue)
     verdict = dataclasses.replace(
         calibration.verdict, covariance_from="posterior", errors_from=posterior.errors_from
     )

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Sequence
 from typing import Any
 
 from walop_jax.calibration.from_file import read_calibration
 from walop_jax.data.filters import builtin_filter
 from walop_jax.model.build import nominal_instrument
+from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.trace import Sightline, Stage, trace
 from walop_jax.runs.left_out import KEY, left_out_sentences
@@ -42,6 +44,7 @@ def trace_source(
     product: str | os.PathLike[str] | None = None,
     *,
     instrument: str | os.PathLike[str] | None = None,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
 ) -> TracedSource:
     """The light of a source, stage by stage, through the instrument of a calibration, or `instrument` as designed.
 
@@ -52,7 +55,7 @@ def trace_source(
     if product is None:
         design = nominal_instrument() if instrument is None else Instrument.read(instrument)
         return TracedSource(trace(design, builtin_filter(name), sightline))
-    held = read_calibration(product)
+    held = read_calibration(product, catalogue)
     calibration = held.calibration
     fitted = calibration.model.instrument(calibration.values)
     lost = calibration.left_behind

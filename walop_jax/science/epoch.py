@@ -27,11 +27,15 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import SKY_AND_STARS, model_like
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
+from walop_jax.io.display import Display, Displayed
+from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.rounding import value_and_error, with_minus_sign
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import Model
 from walop_jax.science.star_errors import determinant, joint_errors, sample_stars, statistics
 
 CHANCE = 0.01
+_SHOWN = 8  # parameters
 _KNOWN = 1e-7  # share of the largest eigenvalue below which a direction was measured by neither
 
 
@@ -47,8 +51,8 @@ class MovedParameter:
     z: float
 
 
-@dataclasses.dataclass(frozen=True)
-class Epoch:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Epoch(Displayed):
     """The verdict: `fits` unless the change is one that chance makes in less than 1 % of cases.
 
     `moved` sorts parameters by |z|; `chi2_old` is of the new data with the old instrument; `star_errors` are
@@ -77,6 +81,35 @@ class Epoch:
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
         return dataclasses.asdict(self)
+
+    def to_table(self) -> Any:
+        """The parameters, farthest moved first, as an astropy table."""
+        columns = {"NAME": "name", "OLD": "old", "NEW": "new", "ERROR": "error", "Z": "z", "UNIT": "unit"}
+        about = dict.fromkeys(columns, "") | {"ERROR": "standard error of the change", "Z": "change / error"}
+        return astropy_table(
+            {k: (np.array([getattr(m, v) for m in self.moved]), "", about[k]) for k, v in columns.items()}
+        )
+
+    def display(self) -> Display:
+        """The verdict, and the parameters that have moved farthest."""
+        rows = []
+        for entry in self.moved[:_SHOWN]:
+            old, new = (value_and_error(value, entry.error)[0] for value in (entry.old, entry.new))
+            rows.append((entry.name, old, new, with_minus_sign(f"{entry.z:+.1f}"), entry.unit))
+        errors = self.star_errors["p"]
+        return Display(
+            title="The old calibration still fits" if self.fits else "The instrument HAS CHANGED",
+            facts=(
+                ("chance", f"{self.p_value:.2g} (χ² = {self.test:.1f} in {self.directions} directions)"),
+                (
+                    "stars with the old one",
+                    f"off by {errors['median']:.2g} % in p (median), {errors['max']:.2g} % at most",
+                ),
+            ),
+            head=("parameter", ">old", ">new", ">change / σ", "unit"),
+            rows=tuple(rows),
+            notes=(f"{len(self.moved) - _SHOWN} more in to_table()",) if len(self.moved) > _SHOWN else (),
+        )
 
 
 def fit_like(old: Calibration, calset: CalibrationSet) -> FitResult:

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
-from walop_jax.model.effects import effect_by_name
+from walop_jax.model.effects import EFFECTS, effect_by_name
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.parameters import field_declarations, unknown_name
 
 
-def effect_from_text(text: str, context: Context) -> Effect:
-    """The effect that a text stands for.
+def effect_from_text(text: str, context: Context, catalogue: Sequence[type[Effect]] = EFFECTS) -> Effect:
+    """The effect of `catalogue` that a text stands for.
 
     A value is a number, numbers between slashes (one for each element of the parameter), or a word for a discrete
     choice. Raises ValueError, with the nearest names, for what does not exist, and for values that are missing.
     """
     name, _, rest = (part.strip() for part in text.partition("="))
-    kind = effect_by_name(name)
+    kind = effect_by_name(name, catalogue)
     parameters = tuple(field_declarations(kind))
     values: dict[str, Any] = {}
     if rest and ":" not in rest:
@@ -30,7 +31,8 @@ def effect_from_text(text: str, context: Context) -> Effect:
     known = [field.name for field in dataclasses.fields(kind)]
     for parameter in values:
         if parameter not in known:
-            raise unknown_name(f"parameter of {name}", parameter, known)
+            error = unknown_name(f"parameter of {name}", parameter, known)
+            raise ValueError(f"{error}; {name} takes {', '.join(known)}")
     if parameters and not any(parameter in values for parameter in kind.amplitudes()):
         wanted = " or ".join(kind.amplitudes())
         raise ValueError(f"effect {name!r} changes nothing without a value of {wanted}")

@@ -1,6 +1,6 @@
 """Physical effects beyond the base model: one file each, and `EFFECTS`, in the order light meets them."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.effects.blemish import Blemish
@@ -68,12 +68,13 @@ EFFECTS: tuple[type[Effect], ...] = (
 )
 
 
-def effect_by_name(name: str) -> type[Effect]:
-    """The effect of a canonical name; ValueError with the nearest names when there is none."""
-    for effect in (*EFFECTS, FreeForm):
+def effect_by_name(name: str, catalogue: Sequence[type[Effect]] = EFFECTS) -> type[Effect]:
+    """The effect of a catalogue by its name; ValueError with the nearest names when there is none."""
+    for effect in (*catalogue, FreeForm):
         if effect.name == name:
             return effect
-    raise unknown_name("effect", name, [effect.name for effect in EFFECTS])
+    error = unknown_name("effect", name, [effect.name for effect in catalogue])
+    raise ValueError(f"{error}; one of your own needs --effects FILE.py, or catalogue= in Python")
 
 
 def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:

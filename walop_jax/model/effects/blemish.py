@@ -45,7 +45,7 @@ class Spot(Transmission):
 
 
 class Blemish(Effect):
-    """Throughput of one camera is lower around a field point."""
+    """A dark spot in front of one camera."""
 
     x: Scalar = param(unit="deg", about="centre along X", source=SOURCE, scale=0.02, loose=1.0, default=0.0)
     y: Scalar = param(unit="deg", about="centre along Y", source=SOURCE, scale=0.02, loose=1.0, default=0.0)

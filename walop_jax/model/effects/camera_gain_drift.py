@@ -39,7 +39,7 @@ class GainDrift(DetectorPart):
 
 
 class CameraGainDrift(Effect):
-    """Counts of one camera grow in proportion to time."""
+    """Gain of one camera that drifts with time."""
 
     rate: Scalar = param(
         unit="1/h", about="relative change of the gain", source=SOURCE, width=0.003, default=0.0

@@ -20,7 +20,7 @@ SOURCE = "a plate left in the beam, or a header that is wrong"
 
 
 class ChwpInBeam(Effect):
-    """Calibration plate at 0° where the header says it is out."""
+    """Calibration plate in the beam, at 0°, where the header says that it is out."""
 
     name: ClassVar[str] = "chwp_in_beam"
     reference: ClassVar[str] = SOURCE

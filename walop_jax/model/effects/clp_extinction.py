@@ -25,7 +25,7 @@ SOURCE = "Maharana et al. 2022, Paper II: extinction of the polariser above 5000
 
 
 class ClpExtinction(Effect):
-    """ε of the polariser is `ratio`."""
+    """Extinction ratio of the polariser other than the assumed one."""
 
     ratio: Scalar = param(
         unit="", about="ε, instead of the base model's", source=SOURCE, width=2e-4, default=EXTINCTION

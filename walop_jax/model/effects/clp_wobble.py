@@ -33,7 +33,7 @@ SOURCE = "eccentric code disc of an encoder: expected size"
 
 
 class ClpWobble(Effect):
-    """Transmission axis = CLP_ANGLE + amplitude · sin(CLP_ANGLE − phase)."""
+    """Error of the polariser's encoder, once per turn."""
 
     amplitude: Scalar = param(unit="deg", about="largest error", source=SOURCE, width=0.1, default=0.0)
     phase: Scalar = param(

@@ -23,7 +23,7 @@ SOURCE = "Harrington et al. 2021, JATIS 7, 018004"
 
 
 class ClpZero(Effect):
-    """Transmission axis = CLP_ANGLE + angle."""
+    """Zero point of the polariser's encoder."""
 
     angle: Scalar = param(
         unit="deg", about="added to the encoder reading", source=SOURCE, width=0.3, default=0.0

@@ -38,7 +38,7 @@ QUARTER = REFERENCE_WAVELENGTH / 8.0
 
 
 class Etalon(Effect):
-    """Diattenuation of an air gap along the fast axis of each plate."""
+    """Fringes of an air gap ahead of each half-wave plate."""
 
     contrast: Scalar = param(
         unit="", about="diattenuation at a maximum", source=SOURCE, width=0.003, default=0.0

@@ -25,7 +25,7 @@ BROAD = 0.05  # µm
 
 
 class FilterShift(Effect):
-    """Broad bands are displaced."""
+    """Broad band displaced as a whole."""
 
     wavelength: Scalar = param(
         unit="um", about="displacement of the band", source=SOURCE, width=0.003, default=0.0

@@ -23,7 +23,7 @@ SOURCE = "Tinyanont et al. 2019, arXiv:1811.03138; Tinyanont et al. 2019, arXiv:
 
 
 class Flexure(Effect):
-    """Field coordinates displaced in proportion to the hour angle."""
+    """Field displaced in proportion to the hour angle."""
 
     rate_x: Scalar = param(
         unit="deg/h", about="displacement along X", source=SOURCE, width=0.003, default=0.0

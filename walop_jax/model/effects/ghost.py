@@ -40,7 +40,7 @@ class PointGhost(GhostPart):
 
 
 class Ghost(Effect):
-    """A share of the counts at the opposite field point."""
+    """Ghost image of the field, turned by 180°."""
 
     share: Scalar = param(
         unit="", about="share of the opposite point", source=SOURCE, width=0.005, default=0.0

@@ -24,7 +24,7 @@ SOURCE = "Etzel, Rose & Wang 2000, Appl. Opt. 39, 5796"
 
 
 class HwpTemperature(Effect):
-    """All plates change their birefringence with temperature."""
+    """Birefringence of all plates that changes with temperature."""
 
     coefficient: Scalar = param(
         unit="",

@@ -24,7 +24,7 @@ SOURCE = "Berry, Dennis & Lee 2004, New J. Phys. 6, 162; Gál et al. 2001, JGR 1
 
 
 class MoonMultipleScattering(Effect):
-    """Sky polarisation smaller by p along the direction of single scattering."""
+    """Polarisation of the Moon sky lowered by multiple scattering."""
 
     p: Scalar = param(unit="", about="missing degree of polarisation", source=SOURCE, width=0.01, default=0.0)
 

@@ -29,7 +29,7 @@ SOURCE = "Maharana et al. 2023, A&A 679, A68"
 
 
 class MoonPatch(Effect):
-    """What a patch has beyond single scattering, per Moon exposure."""
+    """Polarisation of each Moon patch beyond single scattering."""
 
     positions: tuple[int, ...] = eqx.field(static=True)
     ids: tuple[int, ...] = eqx.field(static=True)

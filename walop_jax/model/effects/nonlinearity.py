@@ -41,7 +41,7 @@ class Distortion(DetectorPart):
 
 
 class Nonlinearity(Effect):
-    """Counts grow or shrink in proportion to themselves."""
+    """Detectors that are not linear."""
 
     coefficient: Float[Array, " k"] = param(
         unit="", about="relative change at 10⁶", source=SOURCE, width=0.02

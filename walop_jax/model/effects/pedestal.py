@@ -37,7 +37,7 @@ class DiffuseLight(DetectorPart):
 
 
 class Pedestal(Effect):
-    """A share of the exposure's median counts everywhere."""
+    """Scattered light: a pedestal under the whole exposure, one level per camera."""
 
     level: Float[Array, " k"] = param(unit="", about="share of the median counts", source=SOURCE, width=0.003)
 

@@ -36,7 +36,7 @@ class PlateAxis(Effect):
 
 
 class ChwpAxis(PlateAxis):
-    """Fast axis of the calibration plate = CHWP_ANGLE + angle."""
+    """Fast axis of the calibration plate away from its encoder reading."""
 
     name: ClassVar[str] = "chwp_axis"
     where: ClassVar[str] = "chwp"
@@ -47,7 +47,7 @@ class ChwpAxis(PlateAxis):
 
 
 class Hwp1Axis(PlateAxis):
-    """Fast axis of HWP1 = angle."""
+    """Fast axis of HWP1 turned."""
 
     name: ClassVar[str] = "hwp1_axis"
     where: ClassVar[str] = "half1.plate"
@@ -59,7 +59,7 @@ class Hwp1Axis(PlateAxis):
 
 
 class Hwp2Axis(PlateAxis):
-    """Fast axis of HWP2 = 22.5° + angle."""
+    """Fast axis of HWP2 turned."""
 
     name: ClassVar[str] = "hwp2_axis"
     where: ClassVar[str] = "half2.plate"

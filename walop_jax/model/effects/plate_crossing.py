@@ -43,14 +43,14 @@ class PlateCrossing(Effect):
 
 
 class Hwp1Crossing(PlateCrossing):
-    """HWP1."""
+    """Crystals of HWP1 not crossed at 90°."""
 
     name: ClassVar[str] = "hwp1_crossing"
     where: ClassVar[str] = "half1.plate"
 
 
 class Hwp2Crossing(PlateCrossing):
-    """HWP2."""
+    """Crystals of HWP2 not crossed at 90°."""
 
     name: ClassVar[str] = "hwp2_crossing"
     where: ClassVar[str] = "half2.plate"

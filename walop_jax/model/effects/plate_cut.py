@@ -65,14 +65,14 @@ class PlateCut(Effect):
 
 
 class Hwp1AxisCut(PlateCut):
-    """HWP1."""
+    """Optic axis of one crystal of HWP1 tilted out of its surface."""
 
     name: ClassVar[str] = "hwp1_axis_cut"
     where: ClassVar[str] = "half1.plate"
 
 
 class Hwp2AxisCut(PlateCut):
-    """HWP2."""
+    """Optic axis of one crystal of HWP2 tilted out of its surface."""
 
     name: ClassVar[str] = "hwp2_axis_cut"
     where: ClassVar[str] = "half2.plate"

@@ -24,7 +24,7 @@ SOURCE = "position angle on the sky minus ROTATOR is the angle in the instrument
 
 
 class RotatorZero(Effect):
-    """Position angle of +X = ROTATOR + angle."""
+    """Zero point of the position angle of the instrument."""
 
     angle: Scalar = param(unit="deg", about="added to ROTATOR", source=SOURCE, width=0.3, default=0.0)
 

@@ -24,7 +24,7 @@ SOURCE = "Blinov et al. 2023, A&A 677, A144"
 
 
 class StandardOutlier(Effect):
-    """Stokes parameters of one standard differ from the catalogue."""
+    """Stokes parameters of one standard that differ from the catalogue."""
 
     q: Scalar = param(unit="", about="added to the catalogue q", source=SOURCE, width=0.005, default=0.0)
     u: Scalar = param(unit="", about="added to the catalogue u", source=SOURCE, width=0.005, default=0.0)

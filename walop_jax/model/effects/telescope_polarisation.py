@@ -25,7 +25,7 @@ SOURCE = "Patat & Taubenberger 2011, A&A 529, A57"
 
 
 class TelescopePolarisation(Effect):
-    """(0, q, u, 0) added to light from the sky."""
+    """Polarisation that the telescope adds to light from the sky."""
 
     q: Scalar = param(unit="", about="polarisation added along +X", source=SOURCE, width=0.002, default=0.0)
     u: Scalar = param(unit="", about="polarisation added along +45°", source=SOURCE, width=0.002, default=0.0)

@@ -32,7 +32,7 @@ SOURCE = "Selbing 2010, arXiv:1010.4142"
 
 
 class UpstreamRetarder(Effect):
-    """Uniform linear retarder behind the collimator."""
+    """Uniform linear retarder between the collimator and the plates."""
 
     delta: Scalar = param(unit="rad", about="retardance", source=SOURCE, width=0.02, default=0.0)
     axis: Scalar = param(unit="deg", about="fast axis", source=SOURCE, scale=10.0, loose=500.0, default=0.0)

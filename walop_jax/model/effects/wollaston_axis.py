@@ -21,7 +21,7 @@ SOURCE = "mounting of the prisms: expected size"
 
 
 class WollastonAxis(Effect):
-    """Analysers of both halves rotated."""
+    """Wollaston prisms of both halves turned about the optical axis."""
 
     angle: Scalar = param(
         unit="deg", about="rotation of the analysers", source=SOURCE, width=0.3, default=0.0

@@ -1,0 +1,69 @@
+"""Pages about single effects and elements: one for each, with the numbers that were worked out for it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_run import small_fit
+
+from walop_jax.diagnosis.detectability import beyond_rival, detectability
+from walop_jax.model.effects import EFFECTS
+from walop_jax.model.elements import ELEMENTS
+from walop_jax.model.gallery import numbers
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
+def test_a_page_for_every_effect(call, effect):
+    text = call("docs", "effect", effect.name).output
+    assert text.startswith(f"# {effect.name}\n")
+    assert "Equation" in text
+    assert "## How small it may be" in text
+    known = numbers()["effects"].get(effect.name)
+    if known is not None:
+        assert f"{known['found']:.2g}" in text
+        assert all(f"`{rival}`" in text for rival, _ in known["rivals"])
+
+
+@pytest.mark.parametrize("kind", ELEMENTS, ids=lambda kind: kind.kind)
+def test_a_page_for_every_element(call, kind):
+    text = call("docs", "element", kind.kind).output
+    assert text.startswith(f"# {kind.kind}\n")
+    assert len(text) > 150
+
+
+def test_lists_and_wrong_names(call):
+    shown = call("docs", "effect").output
+    assert all(effect.name in shown for effect in EFFECTS)
+    wrong = call("docs", "effect", "clp_wobbel")
+    assert wrong.exit_code == 2
+    assert "clp_wobble" in wrong.output
+    assert call("docs", "model", "x").exit_code == 2
+
+
+def test_most_effects_have_numbers():
+    found = numbers()["effects"]
+    assert len(found) > 0.7 * len(EFFECTS)
+    assert all(one["named"] >= one["found"] > 0 for one in found.values() if one["named"] is not None)
+
+
+def test_what_a_rival_cannot_imitate():
+    """Columns typed by hand: (1, 0, 1) beside the plane of (1, 0, 0) and (0, 1, 0) keeps its third component."""
+    columns = np.array([[1.0, 0, 1], [1, 0, 0], [0, 1, 0]]).T
+    gram = columns.T @ columns
+    assert beyond_rival(gram, 0, slice(1, 3), np.ones(3, bool)) == pytest.approx(1.0)
+    assert beyond_rival(gram, 1, slice(1, 2), np.ones(3, bool)) == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.long
+def test_sizes_are_those_of_a_fit():
+    """An encoder error of the size that is found stands as many errors out of a fit as the threshold says."""
+    found = {one.effect: one for one in detectability(small_fit())}
+    result = small_fit()
+    from walop_jax.fit.refit import refit
+    from walop_jax.model.specification import effect_context, with_effects
+
+    model = with_effects(
+        result.model, ["clp_zero"], effect_context(result.model.template, result.calset.exposures)
+    )
+    sigma = refit(result.calset, model).value("clp_zero.angle")[1]
+    assert 4.0 < found["clp_zero"].found / sigma < 8.0

@@ -1,0 +1,83 @@
+"""What the program says of itself: help that the terminal wraps, steps, sources as BibTeX, errors with advice."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from walop_jax.cli.app import COMMANDS
+from walop_jax.cli.common import step_counter
+
+RANDOM = ("simulate", "sample", "diagnose", "compare")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_every_command(call, name):
+    shown = call(name, "-h")
+    assert shown.exit_code == 0
+    assert shown.output == call(name, "--help").output
+    # Wrapped by the terminal, to 80 columns here: no line breaks early, where the source breaks.
+    paragraphs = re.split(r"\n\s*\n", shown.output)
+    for text in paragraphs[1:]:
+        lines = text.strip("\n").splitlines()
+        if lines and not lines[0].rstrip().endswith(":"):
+            assert all(len(line) > 55 for line in lines[:-1]), text
+    assert ("--seed" in shown.output) == (name in RANDOM)
+    assert not re.search(r"\ba [aeio]|may take\.|\bgiven away\b", shown.output), shown.output
+
+
+def test_help_tells_exit_codes_and_completion(call):
+    shown = call("-h").output
+    assert "Exit codes: 0 done" in shown
+    assert "--install-completion" in shown
+    assert "…" not in shown
+    assert "..." not in shown.replace("[ARGS]...", "")
+
+
+def test_steps_are_counted():
+    say = step_counter(("reading", "fitting"))
+    assert say("waking up") == "waking up"
+    assert say("reading a.fits") == "step 1 of 2: reading a.fits"
+    assert say("χ² 12") == "step 1 of 2: χ² 12"
+    assert say("fitting") == "step 2 of 2: fitting"
+    assert say("reading again") == "step 2 of 2: reading again"
+
+
+def test_cite_as_bibtex(call):
+    text = call("cite", "--bibtex").output
+    entries = re.findall(r"^@(\w+)\{(\w+),\n(.*?)\n\}$", text, re.MULTILINE | re.DOTALL)
+    keys = [key for _, key, _ in entries]
+    assert text.count("@") == len(entries)
+    assert len(keys) == len(set(keys))
+    assert {"walop_jax", "maharana2022", "yeh1980", "golub1969"} <= set(keys)
+    yeh = dict(re.findall(r"(\w+)\s*= \{(.*)\}", next(body for _, key, body in entries if key == "yeh1980")))
+    assert yeh == {"author": "Yeh", "journal": "Surf. Sci.", "year": "1980", "volume": "96", "pages": "41"}
+    for _, _, body in entries:
+        assert body.count("{") == body.count("}")
+
+
+def test_an_output_that_exists_names_the_option(call, calset_file, run):
+    assert "--overwrite" in call("refit", calset_file, "-o", run).output
+
+
+@pytest.mark.parametrize(
+    ("effect", "words"),
+    [("clp_wobble=amp:0.06", ("'amp'", "amplitude, phase")), ("clp_wobbel=1", ("clp_wobble",))],
+)
+def test_a_wrong_effect_is_named(call, tmp_path, effect, words):
+    refused = call("simulate", "-o", tmp_path / "s.fits", "--effect", effect)
+    assert refused.exit_code == 2
+    assert all(word in refused.output for word in words), refused.output
+
+
+def test_matrix_says_where_it_comes_from(call, run, tmp_path):
+    from astropy.table import Table
+
+    from walop_jax.calibration.product import read_product
+
+    (tmp_path / "p.csv").write_text("X,Y\n0,0\n")
+    assert call("matrix", run, "--points", tmp_path / "p.csv", "-o", tmp_path / "o.fits").exit_code == 0
+    meta = Table.read(tmp_path / "o.fits").meta
+    assert meta["CALHASH"] == read_product(run / "calibration.fits").content_hash()
+    assert meta["ERRFROM"] == "covariance of the fit, N_ERR"

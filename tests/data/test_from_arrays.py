@@ -1,0 +1,128 @@
+"""A calibration set made of arrays: the same as from a file, and refused for the same reasons."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from astropy import units
+from small_run import SEED, SMALL
+
+from walop_jax.data.from_arrays import checked, from_arrays
+from walop_jax.data.records import CalibrationSet
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.io.errors import DataError
+from walop_jax.simulation.simulate import simulate
+
+X, Y, ANGLES = np.array([-0.1, 0.0, 0.1]), np.array([0.05, -0.05, 0.1]), np.arange(8) * 22.5
+
+
+def light() -> np.ndarray:
+    """Counts (3, 8, 4) of an ideal instrument: N (1 ± cos 2θ), N (1 ± sin 2θ) with polarised light."""
+    two = 2 * np.deg2rad(ANGLES)
+    return (
+        1e5
+        * (1.1 + np.stack([np.cos(two), -np.cos(two), np.sin(two), -np.sin(two)], axis=-1)[None])
+        * np.ones((3, 1, 1))
+    )
+
+
+def made(**changes) -> CalibrationSet:
+    given = {"counts": light(), "errors": np.sqrt(light()), "x": X, "y": Y, "angles": ANGLES}
+    return from_arrays(**(given | changes))
+
+
+def test_arrays_come_back():
+    block = made().intensities.block(0, 3)
+    np.testing.assert_array_equal(block.counts, light())
+    np.testing.assert_array_equal(block.sigma, np.sqrt(light()))
+    np.testing.assert_array_equal(made().exposures.clp_angle, ANGLES)
+    assert made().exposures.clp_in.all()
+    assert set(made().exposures.kind) == {"clp"}
+
+
+def test_units_are_converted():
+    calset = made(x=X * 60 * units.arcmin, angles=np.deg2rad(ANGLES) * units.rad, temp=283.15 * units.K)
+    np.testing.assert_allclose(calset.points.x, X, rtol=1e-14)
+    np.testing.assert_allclose(calset.exposures.clp_angle, ANGLES, rtol=1e-14, atol=1e-12)
+    np.testing.assert_allclose(calset.exposures.temp, 10.0, atol=1e-12)
+
+
+def test_big_endian_and_lists():
+    calset = made(counts=light().astype(">f8"), x=X.tolist(), y=Y.astype(">f4"))
+    assert calset.intensities.block(0, 3).counts.dtype == np.dtype(float)
+    np.testing.assert_array_equal(calset.points.x, X)
+
+
+def test_what_was_not_measured_is_nan():
+    counts = light()
+    counts[1, 2] = np.nan
+    used = made(counts=counts).intensities.block(0, 3).used
+    assert used.sum() == 23
+    assert not used[1, 2]
+
+
+def test_a_single_nan_is_masked_and_said_with_its_place():
+    counts = light()
+    counts[1, 2, 3] = np.nan
+    calset = made(counts=counts)
+    assert not calset.intensities.block(0, 3).used[1, 2]
+    assert any("row 10" in remark or "1 row" in remark for remark in calset.remarks), calset.remarks
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"x": X * 60}, "degrees: are these arcmin"),
+        ({"x": X * units.m}, "cannot be converted to 'deg'"),
+        ({"angles": np.deg2rad(ANGLES) + 0.01}, "are these radians"),
+        ({"errors": -np.sqrt(light())}, "N_ERR"),
+        ({"counts": light()[:2]}, "shape"),
+        ({"errors": np.sqrt(light())[:, :2]}, "errors"),
+        ({"kinds": "polarizer"}, "'polarizer' is not a kind"),
+        ({"filter": "SDSS-g'"}, "FILTER"),
+        ({"instrument": ""}, "INSTRUME"),
+        ({"temp": [1.0, 2.0]}, "temp"),
+        ({"chwp_in": True}, "CHWP_ANGLE"),
+        ({"counts": light() * units.m}, "electron"),
+        ({"x": np.array(["a", "b", "c"])}, "not made of numbers"),
+    ],
+)
+def test_what_a_file_is_refused_for(changes, message):
+    with pytest.raises(DataError, match=message):
+        made(**changes)
+
+
+def test_standards():
+    source = np.full((3, 8), -1)
+    source[0, 0] = 0
+    kinds = np.array(["standard", *["clp"] * 7])
+    angles = np.where(kinds == "clp", ANGLES, np.nan)
+    stars = {"NAME": ["HD 1"], "Q": [0.01], "U": [0.0], "Q_ERR": [2e-4], "U_ERR": [2e-4]}
+    counts = light()
+    counts[1:, 0] = np.nan
+    calset = made(counts=counts, kinds=kinds, angles=angles, rotator=0.0, sources=stars, source=source)
+    assert calset.sources.name.tolist() == ["HD 1"]
+    assert calset.intensities.block(0, 1).source[0, 0] == 0
+    with pytest.raises(DataError, match="U_ERR"):
+        made(sources={name: stars[name] for name in ("NAME", "Q", "U", "Q_ERR")})
+
+
+def test_a_simulated_set_passes_unchanged():
+    calset = simulate(SMALL, seed=SEED).calset
+    again = checked(calset)
+    one, other = (c.intensities.block(0, len(c.points)) for c in (calset, again))
+    for field in dataclasses.fields(one):
+        np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
+
+
+def test_a_set_in_memory_meets_the_checks_of_a_file():
+    calset = simulate(SMALL, seed=SEED).calset
+    table = calset.intensities
+    assert isinstance(table, TableIntensities)
+    table.counts[5, 1] = np.nan
+    assert not checked(calset).intensities.used[5]
+    table.sigma[7] = 0.0
+    with pytest.raises(DataError, match="row 7"):
+        checked(calset)

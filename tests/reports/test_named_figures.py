@@ -1,0 +1,114 @@
+"""Figures of a run by name: each is drawn, and shows what it says."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_run import SEED, SMALL
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.product import write_product
+from walop_jax.calibration.retardance import plate_retardances, retardance
+from walop_jax.data import read_calibration_set, write_calibration_set
+from walop_jax.fit.refit import refit
+from walop_jax.io.errors import DataError
+from walop_jax.model import mueller
+from walop_jax.reports.matrix_panels import element_kind
+from walop_jax.reports.named import FIGURES, Source, draw
+from walop_jax.reports.posterior_figures import informed
+from walop_jax.runs.plot import plot_figure
+from walop_jax.simulation.simulate import simulate
+
+WITHOUT = ("corner", "trace", "residual-map")  # what this run has not
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory) -> Source:
+    folder = tmp_path_factory.mktemp("run")
+    write_calibration_set(folder / "set.fits", simulate(SMALL, seed=SEED).calset)
+    calibration = Calibration.from_fit(refit(read_calibration_set(folder / "set.fits")))
+    write_product(folder / "calibration.fits", calibration.to_product())
+    return Source(folder)
+
+
+@pytest.mark.parametrize("name", [name for name in FIGURES if name not in WITHOUT])
+def test_figures_are_drawn(source, name):
+    figure = draw(name, source)
+    axes = [axis for axis in figure.axes if axis.get_title() or axis.get_xlabel()]
+    assert axes
+    assert any(axis.has_data() for axis in axes)
+
+
+@pytest.mark.parametrize("name", WITHOUT)
+def test_what_a_run_lacks_is_said(source, name):
+    with pytest.raises(DataError, match=r"has no posterior|holds no map"):
+        draw(name, source)
+
+
+def test_names_and_files(source, tmp_path):
+    with pytest.raises(DataError, match="did you mean 'efficiency'"):
+        draw("eficiency", source)
+    with pytest.raises(DataError, match="no picture"):
+        plot_figure(source.folder, "matrix", tmp_path / "matrix.txt")
+    path = plot_figure(source.folder, "matrix", tmp_path / "matrix.svg")
+    assert path.read_text().startswith("<?xml")
+    with pytest.raises(DataError, match="--overwrite"):
+        plot_figure(source.folder, "matrix", path)
+
+
+def test_maps_say_their_scale(source):
+    maps = source.product.maps
+    axis = draw("efficiency", source).axes[0]
+    low, high = (float(part.replace("−", "-")) for part in axis.get_title().splitlines()[1].split(" … "))
+    np.testing.assert_allclose(
+        [low, high], [maps.values[1].min(), maps.values[1].max()], atol=np.ptp(maps.values[1]) / 50
+    )
+    assert "efficiency" in axis.get_title()
+
+
+def test_names_of_the_paper():
+    # m21 m22 m23 m31 m32 m33
+    assert [element_kind(i, 2) for i in range(6)] == [0, 1, 2, 0, 2, 1]
+
+
+@pytest.mark.parametrize("delta", [10.0, 90.0, 170.0, 190.0, 300.0])
+@pytest.mark.parametrize("axis", [0.0, 22.5, 100.0])
+def test_retardance_of_a_pure_retarder(delta, axis):
+    """The rotation of the Poincaré sphere by δ about the axis, multiplied out from its definition."""
+    two, d = 2 * np.deg2rad(axis), np.deg2rad(delta)
+    n = np.array([np.cos(two), np.sin(two), 0.0])
+    cross = np.array([[0, -n[2], n[1]], [n[2], 0, -n[0]], [-n[1], n[0], 0]])
+    rotation = np.eye(3) + np.sin(d) * cross + (1 - np.cos(d)) * cross @ cross
+    found = {round(float(retardance(_whole(r), n[:2])), 9) for r in (rotation, rotation.T)}
+    assert found == {delta, 360.0 - delta}
+    own = np.asarray(mueller.retarder(jnp.asarray(d), jnp.asarray(np.deg2rad(axis))))
+    assert round(float(retardance(own, n[:2])), 6) == delta
+
+
+def _whole(rotation: np.ndarray) -> np.ndarray:
+    whole = np.eye(4)
+    whole[1:, 1:] = rotation
+    return whole
+
+
+def test_retardance_on_the_axis_is_that_of_the_crystals(source):
+    """2π/λ Σ (n_e − n_o) d along the axis of the first plate, MgF2 crossed against quartz; no wedge bends this ray."""
+    from walop_jax.model import materials
+
+    instrument = source.calibration.model.instrument(source.calibration.values)
+    lam = 0.62
+    quartz, mgf2 = (
+        float(crystal.extraordinary.refractive_index(lam) - crystal.ordinary.refractive_index(lam))
+        for crystal in (materials.CRYSTALS["quartz"], materials.CRYSTALS["mgf2"])
+    )
+    thick = dict(zip(source.calibration.model.names, source.calibration.values, strict=True))
+    straight = instrument.changed("half1.wedge", angle=0.0)
+    found = plate_retardances(straight, np.array([lam]), np.zeros(1), np.zeros(1))[0, 0, 0]
+    path = quartz * thick["half1.plate.quartz"] - mgf2 * thick["half1.plate.mgf2"]
+    assert abs((found - 360.0 * path / lam + 180.0) % 360.0 - 180.0) < 0.5
+
+
+def test_coefficients_that_are_only_prior_are_not_shown():
+    spread = {"a": 0.1, "b": 0.99, "c": 0.5, "d": 3.0}
+    assert informed(tuple(spread), spread, {"a": 1.0, "b": 1.0, "c": 1.0, "d": np.nan}) == ("d", "a", "c")

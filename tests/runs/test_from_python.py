@@ -1,0 +1,185 @@
+"""The commands as functions: they take what astronomers have, and give what the commands give."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy import units
+from astropy.table import QTable, Table
+from small_run import small_fit
+
+import walop_jax as walop
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.data.records import CalibrationSet
+
+OWN = '''
+import walop_jax as walop
+
+
+class LateZero(walop.Effect):
+    """Zero point of the polariser, called by another name."""
+
+    angle: walop.Scalar = walop.param(unit="deg", about="added", source="a test", width=0.3, default=0.0)
+    name = "late_zero"
+
+    def patch(self, instrument):
+        return instrument.changed("polariser", zero=lambda zero: self.angle + (0.0 if zero is None else zero))
+'''
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    return Calibration.from_fit(small_fit())
+
+
+def test_read_gives_what_a_path_holds(fitted):
+    assert isinstance(walop.read(fitted.calset), CalibrationSet)
+    assert isinstance(walop.read(fitted.run / "calibration.fits"), Calibration)
+    run = walop.read(fitted.run)
+    assert isinstance(run, walop.Run)
+    np.testing.assert_array_equal(run.calibration.values, fitted.calibration.values)
+    assert run.documents["summary"]["instrument"] == "WALOP-SOUTH"
+    assert "trusted" in repr(run).splitlines()[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("set.csv", "is no calibration set"), ("", "holds no results"), ("absent.fits", "no such file")],
+)
+def test_read_says_what_a_path_is_not(tmp_path, name, message):
+    (tmp_path / "set.csv").write_text("X,Y\n1,2\n")
+    with pytest.raises(walop.DataError, match=message):
+        walop.read(tmp_path / name)
+
+
+def test_a_folder_or_a_product_is_no_set(fitted):
+    with pytest.raises(walop.DataError, match="is a folder"):
+        walop.refit(fitted.run)
+    with pytest.raises(walop.DataError, match="calibration product"):
+        walop.refit(fitted.run / "calibration.fits")
+
+
+# --------------------------------------------------------------------------------------------- the matrix
+
+
+def test_positions_may_be_quantities_scalars_and_big_endian(calibration):
+    expected, covariance = calibration.matrix(np.array([0.1]), np.array([0.2]))
+    for x, y in ((0.1, 0.2), (6 * units.arcmin, 0.2), (np.float64(0.1), 720 * units.arcsec)):
+        m, c = calibration.matrix(x, y)
+        np.testing.assert_allclose(m, expected[0], rtol=1e-10)
+        np.testing.assert_allclose(c, covariance[0], rtol=1e-8)
+    column = Table({"X": np.array([0.1], ">f8")})["X"]
+    np.testing.assert_array_equal(calibration.matrix(column, [0.2])[0], expected)
+    with pytest.raises(walop.DataError, match="'m' cannot be converted"):
+        calibration.matrix(1 * units.m, 0.2)
+
+
+def test_beyond_the_field_there_is_nothing(calibration):
+    m, c = calibration.matrix([0.1, 0.5], [0.2, 0.2])
+    assert np.isfinite(m[0]).all()
+    assert np.isnan(m[1]).all()
+    assert np.isnan(c[1]).all()
+    table = walop.matrix(calibration, 0.5, 0.2)
+    assert np.isnan(table["M21"][0])
+    assert table["FLAG"][0] & 32
+
+
+def test_matrix_is_the_table_of_the_command(call, fitted, tmp_path):
+    points = tmp_path / "points.ecsv"
+    QTable({"X": [6.0, -3.0] * units.arcmin, "Y": [0.2, 0.1] * units.deg, "TEFF": [5000.0, 6000.0]}).write(
+        points
+    )
+    result = call("matrix", fitted.run, "--points", points, "-o", tmp_path / "out.ecsv", "--quiet")
+    assert result.exit_code == 0, result.output
+    expected = Table.read(tmp_path / "out.ecsv")
+    for given in (points, Table.read(points), QTable.read(points)):
+        found = walop.matrix(fitted.run, given)
+        assert found.colnames == expected.colnames
+        np.testing.assert_array_equal(found["M32_ERR"], expected["M32_ERR"])
+    found = walop.matrix(fitted.run, [6, -3] * units.arcmin, [0.2, 0.1], teff=[5000, 6000])
+    np.testing.assert_allclose(found["M32"], expected["M32"], rtol=1e-12)
+    one = walop.matrix(fitted.run, [0.1, 0.2], 0.1, filter="SDSS-r")
+    assert len(one) == 2
+
+
+# ---------------------------------------------------------------------------------------------- and others
+
+
+def test_apply_is_the_table_of_the_command(call, fitted, tmp_path):
+    n = np.array([[2.1e5, 1.9e5, 2e5, 2e5], [1.9e5, 2.1e5, 2e5, 2.1e5]])
+    stars = Table({"X": [0.1, 0.2], "Y": [0.0, 0.1], "N": n, "N_ERR": np.sqrt(n)})
+    stars.write(tmp_path / "stars.fits")
+    result = call("apply", fitted.run, tmp_path / "stars.fits", "-o", tmp_path / "out.fits", "--quiet")
+    assert result.exit_code == 0, result.output
+    expected, found = Table.read(tmp_path / "out.fits"), walop.apply(fitted.run, stars)
+    for name in ("Q", "U_ERR", "P", "FLAG"):
+        np.testing.assert_array_equal(found[name], expected[name])
+    stars.write(tmp_path / "stars.vot", format="votable")
+    result = call("apply", fitted.run, tmp_path / "stars.vot", "-o", tmp_path / "out.vot", "--quiet")
+    assert result.exit_code == 0, result.output
+    np.testing.assert_array_equal(Table.read(tmp_path / "out.vot")["Q"], expected["Q"])
+    assert found.meta["CALHASH"] == expected.meta["CALHASH"]
+    cameras = {f"N{k}": n[:, k] for k in range(4)} | {f"N_ERR{k}": np.sqrt(n[:, k]) for k in range(4)}
+    split = walop.apply(fitted.run, {"X": [0.1, 0.2], "Y": [0.0, 0.1]} | cameras)
+    np.testing.assert_array_equal(split["Q"], found["Q"])
+
+
+def test_trace_ends_with_the_counts_of_the_command(call, fitted):
+    text = call("trace", fitted.run, "--x", "0.1", "--q", "0.03").output.splitlines()[-1]
+    counts = walop.trace(0.1, q=0.03, calibration=fitted.run)[-1].value[0]
+    assert [f"{value:.6f}" for value in counts] == text.split()[1:5]
+
+
+def test_limits_as_a_table():
+    zero = walop.effect_by_name("clp_zero")
+    table = walop.limits(small_fit(), catalogue=(zero,)).to_table()
+    assert table["EFFECT"].tolist() == ["clp_zero"]
+    assert 0 < table["DETECTED"][0, 0] < 0.1  # deg
+
+
+def test_certify_and_epoch(fitted):
+    assert {check.name for check in walop.certify(fitted.run).checks} >= {"converged", "physics"}
+    found = walop.epoch(fitted.run, fitted.calset)
+    assert found.fits
+    assert found.test < 1e-3 * found.directions  # the same data
+
+
+def test_an_effect_of_ones_own_from_a_file(call, fitted, tmp_path):
+    own, model = tmp_path / "own.py", tmp_path / "model.toml"
+    own.write_text(OWN)
+    made = call("model", fitted.calset, "--effect", "late_zero", "--effects", own, "-o", model)
+    assert made.exit_code == 0, made.output
+    run = tmp_path / "RUN"
+    result = call("refit", fitted.calset, "--model", model, "--effects", own, "-o", run, "--quiet")
+    assert result.exit_code == 0, result.output
+    without = call("certify", run)
+    assert without.exit_code == 1
+    assert "late_zero" in without.output
+    assert "--effects" in without.output
+    assert call("certify", run, "--effects", own).exit_code == 0
+    catalogue = (
+        *walop.EFFECTS,
+        walop.read(run, catalogue=_own(own)).calibration.model.template.effects[0].__class__,
+    )
+    assert catalogue[-1].name == "late_zero"
+
+
+def _own(path):
+    from walop_jax.model.effects.own import catalogue_with
+
+    return catalogue_with(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x = 1", "defines no effect"),
+        ("1/0", "ZeroDivisionError"),
+        (OWN.replace('"late_zero"', '"clp_zero"'), "name of another effect"),
+        (OWN.replace('name = "late_zero"', "pass"), "no name"),
+    ],
+)
+def test_files_of_effects_that_are_none(tmp_path, text, message):
+    (tmp_path / "own.py").write_text(text)
+    with pytest.raises(walop.DataError, match=message):
+        _own(tmp_path / "own.py")

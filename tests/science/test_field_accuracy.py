@@ -1,0 +1,52 @@
+"""Accuracy of p over the field, against a draw of matrices and the closed form of an ideal instrument."""
+
+from __future__ import annotations
+
+import numpy as np
+from small_run import small_fit
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.science.field_accuracy import field_accuracy, p_errors
+from walop_jax.science.star_errors import sample_stars
+
+IDEAL = np.array([[0.0, 1.0, 0.0, 0.0, 0.0, 1.0]])
+
+
+def test_ideal_instrument_with_uncertain_zero_points():
+    covariance = np.diag([0.01, 0, 0, 0.01, 0, 0])[None] ** 2
+    # δp = −e · (δm21, δm31) with |e| = 1: the error of a zero point.
+    np.testing.assert_allclose(p_errors(IDEAL, covariance, sample_stars()), 0.01, rtol=1e-12)
+
+
+def test_ideal_instrument_with_an_uncertain_efficiency():
+    covariance = np.diag([0, 0.01, 0, 0, 0, 0])[None] ** 2
+    stars = np.array([[0.04, 0.0]])
+    # δq = −q δm22
+    np.testing.assert_allclose(p_errors(IDEAL, covariance, stars), 0.0004, rtol=1e-12)
+
+
+def test_against_drawn_matrices():
+    rng = np.random.default_rng(1)
+    matrix = np.array([[0.02, 0.97, 0.1, -0.03, -0.2, 0.7]])
+    root = 1e-4 * rng.standard_normal((6, 6))
+    stars = sample_stars(20)
+    drawn = matrix + rng.standard_normal((40_000, 6)) @ root.T
+    measured = matrix[0, [0, 3]] + stars @ matrix[0, [1, 2, 4, 5]].reshape(2, 2).T
+    inverse = np.linalg.inv(drawn[:, [1, 2, 4, 5]].reshape(-1, 2, 2))
+    found = np.einsum("dij,dnj->dni", inverse, measured - drawn[:, None, [0, 3]])
+    scatter = np.sqrt(np.mean((np.hypot(*np.moveaxis(found, -1, 0)) - np.hypot(*stars.T)) ** 2))
+    np.testing.assert_allclose(p_errors(matrix, (root @ root.T)[None], stars), scatter, rtol=0.03)
+
+
+def test_no_inverse_is_no_knowledge():
+    blind = np.array([[0.0, 1.0, 0.0, 0.0, 0.0, 0.0]])
+    assert not np.isfinite(p_errors(blind, 1e-8 * np.eye(6)[None], sample_stars())).any()
+
+
+def test_map_of_a_fit():
+    found = field_accuracy(Calibration.from_fit(small_fit()), size=5)
+    assert found is not None
+    assert found.error.shape == (5, 5)
+    assert found.filter == "SDSS-r"
+    assert 0 < found.median < 0.01
+    assert found.share == np.mean(found.error < 1e-3)

@@ -1,0 +1,78 @@
+"""The parameters of a fit as a table and as something to look at: values, priors, and what the data say of each."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.rounding import value_and_error, with_error, with_minus_sign
+from walop_jax.model.specification import Model, Parameter
+
+Vector = Float[np.ndarray, " n"]
+Columns = dict[str, tuple[np.ndarray, str, str]]
+
+PRIOR_ONLY = 0.99  # of the prior width: an error above it owes nothing to the data
+HEAD = ("parameter", ">value", ">error", "unit", ">start", "prior", "")
+HIDDEN = "throughput."  # smooth maps: their terms mean nothing one by one
+
+
+def unconstrained(model: Model, sigma: Vector) -> tuple[str, ...]:
+    """Names of the free parameters of which the data say nothing: their error is the width of their prior."""
+    return tuple(
+        p.name
+        for p, s in zip(model.parameters, sigma, strict=True)
+        if p.free and p.tie is None and p.prior is not None and s > PRIOR_ONLY * p.prior[1]
+    )
+
+
+def parameter_table(model: Model, values: Vector, sigma: Vector) -> Any:
+    """An astropy table with a row for every parameter; errors of fixed ones are 0, priors NaN where there is none."""
+    idle = unconstrained(model, sigma)
+    priors = np.array([p.prior or (np.nan, np.nan) for p in model.parameters]).reshape(-1, 2)
+    states = [_state(p, idle) or "free" for p in model.parameters]
+    columns: Columns = {
+        "NAME": (np.array(model.names), "", "parameter"),
+        "VALUE": (np.asarray(values), "", "fitted value, or the one that it was held at"),
+        "SIGMA": (np.asarray(sigma), "", "standard error"),
+        "UNIT": (np.array([p.unit for p in model.parameters]), "", "unit of the numbers of this row"),
+        "START": (model.start, "", "start value"),
+        "PRIOR_MEAN": (priors[:, 0], "", "mean of the prior"),
+        "PRIOR_SIGMA": (priors[:, 1], "", "standard deviation of the prior"),
+        "STATE": (np.array(states), "", "free, fixed, tied to another, or known from its prior only"),
+        "ABOUT": (np.array([p.about for p in model.parameters]), "", "what it is"),
+    }
+    return astropy_table(columns)
+
+
+def parameter_rows(model: Model, values: Vector, sigma: Vector) -> tuple[tuple[str, ...], ...]:
+    """Rows below `HEAD`, without the terms of the throughput; no start where it is the mean of the prior."""
+    idle = unconstrained(model, sigma)
+    rows = []
+    for p, value, s in zip(model.parameters, values, sigma, strict=True):
+        if p.name.startswith(HIDDEN):
+            continue
+        prior = "" if p.prior is None else with_error(p.prior[0] + 0.0, p.prior[1])
+        same = p.prior is not None and p.prior[0] == p.start
+        start = "" if same else with_minus_sign(f"{p.start + 0.0:.6g}")
+        texts = value_and_error(float(value), float(s))
+        rows.append((p.name, *texts, p.unit, start, prior, _state(p, idle)))
+    return tuple(rows)
+
+
+def parameter_notes(model: Model, sigma: Vector) -> tuple[str, ...]:
+    """What a table of `parameter_rows` leaves out, and which parameters the data do not constrain."""
+    hidden = sum(name.startswith(HIDDEN) for name in model.names)
+    idle = unconstrained(model, sigma)
+    notes = [f"{hidden} throughput terms not shown; to_table() has them"] if hidden else []
+    if idle:
+        notes.append(f"not constrained by these data, only by the prior: {', '.join(idle)}")
+    return tuple(notes)
+
+
+def _state(p: Parameter, idle: tuple[str, ...]) -> str:
+    if p.tie is not None:
+        return f"tied to {p.tie}"
+    return "fixed" if not p.free else "prior only" if p.name in idle else ""

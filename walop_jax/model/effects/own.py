@@ -1,0 +1,35 @@
+"""Effects that users bring along: a Python file beside the catalogue that comes with the package."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+from walop_jax.io.errors import fail
+from walop_jax.io.own_code import classes_of
+from walop_jax.model.effects import EFFECTS
+from walop_jax.model.effects.base import Effect
+
+
+def catalogue_with(
+    own: str | os.PathLike[str] | None, catalogue: Sequence[type[Effect]] = EFFECTS
+) -> tuple[type[Effect], ...]:
+    """The catalogue followed by the effects that the Python file `own` defines (None: nothing more).
+
+    The file is run. Raises `DataError` if it cannot be, defines no effect, or one without a name or with that of
+    another.
+    """
+    if own is None:
+        return tuple(catalogue)
+    found = classes_of(
+        own, Effect, "give a Python file with subclasses of Effect (walop-jax docs adding-an-effect)"
+    )
+    if not found:
+        raise fail("defines no effect", file=own, advice="see walop-jax docs adding-an-effect")
+    taken = {effect.name for effect in catalogue}
+    for class_name, effect in found.items():
+        if not effect.name or effect.name in taken:
+            what = f"{class_name} has {'the name of another effect' if effect.name else 'no name'}"
+            raise fail(what, file=own, advice='write name = "…" into the class')
+        taken.add(effect.name)
+    return (*catalogue, *found.values())

@@ -1,0 +1,136 @@
+"""Pages about single effects and elements, made of what their code says of them and of numbers kept beside the
+pages."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import sys
+from collections.abc import Iterator, Mapping
+from importlib.resources import files
+from typing import Any
+
+from walop_jax.model.effects import EFFECTS, Effect, effect_by_name
+from walop_jax.model.elements import ELEMENTS
+from walop_jax.model.elements.base import Element
+from walop_jax.model.parameters import field_declarations, numbers_of, unknown_name
+
+NUMBERS = "gallery.json"
+_UNSEEN = 3.0  # standard deviations below which two effects cannot be told apart
+
+
+def effect_page(name: str) -> str:
+    """The page about an effect, as Markdown; ValueError with the nearest names when there is none."""
+    return "\n".join(_effect(effect_by_name(name))).rstrip() + "\n"
+
+
+def element_page(name: str) -> str:
+    """The page about a kind of element, as Markdown; ValueError with the nearest names when there is none."""
+    for kind in ELEMENTS:
+        if kind.kind == name:
+            return "\n".join(_element(kind)).rstrip() + "\n"
+    raise unknown_name("kind of element", name, [kind.kind for kind in ELEMENTS])
+
+
+def listed() -> str:
+    """All effects and elements, each with a few words."""
+    effects = {effect.name: _about(effect) for effect in EFFECTS}
+    elements = {kind.kind: _about(kind) for kind in ELEMENTS}
+    width = max(map(len, (*effects, *elements)))
+    lines = [f"effect  {name:<{width}}  {about}" for name, about in effects.items()]
+    lines += [f"element {name:<{width}}  {about}" for name, about in elements.items()]
+    return "\n".join(lines) + "\n"
+
+
+def numbers() -> dict[str, Any]:
+    """The numbers of the pages: `plan` in words, and by effect what `diagnosis.detectability` finds for it."""
+    return json.loads((files("walop_jax") / "docs" / NUMBERS).read_text(encoding="utf-8"))
+
+
+def _about(kind: type[Any]) -> str:
+    return inspect.cleandoc(kind.__doc__ or "").splitlines()[0].rstrip(".")
+
+
+def _effect(effect: type[Effect]) -> Iterator[str]:
+    yield f"# {effect.name}"
+    yield ""
+    yield f"{_about(effect)}."
+    yield ""
+    yield from _head(effect)
+    yield from _table(
+        ("parameter", "unit", "usual size", "what it is"),
+        [
+            (n, d.unit, "" if d.width is None else f"{d.width:g}", d.about)
+            for n, d in field_declarations(effect).items()
+        ],
+    )
+    if effect.revealed_by:
+        yield f"**Revealed by** {effect.revealed_by}."
+        yield ""
+    found = numbers()
+    one = found["effects"].get(effect.name)
+    yield "## How small it may be, and what it looks like"
+    yield ""
+    if one is None:
+        yield f"Not shown by the exposures of the example ({found['plan']}), or without an amplitude."
+        yield ""
+    else:
+        yield from _sizes(one, found["plan"])
+    if effect.separated_by:
+        yield f"**Told apart by** {effect.separated_by}."
+        yield ""
+    if effect.reference:
+        yield f"Source: {effect.reference}."
+
+
+def _sizes(one: Mapping[str, Any], plan: str) -> Iterator[str]:
+    unit = f" {one['unit']}" if one["unit"] else ""
+    yield f"In a run of {plan}:"
+    yield ""
+    yield f"- found, 99 times in 100, from {one['parameter']} = {one['found']:.2g}{unit} on"
+    named = one["named"]
+    if named is None or named != named or named > 1e3 * one["found"]:
+        yield "- named alone at no size: the first effect below makes the same pattern there"
+    else:
+        yield f"- named alone (5 σ from every other effect) from {named:.2g}{unit} on"
+    for rival, separation in one["rivals"]:
+        verdict = "cannot be told from" if separation < _UNSEEN else f"{separation:.1f} σ away from"
+        yield f"- at the size from which it is found, {verdict} `{rival}`"
+    yield ""
+
+
+def _element(kind: type[Element]) -> Iterator[str]:
+    yield f"# {kind.kind}"
+    yield ""
+    yield f"{_about(kind)}."
+    yield ""
+    yield from _head(kind)
+    yield from _table(
+        ("number", "unit", "what it is"), [(n, d.unit, d.about) for n, d in numbers_of(kind).items()]
+    )
+    changed = [effect.name for effect in EFFECTS if kind.kind and kind.kind in _head_text(effect).lower()]
+    if changed:
+        yield f"Effects that speak of it: {', '.join(f'`{name}`' for name in changed)}."
+        yield ""
+    if kind.reference:
+        yield f"Source: {kind.reference}."
+
+
+def _head_text(kind: type[Any]) -> str:
+    return inspect.cleandoc(sys.modules[kind.__module__].__doc__ or "")
+
+
+def _head(kind: type[Any]) -> Iterator[str]:
+    """The head of the file that defines it, equation and symbols, as it stands there."""
+    lines = _head_text(kind).splitlines()[2:]
+    if lines:
+        yield from (f"    {line}".rstrip() for line in lines)
+        yield ""
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[str]:
+    if rows:
+        yield f"| {' | '.join(head)} |"
+        yield f"|{' --- |' * len(head)}"
+        yield from (f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in rows)
+        yield ""
