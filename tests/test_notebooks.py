@@ -24,7 +24,7 @@ NOT_OURS = {
 }
 """Notebooks that read what does not come with the project: the variable that says where it lies, and the file.
 
-They are stored as they came out, for readers who do not have the data."""
+They may be stored as they came out, for readers who do not have the data."""
 TIMEOUT = 900  # seconds per cell, on a machine that does other things as well
 
 
@@ -54,7 +54,9 @@ def test_there_are_notebooks():
 def test_notebooks_are_stored_without_output(path: Path):
     cells = [cell for cell in read(path).cells if cell.cell_type == "code"]
     if path.stem in NOT_OURS:
-        assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
+        # From beginning to end in one go, or not at all.
+        counts = [cell.execution_count for cell in cells]
+        assert counts in (list(range(1, len(cells) + 1)), [None] * len(cells))
         assert not [out for cell in cells for out in cell.outputs if out.output_type == "error"]
         return
     for cell in cells:
