@@ -34,7 +34,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM
 from walop_jax.diagnosis.freeform import strata
-from walop_jax.diagnosis.score import Scorer, ScoreSpace, ScoreTable
+from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable
 from walop_jax.fit.refit import FitResult, with_honest_errors
 from walop_jax.fit.refit import refit as fit_refit
 from walop_jax.likelihood import limits
@@ -47,6 +47,8 @@ from walop_jax.model.specification import Model
 
 UNEVEN = 1.25
 """Factor between the squared residuals of a group and those of all below which it is a matter of the stated errors."""
+NOISELESS = 1e-6
+"""Squared residuals, beyond what the parameters can make, of data that hold no noise: rounding, and second order."""
 _SHOWN = 3
 
 Cube = Float[np.ndarray, "p e k"]
@@ -60,12 +62,21 @@ def examined(result: FitResult, seed: int = 0) -> FitResult:
     to the stated errors (`FitResult.noise_only`), and the standard errors are made from the residuals.
     """
     explained = result.explains_data or result.nearly_explains_data
-    if not result.converged or result.noiseless or not explained:
+    if not result.converged or not explained:
         return dataclasses.replace(result, examined=True)
     design = Design.of(sampled(result, limits.TRUST_ROWS))
+    if result.errors_too_large and _hold_no_noise(design):
+        return dataclasses.replace(result, examined=True, noiseless=True)
     table = pattern_scores(design, seed)
     doubts = (*_patterns(table), *_groups(design))
     return with_honest_errors(dataclasses.replace(result, examined=True, doubts=doubts))
+
+
+def _hold_no_noise(design: Design) -> bool:
+    """Whether the data are the model's at some values of its parameters: what priors pull at, noise has not made."""
+    data = slice(0, design.rows)
+    left = Projector(design.jacobian[data])(design.residual[data])
+    return float(left @ left) < NOISELESS * design.rows
 
 
 def refit(

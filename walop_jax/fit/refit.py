@@ -34,7 +34,6 @@ Matrix = Float[np.ndarray, "n n"]
 
 SUSPECT_SIGMA = 5.0  # excess of χ² over its expectation, in its own standard deviations
 NEARLY = 1.15  # χ²/dof that errors stated seven per cent too small give
-NOISELESS = 1e-8  # χ²/dof of data that differ from the model by rounding and by the rest of a search
 TOO_LOW = 0.8  # χ²/dof below which the stated errors are those of something else
 PRIOR_EDGE = 4.0  # standard deviations
 
@@ -45,8 +44,8 @@ class FitResult(Displayed):
 
     `values` and `covariance` are of all parameters in tree order, frozen ones with zero variance. `trusted` needs a
     converged fit that explains the data within its priors, and no doubts: `doubts` is what the residuals say against
-    it, once they were `examined` (`diagnosis.trust`). `errors_from` is what the covariance was made from, the stated
-    errors of the data (`STATED`) or residuals.
+    it, once they were `examined` (`diagnosis.trust`); `noiseless` data are expected counts, those of a plan.
+    `errors_from` is what the covariance was made from, the stated errors of the data (`STATED`) or residuals.
     """
 
     likelihood: Likelihood
@@ -59,6 +58,7 @@ class FitResult(Displayed):
     errors_from: str = STATED
     examined: bool = False
     doubts: tuple[str, ...] = ()
+    noiseless: bool = False
 
     @property
     def model(self) -> Model:
@@ -129,11 +129,6 @@ class FitResult(Displayed):
     def errors_too_large(self) -> bool:
         """Whether χ² is far smaller than noise of the stated size would make it."""
         return not self.noiseless and bool(self.excess < -SUSPECT_SIGMA and self.chi2 < TOO_LOW * self.dof)
-
-    @property
-    def noiseless(self) -> bool:
-        """Whether the data are expected counts, with the errors that noise would give them: a plan, not data."""
-        return self.dof > 0 and bool(self.chi2 < NOISELESS * self.dof)
 
     @property
     def at_prior_edge(self) -> tuple[str, ...]:
