@@ -93,13 +93,13 @@ def _whole(rotation: np.ndarray) -> np.ndarray:
 
 
 def test_retardance_on_the_axis_is_that_of_the_crystals(source):
-    """2π/λ Σ (n_e − n_o) d along the axis of the first plate, MgF2 crossed against quartz; no wedge bends this ray."""
+    """2π/λ Σ (n_o − n_e) d about the optic axis of the quartz, MgF2 crossed against it; no wedge bends this ray."""
     from walop_jax.model import materials
 
     instrument = source.calibration.model.instrument(source.calibration.values)
     lam = 0.62
     quartz, mgf2 = (
-        float(crystal.extraordinary.refractive_index(lam) - crystal.ordinary.refractive_index(lam))
+        float(crystal.ordinary.refractive_index(lam) - crystal.extraordinary.refractive_index(lam))
         for crystal in (materials.CRYSTALS["quartz"], materials.CRYSTALS["mgf2"])
     )
     thick = dict(zip(source.calibration.model.names, source.calibration.values, strict=True))

@@ -64,8 +64,8 @@ def plate_retardances(
     x: Float[np.ndarray, " p"],
     y: Float[np.ndarray, " p"],
 ) -> Float[np.ndarray, "w p l"]:
-    """Retardance (deg, modulo 360) of every plate of `plate_names` at wavelengths (µm, ascending) and field
-    positions."""
+    """Retardance (deg, modulo 360) about the first optic axis of every plate of `plate_names` at wavelengths (µm,
+    ascending) and field positions."""
     there = instrument.patched()
     names = [f"{LINE}{k:04d}" for k in range(len(wavelength))]
     curves = {n: FilterCurve(n, np.array([w]), np.ones(1)) for n, w in zip(names, wavelength, strict=True)}
