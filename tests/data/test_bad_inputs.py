@@ -281,7 +281,7 @@ def test_something_else(tmp_path, content, fragment):
 def test_no_file_no_path_no_link(tmp_path):
     with pytest.raises(DataError, match="there is no such file"):
         read_calibration_set(tmp_path / "absent.fits")
-    with pytest.raises(DataError, match="cannot be read"):
+    with pytest.raises(DataError, match="is a folder; a calibration set is a FITS file"):
         read_calibration_set(tmp_path)
     with pytest.raises(DataError, match="no file was given"):
         read_calibration_set()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import inspect
 import os
 import sys
 from pathlib import Path
@@ -15,7 +14,7 @@ T = TypeVar("T")
 
 
 def classes_of(path: str | os.PathLike[str], base: type[T], advice: str) -> dict[str, type[T]]:
-    """The subclasses of `base` that a Python file defines and that can be made, by name, in the order of the file.
+    """The subclasses of `base` that a Python file defines, by name, in the order of the file.
 
     The file is run. Raises `DataError`, with `advice` where there is no such file, and if it fails when it is run.
     """
@@ -35,8 +34,5 @@ def classes_of(path: str | os.PathLike[str], base: type[T], advice: str) -> dict
     return {
         name: value
         for name, value in vars(module).items()
-        if isinstance(value, type)
-        and issubclass(value, base)
-        and value.__module__ == module_name
-        and not inspect.isabstract(value)
+        if isinstance(value, type) and issubclass(value, base) and value.__module__ == module_name
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 from collections.abc import Sequence
 
@@ -24,6 +25,7 @@ def catalogue_with(
     found = classes_of(
         own, Effect, "give a Python file with subclasses of Effect (walop-jax docs adding-an-effect)"
     )
+    found = {name: effect for name, effect in found.items() if not inspect.isabstract(effect)}
     if not found:
         raise fail("defines no effect", file=own, advice="see walop-jax docs adding-an-effect")
     taken = {effect.name for effect in catalogue}
