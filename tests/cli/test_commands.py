@@ -167,7 +167,7 @@ def test_missing_and_alien_inputs(call, run, calset_file, tmp_path):
         ("refit", "x.fits"),
         ("refti", "x"),
         ("matrix", "x", "--pionts", "y"),
-        ("cite", "--seed", "1"),
+        ("cite", "--sede", "1"),
     ],
 )
 def test_wrong_usage(call, args):

@@ -9,7 +9,7 @@ import pytest
 from walop_jax.cli.app import COMMANDS
 from walop_jax.cli.common import step_counter
 
-RANDOM = ("simulate", "sample", "diagnose", "compare")
+RANDOM = ("simulate", "sample", "diagnose", "limits", "compare")
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -25,6 +25,12 @@ def test_help_of_every_command(call, name):
             assert all(len(line) > 55 for line in lines[:-1]), text
     assert ("--seed" in shown.output) == (name in RANDOM)
     assert not re.search(r"\ba [aeio]|may take\.|\bgiven away\b", shown.output), shown.output
+
+
+def test_every_command_takes_a_seed(call):
+    """Scripts may give it to all; where nothing is random it changes nothing."""
+    assert call("cite", "--seed", "1").output == call("cite").output
+    assert call("cite", "--seed", "one").exit_code == 2
 
 
 def test_help_tells_exit_codes_and_completion(call):

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import importlib.util
 import inspect
 import os
 import re
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from walop_jax.cli.common import guarded
+
+_UNUSED_SEED = Annotated[int | None, typer.Option("--seed", hidden=True)]
 
 COMMANDS = (
     "inspect",
@@ -39,8 +42,8 @@ COMMANDS = (
 
 HELP = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 EXIT_CODES = (
-    "Exit codes: 0 done; 1 not done, or a check that does not hold, with one line on stderr; 2 wrong usage; 130 "
-    "interrupted."
+    "Exit codes: 0 done; 1 not done, or a check that does not hold, with one line on stderr; 2 wrong usage; 3 done, "
+    "but the result is not to be trusted; 130 interrupted."
 )
 
 app = typer.Typer(
@@ -86,6 +89,23 @@ def _in_short(function: Callable[..., None]) -> str:
     return re.split(r"[:;.](?:\s|$)", _paragraphs(function))[0] + "."
 
 
+def accepting_seed(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with `--seed`, which every command takes: not shown, and without effect, where nothing is random."""
+    signature = inspect.signature(command, eval_str=True)
+    if "seed" in signature.parameters:
+        return command
+
+    @functools.wraps(command)
+    def run(*args: Any, seed: int | None = None, **kwargs: Any) -> None:
+        del seed
+        command(*args, **kwargs)
+
+    seed = inspect.Parameter("seed", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=_UNUSED_SEED)
+    run.__signature__ = signature.replace(parameters=[*signature.parameters.values(), seed])  # type: ignore[attr-defined]
+    run.__annotations__ = {name: p.annotation for name, p in run.__signature__.parameters.items()}  # type: ignore[attr-defined]
+    return run
+
+
 def _register() -> None:
     for name in COMMANDS:
         identifier = name.replace("-", "_")
@@ -94,7 +114,7 @@ def _register() -> None:
             function = getattr(importlib.import_module(path), identifier)
             app.command(
                 name, context_settings=HELP, help=_paragraphs(function), short_help=_in_short(function)
-            )(guarded(function))
+            )(guarded(accepting_seed(function)))
 
 
 _register()

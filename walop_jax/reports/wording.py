@@ -62,7 +62,8 @@ def verdict_of_fit(summary: Mapping[str, Any]) -> tuple[str, str]:
     if not summary["converged"]:
         return "Not trusted", f"The fit did not converge ({summary['message']}); {numbers}."
     if not summary.get("trusted", True):
-        return "Not trusted", f"The fit converged, but the model does not explain the data: {numbers}."
+        against = summary.get("doubts") or summary.get("warnings") or ["the model does not explain the data"]
+        return "Not trusted", f"The fit converged, with {numbers}, but {against[0]}."
     return "Trusted", f"The fit converged, and the data are consistent with the model: {numbers}."
 
 

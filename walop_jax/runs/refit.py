@@ -90,7 +90,7 @@ def refit_sets(
     residuals = residual_map(result) if result.likelihood.layout.large and result.converged else None
     misfit = describe(result) if first and not result.explains_data else None
     seconds = time.perf_counter() - began
-    found = summary(result, seconds=seconds, misfit=misfit, residuals=residuals)
+    found = summary(result, seconds=seconds, misfit=misfit, residuals=residuals) | {"seed": None}
     if first:
         tell("mapping the field")
         _write(folder, result, residuals, found, overwrite=overwrite)
