@@ -86,7 +86,7 @@ class Rehearsal(workflow._Diagnosing):
         self.calset, self.catalogue = SimpleNamespace(points=()), ()
         self.fit = Mock(spec=FitResult, explains_data=True)
         self.steps = ["name"]
-        self.tell = lambda text: None
+        self.tell, self.until = lambda text: None, float("inf")
 
     def _examine(self, earlier=None):
         examination = Mock(spec=Examination, alarm=bool(self.steps), design=Mock(spec=Design))

@@ -77,4 +77,5 @@ def test_inflation_divides_chi2_by_f_squared(scene: Scene, density: Density, pla
         slope = (chi2 * np.exp(-2.0 * ln_f) - ln_f - n) / np.sqrt(2.0 * n)
         assert gradient[-1] == pytest.approx(slope, rel=1e-9)
     at_one = inflated.value_and_gradient(np.append(place, 0.0))[1][:-1]
-    np.testing.assert_allclose(at_one, density.value_and_gradient(place)[1], rtol=1e-10, atol=1e-11)
+    # Two programs: counts are alike to 1e-13, residuals to N/σ = 1000 times that; each element is a sum of thousands.
+    np.testing.assert_allclose(at_one, density.value_and_gradient(place)[1], rtol=0, atol=2e-9)

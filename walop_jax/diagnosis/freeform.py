@@ -174,10 +174,14 @@ def strata(measured: Measured) -> Iterator[Candidate]:
             "fine",
         )
     for name, quantity, block in (
-        ("time", (e.mjd - np.nanmean(e.mjd))[None, :], "exposures"),
-        ("temperature", (e.temp - np.nanmean(e.temp))[None, :], "exposures"),
-        ("flux", measured.flux - measured.flux[measured.used].mean(), None),
+        ("time", e.mjd[None, :], "exposures"),
+        ("temperature", e.temp[None, :], "exposures"),
+        ("flux", measured.flux, None),
     ):
+        known = quantity[measured.used] if quantity.shape == measured.used.shape else quantity
+        if not np.isfinite(known).any():
+            continue
+        quantity = quantity - np.nanmean(known)
         spread = np.nanstd(quantity)
         if np.isfinite(spread) and spread > 1e-9 * max(1.0, float(np.nanmax(np.abs(quantity)))):
             scaled = np.nan_to_num(quantity / spread)

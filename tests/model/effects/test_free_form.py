@@ -28,7 +28,11 @@ def test_it_is_found_by_name_but_is_no_candidate():
 
 
 def test_neutral_changes_nothing():
-    np.testing.assert_allclose(scenes.observe(FreeForm.neutral(scenes.CONTEXT)), scenes.observe(), rtol=1e-12)
+    plain = scenes.observe()
+    # Rounding is a share of the light, not of what an analyser leaves of it.
+    np.testing.assert_allclose(
+        scenes.observe(FreeForm.neutral(scenes.CONTEXT)), plain, rtol=0, atol=1e-12 * plain.max()
+    )
 
 
 @pytest.mark.parametrize("blocks", [(), *((b,) for b in BLOCKS), BLOCKS])

@@ -80,7 +80,7 @@ class Shares(ExposurePart):
 
     harmonics: Float[Array, "c h 2 g"]
     exposures: Float[Array, "e k"]  # one of the two may be empty
-    fine: Float[Array, "c f"]  # structure that the response is told without
+    fine: Float[Array, "d f"]  # structure that the response is told without; may be empty
 
     @property
     def exposures_known(self) -> int | None:
