@@ -15,6 +15,7 @@ def blind():
     return suite.Blind(simulate(plan, seed=41).calset, seed=2)
 
 
+@pytest.mark.long
 def test_verdicts_on_hidden_effects(blind):
     found = suite.study(blind, each=1, ratios=(10.0,), nulls=100)
     rates = found["rates"]
