@@ -1,17 +1,19 @@
 """The efficient score: what each candidate would explain that the base parameters cannot. Plain linear algebra.
 
-Symbols      r whitened residuals at the best fit, prior rows appended; J = ∂r/∂θ of the free base parameters; C_g =
-∂r/∂ε of the amplitudes of candidate g at zero. Projection   C̃ = (1 − QQᵀ) C with Q from the QR decomposition of J:
-what the base could have absorbed is removed. Gram matrix  Everything below follows from G = C̃ᵀC̃, s = C̃ᵀr and
-r·r. A candidate joins the base by a Schur complement. Statistic    T_g = s_gᵀ G_gg⁺ s_g; χ² with rank(G_gg) degrees
-of freedom under the base model. One-step amplitudes ε = −G_gg⁺ s_g, covariance G_gg⁺. Noise scale  T is divided by
-the mean square of the residuals in the complement of base and candidates, so that errors that are stated a few per
-cent too small or too large raise no alarm (an F statistic; the complement has thousands of degrees of freedom, so
-χ² serves). Global p     Under the base model the scores of all candidates together are N(0, G): the smallest p of a
-draw is compared with the smallest p found, 10⁴ times, without a model call. Beyond the reach of the draws the tail
-is continued with the effective number of trials that the draws themselves give. Sources      Rao 1948; Bera &
-Bilias 2001, J. Stat. Plan. Inference 97, 9 (score tests); Gross & Vitells 2010, Eur. Phys. J. C 70, 525 (trial
-factors).
+Symbols      r whitened residuals at the best fit, prior rows appended; J = ∂r/∂θ of the free base parameters;
+             C_g = ∂r/∂ε of the amplitudes of candidate g at zero.
+Projection   C̃ = (1 − QQᵀ) C with Q from the QR decomposition of J: what the base could have absorbed is removed.
+Gram matrix  Everything below follows from G = C̃ᵀC̃, s = C̃ᵀr and r·r. A candidate joins the base by a Schur complement.
+Statistic    T_g = s_gᵀ G_gg⁺ s_g; χ² with rank(G_gg) degrees of freedom under the base model.
+             One-step amplitudes ε = −G_gg⁺ s_g, covariance G_gg⁺.
+Noise scale  T is divided by the mean square of the residuals in the complement of base and candidates, so that
+             errors that are stated a few per cent too small or too large raise no alarm (an F statistic; the
+             complement has thousands of degrees of freedom, so χ² serves).
+Global p     Under the base model the scores of all candidates together are N(0, G): the smallest p of a draw is
+             compared with the smallest p found, 10⁴ times, without a model call. Beyond the reach of the draws the
+             tail is continued with the effective number of trials that the draws themselves give.
+Sources      Rao 1948; Bera & Bilias 2001, J. Stat. Plan. Inference 97, 9 (score tests); Gross & Vitells 2010,
+             Eur. Phys. J. C 70, 525 (trial factors).
 """
 
 from __future__ import annotations
