@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from small_run import small_fit
 
-from walop_jax.diagnosis.detectability import beyond_rival, detectability
+from walop_jax.diagnosis.detectability import detectability
+from walop_jax.diagnosis.score import ScoreSpace, separations
 from walop_jax.model.effects import EFFECTS
 from walop_jax.model.elements import ELEMENTS
 from walop_jax.model.gallery import numbers
@@ -50,8 +51,9 @@ def test_what_a_rival_cannot_imitate():
     """Columns typed by hand: (1, 0, 1) beside the plane of (1, 0, 0) and (0, 1, 0) keeps its third component."""
     columns = np.array([[1.0, 0, 1], [1, 0, 0], [0, 1, 0]]).T
     gram = columns.T @ columns
-    assert beyond_rival(gram, 0, slice(1, 3), np.ones(3, bool)) == pytest.approx(1.0)
-    assert beyond_rival(gram, 1, slice(1, 2), np.ones(3, bool)) == pytest.approx(0.0, abs=1e-9)
+    space = ScoreSpace(("own", "plane"), (1, 2), np.ones(3), np.diag(gram), gram, 10)
+    assert separations(space, gram[:, 0], gram[0, 0])["plane"] == pytest.approx(1.0)
+    assert separations(space, gram[:, 1], gram[1, 1])["plane"] == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.long

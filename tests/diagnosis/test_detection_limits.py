@@ -63,7 +63,7 @@ def test_every_effect_has_a_limit_or_is_named_as_beyond_these_data(found):
 
 def test_the_alarm_is_raised_with_the_stated_probability(found, examination):
     """Scores drawn with each effect at its limit: 99 % of the draws raise the alarm, at 90 % of it clearly fewer."""
-    space = examination.scored_space
+    space = examination.scorer.space
     scorer = Scorer(space, np.random.default_rng(2))
     value, vector = np.linalg.eigh(space.gram)
     root = vector * np.sqrt(np.clip(value, 0.0, None))

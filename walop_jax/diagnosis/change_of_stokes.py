@@ -12,20 +12,26 @@ from jaxtyping import Float
 
 from walop_jax.calibration.matrix import sky_vectors
 from walop_jax.calibration.records import SMALLEST_DETERMINANT
+from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
 from walop_jax.model import light
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.planning import plan_for_settings
 
 LARGEST_P = 0.05
 
 
+def first_setting(calset: CalibrationSet, instrument: Instrument) -> Settings:
+    """Filter and positions of the first exposure of a set, all else as by default."""
+    first = Settings.of(calset.exposures[:1], instrument.patched().moving())
+    return Settings.default(1, str(first.filter[0])).at(**first.positions)
+
+
 def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p a 3"]:
     """Instrument matrix at the field points of a fit, in the filter and plate setting of its first exposure."""
     instrument, calset = result.model.instrument(result.values), result.calset
-    first = Settings.of(calset.exposures[:1], instrument.patched().moving())
-    setting = Settings.default(1, str(first.filter[0])).at(**first.positions)
-    plan = plan_for_settings(instrument, setting, calset.filters)
+    plan = plan_for_settings(instrument, first_setting(calset, instrument), calset.filters)
     vectors = sky_vectors(instrument, plan, calset.points.x, calset.points.y)[:, 0]
     return np.asarray(light.instrument_matrix(jnp.asarray(vectors), instrument.cameras.pairs))
 

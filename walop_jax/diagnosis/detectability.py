@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from walop_jax.diagnosis.effect_columns import probes
+from walop_jax.diagnosis.effect_columns import Probe, applicable, probes
 from walop_jax.diagnosis.examination import ALARM, Examination
+from walop_jax.diagnosis.score import separations
 from walop_jax.fit.refit import FitResult
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.parameters import field_declarations
@@ -52,38 +53,29 @@ def detectability(
     """Of every effect of the catalogue with an amplitude that the exposures can show, at one of its shapes (the
     first)."""
     context = effect_context(fit.model.template, fit.calset.exposures)
-    there = [kind for kind in catalogue if kind.neutral(context).fits(fit.model.template)]
+    there = applicable(catalogue, context, fit.model.template)
     examination = Examination(fit, list(probes(there, context)), np.random.default_rng(seed))
     space, places = examination.space, examination.space.places()
     alive = space.alive()
     threshold = stats.norm.isf(0.5 * ALARM / max(examination.table.trials, 1.0)) + stats.norm.ppf(FOUND)
-    first: dict[str, tuple[type[Effect], int, slice]] = {}
+    first: dict[str, tuple[Probe, int]] = {}
     for probe in examination.probes:
         at = places[probe.name]
         if probe.effect.name not in first and alive[at].any():
-            first[probe.effect.name] = probe.effect, at.start + int(np.argmax(alive[at])), at
+            first[probe.effect.name] = probe, at.start + int(np.argmax(alive[at]))
     found = []
-    for name, (effect, i, _) in first.items():
+    for name, (probe, i) in first.items():
         whole = float(space.gram[i, i])
         size = threshold / np.sqrt(whole)
+        apart = separations(space, space.gram[:, i], whole)
         left = {
-            other: beyond_rival(space.gram, i, at, alive) / np.sqrt(whole)
-            for other, (_, _, at) in first.items()
-            if other != name
+            other: apart[rival.name] / np.sqrt(whole) for other, (rival, _) in first.items() if other != name
         }
         nearest = sorted(left, key=lambda other: left[other])[:MOST_RIVALS]
         closest = left[nearest[0]] if nearest else 1.0
         named = max(size, NAMED / (closest * np.sqrt(whole))) if closest > 0 else np.nan
-        parameter = effect.amplitudes()[0]
-        unit = field_declarations(effect)[parameter].unit
+        parameter = probe.effect.amplitudes()[0]
+        unit = field_declarations(probe.effect)[parameter].unit
         rivals = tuple((other, float(threshold * left[other])) for other in nearest)
         found.append(Detectability(name, parameter, unit, float(size), float(named), rivals))
     return tuple(found)
-
-
-def beyond_rival(gram: np.ndarray, i: int, rival: slice, alive: np.ndarray) -> float:
-    """Norm of the part of column `i` that the columns `rival` cannot imitate."""
-    at = np.arange(rival.start, rival.stop)[alive[rival]]
-    along = gram[at, i]
-    inverse = np.linalg.pinv(gram[np.ix_(at, at)], hermitian=True, rcond=1e-10)
-    return float(np.sqrt(max(gram[i, i] - along @ inverse @ along, 0.0)))

@@ -31,13 +31,12 @@ from jaxtyping import Float
 from scipy import optimize, stats
 
 from walop_jax.calibration.matrix_slopes import effect_slopes, matrix_slopes
-from walop_jax.data.settings import Settings
-from walop_jax.diagnosis.change_of_stokes import change_of_qu
-from walop_jax.diagnosis.effect_columns import Probe
+from walop_jax.diagnosis.change_of_stokes import change_of_qu, first_setting
+from walop_jax.diagnosis.effect_columns import Probe, applicable
 from walop_jax.diagnosis.effect_columns import probes as all_probes
 from walop_jax.diagnosis.examination import ALARM, Examination
 from walop_jax.diagnosis.naming import SEPARATION
-from walop_jax.diagnosis.score import Scorer, ScoreSpace, whitening
+from walop_jax.diagnosis.score import separations
 from walop_jax.diagnosis.trust import sampled
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.plain_tables import astropy_table
@@ -147,14 +146,12 @@ def detection_limits(
     tell = progress or (lambda text: None)
     result = sampled(result, limits.DIAGNOSED_ROWS)
     context = effect_context(result.model.template, result.calset.exposures)
-    fitting = [kind for kind in catalogue if kind.neutral(context).fits(result.model.template)]
+    fitting = applicable(catalogue, context, result.model.template)
     tell("differentiating every effect")
-    rng = np.random.default_rng(seed)
-    examination = Examination(result, list(all_probes(fitting, context)), rng)
-    space = examination.scored_space
-    noncentrality = _Noncentrality(Scorer(space, rng).threshold(ALARM))
+    examination = Examination(result, list(all_probes(fitting, context)), np.random.default_rng(seed))
+    noncentrality = _Noncentrality(examination.scorer.threshold(ALARM))
     tell("comparing the effects")
-    columns = [c for probe in examination.probes for c in _columns(examination, space, probe, noncentrality)]
+    columns = [c for probe in examination.probes for c in _columns(examination, probe, noncentrality)]
     tell("finding what goes unnoticed")
     return _collected(examination, columns, _errors(examination, columns), fitting)
 
@@ -188,20 +185,17 @@ class _Column:
     rivals: Mapping[str, float]
 
 
-def _columns(
-    examination: Examination, space: ScoreSpace, probe: Probe, noncentrality: _Noncentrality
-) -> list[_Column]:
-    at, alive = space.places()[probe.name], space.alive()
-    inside = np.arange(at.start, at.stop)
-    rank = whitening(np.where(np.outer(alive[at], alive[at]), space.gram[at, at], 0.0)).shape[1]
+def _columns(examination: Examination, probe: Probe, noncentrality: _Noncentrality) -> list[_Column]:
+    space, full = examination.scorer.space, examination.space
+    at, alive, rank = space.places()[probe.name], space.alive(), space.whitened[probe.name].shape[1]
     found = []
-    for number, place in enumerate(inside.tolist()):
+    for number, place in enumerate(range(at.start, at.stop)):
         if not alive[place]:
             continue
         detected = float(np.sqrt(noncentrality(rank) / space.gram[place, place]))
-        full = examination.space
         square = float(full.gram[place, place])
-        apart = _separations(full, examination, probe, place)
+        apart = examination.nearest(separations(full, full.gram[:, place], square))
+        del apart[probe.effect.name]
         nearest = min(apart.values(), default=np.inf)
         named = detected
         if nearest <= np.sqrt(_ABSORBED * square):
@@ -213,19 +207,6 @@ def _columns(
     return found
 
 
-def _separations(space: ScoreSpace, examination: Examination, probe: Probe, place: int) -> dict[str, float]:
-    """How far every other effect stays from one column, for an amplitude of one."""
-    found: dict[str, float] = {}
-    square = float(space.gram[place, place])
-    for rival in examination.probes:
-        if rival.effect is probe.effect:
-            continue
-        along = examination.whitened[rival.name] @ space.gram[space.places()[rival.name], place]
-        left = float(np.sqrt(max(square - float(along @ along), 0.0)))
-        found[rival.effect.name] = min(left, found.get(rival.effect.name, np.inf))
-    return found
-
-
 def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.ndarray, "c p"]:
     """Error of q and u at every field point from each column, at the amplitude that is just detected.
 
@@ -233,8 +214,7 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
     """
     design, result = examination.design, examination.result
     instrument, calset = result.model.instrument(result.values), result.calset
-    first = Settings.of(calset.exposures[:1], instrument.patched().moving())
-    setting = Settings.default(1, str(first.filter[0])).at(**first.positions)
+    setting = first_setting(calset, instrument)
     x, y = calset.points.x, calset.points.y
     matrix, slopes = matrix_slopes(instrument, setting, calset.filters, x, y)
     slopes = slopes @ result.model.selection()

@@ -62,6 +62,13 @@ class Probe:
         return np.array([name in self.effect.one_sided for name in self._fields()], bool)
 
 
+def applicable(
+    catalogue: Sequence[type[Effect]], context: Context, instrument: Instrument
+) -> tuple[type[Effect], ...]:
+    """The effects of a catalogue that have what they act on in an instrument."""
+    return tuple(kind for kind in catalogue if kind.neutral(context).fits(instrument))
+
+
 def probes(catalogue: Sequence[type[Effect]], context: Context) -> Iterator[Probe]:
     """Every group of probes of every effect that has an amplitude in this context."""
     for effect in catalogue:

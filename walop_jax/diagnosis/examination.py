@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -15,7 +15,7 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.effect_columns import Probe, effect_candidates
 from walop_jax.diagnosis.findings import Limit
 from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, strata
-from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable, separations, whitening
+from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable, separations
 from walop_jax.fit.refit import FitResult
 from walop_jax.model.effects import Effect
 from walop_jax.model.parameters import field_declarations
@@ -44,7 +44,8 @@ class Examination:
 
     `named` are the columns of the effects ahead of any projection, `space` and `columns` those of all candidates,
     effects first, behind it. `ranked` are the effects in order of linear evidence, `patterns` the scores of the
-    free-form strata, `blocks` the blocks of the free-form term that can take candidates up.
+    free-form strata, `blocks` the blocks of the free-form term that can take candidates up. `scorer` has scored all,
+    behind the nuisance that single exposures may have.
     """
 
     def __init__(
@@ -79,7 +80,8 @@ class Examination:
         r = self.design.projector(self.design.residual)
         self._scored = space, *reduce(self.columns.T @ r, float(r @ r))
         self._rng = rng
-        self.table: ScoreTable = Scorer(space, rng)(*self._scored[1:])
+        self.scorer = Scorer(space, rng)
+        self.table: ScoreTable = self.scorer(*self._scored[1:])
         self.ranked = naming.rank(self.table, self.probes)
         self.patterns = [self.table[name] for name in names[len(self.probes) :]]
         # Where the base is excluded, a name competes with patterns that have none, not with the base.
@@ -96,20 +98,6 @@ class Examination:
         points = np.repeat(self.design.measured.used.sum(axis=0), len(self.design.measured.gained))
         square = np.where(self.space.before[at] > 0, self.space.before[at], np.inf)
         return np.maximum(COMMON_MODE * np.sqrt(points / square), 1e-30)
-
-    @property
-    def scored_space(self) -> ScoreSpace:
-        """The space in which everything is scored: behind the nuisance that single exposures may have."""
-        return self._scored[0]
-
-    @cached_property
-    def whitened(self) -> dict[str, Matrix]:
-        """By candidate, the rows that turn its elements of `space.gram` into uncorrelated ones."""
-        alive, found = self.space.alive(), {}
-        for name, at in self.space.places().items():
-            mask = np.outer(alive[at], alive[at])
-            found[name] = whitening(np.where(mask, self.space.gram[at, at], 0.0)).T
-        return found
 
     def patterns_needed(self) -> list[tuple[str, float]]:
         """Patterns that together leave nothing significant, with corrected p: the most probable first, one by one."""
@@ -165,11 +153,14 @@ class Examination:
         projected = own.rest(whole)
         space = dataclasses.replace(self.space, gram=self.space.gram + own.columns.T @ own.columns)
         scores = self.columns.T @ projected + own.columns.T @ (own.basis.T @ projected)
-        by_probe = separations(space, scores, float(projected @ projected))
+        return self.nearest(separations(space, scores, float(projected @ projected)))
+
+    def nearest(self, by_candidate: Mapping[str, float]) -> dict[str, float]:
+        """The smallest number of each effect among those of its probes."""
         found: dict[str, float] = {}
         for probe in self.probes:
             effect = probe.effect.name
-            found[effect] = min(by_probe[probe.name], found.get(effect, np.inf))
+            found[effect] = min(by_candidate[probe.name], found.get(effect, np.inf))
         return found
 
     @cached_property

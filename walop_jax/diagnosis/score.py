@@ -189,6 +189,15 @@ class ScoreSpace:
         share = np.where(self.before > 0, after / np.where(self.before > 0, self.before, 1.0), 0.0)
         return (share > ABSORBED) & (np.sqrt(after) * self.widths > FAINTEST)
 
+    @cached_property
+    def whitened(self) -> Mapping[str, Matrix]:
+        """By candidate its `whitening`, with no part in it of amplitudes that are not alive."""
+        alive, found = self.alive(), {}
+        for name, at in self.places().items():
+            mask = alive[at]
+            found[name] = whitening(np.where(np.outer(mask, mask), self.gram[at, at], 0.0))
+        return found
+
     def with_base(self, names: Sequence[str], widths: Vector | None = None) -> tuple[ScoreSpace, Reduction]:
         """The space when some candidates have joined the base, and what takes (C̃ᵀr, r·r) there.
 
@@ -218,7 +227,7 @@ class Scorer:
         self.space = space
         alive, gram = space.alive(), np.where(np.outer(space.alive(), space.alive()), space.gram, 0.0)
         self._alive = alive
-        self._whitening = {name: whitening(gram[at, at]) for name, at in space.places().items()}
+        self._whitening = space.whitened
         self._all = whitening(gram)
         self._smallest = self._smallest_p(gram, rng, draws)
 
@@ -299,10 +308,8 @@ def separations(space: ScoreSpace, scores: Vector, square: float) -> dict[str, f
 
     `scores` are C̃ᵀD and `square` D·D, both behind the projection (Atkinson & Fedorov 1975, Biometrika 62, 57).
     """
-    alive, found = space.alive(), {}
+    found = {}
     for name, at in space.places().items():
-        mask = alive[at]
-        w = whitening(np.where(np.outer(mask, mask), space.gram[at, at], 0.0))
-        z = w.T @ np.where(mask, scores[at], 0.0)
+        z = space.whitened[name].T @ scores[at]
         found[name] = float(np.sqrt(max(square - float(z @ z), 0.0)))
     return found

@@ -38,7 +38,6 @@ from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable
 from walop_jax.fit.refit import FitResult, with_honest_errors
 from walop_jax.fit.refit import refit as fit_refit
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.flux import sharing
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.processes import Processes
 from walop_jax.likelihood.runner import Progress
@@ -143,8 +142,8 @@ def group_scores(design: Design) -> list[GroupScore]:
     """Every camera, kind, filter and exposure of a fit by itself."""
     measured = design.measured
     residual = design.cube(design.projector(design.residual))
-    shared = sharing(measured.likelihood.model.template, measured.likelihood.plan)
-    power = np.asarray(shared.summed(measured.model**2))
+    shared = measured.shared
+    power = shared.summed(measured.model**2)
     w = np.where(measured.known[..., None], 0.0, measured.model**2 / np.where(power > 0, power, 1.0))
     absorbed = design.cube(np.sum(design.projector.basis**2, axis=1))
     expected = np.where(measured.used[..., None], np.clip(1.0 - w - absorbed, 0.0, None), 0.0)
@@ -157,7 +156,7 @@ def group_scores(design: Design) -> list[GroupScore]:
             continue
         # ‖P‖² among what has a flux in common; what the parameters couple beyond that is small beside it.
         taken = [np.where(part, w, 0.0) for part in (group, rest)]
-        sums = [np.asarray(shared.summed(part)) for part in taken]
+        sums = [shared.summed(part) for part in taken]
         own = [
             np.where(part, (1.0 - w) ** 2 - w**2, 0.0).sum() + np.sum(t * s)
             for part, t, s in zip((group, rest), taken, sums, strict=True)

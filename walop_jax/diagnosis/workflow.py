@@ -22,7 +22,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import location, naming
 from walop_jax.diagnosis.change_of_stokes import instrument_matrices, largest_change
 from walop_jax.diagnosis.design import Design, held_out
-from walop_jax.diagnosis.effect_columns import Probe
+from walop_jax.diagnosis.effect_columns import Probe, applicable
 from walop_jax.diagnosis.effect_columns import probes as all_probes
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.findings import Diagnosis, Outcome, Step, Unexplained
@@ -90,8 +90,7 @@ class _Diagnosing:
         self.calset, self.tell, self.until = calset, tell, until
         self.rng = np.random.default_rng(seed)
         self.context: Context = effect_context(model.template, calset.exposures)
-        fitting = [kind for kind in catalogue if kind.neutral(self.context).fits(model.template)]
-        self.catalogue = tuple(fitting)
+        self.catalogue = applicable(catalogue, self.context, model.template)
         self.wanted: list[Probe] = list(all_probes(self.catalogue, self.context))
         self.steps: list[Step] = []
         tell("fitting the model")
