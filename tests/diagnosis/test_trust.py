@@ -14,12 +14,18 @@ from walop_jax.calibration.records import Quality
 from walop_jax.data.records import Block, CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.trust import examined, group_scores, refit
+from walop_jax.diagnosis.trust import examined, group_scores
+from walop_jax.fit import refit as fitting
 from walop_jax.fit.refit import FitResult
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate
 
 PLAN = ObservingPlan(grid=8)
+
+
+def refit(calset: CalibrationSet) -> FitResult:
+    """A fit, and what its residuals say against it."""
+    return examined(fitting.refit(calset))
 
 
 def block(calset: CalibrationSet) -> Block:

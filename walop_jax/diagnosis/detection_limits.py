@@ -34,7 +34,7 @@ from walop_jax.calibration.matrix_slopes import effect_slopes, matrix_slopes
 from walop_jax.diagnosis.change_of_stokes import change_of_qu, first_setting
 from walop_jax.diagnosis.effect_columns import Probe, applicable
 from walop_jax.diagnosis.effect_columns import probes as all_probes
-from walop_jax.diagnosis.examination import ALARM, Examination
+from walop_jax.diagnosis.examination import ALARM, Examination, most_points
 from walop_jax.diagnosis.naming import SEPARATION
 from walop_jax.diagnosis.score import separations
 from walop_jax.diagnosis.trust import sampled
@@ -144,11 +144,13 @@ def detection_limits(
     Monte Carlo threshold. Of a large set points spread over the field are looked at, as in `diagnose`.
     """
     tell = progress or (lambda text: None)
-    result = sampled(result, limits.DIAGNOSED_ROWS)
-    context = effect_context(result.model.template, result.calset.exposures)
-    fitting = applicable(catalogue, context, result.model.template)
+    template, calset = result.model.template, result.calset
+    context = effect_context(template, calset.exposures)
+    fitting = applicable(catalogue, context, template)
+    wanted = list(all_probes(fitting, context))
+    result = sampled(result, most_points(calset, template, sum(len(probe.widths) for probe in wanted)))
     tell("differentiating every effect")
-    examination = Examination(result, list(all_probes(fitting, context)), np.random.default_rng(seed))
+    examination = Examination(result, wanted, np.random.default_rng(seed))
     noncentrality = _Noncentrality(examination.scorer.threshold(ALARM))
     tell("comparing the effects")
     columns = [c for probe in examination.probes for c in _columns(examination, probe, noncentrality)]

@@ -10,14 +10,17 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
+from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import naming
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.effect_columns import Probe, effect_candidates
 from walop_jax.diagnosis.findings import Limit
-from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, strata
+from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, number_of_columns, strata
 from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable, separations
 from walop_jax.fit.refit import FitResult
+from walop_jax.likelihood import limits
 from walop_jax.model.effects import Effect
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations
 
 Vector = Float[np.ndarray, " _"]
@@ -167,6 +170,17 @@ class Examination:
     def significant(self) -> list[naming.Ranked]:
         """Effects that are significant by themselves, best evidence first."""
         return [r for r in self.ranked if self.table.corrected(r.score) < ALARM]
+
+
+def most_points(calset: CalibrationSet, instrument: Instrument, amplitudes: int) -> int:
+    """Number of field points that are looked at: as many as rows, and numbers in all columns, may be.
+
+    `amplitudes` are those of the effects that are examined.
+    """
+    columns = amplitudes + number_of_columns(calset, instrument)
+    exposures = len(calset.exposures)
+    numbers = exposures * calset.cameras * columns
+    return max(1, min(limits.DIAGNOSED_ROWS // exposures, limits.DIAGNOSED_NUMBERS // numbers))
 
 
 def upper_limit(value: float, sigma: float, *, one_sided: bool) -> float:

@@ -23,26 +23,20 @@ Limits      Noise alone raises a doubt in about one fit of 200. Of a large set a
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Iterator, Mapping
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import stats
 
-from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM
 from walop_jax.diagnosis.freeform import strata
 from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable
 from walop_jax.fit.refit import FitResult, with_honest_errors
-from walop_jax.fit.refit import refit as fit_refit
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.processes import Processes
-from walop_jax.likelihood.runner import Progress
 from walop_jax.likelihood.thinning import thinned
-from walop_jax.model.specification import Model
 
 UNEVEN = 1.25
 """Factor between the squared residuals of a group and those of all below which it is a matter of the stated errors."""
@@ -63,7 +57,7 @@ def examined(result: FitResult, seed: int = 0) -> FitResult:
     explained = result.explains_data or result.nearly_explains_data
     if not result.converged or not explained:
         return dataclasses.replace(result, examined=True)
-    design = Design.of(sampled(result, limits.TRUST_ROWS))
+    design = Design.of(sampled(result, max(1, limits.TRUST_ROWS // max(len(result.calset.exposures), 1))))
     if result.errors_too_large and _hold_no_noise(design):
         return dataclasses.replace(result, examined=True, noiseless=True)
     table = pattern_scores(design, seed)
@@ -78,27 +72,8 @@ def _hold_no_noise(design: Design) -> bool:
     return float(left @ left) < NOISELESS * design.rows
 
 
-def refit(
-    calset: CalibrationSet,
-    model: Model | None = None,
-    *,
-    folder: str | os.PathLike[str] | None = None,
-    progress: Progress | None = None,
-    memory: float | None = None,
-    processes: Processes | None = None,
-) -> FitResult:
-    """Fit a calibration set with `model` (default: the base model), and examine what it leaves.
-
-    Arguments, and what is raised, are those of `fit.refit.refit`.
-    """
-    return examined(
-        fit_refit(calset, model, folder=folder, progress=progress, memory=memory, processes=processes)
-    )
-
-
-def sampled(result: FitResult, rows: int) -> FitResult:
-    """The fit seen at points spread over the field, with no more than `rows` (exposure, point) pairs."""
-    most = max(1, rows // max(len(result.calset.exposures), 1))
+def sampled(result: FitResult, most: int) -> FitResult:
+    """The fit seen at no more than `most` field points, spread over the field."""
     if len(result.calset.points) <= most:
         return result
     calset = thinned(result.calset, most, neighbours=1)

@@ -24,9 +24,8 @@ from walop_jax.diagnosis.change_of_stokes import instrument_matrices, largest_ch
 from walop_jax.diagnosis.design import Design, held_out
 from walop_jax.diagnosis.effect_columns import Probe, applicable
 from walop_jax.diagnosis.effect_columns import probes as all_probes
-from walop_jax.diagnosis.examination import Examination
+from walop_jax.diagnosis.examination import Examination, most_points
 from walop_jax.diagnosis.findings import Diagnosis, Outcome, Step, Unexplained
-from walop_jax.diagnosis.freeform import number_of_columns
 from walop_jax.diagnosis.score import Score
 from walop_jax.diagnosis.step_summary import before_and_after, refitted_in_order
 from walop_jax.fit.model_builder import base_model
@@ -65,12 +64,9 @@ def diagnose(
     model = model or base_model(calset)
     context = effect_context(model.template, calset.exposures)
     amplitudes = sum(len(probe.widths) for probe in all_probes(tuple(catalogue), context))
-    columns = amplitudes + number_of_columns(calset, model.template)
-    each = len(calset.exposures) * calset.cameras * columns
-    most = min(limits.DIAGNOSED_ROWS // len(calset.exposures), limits.DIAGNOSED_NUMBERS // each)
-    some = thinned(calset, max(1, most), neighbours=1)
+    some = thinned(calset, most_points(calset, model.template, amplitudes), neighbours=1)
     if len(some.points) < len(calset.points):
-        tell(f"looking at {len(some.points)} of {len(calset.points)} field points: {columns} columns each")
+        tell(f"looking at {len(some.points)} of {len(calset.points)} field points")
     found = _Diagnosing(some, model, catalogue, seed, tell, began + 60.0 * minutes).run(began)
     return dataclasses.replace(found, points=len(calset.points))
 

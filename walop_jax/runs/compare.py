@@ -11,7 +11,8 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data import DEFAULT_FILTER
 from walop_jax.data.field_points import true_matrices
 from walop_jax.data.user_tables import new_table, write_output_table
-from walop_jax.diagnosis.trust import refit
+from walop_jax.diagnosis.trust import examined
+from walop_jax.fit.refit import refit
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
 from walop_jax.model.effects import EFFECTS, Effect
@@ -72,7 +73,7 @@ def compare_methods(
     calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
     known = None if truth is None else Truth(*true_matrices(truth, chosen.template.patched()))
     tell("fitting the joint model")
-    result = refit(calset, chosen, progress=tell)
+    result = examined(refit(calset, chosen, progress=tell))
     if not result.converged:
         raise ValueError(f"the joint fit did not converge ({result.minimum.message})")
     tell("fitting and judging the polynomials")

@@ -27,9 +27,11 @@ from walop_jax.data.records import KINDS, CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.user_tables import InputTable, extended, in_memory, read_input_table
-from walop_jax.diagnosis import trust, workflow
+from walop_jax.diagnosis import workflow
 from walop_jax.diagnosis.detection_limits import DetectionLimits, detection_limits
 from walop_jax.diagnosis.findings import Diagnosis
+from walop_jax.diagnosis.trust import examined
+from walop_jax.fit import refit as fitting
 from walop_jax.fit.model_builder import model_for
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import errors_naming
@@ -92,7 +94,9 @@ def refit(
         options |= {"memory": memory, "processes": processes}
         return refit_sets(output=output, **options).result
     calset, chosen = _set_and_model(data, model, instrument, catalogue)
-    return trust.refit(calset, chosen, folder=folder, progress=progress, memory=memory, processes=processes)
+    return examined(
+        fitting.refit(calset, chosen, folder=folder, progress=progress, memory=memory, processes=processes)
+    )
 
 
 def diagnose(
@@ -196,7 +200,11 @@ def compare(
         paths = _paths(data)
         return compare_methods(paths, output, filter_name=filter, seed=seed, overwrite=overwrite).comparison
     calset = _set(data)
-    joint = Calibration.from_fit(trust.refit(calset)) if calibration is None else _calibration(calibration)
+    joint = (
+        Calibration.from_fit(examined(fitting.refit(calset)))
+        if calibration is None
+        else _calibration(calibration)
+    )
     return compare_with_paper(calset, joint, truth, filter, seed)
 
 
@@ -213,7 +221,7 @@ def certify(calibration: CalibrationLike, catalogue: Sequence[type[Effect]] = EF
 def epoch(old: CalibrationLike, new: SetLike) -> Epoch:
     """Whether an old calibration still fits new data, and what has moved: `walop-jax epoch`."""
     calibration = _calibration(old)
-    return epochs.epoch(calibration, trust.examined(epochs.fit_like(calibration, _set(new))))
+    return epochs.epoch(calibration, examined(epochs.fit_like(calibration, _set(new))))
 
 
 def limits(

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from walop_jax.diagnosis.detection_limits import DetectionLimits, detection_limits
-from walop_jax.diagnosis.trust import refit
+from walop_jax.diagnosis.trust import examined
+from walop_jax.fit.refit import refit
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
 from walop_jax.model.effects import EFFECTS, Effect
@@ -55,7 +56,7 @@ def limits_of_sets(
         check_folder(output, OUTPUTS, overwrite=overwrite)
     tell("reading")
     calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
-    result = refit(calset, chosen, progress=tell)
+    result = examined(refit(calset, chosen, progress=tell))
     if not result.converged:
         raise ValueError(f"the fit did not converge ({result.minimum.message})")
     found = detection_limits(result, catalogue=catalogue, seed=seed or 0, progress=tell)

@@ -15,9 +15,9 @@ from walop_jax.calibration.product import write_product
 from walop_jax.calibration.records import ResidualMap
 from walop_jax.calibration.residual_map import residual_map
 from walop_jax.calibration.summary import FAILED, PARTIAL, PRODUCT, SUMMARY, summary
-from walop_jax.diagnosis.trust import refit
+from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.misfit import Misfit, describe
-from walop_jax.fit.refit import FitResult
+from walop_jax.fit.refit import FitResult, refit
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.heartbeat import repeated
@@ -84,9 +84,10 @@ def refit_sets(
     tell("reading")
     calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
     with repeated(tell) as say:
-        result = refit(
+        fitted = refit(
             calset, chosen, folder=folder / PARTIAL, progress=say, memory=memory, processes=processes
         )
+        result = examined(fitted)
     residuals = residual_map(result) if result.likelihood.layout.large and result.converged else None
     misfit = describe(result) if first and not result.explains_data else None
     seconds = time.perf_counter() - began
@@ -95,13 +96,6 @@ def refit_sets(
         tell("mapping the field")
         _write(folder, result, residuals, found, overwrite=overwrite)
     return RefitRun(result, found, residuals, misfit, seconds)
-
-
-def write_fit(
-    output: str | os.PathLike[str], result: FitResult, *, seconds: float, overwrite: bool = False
-) -> None:
-    """Write the folder of a fit that was made elsewhere, as `refit_sets` does."""
-    _write(Path(output), result, None, summary(result, seconds=seconds), overwrite=overwrite)
 
 
 def _write(
