@@ -25,7 +25,7 @@ SCRIPTS = {
     for section in SECTIONS
 }
 SAID = {
-    "The posterior of two thicknesses": "half1.plate.quartz",
+    "The posterior of two thicknesses": "half1.plate.mgf2",
     "Freeze the wedge": "fixed",
     "An effect of my own": "Diagnosis: ",
     "Compare two nights": "HAS CHANGED",

@@ -13,6 +13,7 @@ from walop_jax.posterior.surrogate import Draws, Matrix, Surrogate, features_of
 from walop_jax.posterior.target import Target, choose_sampled
 
 OVERSAMPLING = 1.5  # design points per feature
+LEAST = 1.1  # pairs of points ±u per odd feature, and per even feature: a pair measures one of each
 SPREAD = 1.2  # of the design, in standard errors
 BENT = 8  # directions that get cubic terms
 
@@ -34,9 +35,10 @@ def _coordinates(target: Target, sampled: Int[np.ndarray, " k"]) -> tuple[Matrix
     return along, across
 
 
-def _design(rng: np.random.Generator, points: int, width: int) -> Draws:
+def _design(rng: np.random.Generator, odd: int, even: int, width: int) -> Draws:
     """Points ±u with u normal: odd and even parts of the residuals separate."""
-    half = SPREAD * rng.standard_normal((-(-points // 2), width))
+    pairs = max(0.5 * OVERSAMPLING * (odd + even), LEAST * max(odd, even)) + 1.0
+    half = SPREAD * rng.standard_normal((int(np.ceil(pairs)), width))
     return np.concatenate([half, -half])
 
 
@@ -77,8 +79,9 @@ def build_surrogate(
     triples = np.zeros((0, 3), int)
     if order == 3:
         triples = _cubic_terms(target, along, k)
-    n_features = 1 + k + len(pairs) + len(triples) + s
-    design = _design(np.random.default_rng([seed, 20]), int(OVERSAMPLING * n_features) + 2, k + s)
+    odd, even = k + len(triples) + s, 1 + len(pairs)
+    n_features = odd + even
+    design = _design(np.random.default_rng([seed, 20]), odd, even, k + s)
     x = target.centre + design[:, :k] @ along.T + design[:, k:] @ across.T
     y = np.concatenate(
         [np.asarray(features_of(*(jnp.asarray(a) for a in (design[:, :k], pairs, triples)))), design[:, k:]],
