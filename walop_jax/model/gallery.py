@@ -16,7 +16,8 @@ from walop_jax.model.elements.base import Element
 from walop_jax.model.parameters import field_declarations, numbers_of, unknown_name
 
 NUMBERS = "gallery.json"
-_UNSEEN = 3.0  # standard deviations below which two effects cannot be told apart
+_UNSEEN = 3.0  # standard deviations below which one effect may be taken for another
+_NOTHING = 5e-4  # per cent of the matrix: not worth a number
 
 
 def effect_page(name: str) -> str:
@@ -43,7 +44,8 @@ def listed() -> str:
 
 
 def numbers() -> dict[str, Any]:
-    """The numbers of the pages: `plan` in words, and by effect what `diagnosis.detectability` finds for it."""
+    """The numbers of the pages: `plan` in words, and by effect what `diagnosis.detection_limits` finds for it, and
+    the rms change of the matrix (per cent) at its usual size."""
     return json.loads((files("walop_jax") / "docs" / NUMBERS).read_text(encoding="utf-8"))
 
 
@@ -69,6 +71,8 @@ def _effect(effect: type[Effect]) -> Iterator[str]:
         yield ""
     found = numbers()
     one = found["effects"].get(effect.name)
+    if one is not None:
+        yield from _maps(one)
     yield "## How small it may be, and what it looks like"
     yield ""
     if one is None:
@@ -83,20 +87,40 @@ def _effect(effect: type[Effect]) -> Iterator[str]:
         yield f"Source: {effect.reference}."
 
 
+def _maps(one: Mapping[str, Any]) -> Iterator[str]:
+    """What it does to the maps of the instrument matrix, at its usual size."""
+    yield "## What it does to the maps"
+    yield ""
+    size = f"{one['parameter']} = {one['usual']:g}{_unit(one)}"
+    seen = {name: value for name, value in one["maps"].items() if value >= _NOTHING}
+    if seen:
+        yield f"At {size} the elements of the instrument matrix change by (rms over the field, per cent)"
+        yield ""
+        yield from _table(tuple(one["maps"]), [tuple(f"{value:.2g}" for value in one["maps"].values())])
+    else:
+        yield f"Nothing: at {size} it disturbs the calibration data, not the light of the stars."
+        yield ""
+
+
 def _sizes(one: Mapping[str, Any], plan: str) -> Iterator[str]:
-    unit = f" {one['unit']}" if one["unit"] else ""
     yield f"In a run of {plan}:"
     yield ""
-    yield f"- found, 99 times in 100, from {one['parameter']} = {one['found']:.2g}{unit} on"
+    least, most = one["found"]
+    seldom = f", {most:.2g} in the shape that shows least" if most > 1.05 * least else ""
+    yield f"- found, 99 times in 100, from {one['parameter']} = {least:.2g}{_unit(one)} on{seldom}"
     named = one["named"]
-    if named is None or named != named or named > 1e3 * one["found"]:
+    if named is None or named > 1e3 * most:
         yield "- named alone at no size: the first effect below makes the same pattern there"
     else:
-        yield f"- named alone (5 σ from every other effect) from {named:.2g}{unit} on"
+        yield f"- named alone, 99 times in 100, from {named:.2g}{_unit(one)} on{', in every shape' if seldom else ''}"
     for rival, separation in one["rivals"]:
-        verdict = "cannot be told from" if separation < _UNSEEN else f"{separation:.1f} σ away from"
+        verdict = "may be taken for" if separation < _UNSEEN else f"{separation:.1f} σ away from"
         yield f"- at the size from which it is found, {verdict} `{rival}`"
     yield ""
+
+
+def _unit(one: Mapping[str, Any]) -> str:
+    return f" {one['unit']}" if one["unit"] else ""
 
 
 def _element(kind: type[Element]) -> Iterator[str]:
