@@ -19,6 +19,7 @@ from walop_jax.calibration.product import (
 from walop_jax.data import empty_sources
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import InputFile, Points, Site
+from walop_jax.diagnosis.detection_limits import DetectionLimit, DetectionLimits
 from walop_jax.diagnosis.figure_file import (
     DiagnosisFigureData,
     ExposureLabels,
@@ -27,6 +28,7 @@ from walop_jax.diagnosis.figure_file import (
     Shares,
     write_figure_data,
 )
+from walop_jax.io.text import json_text
 
 INPUT = "night <b>one</b> & two.fits"
 X, Y = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.2, 0.2, 3), np.linspace(-0.2, 0.2, 3)))
@@ -161,4 +163,34 @@ def make_diagnosis(folder: Path, **changes: Any) -> Path:
     (folder / "diagnosis.json").write_text(json.dumps(content))
     effects = tuple(step["effect"] for step in content["steps"])
     write_figure_data(folder / "diagnosis.fits", figure_data(effects), overwrite=True)
+    return folder
+
+
+def limits() -> DetectionLimits:
+    """What a set can show: two effects, one of them never named, and a point where an exposure gives no u."""
+    nothing = float("nan")
+    return DetectionLimits(
+        limits=(
+            DetectionLimit("ghost", "share", "", (0.00041, 0.00041), 0.00052, (), (0.0003, 0.0125)),
+            DetectionLimit(
+                "clp_zero", "angle", "deg", (0.012, 0.4), np.inf, ("clp_wobble",), (nothing, nothing)
+            ),
+        ),
+        effects=("ghost", "clp_zero"),
+        separation=np.array([[nothing, 7.0], [2.5, nothing]]),
+        x=np.array([-0.1, 0.2, 0.0]),
+        y=np.array([0.0, -0.2, 0.1]),
+        protection=np.array([0.001, 0.0125, nothing]),
+        caused_by=("clp_zero", "ghost", ""),
+        untestable=("chwp_axis",),
+    )
+
+
+def make_limits(folder: Path, sha256: str = "ab" * 32) -> Path:
+    """A folder as `limits` leaves it, of data with this checksum."""
+    document = limits().document() | {
+        "instrument": "WALOP-SOUTH",
+        "inputs": [{"path": INPUT, "sha256": sha256}],
+    }
+    (folder / "limits.json").write_text(json_text(document))
     return folder

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import handmade_run
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from walop_jax.reports.posterior_figures import informed
 from walop_jax.runs.plot import plot_figure
 from walop_jax.simulation.simulate import simulate
 
-WITHOUT = ("corner", "trace", "residual-map")  # what this run has not
+WITHOUT = ("corner", "trace", "residual-map", "protection", "separation")  # what this run has not
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def test_figures_are_drawn(source, name):
 
 @pytest.mark.parametrize("name", WITHOUT)
 def test_what_a_run_lacks_is_said(source, name):
-    with pytest.raises(DataError, match=r"has no posterior|holds no map"):
+    with pytest.raises(DataError, match=r"has no posterior|holds no (map|limits)"):
         draw(name, source)
 
 
@@ -112,3 +113,9 @@ def test_retardance_on_the_axis_is_that_of_the_crystals(source):
 def test_coefficients_that_are_only_prior_are_not_shown():
     spread = {"a": 0.1, "b": 0.99, "c": 0.5, "d": 3.0}
     assert informed(tuple(spread), spread, {"a": 1.0, "b": 1.0, "c": 1.0, "d": np.nan}) == ("d", "a", "c")
+
+
+@pytest.mark.parametrize("name", ["protection", "separation"])
+def test_figures_of_limits(tmp_path, name):
+    figure = draw(name, Source(handmade_run.make_limits(tmp_path)))
+    assert figure.axes[0].has_data()

@@ -73,22 +73,5 @@ def compare(
     if json:
         print_json(found.document)
     elif not quiet:
-        _show(found.document, output)
-
-
-def _show(document: dict, output: Path) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table("where", "error", "method", "median", "rms", "95 %", "max", "< 0.1 %")
-    for place, title in (("on_grid", "on grid"), ("between", "between")):
-        for quantity in ("q", "u", "p"):
-            for method in ("paper", "joint"):
-                s = document[place][method]["all"][quantity]
-                row = [f"{s[k]:.4f} %" for k in ("median", "rms", "p95", "max")]
-                table.add_row(title, quantity, method, *row, f"{100 * s['share_below_goal']:.1f} %")
-    console = Console(highlight=False)
-    console.print(table)
-    console.print(
-        f"joint errors from the {document['joint_errors_from']}; {output}", markup=False, soft_wrap=True
-    )
+        typer.echo(found.comparison.display().text())
+        typer.echo(str(output))

@@ -18,7 +18,7 @@ from walop_jax.cli.common import (
 )
 
 RunArgument = Annotated[
-    Path, typer.Argument(metavar="RUN", help="Folder of `walop-jax refit` or `diagnose`.")
+    Path, typer.Argument(metavar="RUN", help="Folder of refit, diagnose, compare, epoch or limits.")
 ]
 OutputOption = Annotated[
     Path | None,
@@ -40,8 +40,9 @@ def report(
 
     The verdict, the accuracy of p over the field, what the data were, what was found, residuals before and after, maps
     of the matrix and of its errors, pulls from the priors, all parameters, warnings, inputs and versions, as far as RUN
-    holds them; the page says what is missing. It also reads the RUN of compare and of epoch. A page that exists is made
-    anew; another file of that name is left alone unless --overwrite is given.
+    holds them; the page says what is missing. What sample and limits have put into RUN is there as
+    well; compare, epoch and limits have pages of their own. A page that exists is made anew; another file of that
+    name is left alone unless --overwrite is given.
     """
     switch_on_jax()
     from walop_jax.model.effects.own import catalogue_with

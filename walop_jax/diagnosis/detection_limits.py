@@ -39,7 +39,9 @@ from walop_jax.diagnosis.naming import SEPARATION
 from walop_jax.diagnosis.score import separations
 from walop_jax.diagnosis.trust import sampled
 from walop_jax.fit.refit import FitResult
+from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.rounding import two_digits, two_digits_range, with_minus_sign
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.parameters import field_declarations
@@ -72,8 +74,8 @@ class DetectionLimit:
     error_of_qu: tuple[float, float]
 
 
-@dataclasses.dataclass(frozen=True)
-class DetectionLimits:
+@dataclasses.dataclass(frozen=True, repr=False)
+class DetectionLimits(Displayed):
     """What a set can show of every effect, and what the effects that it cannot show may do.
 
     `separation` (row, column) is how far (σ) the effect of the column stays from that of the row when this is just
@@ -129,6 +131,76 @@ class DetectionLimits:
             },
             "untestable": list(self.untestable),
         }
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> DetectionLimits:
+        """What `document` describes. Raises KeyError or TypeError for one that it has not made."""
+        protection = document["protection"]
+        return cls(
+            limits=tuple(
+                DetectionLimit(
+                    effect=entry["effect"],
+                    parameter=entry["parameter"],
+                    unit=entry["unit"],
+                    detected=(float(entry["detected"][0]), float(entry["detected"][1])),
+                    named=np.inf if entry["named"] is None else float(entry["named"]),
+                    taken_for=tuple(entry["taken_for"]),
+                    error_of_qu=(_number(entry["error_of_qu"][0]), _number(entry["error_of_qu"][1])),
+                )
+                for entry in document["limits"]
+            ),
+            effects=tuple(document["effects"]),
+            separation=np.array(document["separation"], float).reshape(2 * (len(document["effects"]),)),
+            x=np.array(protection["x"], float),
+            y=np.array(protection["y"], float),
+            protection=np.array(protection["error_of_qu"], float),
+            caused_by=tuple(protection["caused_by"]),
+            untestable=tuple(document["untestable"]),
+        )
+
+    def display(self) -> Display:
+        """The protection level in a sentence, and a row for each effect and parameter."""
+        rows = tuple(
+            (
+                f"{entry.effect}.{entry.parameter}",
+                two_digits_range(*entry.detected),
+                two_digits(entry.named) if np.isfinite(entry.named) else "never",
+                entry.unit,
+                two_digits_range(*(100.0 * value for value in entry.error_of_qu)),
+                ", ".join(entry.taken_for),
+            )
+            for entry in self.limits
+        )
+        notes = (f"cannot be seen in these data: {', '.join(self.untestable)}",) if self.untestable else ()
+        return Display(
+            title="What these data can show, with 99 % probability",
+            facts=(("protection level", self.protection_in_words() or "one exposure does not give q and u"),),
+            head=("amplitude", ">detected", ">named", "unit", ">error of q, u (%)", "may be taken for"),
+            rows=rows,
+            notes=notes,
+        )
+
+    def protection_in_words(self) -> str:
+        """The largest error of q and u over the field that goes unnoticed; empty where none is known."""
+        worst = self.worst
+        if worst is None:
+            return ""
+        x, y = (with_minus_sign(f"{value:+.2f}°") for value in (self.x[worst], self.y[worst]))
+        return (
+            f"no single effect of the catalogue can make q or u of a star with p ≤ 5 % wrong by more than "
+            f"{two_digits(100 * self.protection[worst])} % without being detected "
+            f"({two_digits(100 * float(np.nanmedian(self.protection)))} % in the median of the field); "
+            f"the largest would be {self.caused_by[worst]} at ({x}, {y})"
+        )
+
+    @property
+    def worst(self) -> int | None:
+        """The field point where most can go unnoticed; None if one exposure nowhere gives q and u."""
+        return int(np.nanargmax(self.protection)) if np.isfinite(self.protection).any() else None
+
+
+def _number(value: float | None) -> float:
+    return np.nan if value is None else float(value)
 
 
 def detection_limits(

@@ -26,7 +26,9 @@ from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.filters import DEFAULT_FILTER
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
+from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError
+from walop_jax.io.rounding import two_digits
 from walop_jax.paper.full_moon import full_moon_scheme, judge_patches
 from walop_jax.paper.polynomial import (
     PaperCalibration,
@@ -147,8 +149,8 @@ def offsets(
 # ------------------------------------------------------------------------------------- both methods, one set
 
 
-@dataclasses.dataclass(frozen=True)
-class Comparison:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Comparison(Displayed):
     """Paper II's method and the joint model on one calibration set.
 
     `grid` has the errors at the points that the polynomials were made for, `between` those elsewhere; `truth` says
@@ -190,6 +192,35 @@ class Comparison:
             "colour": {"temperatures": list(TEMPERATURES), "degree": DEGREE} | spread_document(self.colours),
             "full_moon": self.moon,
         }
+
+    def display(self) -> Display:
+        """Errors of q, u and p by both methods, on the grid points and between them."""
+        rows = []
+        for where, errors in (("on the grid", self.grid.document()), ("between", self.between.document())):
+            for quantity in QUANTITIES:
+                for method, name in (("paper", "Paper II"), ("joint", "joint model")):
+                    s = errors[method]["all"][quantity]
+                    sizes = (two_digits(s[key]) for key in ("median", "rms", "p95", "max"))
+                    rows.append((where, quantity, name, *sizes, f"{100 * s['share_below_goal']:.1f} %"))
+        source = "truth" if self.truth else "covariance"
+        return Display(
+            title="Errors of stars over the field, Paper II beside the joint model",
+            facts=(
+                ("stars", f"p ≤ {100 * LARGEST_P:.0f} %, through {self.filter}"),
+                ("joint model", f"errors from the {source}"),
+            ),
+            head=(
+                "where",
+                "of",
+                "method",
+                ">median (%)",
+                ">rms (%)",
+                ">95 % (%)",
+                ">max (%)",
+                ">below 0.1 %",
+            ),
+            rows=tuple(rows),
+        )
 
     def columns(self) -> dict[str, tuple[np.ndarray, str]]:
         """One row per point, the grid first: position, errors of both methods, what the paper gives."""

@@ -16,12 +16,20 @@ from walop_jax.calibration.from_file import read_calibration
 from walop_jax.calibration.product import CalibrationProduct, read_product
 from walop_jax.calibration.summary import PRODUCT
 from walop_jax.data import CalibrationSet, read_calibration_set
+from walop_jax.diagnosis.detection_limits import DetectionLimits
 from walop_jax.io.errors import fail, nearest
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.posterior.from_run import locate
 from walop_jax.posterior.output import read_inference_data
-from walop_jax.reports import accuracy_figures, figures, paper_figures, posterior_figures, product_figures
-from walop_jax.reports.run import POSTERIOR
+from walop_jax.reports import (
+    accuracy_figures,
+    figures,
+    limits_figures,
+    paper_figures,
+    posterior_figures,
+    product_figures,
+)
+from walop_jax.reports.run import LIMITS, POSTERIOR, read_limits
 from walop_jax.science.field_accuracy import field_accuracy
 
 
@@ -54,6 +62,13 @@ class Source:
         if not paths:
             raise fail("does not say what it was fitted to", file=self.folder, advice="refit from files")
         return read_calibration_set(*paths)
+
+    @property
+    def limits(self) -> DetectionLimits:
+        """What the data can show."""
+        if not (self.folder / LIMITS).exists():
+            raise fail(f"holds no {LIMITS}", file=self.folder, advice="run walop-jax limits -o RUN first")
+        return read_limits(self.folder / LIMITS)
 
     @property
     def filter(self) -> str:
@@ -161,6 +176,13 @@ FIGURES: Mapping[str, NamedFigure] = {
         lambda s: paper_figures.transmission_figure(s.calset, s.filter, s.place),
     ),
     "modulation": NamedFigure("q_m and u_m against polariser angle", _modulation),
+    "protection": NamedFigure(
+        "largest error of q and u that an effect can make undetected",
+        lambda s: limits_figures.protection_figure(s.limits),
+    ),
+    "separation": NamedFigure(
+        "which effects look alike", lambda s: limits_figures.separation_figure(s.limits)
+    ),
     "residual-map": NamedFigure("what the smooth model leaves, of whole frames", _residual_map),
     "corner": NamedFigure("posterior of coefficients in pairs", _corner),
     "trace": NamedFigure("chains of the posterior", _trace),

@@ -16,16 +16,17 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from walop_jax.calibration.records import Quality
-from walop_jax.io.rounding import rounded, value_and_error, with_error, with_minus_sign
+from walop_jax.io.rounding import probability, rounded, value_and_error, with_error, with_minus_sign
 from walop_jax.reports import diagnosis_figures, product_figures
 from walop_jax.reports.about_data import data_in_words, model_entries, symbols_in_words
 from walop_jax.reports.accuracy_figures import accuracy_figure
+from walop_jax.reports.limits_figures import protection_figure
+from walop_jax.reports.limits_in_words import limits_in_words
 from walop_jax.reports.posterior_figures import MOST_IN_CORNER, informed
 from walop_jax.reports.run import RunContents
 from walop_jax.reports.wording import (
     UNNAMED,
     effect_in_words,
-    probability,
     verdict_of_diagnosis,
     verdict_of_fit,
 )
@@ -96,6 +97,7 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         "versions": summary["versions"],
         "accuracy": None if accuracy is None else _accuracy_in_words(accuracy),
         "data": [] if run.product is None else data_in_words(run.product),
+        "limits": limits_in_words(run.limits),
         "symbols": "" if run.corner is None else symbols_in_words(_in_corner(run)),
     }
 
@@ -195,6 +197,8 @@ def _figures(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, str]
     made: dict[str, Figure] = {}
     if accuracy is not None:
         made["accuracy"] = accuracy_figure(accuracy)
+    if run.limits is not None and run.limits.worst is not None:
+        made["protection"] = protection_figure(run.limits)
     if run.product is not None:
         made["matrix"] = product_figures.matrix_maps_figure(run.product.maps)
         made["errors"] = product_figures.matrix_errors_figure(run.product.maps)

@@ -13,13 +13,14 @@ import numpy as np
 from walop_jax.calibration.product import CalibrationProduct, read_product
 from walop_jax.calibration.summary import FAILED, PRODUCT, SUMMARY
 from walop_jax.data.user_tables import read_input_table
+from walop_jax.diagnosis.detection_limits import DetectionLimits
 from walop_jax.diagnosis.document import DIAGNOSIS
 from walop_jax.diagnosis.figure_data import UNNAMED
 from walop_jax.diagnosis.figure_file import FIGURE_DATA, DiagnosisFigureData, read_figure_data
 from walop_jax.io.errors import DataError, fail
 
 POSTERIOR, INTERVALS, CORNER, SAMPLE = "posterior.nc", "posterior.ecsv", "posterior_corner.png", "sample.json"
-COMPARISON, EPOCH = "comparison.json", "epoch.json"
+COMPARISON, EPOCH, LIMITS = "comparison.json", "epoch.json", "limits.json"
 SUMMARY_KEYS = ("chi2", "dof", "n_data", "parameters", "converged", "message", "versions", "inputs")
 DIAGNOSIS_KEYS = ("verdict", "steps", "candidates", "unexplained")
 DEFAULTS: dict[str, Any] = {"warnings": [], "remarks": [], "misfit": None}  # what a summary may lack
@@ -33,7 +34,7 @@ class RunContents:
     """The contents of a run; None for what is not there. `missing` says what that means for a page.
 
     `summary`, `diagnosis` and `sample` are the contents of the JSON files; `intervals` are rows of the table of
-    posterior intervals; `corner` are the bytes of a PNG.
+    posterior intervals; `corner` are the bytes of a PNG; `limits` is what `limits` has found for the same data.
     """
 
     folder: Path
@@ -44,6 +45,7 @@ class RunContents:
     sample: dict[str, Any] | None
     intervals: tuple[dict[str, Any], ...]
     corner: bytes | None
+    limits: DetectionLimits | None
     missing: tuple[str, ...]
 
 
@@ -110,6 +112,7 @@ def read_run(folder: Path) -> RunContents:
         sample=optional(SAMPLE, lambda path: _document(path, ()), "no verdict on the sampling", sampled),
         intervals=optional(INTERVALS, _intervals, "no table of the posterior", sampled) or (),
         corner=optional(CORNER, Path.read_bytes, "no corner plot", sampled),
+        limits=optional(LIMITS, lambda path: _limits(path, summary), "no protection level", wanted=False),
         missing=tuple(missing),
     )
 
@@ -126,6 +129,27 @@ def _document(path: Path, keys: tuple[str, ...]) -> dict[str, Any]:
         what = f"has no {lacking[0]!r}" if lacking else "is not a summary"
         raise fail(what, file=path, advice="run the command that made it again")
     return content
+
+
+def read_limits(path: Path) -> DetectionLimits:
+    """The content of a `limits.json`. Raises `DataError` if it is none."""
+    try:
+        return DetectionLimits.from_document(_document(path, ("limits", "effects", "protection")))
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise fail(
+            f"is not what walop-jax limits writes: {error}", file=path, advice="run it again"
+        ) from error
+
+
+def _limits(path: Path, summary: dict[str, Any]) -> DetectionLimits:
+    """The limits of the data behind a summary; those of other data are refused."""
+    of, wanted = (
+        {entry["sha256"] for entry in document["inputs"]}
+        for document in (_document(path, ("inputs",)), summary)
+    )
+    if of != wanted:
+        raise fail("is of other data", file=path, advice="run walop-jax limits on the sets of this run")
+    return read_limits(path)
 
 
 def _another_fit(summary: dict[str, Any], diagnosis: dict[str, Any]) -> bool:

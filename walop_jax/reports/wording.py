@@ -5,34 +5,15 @@ An agreement is "consistent with" a cause, never proof of one.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from walop_jax.diagnosis.figure_data import UNNAMED
-from walop_jax.io.rounding import rounded, value_and_error
+from walop_jax.io.rounding import probability, rounded, value_and_error
 from walop_jax.model.effects import EFFECTS
 
-TINY = 1e-15  # probabilities below are not to be taken at their word
 MOST_PARAMETERS = 6  # of an effect, in a sentence
 _PROPER = ("Wollaston", "Moon", "Stokes")
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-def probability(p: float | None) -> str:
-    """`= 0.43`, `= 2.1 × 10⁻⁷` or `< 10⁻¹⁵`."""
-    if p is None or not math.isfinite(p):
-        return "unknown"
-    if p < TINY:
-        return f"< {_power(TINY)}"
-    if p >= 1e-3:
-        return f"= {p:.2g}"
-    mantissa, exponent = f"{p:.1e}".split("e")
-    return f"= {mantissa} × 10{str(int(exponent)).translate(_RAISED)}"
-
-
-def _power(value: float) -> str:
-    return "10" + str(round(math.log10(value))).translate(_RAISED)
 
 
 def effect_in_words(effect: str) -> str:

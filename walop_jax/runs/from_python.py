@@ -188,23 +188,31 @@ def compare(
     *,
     truth: Truth | None = None,
     filter: str = DEFAULT_FILTER,
+    model: ModelLike | None = None,
+    instrument: Instrument | Path_ | None = None,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
     seed: int = 0,
     output: Path_ | None = None,
     overwrite: bool = False,
+    progress: Tell | None = None,
 ) -> Comparison:
     """The method of Paper II beside the joint model on the same data: `walop-jax compare`.
 
-    `calibration` is the joint fit (default: made here). With `output` (data from files) the folder of a run is written.
+    `calibration` is the joint fit (default: made here, with `model`, `instrument` and `catalogue` as for `refit`). With
+    `output` (data from files) the folder of a run is written, and the joint fit is always made.
+
+    Raises ValueError for a `calibration` or `truth` in memory together with `output`.
     """
     if output is not None:
-        paths = _paths(data)
-        return compare_methods(paths, output, filter_name=filter, seed=seed, overwrite=overwrite).comparison
-    calset = _set(data)
-    joint = (
-        Calibration.from_fit(examined(fitting.refit(calset)))
-        if calibration is None
-        else _calibration(calibration)
-    )
+        if calibration is not None or truth is not None:
+            raise ValueError("with output the joint fit is made anew: leave calibration and truth out")
+        options = _run_options(data, model, instrument, catalogue, overwrite, progress)
+        return compare_methods(output=output, filter_name=filter, seed=seed, **options).comparison
+    if calibration is None:
+        calset, chosen = _set_and_model(data, model, instrument, catalogue)
+        joint = Calibration.from_fit(examined(fitting.refit(calset, chosen, progress=progress)))
+    else:
+        calset, joint = _set(data), _calibration(calibration)
     return compare_with_paper(calset, joint, truth, filter, seed)
 
 

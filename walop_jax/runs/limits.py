@@ -15,10 +15,11 @@ from walop_jax.io.folder import atomic_folder, check_folder
 from walop_jax.io.text import json_text, read_text
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.reports.limits_figures import protection_figure, separation_figure
+from walop_jax.reports.run import LIMITS
 from walop_jax.runs.inputs import sets_and_model
 
-DOCUMENT, PROTECTION, SEPARATION = "limits.json", "limits_protection.png", "limits_separation.png"
-OUTPUTS = (DOCUMENT, PROTECTION, SEPARATION)
+PROTECTION, SEPARATION = "limits_protection.png", "limits_separation.png"
+OUTPUTS = (LIMITS, PROTECTION, SEPARATION)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +70,7 @@ def limits_of_sets(
     }
     if output is not None:
         with atomic_folder(Path(output), OUTPUTS, overwrite=overwrite) as folder:
-            (folder / DOCUMENT).write_text(json_text(document), encoding="utf-8")
+            (folder / LIMITS).write_text(json_text(document), encoding="utf-8")
             protection_figure(found).savefig(folder / PROTECTION, dpi=130)
             separation_figure(found).savefig(folder / SEPARATION, dpi=130)
     return LimitsRun(found, document, tuple(f"the fit: {text}" for text in result.warnings))

@@ -19,7 +19,7 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import fail
 from walop_jax.io.fits_reading import primary_keywords
 from walop_jax.model.effects import EFFECTS, Effect
-from walop_jax.reports.run import COMPARISON, EPOCH, POSTERIOR, SAMPLE
+from walop_jax.reports.run import COMPARISON, EPOCH, LIMITS, POSTERIOR, SAMPLE
 
 DOCUMENTS = {
     "summary": SUMMARY,
@@ -27,6 +27,7 @@ DOCUMENTS = {
     "sample": SAMPLE,
     "comparison": COMPARISON,
     "epoch": EPOCH,
+    "limits": LIMITS,
 }
 """The documents that a run may hold, and their files."""
 
@@ -46,7 +47,7 @@ class Run(Displayed):
 
     @functools.cached_property
     def documents(self) -> dict[str, dict[str, Any]]:
-        """The JSON documents of the run by name: summary, diagnosis, sample, comparison, epoch."""
+        """The JSON documents of the run by name: summary, diagnosis, sample, comparison, epoch, limits."""
         found = {}
         for name, file in DOCUMENTS.items():
             path = self.folder / file

@@ -43,7 +43,7 @@ def write_report(
 ) -> Page:
     """Write an HTML page about the folder `run`, figures inside, as `output` (default: `run`/report.html).
 
-    `run` is that of a refit, diagnose, sample, compare or epoch. A page of this program is made anew; any other
+    `run` is that of a refit, diagnose, sample, compare, epoch or limits. A page of this program is made anew; any other
     file is left alone unless `overwrite`. `catalogue` are the effects that the model may have. `progress` is told
     what is being done. Raises `DataError` as `read_run` does, and if the page cannot be written.
     """

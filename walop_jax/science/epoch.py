@@ -29,7 +29,7 @@ from walop_jax.fit.model_builder import SKY_AND_STARS, model_like
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.rounding import value_and_error, with_minus_sign
+from walop_jax.io.rounding import probability, two_digits, value_and_error, with_minus_sign
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import Model
 from walop_jax.science.star_errors import determinant, joint_errors, sample_stars, statistics
@@ -100,10 +100,13 @@ class Epoch(Displayed):
         return Display(
             title="The old calibration still fits" if self.fits else "The instrument HAS CHANGED",
             facts=(
-                ("chance", f"{self.p_value:.2g} (χ² = {self.test:.1f} in {self.directions} directions)"),
+                (
+                    "chance",
+                    f"p {probability(self.p_value)} (χ² = {self.test:.1f} in {self.directions} directions)",
+                ),
                 (
                     "stars with the old one",
-                    f"off by {errors['median']:.2g} % in p (median), {errors['max']:.2g} % at most",
+                    f"off by {two_digits(errors['median'])} % in p (median), {two_digits(errors['max'])} % at most",
                 ),
             ),
             head=("parameter", ">old", ">new", ">change / σ", "unit"),
