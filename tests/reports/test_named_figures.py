@@ -119,3 +119,11 @@ def test_coefficients_that_are_only_prior_are_not_shown():
 def test_figures_of_limits(tmp_path, name):
     figure = draw(name, Source(handmade_run.make_limits(tmp_path)))
     assert figure.axes[0].has_data()
+
+
+def test_modulation_shows_a_point_that_was_seen_behind_the_polariser(source):
+    """The point at the centre holds a standard star alone."""
+    axes = draw("modulation", source).axes
+    assert all(
+        max(len(line.get_xdata()) for line in axis.lines if line.get_marker() != "None") >= 4 for axis in axes
+    )

@@ -129,9 +129,13 @@ def _trace(source: Source) -> Figure:
 
 
 def _modulation(source: Source) -> Figure:
-    points = source.calset.points
-    near = np.argsort(np.hypot(points.x - source.place[0], points.y - source.place[1]))
-    return figures.modulation_figure(source.calset, [int(near[0])])
+    exposures, points = source.calset.exposures, source.calset.points
+    behind = np.flatnonzero(exposures.clp_in & ~exposures.chwp_in)
+    seen = source.calset.intensities.block(0, len(points)).used[:, behind].any(axis=1)
+    if not seen.any():
+        raise fail("no field point was seen behind the polariser", file=source.folder, advice="plot matrix")
+    away = np.hypot(points.x - source.place[0], points.y - source.place[1])
+    return figures.modulation_figure(source.calset, [int(np.argmin(np.where(seen, away, np.inf)))])
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.retardance import plate_names, plate_retardances
 from walop_jax.data.records import CalibrationSet
 from walop_jax.io.errors import DataError
+from walop_jax.io.rounding import with_minus_sign
 from walop_jax.paper.polynomial import (
     fit_paper,
     fit_transmissions,
@@ -52,8 +54,8 @@ def retardance_wavelength_figure(
     line = np.linspace(*wavelengths, _LINES)
     low_x, high_x, low_y, high_y = calibration.field
     places = {"centre": (0.5 * (low_x + high_x), 0.5 * (low_y + high_y))}
-    places |= {f"X = {x:+.2f}°": (x, 0.0) for x in (low_x, high_x)}
-    places |= {f"Y = {y:+.2f}°": (0.0, y) for y in (low_y, high_y)}
+    places |= {with_minus_sign(f"X = {x:+.2f}°"): (x, 0.0) for x in (low_x, high_x)}
+    places |= {with_minus_sign(f"Y = {y:+.2f}°"): (0.0, y) for y in (low_y, high_y)}
     x, y = (np.array(values) for values in zip(*places.values(), strict=True))
     found = plate_retardances(instrument, line, x, y)
     figure = empty_figure(3.9 * len(names), 3.1)
@@ -79,9 +81,10 @@ def coefficients_figure(calset: CalibrationSet, filter_name: str) -> Figure:
     for row, quantity, coefficients in zip(axes, "qu", np.moveaxis(found.coefficients, 1, 0), strict=True):
         for axis, name, values in zip(row, COEFFICIENTS, coefficients.T, strict=True):
             field_axes(axis, f"{quantity}: {name}")
-            far = float(np.percentile(np.abs(values), 98)) or 1.0
-            whole = (values < 0).any() and (values > 0).any()
-            low, high = (-far, far) if whole else np.percentile(values, (2, 98))
+            low, high = _most(values)  # where an exposure holds no u a few are larger by orders of magnitude
+            whole = low < 0 < high
+            if whole:
+                low, high = -max(-low, high), max(-low, high)
             shown = axis.scatter(
                 found.x, found.y, c=values, s=18, marker="s", vmin=low, vmax=high,
                 cmap=DIVERGING if whole else "viridis", linewidths=0,
@@ -89,6 +92,13 @@ def coefficients_figure(calset: CalibrationSet, filter_name: str) -> Figure:
             figure.colorbar(shown, ax=axis, pad=0.03, extend="both").ax.tick_params(labelsize=SMALL - 1)
     outer_labels(axes)
     return figure
+
+
+def _most(values: Float[np.ndarray, " p"]) -> tuple[float, float]:
+    """The range of the values without those more than five (robust) standard deviations from their median."""
+    median = float(np.median(values))
+    spread = 5.0 * 1.4826 * float(np.median(np.abs(values - median))) or 1.0
+    return max(float(values.min()), median - spread), min(float(values.max()), median + spread)
 
 
 def transmission_figure(
@@ -129,7 +139,8 @@ def transmission_figure(
             angle, residual, 100.0 * sigma[:, k] / total[:, 0], fmt="osD^"[k % 4], ms=3, color=f"C{k}", lw=0.8
         )
     below.axhline(0.0, color="0.6", lw=0.8)
-    above.set_title(f"({block.x[point]:+.2f}°, {block.y[point]:+.2f}°), {filter_name}", fontsize=FONT)
+    where = with_minus_sign(f"({block.x[point]:+.2f}°, {block.y[point]:+.2f}°)")
+    above.set_title(f"{where}, {filter_name}", fontsize=FONT)
     above.set_ylabel("share of the light", fontsize=FONT)
     below.set_ylabel("residual (%)", fontsize=FONT)
     below.set_xlabel("polariser angle (deg)", fontsize=FONT)
