@@ -19,7 +19,8 @@ from walop_jax.cli import app
 from walop_jax.data import write_calibration_set
 from walop_jax.fit.model_builder import model_for
 from walop_jax.fit.refit import refit
-from walop_jax.science.epoch import chi2_of_change, chi2_tail, epoch, fit_like
+from walop_jax.science.chance import chi2_tail
+from walop_jax.science.epoch import chi2_of_change, epoch, fit_like
 from walop_jax.simulation.simulate import simulate
 
 

@@ -77,9 +77,9 @@ def _verdict(product: CalibrationProduct) -> list[Check]:
             f"χ²/dof = {v.chi2 / max(v.dof, 1):.4f}" + "".join(f"; {text}" for text in v.warnings),
         ),
         Check(
-            "conditioned",
+            "well conditioned",
             not v.quality & Quality.ILL_CONDITIONED,
-            "ill-conditioned" if v.quality & Quality.ILL_CONDITIONED else "well",
+            "ill-conditioned" if v.quality & Quality.ILL_CONDITIONED else "yes",
         ),
     ]
 
@@ -111,7 +111,7 @@ def _parents(product: CalibrationProduct) -> Check:
     bad = [entry for entry in product.inputs if not re.fullmatch(r"[0-9a-f]{64}", entry.sha256)]
     good = bool(product.inputs) and not bad
     return Check(
-        "parents", good, f"{len(product.inputs)} calibration set(s) by SHA-256" if good else "not known"
+        "inputs", good, f"{len(product.inputs)} calibration set(s), hashes recorded" if good else "not known"
     )
 
 
@@ -137,4 +137,6 @@ def _physics(calibration: Calibration) -> Check:
     arms = zip(analysis.instrument.arms, analysis.instrument.cameras.pairs, strict=True)
     found = ", ".join(f"{arm.name} {least[list(pair)].min():.1e}" for arm, pair in arms)
     good = bool(np.all(vectors[..., 0] > 0)) and bool(np.all(least > -DARKEST))
-    return Check("physics", good, f"least light that a camera sees, of unpolarised: {found}")
+    return Check(
+        "physics", good, f"least transmission for any polarisation, over that of unpolarised light: {found}"
+    )

@@ -52,6 +52,7 @@ class Quality(enum.IntFlag):
     NO_STOKES = 16384
     DOUBTED = 32768
     ERRORS_TOO_LARGE = 65536
+    DISAGREES = 131072
 
     @property
     def meanings(self) -> tuple[str, ...]:
@@ -76,6 +77,7 @@ _MEANINGS = {
     Quality.UNEXPLAINED: "the model does not explain the data",
     Quality.DOUBTED: "the residuals hold more than noise, or differ between parts of the data",
     Quality.ERRORS_TOO_LARGE: "the stated errors are far larger than the scatter of the data",
+    Quality.DISAGREES: "the intensities disagree with the calibration by more than noise",
     Quality.NO_STOKES: "no Stokes parameters: too few cameras, too little light, or no u in the rows there are",
 }
 

@@ -34,6 +34,8 @@ SaturationOption = Annotated[
     typer.Option("--saturation", metavar="ELECTRONS", help="Counts from here on are not used (FLAG 256)."),
 ]
 
+STAGES = ("reading", "tabulating", "writing")
+
 
 def apply(
     product: Product,
@@ -57,7 +59,8 @@ def apply(
     Errors hold photon noise and calibration; Q_COLOUR and U_COLOUR say what ignoring TEFF does. FLAG: 16 a
     direction of (q, u) is hardly measured, 32 beyond the calibrated field (no result a quarter beyond), 64
     filter, temperature or colour that the calibration has not seen, 128 a camera is missing, 256 flagged or
-    saturated counts, 16384 no result; bits of the calibration itself are added to all rows.
+    saturated counts, 16384 no result, 131072 intensities that disagree with the calibration by more than photon
+    noise; bits of the calibration itself are added to all rows.
     """
     switch_on_jax()
     from walop_jax.model.effects.own import catalogue_with
@@ -68,7 +71,7 @@ def apply(
         raise typer.BadParameter(f"{debias!r} is neither MAS nor WK", param_hint="--debias")
     if saturation is not None and not saturation > 0:
         raise typer.BadParameter("must be above 0 electrons", param_hint="--saturation")
-    with progress(quiet or json) as tell:
+    with progress(quiet or json, STAGES) as tell:
         found = apply_to_catalogue(
             product,
             catalogue,

@@ -25,7 +25,7 @@ def certify(
     """Check a calibration product from its checksums to its physics; exit code 1 if anything does not hold.
 
     Version, content hash, convergence, covariance, validity (dates, filters, temperatures), hashes of the
-    calibration sets it was made from, maps against parameters, and that no camera sees less than no light.
+    calibration sets it was made from, maps against parameters, and that no camera has a negative transmission.
     """
     switch_on_jax()
     from walop_jax.model.effects.own import catalogue_with

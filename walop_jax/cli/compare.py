@@ -44,7 +44,7 @@ def compare(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Run the method of Paper II as it is published, and the joint fit, and tell how good each is.
+    """Compare the method of Paper II, as it is published, with the joint fit.
 
     A quadratic per grid point, a transmission model per camera, 100 stars with p up to 5 %, corrections Δq and
     Δu; on the grid points and between them. The reference is the joint model, or the truth that comes with a

@@ -25,7 +25,7 @@ from walop_jax.cli.common import (
 from walop_jax.io.rounding import with_error
 
 MinutesOption = Annotated[
-    float, typer.Option(min=0.0, help="Begin no search for a further name after so long.")
+    float, typer.Option(min=0.0, help="Minutes after which no further name is looked for.")
 ]
 
 if TYPE_CHECKING:
@@ -82,6 +82,8 @@ def diagnose(
 def _show(found: Diagnosis, output: Path) -> None:
     from rich.console import Console
 
+    from walop_jax.io.rounding import probability
+
     console = Console(highlight=False, soft_wrap=True)
     before, after = found.before, found.after
     for step in found.steps:
@@ -99,10 +101,12 @@ def _show(found: Diagnosis, output: Path) -> None:
             )
     if found.untestable:
         console.print(f"cannot be tested with these data: {', '.join(found.untestable)}")
-    console.print(
-        f"χ²/dof {before.chi2 / max(before.dof, 1):.4f} → {after.chi2 / max(after.dof, 1):.4f}; significance of the "
-        f"disagreement p = {found.p_value:.2g} → {found.remaining_p:.2g}"
-    )
+    now = f"χ²/dof {after.chi2 / max(after.dof, 1):.4f}, chance of such residuals p {probability(found.remaining_p)}"
+    if after is before:
+        console.print(now)
+    else:
+        was = f"χ²/dof {before.chi2 / max(before.dof, 1):.4f}, p {probability(found.p_value)}"
+        console.print(f"before: {was}\nafter:  {now}")
     if found.caution:
         warn(found.caution)
     console.print(f"verdict: {found.verdict}   ({found.seconds:.0f} s)   {output}", markup=False)

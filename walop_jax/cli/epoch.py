@@ -33,6 +33,8 @@ OutputOption = Annotated[
     typer.Option("--output", "-o", metavar="RUN", help="Folder for the new calibration and what was found."),
 ]
 
+STAGES = ("reading", "fitting the new set", "looking for what")
+
 
 def epoch(
     old: OldProduct,
@@ -56,7 +58,7 @@ def epoch(
     from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.epoch import compare_epochs
 
-    with progress(quiet or json) as tell:
+    with progress(quiet or json, STAGES) as tell:
         compared = compare_epochs(
             old, calsets, output=output, overwrite=overwrite, progress=tell, catalogue=catalogue_with(effects)
         )

@@ -22,6 +22,8 @@ from walop_jax.cli.common import (
     warn,
 )
 
+STAGES = ("reading", "fit", "differentiating", "comparing", "finding what goes")
+
 
 def limits(
     calsets: CalsetFiles,
@@ -51,7 +53,7 @@ def limits(
     from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.limits import limits_of_sets
 
-    with progress(quiet or json) as tell:
+    with progress(quiet or json, STAGES) as tell:
         run = limits_of_sets(
             calsets,
             output,

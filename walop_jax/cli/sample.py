@@ -31,9 +31,11 @@ SamplerOption = Annotated[
     str, typer.Option("--sampler", metavar="NAME", help="emcee, nuts, or your own as FILE.py:CLASS.")
 ]
 MaximumOption = Annotated[int, typer.Option("--maximum-steps", min=1, help="Stop there, converged or not.")]
-WalkersOption = Annotated[int, typer.Option("--walkers", min=0, help="Of an emcee ensemble; 0: at least 64.")]
+WalkersOption = Annotated[
+    int, typer.Option("--walkers", min=0, help="Walkers of an emcee ensemble; 0: at least 64.")
+]
 IntervalOption = Annotated[int, typer.Option("--interval", min=1, help="Steps between checkpoints.")]
-MovesOption = Annotated[str, typer.Option("--moves", help="Of emcee: laplace, de or stretch.")]
+MovesOption = Annotated[str, typer.Option("--moves", help="Moves of emcee: laplace, de or stretch.")]
 InflateOption = Annotated[bool, typer.Option("--inflate", help="Sample a factor on the errors of the data.")]
 SeedOption = Annotated[int, typer.Option("--seed", help="Seed of random numbers.")]
 

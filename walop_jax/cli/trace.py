@@ -28,7 +28,7 @@ AtOption = Annotated[
     typer.Option(
         "--at",
         metavar="P=ANGLE",
-        help="A moving element in the beam, by the prefix of its columns: CHWP=45 (deg). May be repeated.",
+        help="Angle (deg) of a moving element in the beam, named like its columns: CHWP=45. May be repeated.",
         show_default=False,
     ),
 ]

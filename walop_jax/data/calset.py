@@ -72,8 +72,8 @@ def _read_one(path: Path, kinds: Collection[str]) -> CalibrationSet:
     if path.is_dir():
         raise fail("is a folder", file=path, advice="a calibration set is a FITS file; a RUN holds results")
     if path.suffix.lower() in _NO_SETS:
-        advice = "it is a FITS file (walop-jax docs files); walop_jax.from_arrays makes a set of arrays"
-        raise fail("is no calibration set", file=path, advice=advice)
+        advice = "a calibration set is a FITS file (walop-jax docs files); walop_jax.from_arrays makes one of arrays"
+        raise fail("is not a calibration set", file=path, advice=advice)
     with open_fits(path) as opened:
         try:
             found = _from_hdus(opened, (*KINDS, *kinds))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from walop_jax.io.fits_reading import OpenFile
 NAME = "arrays"
 """What errors call the file that is none."""
 
+_SHOWN = 3
 _UNITS = {name: rule.unit for name, rule in schema.EXPOSURES.items()}
 
 
@@ -73,7 +75,7 @@ def from_arrays(
     } | {name.upper(): _column(name.upper(), values, number) for name, values in exposures.items()}
     for name, rule in schema.EXPOSURES.items():
         columns.setdefault(name, np.full(number, rule.missing))
-    point, exposure = np.nonzero(np.isfinite(counts).any(axis=2))
+    point, exposure = np.nonzero(np.isfinite(counts).all(axis=2))
     rows = {
         "EXPOSURE": exposure,
         "POINT": point,
@@ -99,7 +101,21 @@ def from_arrays(
         hdus.append(table_hdu("SOURCES", _sources(sources), NAME))
     if filters:
         hdus.append(table_hdu("FILTERS", filter_columns(filters), NAME))
-    return set_from_hdus(_in_memory(hdus))
+    found = set_from_hdus(_in_memory(hdus))
+    return dataclasses.replace(found, remarks=(*found.remarks, *_spoilt(counts)))
+
+
+def _spoilt(counts: np.ndarray) -> Iterator[str]:
+    """What is measured in some cameras only, by its place in the array."""
+    finite = np.isfinite(counts)
+    places = np.argwhere(finite.any(axis=2) & ~finite.all(axis=2))
+    if len(places):
+        shown = ", ".join(
+            f"counts[{p}, {e}] (camera {' and '.join(str(k) for k in np.flatnonzero(~finite[p, e]))})"
+            for p, e in places[:_SHOWN].tolist()
+        )
+        more = f" and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
+        yield f"{NAME}: not finite in {shown}{more}: not used in any camera"
 
 
 def checked(calset: CalibrationSet, kinds: Collection[str] = ()) -> CalibrationSet:

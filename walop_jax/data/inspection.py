@@ -23,6 +23,7 @@ _FEWEST_SETTINGS = 3
 _NARROW = 30.0  # degrees
 _FEW_POINTS = 15
 _NOISE = (0.8, 25.0)  # believable σ²/N
+_UNEVEN = 1.5  # factor between the N_ERR²/N of cameras
 _MUCH = 0.05
 
 
@@ -103,6 +104,7 @@ class _Sample:
     used: np.ndarray  # (point, exposure)
     counts: np.ndarray  # used rows that are not KIND flux
     ratio: np.ndarray
+    by_camera: np.ndarray  # median of the ratio, camera by camera
 
 
 def inspect(calset: CalibrationSet) -> Inspection:
@@ -137,7 +139,11 @@ def inspect(calset: CalibrationSet) -> Inspection:
         filters=tuple(calset.filters),
         findings=(),
     )
-    findings = [*_findings(calset, made), *_about_settings(calset.exposures, live)]
+    findings = [
+        *_findings(calset, made),
+        *_about_cameras(sample.by_camera),
+        *_about_settings(calset.exposures, live),
+    ]
     notes = [Finding("note", remark) for remark in calset.remarks]
     return dataclasses.replace(made, findings=(*findings, *notes))
 
@@ -151,14 +157,14 @@ def _sample(calset: CalibrationSet) -> _Sample:
         blocks = [calset.intensities.block(int(start), int(start) + _RUN) for start in starts]
     used = np.concatenate([block.used for block in blocks])
     counted = calset.exposures.kind != "flux"
-    counts, ratio = [], []
-    for block in blocks:
-        rows = block.used & counted
-        n, sigma = block.counts[rows], block.sigma[rows]
-        counts.append(n.ravel())
-        bright = n > 0
-        ratio.append(sigma[bright] ** 2 / n[bright])
-    return _Sample(len(used), used, np.concatenate(counts), np.concatenate(ratio))
+    rows = used & counted
+    counts = np.concatenate([block.counts for block in blocks])[rows]
+    sigma = np.concatenate([block.sigma for block in blocks])[rows]
+    ratio = np.where(counts > 0, sigma**2 / np.where(counts > 0, counts, 1.0), np.nan)
+    seen = np.isfinite(ratio).any(axis=0)
+    by_camera = np.full(ratio.shape[1], np.nan)
+    by_camera[seen] = np.nanmedian(ratio[:, seen], axis=0)
+    return _Sample(len(used), used, counts.ravel(), ratio[np.isfinite(ratio)], by_camera)
 
 
 def _groups(calset: CalibrationSet, share: np.ndarray) -> tuple[Group, ...]:
@@ -227,6 +233,18 @@ def _findings(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
         yield Finding("doubt", f"{saturated} rows are saturated", "expose for a shorter time")
     if unknown := made.flags.get("other", 0):
         yield Finding("note", f"{unknown} rows have FLAG bits without a meaning", "they are not used")
+
+
+def _about_cameras(noise_ratio: np.ndarray) -> Iterator[Finding]:
+    """N_ERR²/N is the same in all cameras whose light is mostly counted in the same unit."""
+    known = noise_ratio[np.isfinite(noise_ratio)]
+    if known.size and known.max() > _UNEVEN * known.min():
+        listed = ", ".join(f"N{k} {value:.3g}" for k, value in enumerate(noise_ratio))
+        yield Finding(
+            "doubt",
+            f"N_ERR²/N differs between the cameras: {listed}",
+            "are all of them in electrons, or some in counts (multiply by the gain)?",
+        )
 
 
 def _about_angles(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:

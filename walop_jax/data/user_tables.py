@@ -18,11 +18,13 @@ from jaxtyping import Bool, Float
 
 from walop_jax.data.schema import Column, Place, convert_unit
 from walop_jax.io.atomic import atomic_path, check_output
-from walop_jax.io.errors import DataError, fail, nearest, rows_text
+from walop_jax.io.errors import DataError, fail, rows_text
 from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits
 from walop_jax.io.plain_tables import table_format
 
 _TRUE, _FALSE = ("true", "t", "1", "yes"), ("false", "f", "0", "no", "")
+
+_LISTED = 12  # columns, in a message
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,7 +109,7 @@ def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
     place = Place(source.path, "")
     if name not in source.names:
         if rule.missing is None:
-            advice = f"add it ({nearest(name, source.names)})"
+            advice = f"add it, or name it so; {_what_is_there(source)}"
             raise place.fail("the column is missing", name, advice)
         return np.full(source.rows, rule.missing)
     column = source.table.columns[source.names.index(name)]
@@ -121,6 +123,12 @@ def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
     if rule.kind == "bool":
         return _truth(values, masked, name, place)
     return _numbers(values, masked, str(column.unit or ""), name, rule, place)
+
+
+def _what_is_there(source: InputTable) -> str:
+    names = [str(name) for name in source.table.colnames]
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return f"the table has {', '.join(names[:_LISTED])}{more}"
 
 
 def vector_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
@@ -140,7 +148,7 @@ def vector_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
         if not any(part in source.names for part in parts):
             if rule.missing is not None:
                 return np.full((source.rows, width), rule.missing)
-            advice = f"add it, or {parts[0]} … {parts[-1]} ({nearest(name, source.names)})"
+            advice = f"add it, or {parts[0]} … {parts[-1]}; {_what_is_there(source)}"
             raise place.fail("the column is missing", name, advice)
         single = dataclasses.replace(rule, width=1)
         return np.stack([numeric_column(source, part, single) for part in parts], axis=1)

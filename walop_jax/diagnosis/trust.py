@@ -32,8 +32,9 @@ from scipy import stats
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM
 from walop_jax.diagnosis.freeform import strata
+from walop_jax.diagnosis.mixups import refuse_mixups
 from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable
-from walop_jax.fit.refit import FitResult, with_honest_errors
+from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.thinning import thinned
@@ -48,21 +49,41 @@ Cube = Float[np.ndarray, "p e k"]
 
 
 def examined(result: FitResult, seed: int = 0) -> FitResult:
-    """The fit with what its residuals say against it (`doubts`); as it is where it is not to be trusted anyway.
+    """The fit with what its residuals say against it (`doubts`).
 
-    `seed` is that of the Monte Carlo p. Of a set with more than `limits.TRUST_ROWS` (exposure, point) pairs, points
-    spread over the field are looked at. A χ² that is a few per cent too large while nothing else is wrong is put down
-    to the stated errors (`FitResult.noise_only`), and the standard errors are made from the residuals.
+    A fit that explains nothing is held against other readings of its data first (`mixups`), and against stated errors
+    that are too small. `seed` is that of the Monte Carlo p. Of a set with more than `limits.TRUST_ROWS` (exposure,
+    point) pairs, points spread over the field are looked at. A χ² that is a few per cent too large while nothing else
+    is wrong is put down to the stated errors (`FitResult.noise_only`), and the standard errors are made from the
+    residuals. Raises `DataError` with the remedy for data that another reading explains.
     """
-    explained = result.explains_data or result.nearly_explains_data
-    if not result.converged or not explained:
+    if not result.converged:
         return dataclasses.replace(result, examined=True)
-    design = Design.of(sampled(result, max(1, limits.TRUST_ROWS // max(len(result.calset.exposures), 1))))
+    if not (result.explains_data or result.nearly_explains_data):
+        refuse_mixups(result)
+        return dataclasses.replace(result, examined=True, doubts=tuple(_errors_too_small(result, seed)))
+    design = Design.of(_looked_at(result))
     if result.errors_too_large and _hold_no_noise(design):
         return dataclasses.replace(result, examined=True, noiseless=True)
     table = pattern_scores(design, seed)
     doubts = (*_patterns(table), *_groups(design))
     return with_honest_errors(dataclasses.replace(result, examined=True, doubts=doubts))
+
+
+def _looked_at(result: FitResult) -> FitResult:
+    return sampled(result, max(1, limits.TRUST_ROWS // max(len(result.calset.exposures), 1)))
+
+
+def _errors_too_small(result: FitResult, seed: int) -> Iterator[str]:
+    """Whether residuals far larger than the stated errors are nothing but noise."""
+    factor = float(np.sqrt(result.chi2 / max(result.dof, 1)))
+    scaled = fit(result.likelihood, start=result.values, noise_scale=factor)
+    design = Design.of(_looked_at(scaled))
+    if pattern_scores(design, seed).p_global >= ALARM and not list(_groups(design)):
+        yield (
+            f"N_ERR is {factor:.3g} times too small: with errors as large the residuals hold nothing but noise; check "
+            "the gain and the unit of N_ERR"
+        )
 
 
 def _hold_no_noise(design: Design) -> bool:

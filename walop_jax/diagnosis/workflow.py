@@ -26,6 +26,7 @@ from walop_jax.diagnosis.effect_columns import Probe, applicable
 from walop_jax.diagnosis.effect_columns import probes as all_probes
 from walop_jax.diagnosis.examination import Examination, most_points
 from walop_jax.diagnosis.findings import Diagnosis, Outcome, Step, Unexplained
+from walop_jax.diagnosis.mixups import refuse_mixups
 from walop_jax.diagnosis.score import Score
 from walop_jax.diagnosis.step_summary import before_and_after, refitted_in_order
 from walop_jax.fit.model_builder import base_model
@@ -57,7 +58,7 @@ def diagnose(
     `catalogue` are the effects that may be named. Of a set with more than `limits.DIAGNOSED_ROWS` (exposure, point)
     pairs, or whose columns would be more than `limits.DIAGNOSED_NUMBERS`, points spread over the field are looked at.
     The search for a further name, or for a free-form term, does not begin after `minutes`; what is left then has no
-    name. Raises what `fit` raises.
+    name. Raises what `fit` raises, and `DataError` for data that another reading explains (`mixups`).
     """
     began = time.perf_counter()
     tell = progress or (lambda text: None)
@@ -91,6 +92,7 @@ class _Diagnosing:
         self.steps: list[Step] = []
         tell("fitting the model")
         self.fit: FitResult = fit(Likelihood.of(calset, model))
+        refuse_mixups(self.fit)
 
     def run(self, began: float) -> Diagnosis:
         before = self.fit

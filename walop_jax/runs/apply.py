@@ -33,6 +33,7 @@ BITS = (
     Quality.CAMERA_MISSING,
     Quality.SATURATED,
     Quality.NO_STOKES,
+    Quality.DISAGREES,
 )
 """Bits of FLAG that a star can have by itself."""
 
@@ -79,6 +80,7 @@ def apply_to_catalogue(
         raise ValueError(f"saturation {saturation} must be above 0 electrons")
     table_format(output)
     check_output(output, overwrite=overwrite)
+    tell("reading")
     held = read_calibration(product, effects)
     table = read_input_table(catalogue)
     instrument = held.calibration.model.template.patched()
@@ -101,6 +103,11 @@ def apply_to_catalogue(
         (Quality.NO_STOKES, "star(s) without a result (FLAG 16384)"),
         (Quality.BEYOND_FIELD, "star(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)"),
         (Quality.BEYOND_SETTINGS, "star(s) with a filter, temperature or TEFF beyond the calibration"),
+        (
+            Quality.DISAGREES,
+            "star(s) whose intensities disagree with the calibration by more than photon noise (FLAG 131072, CHI2): is "
+            "the background subtracted, are the cameras in order?",
+        ),
     )
     flagged = [f"{catalogue}: {counts[bit]} {text}" for bit, text in said if counts[bit]]
     return StokesTable(

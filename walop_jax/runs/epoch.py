@@ -65,6 +65,7 @@ def compare_epochs(
     tell = progress or (lambda text: None)
     if output is not None:
         check_folder(output, OUTPUTS, overwrite=overwrite)
+    tell("reading")
     path = product_path(old)
     product = read_product(path)
     calset = read_calibration_set(*calsets)
@@ -75,6 +76,7 @@ def compare_epochs(
         found = epoch(calibration, result)
     lacking = None
     if not found.new_trusted:
+        tell("looking for what the new fit lacks")
         lacking = diagnose(calset, result.model, catalogue=catalogue, progress=tell)
     parents = tuple(entry.sha256 for entry in calset.inputs)
     compared = EpochComparison(found, product.content_hash(), parents, result, lacking)

@@ -50,6 +50,7 @@ from walop_jax.posterior.propagate import with_draws, with_moments
 from walop_jax.runs.certify import Certificate, certify_product
 from walop_jax.runs.compare import compare_methods
 from walop_jax.runs.diagnose import diagnose_sets
+from walop_jax.runs.reading import Run
 from walop_jax.runs.refit import refit_sets
 from walop_jax.runs.report import Page, write_report
 from walop_jax.runs.sample import sample_run
@@ -63,7 +64,7 @@ from walop_jax.science.stokes_columns import header, stokes_columns
 
 Path_ = str | os.PathLike[str]
 SetLike = CalibrationSet | Path_ | Sequence[Path_]
-CalibrationLike = Calibration | FitResult | Path_
+CalibrationLike = Calibration | FitResult | Run | Path_
 ModelLike = Model | Path_
 Tell = Callable[[str], None]
 
@@ -218,6 +219,8 @@ def compare(
 
 def certify(calibration: CalibrationLike, catalogue: Sequence[type[Effect]] = EFFECTS) -> Certificate:
     """Check whether a calibration is fit for use: `walop-jax certify`."""
+    if isinstance(calibration, Run):
+        return certify_product(calibration.folder, catalogue)
     if not isinstance(calibration, Calibration | FitResult):
         return certify_product(calibration, catalogue)
     product = _calibration(calibration).to_product()
@@ -341,9 +344,13 @@ def _run_options(
 def _calibration(given: CalibrationLike) -> Calibration:
     if isinstance(given, Calibration):
         return given
-    return (
-        Calibration.from_fit(given) if isinstance(given, FitResult) else read_calibration(given).calibration
-    )
+    if isinstance(given, FitResult):
+        return Calibration.from_fit(given)
+    if not isinstance(given, Run | str | os.PathLike):
+        raise TypeError(
+            f"a calibration, a fit, a run or the path of one is needed, not {type(given).__name__}"
+        )
+    return read_calibration(given.folder if isinstance(given, Run) else given).calibration
 
 
 def _table(given: Any, columns: dict[str, Any]) -> InputTable:

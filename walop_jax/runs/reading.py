@@ -73,12 +73,14 @@ class Run(Displayed):
     def display(self) -> Display:
         """The files, and the calibration if there is one."""
         found = self.documents
-        facts = [("holds", ", ".join(found) or "no document")]
+        files = {"calibration": PRODUCT, "posterior": POSTERIOR}
+        held = [name for name, file in files.items() if (self.folder / file).exists()]
+        facts = [("holds", ", ".join([*held, *found]) or "nothing")]
         if "diagnosis" in found:
             facts.append(("verdict", str(found["diagnosis"].get("verdict"))))
         inner = Display("") if self.calibration is None else self.calibration.display()
         return dataclasses.replace(
-            inner, title=f"Run {self.folder}: {inner.title}".rstrip(": "), facts=(*facts, *inner.facts)
+            inner, title=f"Run {self.folder}. {inner.title}".removesuffix(". "), facts=(*facts, *inner.facts)
         )
 
 

@@ -7,6 +7,7 @@ is in the catalogue.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator
 
 import jax
@@ -24,6 +25,7 @@ from walop_jax.io.errors import DataError
 from walop_jax.likelihood import limits
 from walop_jax.model import carried, light
 from walop_jax.model.parameters import with_values
+from walop_jax.science.chance import chi2_tail
 from walop_jax.science.estimate import calibration_shift, estimate, estimate_by_arm
 
 MOST_SETTINGS = 200
@@ -31,6 +33,8 @@ ILL_POSED = 10.0  # ratio of the errors of the two principal directions from whi
 COOL, HOT = 3500.0, 10000.0
 """Colour temperatures (K) between which stars without TEFF are taken to lie."""
 _ROUNDS = 16
+IMPROBABLE = 1e-6
+"""Probability of a CHI2 as large, by photon noise alone, below which FLAG 131072 is set."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,7 +149,9 @@ def _stars_of_rows(
         chi2=found.chi2,
         dof=found.dof,
         rows=np.diff(first, append=len(rows)),
-        flag=_flags(vectors, catalogue, rows, used, first, found.qu, found.condition),
+        flag=_flags(
+            vectors, catalogue, rows, used, first, found.qu, found.condition, _disagree(found.chi2, found.dof)
+        ),
     )
 
 
@@ -210,6 +216,24 @@ def _settings(vectors: AnalysisVectors, catalogue: Catalogue) -> tuple[list[Sett
     return [setting for setting, _ in found], of
 
 
+@functools.cache
+def improbable_chi2(dof: int) -> float:
+    """The χ² that noise alone exceeds with the probability `IMPROBABLE`."""
+    low, high = float(dof), dof + 60.0 + 20.0 * np.sqrt(dof)
+    while high - low > 1e-6 * high:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if chi2_tail(middle, dof) > IMPROBABLE else (low, middle)
+    return high
+
+
+def _disagree(chi2: Float[np.ndarray, " s"], dof: Int[np.ndarray, " s"]) -> Bool[np.ndarray, " s"]:
+    """Stars whose intensities no Stokes parameters explain, photon noise allowed for."""
+    found = np.zeros(len(chi2), bool)
+    for k in np.unique(dof[dof > 0]).tolist():
+        found |= (dof == k) & (chi2 > improbable_chi2(k))
+    return found
+
+
 def _flags(
     vectors: AnalysisVectors,
     catalogue: Catalogue,
@@ -218,8 +242,9 @@ def _flags(
     first: Int[np.ndarray, " s"],
     qu: Float[np.ndarray, "s 2"],
     condition: Float[np.ndarray, " s"],
+    disagree: Bool[np.ndarray, " s"],
 ) -> Int[np.ndarray, " s"]:
-    """Quality bits of every star: those of its rows and of the calibration, and two that need all of its rows."""
+    """Quality bits of every star: those of its rows and of the calibration, and three that need all of its rows."""
     points = catalogue.points
     settings = points.settings[rows]
     bits = vectors.calibration.flags(points.x[rows], points.y[rows], settings)
@@ -230,6 +255,7 @@ def _flags(
     flag = np.bitwise_or.reduceat(bits, first) | vectors.calibration.verdict.quality
     flag[~(condition < ILL_POSED)] |= Quality.HIGH_CROSSTALK
     flag[~np.isfinite(qu).all(axis=1)] |= Quality.NO_STOKES
+    flag[disagree] |= Quality.DISAGREES
     return flag
 
 

@@ -15,9 +15,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import gammaincc
 from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
@@ -32,6 +30,7 @@ from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.rounding import probability, two_digits, value_and_error, with_minus_sign
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import Model
+from walop_jax.science.chance import chi2_tail
 from walop_jax.science.star_errors import determinant, joint_errors, sample_stars, statistics
 
 CHANCE = 0.01
@@ -180,11 +179,6 @@ def chi2_of_change(
     good = value > _KNOWN * value[-1]
     along = vector[:, good].T @ (change[known] / sigma[known])
     return float(np.sum(along**2 / value[good])), int(good.sum())
-
-
-def chi2_tail(value: float, dof: int) -> float:
-    """Probability that χ² with `dof` degrees of freedom exceeds a value: Q(dof/2, value/2)."""
-    return float(gammaincc(jnp.asarray(0.5 * dof), jnp.asarray(0.5 * value)))
 
 
 def _star_errors(old: Calibration, new: Calibration) -> dict[str, dict[str, float]]:

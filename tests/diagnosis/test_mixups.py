@@ -1,0 +1,142 @@
+"""Sets that were written down wrongly: each mix-up is told by its name, with the remedy, and nothing else is."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from walop_jax.data.inspection import inspect
+from walop_jax.data.records import CalibrationSet
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.diagnosis.mixups import mixups
+from walop_jax.diagnosis.trust import examined
+from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.refit import FitResult
+from walop_jax.fit.refit import refit as plain_refit
+from walop_jax.io.errors import DataError
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
+
+PLAN = ObservingPlan(
+    grid=5,
+    standard_grid=2,
+    polariser_angles=polariser_turn(9),
+    moon_patches=4,
+    standards=4,
+    plate=(None, 22.5),
+)
+
+
+@pytest.fixture(scope="module")
+def calset() -> CalibrationSet:
+    return simulate(PLAN, seed=8).calset
+
+
+def with_data(
+    calset: CalibrationSet, order: tuple[int, ...] = (0, 1, 2, 3), **points: np.ndarray
+) -> CalibrationSet:
+    where = dataclasses.replace(calset.points, **points)
+    block = calset.intensities.block(0, len(where))
+    block = dataclasses.replace(
+        block,
+        counts=block.counts[..., list(order)],
+        sigma=block.sigma[..., list(order)],
+        x=where.x,
+        y=where.y,
+    )
+    return dataclasses.replace(calset, points=where, intensities=TableIntensities.dense(where, block))
+
+
+def with_angle(calset: CalibrationSet, **columns: np.ndarray) -> CalibrationSet:
+    return dataclasses.replace(calset, exposures=dataclasses.replace(calset.exposures, **columns))
+
+
+def unpolarised(calset: CalibrationSet) -> CalibrationSet:
+    """The polariser exposures as they would be without it, written down as if it had been there."""
+    e = calset.exposures
+    out = with_angle(calset, clp_in=np.zeros(len(e), bool), clp_angle=np.full(len(e), np.nan))
+    model = base_model(out)
+    block = calset.intensities.block(0, len(calset.points))
+    _, left = Likelihood.of(out, model).residuals(model.start)
+    expected = np.where(block.used[..., None], block.counts - left * block.sigma, 0.0)
+    noise = np.random.default_rng(1).standard_normal(expected.shape) * block.sigma
+    seen = np.where(e.clp_in[:, None], expected + noise, block.counts)
+    table = TableIntensities.dense(calset.points, dataclasses.replace(block, counts=seen))
+    return dataclasses.replace(calset, intensities=table)
+
+
+Spoil = Callable[[CalibrationSet], CalibrationSet]
+CASES: dict[str, tuple[Spoil, str]] = {
+    "the arms exchanged": (lambda c: with_data(c, (2, 3, 0, 1)), "their order is O1, E1, O2, E2"),
+    "the beams of an arm exchanged": (lambda c: with_data(c, (1, 0, 2, 3)), "hold the cameras E1, O1, O2, E2"),
+    "cameras in a ring": (lambda c: with_data(c, (1, 2, 3, 0)), "hold the cameras E1, O2, E2, O1"),
+    "the polariser runs backwards": (lambda c: with_angle(c, clp_angle=-c.exposures.clp_angle), "give −CLP_ANGLE"),
+    "polariser + 90": (lambda c: with_angle(c, clp_angle=c.exposures.clp_angle + 90), r"give CLP_ANGLE \+ 90°"),
+    "polariser + 45": (lambda c: with_angle(c, clp_angle=c.exposures.clp_angle + 45), r"give CLP_ANGLE \+ 135°"),
+    "polariser in radians": (
+        lambda c: with_angle(c, clp_angle=np.deg2rad(c.exposures.clp_angle)), "CLP_ANGLE is in radians",
+    ),
+    "plate backwards": (lambda c: with_angle(c, chwp_angle=-c.exposures.chwp_angle), "give −CHWP_ANGLE"),
+    "X mirrored": (lambda c: with_data(c, x=-c.points.x), "give −X"),
+    "Y mirrored": (lambda c: with_data(c, y=-c.points.y), "give −Y"),
+    "turned by 90 degrees": (lambda c: with_data(c, x=c.points.y, y=-c.points.x), "give −Y as X, and X as Y"),
+    "arcminutes": (lambda c: with_data(c, x=60 * c.points.x, y=60 * c.points.y), "X and Y are in arcmin"),
+    "no polariser": (unpolarised, "the calibration polariser was not in the beam"),
+    "South labelled North": (lambda c: dataclasses.replace(c, instrument="WALOP-NORTH"), "they came from WALOP-SOUTH"),
+}  # fmt: skip
+FAST = ("the arms exchanged", "the polariser runs backwards", "turned by 90 degrees")
+
+
+@pytest.mark.parametrize("name", [n if n in FAST else pytest.param(n, marks=pytest.mark.long) for n in CASES])
+def test_every_mix_up_is_told_with_its_remedy(calset, name):
+    spoil, said = CASES[name]
+    bad = spoil(calset)
+    found = mixups(bad, base_model(bad), left=1e5)
+    # A plate at a single angle does not tell another sense from another zero.
+    assert len(found) == (2 if name == "plate backwards" else 1)
+    assert any(re.search(said, str(one)) for one in found)
+    assert (
+        found[0].explained < 1.5 or name == "no polariser"
+    )  # of that the levels are those of the polarised light
+
+
+def test_a_fit_of_mixed_up_data_is_refused(calset):
+    bad = with_data(calset, x=-calset.points.x)
+    with pytest.raises(DataError, match=r"do not fit .* and would if X runs the other way .*: give −X"):
+        examined(plain_refit(bad))
+
+
+def test_right_data_and_effects_are_no_mix_up(calset):
+    """However large: an encoder error of 2°, and half the light of a camera."""
+    block = calset.intensities.block(0, len(calset.points))
+    model = base_model(calset)
+    assert mixups(calset, model, left=1.0) == ()
+    wobble = 2.0 * np.sin(np.deg2rad(calset.exposures.clp_angle))
+    assert mixups(with_angle(calset, clp_angle=calset.exposures.clp_angle + wobble), model, left=5e3) == ()
+    counts = block.counts * np.array([1.0, 0.5, 1.0, 1.0])
+    table = TableIntensities.dense(calset.points, dataclasses.replace(block, counts=counts))
+    assert mixups(dataclasses.replace(calset, intensities=table), model, left=1e3) == ()
+
+
+def test_errors_that_are_far_too_small_are_told_from_a_wrong_model(calset):
+    block = calset.intensities.block(0, len(calset.points))
+    table = TableIntensities.dense(calset.points, dataclasses.replace(block, sigma=block.sigma / 100.0))
+    result: FitResult = examined(plain_refit(dataclasses.replace(calset, intensities=table)))
+    assert not result.trusted
+    assert any(re.search(r"N_ERR is (9\d|10\d)(\.\d)? times too small", text) for text in result.warnings)
+
+
+def test_cameras_in_different_units_are_seen_without_a_fit(calset):
+    block = calset.intensities.block(0, len(calset.points))
+    gain = np.array([1.0, 1.0, 4.0, 1.0])
+    table = TableIntensities.dense(
+        calset.points, dataclasses.replace(block, counts=block.counts / gain, sigma=block.sigma / gain)
+    )
+    findings = [str(one) for one in inspect(dataclasses.replace(calset, intensities=table)).findings]
+    assert any("N2 0.25" in text and "electrons" in text for text in findings)
+    assert not any("between the cameras" in str(one) for one in inspect(calset).findings)

@@ -1,0 +1,271 @@
+"""Have the data been written down wrongly? Discrete alternatives, tried where a fit explains nothing.
+
+Cameras in another order, angles that run the other way or start elsewhere, a field that is mirrored, turned or in
+other units, a polariser that was not in the beam, another instrument: each makes residuals far beyond what any effect
+makes, and each is undone by rewriting the set. An alternative is worth what a fit of the rewritten set at a few field
+points leaves,
+
+    χ²(θ₀ + δ),   δ = −(JᵀJ/s² + P)⁻¹ (Jᵀr/s² + P(θ₀ − θ_prior)),
+
+after one Gauss–Newton step from the model as designed, the errors of the data scaled by s as the fit of the set as it
+stands asks for, so that priors hold what residuals of a wrong model would bend. The best ones take more steps. What
+brings χ²/dof − 1 below a tenth of what the fit of the set as it stands has left is told.
+
+Symbols     J, r Jacobian and whitened residuals; P inverse prior variances; θ₀ start values.
+Limits      One mix-up at a time. Two that do the same to these data are told together.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, CalibrationSet, Exposures, Points
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.refit import FitResult
+from walop_jax.fit.search import FAR_OFF
+from walop_jax.instruments.description import shipped
+from walop_jax.io.errors import DataError
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.thinning import thinned
+from walop_jax.model.specification import Model
+
+GAIN = 10.0
+"""Factor by which an alternative must bring down χ²/dof − 1 to be told."""
+_COARSE = 0.01  # share of the light that a fit of mixed-up data misses at least
+_POINTS, _FEW = 16, 64  # field points that are looked at; sets of so few are looked at whole
+_STEPS = (1, 6)  # Gauss–Newton steps at the first look, and of the best
+_BEST = 3  # alternatives that are looked at again
+_ALIKE = 1.5  # factor in χ² within which two alternatives are both told
+_ALL_ORDERS = 4  # cameras up to which all orders are tried, beyond pairs alone
+_FIELD = 1.5  # of the designed field: what a field in other units must fit into
+
+Change = Callable[[CalibrationSet], CalibrationSet]
+
+
+@dataclasses.dataclass(frozen=True)
+class Alternative:
+    """Another reading of a set: what must have happened, what to do about it, and the set rewritten.
+
+    `explained` is its χ²/dof at the field points that were looked at.
+    """
+
+    what: str
+    remedy: str
+    change: Change
+    instrument: str = ""
+    explained: float = np.inf
+
+    def __str__(self) -> str:
+        return f"{self.what} (χ²/dof = {self.explained:.3g}): {self.remedy}"
+
+
+def refuse_mixups(result: FitResult) -> None:
+    """Raise `DataError` with the remedy if a fit leaves what another reading of its data explains."""
+    if result.dof <= 0:
+        return
+    left = result.chi2 / result.dof
+    found = mixups(result.calset, result.model, left)
+    if found:
+        reasons = "; or if ".join(str(one) for one in found)
+        raise DataError(f"the data do not fit (χ²/dof = {left:.3g}), and would if {reasons}")
+
+
+def mixups(calset: CalibrationSet, model: Model, left: float) -> tuple[Alternative, ...]:
+    """The readings of the data that explain them, best first, where a fit misses them by a per cent or more.
+
+    `left` is the χ²/dof of a fit of `model`.
+    """
+    if left < FAR_OFF:
+        return ()
+    # The program that a small set was fitted with is there already.
+    few = calset if len(calset.points) <= _FEW else thinned(calset, _POINTS, neighbours=1)
+    block = few.intensities.block(0, len(few.points))
+    seen = block.used[..., None] & (block.counts > 0)
+    if not seen.any() or np.median(block.sigma[seen] / block.counts[seen]) * np.sqrt(left) < _COARSE:
+        return ()
+    few = dataclasses.replace(few, intensities=TableIntensities.dense(few.points, block))
+    as_it_stands = Alternative("", "", lambda calset: calset)
+    left = min(left, _judged(as_it_stands, few, model, left, _STEPS[1]).explained)
+    if left < FAR_OFF:  # the fit has lost its way, not the data
+        return ()
+    for readings in (_readings(few, model), _instruments(few)):
+        tried = [_judged(one, few, model, left, _STEPS[0]) for one in readings]
+        best = [_judged(one, few, model, one.explained, _STEPS[1]) for one in _sorted(tried)[:_BEST]]
+        good = [one for one in _sorted(best) if one.explained - 1.0 < (left - 1.0) / GAIN]
+        if good:
+            return tuple(one for one in good if one.explained < _ALIKE * good[0].explained)
+    return ()
+
+
+def _sorted(found: list[Alternative]) -> list[Alternative]:
+    return sorted(found, key=lambda one: one.explained)
+
+
+def _judged(one: Alternative, calset: CalibrationSet, model: Model, left: float, steps: int) -> Alternative:
+    """An alternative with χ²/dof after some Gauss–Newton steps from the model as designed; ∞ where none can be made."""
+    try:
+        rewritten = one.change(calset)
+        if one.instrument:
+            model = base_model(rewritten)
+        return dataclasses.replace(one, explained=_left(Likelihood.of(rewritten, model), left, steps))
+    except (ValueError, np.linalg.LinAlgError):
+        return one
+
+
+def _left(likelihood: Likelihood, before: float, steps: int) -> float:
+    """χ²/dof after some steps, the errors of the data scaled as `before`, then as the step before, asks for."""
+    select, values, least = likelihood.model.selection(), likelihood.model.start, before
+    here, found = None, np.inf
+    for number in range(steps + 1):
+        here = likelihood.expand(values, np.sqrt(max(least, 1.0)), here)
+        if here.dof <= 0 or not np.isfinite(here.chi2):
+            break
+        least = here.chi2 / here.dof
+        found = min(found, least)
+        if number < steps:
+            width = np.sqrt(np.diag(here.matrix))
+            step = np.linalg.solve(here.matrix / np.outer(width, width), here.gradient / width) / width
+            values = values - select @ step
+    return found
+
+
+# ------------------------------------------------------------------------------------------- the alternatives
+
+
+def _readings(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
+    yield from _orders(model)
+    yield from _angles(calset)
+    yield from _fields(calset, model)
+    e = calset.exposures
+    if e.clp_in.any():
+        yield Alternative(
+            "the calibration polariser was not in the beam",
+            "set CLP_IN to F and CLP_ANGLE to NaN, or observe again",
+            _with_exposures(_without_polariser),
+        )
+
+
+def _instruments(calset: CalibrationSet) -> Iterator[Alternative]:
+    """Those that come with the package; each costs a program of its own, so they come last."""
+    for name in shipped():
+        if name != calset.instrument:
+            yield Alternative(
+                f"they came from {name}",
+                f"correct INSTRUME, which says {calset.instrument}",
+                lambda calset, name=name: dataclasses.replace(calset, instrument=name),
+                instrument=name,
+            )
+
+
+def _orders(model: Model) -> Iterator[Alternative]:
+    names = model.template.cameras.names
+    count = len(names)
+    if count <= _ALL_ORDERS:
+        orders = list(itertools.permutations(range(count)))[1:]
+    else:
+        pairs = itertools.combinations(range(count), 2)
+        orders = [tuple(b if k == a else a if k == b else k for k in range(count)) for a, b in pairs]
+    for order in orders:
+        held = ", ".join(names[k] for k in np.argsort(order))
+        yield Alternative(
+            f"the columns of N hold the cameras {held}",
+            f"their order is {', '.join(names)}",
+            lambda calset, order=order: _with_cameras(calset, list(order)),
+        )
+
+
+def _angles(calset: CalibrationSet) -> Iterator[Alternative]:
+    e = calset.exposures
+    prefixes = [p for p in (POLARISER, CALIBRATION_PLATE, *e.moving) if e.position(p).inside.any()]
+    for prefix in prefixes:
+        angle = e.position(prefix).angle
+        column = f"{prefix}_ANGLE"
+        for sign, offset in itertools.product((1.0, -1.0), (0.0, 45.0, 90.0, 135.0)):
+            if (sign, offset) == (1.0, 0.0):
+                continue
+            runs = "runs the other way" if sign < 0 else ""
+            starts = f"is {offset:g}° too small" if offset else ""
+            yield Alternative(
+                f"{column} {' and '.join(text for text in (runs, starts) if text)}",
+                f"give {'−' if sign < 0 else ''}{column}{f' + {offset:g}°' if offset else ''}",
+                _with_angle(prefix, lambda a, sign=sign, offset=offset: sign * a + offset),
+            )
+        if np.nanmax(np.abs(angle)) <= 2.0 * np.pi:
+            yield Alternative(
+                f"{column} is in radians", "give degrees, or the unit of the column", _with_angle(prefix, np.rad2deg)
+            )  # fmt: skip
+    if np.isfinite(e.rotator).any():
+        for words, change in (
+            ("runs the other way", lambda a: -a),
+            ("is 90° too small", lambda a: a + 90.0),
+            ("is in radians", np.rad2deg),
+        ):
+            yield Alternative(
+                f"ROTATOR {words}",
+                "correct it (docs: conventions)",
+                _with_exposures(lambda e, change=change: dataclasses.replace(e, rotator=change(e.rotator))),
+            )
+
+
+def _fields(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
+    turns: tuple[tuple[str, str, Callable[..., tuple[np.ndarray, np.ndarray]]], ...] = (
+        ("X runs the other way", "give −X", lambda x, y: (-x, y)),
+        ("Y runs the other way", "give −Y", lambda x, y: (x, -y)),
+        ("the field is turned by 180°", "give −X and −Y", lambda x, y: (-x, -y)),
+        ("the field is turned by 90°", "give −Y as X, and X as Y", lambda x, y: (-y, x)),
+        ("the field is turned by −90°", "give Y as X, and −X as Y", lambda x, y: (y, -x)),
+        ("X and Y are exchanged", "exchange them", lambda x, y: (y, x)),
+        ("X and Y are exchanged and run the other way", "give −Y as X, and −X as Y", lambda x, y: (-y, -x)),
+    )  # fmt: skip
+    for what, remedy, turn in turns:
+        yield Alternative(what, remedy, _with_places(turn))
+    extent = model.template.field_limit
+    far = float(np.hypot(calset.points.x, calset.points.y).max())
+    for unit, factor in (("arcmin", 1.0 / 60.0), ("arcsec", 1.0 / 3600.0), ("radians", np.rad2deg(1.0))):
+        if 0.05 * extent < factor * far < _FIELD * extent:
+            yield Alternative(
+                f"X and Y are in {unit}",
+                "give degrees, or the unit of the columns",
+                _with_places(lambda x, y, factor=factor: (factor * x, factor * y)),
+            )
+
+
+def _with_cameras(calset: CalibrationSet, order: list[int]) -> CalibrationSet:
+    there = calset.intensities.block(0, len(calset.points))
+    block = dataclasses.replace(there, counts=there.counts[..., order], sigma=there.sigma[..., order])
+    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
+
+
+def _with_places(turn: Callable[..., tuple[np.ndarray, np.ndarray]]) -> Change:
+    def change(calset: CalibrationSet) -> CalibrationSet:
+        x, y = turn(calset.points.x, calset.points.y)
+        points = Points(calset.points.point, x, y)
+        block = dataclasses.replace(calset.intensities.block(0, len(points)), x=x, y=y)
+        return dataclasses.replace(calset, points=points, intensities=TableIntensities.dense(points, block))
+
+    return change
+
+
+def _with_angle(prefix: str, turned: Callable[[np.ndarray], np.ndarray]) -> Change:
+    def change(e: Exposures) -> Exposures:
+        if prefix == POLARISER:
+            return dataclasses.replace(e, clp_angle=turned(e.clp_angle))
+        if prefix == CALIBRATION_PLATE:
+            return dataclasses.replace(e, chwp_angle=turned(e.chwp_angle))
+        there = dataclasses.replace(e.moving[prefix], angle=turned(e.moving[prefix].angle))
+        return dataclasses.replace(e, moving={**e.moving, prefix: there})
+
+    return _with_exposures(change)
+
+
+def _without_polariser(e: Exposures) -> Exposures:
+    return dataclasses.replace(e, clp_in=np.zeros(len(e), bool), clp_angle=np.full(len(e), np.nan))
+
+
+def _with_exposures(change: Callable[[Exposures], Exposures]) -> Change:
+    return lambda calset: dataclasses.replace(calset, exposures=change(calset.exposures))
