@@ -100,7 +100,7 @@ def test_optional_columns_may_be_absent(handmade):
 def test_unknown_columns_and_extensions_are_remarked_on(handmade):
     handmade["POINTS"]["XX"] = ["D", "deg", np.zeros(3)]
     path = handmade.folder / "set.fits"
-    fits.HDUList([*handmade.hdus(), fits.ImageHDU(np.zeros((2, 2)), name="PREVIEW")]).writeto(path)
+    fits.HDUList([*handmade.hdus(), fits.ImageHDU(np.zeros((2, 2)), name="PREVIEW")]).writeto(path, checksum=True)
     calset = read_calibration_set(path)
     assert len(calset.remarks) == 2
     assert "[PREVIEW]: unknown extension" in calset.remarks[0]

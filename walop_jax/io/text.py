@@ -9,11 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from walop_jax.io.errors import fail
+from walop_jax.io.inputs import check_input
+
+_LARGEST = 1 << 24
+"""Bytes of a text file beyond which it is none of ours."""
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """The text of a file; `DataError`, with the name, if it is missing or not text in UTF-8."""
+    """The text of a file; `DataError`, with the name, if it is missing, beyond 16 MiB or not text in UTF-8."""
     try:
+        if check_input(path).stat().st_size > _LARGEST:
+            raise fail("is larger than 16 MiB", file=path, advice="is this the right file?")
         return Path(path).read_text(encoding="utf-8")
     except OSError as error:
         raise fail(f"cannot be read: {error.strerror or error}", file=path) from None
