@@ -97,7 +97,7 @@ def test_header_without_end_is_not_followed_for_ever(tmp_path):
 def test_card_given_twice(handmade):
     path = handmade.write(checksum=False)
     content = path.read_bytes()
-    place = content.index(b"TUNIT", content.index(b"EXPOSURES"))
+    place = content.index(b"TUNIT")
     path.write_bytes(content[:place] + b"TFIELDS =                   15".ljust(80) + content[place + 80 :])
     with pytest.raises(DataError, match=r"\[EXPOSURES\] TFIELDS: is there twice"):
         read_calibration_set(path)

@@ -22,6 +22,7 @@ from walop_jax.data.checks import (
 from walop_jax.data.filters import builtin_filter
 from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
 from walop_jax.data.merge import merge_calibration_sets
+from walop_jax.data.plausibility import doubts_about
 from walop_jax.data.records import (
     KINDS,
     CalibrationSet,
@@ -109,6 +110,7 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
     filters = make_filters(table("FILTERS"), Place(path, "FILTERS")) if "FILTERS" in tables else {}
     place = Place(path, "EXPOSURES")
     exposures = make_exposures(table("EXPOSURES"), filters, site, place, version=version, kinds=kinds)
+    remarks.extend(doubts_about(instrument, site, exposures, place))
     sources = (
         make_sources(table("SOURCES"), Place(path, "SOURCES")) if "SOURCES" in tables else empty_sources()
     )

@@ -92,7 +92,9 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[OpenFile]:
             raw.seek(0)
             sha256 = hashlib.file_digest(raw, "sha256").hexdigest()
         remarks = tuple(f"{path}: {one_line(entry.message)}" for entry in caught)
-        yield OpenFile(path, sha256, units, compressed, (*remarks, *_unprotected(path, units)))
+        # A file packed with gzip carries a CRC-32 of all its bytes.
+        unprotected = [] if compressed else _unprotected(path, units)
+        yield OpenFile(path, sha256, units, compressed, (*remarks, *unprotected))
 
 
 def primary_keywords(path: str | os.PathLike[str]) -> tuple[str, ...]:
