@@ -20,6 +20,7 @@ from walop_jax.data.schema import Column, Place, convert_unit
 from walop_jax.io.atomic import atomic_path, check_output
 from walop_jax.io.errors import DataError, fail, nearest, rows_text
 from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits
+from walop_jax.io.inputs import check_input
 from walop_jax.io.plain_tables import table_format
 
 _TRUE, _FALSE = ("true", "t", "1", "yes"), ("false", "f", "0", "no", "")
@@ -46,7 +47,8 @@ def read_input_table(path: str | os.PathLike[str]) -> InputTable:
     """
     from astropy.table import Table  # imported here: it takes a third of a second
 
-    path, kind = Path(path), table_format(path)
+    kind = table_format(path)
+    path = check_input(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -62,8 +64,6 @@ def read_input_table(path: str | os.PathLike[str]) -> InputTable:
                 table = Table.read(path, format=kind)
     except DataError:
         raise
-    except FileNotFoundError:
-        raise fail("there is no such file", file=path, advice="check the name") from None
     except (*UNREADABLE, UnicodeError) as error:
         what = f"cannot be read as a table: {one_line(error)}"
         raise fail(what, file=path, advice="write it again") from error

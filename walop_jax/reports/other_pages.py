@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import base64
-import json
 from pathlib import Path
 from typing import Any
 
 from walop_jax.io.errors import fail
+from walop_jax.io.text import read_json
 from walop_jax.reports.page import environment
 from walop_jax.reports.run import COMPARISON, EPOCH
 
@@ -33,12 +33,7 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
     Raises `DataError` for a document that cannot be read or lacks what the page shows.
     """
     path = folder / (COMPARISON if kind == "comparison" else EPOCH)
-    try:
-        document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise fail(
-            f"cannot be read: {error}", file=path, advice="run the command that made it again"
-        ) from error
+    document: dict[str, Any] = read_json(path)
     needed = ("on_grid", "between") if kind == "comparison" else ("fits", "moved", "star_errors")
     for key in needed:
         if key not in document:
