@@ -19,7 +19,7 @@ from walop_jax.io.plain_tables import write_columns
 from walop_jax.io.text import json_text, read_text
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.posterior import Options, PosteriorSample, sample
-from walop_jax.posterior.checkpoint import Checkpoints
+from walop_jax.posterior.checkpoint import Checkpoints, digest_of_fit
 from walop_jax.posterior.from_run import fit_of_run
 from walop_jax.posterior.output import intervals, report, write_posterior
 from walop_jax.posterior.result import Report
@@ -80,7 +80,9 @@ def sample_run(
         if overwrite and not resume:
             Checkpoints(folder / CHAINS, {}).clear()
         posterior = sample(result, options, folder=folder / CHAINS, resume=resume, report=progress)
-        posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted)
+        table = product.parameters
+        fitted = digest_of_fit(product.inputs, table.name.tolist(), table.value)
+        posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted, fit=fitted)
         summary = report(posterior)
         _write(out, product, posterior, summary, catalogue)
     return SampledRun(posterior, summary)
