@@ -34,6 +34,7 @@ from walop_jax.data.records import (
     Site,
     Sources,
 )
+from walop_jax.data.repeats import check_repeats
 from walop_jax.data.schema import CALVERS, Place, column_names, read_table, table_rules
 from walop_jax.data.table_intensities import TableIntensities, mask_repeats, table_intensities, usable
 from walop_jax.io.errors import DataError, fail, nearest
@@ -126,6 +127,7 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
         intensities, more = table_intensities(table("INTENSITIES"), exposures, points, sources, place)
         intensities, repeated = mask_repeats(intensities, exposures)
         remarks.extend(more + repeated + _idle(intensities, exposures, path))
+    remarks.extend(check_repeats(intensities, exposures, points, path))
     return CalibrationSet(
         instrument=instrument,
         site=site,
