@@ -210,7 +210,7 @@ def write_output_table(
 ) -> None:
     """Write a table with columns added (an old column of that name is replaced), in the format of the name.
 
-    A value of `added` is an array, or a pair of an array and its description; `header` adds to the header of
+    A value of `added` is an array, alone or with its description and its unit; `header` adds to the header of
     the table (CSV has none). The file appears whole or not at all. Raises `DataError` as `atomic_path` does, and
     for an unknown extension.
     """
@@ -235,8 +235,9 @@ def extended(source: InputTable, added: Mapping[str, Any], header: Mapping[str, 
     for name, values in added.items():
         if name in present:
             table.remove_column(present[name])
-        values, description = values if isinstance(values, tuple) else (values, "")
+        values, *about = values if isinstance(values, tuple) else (values,)
         table[name] = values
-        if description:
-            table[name].description = description
+        for attribute, text in zip(("description", "unit"), about, strict=False):
+            if text:
+                setattr(table[name], attribute, text)
     return table

@@ -63,11 +63,16 @@ def json_text(value: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """The value with mappings as dicts, sequences as lists and numbers that are not finite as None."""
+    """The value with mappings as dicts, sequences as lists, numbers that are not finite as None, texts `printable`."""
     if isinstance(value, dict):
         return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [plain(entry) for entry in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    return value
+    return printable(value) if isinstance(value, str) else value
+
+
+def printable(text: str) -> str:
+    """The text with the bytes of a path that are not UTF-8, which no output takes, written as \\xff."""
+    return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
