@@ -35,6 +35,7 @@ COMMANDS = (
     "import-zemax",
     "trace",
     "cite",
+    "conformance",
     "docs",
 )
 """In the order of the help; `import-zemax` is the function `import_zemax` of `import_zemax.py`, and so on."""
