@@ -124,6 +124,20 @@ def test_every_library_is_declared():
     assert {name: used[name] for name in missing} == {}
 
 
+def test_every_library_is_locked_with_its_hashes():
+    """A version and the hashes of its files for every dependency, within the bounds of pyproject.toml."""
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
+    text = (PACKAGE.parent / "requirements.lock").read_text()
+    locked = dict(
+        re.findall(r"^([\w.-]+)==([\w.]+)[^\n]*\\\n    --hash=sha256:[0-9a-f]{64}", text, re.MULTILINE)
+    )
+    for entry in (*project["dependencies"], *project["optional-dependencies"]["test"]):
+        name, least = re.match(r"([\w-]+)(?:\[\w+\])?>=([\d.]+)", entry).groups()  # type: ignore[union-attr]
+        version = locked[name.lower()]
+        assert [int(n) for n in version.split(".")[:2]] >= [int(n) for n in least.split(".")[:2]], entry
+    assert "://" not in text
+
+
 def test_every_folder_is_a_room():
     """A new room must be given its place in the order."""
     folders = {path.parent.relative_to(PACKAGE).parts[0] for path in files() if path.parent != PACKAGE}

@@ -122,6 +122,10 @@ def test_the_hash_is_of_the_content(product):
     assert moved.content_hash() != product.content_hash()
     warned = dataclasses.replace(product, verdict=dataclasses.replace(product.verdict, trusted=True))
     assert warned.content_hash() != product.content_hash()
+    for name in ("temp", "ha", "teff", "clp_angle", "rotator"):
+        other = dataclasses.replace(product.exposures, **{name: getattr(product.exposures, name) + 1.5})
+        if np.isfinite(getattr(other, name)).any():
+            assert dataclasses.replace(product, exposures=other).content_hash() != product.content_hash()
 
 
 def test_signs_are_spelt_out():

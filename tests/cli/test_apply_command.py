@@ -51,6 +51,7 @@ def test_apply_adds_columns(call, run, tmp_path, suffix):
     assert np.all(table["P_DEBIASED"] <= table["P"])
     np.testing.assert_allclose(np.hypot(table["Q"], table["U"]), table["P"], rtol=1e-12)
     if suffix != ".csv":
+        assert [str(table[name].unit) for name in ("EVPA", "EVPA_ERR", "Q")] == ["deg", "deg", "None"]
         assert table.meta["QUFRAME"] == "sky"
         assert table.meta["CALHASH"] == read_product(run / "calibration.fits").content_hash()
         assert table.meta["PESTIM"].startswith("Plaszczynski")

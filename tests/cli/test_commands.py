@@ -140,6 +140,8 @@ def test_outputs_that_cannot_be(call, calset_file, tmp_path, monkeypatch):
         ('[model]\neffects = ["clp_woble"]', "clp_wobble"),
         ('[parameters."half1.plate.quarz"]\nfree = false', "half1.plate.quartz"),
         ("[model", "not valid TOML"),
+        (f"x = {'[' * 100000}", "nested too deep"),
+        (f"x.{'y.' * 40}z = 1", "nested too deep"),
         ('[model]\ninstrument = "WALOP-NORTH"', "WALOP-SOUTH"),
     ],
 )
@@ -155,7 +157,7 @@ def test_bad_model_files(call, calset_file, tmp_path, text, message):
 def test_missing_and_alien_inputs(call, run, calset_file, tmp_path):
     assert "no such file" in one_line(call("refit", tmp_path / "none.fits", "-o", tmp_path / "run"))
     missing = one_line(call("refit", calset_file, "-o", tmp_path / "run", "--model", tmp_path / "none.toml"))
-    assert "none.toml: cannot be read" in missing
+    assert "none.toml: there is no such file" in missing
     assert "calibration product" in one_line(call("refit", run / "calibration.fits", "-o", tmp_path / "run"))
     assert list(tmp_path.iterdir()) == []
 

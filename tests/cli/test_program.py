@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
+from south_sets import CUTS
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -61,6 +63,40 @@ def test_wrong_usage_and_errors_have_their_exit_codes(tmp_path):
     assert failed.returncode == 1
     assert failed.stdout == ""
     assert re.fullmatch(r"walop-jax: error: .*none\.fits.*\n", failed.stderr)
+
+
+@pytest.mark.parametrize(
+    ("module", "disguised"), [("typer", False), ("walop_jax.runs.inspect", False), ("numpy", True)]
+)
+def test_an_interrupt_during_imports_is_one_line(tmp_path, module, disguised):
+    """Libraries in C turn the interrupt into an error of their own."""
+    error = "raise ImportError('failed') from KeyboardInterrupt()" if disguised else "raise KeyboardInterrupt"
+    code = (
+        "import sys\n"
+        "class Interrupting:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name == {module!r}:\n"
+        f"            {error}\n"
+        "sys.meta_path.insert(0, Interrupting())\n"
+        "from walop_jax.cli import main\n"
+        "main()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "inspect", str(tmp_path / "none.fits")],
+        capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 130
+    assert done.stderr == "walop-jax: error: interrupted; nothing was left half-written\n"
+
+
+def test_a_path_that_is_not_utf_8(tmp_path):
+    path = os.fsencode(tmp_path) + b"/a\xff.fits.gz"
+    shutil.copy(CUTS / "walop_south_a.fits.gz", path)
+    done = program("inspect", os.fsdecode(path), PYTHONIOENCODING="utf-8:strict")
+    assert done.returncode == 0, done.stderr
+    assert "\\xff.fits.gz" in done.stdout or "\\udcff.fits.gz" in done.stdout
+    told = json.loads(program("inspect", "--json", os.fsdecode(path)).stdout)
+    assert told["sets"][0]["files"] == [f"{tmp_path}/a\\xff.fits.gz"]
 
 
 def test_refit_as_a_process(calset_file, tmp_path):

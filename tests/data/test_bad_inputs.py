@@ -61,6 +61,14 @@ def scale(table, name, factor):
     return change
 
 
+def no_moon(name, value):
+    def change(made):
+        made.values(E, "KIND")[6] = "flux"
+        made.header[name] = value
+
+    return change
+
+
 def repeat_pair(made):
     made.values("INTENSITIES", "POINT")[4] = 5
 
@@ -95,6 +103,7 @@ BAD = {
     "site text": (header("SITELAT", "south"), "[PRIMARY] SITELAT: is 'south'", "degrees"),
     "Moon, no site": (header("SITELONG", None), "[PRIMARY] SITELONG: is nan", "site"),
     "latitude": (header("SITELAT", -132.0), "SITELAT: is -132, not in -90 … 90"),
+    "latitude, no Moon": (no_moon("SITELAT", -132.0), "SITELAT: is -132, not in -90 … 90"),
     # tables as such
     "no table": (remove(P), "[POINTS]: the extension is missing"),
     "no rows": (empty(I), "[INTENSITIES]: has no rows"),
@@ -129,6 +138,10 @@ BAD = {
     "moon ROTATOR": (put(E, "ROTATOR", 6, NAN), "[EXPOSURES] ROTATOR: is not finite in row 6"),
     "moon MJD": (put(E, "MJD", 6, NAN), "[EXPOSURES] MJD: is not finite in row 6"),
     "moon JD": (put(E, "MJD", 6, 2461044.35), "[EXPOSURES] MJD", "row 6", "Julian Date"),
+    "JD of a lamp": (put(E, "MJD", 2, 2461044.35), "[EXPOSURES] MJD", "row 2", "Julian Date"),
+    "negative time": (put(E, "EXPTIME", 2, -30.0), "[EXPOSURES] EXPTIME: is not a time in row 2", "seconds"),
+    "bell in a name": (put(S, "NAME", 1, "HD\a1"), "[SOURCES] NAME: holds a control character in row 1"),
+    "line in a filter": (put(F, "FILTER", 0, "NAR\nROW"), "[FILTERS] FILTER: holds a control character"),
     "standard ROTATOR": (put(E, "ROTATOR", 7, NAN), "[EXPOSURES] ROTATOR: is not finite in row 7"),
     "filter": (put(E, "FILTER", 2, "SDSS-R"), "[EXPOSURES] FILTER: 'SDSS-R'", "row 2", "'SDSS-r'"),
     "TEFF zero": (put(E, "TEFF", 2, 0.0), "[EXPOSURES] TEFF", "row 2", "NaN means"),

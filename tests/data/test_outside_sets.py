@@ -33,7 +33,8 @@ def is_read_and_written(path, sizes, instrument, tmp_path):
     exposures, points, rows = sizes
     calset = read_calibration_set(path)
     assert (len(calset.exposures), len(calset.points)) == (exposures, points)
-    assert (calset.intensities.rows, calset.instrument, calset.remarks) == (rows, instrument, ())
+    assert (calset.intensities.rows, calset.instrument) == (rows, instrument)
+    assert not [remark for remark in calset.remarks if "no checksum" not in remark]
 
     block = calset.intensities.block(0, points)
     with fits.open(path) as hdus:

@@ -100,7 +100,9 @@ def test_optional_columns_may_be_absent(handmade):
 def test_unknown_columns_and_extensions_are_remarked_on(handmade):
     handmade["POINTS"]["XX"] = ["D", "deg", np.zeros(3)]
     path = handmade.folder / "set.fits"
-    fits.HDUList([*handmade.hdus(), fits.ImageHDU(np.zeros((2, 2)), name="PREVIEW")]).writeto(path)
+    fits.HDUList([*handmade.hdus(), fits.ImageHDU(np.zeros((2, 2)), name="PREVIEW")]).writeto(
+        path, checksum=True
+    )
     calset = read_calibration_set(path)
     assert len(calset.remarks) == 2
     assert "[PREVIEW]: unknown extension" in calset.remarks[0]
@@ -249,3 +251,34 @@ def test_blocks_are_slices(handmade):
         part = intensities.block(start, stop)
         for name in whole.__dataclass_fields__:
             np.testing.assert_array_equal(getattr(part, name), getattr(whole, name)[start:stop])
+
+
+@pytest.mark.parametrize(
+    ("change", "fragments"),
+    [
+        (lambda made: made.header.update(SITELAT=-31.3795), ["[PRIMARY] SITELAT: is -31.3795°", "-32.3795°"]),
+        (lambda made: made.header.update(SITEELEV=179.8), ["SITEELEV: is 179.8 m", "stands at 1798 m"]),
+        (lambda made: made.header.update(SITELONG=20.85), []),
+        (
+            lambda made: made.values("EXPOSURES", "MJD").__setitem__(3, 41043.85),
+            ["MJD: is before 1990 in row 3"],
+        ),
+        (
+            lambda made: made.values("EXPOSURES", "MJD").__setitem__(3, 61543.85),
+            ["MJD: is more than 400", "row 3"],
+        ),
+    ],
+)
+def test_implausible_place_and_time_are_remarked_on(handmade, change, fragments):
+    change(handmade)
+    remarks = "\n".join(read_calibration_set(handmade.write()).remarks)
+    for fragment in fragments:
+        assert fragment in remarks
+    assert ("SITE" in remarks or "MJD" in remarks) == bool(fragments)
+
+
+def test_conversion_of_a_unit_is_remarked_on(handmade):
+    handmade["POINTS"]["X"] = ["D", "arcmin", np.array([-12.0, 0.0, 15.0])]
+    calset = read_calibration_set(handmade.write())
+    np.testing.assert_allclose(calset.points.x, [-0.2, 0.0, 0.25])
+    assert any("[POINTS] X: is in arcmin, converted to deg" in remark for remark in calset.remarks)

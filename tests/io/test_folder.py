@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import random
+import signal
+import subprocess
+import sys
+import textwrap
+import time
 
 import pytest
 
 from walop_jax.data import DataError
-from walop_jax.io.folder import atomic_folder, check_folder
+from walop_jax.io import folder as folders
+from walop_jax.io.folder import check_folder, output_folder
 
 NAMES = ("a.txt", "b.txt")
 
 
 def fill(path, text="new", **options):
-    with atomic_folder(path, NAMES, **options) as folder:
+    with output_folder(path, NAMES, **options) as out, out.filled() as folder:
         for name in NAMES:
             (folder / name).write_text(text)
 
@@ -51,7 +59,7 @@ def test_an_interrupt_leaves_nothing(tmp_path, existing):
         fill(tmp_path / "run", "old")
 
     def interrupted():
-        with atomic_folder(tmp_path / "run", NAMES, overwrite=True) as folder:
+        with output_folder(tmp_path / "run", NAMES, overwrite=True) as out, out.filled() as folder:
             (folder / "a.txt").write_text("half")
             raise KeyboardInterrupt
 
@@ -65,7 +73,8 @@ def test_an_interrupt_leaves_nothing(tmp_path, existing):
 def test_a_file_that_was_forgotten_stops_all(tmp_path):
     with (
         pytest.raises(DataError, match=r"b\.txt was not written"),
-        atomic_folder(tmp_path / "run", NAMES) as folder,
+        output_folder(tmp_path / "run", NAMES) as out,
+        out.filled() as folder,
     ):
         (folder / "a.txt").write_text("one")
     assert left(tmp_path) == []
@@ -85,3 +94,171 @@ def test_a_read_only_folder_is_refused(tmp_path, monkeypatch):
     for path in (tmp_path / "run", tmp_path / "new"):
         with pytest.raises(DataError, match="read-only"):
             check_folder(path)
+
+
+# ---- one writer at a time, and one set of results at any moment ----
+
+WRITER = textwrap.dedent(
+    """
+    import sys
+    from walop_jax.io.folder import output_folder
+
+    for number in range(100000):
+        with output_folder(sys.argv[1], ("a.txt", "b.txt"), overwrite=True) as out:
+            with out.filled(drop=("partial",)) as folder:
+                (folder / "a.txt").write_text(f"{sys.argv[2]} {number}")
+                (folder / "b.txt").write_text(f"{sys.argv[2]} {number}")
+        print(number, flush=True)
+    """
+)
+
+
+def start(path, name):
+    """Another process that writes the folder again and again; it has begun when this returns."""
+    command = [sys.executable, "-c", WRITER, str(path), name]
+    writer = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert writer.stdout is not None
+    writer.stdout.readline()
+    return writer
+
+
+def consistent(path):
+    """Both files, of one run; what else the folder holds is there too."""
+    assert (path / "a.txt").read_text() == (path / "b.txt").read_text()
+    assert (path / "notes" / "mine.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("two_steps", [False, True])
+@pytest.mark.parametrize("kills", [4, pytest.param(200, marks=pytest.mark.long)])
+def test_kills_leave_results_of_one_run_and_the_next_one_cleans_up(tmp_path, kills, two_steps):
+    run, draw = tmp_path / "run", random.Random(1)
+    (run / "notes").mkdir(parents=True)
+    (run / "notes" / "mine.txt").write_text("mine")
+    script = "from walop_jax.io import folder\nimport errno\n"
+    script += "def no(*_): raise OSError(errno.ENOSYS, '')\nfolder._exchange = no\n" if two_steps else ""
+    for _ in range(kills):
+        command = [sys.executable, "-c", script + WRITER, str(run), "one"]
+        writer = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert writer.stdout is not None
+        writer.stdout.readline()
+        time.sleep(draw.uniform(0.0, 0.03))
+        writer.kill()
+        writer.communicate()
+        if (
+            not two_steps
+        ):  # without an exchange of names the folder may be away for a moment; the next run restores it
+            consistent(run)
+        fill(run, "again", overwrite=True)
+        consistent(run)
+        assert left(tmp_path) == ["run", "run/a.txt", "run/b.txt", "run/notes", "run/notes/mine.txt"]
+
+
+def test_the_second_of_two_writers_is_told_who_the_first_is(tmp_path):
+    run = tmp_path / "run"
+    with output_folder(run, NAMES) as out:
+        with pytest.raises(
+            DataError, match=rf"run: is being written by process {os.getpid()} on .* since 20"
+        ):
+            fill(run)
+        with output_folder(tmp_path / "other", NAMES), out.filled() as folder:
+            for name in NAMES:
+                (folder / name).write_text("first")
+    fill(run, "second", overwrite=True)
+    assert left(tmp_path) == ["run", "run/a.txt", "run/b.txt"]
+
+
+@pytest.mark.parametrize("races", [2, pytest.param(100, marks=pytest.mark.long)])
+def test_races_end_with_one_winner_and_errors_for_the_others(tmp_path, races):
+    run = tmp_path / "run"
+    (run / "notes").mkdir(parents=True)
+    (run / "notes" / "mine.txt").write_text("mine")
+    for _ in range(races):
+        writers = [start(run, name) for name in ("one", "two", "three")]
+        time.sleep(0.05)
+        for writer in writers:
+            writer.send_signal(signal.SIGKILL)
+            error = writer.communicate()[1]
+            assert not error or "is being written by" in error or "meanwhile" in error
+        consistent(run)
+
+
+@pytest.mark.parametrize("place", ["current", "read-only parent", "large"])
+def test_a_folder_that_is_not_exchanged_mixes_nothing_either(tmp_path, monkeypatch, place):
+    run = tmp_path / "run"
+    fill(run, "old")
+    number = run.stat().st_ino
+    if place == "current":
+        monkeypatch.chdir(run)
+    elif place == "large":
+        monkeypatch.setattr(folders, "_MOST", 0)
+    else:
+        access = os.access
+        monkeypatch.setattr(
+            os, "access", lambda path, mode: access(path, mode) and str(path) != str(tmp_path)
+        )
+    placed, replace = [], os.replace
+
+    def once(source, target):
+        if placed:
+            raise OSError(errno.EIO, "the disk is gone")
+        placed.append(target)
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", once)
+    with pytest.raises(DataError, match="writing failed: the disk is gone"):
+        fill(run, "new", overwrite=True)
+    assert {path.name: path.read_text() for path in run.iterdir()} == {"a.txt": "new"}  # b.txt of old is gone
+    monkeypatch.setattr(os, "replace", replace)
+    fill(run, "new", overwrite=True)
+    assert run.stat().st_ino == number
+    assert left(tmp_path) == ["run", "run/a.txt", "run/b.txt"]
+
+
+def test_what_others_put_there_while_the_folder_is_exchanged_is_kept(tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    fill(run, "old")
+    exchange = folders._exchange
+
+    def late(one, other):
+        (run / "report.html").write_text("written meanwhile")
+        exchange(one, other)
+
+    monkeypatch.setattr(folders, "_exchange", late)
+    fill(run, "new", overwrite=True)
+    assert (run / "report.html").read_text() == "written meanwhile"
+    assert (run / "a.txt").read_text() == "new"
+
+
+def test_links_and_permissions_of_a_folder_stay(tmp_path):
+    fill(tmp_path / "run", "old")
+    (tmp_path / "run").chmod(0o750)
+    (tmp_path / "run" / "b.txt").chmod(0o640)
+    (tmp_path / "run" / "link").symlink_to("nowhere")
+    (tmp_path / "latest").symlink_to("run")
+    fill(tmp_path / "latest", "new", overwrite=True)
+    assert (tmp_path / "latest").is_symlink()
+    assert (tmp_path / "run" / "a.txt").read_text() == "new"
+    assert (tmp_path / "run" / "link").is_symlink()
+    assert (tmp_path / "run").stat().st_mode & 0o777 == 0o750
+    assert (tmp_path / "run" / "b.txt").stat().st_mode & 0o777 == 0o640
+
+
+@pytest.mark.parametrize("kind", [DataError, OSError])
+def test_temporary_names_are_never_in_messages(tmp_path, kind):
+    run = tmp_path / "run"
+    fill(run, "old")
+
+    def failing():
+        with output_folder(run, NAMES, overwrite=True) as out, out.filled() as folder:
+            path = folder / "a.txt"
+            raise (
+                DataError(f"{path}: cannot be")
+                if kind is DataError
+                else OSError(28, "No space left", str(path))
+            )
+
+    with pytest.raises(DataError) as caught:
+        failing()
+    assert ".walop" not in str(caught.value)
+    assert str(run) in str(caught.value)
+    assert left(tmp_path) == ["run", "run/a.txt", "run/b.txt"]

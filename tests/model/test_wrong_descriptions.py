@@ -196,15 +196,15 @@ def test_a_wrong_file_is_refused_with_its_place(tmp_path: Path, case):
 
 def test_a_file_that_cannot_be_read(tmp_path: Path):
     path = tmp_path / "own.toml"
-    with pytest.raises(DataError, match=r"own\.toml: cannot be read.*; give a TOML file or a shipped name"):
+    with pytest.raises(DataError, match=r"own\.toml: there is no such file; check the name"):
         read_description(path)
     path.write_bytes(OWN.encode("utf-16"))
-    with pytest.raises(DataError, match=r"own\.toml: cannot be read.*utf-8"):
+    with pytest.raises(DataError, match=r"own\.toml: is not text in UTF-8"):
         read_description(path)
     path.write_bytes(b"\xff\xfe")
-    with pytest.raises(DataError, match=r"own\.toml: cannot be read"):
+    with pytest.raises(DataError, match=r"own\.toml: is not text in UTF-8"):
         read_description(path)
-    with pytest.raises(DataError, match=r"cannot be read.*directory"):
+    with pytest.raises(DataError, match="is a folder"):
         read_description(tmp_path)
 
 

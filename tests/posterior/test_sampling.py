@@ -122,6 +122,9 @@ def test_posterior_file_table_and_report(posterior: PosteriorSample, tmp_path: P
     np.testing.assert_array_equal(draws, posterior.draws.reshape(draws.shape))
     with pytest.raises(DataError, match="another model"):
         read_draws(tmp_path / "posterior.nc", posterior.names[1:])
+    assert len(read_draws(tmp_path / "posterior.nc", posterior.names, posterior.fit)) == len(draws)
+    with pytest.raises(DataError, match="is of another fit with the same parameters"):
+        read_draws(tmp_path / "posterior.nc", posterior.names, posterior.fit[::-1])
     data = inference_data(posterior)
     assert data.posterior["half1.plate.quartz"].attrs["units"] == "um"
     assert data.posterior["half1.wedge"].shape == posterior.draws.shape[:2]
@@ -163,7 +166,7 @@ def test_matrix_by_draws_agrees_with_the_covariance(
 
 def test_options_that_make_no_sense() -> None:
     for wrong in (
-        {"moves": "walk"}, {"ensembles": 1}, {"interval": 3}, {"draws": 0},
+        {"moves": "walk"}, {"ensembles": 1}, {"interval": 3}, {"draws": 0}, {"maximum_steps": 100},
         {"parameters": tuple("abcdefghijklmnopqrstu")},
     ):  # fmt: skip
         with pytest.raises(ValueError, match=r"\w"):

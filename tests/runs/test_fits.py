@@ -98,7 +98,7 @@ def test_results_are_left_alone(fitted: FittedSet, tmp_path: Path, function):
     (tmp_path / output).write_text("mine")
     with pytest.raises(DataError, match=f"holds {output} already"):
         function([fitted.calset], tmp_path)
-    with pytest.raises(DataError, match=r"m\.toml: cannot be read"):
+    with pytest.raises(DataError, match=r"m\.toml: there is no such file"):
         function([fitted.calset], tmp_path, model=tmp_path / "m.toml")
     assert [entry.read_text() for entry in tmp_path.iterdir()] == ["mine"]
 

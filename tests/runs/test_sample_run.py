@@ -107,5 +107,5 @@ def test_what_is_no_run_is_refused(fitted: FittedSet, tmp_path: Path):
         sample_run(fitted.calset)
     with pytest.raises(DataError, match="no such file"):
         sample_run(tmp_path)
-    with pytest.raises(DataError, match=r"m\.toml: cannot be read"):
+    with pytest.raises(DataError, match=r"m\.toml: there is no such file"):
         sample_run(fitted.run, model=tmp_path / "m.toml")

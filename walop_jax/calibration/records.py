@@ -272,9 +272,8 @@ class CalibrationProduct:
     def _arrays(self) -> Iterable[np.ndarray]:
         for record in (self.parameters, self.sources):
             yield from (getattr(record, entry.name) for entry in dataclasses.fields(record))
-        yield from (getattr(self.exposures, name) for name in ("exposure", "kind", "mjd", "filter"))
-        for prefix, position in self.exposures.moving.items():
-            yield from (np.array([prefix]), position.inside, position.angle)
+        for name, values in self.exposures.columns().items():
+            yield from (np.array([name]), values)
         yield from (self.covariance, self.maps.values, self.maps.errors)
         if self.residuals is not None:
             yield from (self.residuals.values, self.residuals.errors, self.residuals.chi2)

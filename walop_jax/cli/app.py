@@ -6,7 +6,6 @@ import functools
 import importlib
 import importlib.util
 import inspect
-import os
 import re
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -36,6 +35,7 @@ COMMANDS = (
     "import-zemax",
     "trace",
     "cite",
+    "conformance",
     "docs",
 )
 """In the order of the help; `import-zemax` is the function `import_zemax` of `import_zemax.py`, and so on."""
@@ -119,11 +119,3 @@ def _register() -> None:
 
 
 _register()
-
-
-def main() -> None:
-    """Run the program: the entry point."""
-    # Before numpy is imported. Its matrices have a hundred rows here: threads cost more than they give
-    # (a refit of 169 points took 8.9 s with them, 6.1 s without, on two cores). JAX has its own threads.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    app()

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from walop_jax.cli import INTERRUPTED
 from walop_jax.io.text import json_text
 
 if TYPE_CHECKING:
@@ -101,11 +102,14 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
             raise typer.Exit(1) from None
         except KeyboardInterrupt:
             complain("interrupted; nothing was left half-written")
-            raise typer.Exit(130) from None
+            raise typer.Exit(INTERRUPTED) from None
         except MemoryError:
             complain("out of memory: use fewer field points, or a machine with more")
             raise typer.Exit(1) from None
         except Exception as error:
+            if _is_interrupt(error):  # that came while a compiled library was imported
+                complain("interrupted; nothing was left half-written")
+                raise typer.Exit(INTERRUPTED) from None
             if os.environ.get(DEBUG_VARIABLE) or type(error).__module__.split(".")[0] in ("typer", "click"):
                 raise
             expected = isinstance(error, CommandError | ValueError | OSError)
@@ -114,6 +118,16 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
             raise typer.Exit(1) from None
 
     return run
+
+
+def _is_interrupt(error: BaseException) -> bool:
+    """Whether an error was made of an interrupt by whoever caught it first."""
+    before: BaseException | None = error
+    for _ in range(20):
+        if before is None or isinstance(before, KeyboardInterrupt):
+            break
+        before = before.__cause__ or before.__context__
+    return isinstance(before, KeyboardInterrupt)
 
 
 def complain(message: str) -> None:

@@ -30,7 +30,12 @@ ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on from the che
 SamplerOption = Annotated[
     str, typer.Option("--sampler", metavar="NAME", help="emcee, nuts, or your own as FILE.py:CLASS.")
 ]
-MaximumOption = Annotated[int, typer.Option("--maximum-steps", min=1, help="Stop there, converged or not.")]
+MaximumOption = Annotated[
+    int,
+    typer.Option(
+        "--maximum-steps", min=1, help="Stop there at the latest, converged or not; a multiple of --interval."
+    ),
+]
 WalkersOption = Annotated[
     int, typer.Option("--walkers", min=0, help="Walkers of an emcee ensemble; 0: at least 64.")
 ]

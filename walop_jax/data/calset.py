@@ -22,6 +22,7 @@ from walop_jax.data.checks import (
 from walop_jax.data.filters import builtin_filter
 from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
 from walop_jax.data.merge import merge_calibration_sets
+from walop_jax.data.plausibility import doubts_about
 from walop_jax.data.records import (
     KINDS,
     CalibrationSet,
@@ -33,6 +34,7 @@ from walop_jax.data.records import (
     Site,
     Sources,
 )
+from walop_jax.data.repeats import check_repeats
 from walop_jax.data.schema import CALVERS, Place, column_names, read_table, table_rules
 from walop_jax.data.table_intensities import TableIntensities, mask_repeats, table_intensities, usable
 from walop_jax.io.errors import DataError, fail, nearest
@@ -109,6 +111,7 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
     filters = make_filters(table("FILTERS"), Place(path, "FILTERS")) if "FILTERS" in tables else {}
     place = Place(path, "EXPOSURES")
     exposures = make_exposures(table("EXPOSURES"), filters, site, place, version=version, kinds=kinds)
+    remarks.extend(doubts_about(instrument, site, exposures, place))
     sources = (
         make_sources(table("SOURCES"), Place(path, "SOURCES")) if "SOURCES" in tables else empty_sources()
     )
@@ -124,6 +127,7 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
         intensities, more = table_intensities(table("INTENSITIES"), exposures, points, sources, place)
         intensities, repeated = mask_repeats(intensities, exposures)
         remarks.extend(more + repeated + _idle(intensities, exposures, path))
+    remarks.extend(check_repeats(intensities, exposures, points, path))
     return CalibrationSet(
         instrument=instrument,
         site=site,

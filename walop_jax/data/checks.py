@@ -192,10 +192,11 @@ def make_exposures(
         standard & ~np.isfinite(table["ROTATOR"]), "is not finite", "ROTATOR", "a standard needs it", place
     )
     low, high = EPHEMERIS_MJD
-    bad = moon & ((table["MJD"] < low) | (table["MJD"] > high))
+    bad = (moon & (table["MJD"] < low)) | (table["MJD"] > high)
     refuse(bad, "is not in 1900 … 2100", "MJD", "is this a Julian Date? subtract 2400000.5", place)
-    if np.any(moon):
-        _site(site, place)
+    bad = (table["EXPTIME"] < 0) | np.isinf(table["EXPTIME"])
+    refuse(bad, "is not a time", "EXPTIME", "seconds; NaN where it is not known", place)
+    _site(site, place, needed=bool(np.any(moon)))
     return Exposures.from_columns(table)
 
 
@@ -229,14 +230,14 @@ def _ranges(table: dict[str, Any], angles: list[str], place: Place) -> None:
         refuse(np.abs(table[name]) > limit, f"exceeds ±{limit:g}", name, advice, place)
 
 
-def _site(site: Site, place: Place) -> None:
+def _site(site: Site, place: Place, *, needed: bool) -> None:
     values = {
         "SITELAT": (site.latitude, -90.0, 90.0),
         "SITELONG": (site.longitude, -180.0, 360.0),
         "SITEELEV": (site.elevation, -500.0, 9000.0),
     }
     for name, (value, low, high) in values.items():
-        if not low <= value <= high:
+        if not low <= value <= high and (needed or not np.isnan(value)):
             raise Place(place.file, "PRIMARY").fail(
                 f"is {value:g}, not in {low:g} … {high:g}", name, "the Moon's parallax needs the site"
             )

@@ -19,6 +19,7 @@ from walop_jax.data.records import (
     Site,
     Sources,
 )
+from walop_jax.data.repeats import check_repeats
 from walop_jax.data.table_intensities import TableIntensities, empty_block, mask_repeats
 from walop_jax.io.errors import DataError, fail
 
@@ -122,6 +123,8 @@ def merge_calibration_sets(*sets: CalibrationSet) -> CalibrationSet:
     else:
         intensities = JoinedIntensities(tuple(parts), len(exposures))
         points = _stack_points([part[1] for part in parts])
+    names = ", ".join(str(entry_input.path) for entry in sets for entry_input in entry.inputs)
+    remarks += check_repeats(intensities, exposures, points, names)
     return CalibrationSet(
         instrument=first.instrument,
         site=first.site,

@@ -196,7 +196,11 @@ def read_table(hdu: Any, schema: Mapping[str, Column], place: Place) -> tuple[di
     table: dict[str, Any] = {}
     for name, column in schema.items():
         if name in names:
-            table[name] = _read_column(hdu, names.index(name), name, column, place)
+            index = names.index(name)
+            table[name] = _read_column(hdu, index, name, column, place)
+            if _is_converted(hdu.columns[index].unit, column):
+                where, unit = f"{place.file} [{place.extension}] {name}", hdu.columns[index].unit.strip()
+                remarks.append(f"{where}: is in {unit}, converted to {column.unit or 'a fraction'}")
         else:
             table[name] = np.full(rows, column.missing)
             if column.remarked:
@@ -247,7 +251,14 @@ def _convert(values: np.ndarray, unit: str | None, name: str, column: Column, pl
     if column.kind == "str":
         if not strings:
             raise place.fail("holds numbers where names are needed", name, "write it as a string column")
-        return np.char.strip(values.astype(str))
+        names = np.char.strip(values.astype(str))
+        if np.any(bad := [not (text.isascii() and text.isprintable()) for text in names.tolist()]):
+            raise place.fail(
+                f"holds a control character in {rows_text(np.flatnonzero(bad))}",
+                name,
+                "write printable ASCII",
+            )
+        return names
     if strings:
         raise place.fail(
             f"holds strings where numbers are needed, {str(values.flat[0])!r} in row 0 (counted from 0)",
@@ -274,6 +285,12 @@ def _convert(values: np.ndarray, unit: str | None, name: str, column: Column, pl
 
 def _to_unit(values: np.ndarray, unit: str | None, name: str, column: Column, place: Place) -> np.ndarray:
     return values if not (unit or "").strip() else convert_unit(values, str(unit), column.unit, name, place)
+
+
+def _is_converted(unit: str | None, column: Column) -> bool:
+    """Whether numbers in a unit that can be read become others in that of the schema."""
+    given = (unit or "").strip()
+    return bool(given) and column.kind == "float" and units.Unit(given) != units.Unit(column.unit)
 
 
 def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: Place) -> np.ndarray:

@@ -20,6 +20,7 @@ from walop_jax.data.schema import Column, Place, convert_unit
 from walop_jax.io.atomic import atomic_path, check_output
 from walop_jax.io.errors import DataError, fail, rows_text
 from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits
+from walop_jax.io.inputs import check_input
 from walop_jax.io.plain_tables import table_format
 
 _TRUE, _FALSE = ("true", "t", "1", "yes"), ("false", "f", "0", "no", "")
@@ -48,7 +49,8 @@ def read_input_table(path: str | os.PathLike[str]) -> InputTable:
     """
     from astropy.table import Table  # imported here: it takes a third of a second
 
-    path, kind = Path(path), table_format(path)
+    kind = table_format(path)
+    path = check_input(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -64,8 +66,6 @@ def read_input_table(path: str | os.PathLike[str]) -> InputTable:
                 table = Table.read(path, format=kind)
     except DataError:
         raise
-    except FileNotFoundError:
-        raise fail("there is no such file", file=path, advice="check the name") from None
     except (*UNREADABLE, UnicodeError) as error:
         what = f"cannot be read as a table: {one_line(error)}"
         raise fail(what, file=path, advice="write it again") from error
@@ -218,7 +218,7 @@ def write_output_table(
 ) -> None:
     """Write a table with columns added (an old column of that name is replaced), in the format of the name.
 
-    A value of `added` is an array, or a pair of an array and its description; `header` adds to the header of
+    A value of `added` is an array, alone or with its description and its unit; `header` adds to the header of
     the table (CSV has none). The file appears whole or not at all. Raises `DataError` as `atomic_path` does, and
     for an unknown extension.
     """
@@ -243,8 +243,9 @@ def extended(source: InputTable, added: Mapping[str, Any], header: Mapping[str, 
     for name, values in added.items():
         if name in present:
             table.remove_column(present[name])
-        values, description = values if isinstance(values, tuple) else (values, "")
+        values, *about = values if isinstance(values, tuple) else (values,)
         table[name] = values
-        if description:
-            table[name].description = description
+        for attribute, text in zip(("description", "unit"), about, strict=False):
+            if text:
+                setattr(table[name], attribute, text)
     return table

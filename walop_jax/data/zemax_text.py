@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.io.errors import DataError, fail
+from walop_jax.io.inputs import check_input
 
 HEADING = "Polarization Transmission Data"
 """First line of every export."""
@@ -97,7 +98,7 @@ def read_export(path: str | os.PathLike[str]) -> TransmissionExport | None:
 
 def _lines(path: Path) -> list[str]:
     try:
-        content = path.read_bytes()
+        content = check_input(path).read_bytes()
         marked = content.startswith((b"\xff\xfe", b"\xfe\xff"))
         # All that is read is ASCII, so any one-byte encoding (and UTF-8) may pass for Latin-1.
         text = content.decode("utf-16") if marked else content.removeprefix(b"\xef\xbb\xbf").decode("latin-1")

@@ -96,10 +96,17 @@ def instrument_of(calset: CalibrationSet) -> Instrument:
 
 def standard_names(sources: Sources) -> tuple[str, ...]:
     """Unique names of the standards, usable in parameter names."""
+    plain = [
+        "".join(c if c.isalnum() else "_" for c in str(name).strip()) or f"source{number}"
+        for number, name in zip(sources.source, sources.name, strict=True)
+    ]
     names: list[str] = []
-    for number, name in zip(sources.source, sources.name, strict=True):
-        clean = "".join(c if c.isalnum() else "_" for c in str(name).strip()) or f"source{number}"
-        names.append(clean if clean not in names else f"{clean}_{number}")
+    for number, name in zip(sources.source, plain, strict=True):
+        # A name that another star bears by right is not given to a namesake.
+        unique = name
+        while unique in names or (unique != name and unique in plain):
+            unique = f"{unique}_{number}"
+        names.append(unique)
     return tuple(names)
 
 

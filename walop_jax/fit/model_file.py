@@ -23,12 +23,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import tomllib
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import tomlkit
 
+from walop_jax.io.text import parse_toml
 from walop_jax.model.specification import Model, Parameter, unknown_name
 
 TABLES = ("model", "effects", "parameters")
@@ -99,9 +99,9 @@ def parse(text: str, build: Callable[[Header], Model]) -> Model:
     Raises ValueError naming the table and key that is wrong, and what to write instead.
     """
     try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"the model file is not valid TOML: {error}") from None
+        content = parse_toml(text)
+    except ValueError as error:
+        raise ValueError(f"the model file is {error}") from None
     for key in content:
         if key not in TABLES:
             raise unknown_name("table", key, TABLES)

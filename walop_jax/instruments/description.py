@@ -12,13 +12,13 @@ import functools
 import math
 import os
 import re
-import tomllib
 from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from walop_jax.io.errors import DataError, fail, nearest
+from walop_jax.io.errors import DataError, nearest
+from walop_jax.io.text import parse_toml, read_text
 
 Table = Mapping[str, Any]
 
@@ -150,13 +150,7 @@ def read_description(source: str | os.PathLike[str]) -> Description:
     path = Path(source)
     if path.suffix != ".toml" and not path.exists():
         return described(text)
-    try:
-        content = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise fail(
-            f"cannot be read: {error}", file=path, advice="give a TOML file or a shipped name"
-        ) from None
-    return parsed(content, str(path))
+    return parsed(read_text(path), str(path))
 
 
 def parsed(text: str, where: str) -> Description:
@@ -167,12 +161,8 @@ def parsed(text: str, where: str) -> Description:
 def _whole(text: str, where: str, seen: tuple[str, ...]) -> Table:
     """The table of a text with that of the instrument it stands on."""
     try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise DataError(f"{where}: not valid TOML: {error}") from None
-    except RecursionError:
-        raise DataError(f"{where}: tables nested too deep") from None
-    except ValueError as error:  # numbers too long to be read
+        table = parse_toml(text)
+    except ValueError as error:
         raise DataError(f"{where}: {error}") from None
     like = table.get("like")
     if like is None:

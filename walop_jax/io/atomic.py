@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from walop_jax.io.errors import fail
+from walop_jax.io.temporary import errors_of, own_prefix, remove_leftovers
 
 
 def check_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
@@ -53,18 +54,23 @@ def atomic_path(path: str | os.PathLike[str], *, overwrite: bool = False) -> Ite
     Raises `DataError` as `check_output` does, and for what the operating system refuses (a full disk).
     """
     target = check_output(path, overwrite=overwrite)
+    remove_leftovers(target)
     try:
-        descriptor, name = tempfile.mkstemp(prefix=".walop-", suffix=target.suffix, dir=target.parent)
+        descriptor, name = tempfile.mkstemp(
+            prefix=own_prefix(target), suffix=target.suffix, dir=target.parent
+        )
     except OSError as error:
-        raise fail(f"cannot be written: {error}", file=path, advice="choose another folder") from error
+        what = f"cannot be written: {error.strerror}"
+        raise fail(what, file=path, advice="choose another folder") from error
     os.close(descriptor)
     temporary = Path(name)
     try:
-        yield temporary
-        publish(temporary, target, overwrite=overwrite)
+        with errors_of(path, temporary):
+            yield temporary
+        _publish(temporary, target, overwrite=overwrite)
     except OSError as error:
         raise fail(
-            f"writing failed: {error}",
+            f"writing failed: {error.strerror or error}",
             file=path,
             advice="free some space; what stood there before is untouched",
         ) from error
@@ -72,13 +78,11 @@ def atomic_path(path: str | os.PathLike[str], *, overwrite: bool = False) -> Ite
         temporary.unlink(missing_ok=True)
 
 
-def publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
+def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
     """Flush `temporary` to disk and move it to `target`, with the permissions of an ordinary new file."""
-    umask = os.umask(0)
-    os.umask(umask)
-    temporary.chmod(target.stat().st_mode & 0o777 if target.exists() else 0o666 & ~umask)
-    with temporary.open("rb+") as stream:
-        os.fsync(stream.fileno())
+    flush(temporary)
+    if target.exists():
+        temporary.chmod(target.stat().st_mode & 0o777)
     if overwrite:
         os.replace(temporary, target)
     else:
@@ -89,11 +93,20 @@ def publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
             raise fail("has been written by another program meanwhile", file=target) from None
         except OSError:
             os.replace(temporary, target)  # a file system without hard links
-    _flush_folder(target.parent)
+    flush_folder(target.parent)
 
 
-def _flush_folder(folder: Path) -> None:
-    """Flush the folder's entry, without which a power cut may undo the rename."""
+def flush(path: Path) -> None:
+    """Flush a file to disk, and give it the permissions of an ordinary new one."""
+    umask = os.umask(0)
+    os.umask(umask)
+    path.chmod(0o666 & ~umask)
+    with path.open("rb+") as stream:
+        os.fsync(stream.fileno())
+
+
+def flush_folder(folder: Path) -> None:
+    """Flush the entries of a folder, without which a power cut may undo a rename."""
     with contextlib.suppress(OSError):  # some network file systems cannot
         descriptor = os.open(folder, os.O_RDONLY)
         try:

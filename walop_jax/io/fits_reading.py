@@ -14,6 +14,7 @@ import gzip
 import hashlib
 import io
 import os
+import struct
 import warnings
 import zlib
 from collections.abc import Iterator
@@ -24,11 +25,11 @@ import numpy as np
 from astropy.io import fits
 
 from walop_jax.io.errors import DataError, fail
+from walop_jax.io.fits_structure import BLOCK, BROKEN, check_structure, header_keywords
+from walop_jax.io.inputs import check_input
 
 _CHUNK = 1 << 23  # a multiple of four, so that words never straddle two chunks
 _LARGEST_GZIP = 1 << 31
-_BLOCK = 2880
-_BROKEN = "the copy is damaged or incomplete; transfer or write the file again"
 
 UNREADABLE = (
     OSError,
@@ -38,6 +39,8 @@ UNREADABLE = (
     KeyError,
     IndexError,
     AttributeError,
+    OverflowError,
+    struct.error,
     zlib.error,
     fits.VerifyError,
 )
@@ -59,15 +62,16 @@ class OpenFile:
 def open_fits(path: str | os.PathLike[str]) -> Iterator[OpenFile]:
     """Open a FITS file (plain, or compressed with gzip) after checking that it is whole.
 
-    Raises `DataError` if it is missing, not FITS, truncated, longer than its headers say, or if a checksum
-    that it carries does not agree with its bytes.
+    A file without checksums is remarked on: damage to it cannot be noticed. Raises `DataError` as `check_input` and
+    `check_structure` do, and if a checksum that the file carries does not agree with its bytes.
     """
-    path = Path(path)
+    path = check_input(path)
     with contextlib.ExitStack() as stack:
         try:
             raw = stack.enter_context(path.open("rb"))
             compressed = raw.read(2) == b"\x1f\x8b"
             content = _decompressed(path) if compressed else raw
+            check_structure(io.BytesIO(content) if isinstance(content, bytes) else raw, path)
             caught = stack.enter_context(warnings.catch_warnings(record=True))
             warnings.simplefilter("always")
             # Opened here because astropy does not close a file that it fails to read.
@@ -82,25 +86,40 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[OpenFile]:
             sha256 = _verify(path, units, io.BytesIO(content) if isinstance(content, bytes) else raw)
         except DataError:
             raise
-        except FileNotFoundError:
-            raise fail("there is no such file", file=path, advice="check the name") from None
         except UNREADABLE as error:
-            raise fail(f"cannot be read as FITS: {one_line(error)}", file=path, advice=_BROKEN) from error
+            raise fail(f"cannot be read as FITS: {one_line(error)}", file=path, advice=BROKEN) from error
         if isinstance(content, bytes):
             raw.seek(0)
             sha256 = hashlib.file_digest(raw, "sha256").hexdigest()
         remarks = tuple(f"{path}: {one_line(entry.message)}" for entry in caught)
-        yield OpenFile(path, sha256, units, compressed, remarks)
+        # A file packed with gzip carries a CRC-32 of all its bytes.
+        unprotected = [] if compressed else _unprotected(path, units)
+        yield OpenFile(path, sha256, units, compressed, (*remarks, *unprotected))
 
 
 def primary_keywords(path: str | os.PathLike[str]) -> tuple[str, ...]:
     """Keywords of the primary header, unchecked, to see what a file is; none if it is no FITS file."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return tuple(fits.getheader(path))
+        with check_input(path).open("rb") as raw:
+            if raw.read(2) == b"\x1f\x8b":
+                with gzip.open(path) as content:
+                    return header_keywords(content, Path(path))
+            raw.seek(0)
+            return header_keywords(raw, Path(path))
     except UNREADABLE:
         return ()
+
+
+def _unprotected(path: Path, hdus: list[Any]) -> list[str]:
+    """A remark on the extensions whose data no checksum protects."""
+    names = [
+        hdu.name or f"HDU {n}" for n, hdu in enumerate(hdus) if not {"CHECKSUM", "DATASUM"} & set(hdu.header)
+    ]
+    if not names:
+        return []
+    where = "" if len(names) == len(hdus) else f" [{', '.join(names)}]"
+    advice = "write the file with checksums (astropy: writeto(…, checksum=True))"
+    return [f"{path}{where}: no checksum, so that damage to the file cannot be noticed; {advice}"]
 
 
 def one_line(message: object) -> str:
@@ -111,6 +130,8 @@ def one_line(message: object) -> str:
 def _decompressed(path: Path) -> bytes:
     """Unpack a gzip file into memory, with a limit: a small file may unpack to any size."""
     with gzip.open(path) as stream:
+        header_keywords(stream, path)  # of what is no FITS file nothing more is unpacked
+        stream.seek(0)
         content = stream.read(_LARGEST_GZIP + 1)
     if len(content) > _LARGEST_GZIP:
         raise fail("unpacks to more than 2 GiB", file=path, advice="unpack it with gunzip")
@@ -118,35 +139,27 @@ def _decompressed(path: Path) -> bytes:
 
 
 def _verify(path: Path, hdus: list[Any], stream: io.BufferedIOBase) -> str:
-    """Read the file once; check length and checksums; return the SHA-256 of the bytes."""
-    stream.seek(0, os.SEEK_END)
-    size = stream.tell()
+    """Read the file once; check the checksums; return the SHA-256 of the bytes."""
+    size = stream.seek(0, os.SEEK_END)
     stream.seek(0)
     digest = hashlib.sha256()
     for number, hdu in enumerate(hdus):
         info = hdu.fileinfo() if hasattr(hdu, "fileinfo") else None
         if info is None:  # astropy's stand-in for an extension whose header it cannot understand
-            raise fail(f"the header of extension {number} is damaged", file=path, advice=_BROKEN)
+            raise fail(f"the header of extension {number} is damaged", file=path, advice=BROKEN)
         name = hdu.name or f"HDU {number}"
         start, data, end = info["hdrLoc"], info["datLoc"], info["datLoc"] + info["datSpan"]
-        if end > size:
-            raise fail(
-                f"truncated: {size} bytes where {end} are announced",
-                file=path,
-                extension=name,
-                advice=_BROKEN,
-            )
         header_sum = _sum(stream, data - start, digest)
         data_sum = _sum(stream, end - data, digest)
         declared = hdu.header.get("DATASUM")
         if declared is not None and str(declared).strip() != str(data_sum):
-            raise fail("the data do not agree with DATASUM", file=path, extension=name, advice=_BROKEN)
+            raise fail("the data do not agree with DATASUM", file=path, extension=name, advice=BROKEN)
         if "CHECKSUM" in hdu.header and _fold(header_sum + data_sum) not in (0, 0xFFFFFFFF):
-            advice = f"{_BROKEN}, or renew the checksum if the header was edited on purpose"
+            advice = f"{BROKEN}, or renew the checksum if the header was edited on purpose"
             raise fail("the bytes do not agree with CHECKSUM", file=path, extension=name, advice=advice)
     if stream.tell() != size:
         raise fail(
-            f"{size - stream.tell()} bytes after the last extension cannot be read", file=path, advice=_BROKEN
+            f"{size - stream.tell()} bytes after the last extension cannot be read", file=path, advice=BROKEN
         )
     return digest.hexdigest()
 
@@ -201,4 +214,4 @@ def _punctuation(letter: int) -> bool:
 
 def padded(length: int) -> int:
     """Round a number of bytes up to whole FITS blocks."""
-    return -(-length // _BLOCK) * _BLOCK
+    return -(-length // BLOCK) * BLOCK

@@ -1,16 +1,27 @@
-"""Folders of results: several files that appear together or not at all."""
+"""Folders of results: several files that appear together or not at all, written by one process at a time."""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import dataclasses
+import errno
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from walop_jax.io.atomic import check_output, publish
+from walop_jax.io.atomic import check_output, flush, flush_folder
 from walop_jax.io.errors import fail
+from walop_jax.io.lock import locked
+from walop_jax.io.temporary import errors_of, own_prefix, prefix_of, remove, remove_leftovers
+
+_MOST = 2000
+"""Files beyond which a folder is not exchanged as a whole: it is more than that of a run."""
+
+_EXCHANGE = 2  # RENAME_EXCHANGE of renameat2(2), and RENAME_SWAP of renamex_np(2)
+_HERE = -100  # AT_FDCWD
 
 
 def check_folder(path: str | os.PathLike[str], names: Sequence[str] = (), *, overwrite: bool = False) -> Path:
@@ -37,43 +48,181 @@ def check_folder(path: str | os.PathLike[str], names: Sequence[str] = (), *, ove
         )
     if not os.access(folder, os.W_OK | os.X_OK):
         raise fail("the folder is read-only", file=path, advice="choose another folder")
-    return folder
+    return Path(os.path.realpath(folder))
+
+
+@dataclasses.dataclass(frozen=True)
+class OutputFolder:
+    """A folder that this process alone writes results to; `path` is what the caller named it."""
+
+    path: Path
+    target: Path
+    names: tuple[str, ...]
+    overwrite: bool
+
+    @contextlib.contextmanager
+    def filled(self, names: Sequence[str] = (), drop: Sequence[str] = ()) -> Iterator[Path]:
+        """Give a temporary folder to write the files `names` in; put them into `path` if the block ends well.
+
+        A new folder appears in one step with all its files. One that exists is exchanged in one step for a folder
+        with the new files and all others that it held, but for those named in `drop`: at no moment do results of two
+        runs stand side by side. Where it cannot be exchanged (its parent is read-only, it is the current folder or a
+        mount point, or it holds thousands of files) the old results go before the new ones come, one by one. When
+        the block raises, nothing of it is left. `names` are those of the reservation, unless given.
+
+        Raises `DataError` as `check_folder` does, for a file that was not written, and for what the operating
+        system refuses.
+        """
+        names = tuple(names) or self.names
+        check_folder(self.path, names, overwrite=self.overwrite)
+        whole = not self.target.is_dir() or _exchangeable(self.target)
+        where = self.target.parent if whole else self.target
+        try:
+            temporary = Path(tempfile.mkdtemp(prefix=own_prefix(self.target), dir=where))
+        except OSError as error:
+            what = f"cannot be written: {error.strerror}"
+            raise fail(what, file=self.path, advice="choose another folder") from error
+        try:
+            with errors_of(self.path, temporary):
+                yield temporary
+                if missing := [name for name in names if not (temporary / name).is_file()]:
+                    raise fail(f"{missing[0]} was not written", file=self.path, advice="report this")
+            for name in names:
+                flush(temporary / name)
+                if (self.target / name).is_file():
+                    (temporary / name).chmod((self.target / name).stat().st_mode & 0o777)
+            flush_folder(temporary)
+            if whole:
+                _appear(temporary, self.target, {*names, *drop})
+            else:
+                _move(temporary, self.target, names, drop)
+        except OSError as error:
+            advice = "free some space; what was there is untouched"
+            raise fail(f"writing failed: {error.strerror or error}", file=self.path, advice=advice) from error
+        finally:
+            remove(temporary)
 
 
 @contextlib.contextmanager
-def atomic_folder(
+def output_folder(
     path: str | os.PathLike[str], names: Sequence[str], *, overwrite: bool = False
-) -> Iterator[Path]:
-    """Give a temporary folder to write the files `names` in; put them into `path` if the block ends well.
+) -> Iterator[OutputFolder]:
+    """Reserve a folder for the results `names` of the block; what a killed writer has left of its own goes.
 
-    A new folder appears in one step with all its files. In a folder that exists, each file takes its place
-    in one step, after all of them have been written; other files stay. When the block raises, nothing of it
-    is left.
-
-    Raises `DataError` as `check_folder` does, for a file that was not written, and for what the operating
-    system refuses.
+    Raises `DataError` as `check_folder` does, and if another process is writing there.
     """
     target = check_folder(path, names, overwrite=overwrite)
-    try:
-        temporary = Path(tempfile.mkdtemp(prefix=".walop-", dir=target if target.is_dir() else target.parent))
-    except OSError as error:
-        raise fail(f"cannot be written: {error}", file=path, advice="choose another folder") from error
-    try:
-        yield temporary
-        missing = [name for name in names if not (temporary / name).is_file()]
-        if missing:
-            raise fail(f"{missing[0]} was not written", file=path, advice="report this")
+    apart = os.access(target.parent, os.W_OK | os.X_OK)
+    lock = (target.parent / f"{prefix_of(target)}lock") if apart else target / f"{prefix_of(target)}lock"
+    with locked(lock, path):
+        _restore(target)
+        remove_leftovers(target)
         if target.is_dir():
-            for name in names:
-                publish(temporary / name, target / name, overwrite=overwrite)
-        else:
-            umask = os.umask(0)
-            os.umask(umask)
-            temporary.chmod(0o777 & ~umask)
-            os.rename(temporary, target)
+            remove_leftovers(target / target.name)
+        check_folder(path, names, overwrite=overwrite)  # another process may have written meanwhile
+        yield OutputFolder(Path(path), target, tuple(names), overwrite)
+
+
+def _exchangeable(folder: Path) -> bool:
+    """Whether a folder may be replaced by another of the same name without anybody missing something."""
+    if os.path.ismount(folder) or not os.access(folder.parent, os.W_OK | os.X_OK):
+        return False
+    try:
+        here = Path.cwd()
+    except OSError:  # it has been removed
+        here = Path()
+    if here == folder or folder in here.parents:
+        return False
+    count = 0
+    for _, folders, files in os.walk(folder):
+        count += len(folders) + len(files)
+        if count > _MOST:
+            return False
+    return True
+
+
+def _appear(temporary: Path, target: Path, new: set[str]) -> None:
+    """Put a folder in the place of another, with all that this one holds but for the entries `new`."""
+    umask = os.umask(0)
+    os.umask(umask)
+    temporary.chmod(0o777 & ~umask)
+    if not target.is_dir():
+        os.rename(temporary, target)
+        flush_folder(target.parent)
+        return
+    _carry(target, temporary, new)
+    shutil.copystat(target, temporary)
+    with contextlib.suppress(OSError):
+        os.chown(temporary, -1, target.stat().st_gid)
+    try:
+        _exchange(temporary, target)
     except OSError as error:
-        raise fail(
-            f"writing failed: {error}", file=path, advice="free some space; what was there is untouched"
-        ) from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        if error.errno not in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP):
+            raise
+        aside = _aside(target)
+        remove(aside)
+        os.rename(target, aside)
+        os.rename(temporary, target)
+        os.rename(aside, temporary)
+    flush_folder(target.parent)
+    _carry(temporary, target, new)  # what others have put there in the meantime
+
+
+def _carry(source: Path, target: Path, leave: set[str]) -> None:
+    """Give `target` all files of `source` that it lacks, but for the entries `leave`; a link costs no space."""
+    for entry in os.scandir(source):
+        there = target / entry.name
+        if entry.name in leave:
+            continue
+        if entry.is_dir(follow_symlinks=False):
+            if not there.exists():
+                there.mkdir()
+                shutil.copystat(entry.path, there)
+            _carry(Path(entry.path), there, set())
+        elif not os.path.lexists(there):
+            try:
+                os.link(entry.path, there, follow_symlinks=False)
+            except OSError:  # a file system without links
+                shutil.copy2(entry.path, there, follow_symlinks=False)
+
+
+def _move(temporary: Path, target: Path, names: Sequence[str], drop: Sequence[str]) -> None:
+    """Put files into a folder one by one; the old ones go first, so that a kill mixes no results."""
+    for name in (*names[1:], *drop):
+        remove(target / name)
+    for name in names:
+        os.replace(temporary / name, target / name)
+    flush_folder(target)
+
+
+def _exchange(one: Path, other: Path) -> None:
+    """Exchange the names of two folders in one step; OSError with ENOSYS where the system cannot."""
+    try:
+        library = ctypes.CDLL(None, use_errno=True)
+    except (OSError, TypeError):
+        raise OSError(errno.ENOSYS, "no exchange of names") from None
+    names = os.fsencode(one), os.fsencode(other)
+    if hasattr(library, "renameat2"):  # Linux
+        failed = library.renameat2(_HERE, names[0], _HERE, names[1], _EXCHANGE)
+    elif hasattr(library, "renamex_np"):  # macOS
+        failed = library.renamex_np(*names, _EXCHANGE)
+    else:
+        raise OSError(errno.ENOSYS, "no exchange of names")
+    if failed:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+
+
+def _aside(target: Path) -> Path:
+    """Where a folder stands for a moment that cannot be exchanged in one step."""
+    return target.parent / f"{prefix_of(target)}before"
+
+
+def _restore(target: Path) -> None:
+    """Bring back a folder whose exchange was killed between two steps; remove one whose exchange was done."""
+    aside = _aside(target)
+    if aside.is_dir():
+        if target.exists():
+            remove(aside)
+        else:
+            os.rename(aside, target)

@@ -5,20 +5,56 @@ from __future__ import annotations
 import json
 import math
 import os
+import tomllib
 from pathlib import Path
 from typing import Any
 
 from walop_jax.io.errors import fail
+from walop_jax.io.inputs import check_input
+
+_DEEPEST = 30
+_DEEP = "not valid TOML here: tables nested too deep"
+_LARGEST = 1 << 24
+"""Bytes of a text file beyond which it is none of ours."""
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """The text of a file; `DataError`, with the name, if it is missing or not text in UTF-8."""
+    """The text of a file; `DataError`, with the name, if it is missing, beyond 16 MiB or not text in UTF-8."""
     try:
+        if check_input(path).stat().st_size > _LARGEST:
+            raise fail("is larger than 16 MiB", file=path, advice="is this the right file?")
         return Path(path).read_text(encoding="utf-8")
     except OSError as error:
         raise fail(f"cannot be read: {error.strerror or error}", file=path) from None
     except UnicodeDecodeError:
         raise fail("is not text in UTF-8", file=path) from None
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The tables of a TOML text; ValueError for one that is not valid or nests tables and lists without reason."""
+    try:
+        content = tomllib.loads(text)
+    except ValueError as error:
+        raise ValueError(f"not valid TOML: {error}") from None
+    except RecursionError:
+        raise ValueError(_DEEP) from None
+    level: list[Any] = [content]
+    for _ in range(_DEEPEST):
+        inner = (entry.values() if isinstance(entry, dict) else entry for entry in level)
+        level = [value for entry in inner for value in entry if isinstance(value, dict | list)]
+    if level:
+        raise ValueError(_DEEP)
+    return content
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """The content of a JSON file that this program has written; `DataError` as for `read_text`, or if it is none."""
+    text = read_text(path)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        advice = "run the command that made it again"
+        raise fail(f"cannot be read: {error}", file=path, advice=advice) from error
 
 
 def json_text(value: Any) -> str:
@@ -27,11 +63,16 @@ def json_text(value: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """The value with mappings as dicts, sequences as lists and numbers that are not finite as None."""
+    """The value with mappings as dicts, sequences as lists, numbers that are not finite as None, texts `printable`."""
     if isinstance(value, dict):
         return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [plain(entry) for entry in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    return value
+    return printable(value) if isinstance(value, str) else value
+
+
+def printable(text: str) -> str:
+    """The text with the bytes of a path that are not UTF-8, which no output takes, written as \\xff."""
+    return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")

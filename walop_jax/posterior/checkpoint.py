@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import io
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -21,6 +22,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from walop_jax.data.records import InputFile
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail
 from walop_jax.posterior.samplers import State, Stretch
@@ -42,6 +44,11 @@ def digest(*parts: Any) -> str:
         else:
             total.update(repr(part.tolist() if isinstance(part, np.ndarray) else part).encode() + b"\n")
     return total.hexdigest()
+
+
+def digest_of_fit(inputs: Sequence[InputFile], names: Sequence[str], values: np.ndarray) -> str:
+    """What tells a fit from others: its data, its parameters and their values, to the last bit."""
+    return digest(sorted(entry.sha256 for entry in inputs), list(names), np.asarray(values, float))
 
 
 class Checkpoints:
@@ -122,7 +129,9 @@ class Checkpoints:
 
     def _write(self, path: Path, arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
-        with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        # In memory first: HDF5 does not survive a disk that is full.
+        buffer = io.BytesIO()
+        with h5py.File(buffer, "w") as file:
             file.attrs["format"] = FORMAT
             file.attrs["fingerprint"] = json.dumps(self.fingerprint)
             for name, value in attributes.items():
@@ -130,6 +139,8 @@ class Checkpoints:
             for name, value in arrays.items():
                 file.create_dataset(name, data=value)
             file.attrs["content"] = digest(*(np.asarray(arrays[name]) for name in sorted(arrays)))
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(buffer.getbuffer())
 
     def _read(self, path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         try:

@@ -99,7 +99,7 @@ class Ensembles:
     def until_converged(
         self, names: Sequence[str], quoted: Quoted = np.asarray, report: Report | None = None
     ) -> Convergence:
-        """Go on until the rules of convergence hold or `maximum_steps` are done; returns the verdict.
+        """Go on until the rules of convergence hold or another block would exceed `maximum_steps`; returns the verdict.
 
         Judged are the quantities that `quoted` makes of positions, under their `names`.
         """
@@ -107,7 +107,7 @@ class Ensembles:
             verdict = None
             if self.blocks:
                 verdict = assess(quoted(self.kept()[0]), tuple(names), self.thin)
-                if verdict.converged or self.steps >= self.options.maximum_steps:
+                if verdict.converged or self.steps + self.options.interval > self.options.maximum_steps:
                     return verdict
             if report is not None:
                 goal = self.options.maximum_steps if verdict is None else self.steps + verdict.needed

@@ -7,11 +7,13 @@ attributes.
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import warnings
 from typing import Any
 
+import h5py
 import numpy as np
 from jaxtyping import Float
 
@@ -52,6 +54,7 @@ def inference_data(sample: PosteriorSample) -> Any:
             "steps": v.steps,
             "acceptance": sample.acceptance,
             "fingerprint": json.dumps(sample.fingerprint),
+            "fit": sample.fit,
             "fixed": json.dumps(
                 {n: float(sample.draws[0, 0, i]) for i, n in enumerate(sample.names) if i not in varies}
             ),
@@ -71,9 +74,25 @@ def write_posterior(
     It appears whole or not at all. Raises `DataError` as `atomic_path` does.
     """
     data = inference_data(sample)
-    with atomic_path(path, overwrite=overwrite) as temporary, warnings.catch_warnings():
+    with atomic_path(path, overwrite=overwrite) as temporary:
+        temporary.write_bytes(_netcdf(data))
+
+
+def _netcdf(data: Any) -> memoryview:
+    """The bytes of a netCDF file of ArviZ InferenceData, one group each.
+
+    Made in memory: HDF5 does not survive a disk that is full.
+    """
+    import h5netcdf
+    from xarray.backends import H5NetCDFStore
+
+    buffer = io.BytesIO()
+    with warnings.catch_warnings(), h5py.File(buffer, "w") as file:
         warnings.simplefilter("ignore")
-        data.to_netcdf(str(temporary), engine="h5netcdf")
+        with h5netcdf.File(file, "a") as content:
+            for group in data.groups():
+                data[group].dump_to_store(H5NetCDFStore(content, group=group, mode="a"))
+    return buffer.getbuffer()
 
 
 def read_inference_data(path: str | os.PathLike[str]) -> Any:
@@ -86,10 +105,13 @@ def read_inference_data(path: str | os.PathLike[str]) -> Any:
         raise fail(f"cannot be read: {error}", file=path, advice="run walop-jax sample again") from error
 
 
-def read_draws(path: str | os.PathLike[str], names: tuple[str, ...]) -> Float[np.ndarray, "d n"]:
+def read_draws(
+    path: str | os.PathLike[str], names: tuple[str, ...], fit: str | None = None
+) -> Float[np.ndarray, "d n"]:
     """Draws of the parameters `names`, all chains one after the other; fixed ones keep their value.
 
-    Raises `DataError` for a file that cannot be read, is of another model or may not be trusted.
+    `fit` is the `digest_of_fit` that was sampled around; None: whichever. Raises `DataError` for a file that cannot be
+    read, is of another model or another fit, or may not be trusted.
     """
     data = read_inference_data(path)
     try:
@@ -105,6 +127,9 @@ def read_draws(path: str | os.PathLike[str], names: tuple[str, ...]) -> Float[np
         raise fail(
             f"is of another model ({', '.join(odd[:3])})", file=path, advice="run walop-jax sample again"
         )
+    if fit is not None and posterior.attrs.get("fit") != fit:
+        advice = "give the posterior of this calibration, or run walop-jax sample again"
+        raise fail("is of another fit with the same parameters", file=path, advice=advice)
     if not trusted:
         verdict = posterior.attrs["verdict"]
         raise fail(

@@ -17,6 +17,7 @@ from walop_jax.data.settings import Settings
 from walop_jax.model import light
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import Model
+from walop_jax.posterior.checkpoint import digest_of_fit
 from walop_jax.posterior.output import read_draws
 
 DRAWS = 200
@@ -64,9 +65,9 @@ def with_draws(
 ) -> DrawnCalibration:
     """The calibration with draws from a `posterior.nc`.
 
-    `DataError` for a file of another model, or not trusted.
+    `DataError` for a file of another model or another fit, or not trusted.
     """
-    draws = read_draws(path, calibration.model.names)
+    draws = _draws_of(calibration, path)
     chosen = np.random.default_rng(seed).permutation(len(draws))[:count]
     known = {f.name: getattr(calibration, f.name) for f in dataclasses.fields(Calibration)}
     return DrawnCalibration(**known, draws=draws[chosen])
@@ -77,5 +78,10 @@ def with_moments(calibration: Calibration, path: str | os.PathLike[str]) -> Cali
 
     For what is propagated linearly anyway, star by star. `DataError` as in `with_draws`.
     """
-    draws = read_draws(path, calibration.model.names)
+    draws = _draws_of(calibration, path)
     return dataclasses.replace(calibration, values=draws.mean(axis=0), covariance=np.cov(draws, rowvar=False))
+
+
+def _draws_of(calibration: Calibration, path: str | os.PathLike[str]) -> Float[np.ndarray, "d n"]:
+    names = calibration.model.names
+    return read_draws(path, names, digest_of_fit(calibration.inputs, names, calibration.values))

@@ -25,7 +25,8 @@ BURN_IN = 0.2  # share of the steps that is not used
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """How to sample. `interval` is the length of a block, hence of what a kill can lose, in steps.
+    """How to sample. `interval` is the length of a block, hence of what a kill can lose, in steps; whole blocks are
+    done, so that there are never more steps than `maximum_steps`.
 
     `sampler` is a name (`emcee`, `nuts`), `FILE.py:CLASS`, or a `Sampler`; `walkers` and `moves` are options of emcee,
     `walkers` 0 standing for twice the number of sampled coefficients, at least 64. `parameters` names what is
@@ -54,6 +55,10 @@ class Options:
             raise ValueError("at least two independent ensembles are needed to judge convergence")
         if min(self.interval, self.draws, self.checks, self.maximum_steps) < 1 or self.thin < 0:
             raise ValueError("interval, draws, checks and maximum_steps must be 1 or more, thin not negative")
+        if self.maximum_steps < self.interval:
+            raise ValueError(
+                f"maximum_steps {self.maximum_steps} is less than one block: lower interval ({self.interval}) as well"
+            )
         thin = self.thin or sampler.thin
         if self.interval % thin:
             raise ValueError(f"interval {self.interval} must be a multiple of thin {thin}")
@@ -88,7 +93,7 @@ class PosteriorSample(Displayed):
     figures show. `accuracy` is that of the surrogate, None where the exact posterior was sampled; `trusted` needs
     convergence, a surrogate that is exact enough, and a fit that is trusted (`of_trusted_fit`). `errors_from` says
     what their spread was made from: the stated errors of the data, or, as for the fit, what it leaves (`adjusted`).
-    `counts` are what the sampler counted.
+    `counts` are what the sampler counted, `fit` the `digest_of_fit` of what was sampled around.
     """
 
     sampler: str
@@ -110,6 +115,7 @@ class PosteriorSample(Displayed):
     seconds: float
     fingerprint: dict[str, str]
     of_trusted_fit: bool = True
+    fit: str = ""
     errors_from: str = STATED
 
     @property

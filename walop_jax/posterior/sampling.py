@@ -17,7 +17,7 @@ from walop_jax.io.errors import fail
 from walop_jax.io.software import versions_of
 from walop_jax.likelihood.expansion import STATED
 from walop_jax.posterior.adjusted import with_errors_of
-from walop_jax.posterior.checkpoint import Checkpoints, digest
+from walop_jax.posterior.checkpoint import Checkpoints, digest, digest_of_fit
 from walop_jax.posterior.convergence import Convergence
 from walop_jax.posterior.ensembles import Ensembles, numbers_of
 from walop_jax.posterior.exact import ExactPosterior
@@ -113,7 +113,8 @@ def sample(
     verdict = ensembles.until_converged(posterior.quoted_names, posterior.quoted, report)
     report(Progress("comparing with the exact posterior", 1.0, *numbers_of(verdict)))
     finished = _finish(target, posterior, ensembles, verdict, seconds)
-    return dataclasses.replace(finished, of_trusted_fit=result.trusted)
+    fit = digest_of_fit(result.calset.inputs, result.model.names, result.values)
+    return dataclasses.replace(finished, of_trusted_fit=result.trusted, fit=fit)
 
 
 def _surrogate(

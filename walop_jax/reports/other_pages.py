@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import base64
-import json
 from pathlib import Path
 from typing import Any
 
 from walop_jax.io.errors import fail
 from walop_jax.io.rounding import two_digits
+from walop_jax.io.text import read_json
 from walop_jax.reports.limits_figures import protection_figure, separation_figure
 from walop_jax.reports.limits_in_words import limits_in_words
 from walop_jax.reports.page import embedded, environment
@@ -51,12 +51,7 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
     Raises `DataError` for a document that cannot be read or lacks what the page shows.
     """
     path = folder / KINDS[kind]
-    try:
-        document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise fail(
-            f"cannot be read: {error}", file=path, advice="run the command that made it again"
-        ) from error
+    document: dict[str, Any] = read_json(path)
     for key in NEEDED[kind]:
         if key not in document:
             raise fail(f"has no {key!r}", file=path, advice="run the command that made it again")

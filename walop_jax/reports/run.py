@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,6 +17,7 @@ from walop_jax.diagnosis.document import DIAGNOSIS
 from walop_jax.diagnosis.figure_data import UNNAMED
 from walop_jax.diagnosis.figure_file import FIGURE_DATA, DiagnosisFigureData, read_figure_data
 from walop_jax.io.errors import DataError, fail
+from walop_jax.io.text import read_json
 
 POSTERIOR, INTERVALS, CORNER, SAMPLE = "posterior.nc", "posterior.ecsv", "posterior_corner.png", "sample.json"
 COMPARISON, EPOCH, LIMITS = "comparison.json", "epoch.json", "limits.json"
@@ -118,12 +118,7 @@ def read_run(folder: Path) -> RunContents:
 
 
 def _document(path: Path, keys: tuple[str, ...]) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise fail(
-            f"cannot be read: {error}", file=path, advice="run the command that made it again"
-        ) from error
+    content = read_json(path)
     lacking = [key for key in keys if not isinstance(content, dict) or key not in content]
     if lacking or not isinstance(content, dict):
         what = f"has no {lacking[0]!r}" if lacking else "is not a summary"

@@ -13,7 +13,7 @@ from walop_jax.data.field_points import true_matrices
 from walop_jax.data.user_tables import new_table, write_output_table
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.refit import refit
-from walop_jax.io.folder import atomic_folder, check_folder
+from walop_jax.io.folder import output_folder
 from walop_jax.io.text import json_text, read_text
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.paper.comparison import Comparison, compare
@@ -68,23 +68,23 @@ def compare_methods(
     """
     tell = progress or (lambda text: None)
     text = "" if model is None else read_text(model)
-    check_folder(output, OUTPUTS, overwrite=overwrite)
-    tell("reading")
-    calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
-    known = None if truth is None else Truth(*true_matrices(truth, chosen.template.patched()))
-    tell("fitting the joint model")
-    result = examined(refit(calset, chosen, progress=tell))
-    if not result.converged:
-        raise ValueError(f"the joint fit did not converge ({result.minimum.message})")
-    tell("fitting and judging the polynomials")
-    calibration = Calibration.from_fit(result)
-    found = compare(calset, calibration, known, filter_name, seed or 0)
-    lost = calibration.left_behind
-    document = found.document() | {"trusted": result.trusted, KEY: list(lost)}
-    with atomic_folder(output, OUTPUTS, overwrite=overwrite) as folder:
-        (folder / DOCUMENT).write_text(json_text(document), encoding="utf-8")
-        write_output_table(folder / TABLE, new_table(found.columns()), {}, header=left_out_cards(lost))
-        for name, figure in FIGURES.items():
-            figure(found).savefig(folder / name, dpi=130)
+    with output_folder(output, OUTPUTS, overwrite=overwrite) as out:
+        tell("reading")
+        calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
+        known = None if truth is None else Truth(*true_matrices(truth, chosen.template.patched()))
+        tell("fitting the joint model")
+        result = examined(refit(calset, chosen, progress=tell))
+        if not result.converged:
+            raise ValueError(f"the joint fit did not converge ({result.minimum.message})")
+        tell("fitting and judging the polynomials")
+        calibration = Calibration.from_fit(result)
+        found = compare(calset, calibration, known, filter_name, seed or 0)
+        lost = calibration.left_behind
+        document = found.document() | {"trusted": result.trusted, KEY: list(lost)}
+        with out.filled() as folder:
+            (folder / DOCUMENT).write_text(json_text(document), encoding="utf-8")
+            write_output_table(folder / TABLE, new_table(found.columns()), {}, header=left_out_cards(lost))
+            for name, figure in FIGURES.items():
+                figure(found).savefig(folder / name, dpi=130)
     warnings = () if result.trusted else tuple(f"the joint fit: {text}" for text in result.warnings)
     return ComparedRun(found, document, (*warnings, *left_out_sentences(lost)))

@@ -6,7 +6,6 @@ import dataclasses
 import os
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 from walop_jax.calibration.calibration import Calibration
@@ -21,7 +20,7 @@ from walop_jax.diagnosis.workflow import MINUTES, diagnose
 from walop_jax.fit.misfit import describe
 from walop_jax.fit.model_file import render
 from walop_jax.fit.refit import with_honest_errors
-from walop_jax.io.folder import atomic_folder, check_folder
+from walop_jax.io.folder import output_folder
 from walop_jax.io.heartbeat import repeated
 from walop_jax.io.text import json_text, read_text
 from walop_jax.model.effects import EFFECTS, Effect
@@ -66,22 +65,24 @@ def diagnose_sets(
     began = time.perf_counter()
     tell = progress or (lambda text: None)
     text = "" if model is None else read_text(model)
-    check_folder(output, OUTPUTS, overwrite=overwrite)
-    tell("reading")
-    calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
-    with repeated(tell) as say:
-        found = diagnose(calset, chosen, catalogue=catalogue, seed=seed or 0, minutes=minutes, progress=say)
-    tell("mapping the field")
-    after = examined(with_honest_errors(found.after))
-    product = Calibration.from_fit(after).to_product()
-    misfit = None if after.explains_data else describe(after)
-    content = document(found)
-    fitted = summary(after, seconds=time.perf_counter() - began, misfit=misfit) | {"seed": seed}
-    drawn_from = figure_data(found)
-    with atomic_folder(Path(output), OUTPUTS, overwrite=overwrite) as folder:
-        write_product(folder / PRODUCT, product)
-        (folder / SUMMARY).write_text(json_text(fitted), encoding="utf-8")
-        (folder / DIAGNOSIS).write_text(json_text(content), encoding="utf-8")
-        write_figure_data(folder / FIGURE_DATA, drawn_from)
-        (folder / MODEL).write_text(render(after.model), encoding="utf-8")
+    with output_folder(output, OUTPUTS, overwrite=overwrite) as out:
+        tell("reading")
+        calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
+        with repeated(tell) as say:
+            found = diagnose(
+                calset, chosen, catalogue=catalogue, seed=seed or 0, minutes=minutes, progress=say
+            )
+        tell("mapping the field")
+        after = examined(with_honest_errors(found.after))
+        product = Calibration.from_fit(after).to_product()
+        misfit = None if after.explains_data else describe(after)
+        content = document(found)
+        fitted = summary(after, seconds=time.perf_counter() - began, misfit=misfit) | {"seed": seed}
+        drawn_from = figure_data(found)
+        with out.filled() as folder:
+            write_product(folder / PRODUCT, product)
+            (folder / SUMMARY).write_text(json_text(fitted), encoding="utf-8")
+            (folder / DIAGNOSIS).write_text(json_text(content), encoding="utf-8")
+            write_figure_data(folder / FIGURE_DATA, drawn_from)
+            (folder / MODEL).write_text(render(after.model), encoding="utf-8")
     return DiagnosedRun(found, content)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 from collections.abc import Callable, Sequence
@@ -18,7 +19,7 @@ from walop_jax.diagnosis.trust import examined
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import errors_naming
-from walop_jax.io.folder import atomic_folder, check_folder
+from walop_jax.io.folder import output_folder
 from walop_jax.io.text import json_text
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.reports.run import EPOCH
@@ -63,25 +64,25 @@ def compare_epochs(
     `science.epoch` raises.
     """
     tell = progress or (lambda text: None)
-    if output is not None:
-        check_folder(output, OUTPUTS, overwrite=overwrite)
-    tell("reading")
-    path = product_path(old)
-    product = read_product(path)
-    calset = read_calibration_set(*calsets)
-    tell("fitting the new set")
-    with errors_naming(path):
-        calibration = Calibration.from_product(product, catalogue)
-        result = examined(fit_like(calibration, calset))
-        found = epoch(calibration, result)
-    lacking = None
-    if not found.new_trusted:
-        tell("looking for what the new fit lacks")
-        lacking = diagnose(calset, result.model, catalogue=catalogue, progress=tell)
-    parents = tuple(entry.sha256 for entry in calset.inputs)
-    compared = EpochComparison(found, product.content_hash(), parents, result, lacking)
-    if output is not None:
-        with atomic_folder(output, OUTPUTS, overwrite=overwrite) as folder:
-            write_product(folder / PRODUCT, Calibration.from_fit(result).to_product())
-            (folder / EPOCH).write_text(json_text(compared.document()), encoding="utf-8")
+    reserved = None if output is None else output_folder(output, OUTPUTS, overwrite=overwrite)
+    with contextlib.nullcontext() if reserved is None else reserved as out:
+        tell("reading")
+        path = product_path(old)
+        product = read_product(path)
+        calset = read_calibration_set(*calsets)
+        tell("fitting the new set")
+        with errors_naming(path):
+            calibration = Calibration.from_product(product, catalogue)
+            result = examined(fit_like(calibration, calset))
+            found = epoch(calibration, result)
+        lacking = None
+        if not found.new_trusted:
+            tell("looking for what the new fit lacks")
+            lacking = diagnose(calset, result.model, catalogue=catalogue, progress=tell)
+        parents = tuple(entry.sha256 for entry in calset.inputs)
+        compared = EpochComparison(found, product.content_hash(), parents, result, lacking)
+        if out is not None:
+            with out.filled() as folder:
+                write_product(folder / PRODUCT, Calibration.from_fit(result).to_product())
+                (folder / EPOCH).write_text(json_text(compared.document()), encoding="utf-8")
     return compared

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 from walop_jax.diagnosis.detection_limits import DetectionLimits, detection_limits
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.refit import refit
-from walop_jax.io.folder import atomic_folder, check_folder
+from walop_jax.io.folder import output_folder
 from walop_jax.io.text import json_text, read_text
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.reports.limits_figures import protection_figure, separation_figure
@@ -53,24 +53,24 @@ def limits_of_sets(
     """
     tell = progress or (lambda text: None)
     text = "" if model is None else read_text(model)
-    if output is not None:
-        check_folder(output, OUTPUTS, overwrite=overwrite)
-    tell("reading")
-    calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
-    result = examined(refit(calset, chosen, progress=tell))
-    if not result.converged:
-        raise ValueError(f"the fit did not converge ({result.minimum.message})")
-    found = detection_limits(result, catalogue=catalogue, seed=seed or 0, progress=tell)
-    document = found.document() | {
-        "instrument": result.model.name,
-        "effects_of_the_model": list(result.model.effect_names),
-        "inputs": [{"path": str(entry.path), "sha256": entry.sha256} for entry in calset.inputs],
-        "trusted": result.trusted,
-        "seed": seed,
-    }
-    if output is not None:
-        with atomic_folder(Path(output), OUTPUTS, overwrite=overwrite) as folder:
-            (folder / LIMITS).write_text(json_text(document), encoding="utf-8")
-            protection_figure(found).savefig(folder / PROTECTION, dpi=130)
-            separation_figure(found).savefig(folder / SEPARATION, dpi=130)
+    reserved = None if output is None else output_folder(output, OUTPUTS, overwrite=overwrite)
+    with contextlib.nullcontext() if reserved is None else reserved as out:
+        tell("reading")
+        calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
+        result = examined(refit(calset, chosen, progress=tell))
+        if not result.converged:
+            raise ValueError(f"the fit did not converge ({result.minimum.message})")
+        found = detection_limits(result, catalogue=catalogue, seed=seed or 0, progress=tell)
+        document = found.document() | {
+            "instrument": result.model.name,
+            "effects_of_the_model": list(result.model.effect_names),
+            "inputs": [{"path": str(entry.path), "sha256": entry.sha256} for entry in calset.inputs],
+            "trusted": result.trusted,
+            "seed": seed,
+        }
+        if out is not None:
+            with out.filled() as folder:
+                (folder / LIMITS).write_text(json_text(document), encoding="utf-8")
+                protection_figure(found).savefig(folder / PROTECTION, dpi=130)
+                separation_figure(found).savefig(folder / SEPARATION, dpi=130)
     return LimitsRun(found, document, tuple(f"the fit: {text}" for text in result.warnings))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import os
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -18,6 +17,7 @@ from walop_jax.diagnosis.document import DIAGNOSIS
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import fail
 from walop_jax.io.fits_reading import primary_keywords
+from walop_jax.io.text import read_json
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.reports.run import COMPARISON, EPOCH, LIMITS, POSTERIOR, SAMPLE
 
@@ -52,12 +52,7 @@ class Run(Displayed):
         for name, file in DOCUMENTS.items():
             path = self.folder / file
             if path.exists():
-                try:
-                    found[name] = json.loads(path.read_text(encoding="utf-8"))
-                except (OSError, ValueError) as error:
-                    raise fail(
-                        f"cannot be read: {error}", file=path, advice="run the command that made it again"
-                    ) from error
+                found[name] = read_json(path)
         return found
 
     @functools.cached_property

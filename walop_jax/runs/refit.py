@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,8 +19,9 @@ from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.misfit import Misfit, describe
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.io.atomic import atomic_path
-from walop_jax.io.folder import atomic_folder, check_folder
+from walop_jax.io.folder import OutputFolder, output_folder
 from walop_jax.io.heartbeat import repeated
+from walop_jax.io.temporary import remove
 from walop_jax.io.text import json_text, read_text
 from walop_jax.likelihood.processes import Processes
 from walop_jax.model.effects import EFFECTS, Effect
@@ -78,38 +79,35 @@ def refit_sets(
     tell = progress or (lambda text: None)
     first = processes is None or processes.index == 0
     text = "" if model is None else read_text(model)
-    if first:
-        check_folder(output, OUTPUTS, overwrite=overwrite)
-    folder = Path(output)
-    tell("reading")
-    calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
-    with repeated(tell) as say:
-        fitted = refit(
-            calset, chosen, folder=folder / PARTIAL, progress=say, memory=memory, processes=processes
-        )
-        result = examined(fitted)
-    residuals = residual_map(result) if result.likelihood.layout.large and result.converged else None
-    misfit = describe(result) if first and not result.explains_data else None
-    seconds = time.perf_counter() - began
-    found = summary(result, seconds=seconds, misfit=misfit, residuals=residuals) | {"seed": None}
-    if first:
-        tell("mapping the field")
-        _write(folder, result, residuals, found, overwrite=overwrite)
+    # Of several processes the first one writes; it alone holds the folder.
+    with output_folder(output, OUTPUTS, overwrite=overwrite) if first else contextlib.nullcontext() as out:
+        tell("reading")
+        calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
+        with repeated(tell) as say:
+            partial = Path(output) / PARTIAL
+            fitted = refit(calset, chosen, folder=partial, progress=say, memory=memory, processes=processes)
+            result = examined(fitted)
+        residuals = residual_map(result) if result.likelihood.layout.large and result.converged else None
+        misfit = describe(result) if first and not result.explains_data else None
+        seconds = time.perf_counter() - began
+        found = summary(result, seconds=seconds, misfit=misfit, residuals=residuals) | {"seed": None}
+        if out is not None:
+            tell("mapping the field")
+            _write(out, result, residuals, found)
     return RefitRun(result, found, residuals, misfit, seconds)
 
 
 def _write(
-    output: Path, result: FitResult, residuals: ResidualMap | None, found: dict[str, Any], *, overwrite: bool
+    out: OutputFolder, result: FitResult, residuals: ResidualMap | None, found: dict[str, Any]
 ) -> None:
     """The files of a run; what was kept of the fit on the way goes."""
-    if not result.converged:
-        output.mkdir(exist_ok=True)
-        with atomic_path(output / FAILED, overwrite=True) as temporary:
-            temporary.write_text(json_text(found), encoding="utf-8")
-    else:
+    if result.converged:
         product = Calibration.from_fit(result, residuals).to_product()
-        with atomic_folder(output, OUTPUTS, overwrite=overwrite) as folder:
+        with out.filled(drop=(FAILED, PARTIAL)) as folder:
             write_product(folder / PRODUCT, product)
             (folder / SUMMARY).write_text(json_text(found), encoding="utf-8")
-        (output / FAILED).unlink(missing_ok=True)
-    shutil.rmtree(output / PARTIAL, ignore_errors=True)
+        return
+    out.path.mkdir(exist_ok=True)
+    with atomic_path(out.path / FAILED, overwrite=True) as temporary:
+        temporary.write_text(json_text(found), encoding="utf-8")
+    remove(out.path / PARTIAL)

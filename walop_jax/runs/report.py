@@ -10,6 +10,7 @@ from typing import Any
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.io.atomic import atomic_path, check_output
+from walop_jax.io.text import printable
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.reports.other_pages import kind_of_run, render_other
 from walop_jax.reports.page import render
@@ -64,6 +65,7 @@ def write_report(
         tell("drawing")
         missing = (*found.missing, *lacking)
         text = render(dataclasses.replace(found, missing=missing), accuracy)
+    text = printable(text)
     with atomic_path(target, overwrite=overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return Page(target, len(text.encode()), missing)

@@ -14,12 +14,12 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import CalibrationProduct, read_product, write_product
 from walop_jax.calibration.summary import PRODUCT
 from walop_jax.io.errors import fail
-from walop_jax.io.folder import atomic_folder
+from walop_jax.io.folder import OutputFolder, output_folder
 from walop_jax.io.plain_tables import write_columns
 from walop_jax.io.text import json_text, read_text
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.posterior import Options, PosteriorSample, sample
-from walop_jax.posterior.checkpoint import Checkpoints
+from walop_jax.posterior.checkpoint import Checkpoints, digest_of_fit
 from walop_jax.posterior.from_run import fit_of_run
 from walop_jax.posterior.output import intervals, report, write_posterior
 from walop_jax.posterior.result import Report
@@ -70,23 +70,26 @@ def sample_run(
     folder = Path(run)
     if not folder.is_dir():
         raise fail("is not a folder", file=folder, advice="give the RUN of walop-jax refit")
-    product = read_product(folder / PRODUCT)
     text = None if model is None else read_text(model)
     found = [name for name in OUTPUTS if (folder / name).exists()]
     if found and not (overwrite or resume):
         raise fail(f"holds {found[0]} already", file=folder, advice="go on with --resume, or --overwrite it")
-    result = fit_of_run(product, folder, text, catalogue)
-    if overwrite and not resume:
-        Checkpoints(folder / CHAINS, {}).clear()
-    posterior = sample(result, options, folder=folder / CHAINS, resume=resume, report=progress)
-    posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted)
-    summary = report(posterior)
-    _write(folder, product, posterior, summary, catalogue)
+    with output_folder(folder, OUTPUTS, overwrite=True) as out:
+        product = read_product(folder / PRODUCT)
+        result = fit_of_run(product, folder, text, catalogue)
+        if overwrite and not resume:
+            Checkpoints(folder / CHAINS, {}).clear()
+        posterior = sample(result, options, folder=folder / CHAINS, resume=resume, report=progress)
+        table = product.parameters
+        fitted = digest_of_fit(product.inputs, table.name.tolist(), table.value)
+        posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted, fit=fitted)
+        summary = report(posterior)
+        _write(out, product, posterior, summary, catalogue)
     return SampledRun(posterior, summary)
 
 
 def _write(
-    run: Path,
+    out: OutputFolder,
     product: CalibrationProduct,
     posterior: PosteriorSample,
     summary: dict[str, Any],
@@ -96,7 +99,7 @@ def _write(
     sampled = [units.get(name, "") for name in posterior.sampled]
     notes = {"TRUSTED": posterior.trusted, "STEPS": posterior.convergence.steps}
     names = OUTPUTS + ((PRODUCT,) if posterior.trusted else ())
-    with atomic_folder(run, names, overwrite=True) as folder:
+    with out.filled(names) as folder:
         write_posterior(folder / POSTERIOR, posterior)
         for name in (INTERVALS_FITS, INTERVALS):
             write_columns(folder / name, intervals(posterior), notes)

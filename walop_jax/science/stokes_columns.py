@@ -10,7 +10,7 @@ from jaxtyping import Int
 from walop_jax.science.apply import COOL, HOT, Stars
 from walop_jax.science.polarisation import polarisation
 
-Columns = dict[str, tuple[np.ndarray, str]]
+Columns = dict[str, tuple[np.ndarray, str, str]]  # values, description, unit
 
 
 def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) -> Columns:
@@ -22,7 +22,7 @@ def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) ->
     light = polarisation(stars.qu, covariance, estimator)
     error = np.sqrt(np.einsum("sii->si", covariance))
     photon = np.sqrt(np.einsum("sii->si", stars.photon))
-    columns: Columns = {
+    columns = {
         "Q": (stars.qu[:, 0], "q of the star: on the sky where ROTATOR is given"),
         "U": (stars.qu[:, 1], "u of the star: on the sky where ROTATOR is given"),
         "Q_ERR": (error[:, 0], "standard error of Q: photons and calibration"),
@@ -31,8 +31,8 @@ def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) ->
         "P": (light.degree, "degree of polarisation"),
         "P_DEBIASED": (light.debiased, f"degree of polarisation without its bias, {estimator}"),
         "P_ERR": (light.degree_error, "standard error of P"),
-        "EVPA": (light.angle, "[deg] electric vector angle: north to east, or from +X"),
-        "EVPA_ERR": (light.angle_error, "[deg] standard error of EVPA"),
+        "EVPA": (light.angle, "electric vector angle: north to east, or from +X"),
+        "EVPA_ERR": (light.angle_error, "standard error of EVPA"),
         "Q_PHOTON": (photon[:, 0], "the share of the photons in Q_ERR"),
         "U_PHOTON": (photon[:, 1], "the share of the photons in U_ERR"),
         "Q_COLOUR": (stars.colour[:, 0], "error of Q if TEFF is ignored; not in Q_ERR"),
@@ -42,7 +42,8 @@ def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) ->
         "NROWS": (stars.rows.astype(np.int32), "rows that were combined"),
         "FLAG": (stars.flag.astype(np.int32), "quality bits, 0 is good"),
     }
-    return {name: (values[star], about) for name, (values, about) in columns.items()}
+    units = {"EVPA": "deg", "EVPA_ERR": "deg"}
+    return {name: (values[star], about, units.get(name, "")) for name, (values, about) in columns.items()}
 
 
 def header(product: str, estimator: str, on_sky: float) -> dict[str, Any]:

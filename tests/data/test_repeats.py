@@ -1,0 +1,241 @@
+"""Data that are there twice under other times, identifiers or coordinates; and data that only look like it."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+from south_sets import CUTS, SouthSet
+
+from walop_jax.data import (
+    DataError,
+    Grid,
+    TableIntensities,
+    read_calibration_set,
+    write_calibration_set,
+    write_frames,
+)
+from walop_jax.data.records import CalibrationSet, Exposures, Points
+from walop_jax.data.repeats import _Rows, _smallest_singular_value, check_repeats
+
+COLUMNS = ("exposure", "point", "source", "counts", "sigma", "flag", "used")
+
+
+@functools.cache
+def plain() -> CalibrationSet:
+    """31 exposures of 25 points with noise, by another program."""
+    return read_calibration_set(SouthSet.of(CUTS, "a").path)
+
+
+def again(
+    calset: CalibrationSet, chosen: slice = slice(None), points: Points | None = None, **changes
+) -> CalibrationSet:
+    """A set with some exposures twice, the second time under new numbers, with columns, counts or points changed."""
+    e, table = calset.exposures, calset.intensities
+    assert isinstance(table, TableIntensities)
+    rows = np.arange(len(e))[chosen]
+    copied = np.isin(table.exposure, rows)
+    columns = {name: np.concatenate([value, value[rows]]) for name, value in e.columns().items()}
+    columns["EXPOSURE"][len(e) :] = e.exposure.max() + 1 + np.arange(len(rows))
+    for name in changes.keys() & {"MJD", "TEMP"}:
+        columns[name][len(e) :] = changes[name](e.columns()[name][rows])
+    more = {name: getattr(table, name)[copied] for name in COLUMNS}
+    more["exposure"] = len(e) + np.searchsorted(rows, more["exposure"])
+    more["counts"] = changes.get("counts", lambda n, s: n)(more["counts"], more["sigma"])
+    whole = calset.points
+    if points is not None:
+        more["point"] = more["point"] + len(whole)
+        whole = Points(
+            *(np.concatenate([getattr(whole, n), getattr(points, n)]) for n in ("point", "x", "y"))
+        )
+    joined = {name: np.concatenate([getattr(table, name), more[name]]) for name in COLUMNS}
+    total = TableIntensities(len(e) + len(rows), whole, **joined)
+    return dataclasses.replace(
+        calset, exposures=Exposures.from_columns(columns), points=whole, intensities=total, inputs=()
+    )
+
+
+def new_points(calset: CalibrationSet, change=np.asarray) -> Points:
+    p = calset.points
+    return Points(p.point + 1000, change(p.x).astype(float), change(p.y).astype(float))
+
+
+def second_later(mjd):
+    return mjd + 1.0 / 86400.0
+
+
+COPIES = {
+    "a second later": {"MJD": second_later},
+    "without time": {"MJD": lambda mjd: np.full(len(mjd), np.nan)},
+    "counts in the last digits": {"MJD": second_later, "counts": lambda n, s: n * (1 + 1e-12)},
+    "counts in single precision": {
+        "MJD": second_later,
+        "counts": lambda n, s: n.astype(np.float32).astype(float),
+    },
+    "another temperature": {"MJD": second_later, "TEMP": lambda temp: temp + 0.5},
+}
+
+
+@pytest.mark.parametrize("name", COPIES)
+@pytest.mark.parametrize("chosen", [slice(4, 5), slice(15)], ids=["one", "many"])
+def test_near_copies_of_exposures_are_refused_by_number_and_row(tmp_path, name, chosen):
+    path = tmp_path / "twice.fits"
+    calset = again(plain(), chosen, **COPIES[name])
+    write_calibration_set(path, calset)
+    first = range(31)[chosen][0]
+    ids = calset.exposures.exposure[first], calset.exposures.exposure[31]
+    expected = (
+        rf"exposures {ids[0]} and {ids[1]} \(rows {first}, 31 .*\) hold the same noise.*; remove one of them"
+    )
+    with pytest.raises(DataError, match=expected) as caught:
+        read_calibration_set(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("change", [np.asarray, np.float32], ids=["same", "float32"])
+def test_points_under_new_numbers_are_refused(tmp_path, change):
+    table = plain().intensities
+    assert isinstance(table, TableIntensities)
+    points = new_points(plain(), change)
+    whole = Points(
+        *(np.concatenate([getattr(plain().points, n), getattr(points, n)]) for n in ("point", "x", "y"))
+    )
+    columns = {name: np.concatenate([getattr(table, name)] * 2) for name in COLUMNS}
+    columns["point"][len(table.point) :] += len(points)
+    calset = dataclasses.replace(plain(), points=whole, intensities=TableIntensities(31, whole, **columns))
+    write_calibration_set(tmp_path / "twice.fits", calset)
+    with pytest.raises(
+        DataError, match=r"points \d+, \d+ \(rows \d+, \d+ .*\) lie at one place and hold the same noise"
+    ):
+        read_calibration_set(tmp_path / "twice.fits")
+
+
+@pytest.mark.parametrize("change", [np.asarray, np.float32], ids=["same", "float32"])
+def test_the_same_data_in_a_second_file(tmp_path, change):
+    later = dataclasses.replace(plain().exposures, mjd=second_later(plain().exposures.mjd))
+    p = plain().points
+    moved = dataclasses.replace(p, x=change(p.x).astype(float), y=change(p.y).astype(float))
+    table = plain().intensities
+    columns = {name: getattr(table, name) for name in COLUMNS}
+    second = dataclasses.replace(
+        plain(), exposures=later, points=moved, intensities=TableIntensities(31, moved, **columns)
+    )
+    for name, calset in (("a.fits", plain()), ("b.fits", second)):
+        write_calibration_set(tmp_path / name, calset)
+    with pytest.raises(DataError, match=r"a\.fits.*b\.fits.*hold the same noise, and 30 pairs more"):
+        read_calibration_set(tmp_path / "a.fits", tmp_path / "b.fits")
+
+
+def noise(seed):
+    draw = np.random.default_rng(seed)
+    return lambda n, s: n + s * draw.standard_normal(n.shape)
+
+
+def remarks_of(calset: CalibrationSet) -> tuple[str, ...]:
+    return check_repeats(calset.intensities, calset.exposures, calset.points, "set")
+
+
+def test_repeated_exposures_with_noise_of_their_own_pass():
+    assert remarks_of(again(plain(), MJD=second_later, counts=noise(1))) == ()
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e-3, 1e6])
+def test_very_bright_and_very_faint_sets_pass(factor):
+    """Repeated exposures whose noise is drawn anew; errors go with the root of the counts, counts are whole."""
+    table = plain().intensities
+    assert isinstance(table, TableIntensities)
+    mean = np.round(table.counts * factor)
+    draw = np.random.default_rng(2)
+    changed = {name: getattr(table, name) for name in COLUMNS} | {"sigma": np.sqrt(mean + 1.0)}
+    changed["counts"] = draw.poisson(mean).astype(float)
+    calset = dataclasses.replace(plain(), intensities=TableIntensities(31, plain().points, **changed))
+    assert (
+        remarks_of(again(calset, MJD=second_later, counts=lambda n, s: draw.poisson(n).astype(float))) == ()
+    )
+
+
+def ideal(angles: np.ndarray, electrons: float = 1e6, points: int = 25) -> CalibrationSet:
+    """Expected counts without noise of an analyser with a diattenuating plate ahead, smooth over the field."""
+    two = 2 * np.deg2rad(angles)[:, None]
+    slope = np.linspace(-0.05, 0.05, points)[None, :]
+    light = 1 + slope * np.cos(two)
+    c, s = (np.cos(two) + slope) / light, np.sin(two + slope)
+    share = 1.02 + np.stack([c, -c, s, -s], axis=-1)
+    counts = (electrons * light[..., None] * share).reshape(-1, 4)
+    point, exposure = np.tile(np.arange(points), len(angles)), np.repeat(np.arange(len(angles)), points)
+    zeros = np.zeros(len(point), int)
+    where = Points(np.arange(points), np.linspace(-0.3, 0.3, points), np.zeros(points))
+    row = plain().exposures[np.zeros(len(angles), int)].columns()
+    row |= {
+        "EXPOSURE": np.arange(len(angles)),
+        "CLP_ANGLE": angles,
+        "MJD": 61043.0 + 0.01 * np.arange(len(angles)),
+    }
+    row |= {"KIND": np.full(len(angles), "clp"), "CLP_IN": np.ones(len(angles), bool)}
+    table = TableIntensities(
+        len(angles), where, exposure=exposure, point=point, source=zeros - 1, counts=counts,
+        sigma=np.sqrt(counts + 25.0), flag=zeros, used=zeros == 0,
+    )  # fmt: skip
+    return dataclasses.replace(
+        plain(), exposures=Exposures.from_columns(row), points=where, intensities=table
+    )
+
+
+@pytest.mark.parametrize("electrons", [1e4, 1e6, 1e10])
+def test_expected_counts_without_noise_pass(electrons):
+    """A full turn: every angle returns after half of it, with the same counts to the last bit."""
+    calset = ideal(np.arange(0.0, 360.0, 11.25), electrons)
+    assert remarks_of(calset) == ()
+    assert remarks_of(again(calset, MJD=second_later)) == ()
+
+
+def test_noise_and_its_absence_are_told_apart():
+    """With noise the smallest singular value is 1 − √(exposures/values), here 1 − √(31/75), within a fifth."""
+    calset = ideal(np.linspace(0.0, 170.0, 31))
+    table = calset.intensities
+    assert isinstance(table, TableIntensities)
+    rows = _Rows(table.exposure, table.point, table.point, table.counts, table.sigma)
+    assert _smallest_singular_value(rows, np.arange(31)) < 1e-6
+    noisy = dataclasses.replace(rows, counts=noise(3)(rows.counts, rows.sigma))
+    assert _smallest_singular_value(noisy, np.arange(31)) == pytest.approx(1 - np.sqrt(31 / 75), rel=0.2)
+
+
+def test_too_few_exposures_to_see_noise_are_remarked_on(handmade):
+    calset = read_calibration_set(handmade.write())
+    (remark,) = remarks_of(again(calset, slice(1, 3), MJD=second_later))
+    assert "exposures 11 and 18 (rows 1, 8" in remark
+
+
+def test_frames_in_two_files(tmp_path):
+    """The same frames a second later, in another file; frames with noise of their own are no copies."""
+    grid = Grid(7, 5, (4.0, 3.0), (0.0, 0.0), ((0.05, 0.0), (0.0, 0.05)))
+    calset = ideal(np.linspace(0.0, 170.0, 16), points=35)
+    table = calset.intensities
+    assert isinstance(table, TableIntensities)
+    for name, seed, shift in (("one", 1, 0.0), ("same", 1, 1 / 86400), ("other", 2, 2 / 86400)):
+        columns = {key: getattr(table, key) for key in COLUMNS}
+        columns["counts"] = noise(seed)(table.counts, table.sigma)
+        exposures = dataclasses.replace(calset.exposures, mjd=calset.exposures.mjd + shift)
+        whole = TableIntensities(16, grid.points, **columns)
+        made = dataclasses.replace(calset, exposures=exposures, points=grid.points, intensities=whole)
+        write_frames(tmp_path / f"{name}.fits", made, grid)
+    read = functools.partial(read_calibration_set, tmp_path / "one.fits")
+    assert not any("noise" in remark for remark in read(tmp_path / "other.fits").remarks)
+    with pytest.raises(DataError, match=r"exposures 0 and 16 .* hold the same noise, and 15 pairs more"):
+        read(tmp_path / "same.fits")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_false_alarm_among_many_repetitions(seed):
+    """200 exposures of one setting: 20 000 pairs, each called a copy with a probability below e⁻³⁰."""
+    calset = ideal(np.repeat(np.linspace(0, 170, 20), 10), points=9)
+    table = calset.intensities
+    assert isinstance(table, TableIntensities)
+    columns = {name: getattr(table, name) for name in COLUMNS}
+    columns["counts"] = np.random.default_rng(seed).poisson(table.counts).astype(float)
+    assert (
+        remarks_of(dataclasses.replace(calset, intensities=TableIntensities(200, calset.points, **columns)))
+        == ()
+    )

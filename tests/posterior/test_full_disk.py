@@ -1,0 +1,55 @@
+"""A disk that is full, or a quota that is used up, while a posterior or a checkpoint is written."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+WRITERS = {
+    "posterior": """
+        import arviz
+        from walop_jax.posterior import output
+        from walop_jax.posterior.output import write_posterior
+        output.inference_data = lambda sample: arviz.from_dict(posterior={"a": np.zeros((4, 20000)) + sample})
+        write = lambda path: write_posterior(path, 1.0, overwrite=True)
+    """,
+    "checkpoint": """
+        from walop_jax.posterior.checkpoint import Checkpoints
+        def write(path):
+            there = Checkpoints(path.parent, {})
+            there.block_path = lambda number: path
+            there._write(path, {"a": np.zeros((4, 20000))}, {})
+    """,
+}
+LIMITED = """
+    import resource, sys
+    from pathlib import Path
+    import numpy as np
+    {writer}
+    path = Path(sys.argv[1])
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100000, 100000))
+    try:
+        write(path)
+    except ValueError as error:
+        print(error)
+"""
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_full_disk_is_an_error_and_leaves_what_was_there(tmp_path, writer):
+    """HDF5 itself ends the process with a segmentation fault when it cannot write."""
+    path = tmp_path / "posterior.nc"
+    if writer == "posterior":
+        path.write_text("old")
+    script = textwrap.dedent(LIMITED).format(writer=textwrap.dedent(WRITERS[writer]).strip())
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "posterior.nc: writing failed: File too large; free some space" in done.stdout
+    assert ".walop" not in done.stdout + done.stderr
+    left = [entry.read_text() for entry in tmp_path.iterdir()]
+    assert left == (["old"] if writer == "posterior" else [])
