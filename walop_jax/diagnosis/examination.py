@@ -14,7 +14,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import naming
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.effect_columns import Probe, effect_candidates
-from walop_jax.diagnosis.findings import Limit
+from walop_jax.diagnosis.findings import Alike, Limit
 from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, number_of_columns, strata
 from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable, separations
 from walop_jax.fit.refit import FitResult
@@ -30,6 +30,7 @@ ALARM = 0.0027  # three standard deviations
 COMMON_MODE = 0.05  # rms (σ of one intensity) of disturbances that one camera in one exposure may have
 PROBABILITY = 0.95
 MOST_PATTERNS = 8
+MOST_CLASSES = 8
 FLOOR = 1.25  # standard deviations of what is left above which the stated errors are not those of the data
 SAME_COUNTS = 0.01  # relative change of the counts up to which columns are kept
 
@@ -171,6 +172,20 @@ class Examination:
         scores = self.columns.T @ projected + own.columns.T @ (own.basis.T @ projected)
         found = self.nearest(separations(space, scores, float(projected @ projected)))
         return {rival: apart / self.floor for rival, apart in found.items()}
+
+    def classes(self) -> Iterator[Alike]:
+        """Which other effects could follow what each significant one would explain, by linear steps."""
+        places, gram = self.space.places(), self.space.gram
+        for item in self.significant[:MOST_CLASSES]:
+            at, amplitudes = places[item.probe.name], item.score.amplitudes
+            square = float(amplitudes @ gram[at, at] @ amplitudes)
+            apart = self.nearest(separations(self.space, gram[:, at] @ amplitudes, square))
+            close = {name: value for name, value in apart.items() if value < naming.SEPARATION * self.floor}
+            close.pop(item.effect.name, None)
+            if close:
+                yield Alike(
+                    item.effect.name, tuple(sorted(close, key=close.__getitem__)), item.effect.separated_by
+                )
 
     def nearest(self, by_candidate: Mapping[str, float]) -> dict[str, float]:
         """The smallest number of each effect among those of its probes."""

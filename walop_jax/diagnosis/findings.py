@@ -119,6 +119,18 @@ class Choice:
     better_by: float = float("nan")
 
 
+@dataclasses.dataclass(frozen=True)
+class Alike:
+    """A significant effect of the first examination, and those that can follow what it would explain, to within 3 σ.
+
+    `separated_by` is the observation that would tell them apart.
+    """
+
+    effect: str
+    equivalent: tuple[str, ...]
+    separated_by: str
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class Diagnosis(Displayed):
     """What is missing from a model, according to one calibration set.
@@ -126,6 +138,7 @@ class Diagnosis(Displayed):
     `candidates` are (effect, score, corrected p) in the first examination; `before` is the fit of the model given,
     `after` that of the extended one; `remaining_p` is the significance of what is left at the end. `choices` are other
     descriptions of the instrument that were tried, the best first; none where nothing, or only a name, was missing.
+    `classes` are significant effects that these data cannot tell from others, whether they were added or not.
     """
 
     verdict: Outcome
@@ -141,6 +154,7 @@ class Diagnosis(Displayed):
     seconds: float
     points: int
     choices: tuple[Choice, ...] = ()
+    classes: tuple[Alike, ...] = ()
 
     @property
     def caution(self) -> str:

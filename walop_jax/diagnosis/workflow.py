@@ -122,6 +122,7 @@ class _Diagnosing:
             seconds=time.perf_counter() - began,
             points=len(self.calset.points),
             choices=tuple(sorted(self.choices.values(), key=_promise)),
+            classes=tuple(first.classes()),
         )
 
     def _examine(self, earlier: Examination | None = None) -> Examination:
@@ -179,7 +180,7 @@ class _Diagnosing:
             for t in itertools.chain(names, self._other_descriptions() if others else ())
             if t.fit.converged and t.log_bayes / examination.floor**2 > examination.least_evidence
         ]
-        trials.sort(key=lambda t: -t.log_bayes)
+        trials = self._decided(sorted(trials, key=lambda t: -t.log_bayes))
         for trial in trials:
             even = [
                 t for t in trials if t is not trial and abs(t.log_bayes - trial.log_bayes) < naming.EVEN_ODDS
@@ -205,6 +206,23 @@ class _Diagnosing:
                     )
                 return step.effect
         return None
+
+    def _decided(self, trials: list[naming.Trial]) -> list[naming.Trial]:
+        """Trials in order of evidence; what scaled errors leave even at the top is decided with errors as stated."""
+        even = [t for t in trials if trials[0].log_bayes - t.log_bayes < naming.EVEN_ODDS]
+        if self.fit.noise_scale == 1.0 or len(even) < 2:
+            return trials
+        refitted = [
+            dataclasses.replace(t, fit=fit(t.fit.likelihood, start=t.fit.values, noise_scale=1.0))
+            for t in even
+        ]
+        refitted.sort(key=lambda t: t.fit.posterior.objective)
+        best = refitted[0].fit.posterior.objective
+        clearly = [
+            dataclasses.replace(t, log_bayes=t.log_bayes - 0.5 * (t.fit.posterior.objective - best))
+            for t in refitted
+        ]
+        return [*clearly, *trials[len(even) :]]
 
     def _adopt(self, result: FitResult) -> None:
         """Go on with a fit: errors as given where they need not be scaled any more, refuted priors widened."""
