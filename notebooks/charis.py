@@ -102,7 +102,7 @@ def bin_by_bin(measured, plate, derotator, left_out=None, ratio=False):
     """The yardstick: two retardances, three angles and an efficiency for each bin, fitted by least squares.
 
     `measured` is (N0 - N1)/(N0 + N1) of one bin (8, 8), the angles in degrees; `left_out` is a column of it that is
-    predicted only. `ratio`: the beams may have a ratio as well, the fairer comparison. Returns measured minus predicted.
+    predicted only. `ratio`: the beams may have a ratio as well, which is fairer. Returns measured minus predicted.
     """
     h, d = np.meshgrid(np.deg2rad(plate), np.deg2rad(derotator), indexing="ij")
     used = np.arange(8) != (-1 if left_out is None else left_out)
