@@ -28,7 +28,7 @@ from walop_jax.model.specification import Model
 
 LEAST_SURVIVING = 1e-3  # a contrast of 1 % that the band reduces by this factor is 0.001 %: of no consequence
 DEFAULT_WIDTH = 1.0
-FEWEST_POINTS = 3  # that a pattern over the field is looked for in
+FEWEST_POINTS = 9  # in which a pattern over the field is looked for, or what refers to their median
 
 Vector = Float[np.ndarray, " _"]
 

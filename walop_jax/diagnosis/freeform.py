@@ -103,7 +103,7 @@ class Measured:
     @property
     def has_gains(self) -> bool:
         """Whether exposures are seen at so many field points that gains of single ones are not all there is."""
-        return self.used.sum() >= limits.MANY_POINTS * self.used.any(axis=0).sum()
+        return bool(self.used.sum() >= limits.MANY_POINTS * self.used.any(axis=0).sum())
 
     @property
     def gained(self) -> list[int]:
