@@ -4,7 +4,8 @@
    the fitted values and the start values: a description that is badly wrong has bent the fit. What the free parameters
    could absorb of them, at the slopes of the description given, is projected out, priors included (one Gauss–Newton
    step). Nothing is fitted; a sample of the field points is enough.
-2. The few that leave least are fitted, all parameters with them. Their evidence against the description given is half
+2. The few that leave least are fitted, all parameters with them, and other curves of dispersion in any case: plates
+   grow to make up for those, by more than one step can tell. Their evidence against the description given is half
    the gain in χ² less the logarithm of the number of changes that were looked at.
 """
 
@@ -23,13 +24,13 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.thinning import thinned
-from walop_jax.model.alternatives import JOINED, alternatives
+from walop_jax.model.alternatives import JOINED, alternatives, other_curves
 from walop_jax.model.effects import Context, OtherDescription
 from walop_jax.model.specification import Model, with_effects
 
 MOST_FITTED = 4
 NO_DIFFERENCE = 1e-6  # change of the residuals, in standard deviations, that is none
-WITHIN = 0.9  # share of what the description given leaves, below which a change is worth a fit
+LEAST_GAIN = 12.0  # in χ² behind one linear step, above which a change is worth a fit
 Vector = Float[np.ndarray, " n"]
 
 
@@ -61,7 +62,7 @@ class Choices:
         if OtherDescription.name in result.model.effect_names:
             described = result.model.template.effect(OtherDescription.name)
             template = described.patch(template)
-        self.sentences = tuple(alternatives(template))
+        self.sentences, self.curves = tuple(alternatives(template)), other_curves(template)
         self.tried: dict[str, Choice] = {}
 
     def trials(self) -> Iterator[naming.Trial]:
@@ -101,7 +102,9 @@ class Choices:
                 found.append(one)
                 self.tried[sentence] = Choice(sentence, one.left)
         found.sort(key=lambda one: one.left)
-        return [one for one in found if one.left < WITHIN][:MOST_FITTED]
+        promising = [one for one in found if (1.0 - one.left) * given > LEAST_GAIN][:MOST_FITTED]
+        curves = [one for one in found if one.sentence in self.curves and one not in promising]
+        return [*promising, *curves]
 
     def _from_start(self) -> Vector:
         """Start values, of effects as they have been fitted."""

@@ -126,7 +126,7 @@ def number_of_columns(calset: CalibrationSet, instrument: Instrument) -> int:
     of_camera += 5 * (len(np.unique(e.kind)) - 1) + 3 * (len(np.unique(e.filter)) - 1)
     for prefix in instrument.patched().moving():
         of_camera += 3 * (len(np.unique(_positions(e, prefix))) - 1)
-    gains = (len(e) + states(calset).max() + 1) * (cameras - instrument.cameras.fluxes)
+    gains = (len(e) + int(states(calset).max()) + 1) * (cameras - instrument.cameras.fluxes)
     return cameras * of_camera + gains
 
 

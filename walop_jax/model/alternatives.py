@@ -40,6 +40,11 @@ def alternatives(instrument: Instrument) -> dict[str, Change]:
     )
 
 
+def other_curves(instrument: Instrument) -> tuple[str, ...]:
+    """Those of the changes that are another dispersion."""
+    return tuple(sentence for sentence, _ in _dispersion(instrument))
+
+
 def changed(instrument: Instrument, sentence: str) -> Instrument:
     """The instrument with the changes that a sentence names, one after the other; as it is for an empty one.
 
