@@ -98,11 +98,11 @@ def left_over(result, values=None):
     return (asymmetry(*counts.T) - asymmetry(*model.T)).reshape(-1, 8, 8)
 
 
-def bin_by_bin(measured, plate, derotator, left_out=None):
+def bin_by_bin(measured, plate, derotator, left_out=None, ratio=False):
     """The yardstick: two retardances, three angles and an efficiency for each bin, fitted by least squares.
 
     `measured` is (N0 - N1)/(N0 + N1) of one bin (8, 8), the angles in degrees; `left_out` is a column of it that is
-    predicted only. Returns measured minus predicted.
+    predicted only. `ratio`: the beams may have a ratio as well, which is fairer. Returns measured minus predicted.
     """
     h, d = np.meshgrid(np.deg2rad(plate), np.deg2rad(derotator), indexing="ij")
     used = np.arange(8) != (-1 if left_out is None else left_out)
@@ -115,10 +115,11 @@ def bin_by_bin(measured, plate, derotator, left_out=None):
 
     def off(p):
         light = retarded(np.cos(2 * p[4]), np.sin(2 * p[4]), 0.0, p[0], h + p[2])
-        return measured - p[5] * retarded(*light, p[1], d + p[3])[0]
+        expected = p[5] * retarded(*light, p[1], d + p[3])[0]
+        return measured - (expected + p[6]) / (1.0 + p[6] * expected) if ratio else measured - expected
 
     starts = [
-        (plates, turn, 0.0, 0.0, 0.0, 1.0)
+        (plates, turn, 0.0, 0.0, 0.0, 1.0, *((0.0,) if ratio else ()))
         for plates in (2.95, 3.35)
         for turn in (0.5, 1.5, 2.5, 3.2, 4.0, 5.0)
     ]

@@ -89,10 +89,10 @@ CASES: dict[str, tuple[Spoil, str]] = {
     "no polariser": (unpolarised, "the calibration polariser was not in the beam"),
     "South labelled North": (lambda c: dataclasses.replace(c, instrument="WALOP-NORTH"), "they came from WALOP-SOUTH"),
 }  # fmt: skip
-FAST = ("the arms exchanged", "the polariser runs backwards", "turned by 90 degrees")
 
 
-@pytest.mark.parametrize("name", [n if n in FAST else pytest.param(n, marks=pytest.mark.long) for n in CASES])
+@pytest.mark.long  # ten seconds each; one of them, with the fit before it, below
+@pytest.mark.parametrize("name", CASES)
 def test_every_mix_up_is_told_with_its_remedy(calset, name):
     spoil, said = CASES[name]
     bad = spoil(calset)
@@ -111,6 +111,7 @@ def test_a_fit_of_mixed_up_data_is_refused(calset):
         examined(plain_refit(bad))
 
 
+@pytest.mark.long
 def test_right_data_and_effects_are_no_mix_up(calset):
     """However large: an encoder error of 2°, and half the light of a camera."""
     block = calset.intensities.block(0, len(calset.points))

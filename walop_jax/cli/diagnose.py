@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -99,6 +100,14 @@ def _show(found: Diagnosis, output: Path) -> None:
                 f"χ² {found.unexplained.chi2_before:.1f} → {found.unexplained.chi2_after:.1f}",
                 markup=False,
             )
+    for line in _about_choices(found):
+        console.print(line, markup=False)
+    for alike in found.classes:
+        console.print(
+            f"these data cannot tell {alike.effect} from {', '.join(alike.equivalent)}; to tell them apart: "
+            f"{alike.separated_by}",
+            markup=False,
+        )
     if found.untestable:
         console.print(f"cannot be tested with these data: {', '.join(found.untestable)}")
     now = f"χ²/dof {after.chi2 / max(after.dof, 1):.4f}, chance of such residuals p {probability(found.remaining_p)}"
@@ -110,6 +119,15 @@ def _show(found: Diagnosis, output: Path) -> None:
     if found.caution:
         warn(found.caution)
     console.print(f"verdict: {found.verdict}   ({found.seconds:.0f} s)   {output}", markup=False)
+
+
+def _about_choices(found: Diagnosis) -> Iterator[str]:
+    if not found.choices:
+        return
+    fitted = [choice for choice in found.choices if math.isfinite(choice.better_by)]
+    yield f"{len(found.choices)} other descriptions of the instrument were compared, {len(fitted)} of them fitted"
+    for choice in fitted:
+        yield f"  {choice.change}: χ² {'smaller' if choice.better_by > 0 else 'larger'} by {abs(choice.better_by):.4g}"
 
 
 def _about(step: Step) -> Iterator[str]:

@@ -20,7 +20,7 @@ _FIRST_KINDS = ("clp", "moon", "standard", "flux")  # of version 1
 EPHEMERIS_MJD = (15020.0, 88069.0)
 """Where astropy's built-in ephemeris (ERFA `moon98`, the years 1900 to 2100) is meant to be used."""
 
-_WAVELENGTH = (0.3, 1.1)  # µm, where silicon detectors see
+_WAVELENGTH = (0.2, 20.0)  # µm, from the ultraviolet to the thermal infrared
 
 
 def refuse(bad: np.ndarray, what: str, column: str, advice: str, place: Place) -> None:
@@ -102,8 +102,8 @@ def make_filters(table: dict[str, Any], place: Place) -> dict[str, FilterCurve]:
         wavelength, throughput = wavelength[given], throughput[given]
         if wavelength.min() < _WAVELENGTH[0] or wavelength.max() > _WAVELENGTH[1]:
             raise place.fail(
-                f"{name!r} reaches from {wavelength.min():g} to {wavelength.max():g} µm, outside 0.3 … 1.1, "
-                f"in {rows_text(at)}",
+                f"{name!r} reaches from {wavelength.min():g} to {wavelength.max():g} µm, outside {_WAVELENGTH[0]:g} … "
+                f"{_WAVELENGTH[1]:g}, in {rows_text(at)}",
                 "WAVELENGTH",
                 "wavelengths are in µm: are these nm or Angstrom?",
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -81,6 +82,11 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
             }
             for limit in diagnosis.limits
         ],
+        "choices": [
+            {"change": choice.change, "left": choice.left, "better_by": _number(choice.better_by)}
+            for choice in diagnosis.choices
+        ],
+        "classes": [dataclasses.asdict(alike) for alike in diagnosis.classes],
         "cannot_be_tested": list(diagnosis.untestable),
         "chi2_per_dof_before": diagnosis.before.chi2 / max(diagnosis.before.dof, 1),
         "chi2_per_dof_after": diagnosis.after.chi2 / max(diagnosis.after.dof, 1),

@@ -23,10 +23,12 @@ from walop_jax.model.dependence import changed_elements, conditions_asked_by
 from walop_jax.model.effects import Context, Effect
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations
+from walop_jax.model.ray import CONDITIONS
 from walop_jax.model.specification import Model
 
 LEAST_SURVIVING = 1e-3  # a contrast of 1 % that the band reduces by this factor is 0.001 %: of no consequence
 DEFAULT_WIDTH = 1.0
+FEWEST_POINTS = 9  # in which a pattern over the field is looked for, or what refers to their median
 
 Vector = Float[np.ndarray, " _"]
 
@@ -94,10 +96,22 @@ def _kind_of_computation(instrument: Instrument, effect: Effect) -> tuple[object
     return optics, asked, longest, bool(patched.cameras.ghosts)
 
 
+def _can_show(calset: CalibrationSet, instrument: Instrument, effect: Effect) -> bool:
+    """Whether a set has what an effect acts on: several field points, or the conditions that its elements ask for."""
+    if effect.over_field and len(calset.points) < FEWEST_POINTS:
+        return False
+    bare = dataclasses.replace(instrument, effects=())
+    changed = changed_elements(bare, effect)
+    asked = frozenset(name for element in changed for name in conditions_asked_by(element))
+    stated = {name: getattr(calset.exposures, column.lower()) for name, column in CONDITIONS.items()}
+    return all(np.isfinite(stated[name]).any() for name in asked if name in stated)
+
+
 def effect_candidates(
     calset: CalibrationSet, model: Model, values: Vector, wanted: Sequence[Probe]
 ) -> dict[str, Candidate]:
     """Columns of all probes at the fit `values` of `model`, by probe name; without those that the bands blur away."""
+    wanted = [probe for probe in wanted if _can_show(calset, model.template, probe.group[0])]
     number = Counter(p.effect for p in wanted)
     several = {effect for effect, count in number.items() if count > limits.MANY_SHAPES}
     result: dict[str, Candidate] = {}

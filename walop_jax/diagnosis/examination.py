@@ -14,7 +14,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import naming
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.effect_columns import Probe, effect_candidates
-from walop_jax.diagnosis.findings import Limit
+from walop_jax.diagnosis.findings import Alike, Limit
 from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, number_of_columns, strata
 from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable, separations
 from walop_jax.fit.refit import FitResult
@@ -30,6 +30,8 @@ ALARM = 0.0027  # three standard deviations
 COMMON_MODE = 0.05  # rms (σ of one intensity) of disturbances that one camera in one exposure may have
 PROBABILITY = 0.95
 MOST_PATTERNS = 8
+MOST_CLASSES = 8
+FLOOR = 1.25  # standard deviations of what is left above which the stated errors are not those of the data
 SAME_COUNTS = 0.01  # relative change of the counts up to which columns are kept
 
 
@@ -78,17 +80,29 @@ class Examination:
             rest, basis = self.design.without(name)
             self._absorbed[name] = _Absorbed(rest, basis, basis.T @ self.columns)
         self.space = ScoreSpace.projected(self.design.projector, names, widths, self.columns)
-        self.common_mode = self._common_mode()
-        space, reduce = self.space.with_base([SINGLE_EXPOSURES], self.common_mode)
         r = self.design.projector(self.design.residual)
-        self._scored = space, *reduce(self.columns.T @ r, float(r @ r))
+        self._scored = self.space, self.columns.T @ r, float(r @ r)
+        self.common_mode = np.zeros(0)
+        if SINGLE_EXPOSURES in names:
+            self.common_mode = self._common_mode()
+            space, reduce = self.space.with_base([SINGLE_EXPOSURES], self.common_mode)
+            self._scored = space, *reduce(*self._scored[1:])
         self._rng = rng
-        self.scorer = Scorer(space, rng)
+        self.scorer = Scorer(self._scored[0], rng)
         self.table: ScoreTable = self.scorer(*self._scored[1:])
         self.ranked = naming.rank(self.table, self.probes)
         self.patterns = [self.table[name] for name in names[len(self.probes) :]]
         # Where the base is excluded, a name competes with patterns that have none, not with the base.
         self.least_evidence = min(0.0, max(s.log_bayes for s in self.patterns if s.testable))
+
+    @property
+    def floor(self) -> float:
+        """What is left behind everything that was looked for, in standard deviations of the data as stated; 1 or more.
+
+        Above `FLOOR` no candidate explains the data to within N_ERR. Evidence and separations then count in this unit:
+        in that of photons everything would be certain.
+        """
+        return self.table.noise_scale if self.table.noise_scale > FLOOR else 1.0
 
     def _is_like(self, earlier: Examination) -> bool:
         """Whether the expected counts differ so little that derivatives with respect to anything else do as well."""
@@ -156,7 +170,22 @@ class Examination:
         projected = own.rest(whole)
         space = dataclasses.replace(self.space, gram=self.space.gram + own.columns.T @ own.columns)
         scores = self.columns.T @ projected + own.columns.T @ (own.basis.T @ projected)
-        return self.nearest(separations(space, scores, float(projected @ projected)))
+        found = self.nearest(separations(space, scores, float(projected @ projected)))
+        return {rival: apart / self.floor for rival, apart in found.items()}
+
+    def classes(self) -> Iterator[Alike]:
+        """Which other effects could follow what each significant one would explain, by linear steps."""
+        places, gram = self.space.places(), self.space.gram
+        for item in self.significant[:MOST_CLASSES]:
+            at, amplitudes = places[item.probe.name], item.score.amplitudes
+            square = float(amplitudes @ gram[at, at] @ amplitudes)
+            apart = self.nearest(separations(self.space, gram[:, at] @ amplitudes, square))
+            close = {name: value for name, value in apart.items() if value < naming.SEPARATION * self.floor}
+            close.pop(item.effect.name, None)
+            if close:
+                yield Alike(
+                    item.effect.name, tuple(sorted(close, key=close.__getitem__)), item.effect.separated_by
+                )
 
     def nearest(self, by_candidate: Mapping[str, float]) -> dict[str, float]:
         """The smallest number of each effect among those of its probes."""

@@ -106,12 +106,39 @@ class Unexplained:
     change_of_qu: float = float("nan")
 
 
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """A change of the description that was tried.
+
+    `left` is what it leaves of the squared residuals behind one linear step, over what the description given leaves,
+    and `better_by` the gain in χ², data and priors, when all is fitted (NaN where that was not done).
+    """
+
+    change: str
+    left: float
+    better_by: float = float("nan")
+
+
+@dataclasses.dataclass(frozen=True)
+class Alike:
+    """A significant effect of the first examination, and those that can follow what it would explain, to within 3 σ.
+
+    `separated_by` is the observation that would tell them apart.
+    """
+
+    effect: str
+    equivalent: tuple[str, ...]
+    separated_by: str
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class Diagnosis(Displayed):
     """What is missing from a model, according to one calibration set.
 
     `candidates` are (effect, score, corrected p) in the first examination; `before` is the fit of the model given,
-    `after` that of the extended one; `remaining_p` is the significance of what is left at the end.
+    `after` that of the extended one; `remaining_p` is the significance of what is left at the end. `choices` are other
+    descriptions of the instrument that were tried, the best first; none where nothing, or only a name, was missing.
+    `classes` are significant effects that these data cannot tell from others, whether they were added or not.
     """
 
     verdict: Outcome
@@ -126,6 +153,8 @@ class Diagnosis(Displayed):
     after: FitResult
     seconds: float
     points: int
+    choices: tuple[Choice, ...] = ()
+    classes: tuple[Alike, ...] = ()
 
     @property
     def caution(self) -> str:

@@ -9,7 +9,9 @@ harmonic        1θ, 3θ, 4θ, 5θ, 6θ of the polariser angle in one camera × 
 time, flux, temperature   gain of a camera linear in that quantity
 kind, filter, plate       response of a camera that differs between kinds of exposure, filters, plate settings;
                 for kinds also gradients over the field
-exposure        gain of each camera in each single exposure
+exposure        gain of each camera in each single exposure, where it is seen at several field points
+state           gain of each camera in each state, the same in all filters, where there are several: a state is all
+                exposures that differ in nothing but the filter
 fine structure  gain of a camera × field polynomials of degree 5 to 8
 rings           gain of a camera × polynomials of the squared field radius, of degree 3 to 8 in it
 
@@ -27,6 +29,8 @@ from numpy.polynomial.legendre import legvander
 
 from walop_jax.data.records import POLARISER, CalibrationSet, Exposures
 from walop_jax.diagnosis.score import Candidate
+from walop_jax.fit.robust import states
+from walop_jax.likelihood import limits
 from walop_jax.likelihood.flux import Sharing, project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
@@ -35,6 +39,7 @@ from walop_jax.model.instrument import Instrument
 
 RINGS = (3, 4, 5, 6, 7, 8)
 SINGLE_EXPOSURES = "single exposures"
+STATES = "states"
 
 Cube = Float[np.ndarray, "p e k"]
 
@@ -96,6 +101,11 @@ class Measured:
         return np.column_stack(columns)
 
     @property
+    def has_gains(self) -> bool:
+        """Whether exposures are seen at so many field points that gains of single ones are not all there is."""
+        return bool(self.used.sum() >= limits.MANY_POINTS * self.used.any(axis=0).sum())
+
+    @property
     def gained(self) -> list[int]:
         """Cameras that have a gain beside the flux."""
         shared = self.shared.cameras if self.shared.cameras is not None else np.ones((self.cameras,) * 2)
@@ -116,7 +126,7 @@ def number_of_columns(calset: CalibrationSet, instrument: Instrument) -> int:
     of_camera += 5 * (len(np.unique(e.kind)) - 1) + 3 * (len(np.unique(e.filter)) - 1)
     for prefix in instrument.patched().moving():
         of_camera += 3 * (len(np.unique(_positions(e, prefix))) - 1)
-    gains = len(e) * (cameras - instrument.cameras.fluxes)
+    gains = (len(e) + int(states(calset).max()) + 1) * (cameras - instrument.cameras.fluxes)
     return cameras * of_camera + gains
 
 
@@ -210,6 +220,16 @@ def strata(measured: Measured) -> Iterator[Candidate]:
     ]
     if sky_gradients:
         yield measured.candidate("kind, over the field", sky_gradients)
-    yield Candidate(
-        SINGLE_EXPOSURES, measured.gains(), np.full(len(measured.gained) * len(e), WIDTH), "exposures"
-    )
+    if measured.has_gains:
+        yield Candidate(
+            SINGLE_EXPOSURES, measured.gains(), np.full(len(measured.gained) * len(e), WIDTH), "exposures"
+        )
+    state = states(measured.likelihood.calset)
+    several = len(np.unique(state)) < len(state)
+    patterns = [
+        np.broadcast_to((state == number)[None, :, None] * _camera(k), shape)
+        for number in (np.unique(state) if several else ())
+        for k in measured.gained
+    ]
+    if patterns:
+        yield measured.candidate(STATES, patterns)

@@ -42,7 +42,11 @@ def _harmonics(
         waves = (
             [np.ones_like(angle)] if harmonic == 0 else [np.cos(harmonic * angle), np.sin(harmonic * angle)]
         )
-        amplitudes = [np.einsum("pek,e->pk", pattern[:, use], wave / np.linalg.norm(wave)) for wave in waves]
+        lengths = [float(np.linalg.norm(wave)) or 1.0 for wave in waves]
+        amplitudes = [
+            np.einsum("pek,e->pk", pattern[:, use], wave / length)
+            for wave, length in zip(waves, lengths, strict=True)
+        ]
         square = float(sum((a**2).sum() for a in amplitudes))
         power[f"{harmonic}θ"] = square
         if square > best:

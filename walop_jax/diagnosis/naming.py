@@ -106,13 +106,25 @@ def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
 
 def try_effect(base: FitResult, instance: Effect, context: Context, prior_shapes: int = 1) -> Trial:
     """Add an effect at the given values to the fitted model and fit everything again."""
-    model = with_effects(base.model, [instance], context)
-    start = dict(zip(base.model.names, base.values, strict=True))
-    values = np.array([start.get(p.name, p.start) for p in model.parameters])
+    return try_model(
+        base, type(instance), with_effects(base.model, [instance], context), base.values, prior_shapes
+    )
+
+
+def try_model(
+    base: FitResult, effect: type[Effect], model: Model, values: Float[np.ndarray, " n"], prior_shapes: int
+) -> Trial:
+    """Fit a model with an effect, from values of the parameters of the base and its own start values of others."""
+    start = dict(zip(base.model.names, values, strict=True))
     likelihood = Likelihood.of(base.calset, model)
-    result = fit(likelihood, start=values, noise_scale=base.noise_scale, worth=base.posterior.objective)
+    result = fit(
+        likelihood,
+        start=np.array([start.get(p.name, p.start) for p in model.parameters]),
+        noise_scale=base.noise_scale,
+        worth=base.posterior.objective,
+    )
     bayes = log_evidence_ratio(base, result) - (float(np.log(prior_shapes)) if prior_shapes > 1 else 0.0)
-    return Trial(type(instance), result, bayes)
+    return Trial(effect, result, bayes)
 
 
 def try_shapes(base: FitResult, item: Ranked, context: Context, shapes: int) -> Trial:

@@ -35,6 +35,7 @@ Reduction = Callable[[Vector, float], tuple[Vector, float]]
 ABSORBED = 1e-6  # surviving share of a column's square below which the base has swallowed it
 FAINTEST = 0.05  # standard deviations that a plausible amplitude must reach to be testable
 RANK_TOLERANCE = 1e-8
+LEAST_REST = 0.1  # share of the degrees of freedom that must be left behind all candidates to tell the noise
 LEAST_COUNT = 20  # draws below the smallest p found that make counting them precise enough
 
 
@@ -239,7 +240,12 @@ class Scorer:
         """The table from s = C̃ᵀr and r·r, both behind the projection."""
         explained = self._all.T @ np.where(self._alive, scores, 0.0)
         rest = max(square - float(explained @ explained), 0.0)
-        noise = float(np.sqrt(rest / max(self.space.free - self._all.shape[1], 1))) or 1.0
+        left = self.space.free - self._all.shape[1]
+        if (
+            left < LEAST_REST * self.space.free
+        ):  # candidates that could explain anything say nothing of the noise
+            rest, left = square, self.space.free
+        noise = float(np.sqrt(rest / max(left, 1))) or 1.0
         table = tuple(self._score(name, at, scores, noise) for name, at in self.space.places().items())
         return ScoreTable(table, noise, *self._global_p(table))
 

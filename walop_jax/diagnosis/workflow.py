@@ -2,10 +2,11 @@
 
 1. Fit the model. 2. Score every effect of the catalogue and every pattern of the free-form basis; global p by Monte
 Carlo. 3. Below `ALARM`: refit the leaders and take the one with the highest evidence that data which took no part in
-the fit confirm, provided that it is significant after correction for all that was tried. 4. It joins the model, and
-everything is fitted again. 5. Repeat. 6. Drop names that are not needed beside the others. 7. What no name explains is
-added as a free-form term, labelled, and the verdict is `unexplained`; names that only stood in for it are dropped as
-well. 8. List for each name what the data cannot tell from it, and give the verdict.
+the fit confirm, provided that it is significant after correction for all that was tried. Other descriptions of the
+instrument (`choices`) compete with the names where the model is badly off, or no name is found. 4. It joins the
+model, and everything is fitted again. 5. Repeat. 6. Drop names that are not needed beside the others. 7. What no name
+explains is added as a free-form term, labelled, and the verdict is `unexplained`; names that only stood in for it are
+dropped as well. 8. List for each name what the data cannot tell from it, and give the verdict.
 
 An effect is named whatever its size; `Step.negligible` says when it does not matter for q and u.
 """
@@ -13,6 +14,7 @@ An effect is named whatever its size; `Step.negligible` says when it does not ma
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
 
@@ -21,11 +23,12 @@ import numpy as np
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import location, naming
 from walop_jax.diagnosis.change_of_stokes import instrument_matrices, largest_change
+from walop_jax.diagnosis.choices import Choices
 from walop_jax.diagnosis.design import Design, held_out
 from walop_jax.diagnosis.effect_columns import Probe, applicable
 from walop_jax.diagnosis.effect_columns import probes as all_probes
 from walop_jax.diagnosis.examination import Examination, most_points
-from walop_jax.diagnosis.findings import Diagnosis, Outcome, Step, Unexplained
+from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexplained
 from walop_jax.diagnosis.mixups import refuse_mixups
 from walop_jax.diagnosis.score import Score
 from walop_jax.diagnosis.step_summary import before_and_after, refitted_in_order
@@ -34,7 +37,7 @@ from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.thinning import thinned
-from walop_jax.model.effects import EFFECTS, Context, Effect, FreeForm
+from walop_jax.model.effects import EFFECTS, Context, Effect, FreeForm, OtherDescription
 from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import Model, effect_context
 
@@ -72,6 +75,11 @@ def diagnose(
     return dataclasses.replace(found, points=len(calset.points))
 
 
+def _promise(choice: Choice) -> tuple[float, float]:
+    """What other descriptions are sorted by: the gain where it is known, then what is left."""
+    return (-choice.better_by if np.isfinite(choice.better_by) else np.inf), choice.left
+
+
 class _Diagnosing:
     """The state of one diagnosis: the current fit and the steps so far."""
 
@@ -90,6 +98,7 @@ class _Diagnosing:
         self.catalogue = applicable(catalogue, self.context, model.template)
         self.wanted: list[Probe] = list(all_probes(self.catalogue, self.context))
         self.steps: list[Step] = []
+        self.choices: dict[str, Choice] = {}
         tell("fitting the model")
         self.fit: FitResult = fit(Likelihood.of(calset, model))
         refuse_mixups(self.fit)
@@ -114,6 +123,8 @@ class _Diagnosing:
             after=self.fit,
             seconds=time.perf_counter() - began,
             points=len(self.calset.points),
+            choices=tuple(sorted(self.choices.values(), key=_promise)),
+            classes=tuple(first.classes()),
         )
 
     def _examine(self, earlier: Examination | None = None) -> Examination:
@@ -125,7 +136,12 @@ class _Diagnosing:
         """Add names until nothing is missing or none is found; the examination of what they leave."""
         while examination.alarm and len(self.steps) < MOST_STEPS and self._time_left():
             self.tell(f"p = {examination.table.p_global:.2g}: something is missing; trying names")
-            added = self._add_best(examination)
+            poor = self.fit.chi2 > POOR_FIT * self.fit.dof
+            redescribed = any(step.effect == OtherDescription.name for step in self.steps)
+            every = poor and (redescribed or not self.steps)
+            added = self._add_best(examination, self._trials(examination), others=every)
+            if added is None and not every:
+                added = self._add_best(examination, iter(()), others=True)
             if added is None:
                 break
             self.tell(f"added {added}; scoring what is left")
@@ -148,30 +164,67 @@ class _Diagnosing:
                     self.tell(f"trying {effect.name}")
                     yield naming.try_effect(self.fit, effect.neutral(self.context), self.context)
 
-    def _add_best(self, examination: Examination) -> str | None:
-        """Add the name with the highest evidence that held-out data confirm; None when there is none."""
+    def _other_descriptions(self) -> Iterator[naming.Trial]:
+        """The instrument described otherwise; what was tried is kept."""
+        choices = Choices(self.fit, self.context, self._time_left, self.tell)
+        yield from choices.trials()
+        self.choices |= choices.tried
+
+    def _add_best(
+        self, examination: Examination, names: Iterator[naming.Trial], *, others: bool
+    ) -> str | None:
+        """Add the name with the highest evidence that held-out data confirm; None when there is none.
+
+        `others`: descriptions compete with the names.
+        """
         trials = [
             t
-            for t in self._trials(examination)
-            if t.fit.converged and t.log_bayes > examination.least_evidence
+            for t in itertools.chain(names, self._other_descriptions() if others else ())
+            if t.fit.converged and t.log_bayes / examination.floor**2 > examination.least_evidence
         ]
-        trials.sort(key=lambda t: -t.log_bayes)
+        trials = self._decided(sorted(trials, key=lambda t: -t.log_bayes))
         for trial in trials:
-            close = tuple(
-                t.effect.name
-                for t in trials
-                if t is not trial and abs(t.log_bayes - trial.log_bayes) < naming.EVEN_ODDS
-            )
+            even = [
+                t for t in trials if t is not trial and abs(t.log_bayes - trial.log_bayes) < naming.EVEN_ODDS
+            ]
+            same = [naming.in_words(t.instance) for t in even if t.effect is trial.effect]
+            trial = dataclasses.replace(trial, alternatives=(*trial.alternatives, *same))
+            close = tuple(t.effect.name for t in even if t.effect is not trial.effect)
             step = self._step(examination, trial, close)
             if step.confirmed:
-                self.steps.append(step)
+                # A further change of the description joins those before.
+                earlier = next((s for s in self.steps if s.effect == step.effect), None)
+                self.steps = [*(s for s in self.steps if s is not earlier), step]
                 self._adopt(trial.fit)
                 if self.fit is not trial.fit:
-                    after = Design.of(self.fit)
-                    compared = before_and_after(step.effect, examination.design, after)
+                    compared = before_and_after(step.effect, examination.design, Design.of(self.fit))
                     self.steps[-1] = dataclasses.replace(step, **compared)
+                if earlier is not None:
+                    self.steps[-1] = dataclasses.replace(
+                        self.steps[-1],
+                        chi2_before=earlier.chi2_before,
+                        heldout_before=earlier.heldout_before,
+                        residual_before=earlier.residual_before,
+                    )
                 return step.effect
         return None
+
+    def _decided(self, trials: list[naming.Trial]) -> list[naming.Trial]:
+        """Trials in order of evidence; what scaled errors leave even at the top is decided with errors as stated."""
+        even = [t for t in trials if trials[0].log_bayes - t.log_bayes < naming.EVEN_ODDS]
+        if self.fit.noise_scale == 1.0 or len(even) < 2:
+            return trials
+        refitted = [
+            dataclasses.replace(t, fit=fit(t.fit.likelihood, start=t.fit.values, noise_scale=1.0))
+            for t in even
+        ]
+        refitted.sort(key=lambda t: t.fit.posterior.objective)
+        best = refitted[0].fit.posterior.objective
+        clearly = [
+            dataclasses.replace(t, log_bayes=t.log_bayes - 0.5 * (t.fit.posterior.objective - best))
+            for t in refitted
+        ]
+        return [*clearly, *trials[len(even) :]]
 
     def _adopt(self, result: FitResult) -> None:
         """Go on with a fit: errors as given where they need not be scaled any more, refuted priors widened."""

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.likelihood import effect_columns, engine
+from walop_jax.likelihood import effect_columns, engine, limits
 from walop_jax.likelihood.expansion import Census, OpticsUsed, Posterior
 from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.layout import Layout
@@ -247,16 +247,18 @@ class Likelihood:
 
     # ----------------------------------------------------------------------------------------- row by row
 
-    def residuals(self, values: Vector) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e k"]]:
+    def residuals(
+        self, values: Vector, *, once: bool = False
+    ) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e k"]]:
         """Best flux and normalised residuals (data − model)/σ of every (point, exposure); 0 where unused.
 
-        The flux is the mean over the arms where each has its own.
+        The flux is the mean over the arms where each has its own. `once`: see `compiled`.
 
         All of them at once: for whole frames take a sample (`thinning.thinned`).
         """
         instrument = self.model.instrument(values)
         nodes, _ = self.nodes(instrument)
-        parts = [engine.residuals(instrument, self.plan, chunk, nodes) for chunk in self.points]
+        parts = [engine.residuals(instrument, self.plan, chunk, nodes, once=once) for chunk in self.points]
         flux, residual = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
         return flux[: self.layout.points].mean(axis=-1), residual[: self.layout.points]
 
@@ -271,9 +273,10 @@ class Likelihood:
 
     def effect_columns(self, values: Vector, probes: tuple[Effect, ...]) -> Float[np.ndarray, "d a"]:
         """Derivatives of the used residuals with respect to the amplitudes of neutral effects added to the model."""
-        instrument = self.model.instrument(values)
+        instrument, once = self.model.instrument(values), self._is_small
         parts = [
-            _rows(effect_columns.effect_columns(instrument, self.plan, probes, c), c) for c in self.points
+            _rows(effect_columns.effect_columns(instrument, self.plan, probes, c, once=once), c)
+            for c in self.points
         ]
         return np.concatenate(parts)
 
@@ -286,10 +289,17 @@ class Likelihood:
         parts = []
         for chunk in self.points:
             cube = np.asarray(
-                effect_columns.effect_columns_over_shapes(instrument, self.plan, stacked, chunk)
+                effect_columns.effect_columns_over_shapes(
+                    instrument, self.plan, stacked, chunk, once=self._is_small
+                )
             )
             parts.append(np.stack([_rows(one, chunk) for one in cube]))
         return np.concatenate(parts, axis=1)
+
+    @property
+    def _is_small(self) -> bool:
+        """Whether columns that are asked for once or twice are compiled for longer than they are computed."""
+        return self.layout.points * len(self.flux_known) <= limits.COMPILED_ONCE
 
     def stokes(self, values: Vector) -> Float[np.ndarray, "p e 4"]:
         """Stokes vectors that enter the instrument, per unit flux."""

@@ -88,6 +88,13 @@ TRUST_ROWS = 20_000
 """(Exposure, point) pairs whose residuals are searched for patterns after every fit: a second, and half a GB."""
 DIAGNOSED_NUMBERS = 120_000_000
 """Numbers that the columns of a diagnosis may hold: 1 GB, of which there are four copies at most."""
+COMPILED_ONCE = 6000
+"""(Exposure, point) pairs of a set up to which columns of effects are compiled without optimisation."""
+CHOICE_ROWS = 6000
+"""(Exposure, point) pairs on which other descriptions of an instrument are compared before any of them is fitted."""
+MANY_POINTS = 4
+"""Field points of an exposure, on average, above which its cameras may have gains of their own: with fewer there are
+nearly as many gains as data."""
 FREE_EXPOSURES = 100
 """Exposures of a set up to which a free-form term may have a number for each camera in each of them."""
 PROJECTED_COLUMNS = 128

@@ -2,7 +2,7 @@
 
 On CPU the fusion emitters of XLA compute shared sub-expressions over and over when a derivative of the plates is
 compiled (measured with jax 0.10.2: 35 s and 9.6 s a call instead of 3 s and 0.08 s), so they are switched off
-there. `tests/model/test_compiled.py` keeps an eye on it.
+there. `tests/model/test_compiled.py` keeps an eye on it. What is called once or twice is not worth optimising.
 """
 
 from __future__ import annotations
@@ -17,16 +17,22 @@ Result = TypeVar("Result")
 
 
 def compiled(function: Callable[..., Result]) -> Callable[..., Result]:
-    """`jax.jit` with this package's options; the back end is looked up at the first call, not at import."""
+    """`jax.jit` with this package's options; the back end is looked up at the first call, not at import.
+
+    A call with `once=True` compiles without optimisation: sooner ready, slower to run.
+    """
 
     @functools.cache
-    def jitted() -> Any:
-        options = {"xla_cpu_use_fusion_emitters": False} if jax.default_backend() == "cpu" else None
-        return jax.jit(function, compiler_options=options)
+    def jitted(once: bool) -> Any:
+        on_cpu = jax.default_backend() == "cpu"
+        options: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if on_cpu else {}
+        if once:
+            options["xla_backend_optimization_level"] = 0
+        return jax.jit(function, compiler_options=options or None)
 
     @functools.wraps(function)
-    def call(*args: Any) -> Result:
-        return jitted()(*args)
+    def call(*args: Any, once: bool = False) -> Result:
+        return jitted(once)(*args)
 
     return call
 

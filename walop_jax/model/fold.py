@@ -120,13 +120,17 @@ def _stacked(
     """Matrices of a station in every state, None where it is the identity in all."""
     if element.moves is None:
         return matrices[number, None]
-    own = [None if at is None else matrices[number, at] for at in positions(element, moving, keys)]
+    angles = positions(element, moving, keys)
+    distinct = list(dict.fromkeys(angles))
+    own = [None if at is None else matrices[number, at] for at in distinct]
     inside = [matrix for matrix in own if matrix is not None]
     if not inside:
         return None
     whole = np.broadcast_shapes(*(matrix.shape for matrix in inside))
     eye = jnp.broadcast_to(jnp.eye(4), whole)
     stack = jnp.stack([eye if m is None else jnp.broadcast_to(m, whole) for m in own])
+    if len(distinct) < len(angles):
+        stack = stack[np.array([distinct.index(at) for at in angles])]
     return stack if len(whole) == 3 else stack[:, None]
 
 

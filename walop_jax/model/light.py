@@ -32,6 +32,7 @@ from walop_jax.model.sources import ExposureArrays, Sight, Source, turned
 
 Scalar = Float[Array, ""]
 FEW_BANDS = 3
+FEW_SETTINGS = 4  # up to which band integrals are done one by one
 BROAD = 0.05  # µm: equivalent width from which a filter is displaced by `Instrument.filter_shift`
 
 
@@ -150,12 +151,17 @@ def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float
     else:
         rows = at(wavelength)
     weights = band_weights(instrument, plan)
-    bands = jnp.concatenate(
-        [
-            jnp.einsum("bn,nrs->brs", weights[first:last], rows[i])
-            for i, (_, first, last) in enumerate(plan.settings)
-        ]
-    )
+    sizes = {last - first for _, first, last in plan.settings}
+    if len(sizes) == 1 and len(plan.settings) > FEW_SETTINGS:
+        own = weights.reshape(len(plan.settings), *sizes, -1)
+        bands = jnp.einsum("cbn,cnrs->cbrs", own, rows).reshape(-1, *rows.shape[2:])
+    else:
+        bands = jnp.concatenate(
+            [
+                jnp.einsum("bn,nrs->brs", weights[first:last], rows[i])
+                for i, (_, first, last) in enumerate(plan.settings)
+            ]
+        )
     analysers, mean = [arm.analyser for arm in instrument.arms], weights @ wavelength
     if all(analyser.balance is None and analyser.loss is None for analyser in analysers):
         return bands

@@ -1,10 +1,12 @@
 """Refractive indices of the glasses and crystals in the light path.
 
-Equations   Sellmeier formula 1, n² = 1 + Σ B λ²/(λ² − C²) (Dodge), and formula 2, n² = A + Σ B λ²/(λ² − C)
-            (Schott, Ghosh). Mixing the two up is the classic mistake; `FORMULA` says which is which.
+Equations   Sellmeier formula 1, n² = 1 + Σ B λ²/(λ² − C²) (Dodge, Radhakrishnan; Li with a constant), and formula 2,
+            n² = A + Σ B λ²/(λ² − C) (Schott, Ghosh). Mixing the two up is the classic mistake; `_formula_1` says which
+            is which.
 Symbols     λ vacuum wavelength [µm]; n refractive index; A, B dimensionless; C [µm] in formula 1, [µm²] in 2.
 Sources     beside the numbers; the curves as transcribed in the refractiveindex.info database. They hold at 0.3–2.5 µm
-            and 20 °C (N-BK7), 0.198–2.05 µm (quartz), 0.2–7 µm and 19 °C (MgF2).
+            and 20 °C (N-BK7), 0.198–2.05 µm (quartz), 0.2–7 µm and 19 °C (MgF2); the others at 0.18–3 µm and 18 °C
+            (quartz), 0.14–7.5 µm and 20 °C (MgF2).
 """
 
 from __future__ import annotations
@@ -39,6 +41,16 @@ QUARTZ_E = Sellmeier(1.28851804, (1.09509924, 1.15662475), (0.0102101864, 100.0)
 MGF2_O = _formula_1((0.48755108, 0.39875031, 2.3120353), (0.04338408, 0.09461442, 23.793604))
 MGF2_E = _formula_1((0.41344023, 0.50497499, 2.4904862), (0.03684262, 0.09076162, 23.771995))
 
+# Other measurements of the same crystals: they differ by some 10⁻³ of the birefringence, and more in its slope.
+QUARTZ_O_1951 = _formula_1(
+    (0.663044, 0.517852, 0.175912, 0.565380, 1.675299), (0.060, 0.106, 0.119, 8.844, 20.742)
+)
+QUARTZ_E_1951 = _formula_1(
+    (0.665721, 0.503511, 0.214792, 0.539173, 1.807613), (0.060, 0.106, 0.119, 8.792, 19.70)
+)
+MGF2_O_1980 = Sellmeier(1.27620, (0.60967, 0.0080, 2.14973), (0.08636**2, 18.0**2, 25.0**2))
+MGF2_E_1980 = Sellmeier(1.25385, (0.66405, 1.0899, 0.1816, 2.1227), (0.08504**2, 22.2**2, 24.4**2, 40.6**2))
+
 # Relative change of birefringence per kelvin, −(1/Δn) dΔn/dT.
 QUARTZ_THERMAL = 1.23e-4
 MGF2_THERMAL = 5.37e-5
@@ -65,6 +77,22 @@ _ETZEL = "Etzel, Rose & Wang 2000, Appl. Opt. 39, 5796 (temperature)"
 CRYSTALS = {
     "quartz": Crystal(QUARTZ_O, QUARTZ_E, QUARTZ_THERMAL, f"Ghosh 1999, Opt. Commun. 163, 95; {_ETZEL}"),
     "mgf2": Crystal(MGF2_O, MGF2_E, MGF2_THERMAL, f"Dodge 1984, Appl. Opt. 23, 1980; {_ETZEL}"),
+}
+OTHER_CURVES = {
+    "quartz": {"quartz_1951": "Radhakrishnan 1951"},
+    "mgf2": {"mgf2_1980": "Li 1980"},
+}
+"""Crystals with the same name to a reader and another published dispersion: what a description may have meant."""
+CRYSTALS |= {
+    "quartz_1951": Crystal(
+        QUARTZ_O_1951,
+        QUARTZ_E_1951,
+        QUARTZ_THERMAL,
+        f"Radhakrishnan 1951, Proc. Indian Acad. Sci. 31, 22; {_ETZEL}",
+    ),
+    "mgf2_1980": Crystal(
+        MGF2_O_1980, MGF2_E_1980, MGF2_THERMAL, f"Li 1980, J. Phys. Chem. Ref. Data 9, 161; {_ETZEL}"
+    ),
 }
 GLASSES = {"BK7": Glass(BK7, "Schott 2017, data sheet of N-BK7")}
 """Materials that a description file may name."""

@@ -33,6 +33,12 @@ def pupil_direction(
     return tx * norm, ty * norm, norm
 
 
+def rotated(kx: Real, ky: Real, angle: Real) -> tuple[Real, Real]:
+    """A transverse direction turned by `angle` (deg) from +X toward +Y."""
+    c, s = jnp.cos(jnp.deg2rad(angle)), jnp.sin(jnp.deg2rad(angle))
+    return c * kx - s * ky, s * kx + c * ky
+
+
 def behind_wedge(direction: tuple[Real, Real, Real], angle: Real, index: Real) -> tuple[Real, Real]:
     """Transverse direction (sx, sy) behind a wedge of `angle` (rad) and refractive `index`."""
     kx, ky, kz = direction

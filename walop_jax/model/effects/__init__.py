@@ -22,6 +22,7 @@ from walop_jax.model.effects.lens_birefringence import LensBirefringence
 from walop_jax.model.effects.moon_multiple_scattering import MoonMultipleScattering
 from walop_jax.model.effects.moon_patch import MoonPatch
 from walop_jax.model.effects.nonlinearity import Nonlinearity
+from walop_jax.model.effects.other_description import OtherDescription
 from walop_jax.model.effects.pedestal import Pedestal
 from walop_jax.model.effects.plate_axis import ChwpAxis, Hwp1Axis, Hwp2Axis
 from walop_jax.model.effects.plate_crossing import Hwp1Crossing, Hwp2Crossing
@@ -70,7 +71,7 @@ EFFECTS: tuple[type[Effect], ...] = (
 
 def effect_by_name(name: str, catalogue: Sequence[type[Effect]] = EFFECTS) -> type[Effect]:
     """The effect of a catalogue by its name; ValueError with the nearest names when there is none."""
-    for effect in (*catalogue, FreeForm):
+    for effect in (*catalogue, FreeForm, OtherDescription):
         if effect.name == name:
             return effect
     error = unknown_name("effect", name, [effect.name for effect in catalogue])
@@ -78,9 +79,12 @@ def effect_by_name(name: str, catalogue: Sequence[type[Effect]] = EFFECTS) -> ty
 
 
 def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
-    """Effects in the order in which light meets them; what is not in the catalogue comes last."""
-    order = {effect.name: place for place, effect in enumerate(EFFECTS)}
+    """Effects in the order in which light meets them; what is not in the catalogue comes last.
+
+    How the instrument is described comes first: the others act on that.
+    """
+    order = {effect.name: place for place, effect in enumerate((OtherDescription, *EFFECTS))}
     return tuple(sorted(effects, key=lambda effect: order.get(effect.name, len(order))))
 
 
-__all__ = ["EFFECTS", "Context", "Effect", "FreeForm", "effect_by_name", "in_order"]
+__all__ = ["EFFECTS", "Context", "Effect", "FreeForm", "OtherDescription", "effect_by_name", "in_order"]

@@ -50,13 +50,15 @@ class Effect(Component):
     amplitudes, and nothing happens when they are neutral, whatever the shape. `starts` are groups of shapes
     from which to look for the effect: groups are alternatives, the members of a group are directions that
     are fitted together and that `combine` turns into one effect. `one_sided` names amplitudes that physics
-    keeps above neutral; `reference` says where the effect is known from.
+    keeps above neutral; `over_field` says that only a number of field points can show it; `reference` says where
+    the effect is known from.
     """
 
     name: ClassVar[str] = ""
     shape: ClassVar[tuple[str, ...]] = ()
     starts: ClassVar[tuple[tuple[Mapping[str, Any], ...], ...]] = (({},),)
     one_sided: ClassVar[tuple[str, ...]] = ()
+    over_field: ClassVar[bool] = False
     revealed_by: ClassVar[str] = ""
     separated_by: ClassVar[str] = ""
     reference: ClassVar[str] = ""

@@ -61,6 +61,7 @@ class Blemish(Effect):
     camera: int = eqx.field(static=True, default=0)
 
     name: ClassVar[str] = "blemish"
+    over_field: ClassVar[bool] = True
     reference: ClassVar[str] = SOURCE
     shape: ClassVar[tuple[str, ...]] = ("x", "y", "size")
     one_sided: ClassVar[tuple[str, ...]] = ("depth",)

@@ -33,6 +33,7 @@ class Flexure(Effect):
     )
 
     name: ClassVar[str] = "flexure"
+    over_field: ClassVar[bool] = True
     reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = "polariser exposures at different hour angles"
     separated_by: ClassVar[str] = "the same polariser angles at several hour angles and at one temperature"

@@ -47,6 +47,7 @@ class Ghost(Effect):
     )
 
     name: ClassVar[str] = "ghost"
+    over_field: ClassVar[bool] = True
     reference: ClassVar[str] = SOURCE
     one_sided: ClassVar[tuple[str, ...]] = ("share",)
     revealed_by: ClassVar[str] = "extended sources and stars at the same field points"

@@ -42,6 +42,7 @@ class Pedestal(Effect):
     level: Float[Array, " k"] = param(unit="", about="share of the median counts", source=SOURCE, width=0.003)
 
     name: ClassVar[str] = "pedestal"
+    over_field: ClassVar[bool] = True  # the median of one point is its own count
     reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = (
         "polariser exposures: modulation of one camera that is diluted by light of all angles"

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -52,8 +53,21 @@ class Element(Component):
 
     @classmethod
     def solved(cls, cases: Sequence[tuple[Any, Ray]]) -> list[Mueller | None]:
-        """Mueller matrices of several elements of this class; overridden where solving them together pays."""
-        return [element.mueller(ray) for element, ray in cases]
+        """Mueller matrices of several elements of this class; overridden where solving them together pays.
+
+        One element at many angles is traced once: an instrument with many settings would take minutes otherwise.
+        """
+        result: list[Mueller | None] = [None] * len(cases)
+        for members in _turned_copies(cases):
+            element, ray = cases[members[0]]
+            if len(members) == 1:
+                result[members[0]] = element.mueller(ray)
+                continue
+            axes = jnp.stack([cases[i][0].axis for i in members])
+            matrices = jax.vmap(_at_axis, (None, 0, None))(element, axes, ray)
+            for place, i in enumerate(members):
+                result[i] = None if matrices is None else matrices[place]
+        return result
 
     def turned(self, angle: float) -> Self:
         """The element turned by `angle` (deg) from +X toward +Y. Raises TypeError if it has no `axis`."""
@@ -69,3 +83,16 @@ class Element(Component):
     def path_difference(self) -> float:
         """See the class."""
         return 0.0
+
+
+def _at_axis(element: Any, axis: Float[Array, ""], ray: Ray) -> Mueller | None:
+    return dataclasses.replace(element, axis=axis).mueller(ray)
+
+
+def _turned_copies(cases: Sequence[tuple[Any, Ray]]) -> list[list[int]]:
+    """Positions of the cases that are one element at different angles, met by the same ray."""
+    groups: dict[tuple[int, ...], list[int]] = {}
+    for i, (element, ray) in enumerate(cases):
+        parts = [getattr(element, f.name) for f in dataclasses.fields(element) if f.name != "axis"]
+        groups.setdefault((*map(id, parts), id(ray)), []).append(i)
+    return list(groups.values())

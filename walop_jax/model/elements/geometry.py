@@ -42,10 +42,13 @@ class Wedge(Element):
 
     `frame` says what becomes of the plane of vibration: `kept` in the carried axes of the rays (no rotation), or
     `turned` with the ray at each face, as it is for light (see `optics.wedge_rotation`). `sense` −1: the other
-    way round.
+    way round. It bends light along +X, or along `azimuth` from +X toward +Y.
     """
 
     angle: Scalar = number(unit="rad", about="wedge angle")
+    azimuth: Scalar | None = number(
+        unit="deg", about="where it bends light to, from +X toward +Y", default=None
+    )
     material: str = eqx.field(static=True, default="BK7")
     frame: str = eqx.field(static=True, default=FRAMES[0])
     sense: float = eqx.field(static=True, default=1.0)
@@ -59,7 +62,14 @@ class Wedge(Element):
 
     def ray(self, ray: Ray) -> Ray:
         """The ray behind the wedge."""
-        return ray.toward(*optics.behind_wedge((ray.kx, ray.ky, ray.kz), self.turn, self.index(ray)))
+        behind = optics.behind_wedge(self.direction(ray), self.turn, self.index(ray))
+        return ray.toward(*(behind if self.azimuth is None else optics.rotated(*behind, self.azimuth)))
+
+    def direction(self, ray: Ray) -> tuple[Scalar, Scalar, Scalar]:
+        """The direction of a ray with +X where the wedge bends light to."""
+        if self.azimuth is None:
+            return ray.kx, ray.ky, ray.kz
+        return *optics.rotated(ray.kx, ray.ky, -self.azimuth), ray.kz
 
     @property
     def turn(self) -> Scalar:
@@ -74,8 +84,7 @@ class Wedge(Element):
         """Rotation of the plane of vibration against the carried axes; None where it is kept."""
         if self.frame == "kept":
             return None
-        direction = (ray.kx, ray.ky, ray.kz)
-        return mueller.rotation(-optics.wedge_rotation(direction, self.turn, self.index(ray)))
+        return mueller.rotation(-optics.wedge_rotation(self.direction(ray), self.turn, self.index(ray)))
 
 
 class FieldShift(Element):

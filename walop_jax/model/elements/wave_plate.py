@@ -27,6 +27,8 @@ from walop_jax.model.ray import Ray
 
 Scalar = Float[Array, ""]
 Real = Float[Array, "..."]
+Known = dict[tuple[str, int], tuple[Real, Real]]
+"""Ordinary and extraordinary indices by crystal and array of wavelengths (its `id`, while the rays live)."""
 REFERENCE_WAVELENGTH = 0.62  # µm
 MODELS = {"waves": plates.stack_mueller, "fixed_axis": plates.fixed_axis_mueller}
 
@@ -85,13 +87,17 @@ class WavePlate(Element):
         """Of the air gaps: there and back."""
         return 2.0 * max((gap.longest for gap in self.air_gaps), default=0.0)
 
-    def crystals(self, ray: Ray) -> tuple[plates.Plate, ...]:
-        """The layers at the wavelengths of a ray."""
-        made = []
+    def crystals(self, ray: Ray, known: Known | None = None) -> tuple[plates.Plate, ...]:
+        """The layers at the wavelengths of a ray; `known` keeps indices of refraction from plate to plate."""
+        made, known = [], {} if known is None else known
         for layer in self.layers:
-            crystal = materials.CRYSTALS[layer.material]
-            ordinary = crystal.ordinary.refractive_index(ray.wavelength)
-            extraordinary = crystal.extraordinary.refractive_index(ray.wavelength)
+            crystal, case = materials.CRYSTALS[layer.material], (layer.material, id(ray.wavelength))
+            if case not in known:
+                known[case] = (
+                    crystal.ordinary.refractive_index(ray.wavelength),
+                    crystal.extraordinary.refractive_index(ray.wavelength),
+                )
+            ordinary, extraordinary = known[case]
             changes = (layer.slope, layer.bend, layer.twist)
             if any(change is not None for change in changes):
                 u = ray.wavelength - REFERENCE_WAVELENGTH
@@ -131,7 +137,8 @@ def _solved_together(cases: Sequence[tuple[WavePlate, Ray]], model: str) -> Floa
     def together(*values: Real) -> Float[Array, "c n"]:
         return jnp.stack([jnp.broadcast_to(value, nodes) for value in values])
 
-    stacks = [plate.crystals(ray) for plate, ray in cases]
+    known: Known = {}
+    stacks = [plate.crystals(ray, known) for plate, ray in cases]
     if any(crystal.cut is not None for stack in stacks for crystal in stack):
         stacks = [tuple(_with_cut(crystal) for crystal in stack) for stack in stacks]
     kx, ky = together(*(ray.kx for _, ray in cases)), together(*(ray.ky for _, ray in cases))
