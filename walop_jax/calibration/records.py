@@ -245,8 +245,11 @@ class CalibrationProduct:
         if self.residuals is not None and self.residuals.arms != self.maps.arms:
             raise ValueError(f"a residual map of {self.residuals.arms} arms, the matrix has {self.maps.arms}")
 
-    def content_hash(self) -> str:
-        """SHA-256 of what the product says of the instrument: not of dates, paths and versions."""
+    def content_hash(self, *, every_column: bool = True) -> str:
+        """SHA-256 of what the product says of the instrument: not of dates, paths and versions.
+
+        Without `every_column` only those columns of the exposures that the hashes of first products covered.
+        """
         digest = hashlib.sha256()
         verdict = self.verdict
         # Twelve digits: a number in a FITS header may lose its last bit.
@@ -262,18 +265,23 @@ class CalibrationProduct:
         ]
         for text in texts:
             digest.update(text.encode() + b"\n")
-        for values in self._arrays():
+        for values in self._arrays(every_column):
             if values.dtype.kind in "US":
                 digest.update("\n".join(values.astype(str).ravel().tolist()).encode() + b"\n")
             else:
                 digest.update(np.asarray(values, "<f8").tobytes())
         return digest.hexdigest()
 
-    def _arrays(self) -> Iterable[np.ndarray]:
+    def _arrays(self, every_column: bool) -> Iterable[np.ndarray]:
         for record in (self.parameters, self.sources):
             yield from (getattr(record, entry.name) for entry in dataclasses.fields(record))
-        for name, values in self.exposures.columns().items():
-            yield from (np.array([name]), values)
+        if every_column:
+            for name, values in self.exposures.columns().items():
+                yield from (np.array([name]), values)
+        else:
+            yield from (getattr(self.exposures, name) for name in ("exposure", "kind", "mjd", "filter"))
+            for prefix, position in self.exposures.moving.items():
+                yield from (np.array([prefix]), position.inside, position.angle)
         yield from (self.covariance, self.maps.values, self.maps.errors)
         if self.residuals is not None:
             yield from (self.residuals.values, self.residuals.errors, self.residuals.chi2)

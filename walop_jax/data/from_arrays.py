@@ -15,6 +15,7 @@ from walop_jax.data import schema
 from walop_jax.data.calset import set_from_hdus
 from walop_jax.data.quantities import in_unit
 from walop_jax.data.records import CalibrationSet, FilterCurve, Site
+from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.write import filter_columns, set_hdus, table_hdu
 from walop_jax.io.errors import fail
 from walop_jax.io.fits_reading import OpenFile
@@ -123,7 +124,12 @@ def checked(calset: CalibrationSet, kinds: Collection[str] = ()) -> CalibrationS
 
     `kinds` are kinds of exposures beyond those of the format. Raises `DataError` as `read_calibration_set` does.
     """
-    return set_from_hdus(_in_memory(set_hdus(calset, NAME)), kinds)
+    found = set_from_hdus(_in_memory(set_hdus(calset, NAME)), kinds)
+    before, after = calset.intensities, found.intensities
+    if isinstance(before, TableIntensities) and isinstance(after, TableIntensities):
+        # A file says why a row is not to be used, memory only that it is not.
+        return dataclasses.replace(found, intensities=after.using(after.used & before.used))
+    return found
 
 
 def _in_memory(hdus: list[Any]) -> OpenFile:

@@ -7,7 +7,7 @@ import math
 _MOST_PLACES = 8
 _WRITTEN_OUT = 1e7
 _TINY = 1e-15  # probabilities below are not to be taken at their word
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def with_error(value: float, sigma: float) -> str:
@@ -68,8 +68,8 @@ def probability(p: float | None) -> str:
     if p >= 1e-3:
         return f"= {p:.2g}"
     mantissa, exponent = f"{p:.1e}".split("e")
-    return f"= {mantissa} × 10{str(int(exponent)).translate(_RAISED)}"
+    return f"= {mantissa} × 10{str(int(exponent)).translate(RAISED)}"
 
 
 def _power(value: float) -> str:
-    return "10" + str(round(math.log10(value))).translate(_RAISED)
+    return "10" + str(round(math.log10(value))).translate(RAISED)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 
 from walop_jax.reports.style import AFTER, FONT, SMALL, empty_figure, field_axes
 from walop_jax.science.field_accuracy import FieldAccuracy
@@ -36,6 +37,8 @@ def accuracy_figure(accuracy: FieldAccuracy) -> Figure:
         100.0 * GOAL, 1.01, " goal 0.1 %", fontsize=SMALL, transform=right.get_xaxis_transform(), va="bottom"
     )
     right.set_xscale("log")
+    for scale in (bar.ax.yaxis, right.xaxis):
+        scale.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     right.set_xlim(edges[0], max(edges[-1], 150.0 * GOAL))
     right.set_xlabel("standard error of p (%)", fontsize=FONT)
     right.set_ylabel("points of the map", fontsize=FONT)

@@ -27,6 +27,7 @@ from walop_jax.reports.run import RunContents
 from walop_jax.reports.wording import (
     UNNAMED,
     effect_in_words,
+    unit_in_words,
     verdict_of_diagnosis,
     verdict_of_fit,
 )
@@ -53,6 +54,7 @@ def environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    made.filters["unit"] = unit_in_words
     made.globals.update(
         effect_in_words=effect_in_words,
         value_and_error=value_and_error,
@@ -167,7 +169,7 @@ def _pulls(run: RunContents) -> list[dict[str, Any]]:
             "name": str(table.name[i]),
             "value": with_error(float(table.value[i]), float(table.sigma[i])),
             "unit": str(table.unit[i]),
-            "prior": f"{with_minus_sign(f'{table.prior_mean[i] + 0.0:.6g}')} ± {table.prior_width[i]:.3g}",
+            "prior": with_error(float(table.prior_mean[i]), float(table.prior_width[i])),
             "pull": with_minus_sign(f"{size:+.2f}"),
             "strong": abs(float(size)) > STRONG_PULL,
         }

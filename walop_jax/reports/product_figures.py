@@ -11,6 +11,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from walop_jax.calibration.records import MatrixMaps, ResidualMap
+from walop_jax.io.rounding import two_digits
 from walop_jax.reports.matrix_panels import (
     element_kind,
     element_panel,
@@ -57,7 +58,8 @@ def matrix_errors_figure(maps: MatrixMaps) -> Figure:
     norm = LogNorm(min(max(100.0 * float(maps.errors.min()), 1e-3 * high), 0.5 * high), high, clip=True)
     image = None
     for axis, errors, name in zip(axes.ravel(), maps.errors, element_symbols(len(axes)), strict=True):
-        field_axes(axis, f"error of {name}")
+        low, most = (two_digits(100.0 * float(value)) for value in (errors.min(), errors.max()))
+        field_axes(axis, f"error of {name} (%)\n{low} … {most}")
         image = axis.imshow(
             100.0 * errors,
             origin="lower",

@@ -5,11 +5,12 @@ An agreement is "consistent with" a cause, never proof of one.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from walop_jax.diagnosis.figure_data import UNNAMED
-from walop_jax.io.rounding import probability, rounded, value_and_error
+from walop_jax.io.rounding import RAISED, probability, rounded, value_and_error
 from walop_jax.model.effects import EFFECTS
 
 MOST_PARAMETERS = 6  # of an effect, in a sentence
@@ -24,6 +25,12 @@ def effect_in_words(effect: str) -> str:
     if known is None:
         return ""
     return in_a_sentence((known.__doc__ or "").strip().splitlines()[0].rstrip("."))
+
+
+def unit_in_words(unit: str) -> str:
+    """A unit as it is printed: µm, deg⁻²."""
+    raised = re.sub(r"(?<=[A-Za-z])-?\d+", lambda power: power[0].translate(RAISED), unit)
+    return "µm" if raised == "um" else raised
 
 
 def in_a_sentence(text: str) -> str:
