@@ -9,7 +9,8 @@ points leaves,
 
 after one Gauss–Newton step from the model as designed, the errors of the data scaled by s as the fit of the set as it
 stands asks for, so that priors hold what residuals of a wrong model would bend. The best ones take more steps. What
-brings χ²/dof − 1 below a tenth of what the fit of the set as it stands has left is told.
+brings χ²/dof − 1 below a tenth of what the fit of the set as it stands has left, and below what a fit would call far
+off, is told.
 
 Symbols     J, r Jacobian and whitened residuals; P inverse prior variances; θ₀ start values.
 Limits      One mix-up at a time. Two that do the same to these data are told together.
@@ -96,7 +97,8 @@ def mixups(calset: CalibrationSet, model: Model, left: float) -> tuple[Alternati
     for readings in (_readings(few, model), _instruments(few)):
         tried = [_judged(one, few, model, left, _STEPS[0]) for one in readings]
         best = [_judged(one, few, model, one.explained, _STEPS[1]) for one in _sorted(tried)[:_BEST]]
-        good = [one for one in _sorted(best) if one.explained - 1.0 < (left - 1.0) / GAIN]
+        enough = min(1.0 + (left - 1.0) / GAIN, FAR_OFF)
+        good = [one for one in _sorted(best) if one.explained < enough]
         if good:
             return tuple(one for one in good if one.explained < _ALIKE * good[0].explained)
     return ()

@@ -26,7 +26,7 @@ from walop_jax.likelihood import limits
 from walop_jax.model import carried, light
 from walop_jax.model.parameters import with_values
 from walop_jax.science.chance import chi2_tail
-from walop_jax.science.estimate import calibration_shift, estimate, estimate_by_arm
+from walop_jax.science.estimate import calibration_shift, estimate_with
 
 MOST_SETTINGS = 200
 ILL_POSED = 10.0  # ratio of the errors of the two principal directions from which FLAG 16 is set
@@ -122,11 +122,7 @@ def _stars_of_rows(
         spectra[here] = vectors.at(settings[k], x[here], y[here])
     there = np.einsum("rc,rcks->rks", colour_weights(teff, COLOURS), spectra)
     used = np.where(outside[:, None], np.nan, counts)
-    on_sky, cameras = _vectors_on_sky(there, turn), vectors.instrument.cameras
-    if cameras.split:
-        found = estimate_by_arm(on_sky, used, sigma, star, cameras.pairs)
-    else:
-        found = estimate(on_sky, used, sigma, star)
+    found = estimate_with(vectors.instrument.cameras, _vectors_on_sky(there, turn), used, sigma, star)
 
     s = _instrument_stokes(found.qu[star], turn)
     derivative = np.empty((len(rows), 2, len(vectors.parameters)))

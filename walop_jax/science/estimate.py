@@ -27,6 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from walop_jax.likelihood.flux import project_flux
+from walop_jax.model.cameras import Cameras
 
 STEPS = 40
 CONVERGED = 1e-13  # of the largest step in q, u, or 1e-9 σ
@@ -97,6 +98,19 @@ def estimate(
         flux=flux,
         gain=gain,
     )
+
+
+def estimate_with(
+    cameras: Cameras,
+    vectors: Float[np.ndarray, "r k 3"],
+    counts: Float[np.ndarray, "r k"],
+    sigma: Float[np.ndarray, "r k"],
+    star: Int[np.ndarray, " r"],
+) -> Estimate:
+    """As `estimate`, by arm where the shares of the arms in the light are not known."""
+    if cameras.split:
+        return estimate_by_arm(vectors, counts, sigma, star, cameras.pairs)
+    return estimate(vectors, counts, sigma, star)
 
 
 def estimate_by_arm(

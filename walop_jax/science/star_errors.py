@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.data.settings import Settings
-from walop_jax.science.estimate import estimate
+from walop_jax.science.estimate import estimate, estimate_with
 
 STARS, LARGEST_P = 100, 0.05
 GOAL = 0.001
@@ -79,7 +79,8 @@ def promised_errors(
     vectors = analysis.coloured(setting, x, y)
     counts = _ELECTRONS * transmitted(vectors, stars)
     n, rows = len(stars), counts.reshape(-1, counts.shape[-1])
-    found = estimate(np.repeat(vectors, n, axis=0), rows, np.sqrt(rows), np.arange(len(rows)))
+    seen, star = np.repeat(vectors, n, axis=0), np.arange(len(rows))
+    found = estimate_with(analysis.instrument.cameras, seen, rows, np.sqrt(rows), star)
     local = analysis.derivatives(setting, x, y, np.full(len(x), np.nan))
     gain = found.gain.reshape(len(x), n, 2, -1)
     s = np.concatenate([np.ones((n, 1)), stars], axis=1)
@@ -107,7 +108,7 @@ def plate_errors(
     rows = np.stack([analysis.coloured(s, x, y) for s in settings], axis=1)
     counts = _ELECTRONS * rows[..., 0]
     each, star = counts.reshape(n * r, -1), np.repeat(np.arange(n), r)
-    found = estimate(rows.reshape(n * r, -1, 3), each, np.sqrt(each), star)
+    found = estimate_with(analysis.instrument.cameras, rows.reshape(n * r, -1, 3), each, np.sqrt(each), star)
     worst = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(found.photon, nan=np.inf))[:, 1])
     # q from a normalised difference with half of the electrons: σ² = 2 / all electrons.
     return worst / np.sqrt(2.0 / counts.sum(axis=(1, 2)))
