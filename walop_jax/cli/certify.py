@@ -39,6 +39,8 @@ def certify(
     elif not quiet:
         for check in found.checks:
             typer.echo(f"{'ok ' if check.passed else 'BAD'} {check.name}: {check.found}")
+        if not found.failed:
+            typer.echo("fit for use")
     if found.failed:
         raise CommandError(
             f"{found.path}: not valid: "

@@ -66,7 +66,8 @@ def _effect(effect: type[Effect]) -> Iterator[str]:
             for n, d in field_declarations(effect).items()
         ],
     )
-    if effect.revealed_by:
+    said = _head_text(effect)
+    if effect.revealed_by and "\nRevealed" not in said:
         yield f"**Revealed by** {effect.revealed_by}."
         yield ""
     found = numbers()
@@ -83,7 +84,7 @@ def _effect(effect: type[Effect]) -> Iterator[str]:
     if effect.separated_by:
         yield f"**Told apart by** {effect.separated_by}."
         yield ""
-    if effect.reference:
+    if effect.reference and "\nSource" not in said:
         yield f"Source: {effect.reference}."
 
 
@@ -136,7 +137,7 @@ def _element(kind: type[Element]) -> Iterator[str]:
     if changed:
         yield f"Effects that speak of it: {', '.join(f'`{name}`' for name in changed)}."
         yield ""
-    if kind.reference:
+    if kind.reference and "\nSource" not in _head_text(kind):
         yield f"Source: {kind.reference}."
 
 
