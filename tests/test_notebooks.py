@@ -52,9 +52,12 @@ def test_there_are_notebooks():
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_are_stored_as_they_came_out(path: Path):
-    """Run from beginning to end in one go, so that readers see the figures; nothing in them names a machine."""
+    """Run from beginning to end in one go, so that readers see the figures, or not at all; without a machine's names."""
     cells = [cell for cell in read(path).cells if cell.cell_type == "code"]
-    assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
+    counts = [cell.execution_count for cell in cells]
+    if path.stem in NOT_OURS and counts == [None] * len(cells):
+        return
+    assert counts == list(range(1, len(cells) + 1))
     outputs = [out for cell in cells for out in cell.outputs]
     assert not [out for out in outputs if out.output_type == "error" or out.get("name") == "stderr"]
     assert len([out for out in outputs if "image/png" in out.get("data", {})]) >= 3

@@ -44,7 +44,7 @@ def test_read_gives_what_a_path_holds(fitted):
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("set.csv", "is no calibration set"), ("", "holds no results"), ("absent.fits", "no such file")],
+    [("set.csv", "is not a calibration set"), ("", "holds no results"), ("absent.fits", "no such file")],
 )
 def test_read_says_what_a_path_is_not(tmp_path, name, message):
     (tmp_path / "set.csv").write_text("X,Y\n1,2\n")
