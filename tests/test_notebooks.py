@@ -12,14 +12,6 @@ import pytest
 
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
-LONG = (
-    "charis",
-    "hidden_effect",
-    "paper_versus_joint",
-    "posteriors",
-    "walop_north_design",
-    "your_own_effect",
-)  # minutes each; the rooms that they call have tests of their own
 NOT_OURS = {
     "charis": ("CHARIS_TABLE", "charis_internal.ecsv"),
     "walop_north_design": ("NORTH_DESIGN", "walop_north_design.fits"),
@@ -52,7 +44,7 @@ def test_there_are_notebooks():
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_are_stored_as_they_came_out(path: Path):
-    """Run from beginning to end in one go, so that readers see the figures, or not at all; without a machine's names."""
+    """Run from beginning to end in one go, so that readers see the figures, or not at all; no machine is named."""
     cells = [cell for cell in read(path).cells if cell.cell_type == "code"]
     counts = [cell.execution_count for cell in cells]
     if path.stem in NOT_OURS and counts == [None] * len(cells):
@@ -88,11 +80,8 @@ def test_notebooks_are_prose_and_calls(path: Path):
 # The machinery of Jupyter warns of its own future; its sockets may be collected late.
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.parametrize(
-    "path",
-    [pytest.param(p, marks=pytest.mark.long) if p.stem in LONG else p for p in NOTEBOOKS],
-    ids=lambda path: path.stem,
-)
+@pytest.mark.long  # half a minute to minutes each; the rooms that they call have tests of their own
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_run(path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch):
     from nbclient import NotebookClient
 

@@ -101,6 +101,7 @@ def test_rows_are_computed_each_with_its_own_numbers(calibration):
     assert np.abs(difference).max() > 1e-3
 
 
+@pytest.mark.long
 def test_covariance_is_that_of_finite_differences(calibration):
     """C_m = J C_θ Jᵀ with J by central differences in the directions that matter most."""
     value, vector = np.linalg.eigh(calibration.covariance)

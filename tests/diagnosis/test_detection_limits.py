@@ -100,7 +100,12 @@ def alarms(space: ScoreSpace, scores: np.ndarray, threshold: float) -> float:
 
 
 @pytest.mark.parametrize(
-    ("name", "carried"), [("telescope_polarisation", True), ("camera_leakage", True), ("ghost", False)]
+    ("name", "carried"),
+    [
+        ("camera_leakage", True),
+        pytest.param("telescope_polarisation", True, marks=pytest.mark.long),
+        pytest.param("ghost", False, marks=pytest.mark.long),
+    ],
 )
 def test_what_goes_unnoticed_is_what_a_fit_without_the_effect_gets_wrong(fitted, name: str, carried: bool):
     """The matrix of a fit to noiseless data with the effect in them, against the true one: to first order the same."""

@@ -84,7 +84,7 @@ class Rehearsal(workflow._Diagnosing):
 
     def __init__(self):
         self.calset, self.catalogue = SimpleNamespace(points=()), ()
-        self.fit = Mock(spec=FitResult, explains_data=True)
+        self.fit = Mock(spec=FitResult, explains_data=True, chi2=1.0, dof=1)
         self.steps = ["name"]
         self.tell, self.until = lambda text: None, float("inf")
 

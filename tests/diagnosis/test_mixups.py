@@ -91,8 +91,12 @@ CASES: dict[str, tuple[Spoil, str]] = {
 }  # fmt: skip
 
 
-@pytest.mark.long  # ten seconds each; one of them, with the fit before it, below
-@pytest.mark.parametrize("name", CASES)
+QUICK = "the polariser runs backwards"  # ten seconds each
+
+
+@pytest.mark.parametrize(
+    "name", [n if n == QUICK else pytest.param(n, marks=pytest.mark.long) for n in CASES]
+)
 def test_every_mix_up_is_told_with_its_remedy(calset, name):
     spoil, said = CASES[name]
     bad = spoil(calset)
@@ -105,6 +109,7 @@ def test_every_mix_up_is_told_with_its_remedy(calset, name):
     )  # of that the levels are those of the polarised light
 
 
+@pytest.mark.long
 def test_a_fit_of_mixed_up_data_is_refused(calset):
     bad = with_data(calset, x=-calset.points.x)
     with pytest.raises(DataError, match=r"do not fit .* and would if X runs the other way .*: give −X"):

@@ -80,6 +80,7 @@ def test_understated_errors_are_found(clean):
     assert np.abs(pulls(result, true)).max() < 4.5
 
 
+@pytest.mark.long
 def test_exposures_with_a_disturbance_of_their_own(clean, tmp_path):
     """The polariser stands a twentieth of a degree from where its encoder says, each time another way."""
     calset, true = clean

@@ -76,6 +76,7 @@ def test_blocks_change_nothing(made):
     )
 
 
+@pytest.mark.long
 def test_the_fit_of_a_large_set_ends_where_the_usual_one_ends(large, fitted):
     assert large.layout.large
     found = fit(large)

@@ -68,6 +68,7 @@ def test_expansion_agrees(simulated, exact, quick):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-6)
 
 
+@pytest.mark.long
 def test_fit_ends_at_the_same_place(exact, quick):
     one, other = fit(quick), fit(exact)
     assert one.converged

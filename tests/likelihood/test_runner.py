@@ -84,6 +84,7 @@ print(json.dumps({"devices": jax.local_device_count(), "data": found.data, "rows
 """
 
 
+@pytest.mark.long
 def test_two_devices_give_the_same(likelihood):
     code = PLAN.replace("import json", 'jax.config.update("jax_num_cpu_devices", 2)\nimport json', 1) + EXPAND
     found = result_of(run(code))
@@ -109,6 +110,7 @@ assert p.layout.large
 """
 
 
+@pytest.mark.long
 def test_two_processes_fit_as_one_does(likelihood, monkeypatch):
     """To 1e-10 in every parameter, in units of its scale; each has done half of the work."""
     code = (

@@ -160,7 +160,12 @@ def test_every_effect_is_in_a_group():
     )
 
 
-@pytest.mark.parametrize("group", GROUPS)
+QUICK = ("field and band", "plates")  # the others take half a minute each
+
+
+@pytest.mark.parametrize(
+    "group", [g if g in QUICK else pytest.param(g, marks=pytest.mark.long) for g in GROUPS]
+)
 def test_a_fit_has_the_derivatives_of_its_formula(group):
     """Every parameter of the base model and of every effect; none of them is without influence."""
     rng = np.random.default_rng(3)

@@ -62,6 +62,7 @@ def test_good_patches_are_trusted(clean):
     assert np.all(np.abs(found.flatness - 1) < 5 * np.sqrt(2 / dof))
 
 
+@pytest.mark.long
 def test_a_patch_that_is_not_rayleigh_is_found_and_does_no_harm(spoilt):
     """It has the least weight at once; after some rounds the others are trusted again, and zero points are repaired."""
     run, believing = spoilt

@@ -140,6 +140,7 @@ def test_too_few_angles_are_refused():
         paper.fit_paper(simulate(plan).calset)
 
 
+@pytest.mark.long
 def test_promised_errors_are_the_covariance(calibration):
     """Against a set of wrong calibrations: root mean square of `joint_errors` over draws."""
     import dataclasses

@@ -173,7 +173,8 @@ def test_band_holds_uniform_ranks_and_no_others() -> None:
         assert np.mean(band_statistic(bad) < band) > 0.4
 
 
-@pytest.mark.parametrize("count", [20, pytest.param(200, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("count", [20, 200])
 def test_laplace_is_calibrated(study: Study, count: int) -> None:
     """The cheap version: the covariance of the fit in place of the posterior."""
     outcomes = [study.laplace(seed) for seed in range(count)]

@@ -111,6 +111,7 @@ def test_a_sampler_of_ones_own_samples_the_surrogate(scene: Scene, tmp_path: Pat
                folder=tmp_path / "chain", resume=True)  # fmt: skip
 
 
+@pytest.mark.long
 def test_nuts_samples_the_exact_posterior_of_everything(scene: Scene, tmp_path: Path):
     """Too short to be trusted, long enough to see that all free parameters move by their standard errors."""
     pytest.importorskip("blackjax")

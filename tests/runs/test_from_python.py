@@ -144,6 +144,7 @@ def test_certify_and_epoch(fitted):
     assert found.test < 1e-3 * found.directions  # the same data
 
 
+@pytest.mark.long
 def test_an_effect_of_ones_own_from_a_file(call, fitted, tmp_path):
     own, model = tmp_path / "own.py", tmp_path / "model.toml"
     own.write_text(OWN)

@@ -65,6 +65,7 @@ class Interrupting:
             raise StopError
 
 
+@pytest.mark.long
 def test_a_run_that_is_interrupted_goes_on_where_it_was(frames, large, tmp_path):
     whole = refit_sets([frames], tmp_path / "whole")
     assert whole.result.converged
@@ -123,6 +124,7 @@ class Doubled(Intensities):
         return dataclasses.replace(block, counts=2.0 * block.counts)
 
 
+@pytest.mark.long
 def test_the_map_of_a_caller_is_that_of_the_run(frames, large, tmp_path):
     run = refit_sets([frames], tmp_path / "run")
     found = residual_map(run.result)

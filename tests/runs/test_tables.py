@@ -92,6 +92,7 @@ def drifting(fitted: FittedSet, tmp_path: Path) -> Path:
     return tmp_path / "RUN"
 
 
+@pytest.mark.long
 def test_effects_that_cannot_be_carried_over_are_named(
     call, fitted: FittedSet, drifting: Path, points: Path, catalogue: Path, tmp_path: Path
 ):

@@ -77,7 +77,7 @@ def _verdict(product: CalibrationProduct) -> list[Check]:
             f"χ²/dof = {v.chi2 / max(v.dof, 1):.4f}" + "".join(f"; {text}" for text in v.warnings),
         ),
         Check(
-            "well conditioned",
+            "conditioned",
             not v.quality & Quality.ILL_CONDITIONED,
             "ill-conditioned" if v.quality & Quality.ILL_CONDITIONED else "yes",
         ),
@@ -111,7 +111,7 @@ def _parents(product: CalibrationProduct) -> Check:
     bad = [entry for entry in product.inputs if not re.fullmatch(r"[0-9a-f]{64}", entry.sha256)]
     good = bool(product.inputs) and not bad
     return Check(
-        "inputs", good, f"{len(product.inputs)} calibration set(s), hashes recorded" if good else "not known"
+        "parents", good, f"{len(product.inputs)} calibration set(s), hashes recorded" if good else "not known"
     )
 
 

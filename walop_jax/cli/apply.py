@@ -59,8 +59,8 @@ def apply(
     Errors hold photon noise and calibration; Q_COLOUR and U_COLOUR say what ignoring TEFF does. FLAG: 16 a
     direction of (q, u) is hardly measured, 32 beyond the calibrated field (no result a quarter beyond), 64
     filter, temperature or colour that the calibration has not seen, 128 a camera is missing, 256 flagged or
-    saturated counts, 16384 no result, 131072 intensities that disagree with the calibration by more than photon
-    noise; bits of the calibration itself are added to all rows.
+    saturated counts, 16384 no result, 131072 intensities that disagree with the calibration by more than noise
+    and a per cent; bits of the calibration itself are added to all rows.
     """
     switch_on_jax()
     from walop_jax.model.effects.own import catalogue_with

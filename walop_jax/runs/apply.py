@@ -105,7 +105,7 @@ def apply_to_catalogue(
         (Quality.BEYOND_SETTINGS, "star(s) with a filter, temperature or TEFF beyond the calibration"),
         (
             Quality.DISAGREES,
-            "star(s) whose intensities disagree with the calibration by more than photon noise (FLAG 131072, CHI2): is "
+            "star(s) whose intensities disagree with the calibration (FLAG 131072, CHI2): is "
             "the background subtracted, are the cameras in order?",
         ),
     )

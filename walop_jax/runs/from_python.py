@@ -134,6 +134,8 @@ def sample(
 
     `options` are the fields of `walop.Options`: `sampler`, `seed`, `parameters`, `maximum_steps`, …
     """
+    if options.get("parameters") is not None:
+        options["parameters"] = tuple(options["parameters"])
     chosen = Options(**options)
     if isinstance(fit, FitResult):
         return sample_fit(fit, chosen)

@@ -34,7 +34,9 @@ COOL, HOT = 3500.0, 10000.0
 """Colour temperatures (K) between which stars without TEFF are taken to lie."""
 _ROUNDS = 16
 IMPROBABLE = 1e-6
-"""Probability of a CHI2 as large, by photon noise alone, below which FLAG 131072 is set."""
+"""Probability of a CHI2 as large below which FLAG 131072 is set, …"""
+ROUGH = 0.01
+"""… with so much of the light added to the errors: calibrations and flat fields are less perfect than bright stars."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,7 +148,14 @@ def _stars_of_rows(
         dof=found.dof,
         rows=np.diff(first, append=len(rows)),
         flag=_flags(
-            vectors, catalogue, rows, used, first, found.qu, found.condition, _disagree(found.chi2, found.dof)
+            vectors,
+            catalogue,
+            rows,
+            used,
+            first,
+            found.qu,
+            found.condition,
+            _disagree(found.chi2, found.dof, np.maximum.reduceat(_brightness(used, sigma), first)),
         ),
     )
 
@@ -222,9 +231,18 @@ def improbable_chi2(dof: int) -> float:
     return high
 
 
-def _disagree(chi2: Float[np.ndarray, " s"], dof: Int[np.ndarray, " s"]) -> Bool[np.ndarray, " s"]:
-    """Stars whose intensities no Stokes parameters explain, photon noise allowed for."""
+def _brightness(counts: Float[np.ndarray, "r k"], sigma: Float[np.ndarray, "r k"]) -> Float[np.ndarray, " r"]:
+    """Largest signal-to-noise ratio of a camera in every row; 0 where there is none."""
+    good = np.isfinite(counts) & np.isfinite(sigma) & (sigma > 0)
+    return np.where(good, counts / np.where(good, sigma, 1.0), 0.0).max(axis=1)
+
+
+def _disagree(
+    chi2: Float[np.ndarray, " s"], dof: Int[np.ndarray, " s"], brightness: Float[np.ndarray, " s"]
+) -> Bool[np.ndarray, " s"]:
+    """Stars whose intensities no Stokes parameters explain, noise and `ROUGH` of the light allowed for."""
     found = np.zeros(len(chi2), bool)
+    chi2 = chi2 / (1.0 + (ROUGH * brightness) ** 2)
     for k in np.unique(dof[dof > 0]).tolist():
         found |= (dof == k) & (chi2 > improbable_chi2(k))
     return found

@@ -65,7 +65,7 @@ class Wedge(Element):
         behind = optics.behind_wedge(self.direction(ray), self.turn, self.index(ray))
         return ray.toward(*(behind if self.azimuth is None else optics.rotated(*behind, self.azimuth)))
 
-    def direction(self, ray: Ray) -> tuple[Scalar, Scalar, Scalar]:
+    def direction(self, ray: Ray) -> tuple[Float[Array, ...], Float[Array, ...], Float[Array, ...]]:
         """The direction of a ray with +X where the wedge bends light to."""
         if self.azimuth is None:
             return ray.kx, ray.ky, ray.kz
