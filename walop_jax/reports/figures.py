@@ -20,6 +20,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
+from walop_jax.io.rounding import two_digits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.reports.matrix_panels import matrix_panels
 from walop_jax.reports.style import (
@@ -143,9 +144,14 @@ def _histogram(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " n
     used = residual[likelihood.used].ravel()
     width = np.sqrt(np.mean(likelihood.data_per_row[np.nonzero(likelihood.used)[1]]) / likelihood.cameras)
     edges = np.linspace(-4.0, 4.0, 41)
-    axis.hist(
-        np.clip(used / width, -4.0, 4.0), bins=edges.tolist(), density=True, color="0.75", label="residuals"
-    )
+    each = np.full(
+        used.size, 1.0 / (used.size * (edges[1] - edges[0]))
+    )  # those beyond the axis count as well
+    axis.hist(used / width, bins=edges.tolist(), weights=each, color="0.75", label="residuals")
+    beyond = float(np.mean(np.abs(used / width) > edges[-1]))
+    if beyond > 0:
+        said = f"{two_digits(100.0 * beyond)} % beyond ±{edges[-1]:g}"
+        axis.text(0.03, 0.97, said, transform=axis.transAxes, va="top", fontsize=7)
     t = np.linspace(-4.0, 4.0, 201)
     axis.plot(t, np.exp(-0.5 * t**2) / np.sqrt(2 * np.pi), color="C3", lw=1.2, label="noise alone")
     axis.set_xlabel("residual / its expected width", fontsize=FONT)
