@@ -85,18 +85,20 @@ class Rehearsal(workflow._Diagnosing):
     def __init__(self):
         self.calset, self.catalogue = SimpleNamespace(points=()), ()
         self.fit = Mock(spec=FitResult, explains_data=True, chi2=1.0, dof=1)
-        self.steps = ["name"]
+        self.steps, self.choices = [SimpleNamespace(effect="name")], {}
         self.tell, self.until = lambda text: None, float("inf")
 
     def _examine(self, earlier=None):
         examination = Mock(spec=Examination, alarm=bool(self.steps), design=Mock(spec=Design))
         examination.table = SimpleNamespace(p_global=float(not self.steps))
-        examination.summary.return_value = examination.limits.return_value = (
-            examination.untestable.return_value
-        ) = ()
+        for empty in (examination.summary, examination.limits, examination.untestable, examination.classes):
+            empty.return_value = ()
         return examination
 
-    def _add_best(self, examination):
+    def _trials(self, examination):
+        return iter(())
+
+    def _add_best(self, examination, trials, *, others):
         return None
 
     def _drop_what_is_not_needed(self):

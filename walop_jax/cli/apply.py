@@ -60,7 +60,7 @@ def apply(
     direction of (q, u) is hardly measured, 32 beyond the calibrated field (no result a quarter beyond), 64
     filter, temperature or colour that the calibration has not seen, 128 a camera is missing, 256 flagged or
     saturated counts, 16384 no result, 131072 intensities that disagree with the calibration by more than noise
-    and a per cent; bits of the calibration itself are added to all rows.
+    and half a per cent; bits of the calibration itself are added to all rows.
     """
     switch_on_jax()
     from walop_jax.model.effects.own import catalogue_with

@@ -35,7 +35,7 @@ COOL, HOT = 3500.0, 10000.0
 _ROUNDS = 16
 IMPROBABLE = 1e-6
 """Probability of a CHI2 as large below which FLAG 131072 is set, …"""
-ROUGH = 0.01
+ROUGH = 0.005
 """… with so much of the light added to the errors: calibrations and flat fields are less perfect than bright stars."""
 
 
