@@ -4,70 +4,19 @@ from __future__ import annotations
 
 import json
 import re
-from html.parser import HTMLParser
 
 import handmade_run
 import numpy as np
 import pytest
+from html_page import Page
 
 from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import write_columns
 from walop_jax.io.rounding import probability, value_and_error, with_error
-from walop_jax.reports.other_pages import kind_of_run, render_other
 from walop_jax.reports.page import render
-from walop_jax.reports.run import read_limits, read_run
+from walop_jax.reports.run import read_run
 from walop_jax.reports.wording import effect_in_words, verdict_of_diagnosis
 from walop_jax.science.field_accuracy import FieldAccuracy
-
-VOID = {"meta", "img", "br", "link", "hr", "input"}
-
-
-class Page(HTMLParser):
-    """Checks that tags nest; keeps texts, headings, table rows and what is referred to."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.text = ""
-        self.headings: list[str] = []
-        self.rows: list[list[str]] = []
-        self.references: list[str] = []
-        self.ids: list[str] = []
-        self.images: list[dict[str, str | None]] = []
-        self.feed(text)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag, attrs):
-        given = dict(attrs)
-        self.references += [given[name] for name in ("src", "href", "srcset", "data") if given.get(name)]
-        self.ids += [given["id"]] if "id" in given else []
-        if tag == "img":
-            self.images.append(given)
-        if tag not in VOID:
-            self.open.append(tag)
-        if tag == "tr":
-            self.rows.append([])
-        if tag in ("td", "th"):
-            self.rows[-1].append("")
-        if tag in ("h2", "h3"):
-            self.headings.append("")
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if "style" in self.open:
-            return
-        self.text += data
-        if self.open and self.open[-1] in ("td", "th"):
-            self.rows[-1][-1] += data
-        if {"h2", "h3"} & set(self.open):
-            self.headings[-1] += data
-
-    def row(self, name: str) -> list[str]:
-        """The first row of any table that begins with `name`."""
-        return next(row for row in self.rows if row and row[0] == name)
 
 
 def number(text: str) -> float:
@@ -355,79 +304,3 @@ def test_the_data_are_told_of(tmp_path):
     assert "Exposures2 (2 clp)" in text
     assert "Polariser angles2 modulo 180°, widest gap 135°" in text
     assert "Standardsnone" in text
-
-
-def test_page_of_a_comparison(tmp_path):
-    numbers = {"median": 0.0123, "rms": 0.02, "p95": 0.03, "max": 0.04, "share_below_goal": 0.875}
-    methods = {m: {"all": dict.fromkeys("qup", numbers)} for m in ("paper", "joint")}
-    document = {"on_grid": methods, "between": methods, "joint_errors_from": "covariance"}
-    (tmp_path / "comparison.json").write_text(json.dumps(document))
-    (tmp_path / "comparison_map.png").write_bytes(b"\x89PNG")
-    assert kind_of_run(tmp_path) == "comparison"
-    text, missing = render_other(tmp_path, "comparison")
-    page = Page(text)
-    assert page.row("on the grid points")[2:] == ["Paper II", "0.012", "0.020", "0.030", "0.040", "87.5 %"]
-    assert len(page.images) == 1
-    assert len(missing) == 3
-    (tmp_path / "comparison.json").write_text("{}")
-    with pytest.raises(DataError, match="has no 'on_grid'"):
-        render_other(tmp_path, "comparison")
-
-
-def test_page_of_an_epoch(tmp_path):
-    moved = {"name": "half1.wedge", "unit": "rad", "old": -0.23, "new": -0.2289, "error": 0.00021, "z": 5.2}
-    document = {"fits": False, "p_value": 1e-5, "test": 60.0, "directions": 20, "moved": [moved],
-                "star_errors": {"p": {"median": 0.012, "max": 0.2}}}  # fmt: skip
-    (tmp_path / "epoch.json").write_text(json.dumps(document))
-    assert kind_of_run(tmp_path) == "epoch"
-    page = Page(render_other(tmp_path, "epoch")[0])
-    assert page.row("half1.wedge") == ["half1.wedge", "−0.23000", "−0.22890", "+5.2", "rad"]
-    assert "The instrument has changed" in page.text
-
-
-def test_an_epoch_whose_own_fit_is_not_trusted_says_so(tmp_path):
-    document = {
-        "fits": False, "p_value": 0.0, "test": 812.25, "directions": 9, "new_trusted": False,
-        "moved": [], "star_errors": {"p": {"median": 6.7, "max": 120.4}}, "warnings": ["χ²/dof = 5.99"],
-        "diagnosis": {"steps": [{"effect": "ghost", "p_value": 1e-9, "equivalent": ["pedestal"]}], "unexplained": None},
-    }  # fmt: skip
-    (tmp_path / "epoch.json").write_text(json.dumps(document))
-    text = render_other(tmp_path, "epoch")[0]
-    assert "The new data are not explained" in text
-    assert "120 % at most" in text
-    assert "χ²/dof = 5.99" in text
-    assert "cannot tell it from pedestal" in text
-
-
-def test_limits_come_back_from_their_file(tmp_path):
-    found, written = read_limits(handmade_run.make_limits(tmp_path) / "limits.json"), handmade_run.limits()
-    assert found.limits[1].named == np.inf
-    assert repr(found) == repr(written)
-    for name in ("separation", "x", "y", "protection"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(written, name))
-    (tmp_path / "limits.json").write_text('{"limits": [], "effects": [], "protection": {}}')
-    with pytest.raises(DataError, match="walop-jax limits"):
-        read_limits(tmp_path / "limits.json")
-
-
-def test_page_of_limits(tmp_path):
-    assert kind_of_run(handmade_run.make_limits(tmp_path)) == "limits"
-    page = Page(render_other(tmp_path, "limits")[0])
-    assert page.row("ghost.share") == ["ghost.share", "0.00041", "0.00052", "", "0.030 … 1.2", ""]
-    assert page.row("clp_zero.angle") == ["clp_zero.angle", "0.012 … 0.40", "never", "deg", "", "clp_wobble"]
-    assert "wrong by more than 1.2 % without being detected (0.68 % in the median" in page.text
-    assert "ghost at (+0.20°, −0.20°)" in page.text
-    assert "chwp_axis" in page.text
-
-
-def test_limits_of_the_same_data_stand_beside_the_accuracy(tmp_path):
-    """And those of other data are left out, and said to be."""
-    handmade_run.make_limits(handmade_run.make_refit(tmp_path))
-    accuracy = FieldAccuracy(np.full((4, 4), 0.001), (-0.2, 0.2, -0.2, 0.2), "band")
-    page = Page(render(read_run(tmp_path), accuracy))
-    assert "No single effect of the catalogue" in page.text
-    assert "clp_zero.angle" in page.text
-    handmade_run.make_limits(tmp_path, sha256="cd" * 32)
-    found = read_run(tmp_path)
-    assert found.limits is None
-    assert any("of other data" in sentence for sentence in found.missing)

@@ -144,31 +144,17 @@ def _agreeing(rows: _Rows) -> list[tuple[int, int]]:
 
 def _holds_noise(rows: _Rows, exposures: Exposures, copies: set[int]) -> bool | None:
     """Whether counts scatter at all, None where that cannot be seen, in the largest group of alike exposures."""
-    labels = Counter(
-        (
-            str(exposures.kind[n]),
-            str(exposures.filter[n]),
-            bool(exposures.clp_in[n]),
-            bool(exposures.chwp_in[n]),
+    labels = [
+        (str(kind), str(name), bool(polariser), bool(plate))
+        for kind, name, polariser, plate in zip(
+            exposures.kind, exposures.filter, exposures.clp_in, exposures.chwp_in, strict=True
         )
-        for n in np.unique(rows.exposure).tolist()
-        if n not in copies
-    )
-    for label, number in labels.most_common(3):
+    ]
+    numbers = Counter(labels[n] for n in np.unique(rows.exposure).tolist() if n not in copies)
+    for label, number in numbers.most_common(3):
         if number < _FEWEST:
             break
-        group = [
-            n
-            for n in range(len(exposures))
-            if n not in copies
-            and label
-            == (
-                str(exposures.kind[n]),
-                str(exposures.filter[n]),
-                bool(exposures.clp_in[n]),
-                bool(exposures.chwp_in[n]),
-            )
-        ]
+        group = [n for n, own in enumerate(labels) if own == label and n not in copies]
         smallest = _smallest_singular_value(rows, np.array(group))
         if smallest is not None:
             return smallest > _NOISE

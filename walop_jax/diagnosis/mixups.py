@@ -58,7 +58,6 @@ class Alternative:
     what: str
     remedy: str
     change: Change
-    instrument: str = ""
     explained: float = np.inf
 
     def __str__(self) -> str:
@@ -112,7 +111,7 @@ def _judged(one: Alternative, calset: CalibrationSet, model: Model, left: float,
     """An alternative with χ²/dof after some Gauss–Newton steps from the model as designed; ∞ where none can be made."""
     try:
         rewritten = one.change(calset)
-        if one.instrument:
+        if rewritten.instrument != calset.instrument:
             model = base_model(rewritten)
         return dataclasses.replace(one, explained=_left(Likelihood.of(rewritten, model), left, steps))
     except (ValueError, np.linalg.LinAlgError):
@@ -160,7 +159,6 @@ def _instruments(calset: CalibrationSet) -> Iterator[Alternative]:
                 f"they came from {name}",
                 f"correct INSTRUME, which says {calset.instrument}",
                 lambda calset, name=name: dataclasses.replace(calset, instrument=name),
-                instrument=name,
             )
 
 

@@ -96,11 +96,16 @@ def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
     flush_folder(target.parent)
 
 
-def flush(path: Path) -> None:
-    """Flush a file to disk, and give it the permissions of an ordinary new one."""
+def make_ordinary(path: Path, most: int) -> None:
+    """Give a temporary file or folder the permissions of a new one: `most`, as far as the user's mask allows."""
     umask = os.umask(0)
     os.umask(umask)
-    path.chmod(0o666 & ~umask)
+    path.chmod(most & ~umask)
+
+
+def flush(path: Path) -> None:
+    """Flush a file to disk, and give it the permissions of an ordinary new one."""
+    make_ordinary(path, 0o666)
     with path.open("rb+") as stream:
         os.fsync(stream.fileno())
 

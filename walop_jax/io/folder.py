@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from walop_jax.io.atomic import check_output, flush, flush_folder
+from walop_jax.io.atomic import check_output, flush, flush_folder, make_ordinary
 from walop_jax.io.errors import fail
 from walop_jax.io.lock import locked
 from walop_jax.io.temporary import errors_of, own_prefix, prefix_of, remove, remove_leftovers
@@ -143,9 +143,7 @@ def _exchangeable(folder: Path) -> bool:
 
 def _appear(temporary: Path, target: Path, new: set[str]) -> None:
     """Put a folder in the place of another, with all that this one holds but for the entries `new`."""
-    umask = os.umask(0)
-    os.umask(umask)
-    temporary.chmod(0o777 & ~umask)
+    make_ordinary(temporary, 0o777)
     if not target.is_dir():
         os.rename(temporary, target)
         flush_folder(target.parent)

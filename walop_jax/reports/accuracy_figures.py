@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
 
-from walop_jax.reports.style import AFTER, FONT, SMALL, empty_figure, field_axes
+from walop_jax.reports.style import AFTER, FONT, SMALL, empty_figure, field_axes, plain_numbers
 from walop_jax.science.field_accuracy import FieldAccuracy
 from walop_jax.science.star_errors import GOAL
 
@@ -38,7 +37,7 @@ def accuracy_figure(accuracy: FieldAccuracy) -> Figure:
     )
     right.set_xscale("log")
     for scale in (bar.ax.yaxis, right.xaxis):
-        scale.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        scale.set_major_formatter(plain_numbers())
     right.set_xlim(edges[0], max(edges[-1], 150.0 * GOAL))
     right.set_xlabel("standard error of p (%)", fontsize=FONT)
     right.set_ylabel("points of the map", fontsize=FONT)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.colors import BoundaryNorm, LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
 
 from walop_jax.diagnosis.detection_limits import DetectionLimits
 from walop_jax.diagnosis.naming import SEPARATION
-from walop_jax.reports.style import FONT, QUIET, SMALL, empty_figure, field_axes
+from walop_jax.reports.style import FONT, QUIET, SMALL, empty_figure, field_axes, plain_numbers
 
 _STEPS = (0.0, 1.0, 2.0, SEPARATION, 4.0, 5.0, 6.0)
 
@@ -33,7 +32,7 @@ def protection_figure(found: DetectionLimits) -> Figure:
     bar = figure.colorbar(shown, ax=axis, pad=0.03)
     bar.set_label("error of q, u (%)", fontsize=SMALL + 1)
     for which in (bar.ax.yaxis.set_major_formatter, bar.ax.yaxis.set_minor_formatter):
-        which(FuncFormatter(lambda value, _: f"{value:g}"))
+        which(plain_numbers())
     bar.ax.tick_params(labelsize=SMALL, which="both")
     if (~good).any():
         axis.plot(found.x[~good], found.y[~good], "x", color=QUIET, ms=4)

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import FuncFormatter
 
 FONT = 9
 SMALL = 7
@@ -30,6 +31,11 @@ def field_axes(axis: Axes, title: str) -> None:
     axis.set_ylabel("Y (deg)", fontsize=FONT)
     axis.tick_params(labelsize=SMALL)
     axis.set_aspect("equal")
+
+
+def plain_numbers() -> FuncFormatter:
+    """Ticks of a logarithmic scale as numbers instead of powers: 0.1, 1; a formatter serves one axis only."""
+    return FuncFormatter(lambda value, _: f"{value:g}")
 
 
 def outer_labels(axes: Any) -> None:
