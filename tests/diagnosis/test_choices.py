@@ -14,11 +14,11 @@ from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model import optics
 from walop_jax.model.alternatives import alternatives, changed
 from walop_jax.model.build import nominal_instrument
 from walop_jax.model.effects import OtherDescription, effect_by_name
 from walop_jax.model.instrument import Instrument
+from walop_jax.model.ray import Conditions, Ray
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.simulation.observing_plan import NARROW_BANDS
 from walop_jax.simulation.simulate import simulate
@@ -57,15 +57,15 @@ def test_beams_that_are_exchanged_go_to_the_other_camera(south):
 def test_a_turned_wedge_bends_light_to_where_it_points(south, turn):
     """Snell's law at a plane whose normal is (sin w cos a, sin w sin a, cos w), in vectors."""
     wedge = changed(south, f"half1.wedge turned by {turn:.0f} deg").arms[0].elements[1]
-    k, w, a, n = np.array([0.05, -0.08, np.sqrt(1 - 0.05**2 - 0.08**2)]), -0.230, np.deg2rad(turn), 1.5151
+    k, w, a = np.array([0.05, -0.08, np.sqrt(1 - 0.05**2 - 0.08**2)]), -0.230, np.deg2rad(turn)
+    zero, spectrum = jnp.zeros(()), (jnp.array([0.62]), Conditions(jnp.zeros(()), {}))
+    ahead = Ray(zero, zero, jnp.asarray(k[0]), jnp.asarray(k[1]), spectrum)
+    n = np.asarray(wedge.index(ahead)).item()
     normal = np.array([np.sin(w) * np.cos(a), np.sin(w) * np.sin(a), np.cos(w)])
     inside = k + (np.sqrt(n**2 - 1 + (k @ normal) ** 2) - k @ normal) * normal
-    there = optics.rotated(jnp.asarray(k[0]), jnp.asarray(k[1]), jnp.asarray(-turn))
-    back = optics.rotated(
-        *optics.behind_wedge((*there, jnp.asarray(k[2])), wedge.angle, jnp.asarray(n)), wedge.azimuth
-    )
+    behind = wedge.ray(ahead)
     assert float(wedge.azimuth) == turn
-    np.testing.assert_allclose(back, inside[:2], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(np.ravel([behind.kx, behind.ky]), inside[:2], rtol=0, atol=1e-14)
 
 
 def test_a_sentence_that_the_instrument_has_no_place_for_names_the_nearest(south):
