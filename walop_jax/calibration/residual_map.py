@@ -14,6 +14,8 @@ Limit       no structure smaller than the smooth model's: δ scatters about 0 wi
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +30,9 @@ from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.expansion import Census, Posterior
 from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.flux import project_flux, sharing
+from walop_jax.likelihood.frames import FrameSums
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.pixels import PixelPosterior, in_blocks, information
 from walop_jax.likelihood.runner import SlabSums
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
@@ -104,7 +108,7 @@ def cell_of(grid: Grid, x: Vector, y: Vector) -> Int[np.ndarray, " p"]:
     return row * grid.width + column
 
 
-def _main_setting(
+def main_setting(
     settings: Settings, through: Bool[np.ndarray, " e"]
 ) -> tuple[Settings, Bool[np.ndarray, " e"]]:
     """The setting with the most exposures `through` the polariser, all else out preferred, and its exposures."""
@@ -119,7 +123,9 @@ def _main_setting(
 
 
 def residual_map(result: FitResult) -> ResidualMap:
-    """The map of what a fit leaves: one more pass over the points."""
+    """The map of what a fit leaves: from the sums of its last pass, or by one more pass over the points."""
+    if isinstance(result.posterior, PixelPosterior):
+        return residual_map_of_pixels(result.posterior.sums)
     return residual_map_at(result.likelihood, result.values, result.posterior)
 
 
@@ -128,7 +134,7 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
     instrument = likelihood.model.instrument(values)
     nodes, _ = likelihood.nodes(instrument, near)
     exposures = likelihood.calset.exposures
-    setting, chosen = _main_setting(Settings.of(exposures, likelihood.plan.moving), exposures.clp_in)
+    setting, chosen = main_setting(Settings.of(exposures, likelihood.plan.moving), exposures.clp_in)
     grid = cells_for(likelihood.layout.points, likelihood.census if near is None else near.census)
     count = grid.width * grid.height
 
@@ -142,18 +148,64 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
         sums = [np.bincount(cell, column, count) for column in np.concatenate(columns).T]
         return SlabSums(np.concatenate(sums), np.zeros(4))
 
-    total = likelihood.runner.total("residual map", None, work, likelihood.layout)
+    total = likelihood.runner.total("residual map", None, work, likelihood.layout).sums.reshape(-1, count)
     n = len(residual_names(len(instrument.arms)))
+    left = np.zeros((count, n, n))
     i, j = np.triu_indices(n)
-    total = total.sums.reshape(2 + n + len(i), count)  # χ², degrees of freedom, Σ A r, upper half of Σ A P Aᵀ
-    matrix = np.zeros((count, n, n))
-    matrix[:, i, j] = matrix[:, j, i] = total[2 + n :].T
+    left[:, i, j] = left[:, j, i] = total[2 + n :].T
+    sums = MapSums(chi2=total[0], freedom=total[1], right=total[2 : 2 + n], left=left)
+    return solved_map(grid, setting, sums)
+
+
+def residual_map_of_pixels(found: FrameSums) -> ResidualMap:
+    """The map of what the values leave of whole frames: from the sums of cells, with what is smooth in their middle."""
+    likelihood, cells = found.likelihood, found.cells
+    setting, chosen = main_setting(
+        Settings.of(likelihood.calset.exposures, likelihood.plan.moving), likelihood.calset.exposures.clp_in
+    )
+    points = limits.POINTS_PER_CELL
+    together = max(1, round(np.sqrt(points) / cells.side), -(-max(cells.shape) // limits.MOST_CELLS))
+    s, t = np.meshgrid(*cells.middles(together))
+    shape, smooth = s.shape, found.smooth(s.ravel(), t.ravel())
+    pairs = np.array(found.instrument.cameras.pairs)
+    signs = np.eye(likelihood.cameras)[pairs[:, 0]] - np.eye(likelihood.cameras)[pairs[:, 1]]
+    n = len(residual_names(len(pairs)))
+    right, left = np.zeros((n, s.size)), np.zeros((s.size, n, n))
+    matrices = information(found, together).reshape(likelihood.cameras, likelihood.cameras, len(chosen), -1)
+    pull = in_blocks(np.asarray(found.sums.pull), together).reshape(likelihood.cameras, len(chosen), -1)
+    for exposure in np.flatnonzero(chosen):
+        vectors = np.asarray(smooth.vectors)[:, likelihood.plan.band_of[exposure, 0]]
+        total = vectors[:, pairs[:, 0], 0] + vectors[:, pairs[:, 1], 0]
+        stokes = np.asarray(smooth.stokes)[:, exposure, :3]
+        elements = 0.5 * np.einsum("ca,cs,ak->cask", total, stokes, signs).reshape(s.size, -1, likelihood.cameras)
+        later = np.asarray(smooth.unit)[:, None, :, exposure] * np.abs(signs[1:])
+        change = np.concatenate([elements, later], axis=1)
+        right += np.einsum("cdk,kc->dc", change, pull[:, exposure])
+        left += np.einsum("cdk,klc,cfl->cdf", change, matrices[:, :, exposure], change, optimize=True)
+    each = likelihood.cameras - np.where(likelihood.flux_known, 0.0, found.instrument.cameras.fluxes)
+    chi2, used = (in_blocks(np.asarray(v)[chosen], together).reshape(int(chosen.sum()), -1) for v in (found.sums.chi2, found.sums.used))
+    sums = MapSums(chi2.sum(axis=0), each[chosen] @ used, right, left)
+    return solved_map(cells.blocks(together, shape), setting, sums)
+
+
+class MapSums(NamedTuple):
+    """Sums over the pixels of each cell: χ², degrees of freedom, Σ A r and Σ A P Aᵀ."""
+
+    chi2: Float[np.ndarray, " c"]
+    freedom: Float[np.ndarray, " c"]
+    right: Float[np.ndarray, "d c"]
+    left: Float[np.ndarray, "c d d"]
+
+
+def solved_map(grid: Grid, setting: Settings, sums: MapSums) -> ResidualMap:
+    """The map on a grid of cells at one setting, from its normal equations; NaN where these are singular."""
+    matrix, n = sums.left, len(sums.right)
     size = np.sqrt(np.diagonal(matrix, axis1=1, axis2=2))
     scaled = matrix / np.where(size > 0, size, 1.0)[:, :, None] / np.where(size > 0, size, 1.0)[:, None]
     known = np.linalg.eigvalsh(scaled)[:, 0] > 1e-9
-    inverse = np.full((count, n, n), np.nan)
+    inverse = np.full(matrix.shape, np.nan)
     inverse[known] = np.linalg.inv(matrix[known])
-    found = np.einsum("cij,jc->ic", inverse, total[2 : 2 + n])
+    found = np.einsum("cij,jc->ic", inverse, sums.right)
     errors = np.sqrt(np.diagonal(inverse, axis1=1, axis2=2)).T
     shape = (grid.height, grid.width)
     return ResidualMap(
@@ -162,6 +214,6 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
         chwp_angle=float(setting.position(CALIBRATION_PLATE)[0]),
         values=found.reshape(n, *shape),
         errors=errors.reshape(n, *shape),
-        chi2=(total[0] / np.where(total[1] > 0, total[1], np.nan)).reshape(shape),
+        chi2=(sums.chi2 / np.where(sums.freedom > 0, sums.freedom, np.nan)).reshape(shape),
         positions=setting.further(),
     )

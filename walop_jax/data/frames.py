@@ -60,8 +60,8 @@ class Cube:
     blank: int | None
     stamp: tuple[int, int]
 
-    def rows(self, start: int, stop: int) -> Float[np.ndarray, "e y x"]:
-        """Read some rows of all planes; undefined integers (BLANK) become NaN.
+    def stored(self, start: int, stop: int) -> np.ndarray:
+        """Some rows of all planes as they lie in the file, mapped and not yet read.
 
         Raises `DataError` if the file has gone or changed since it was checked.
         """
@@ -71,9 +71,16 @@ class Cube:
                 raise fail("the file has changed since it was opened", file=self.path, advice="start again")
             # Mapped anew each time: no open file to keep, and pages are given back after the slab.
             raw = np.memmap(self.path, self.dtype, mode="r", offset=self.offset, shape=self.shape)
-            part = np.asarray(raw[:, start:stop])
         except OSError as error:
             raise fail(f"cannot be read: {error}", file=self.path, extension=self.extension) from error
+        return np.asarray(raw[:, start:stop])
+
+    def rows(self, start: int, stop: int) -> Float[np.ndarray, "e y x"]:
+        """Read some rows of all planes; undefined integers (BLANK) become NaN.
+
+        Raises what `stored` raises.
+        """
+        part = self.stored(start, stop)
         values = part.astype(np.float64)
         if (self.scale, self.zero) != (1.0, 0.0):
             values = values * self.scale + self.zero

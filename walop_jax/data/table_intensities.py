@@ -11,7 +11,7 @@ from walop_jax.data.records import Block, Exposures, Intensities, Points, Source
 from walop_jax.data.schema import Place
 from walop_jax.io.errors import rows_text
 
-_NEGATIVE = 5.0
+NEGATIVE = 5.0
 """Counts below minus this many sigma are no bias-subtracted counts but a fault."""
 
 _SPOILT = 0.2
@@ -126,7 +126,7 @@ def usable(
     open_ = flag == 0
     with np.errstate(invalid="ignore"):
         impossible = open_ & np.any(np.isfinite(sigma) & (sigma <= 0), axis=-1)
-        good = np.all(np.isfinite(counts) & np.isfinite(sigma) & (counts >= -_NEGATIVE * sigma), axis=-1)
+        good = np.all(np.isfinite(counts) & np.isfinite(sigma) & (counts >= -NEGATIVE * sigma), axis=-1)
     return open_ & good & ~impossible, open_ & ~good & ~impossible, impossible
 
 

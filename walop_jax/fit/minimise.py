@@ -10,6 +10,7 @@ import optimistix as optx
 from jaxtyping import Float
 
 from walop_jax.fit.solver import (
+    LARGEST_CONDITION,
     RESULTS,
     AtEveryStep,
     Evaluate,
@@ -18,6 +19,7 @@ from walop_jax.fit.solver import (
     NormalEquationsSolver,
     Request,
     TrustRegion,
+    distance_to_minimum,
 )
 
 Vector = Float[np.ndarray, " n"]
@@ -114,6 +116,43 @@ def minimise(
         condition=gates["condition"],
         history=tuple(history),
     )
+
+
+def newton(
+    evaluate: Callable[[Vector], Expansion],
+    start: Vector,
+    scale: Vector,
+    *,
+    tolerance: float = TOLERANCE,
+    progress: Callable[[int, float], None] | None = None,
+) -> Minimum | None:
+    """Newton steps from a start near the minimum, for objectives that take long: no place is looked at without need.
+
+    The last step is taken without looking where it leads if what it leaves, by how much the one before it left, is less
+    than `tolerance`: `scaled_gradient` is then what is expected, the expansion that of the place before. None where the
+    steps do not close in on a minimum.
+    """
+    x, before, history = np.asarray(start, float), np.inf, []
+    while len(history) < MAXIMUM_STEPS:
+        found = evaluate(x)
+        scaled = _Scaled.of(found, scale)
+        distance, condition = distance_to_minimum(scaled)
+        history.append(found.objective)
+        if progress is not None:
+            progress(len(history), found.objective)
+        if not distance < before or not condition < LARGEST_CONDITION:
+            return None
+        left = distance * distance / before  # 0 at the first place, where nothing is known of it
+        if distance > tolerance:
+            x = x - scale * np.linalg.solve(scaled.matrix, scaled.gradient)
+        if distance <= tolerance or 0.0 < left <= tolerance:
+            gate = min(distance, left) if left > 0.0 else distance
+            message = _in_words(RESULTS.successful, len(history), gate, condition)
+            return Minimum(
+                x, found, RESULTS.successful, message, len(history), gate, condition, tuple(history)
+            )
+        before = distance
+    return None
 
 
 def _in_words(result: optx.RESULTS, steps: int, distance: float, condition: float) -> str:

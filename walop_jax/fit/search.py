@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.fit.minimise import Minimum, minimise
+from walop_jax.fit.minimise import Minimum, minimise, newton
 from walop_jax.fit.solver import Request, WhenStale
-from walop_jax.likelihood import limits
+from walop_jax.likelihood import limits, pixels
 from walop_jax.likelihood.expansion import Posterior
+from walop_jax.likelihood.frames import stands_for_pixels, strips_of
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.thinning import thinned
 from walop_jax.model import materials
 from walop_jax.model.specification import Model
 
 Vector = Float[np.ndarray, " n"]
+Expand = Callable[[Vector, float, Posterior | None], Posterior]
 
 FAR_OFF = 25.0  # χ²/dof above which other orders are tried and the errors scaled
 MAXIMUM_RESCALINGS = 4
@@ -59,9 +61,14 @@ def _search(
     first: Vector,
     noise_scale: float,
     near: Posterior | None = None,
+    expand: Expand | None = None,
     **how: Any,
 ) -> Found:
-    """The minimum from a full vector of start values; `near` is an expansion at similar ones, if there is any."""
+    """The minimum from a full vector of start values; `near` is an expansion at similar ones, if there is any.
+
+    `expand` takes the place of `Likelihood.expand`.
+    """
+    expand = expand or likelihood.expand
     model = likelihood.model
     select, origin = model.selection(), first[model.free]
 
@@ -70,7 +77,7 @@ def _search(
 
     def evaluate(x: Vector, request: Request) -> Posterior:
         if request.matrix:
-            return likelihood.expand(full(x), noise_scale, request.near or near)
+            return expand(full(x), noise_scale, request.near or near)
         return likelihood.slope(full(x), request.near)
 
     def tell(step: int, objective: float) -> None:
@@ -90,6 +97,8 @@ def find_minimum(
     """
     if not likelihood.layout.large:
         return _minimum_from_afar(likelihood, first, noise_scale, worth)
+    if stands_for_pixels(likelihood, first):
+        return _minimum_of_pixels(likelihood, first, noise_scale, worth)
     near, scale, starts = _minimum_of_sample(likelihood, first, noise_scale, worth)
     found = _search(
         likelihood,
@@ -103,16 +112,57 @@ def find_minimum(
     return dataclasses.replace(found, starts=starts)
 
 
-def _minimum_of_sample(
+def _minimum_of_pixels(
     likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
+) -> Found:
+    """The minimum of whole frames: of a sample, then of some strips of image rows, then of all."""
+    near, scale, starts = _minimum_of_sample(likelihood, first, noise_scale, worth, limits.PIXEL_SAMPLE)
+    every = strips_of(likelihood) // limits.FIRST_STRIPS
+    if every > 1:
+        alone = dataclasses.replace(likelihood, runner=dataclasses.replace(likelihood.runner, journal=None))
+        near = _search_pixels(alone, "fit of some image rows", near, scale, every, 1.0).values
+    found = _search_pixels(likelihood, "fit of all pixels", near, scale, 1, LARGE_TOLERANCE)
+    return dataclasses.replace(found, starts=starts)
+
+
+def _search_pixels(
+    likelihood: Likelihood, label: str, first: Vector, noise_scale: float, every: int, tolerance: float
+) -> Found:
+    """The minimum of one strip of image rows in `every`, by Newton steps where these lead there."""
+    model = likelihood.model
+    select, origin = model.selection(), first[model.free]
+
+    def expand(values: Vector, noise_scale: float, _: Posterior | None = None) -> Posterior:
+        return pixels.expand(likelihood, values, noise_scale, every)
+
+    def full(x: Vector) -> Float[np.ndarray, " all"]:
+        return first + select @ (x - origin)
+
+    def tell(step: int, objective: float) -> None:
+        likelihood.runner.tell(f"{label}: pass {step}, χ² {objective:.10g}")
+
+    minimum = newton(
+        lambda x: expand(full(x), noise_scale), origin, free_scales(model), tolerance=tolerance, progress=tell
+    )
+    if minimum is not None:
+        return Found(minimum, full(minimum.x))
+    return _search(likelihood, label, first, noise_scale, expand=expand, damping=0.0, tolerance=tolerance)
+
+
+def _minimum_of_sample(
+    likelihood: Likelihood,
+    first: Vector,
+    noise_scale: float | None,
+    worth: float | None,
+    points: int | None = None,
 ) -> tuple[Vector, float, int]:
     """The minimum of a sample of a large set, the factor on the errors, and from how many places it was sought.
 
-    The sample of a very large set is large itself.
+    Without a number of `points` the sample of a very large set is large itself.
     """
+    points = points or max(limits.SAMPLE, likelihood.layout.points // limits.FARTHEST)
 
     def make() -> Vector:
-        points = max(limits.SAMPLE, likelihood.layout.points // limits.FARTHEST)
         sample = Likelihood.of(
             thinned(likelihood.calset, points),
             likelihood.model,
@@ -123,7 +173,7 @@ def _minimum_of_sample(
         return np.append(found.values, [found.posterior.noise_scale, found.starts])
 
     journal = likelihood.runner.journal
-    key = f"sample {first.tobytes().hex()} {noise_scale} {worth}"
+    key = f"sample {points} {first.tobytes().hex()} {noise_scale} {worth}"
     *values, scale, starts = make() if journal is None else journal.remembered(key, make)
     return np.array(values), float(scale), int(starts)
 

@@ -165,6 +165,28 @@ def point_residuals(
     return flux, (point.counts - real_counts(instrument, plan, unit, flux)) * point.weight
 
 
+def _linear_unit_counts(
+    instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None
+) -> linear.Linear:
+    """Counts of one point for light of unit flux, and their derivatives with respect to its local quantities."""
+    to_instrument = with_values(instrument)
+
+    def unit_counts(
+        rows: Float[Array, "m b r 4"], all_values: Vector, local: Float[Array, "m k"]
+    ) -> Float[Array, "e k"]:
+        return _unit_counts(to_instrument(all_values), plan, rows, local, point)
+
+    rows, slopes = _rows_and_slopes_at(instrument, plan, point, nodes)
+    return linear.linearised(instrument, unit_counts, rows, slopes, _throughput_at(instrument, point))
+
+
+def unit_slopes(instrument: Instrument, plan: Plan, point: PointData) -> Float[Array, "e k n"]:
+    """Derivatives of the counts of one point for light of unit flux with respect to all parameters."""
+    found = _linear_unit_counts(instrument, plan, point, None)
+    basis = instrument.throughput.basis(*field_sites(instrument, point))
+    return linear.to_all(instrument, found.plain, found.local, basis)
+
+
 def _point_jacobian(
     instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None = None
 ) -> tuple[Float[Array, " d"], Float[Array, "l d"]]:
@@ -174,15 +196,8 @@ def _point_jacobian(
     exposures and cameras.
     """
     to_instrument = with_values(instrument)
-
-    def unit_counts(
-        rows: Float[Array, "m b r 4"], all_values: Vector, local: Float[Array, "m k"]
-    ) -> Float[Array, "e k"]:
-        return _unit_counts(to_instrument(all_values), plan, rows, local, point)
-
-    rows, slopes = _rows_and_slopes_at(instrument, plan, point, nodes)
     throughput = _throughput_at(instrument, point)
-    unit, d_plain, d_local = linear.linearised(instrument, unit_counts, rows, slopes, throughput)
+    unit, d_plain, d_local = _linear_unit_counts(instrument, plan, point, nodes)
     # From unit flux to counts: `along` is the derivative with respect to the flux itself.
     flux = best_flux(instrument, plan, unit, point)
     counts, along = flux * unit, unit

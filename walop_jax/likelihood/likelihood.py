@@ -143,12 +143,23 @@ class Likelihood:
             lambda chunk: engine.normal_equations(instrument, self.plan, chunk, nodes),
             ((), (n,), (n, n)),
         )
-        matrix = matrix / noise_scale**2
-        at = self.priors.index
+        return self.posterior(values, float(data), gradient, matrix, noise_scale, census, optics)
+
+    def posterior(
+        self,
+        values: Vector,
+        data: float,
+        gradient: Vector,
+        matrix: Float[np.ndarray, "n n"],
+        noise_scale: float,
+        census: Census,
+        optics: OpticsUsed,
+    ) -> Posterior:
+        """The posterior from χ² of the data, its half gradient and its Gauss–Newton matrix in all parameters."""
+        matrix, at, select = matrix / noise_scale**2, self.priors.index, self.model.selection()
         matrix[at, at] += self.priors.width**-2
-        select = self.model.selection()
         return self._posterior(
-            values, float(data), gradient, select.T @ matrix @ select, noise_scale, census, optics
+            values, data, gradient, select.T @ matrix @ select, noise_scale, census, optics
         )
 
     def slope(self, values: Vector, near: Posterior) -> Posterior:

@@ -28,6 +28,8 @@ JACOBIAN_BLOCK = 64
 """Field points whose Jacobians are worked on together: these stay in the processor's cache."""
 GRADIENT_BLOCK = 256
 """Field points whose gradients are worked on together, and largest number that is not cut: they need a quarter."""
+COLUMNS = 256
+"""Columns of an image row that are worked on together: the sums of four cameras and 25 exposures take a megabyte."""
 PROBES_AT_ONCE = 6
 """Shapes of one effect that are worked on together: bounds the memory, and more are no faster."""
 
@@ -48,9 +50,19 @@ LARGE_ABOVE = 65536
 """Field points above which the matrix of a fit is computed as seldom as can be: a pass then takes seconds."""
 SAMPLE = 16384
 """Field points of a large set on which its fit begins: a fit of these takes as long as a pass or two of the set."""
+PIXEL_SAMPLE = 1024
+"""Pixels of whole frames on which their fit begins: the optics of so few are soon solved one by one."""
+FIRST_STRIPS = 8
+"""Strips of image rows that are fitted before all of them: twice what a throughput of fourth order asks for."""
 FARTHEST = 32
 """Points of a set for each one of its sample at most: the minima are then some six standard errors apart, and a step
 leaves a thousandth of that."""
+CELLS = 128
+"""Cells of whole frames along the longer side in which pixels are summed: 1.5 MB for each exposure."""
+COMPRESSED_BLOCKS, COMPRESSED_POINTS = 6, 4
+"""Blocks of cells, and points of a block, along a side of frames that are compressed."""
+STRIP_ROWS = 32
+"""Image rows, at least, that are read together."""
 MEDIAN_POINTS = 65536
 """Field points that the median of the counts is taken of: it is then known to half a per cent of its scatter."""
 MEDIAN_SLAB = 4096

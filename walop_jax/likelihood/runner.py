@@ -33,24 +33,35 @@ TOLD_EVERY = 1.0  # s
 
 @dataclasses.dataclass(frozen=True)
 class SlabSums:
-    """What some points contribute: sums, and the extent of the used ones (−x, x, −y, y at most; deg)."""
+    """What some points contribute: sums, and the extent of the used ones (−x, x, −y, y at most; deg).
+
+    `parts` are numbers that belong to one slab and are not added to those of others; all are of the same size.
+    """
 
     sums: Vector
     extent: Float[np.ndarray, 4]
+    parts: dict[int, Vector] = dataclasses.field(default_factory=dict)
 
     def plus(self, other: SlabSums) -> SlabSums:
         """What these points and others contribute."""
-        return SlabSums(self.sums + other.sums, np.maximum(self.extent, other.extent))
+        return SlabSums(
+            self.sums + other.sums, np.maximum(self.extent, other.extent), self.parts | other.parts
+        )
 
     @property
     def packed(self) -> Vector:
         """All of it in one array."""
-        return np.concatenate([self.sums, self.extent])
+        numbered = [np.append(float(number), part) for number, part in self.parts.items()]
+        head = np.array([len(self.sums), len(numbered), len(numbered[0]) if numbered else 0], float)
+        return np.concatenate([head, self.sums, self.extent, *numbered])
 
     @classmethod
     def unpacked(cls, values: Vector) -> SlabSums:
-        """What `packed` holds."""
-        return cls(values[:-4], values[-4:])
+        """What `packed` holds; zeros may follow."""
+        size, count, each = (int(value) for value in values[:3])
+        sums, extent, rest = np.split(values[3:], [size, size + 4])
+        rows = rest[: count * each].reshape(count, each)
+        return cls(sums, extent, {int(row[0]): row[1:] for row in rows})
 
 
 def usual_threads() -> int:
@@ -113,7 +124,13 @@ class Runner:
             raise ValueError(
                 f"{self.processes.count} processes for {layout.slabs} slabs of points: use fewer"
             )
-        rows = self.processes.gather(f"{label} {key}", total.packed)
+        packed = total.packed
+        if total.parts:  # others may have one more
+            most = -(-layout.slabs // self.processes.count)
+            packed = np.pad(
+                packed, (0, (most - len(total.parts)) * (1 + len(next(iter(total.parts.values())))))
+            )
+        rows = self.processes.gather(f"{label} {key}", packed)
         return functools.reduce(SlabSums.plus, map(SlabSums.unpacked, rows))
 
     def _tell_how_far(self, label: str, done: int, points: int, rate: float) -> None:

@@ -1,0 +1,291 @@
+"""A pass over all pixels of whole frames: the counts for light of unit flux as a series, then sums cell by cell.
+
+Cells and series lie in the coordinates of the frame, from −1 to 1 between the edges of the outermost pixels of each
+side; the map from there to the field is linear (`Grid`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.data.frames import FrameIntensities, Grid
+from walop_jax.data.raw_rows import raw_rows
+from walop_jax.data.records import Block
+from walop_jax.likelihood import engine, limits
+from walop_jax.likelihood.cell_sums import CellSums, piece_of, strip_sums
+from walop_jax.likelihood.expansion import Census, OpticsUsed
+from walop_jax.likelihood.field_table import FieldTable, accurate_table
+from walop_jax.likelihood.flux import sharing
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.nodes import TOLERANCE
+from walop_jax.likelihood.points import PointReader
+from walop_jax.likelihood.runner import SlabSums
+from walop_jax.model import chebyshev, light
+from walop_jax.model.chebyshev import Rectangle
+from walop_jax.model.compiled import compiled
+from walop_jax.model.instrument import Instrument
+
+Vector = Float[np.ndarray, " n"]
+FRAME = Rectangle(np.array([-1.0, -1.0]), np.array([1.0, 1.0]))
+
+
+@dataclasses.dataclass(frozen=True)
+class Cells:
+    """How frames are cut: square cells of `side` pixels, those at the far ends partly beyond the frame."""
+
+    grid: Grid
+    side: int
+
+    @classmethod
+    def of(cls, grid: Grid) -> Cells:
+        """At most `limits.CELLS` along the longer side."""
+        return cls(grid, -(-max(grid.width, grid.height) // limits.CELLS))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of cells."""
+        return -(-self.grid.height // self.side), -(-self.grid.width // self.side)
+
+    @property
+    def size(self) -> Float[np.ndarray, 2]:
+        """Width and height of a pixel in the coordinates of the frame."""
+        return 2.0 / np.array([self.grid.width, self.grid.height])
+
+    def edges(self, together: int = 1) -> tuple[Vector, Vector]:
+        """Edges of the columns and rows of cells, or of blocks of `together` × `together` of them, within the frame."""
+        rows, columns = self.shape
+        counts = ((columns, self.grid.width), (rows, self.grid.height))
+        found = [
+            np.minimum(np.append(np.arange(0, n, together), n) * self.side, most) / most * 2.0 - 1.0
+            for n, most in counts
+        ]
+        return found[0], found[1]
+
+    def middles(self, together: int = 1) -> tuple[Vector, Vector]:
+        """Middles of the columns and rows of cells, or of blocks of them."""
+        s, t = (0.5 * (edges[:-1] + edges[1:]) for edges in self.edges(together))
+        return s, t
+
+    def blocks(self, together: int, shape: tuple[int, int]) -> Grid:
+        """Blocks of `together` × `together` cells as a grid of rows and columns."""
+        step = together * self.side
+        first = (self.grid.reference[0] - 0.5) / step + 0.5, (self.grid.reference[1] - 0.5) / step + 0.5
+        (a, b), (c, d) = self.grid.matrix
+        return Grid(
+            shape[1], shape[0], first, self.grid.value, ((a * step, b * step), (c * step, d * step))
+        )
+
+    def field(self, s: Any, t: Any) -> tuple[Any, Any]:
+        """Field coordinates (deg) of places in the frame."""
+        (a, b), (c, d) = self.grid.matrix
+        i = (s + 1.0) * 0.5 * self.grid.width + 0.5 - self.grid.reference[0]
+        j = (t + 1.0) * 0.5 * self.grid.height + 0.5 - self.grid.reference[1]
+        return self.grid.value[0] + (a * i + b * j), self.grid.value[1] + (c * i + d * j)
+
+
+class Smooth(NamedTuple):
+    """What is smooth over the frame: counts for light of unit flux, analysis vectors, Stokes vectors."""
+
+    unit: Any
+    vectors: Any
+    stokes: Any
+
+
+def _smooth(instrument: Instrument, plan: Any, point: engine.PointData) -> Smooth:
+    return Smooth(
+        unit=engine.point_prediction(instrument, plan, point).T,
+        vectors=engine.vectors_at(instrument, plan, point),
+        stokes=light.stokes(instrument, plan.exposures, point.sky, point.source, point.x, point.y),
+    )
+
+
+_solve = compiled(jax.vmap(_smooth, in_axes=(None, None, 0)))
+_slopes = compiled(jax.vmap(engine.unit_slopes, in_axes=(None, None, 0)))
+
+
+def smooth_at(likelihood: Likelihood, instrument: Instrument, x: Vector, y: Vector) -> Smooth:
+    """What is smooth over the frame, at field positions (deg): exact. First axis: positions."""
+    return _at(_solve, likelihood, instrument, x, y)
+
+
+def unit_slopes_at(
+    likelihood: Likelihood, instrument: Instrument, x: Vector, y: Vector
+) -> Float[np.ndarray, "p e k n"]:
+    """Derivatives of the counts for light of unit flux with respect to all parameters, at field positions (deg)."""
+    return _at(_slopes, likelihood, instrument, x, y)
+
+
+def _at(solve: Any, likelihood: Likelihood, instrument: Instrument, x: Vector, y: Vector) -> Any:
+    parts = []
+    for start in range(0, len(x), limits.SOLVED_TOGETHER):
+        # The last batch is filled up with its last place.
+        inside = np.minimum(np.arange(start, start + limits.SOLVED_TOGETHER), len(x) - 1)
+        points = blank_points(likelihood.points.reader, x[inside], y[inside])
+        parts.append(jax.tree.map(np.asarray, solve(instrument, likelihood.plan, points)))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(x)], *parts)
+
+
+def blank_points(reader: PointReader, x: Vector, y: Vector) -> engine.PointData:
+    """Field points (deg) with counts and errors of one in every exposure."""
+    shape = (len(x), len(reader.calset.exposures))
+    ones = np.ones((*shape, reader.calset.cameras))
+    return reader.point_data(Block(x, y, ones, ones, np.ones(shape, bool), np.full(shape, -1)))
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameSums:
+    """What the pixels of a set say at some values of the parameters: sums for each cell, and what was smooth there.
+
+    One strip of image rows in `every` was gone through.
+    """
+
+    likelihood: Likelihood
+    values: Vector
+    cells: Cells
+    sums: CellSums
+    moments: Float[np.ndarray, "j i k e"]
+    every: int
+    smooth: FieldTable
+    optics: OpticsUsed
+
+    @cached_property
+    def instrument(self) -> Instrument:
+        """The instrument with the values."""
+        return self.likelihood.model.instrument(self.values)
+
+    def unit(self, together: int = 1) -> Float[np.ndarray, "k e r c"]:
+        """Counts for light of unit flux in the middle of the cells, or of blocks of them."""
+        s, t = np.meshgrid(*self.cells.middles(together))
+        return np.moveaxis(np.asarray(self.smooth(s, t).unit), (0, 1), (2, 3))
+
+    @property
+    def chi2(self) -> float:
+        """χ² of all pixels."""
+        return float(self.sums.chi2.sum())
+
+    @property
+    def census(self) -> Census:
+        """Pixels used in each exposure, and the part of the field in which any are."""
+        used = np.asarray(self.sums.used)
+        any_used = used.sum(axis=0) > 0
+        half = 0.5 * self.cells.size
+        s, t = (
+            np.stack([edges[:-1] + inner, edges[1:] - inner])
+            for edges, inner in zip(self.cells.edges(), half, strict=True)
+        )
+        corners = [self.cells.field(s[i][None, :], t[j][:, None]) for i in (0, 1) for j in (0, 1)]
+        x, y = (np.stack([corner[i] for corner in corners])[:, any_used] for i in (0, 1))
+        extent = (x.min(), x.max(), y.min(), y.max()) if any_used.any() else (np.nan,) * 4
+        low_x, high_x, low_y, high_y = (float(value) for value in extent)
+        rows = used.sum(axis=(1, 2)).round().astype(int)
+        return Census(rows, (low_x, high_x, low_y, high_y), self.likelihood.cameras)
+
+
+def strips_of(likelihood: Likelihood) -> int:
+    """Number of strips of image rows in which the frames of a set are gone through."""
+    intensities = likelihood.calset.intensities
+    assert isinstance(intensities, FrameIntensities)
+    cells = Cells.of(intensities.grid)
+    return -(-cells.shape[0] // _cell_rows(cells))
+
+
+def stands_for_pixels(likelihood: Likelihood, values: Vector) -> bool:
+    """Whether cells can stand for the pixels of a set: counts linear in a flux of their own, smooth over the frames."""
+    instrument, intensities = likelihood.model.instrument(values), likelihood.calset.intensities
+    if not isinstance(intensities, FrameIntensities) or not light.is_linear(instrument):
+        return False
+    if likelihood.plan.exposures.shared is not None:
+        return False
+    return _series(likelihood, instrument, Cells.of(intensities.grid))[0] is not None
+
+
+def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameSums:
+    """Go once over the pixels of a set for which `stands_for_pixels` holds, or over one strip in `every`.
+
+    Raises `DataError` for what cannot be read, and for errors that are not positive; ValueError where the counts
+    are not smooth over the field.
+    """
+    intensities = likelihood.calset.intensities
+    assert isinstance(intensities, FrameIntensities)
+    cells, runner = Cells.of(intensities.grid), likelihood.runner
+    instrument = likelihood.model.instrument(values)
+    smooth, off = _series(likelihood, instrument, cells)
+    if smooth is None:
+        raise ValueError(f"no series of the counts over the field: off by {off:.2g}")
+    columns, rows = cells.shape[1], _cell_rows(cells)
+    strips = range(0, strips_of(likelihood), every)
+    width, height = -(-cells.grid.width // piece_of(cells.side)) * piece_of(cells.side), rows * cells.side
+    # Beyond the frame there are no pixels: any place will do.
+    s = np.minimum((np.arange(width) + 0.5) * cells.size[0] - 1.0, 1.0)
+    across = jnp.asarray(chebyshev.polynomials(s, smooth.count).T)
+    series = _coefficients(smooth)
+    known, together = jnp.asarray(likelihood.flux_known), sharing(instrument, likelihood.plan).cameras
+    shapes = _shapes(likelihood, rows, columns)
+
+    def work(number: int) -> SlabSums:
+        top = strips[number] * height
+        bottom = min(top + height, cells.grid.height)
+        pixels = raw_rows(intensities, top, bottom, height, width)
+        t = np.minimum((top + np.arange(height) + 0.5) * cells.size[1] - 1.0, 1.0)
+        along = jnp.asarray(chebyshev.polynomials(t, smooth.count))
+        found = strip_sums(pixels, jnp.asarray(series), across, along, jnp.zeros(cells.side), known, together)
+        if int(found.impossible):
+            intensities.block(top * cells.grid.width, bottom * cells.grid.width)  # says which
+        flat = np.concatenate([np.ravel(np.asarray(leaf)[..., :columns]) for leaf in found.cells])
+        return SlabSums(np.ravel(found.moments), np.full(4, -np.inf), {number: flat})
+
+    step = height * cells.grid.width * every
+    layout = dataclasses.replace(likelihood.layout, slab=step, chunk=step)
+    key = f"cells {values.tobytes().hex()} every {every}"
+    total = runner.total("summing pixels", key, work, layout)
+    sums = _assembled(total.parts, shapes, cells.shape[0], every)
+    moments = total.sums.reshape(series.shape)
+    return FrameSums(likelihood, values, cells, sums, moments, every, smooth, OpticsUsed(smooth.count, off))
+
+
+def _cell_rows(cells: Cells) -> int:
+    """Rows of cells in a strip."""
+    return max(1, limits.STRIP_ROWS // cells.side)
+
+
+def _series(likelihood: Likelihood, instrument: Instrument, cells: Cells) -> tuple[FieldTable | None, float]:
+    def exact(s: Vector, t: Vector) -> Smooth:
+        return smooth_at(likelihood, instrument, *cells.field(s, t))
+
+    def error(found: Smooth, truth: Smooth) -> float:
+        off = [float(np.abs(one - other).max()) for one, other in zip(found, truth, strict=True)]
+        return max(off) if np.all(np.isfinite(off)) else float("nan")
+
+    return accurate_table(exact, FRAME, limits.NODES_PER_SIDE, TOLERANCE, error)
+
+
+def _coefficients(table: FieldTable) -> Float[np.ndarray, "j i k e"]:
+    unit = np.asarray(table.coefficients.unit)
+    return np.swapaxes(unit.reshape(table.count, table.count, *unit.shape[1:]), 0, 1)
+
+
+def _shapes(likelihood: Likelihood, rows: int, columns: int) -> list[tuple[int, ...]]:
+    e, k = len(likelihood.flux_known), likelihood.cameras
+    return [(k, e, rows, columns)] * 2 + [(e, rows, columns)] * 3
+
+
+def _assembled(parts: dict[int, Vector], shapes: list[tuple[int, ...]], height: int, every: int) -> CellSums:
+    """All strips in their places; nothing where one was left out."""
+    rows = shapes[0][-2]
+    sizes = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]
+    found = []
+    strips = -(-height // rows)
+    for shape in shapes:
+        found.append(np.zeros((*shape[:-2], strips * rows, shape[-1])))
+    for number, flat in parts.items():
+        for array, shape, piece in zip(found, shapes, np.split(flat, sizes), strict=True):
+            first = number * every * rows
+            array[..., first : first + rows, :] = piece.reshape(shape)
+    return CellSums(*(array[..., :height, :] for array in found))
