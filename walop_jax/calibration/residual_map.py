@@ -177,13 +177,18 @@ def residual_map_of_pixels(found: FrameSums) -> ResidualMap:
         vectors = np.asarray(smooth.vectors)[:, likelihood.plan.band_of[exposure, 0]]
         total = vectors[:, pairs[:, 0], 0] + vectors[:, pairs[:, 1], 0]
         stokes = np.asarray(smooth.stokes)[:, exposure, :3]
-        elements = 0.5 * np.einsum("ca,cs,ak->cask", total, stokes, signs).reshape(s.size, -1, likelihood.cameras)
+        elements = 0.5 * np.einsum("ca,cs,ak->cask", total, stokes, signs).reshape(
+            s.size, -1, likelihood.cameras
+        )
         later = np.asarray(smooth.unit)[:, None, :, exposure] * np.abs(signs[1:])
         change = np.concatenate([elements, later], axis=1)
         right += np.einsum("cdk,kc->dc", change, pull[:, exposure])
         left += np.einsum("cdk,klc,cfl->cdf", change, matrices[:, :, exposure], change, optimize=True)
     each = likelihood.cameras - np.where(likelihood.flux_known, 0.0, found.instrument.cameras.fluxes)
-    chi2, used = (in_blocks(np.asarray(v)[chosen], together).reshape(int(chosen.sum()), -1) for v in (found.sums.chi2, found.sums.used))
+    chi2, used = (
+        in_blocks(np.asarray(v)[chosen], together).reshape(int(chosen.sum()), -1)
+        for v in (found.sums.chi2, found.sums.used)
+    )
     sums = MapSums(chi2.sum(axis=0), each[chosen] @ used, right, left)
     return solved_map(cells.blocks(together, shape), setting, sums)
 

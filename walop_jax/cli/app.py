@@ -20,6 +20,7 @@ COMMANDS = (
     "inspect",
     "simulate",
     "refit",
+    "compress",
     "diagnose",
     "limits",
     "sample",

@@ -19,6 +19,7 @@ from walop_jax.data.checks import (
     make_points,
     make_sources,
 )
+from walop_jax.data.compression import EXTENSION, read_compression, remark
 from walop_jax.data.filters import builtin_filter
 from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
 from walop_jax.data.merge import merge_calibration_sets
@@ -127,8 +128,10 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
         intensities, more = table_intensities(table("INTENSITIES"), exposures, points, sources, place)
         intensities, repeated = mask_repeats(intensities, exposures)
         remarks.extend(more + repeated + _idle(intensities, exposures, path))
-    remarks.extend(check_repeats(intensities, exposures, points, path))
-    return CalibrationSet(
+    compression = None if EXTENSION not in tables else read_compression(tables[EXTENSION], path)
+    if compression is None:
+        remarks.extend(check_repeats(intensities, exposures, points, path))
+    found = CalibrationSet(
         instrument=instrument,
         site=site,
         origin=str(primary.get("ORIGIN", "")).strip(),
@@ -138,7 +141,9 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
         filters=with_builtins(filters, exposures),
         intensities=intensities,
         remarks=tuple(remarks),
+        compression=compression,
     )
+    return found if compression is None else dataclasses.replace(found, remarks=(*remarks, remark(found)))
 
 
 def _header(header: Any, path: Path) -> tuple[int, str, Site]:
@@ -175,9 +180,9 @@ def _extensions(opened: OpenFile, version: int, remarks: list[str]) -> tuple[dic
     for number, hdu in enumerate(opened.hdus[1:], start=1):
         name = hdu.name.strip().upper()
         image = name in four or (version > 1 and _IMAGE.fullmatch(name))
-        kind = tables if name in schema.TABLES else images if image else None
+        kind = tables if name in (*schema.TABLES, EXTENSION) else images if image else None
         if kind is None:
-            known = (*schema.TABLES, *four)
+            known = (*schema.TABLES, EXTENSION, *four)
             remarks.append(f"{opened.path} [{name or number}]: unknown extension ({nearest(name, known)})")
         elif name in kind:
             raise fail("is there twice", file=opened.path, extension=name, advice="remove one")

@@ -224,11 +224,26 @@ class InputFile:
     sha256: str
 
 
+@dataclasses.dataclass(frozen=True)
+class Compression:
+    """What a calibration set stands for that was made of whole frames: so many `pixels` of the files `frames`.
+
+    The pixels were summed at `values` of the model's parameters, where their χ² and its degrees of freedom were these.
+    """
+
+    pixels: int
+    chi2: float
+    dof: int
+    values: Mapping[str, float]
+    frames: tuple[InputFile, ...] = ()
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class CalibrationSet(Displayed):
     """A calibration set, read, checked and free of units.
 
-    `intensities` gives the data of a slice of the points; whole frames are read from disk only then.
+    `intensities` gives the data of a slice of the points; whole frames are read from disk only then. `compression` is
+    there where the field points stand for the pixels of frames.
     """
 
     instrument: str
@@ -241,6 +256,7 @@ class CalibrationSet(Displayed):
     intensities: Intensities
     inputs: tuple[InputFile, ...] = ()
     remarks: tuple[str, ...] = ()
+    compression: Compression | None = None
 
     @property
     def cameras(self) -> int:

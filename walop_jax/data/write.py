@@ -12,6 +12,7 @@ from astropy.io import fits
 
 from walop_jax.data import schema
 from walop_jax.data.checks import instrument_name, oldest_version
+from walop_jax.data.compression import compression_hdu
 from walop_jax.data.frames import Grid, count_names, error_names
 from walop_jax.data.records import CalibrationSet, DataFlag, Exposures, FilterCurve
 from walop_jax.data.table_intensities import TableIntensities
@@ -118,6 +119,8 @@ def _optional(calset: CalibrationSet, path: object) -> list[Any]:
         hdus.append(table_hdu("SOURCES", columns, path))
     if calset.filters:
         hdus.append(table_hdu("FILTERS", filter_columns(calset.filters), path))
+    if calset.compression is not None:
+        hdus.append(compression_hdu(calset.compression))
     return hdus
 
 

@@ -39,6 +39,7 @@ from walop_jax.diagnosis.naming import SEPARATION
 from walop_jax.diagnosis.score import separations
 from walop_jax.diagnosis.trust import sampled
 from walop_jax.fit.refit import FitResult
+from walop_jax.fit.stand_in import on_field_points
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.rounding import two_digits, two_digits_range, with_minus_sign
@@ -220,7 +221,9 @@ def detection_limits(
     context = effect_context(template, calset.exposures)
     fitting = applicable(catalogue, context, template)
     wanted = list(all_probes(fitting, context))
-    result = sampled(result, most_points(calset, template, sum(len(probe.widths) for probe in wanted)))
+    result = sampled(
+        on_field_points(result), most_points(calset, template, sum(len(probe.widths) for probe in wanted))
+    )
     tell("differentiating every effect")
     examination = Examination(result, wanted, np.random.default_rng(seed))
     noncentrality = _Noncentrality(examination.scorer.threshold(ALARM))

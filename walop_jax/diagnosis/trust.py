@@ -16,8 +16,8 @@ Symbols     w = expected counts / errors of what has a flux in common (an exposu
             that was fitted (0 where it is known); Q orthonormal basis of the derivatives with respect to the free
             parameters.
 Sources     Rao 1948; Satterthwaite 1946, Biometrics Bull. 2, 110 (χ² with two moments); Šidák 1967 (many questions).
-Limits      Noise alone raises a doubt in about one fit of 200. Of a large set a sample of the points is looked at:
-            what is smaller than its noise shows in χ² and in the residual map.
+Limits      Noise alone raises a doubt in about one fit of 200. Of a large set a sample of the points is looked at, of
+            whole frames the points that stand for all pixels: what is smaller shows in χ² and in the residual map.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from walop_jax.diagnosis.freeform import strata
 from walop_jax.diagnosis.mixups import refuse_mixups
 from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
+from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.thinning import thinned
@@ -66,12 +67,12 @@ def examined(result: FitResult, seed: int = 0) -> FitResult:
     if result.errors_too_large and _hold_no_noise(design):
         return dataclasses.replace(result, examined=True, noiseless=True)
     table = pattern_scores(design, seed)
-    doubts = (*_patterns(table), *_groups(design))
+    doubts = (*_patterns(table), *_groups(design), *_far_from_pixels(result))
     return with_honest_errors(dataclasses.replace(result, examined=True, doubts=doubts))
 
 
 def _looked_at(result: FitResult) -> FitResult:
-    return sampled(result, max(1, limits.TRUST_ROWS // max(len(result.calset.exposures), 1)))
+    return sampled(on_field_points(result), max(1, limits.TRUST_ROWS // max(len(result.calset.exposures), 1)))
 
 
 def _errors_too_small(result: FitResult, seed: int) -> Iterator[str]:
@@ -83,6 +84,16 @@ def _errors_too_small(result: FitResult, seed: int) -> Iterator[str]:
         yield (
             f"N_ERR is {factor:.3g} times too small: with errors as large the residuals hold nothing but noise; check "
             "the gain and the unit of N_ERR"
+        )
+
+
+def _far_from_pixels(result: FitResult) -> Iterator[str]:
+    """Whether the values have left the place where the pixels that a set stands for were summed."""
+    distance = moved(result)
+    if distance > FARTHEST:
+        yield (
+            f"the fit lies {distance:.3g} standard errors from where the pixels were summed, some "
+            f"{distance / 1000:.1g} of which may be left: compress the frames again, with this model"
         )
 
 

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
+from walop_jax.data.frames import FrameIntensities
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import location, naming
 from walop_jax.diagnosis.change_of_stokes import instrument_matrices, largest_change
@@ -34,8 +35,10 @@ from walop_jax.diagnosis.score import Score
 from walop_jax.diagnosis.step_summary import before_and_after, refitted_in_order
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit
+from walop_jax.fit.stand_in import on_field_points
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.runner import Runner
 from walop_jax.likelihood.thinning import thinned
 from walop_jax.model.effects import EFFECTS, Context, Effect, FreeForm, OtherDescription
 from walop_jax.model.parameters import values_of
@@ -66,6 +69,7 @@ def diagnose(
     began = time.perf_counter()
     tell = progress or (lambda text: None)
     model = model or base_model(calset)
+    calset = _in_points(calset, model, tell)
     context = effect_context(model.template, calset.exposures)
     amplitudes = sum(len(probe.widths) for probe in all_probes(tuple(catalogue), context))
     some = thinned(calset, most_points(calset, model.template, amplitudes), neighbours=1)
@@ -73,6 +77,18 @@ def diagnose(
         tell(f"looking at {len(some.points)} of {len(calset.points)} field points")
     found = _Diagnosing(some, model, catalogue, seed, tell, began + 60.0 * minutes).run(began)
     return dataclasses.replace(found, points=len(calset.points))
+
+
+def _in_points(calset: CalibrationSet, model: Model, tell: Callable[[str], None]) -> CalibrationSet:
+    """Whole frames as a set of field points that stands for all pixels; any other set as it is."""
+    likelihood = Likelihood.of(calset, model, runner=Runner(progress=tell))
+    if not (likelihood.layout.large and isinstance(calset.intensities, FrameIntensities)):
+        return calset
+    tell("fitting all pixels")
+    found = on_field_points(fit(likelihood))
+    if found.calset.compression is not None:
+        tell(f"looking at {len(found.calset.points)} field points that stand for all pixels")
+    return found.calset
 
 
 def _promise(choice: Choice) -> tuple[float, float]:

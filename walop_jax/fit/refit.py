@@ -223,7 +223,7 @@ def fit(
     Raises ValueError when the exposures cannot determine the instrument.
     """
     began, model = time.perf_counter(), likelihood.model
-    first = model.start if start is None else np.asarray(start, float)
+    first = _start(likelihood) if start is None else np.asarray(start, float)
     found = find_minimum(likelihood, first, noise_scale, worth)
     check_constrained(model, found.posterior)
     return FitResult(
@@ -235,6 +235,16 @@ def fit(
         starts=found.starts,
         seconds=time.perf_counter() - began,
     )
+
+
+def _start(likelihood: Likelihood) -> Vector:
+    """The start values of the model; of a set that stands for pixels, the values at which these were summed."""
+    model, compression = likelihood.model, likelihood.calset.compression
+    start = model.start.copy()
+    if compression is not None:
+        known = [i for i in model.free if model.parameters[i].name in compression.values]
+        start[known] = [compression.values[model.parameters[i].name] for i in known]
+    return start
 
 
 def with_honest_errors(result: FitResult) -> FitResult:

@@ -15,7 +15,7 @@ Limit       detectors that report counts as they are, so that N is linear in F.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,11 +33,11 @@ class CellSums(NamedTuple):
     `weight` is Σ F²/σ², `pull` Σ F (N − F u)/σ², `power` Σ F³ Σ_k u²/σ².
     """
 
-    weight: Float[Array, "k e r c"]
-    pull: Float[Array, "k e r c"]
-    power: Float[Array, "e r c"]
-    chi2: Float[Array, "e r c"]
-    used: Float[Array, "e r c"]
+    weight: Float[Any, "k e r c"]
+    pull: Float[Any, "k e r c"]
+    power: Float[Any, "e r c"]
+    chi2: Float[Any, "e r c"]
+    used: Float[Any, "e r c"]
 
 
 class StripSums(NamedTuple):

@@ -8,7 +8,7 @@ Method      Blocks of cells are given n × n field points, at the nodes of the G
 Gradient    That of the points differs by what is not smooth within a block. The g are changed by K J β, the least
             change in units of their errors that gives the parameters of the model the gradient of the pixels.
 Limits      The matrix is that of the points. What is not smooth over the frame is not there: the residual map of the
-            fit shows it. χ² is that of the points; that of the pixels is told beside it (`Compression`).
+            fit shows it. χ² is that of the points; that of the pixels is told beside it (`records.Compression`).
 Source      Golub & Welsch 1969, Mathematics of Computation 23, 221 (nodes of the rule).
 """
 
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import legendre
 
-from walop_jax.data.records import Block, CalibrationSet, Points
+from walop_jax.data.records import Block, CalibrationSet, Compression, Points
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.frames import FrameSums, unit_slopes_at
@@ -43,9 +43,7 @@ def _shares(edges: Vector) -> tuple[Vector, Float[np.ndarray, "c p"]]:
         middle, half = 0.5 * (edges[last] + edges[first]), 0.5 * (edges[last] - edges[first])
         at = (0.5 * (edges[first:last] + edges[first + 1 : last + 1]) - middle) / half
         places.append(middle + half * nodes)
-        shares[first:last, count * block : count * (block + 1)] = (
-            legendre.legvander(at, count - 1) @ scaled.T
-        )
+        shares[first:last, count * block : count * (block + 1)] = legendre.legvander(at, count - 1) @ scaled.T
     return np.concatenate(places), shares
 
 
@@ -74,8 +72,21 @@ def compressed(posterior: PixelPosterior) -> CalibrationSet:
     sigma = np.where(used[..., None], flux / np.sqrt(safe), 1.0)
     points = Points(np.arange(len(x), dtype=np.int32), x, y)
     block = Block(x, y, counts, sigma, used, np.full(used.shape, -1))
+    calset = likelihood.calset
+    names = [parameter.name for parameter in likelihood.model.parameters]
+    record = Compression(
+        pixels=len(calset.points),
+        chi2=found.chi2,
+        dof=posterior.dof,
+        values=dict(zip(names, found.values.tolist(), strict=True)),
+        frames=calset.inputs,
+    )
     return dataclasses.replace(
-        likelihood.calset, points=points, intensities=TableIntensities.dense(points, block)
+        calset,
+        points=points,
+        intensities=TableIntensities.dense(points, block),
+        compression=record,
+        remarks=(),
     )
 
 
@@ -87,7 +98,9 @@ def _with_gradient(
     place: tuple[Vector, Vector],
 ) -> Float[np.ndarray, "p e k"]:
     """The pull at points without what is a change of the flux, with the gradient of all pixels."""
-    matrix = np.moveaxis(information_of(found, *(np.moveaxis(v, 2, 0) for v in (weight, unit))), (2, 3), (0, 1))
+    matrix = np.moveaxis(
+        information_of(found, *(np.moveaxis(v, 2, 0) for v in (weight, unit))), (2, 3), (0, 1)
+    )
     inverse = np.where(weight > 0, 1.0 / np.where(weight > 0, weight, 1.0), 0.0)
     pull = np.einsum("pekl,pel->pek", matrix, inverse * pull)
     slopes = unit_slopes_at(found.likelihood, found.instrument, *place)

@@ -78,9 +78,7 @@ class Cells:
         step = together * self.side
         first = (self.grid.reference[0] - 0.5) / step + 0.5, (self.grid.reference[1] - 0.5) / step + 0.5
         (a, b), (c, d) = self.grid.matrix
-        return Grid(
-            shape[1], shape[0], first, self.grid.value, ((a * step, b * step), (c * step, d * step))
-        )
+        return Grid(shape[1], shape[0], first, self.grid.value, ((a * step, b * step), (c * step, d * step)))
 
     def field(self, s: Any, t: Any) -> tuple[Any, Any]:
         """Field coordinates (deg) of places in the frame."""
@@ -173,7 +171,7 @@ class FrameSums:
     @property
     def census(self) -> Census:
         """Pixels used in each exposure, and the part of the field in which any are."""
-        used = np.asarray(self.sums.used)
+        used = self.sums.used
         any_used = used.sum(axis=0) > 0
         half = 0.5 * self.cells.size
         s, t = (

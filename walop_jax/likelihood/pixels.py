@@ -64,14 +64,12 @@ def in_blocks(values: Float[np.ndarray, "... r c"], side: int) -> Float[np.ndarr
 
 def information(found: FrameSums, together: int = 1) -> Float[np.ndarray, "k k e r c"]:
     """What the pixels say of the counts for light of unit flux: the K of each cell, or of blocks of cells."""
-    return information_of(
-        found, in_blocks(np.asarray(found.sums.weight), together), found.unit(together)
-    )
+    return information_of(found, in_blocks(found.sums.weight, together), found.unit(together))
 
 
 def information_of(
-    found: FrameSums, weight: Float[np.ndarray, "k *p"], unit: Float[np.ndarray, "k *p"]
-) -> Float[np.ndarray, "k k *p"]:
+    found: FrameSums, weight: Float[np.ndarray, "k ..."], unit: Float[np.ndarray, "k ..."]
+) -> Float[np.ndarray, "k k ..."]:
     """K from Σ F²/σ² and the counts for light of unit flux, for any places (exposures anywhere among these axes)."""
     k, likelihood = len(unit), found.likelihood
     shared = sharing(found.instrument, likelihood.plan).cameras

@@ -96,6 +96,11 @@ def _behind_polariser(instrument: Instrument) -> Iterator[Element]:
 
 def conditions_asked_by(element: Element) -> frozenset[str]:
     """What an element asks for, by its name in `ray.CONDITIONS`; found by running it on shapes."""
+    return _conditions_asked(*shapes_of(element))
+
+
+@functools.lru_cache(maxsize=1024)
+def _conditions_asked(structure: Any, shapes: Shapes) -> frozenset[str]:
     asked: set[str] = set()
 
     def run(element: Element) -> tuple[Any, Any]:
@@ -106,7 +111,7 @@ def conditions_asked_by(element: Element) -> frozenset[str]:
 
     while True:
         try:
-            jax.eval_shape(run, element)
+            jax.eval_shape(run, of_shapes(structure, shapes))
             return frozenset(asked)
         except NotPlannedError as missing:
             if missing.quantity in asked:

@@ -1,0 +1,39 @@
+"""A fit of whole frames as one of the field points that stand for their pixels: what looks at residuals can."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from walop_jax.fit.refit import FitResult
+from walop_jax.likelihood.compression import compressed
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.pixels import PixelPosterior
+
+FARTHEST = 100.0
+"""Standard errors from where the pixels were summed up to which a set that stands for them is good: a thousandth of the
+way is left."""
+
+
+def on_field_points(result: FitResult) -> FitResult:
+    """The same values and errors beside a set that stands for all pixels; a fit of anything else comes back as it is."""
+    if not isinstance(result.posterior, PixelPosterior):
+        return result
+    likelihood = Likelihood.of(compressed(result.posterior), result.model, interpolate=False)
+    posterior = likelihood.expand(result.values, result.noise_scale)
+    return dataclasses.replace(result, likelihood=likelihood, posterior=posterior)
+
+
+def moved(result: FitResult) -> float:
+    """How far (standard errors, all parameters together) a fit lies from where the pixels of its set were summed.
+
+    0 for a set that stands for no pixels. Parameters that were not there then count from their start values.
+    """
+    compression = result.calset.compression
+    if compression is None:
+        return 0.0
+    names, start = [p.name for p in result.model.parameters], result.model.start
+    before = np.array([compression.values.get(name, value) for name, value in zip(names, start, strict=True)])
+    step = (result.values - before)[result.model.free]
+    return float(np.sqrt(max(step @ result.posterior.matrix @ step, 0.0)))
