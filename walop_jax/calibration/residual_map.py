@@ -163,34 +163,37 @@ def residual_map_of_pixels(found: FrameSums) -> ResidualMap:
     setting, chosen = main_setting(
         Settings.of(likelihood.calset.exposures, likelihood.plan.moving), likelihood.calset.exposures.clp_in
     )
-    points = limits.POINTS_PER_CELL
-    together = max(1, round(np.sqrt(points) / cells.side), -(-max(cells.shape) // limits.MOST_CELLS))
-    s, t = np.meshgrid(*cells.middles(together))
-    shape, smooth = s.shape, found.smooth(s.ravel(), t.ravel())
+    blocks = (limits.POINTS_PER_CELL**0.5 / cells.side, max(cells.shape) / limits.MOST_CELLS)
+    together = int(np.ceil(max(1.0, *blocks)))
+    s, t = np.meshgrid(*cells.middles())
+    smooth = found.smooth(s.ravel(), t.ravel())
     pairs = np.array(found.instrument.cameras.pairs)
     signs = np.eye(likelihood.cameras)[pairs[:, 0]] - np.eye(likelihood.cameras)[pairs[:, 1]]
     n = len(residual_names(len(pairs)))
-    right, left = np.zeros((n, s.size)), np.zeros((s.size, n, n))
-    matrices = information(found, together).reshape(likelihood.cameras, likelihood.cameras, len(chosen), -1)
-    pull = in_blocks(np.asarray(found.sums.pull), together).reshape(likelihood.cameras, len(chosen), -1)
+    right, left = np.zeros((n, s.size)), np.zeros((n, n, s.size))
+    matrices = information(found).reshape(likelihood.cameras, likelihood.cameras, len(chosen), -1)
+    pull = found.sums.pull.reshape(likelihood.cameras, len(chosen), -1)
     for exposure in np.flatnonzero(chosen):
         vectors = np.asarray(smooth.vectors)[:, likelihood.plan.band_of[exposure, 0]]
         total = vectors[:, pairs[:, 0], 0] + vectors[:, pairs[:, 1], 0]
         stokes = np.asarray(smooth.stokes)[:, exposure, :3]
-        elements = 0.5 * np.einsum("ca,cs,ak->cask", total, stokes, signs).reshape(
-            s.size, -1, likelihood.cameras
-        )
+        elements = 0.5 * np.einsum("ca,cs,ak->cask", total, stokes, signs)
         later = np.asarray(smooth.unit)[:, None, :, exposure] * np.abs(signs[1:])
-        change = np.concatenate([elements, later], axis=1)
+        change = np.concatenate([elements.reshape(s.size, -1, likelihood.cameras), later], axis=1)
         right += np.einsum("cdk,kc->dc", change, pull[:, exposure])
-        left += np.einsum("cdk,klc,cfl->cdf", change, matrices[:, :, exposure], change, optimize=True)
+        left += np.einsum("cdk,klc,cfl->dfc", change, matrices[:, :, exposure], change, optimize=True)
     each = likelihood.cameras - np.where(likelihood.flux_known, 0.0, found.instrument.cameras.fluxes)
-    chi2, used = (
-        in_blocks(np.asarray(v)[chosen], together).reshape(int(chosen.sum()), -1)
-        for v in (found.sums.chi2, found.sums.used)
+    freedom = np.einsum("e,erc->rc", each[chosen], found.sums.used[chosen])
+    shaped = (
+        found.sums.chi2[chosen].sum(axis=0),
+        freedom,
+        right.reshape(n, *s.shape),
+        left.reshape(n, n, *s.shape),
     )
-    sums = MapSums(chi2.sum(axis=0), each[chosen] @ used, right, left)
-    return solved_map(cells.blocks(together, shape), setting, sums)
+    sums = [in_blocks(values, together) for values in shaped]
+    grid = cells.blocks(together, sums[0].shape)
+    chi2, freedom, right, left = (values.reshape(*values.shape[:-2], -1) for values in sums)
+    return solved_map(grid, setting, MapSums(chi2, freedom, right, np.moveaxis(left, 2, 0)))
 
 
 class MapSums(NamedTuple):

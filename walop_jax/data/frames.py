@@ -65,15 +65,38 @@ class Cube:
 
         Raises `DataError` if the file has gone or changed since it was checked.
         """
+        self._check_stamp()
         try:
-            now = self.path.stat()
-            if (now.st_size, now.st_mtime_ns) != self.stamp:
-                raise fail("the file has changed since it was opened", file=self.path, advice="start again")
             # Mapped anew each time: no open file to keep, and pages are given back after the slab.
             raw = np.memmap(self.path, self.dtype, mode="r", offset=self.offset, shape=self.shape)
         except OSError as error:
             raise fail(f"cannot be read: {error}", file=self.path, extension=self.extension) from error
         return np.asarray(raw[:, start:stop])
+
+    def read_into(self, planes: np.ndarray, start: int) -> None:
+        """Read the bytes of some rows of all planes, from row `start` on, into an array (plane, row, column).
+
+        Rows of the array must lie side by side. Raises what `stored` raises.
+        """
+        self._check_stamp()
+        _, height, width = self.shape
+        row = width * self.dtype.itemsize
+        with self.path.open("rb", buffering=0) as file:
+            for number, plane in enumerate(planes):
+                file.seek(self.offset + (number * height + start) * row)
+                target = memoryview(plane).cast("B")
+                if file.readinto(target) != len(target):
+                    raise fail(
+                        "ends too early", file=self.path, extension=self.extension, advice="start again"
+                    )
+
+    def _check_stamp(self) -> None:
+        try:
+            now = self.path.stat()
+        except OSError as error:
+            raise fail(f"cannot be read: {error}", file=self.path, extension=self.extension) from error
+        if (now.st_size, now.st_mtime_ns) != self.stamp:
+            raise fail("the file has changed since it was opened", file=self.path, advice="start again")
 
     def rows(self, start: int, stop: int) -> Float[np.ndarray, "e y x"]:
         """Read some rows of all planes; undefined integers (BLANK) become NaN.

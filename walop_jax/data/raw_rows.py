@@ -6,6 +6,7 @@ a copy, and `float64` turns them into numbers inside a compiled function; anythi
 
 from __future__ import annotations
 
+import threading
 from typing import Any, NamedTuple
 
 import jax
@@ -39,33 +40,44 @@ def float64(values: Array) -> Float[Array, ...]:
     return jax.lax.bitcast_convert_type(swapped, jnp.float32).astype(jnp.float64)
 
 
-def raw_rows(intensities: FrameIntensities, start: int, stop: int, height: int, width: int) -> RawRows:
-    """Read the image rows `start:stop` of all frames into arrays of `height` × `width` pixels.
+class RowReader:
+    """Reads image rows of all frames into arrays of `height` × `width` pixels, which each thread uses again and again.
 
-    Raises `DataError` if a file has gone or changed since it was checked.
+    What was made of the rows must be finished before the next ones are read.
     """
-    shape = (intensities.cameras, intensities.exposures, height, width)
-    inside = (slice(0, stop - start), slice(0, intensities.grid.width))
-    cubes = [cube for stack in intensities.stacks for cube in (*stack.counts, *stack.sigma)]
-    dtype = np.uint32 if all(_is_plain(cube) for cube in cubes) else np.float64
-    # Closed pixels beyond the frames hold zeros, which are never used.
-    counts, sigma = (_empty(shape, dtype) for _ in range(2))
-    closed = np.ones(shape[1:], bool)
-    first = 0
-    for stack in intensities.stacks:
-        here = slice(first, first + stack.exposures)
-        for array, own in ((counts, stack.counts), (sigma, stack.sigma)):
-            for camera, cube in enumerate(own):
-                array[(camera, here, *inside)] = _rows(cube, start, stop, dtype)
-        if stack.flag is None:
-            closed[(here, *inside)] = False
-        else:
-            closed[(here, *inside)] = _is_set(stack.flag, start, stop)
-        first += stack.exposures
-    for array in (counts, sigma):
-        array[..., stop - start :, :] = 0
-        array[..., intensities.grid.width :] = 0
-    return RawRows(jax.device_put(counts), jax.device_put(sigma), ~closed)
+
+    def __init__(self, intensities: FrameIntensities, height: int, width: int) -> None:
+        self.intensities, self.shape = intensities, (height, width)
+        self._own = threading.local()
+
+    def __call__(self, start: int, stop: int) -> RawRows:
+        """The image rows `start:stop`.
+
+        Raises `DataError` if a file has gone or changed since it was checked.
+        """
+        counts, sigma, closed = self._buffers()
+        inside = (slice(0, stop - start), slice(0, self.intensities.grid.width))
+        closed[:] = True
+        first = 0
+        for stack in self.intensities.stacks:
+            here = slice(first, first + stack.exposures)
+            for array, own in ((counts, stack.counts), (sigma, stack.sigma)):
+                for camera, cube in enumerate(own):
+                    _read(cube, start, stop, array[camera, here])
+            closed[(here, *inside)] = False if stack.flag is None else _is_set(stack.flag, start, stop)
+            first += stack.exposures
+        return RawRows(jax.device_put(counts), jax.device_put(sigma), ~closed)
+
+    def _buffers(self) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, "e h w"]]:
+        """This thread's arrays. Closed pixels hold zeros or what was there before, and are never used."""
+        if not hasattr(self._own, "buffers"):
+            frames = self.intensities
+            cubes = [cube for stack in frames.stacks for cube in (*stack.counts, *stack.sigma)]
+            dtype = np.uint32 if all(_is_plain(cube) for cube in cubes) else np.float64
+            shape = (frames.cameras, frames.exposures, *self.shape)
+            counts, sigma = _zeros(shape, dtype), _zeros(shape, dtype)
+            self._own.buffers = counts, sigma, np.ones(shape[1:], bool)
+        return self._own.buffers
 
 
 def _is_plain(cube: Cube) -> bool:
@@ -78,14 +90,19 @@ def _is_set(flag: Cube, start: int, stop: int) -> Bool[np.ndarray, "e y x"]:
     return flag.rows(start, stop) != 0  # an undefined flag, NaN, is no clean bill of health
 
 
-def _rows(cube: Cube, start: int, stop: int, dtype: type) -> np.ndarray:
-    if dtype is np.float64:
-        return cube.rows(start, stop)
-    return cube.stored(start, stop).view(np.uint32)
+def _read(cube: Cube, start: int, stop: int, into: np.ndarray) -> None:
+    """Read rows of a cube into the first rows and columns of an array (plane, row, column)."""
+    height, width = stop - start, cube.shape[2]
+    if into.dtype != np.uint32:
+        into[:, :height, :width] = cube.rows(start, stop)
+    elif width < into.shape[2]:
+        into[:, :height, :width] = cube.stored(start, stop).view(np.uint32)
+    else:
+        cube.read_into(into[:, :height], start)
 
 
-def _empty(shape: tuple[int, ...], dtype: type) -> np.ndarray:
+def _zeros(shape: tuple[int, ...], dtype: type) -> np.ndarray:
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    memory = np.empty(size + _ALIGNED, np.uint8)
+    memory = np.zeros(size + _ALIGNED, np.uint8)
     begin = -memory.ctypes.data % _ALIGNED
     return memory[begin : begin + size].view(dtype).reshape(shape)

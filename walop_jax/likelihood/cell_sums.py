@@ -153,7 +153,7 @@ def _strip_sums(
     )
 
 
-strip_sums = compiled(_strip_sums)
+strip_sums = compiled(_strip_sums, fuse=True)
 """Sums over a strip of image rows.
 
 `series` are the coefficients of the counts for light of unit flux; `across` and `along` the polynomials at the columns

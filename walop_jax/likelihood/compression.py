@@ -31,7 +31,7 @@ Vector = Float[np.ndarray, " n"]
 SINGULAR = 1e-12  # of the largest eigenvalue: directions of the parameters that the data say nothing of
 
 
-def _shares(edges: Vector) -> tuple[Vector, Float[np.ndarray, "c p"]]:
+def _shares(edges: Vector) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "c p"]]:
     """Places of the points along a side of the frame, and what each cell between `edges` gives to them."""
     cells, (nodes, weights) = len(edges) - 1, legendre.leggauss(limits.COMPRESSED_POINTS)
     count = len(nodes)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.data.frames import FrameIntensities, Grid
-from walop_jax.data.raw_rows import raw_rows
+from walop_jax.data.raw_rows import RowReader
 from walop_jax.data.records import Block
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.cell_sums import CellSums, piece_of, strip_sums
@@ -58,7 +58,7 @@ class Cells:
         """Width and height of a pixel in the coordinates of the frame."""
         return 2.0 / np.array([self.grid.width, self.grid.height])
 
-    def edges(self, together: int = 1) -> tuple[Vector, Vector]:
+    def edges(self, together: int = 1) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " r"]]:
         """Edges of the columns and rows of cells, or of blocks of `together` × `together` of them, within the frame."""
         rows, columns = self.shape
         counts = ((columns, self.grid.width), (rows, self.grid.height))
@@ -68,7 +68,7 @@ class Cells:
         ]
         return found[0], found[1]
 
-    def middles(self, together: int = 1) -> tuple[Vector, Vector]:
+    def middles(self, together: int = 1) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " r"]]:
         """Middles of the columns and rows of cells, or of blocks of them."""
         s, t = (0.5 * (edges[:-1] + edges[1:]) for edges in self.edges(together))
         return s, t
@@ -115,7 +115,7 @@ def smooth_at(likelihood: Likelihood, instrument: Instrument, x: Vector, y: Vect
 
 def unit_slopes_at(
     likelihood: Likelihood, instrument: Instrument, x: Vector, y: Vector
-) -> Float[np.ndarray, "p e k n"]:
+) -> Float[np.ndarray, "p e k a"]:
     """Derivatives of the counts for light of unit flux with respect to all parameters, at field positions (deg)."""
     return _at(_slopes, likelihood, instrument, x, y)
 
@@ -226,11 +226,12 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
     series = _coefficients(smooth)
     known, together = jnp.asarray(likelihood.flux_known), sharing(instrument, likelihood.plan).cameras
     shapes = _shapes(likelihood, rows, columns)
+    read = RowReader(intensities, height, width)
 
     def work(number: int) -> SlabSums:
         top = strips[number] * height
         bottom = min(top + height, cells.grid.height)
-        pixels = raw_rows(intensities, top, bottom, height, width)
+        pixels = read(top, bottom)
         t = np.minimum((top + np.arange(height) + 0.5) * cells.size[1] - 1.0, 1.0)
         along = jnp.asarray(chebyshev.polynomials(t, smooth.count))
         found = strip_sums(pixels, jnp.asarray(series), across, along, jnp.zeros(cells.side), known, together)

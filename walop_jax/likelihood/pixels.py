@@ -112,7 +112,7 @@ def normal_equations(found: FrameSums) -> tuple[Vector, Matrix]:
     return gradient, 0.5 * (matrix + matrix.T)
 
 
-def _slopes_on_nodes(found: FrameSums, count: int) -> Iterator[tuple[slice, Float[np.ndarray, "p e k n"]]]:
+def _slopes_on_nodes(found: FrameSums, count: int) -> Iterator[tuple[slice, Float[np.ndarray, "p e k a"]]]:
     """Derivatives of the counts on Chebyshev nodes, some at a time."""
     x, y = found.cells.field(*chebyshev.grid(FRAME, count))
     for start in range(0, len(x), limits.SOLVED_TOGETHER):

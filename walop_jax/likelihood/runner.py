@@ -40,7 +40,7 @@ class SlabSums:
 
     sums: Vector
     extent: Float[np.ndarray, 4]
-    parts: dict[int, Vector] = dataclasses.field(default_factory=dict)
+    parts: dict[int, Float[np.ndarray, " m"]] = dataclasses.field(default_factory=dict)
 
     def plus(self, other: SlabSums) -> SlabSums:
         """What these points and others contribute."""

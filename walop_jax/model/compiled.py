@@ -16,16 +16,17 @@ import jax
 Result = TypeVar("Result")
 
 
-def compiled(function: Callable[..., Result]) -> Callable[..., Result]:
+def compiled(function: Callable[..., Result], *, fuse: bool = False) -> Callable[..., Result]:
     """`jax.jit` with this package's options; the back end is looked up at the first call, not at import.
 
-    A call with `once=True` compiles without optimisation: sooner ready, slower to run.
+    A call with `once=True` compiles without optimisation: sooner ready, slower to run. `fuse` leaves the fusion
+    emitters on, for a function without derivatives of the plates.
     """
 
     @functools.cache
     def jitted(once: bool) -> Any:
         on_cpu = jax.default_backend() == "cpu"
-        options: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if on_cpu else {}
+        options: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if on_cpu and not fuse else {}
         if once:
             options["xla_backend_optimization_level"] = 0
         return jax.jit(function, compiler_options=options or None)

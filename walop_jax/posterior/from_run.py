@@ -63,7 +63,7 @@ def fit_of_run(
             f"has {len(calset.points)} field points: the posterior of so many is as good as normal, and "
             "calibration.fits holds its covariance",
             file=product.inputs[0].path,
-            advice=f"sample sets of up to {limits.LARGE_ABOVE} points, or those that walop-jax compress makes of frames",
+            advice=f"sample sets of up to {limits.LARGE_ABOVE} points; walop-jax compress makes one of frames",
         )
     result = fit(likelihood, start=np.asarray(product.parameters.value, float))
     away = np.abs(result.values - product.parameters.value) / np.where(result.sigma > 0, result.sigma, 1.0)

@@ -1,0 +1,250 @@
+"""Whole frames by the sums of one pass: what they give pixel by pixel, and the set for them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from walop_jax.calibration import residual_map
+from walop_jax.calibration.residual_map import residual_map_of_pixels
+from walop_jax.data import Grid, read_calibration_set, write_calibration_set, write_frames
+from walop_jax.data.raw_rows import RowReader, float64
+from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.refit import fit
+from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points
+from walop_jax.io.errors import DataError
+from walop_jax.likelihood import limits, pixels
+from walop_jax.likelihood.compression import compressed
+from walop_jax.likelihood.frames import Cells, stands_for_pixels
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects import effect_by_name
+from walop_jax.model.effects.blemish import Blemish
+from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
+
+SIDE = 72
+RUN = ObservingPlan(
+    grid=SIDE, standard_grid=1, standards=0, unpolarised=0, moon_patches=3,
+    polariser_angles=polariser_turn(8, full_turn=True), throughput_degree=2,
+)  # fmt: skip
+
+
+def frames_of(calset, path, *, dtype="f4"):
+    step = 2 * RUN.field / (SIDE - 1)
+    grid = Grid(SIDE, SIDE, (1.0, 1.0), (-RUN.field, -RUN.field), ((step, 0.0), (0.0, step)))
+    write_frames(path, calset, grid, dtype=dtype)
+    return path
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    return frames_of(simulate(RUN, seed=12).calset, tmp_path_factory.mktemp("frames") / "frames.fits")
+
+
+@pytest.fixture(scope="module")
+def likelihood(path):
+    calset = read_calibration_set(path)
+    return Likelihood.of(calset, base_model(calset, throughput_degree=2), interpolate=True)
+
+
+@pytest.fixture(scope="module")
+def truth_values(likelihood):
+    """A place some standard errors from the minimum."""
+    found = fit(likelihood)
+    return found.values + 2.0 * found.sigma
+
+
+@pytest.fixture(scope="module")
+def both(likelihood, truth_values):
+    return pixels.expand(likelihood, truth_values), likelihood.expand(truth_values)
+
+
+def assert_same(ours, reference):
+    """Equal χ², counts, gradient (in standard errors) and standard errors."""
+    assert ours.data == pytest.approx(reference.data, rel=1e-10)
+    np.testing.assert_array_equal(ours.census.rows, reference.census.rows)
+    np.testing.assert_allclose(ours.census.field, reference.census.field, atol=1e-12)
+    covariance = np.linalg.inv(reference.matrix)
+    sigma = np.sqrt(np.diag(covariance))
+    step = covariance @ (ours.gradient - reference.gradient)
+    np.testing.assert_allclose(step / sigma, 0.0, atol=1e-3)
+    np.testing.assert_allclose(np.sqrt(np.diag(np.linalg.inv(ours.matrix))) / sigma, 1.0, atol=1e-3)
+
+
+def test_one_pass_is_the_expansion_of_all_pixels(both):
+    assert_same(*both)
+
+
+def test_a_strip_in_two_is_some_of_the_pixels(likelihood, truth_values, monkeypatch):
+    monkeypatch.setattr(limits, "STRIP_ROWS", 8)
+    some = pixels.expand(likelihood, truth_values, every=2)
+    assert some.census.n_data == likelihood.census.n_data * 5 / 9
+
+
+def test_flagged_pixels_and_other_types_are_as_before(path, likelihood, truth_values, tmp_path):
+    """A corner and a speckle of pixels flagged, one camera of half the exposures 0.1 % brighter, in float64."""
+    with fits.open(path) as hdus:
+        flag = np.array(hdus["FLAG"].data)
+        flag[:, :10, :14] = 2
+        flag[3, 20:60:7, 5::9] = 1
+        hdus["FLAG"].data = flag
+        for name in ("N0", "N1", "N2", "N3", "E0", "E1", "E2", "E3"):
+            hdus[name].data = hdus[name].data.astype(">f8")
+        hdus["N2"].data[::2] *= 1.001
+        hdus.writeto(tmp_path / "flagged.fits", checksum=True)
+    calset = read_calibration_set(tmp_path / "flagged.fits")
+    other = Likelihood.of(calset, likelihood.model, interpolate=True)
+    assert_same(pixels.expand(other, truth_values), other.expand(truth_values))
+
+
+def test_the_words_of_a_file_are_its_numbers(path, likelihood):
+    intensities = likelihood.calset.intensities
+    rows = RowReader(intensities, 8, SIDE + 8)(3, 9)
+    block = intensities.block(3 * SIDE, 9 * SIDE)
+    values = np.asarray(float64(rows.counts))[:, :, :6, :SIDE]
+    np.testing.assert_array_equal(
+        values.reshape(4, -1, 6 * SIDE).T.swapaxes(0, 1).swapaxes(0, 1), block.counts
+    )
+    assert not rows.open[:, 6:].any()
+    assert not rows.open[:, :, SIDE:].any()
+
+
+def test_an_error_that_is_not_positive_is_told_with_its_place(path, likelihood, truth_values, tmp_path):
+    with fits.open(path) as hdus:
+        hdus["E1"].data[4, 47, 17] = -1.0
+        hdus.writeto(tmp_path / "bad.fits", checksum=True)
+    calset = read_calibration_set(tmp_path / "bad.fits")
+    with pytest.raises(DataError, match=r"E1.*plane 4, row 47, column 17"):
+        pixels.expand(Likelihood.of(calset, likelihood.model, interpolate=True), truth_values)
+
+
+def test_the_residual_map_of_the_sums_is_that_of_the_pixels(likelihood, both, truth_values, monkeypatch):
+    ours = residual_map_of_pixels(both[0].sums)
+    step, low = 2 * RUN.field / (SIDE - 1), -RUN.field - RUN.field / (SIDE - 1)
+    same = Grid(9, 9, (0.5, 0.5), (low, low), ((8 * step, 0.0), (0.0, 8 * step)))
+    monkeypatch.setattr(residual_map, "cells_for", lambda *_: same)
+    theirs = residual_map.residual_map_at(likelihood, truth_values, both[1])
+    assert ours.values.shape == theirs.values.shape
+    np.testing.assert_allclose((ours.values - theirs.values) / theirs.errors, 0.0, atol=0.1)
+    np.testing.assert_allclose(ours.errors / theirs.errors, 1.0, atol=1e-3)
+    np.testing.assert_allclose(ours.chi2, theirs.chi2, rtol=1e-8)
+    x, y = ours.grid.points.x, ours.grid.points.y
+    np.testing.assert_allclose([x, y], [same.points.x, same.points.y], atol=1e-12)
+
+
+def test_what_is_not_smooth_or_not_linear_goes_pixel_by_pixel(likelihood):
+    assert stands_for_pixels(likelihood, likelihood.model.start)
+    context = effect_context(likelihood.model.template, likelihood.calset.exposures)
+    for effect in (effect_by_name("nonlinearity"), Blemish.of(context, depth=0.01, size=0.003)):
+        model = with_effects(likelihood.model, [effect], context)
+        other = Likelihood.of(likelihood.calset, model, interpolate=True)
+        assert not stands_for_pixels(other, model.start)
+    table = dataclasses.replace(likelihood.calset, intensities=simulate(RUN, seed=12).calset.intensities)
+    assert not stands_for_pixels(
+        Likelihood.of(table, likelihood.model, interpolate=True), likelihood.model.start
+    )
+
+
+def test_cells_cover_frames_of_any_shape():
+    cells = Cells.of(Grid(300, 71, (1.0, 1.0), (0.0, 0.0), ((1e-3, 0.0), (0.0, 1e-3))))
+    assert (cells.side, cells.shape) == (3, (24, 100))
+    s, t = cells.edges()
+    assert (s[0], s[-1], t[0], t[-1]) == (-1.0, 1.0, -1.0, 1.0)
+    # The middle of the first pixel.
+    assert cells.field(s[0] + 1 / 300, t[0] + 1 / 71) == pytest.approx((0.0, 0.0))
+
+
+# ------------------------------------------------------------------------------------ the set that stands for them
+
+
+@pytest.fixture(scope="module")
+def fitted(path):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(limits, "LARGE_ABOVE", 0)
+        calset = read_calibration_set(path)
+        return fit(Likelihood.of(calset, base_model(calset, throughput_degree=2), interpolate=True))
+
+
+@pytest.fixture(scope="module")
+def stand_in(fitted):
+    assert isinstance(fitted.posterior, pixels.PixelPosterior)
+    return compressed(fitted.posterior)
+
+
+def test_the_fit_of_the_sums_ends_where_the_usual_one_ends(fitted, likelihood):
+    usual = fit(likelihood)
+    free = usual.sigma > 0
+    np.testing.assert_allclose((fitted.values - usual.values)[free] / usual.sigma[free], 0, atol=1e-3)
+    assert fitted.chi2 == pytest.approx(usual.chi2, abs=1e-3)
+    assert fitted.dof == usual.dof
+
+
+def as_it_was(model, result):
+    return model
+
+
+def changed_prior(model, result):
+    first = next(p for p in model.parameters if p.free and p.prior is not None)
+    mean, width = first.prior
+    return model.change(first.name, prior=(mean + 0.3 * width, 0.5 * width))
+
+
+def frozen(model, result):
+    """Two standard errors from where it was."""
+    first = next(p for p in model.parameters if p.free and p.prior is not None)
+    value, sigma = result.value(first.name)
+    return model.change(first.name, free=False, start=value + 2.0 * sigma)
+
+
+@pytest.mark.parametrize("change", [as_it_was, changed_prior, frozen])
+def test_other_fits_of_it_are_those_of_the_pixels(fitted, stand_in, likelihood, change):
+    model = change(likelihood.model, fitted)
+    ours = fit(Likelihood.of(stand_in, model, interpolate=False))
+    theirs = fit(Likelihood.of(likelihood.calset, model, interpolate=True))
+    free = theirs.sigma > 0
+    np.testing.assert_allclose((ours.values - theirs.values)[free] / theirs.sigma[free], 0.0, atol=2e-3)
+    np.testing.assert_allclose(ours.sigma[free] / theirs.sigma[free], 1.0, atol=5e-3)
+
+
+def test_it_comes_back_from_its_file(stand_in, fitted, tmp_path):
+    write_calibration_set(tmp_path / "set.fits", stand_in)
+    assert (tmp_path / "set.fits").stat().st_size < 2e6
+    again = read_calibration_set(tmp_path / "set.fits")
+    record = again.compression
+    assert record is not None
+    assert record.pixels == SIDE**2
+    assert record.chi2 == fitted.posterior.sums.chi2
+    assert record.frames[0].sha256 == fitted.calset.inputs[0].sha256
+    assert any("stand for" in text for text in again.remarks)
+    block, other = (one.intensities.block(0, len(one.points)) for one in (stand_in, again))
+    np.testing.assert_array_equal(block.counts, other.counts)
+
+
+@pytest.mark.parametrize("name", ["NPIXELS", "CHI2", "DOF"])
+def test_a_record_that_lacks_something_is_refused(stand_in, tmp_path, name):
+    write_calibration_set(tmp_path / "set.fits", stand_in)
+    with fits.open(tmp_path / "set.fits") as hdus:
+        del hdus["COMPRESSION"].header[name]
+        for hdu in hdus:
+            hdu.add_checksum()
+        hdus.writeto(tmp_path / "short.fits")
+    with pytest.raises(DataError, match=f"COMPRESSION.*{name}.*compress the frames again"):
+        read_calibration_set(tmp_path / "short.fits")
+
+
+def test_a_fit_that_has_left_the_place_is_told(fitted, stand_in):
+    near = on_field_points(fitted)
+    assert moved(near) < 0.1
+    far = {
+        name: value + 100.0 * sigma
+        for (name, value), sigma in zip(stand_in.compression.values.items(), fitted.sigma, strict=True)
+    }
+    record = dataclasses.replace(stand_in.compression, values=far)
+    likelihood = Likelihood.of(
+        dataclasses.replace(stand_in, compression=record), fitted.model, interpolate=False
+    )
+    assert moved(dataclasses.replace(near, likelihood=likelihood)) > FARTHEST
