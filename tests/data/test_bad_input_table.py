@@ -190,7 +190,7 @@ def answer(path: Path, good: CalibrationSet) -> tuple[str, str]:
     try:
         calset = read_calibration_set(path)
         check_identifiable(Likelihood.of(calset, base_model(calset, throughput_degree=1)))
-    except (DataError, ValueError) as error:
+    except DataError as error:
         return "E", str(error)
     findings = [f.what for f in inspect(calset).findings]
     new = [f for f in findings if f not in [g.what for g in inspect(good).findings]]
@@ -212,7 +212,7 @@ def test_the_answer_is_of_the_class_asked_for(tmp_path, asked, change, says):
     found, said = answer(bad.write(), good)
     assert set(asked) <= set(found) if asked != "S" else found == "S", said
     assert says in said
-    if found == "E" and "distinct polariser" not in said and "single field point" not in said:
+    if found == "E":
         assert "set.fits" in said
 
 
