@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from small_run import SMALL
 
 from walop_jax.calibration.matrix import matrices
 from walop_jax.data.records import CalibrationSet
@@ -29,9 +30,7 @@ from walop_jax.model.parameters import values_of
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
-SMALL = ObservingPlan(
-    grid=6, standard_grid=3, polariser_angles=polariser_turn(8, full_turn=True), moon_patches=4, standards=4
-)
+RUN = dataclasses.replace(SMALL, polariser_angles=polariser_turn(8, full_turn=True))
 
 
 class Study(NamedTuple):
@@ -111,7 +110,7 @@ def test_twenty_runs_as_large_as_a_real_one():
 
 
 def test_three_small_runs():
-    found = study(SMALL, range(3))
+    found = study(RUN, range(3))
     # 210 pulls, of which every set shares its noise: about three standard deviations of mean and rms.
     assert abs(found.pulls.mean()) < 0.25
     assert 0.8 < np.sqrt((found.pulls**2).mean()) < 1.2
@@ -135,7 +134,7 @@ def at_truth(calset: CalibrationSet, truth: Instrument) -> Likelihood:
 
 
 def test_noiseless_data_return_the_truth():
-    calset, truth = simulate(SMALL, 4, noiseless=True)
+    calset, truth = simulate(RUN, 4, noiseless=True)
     likelihood = at_truth(calset, truth)
     model, true = likelihood.model, np.asarray(values_of(truth))
     scale = np.array([p.scale for p in model.parameters])
@@ -166,7 +165,7 @@ def twice(calset: CalibrationSet) -> CalibrationSet:
 
 
 def test_twice_the_data_halve_the_covariance():
-    calset, truth = simulate(SMALL, 5)
+    calset, truth = simulate(RUN, 5)
     information = []
     for data in (calset, twice(calset)):
         model = base_model(data)
@@ -180,6 +179,6 @@ def test_twice_the_data_halve_the_covariance():
 
 def test_a_study_can_fail():
     # A model that cannot follow the optics is not trusted, so the study would stop.
-    calset, _ = simulate(SMALL, 6)
+    calset, _ = simulate(RUN, 6)
     result: FitResult = refit(calset, base_model(calset, plates="fixed_axis"))
     assert not result.trusted

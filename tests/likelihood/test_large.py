@@ -20,7 +20,7 @@ from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
 RUN = ObservingPlan(
-    grid=72, standard_grid=1, standards=0, unpolarised=0, moon_patches=3,
+    grid=48, standard_grid=1, standards=0, unpolarised=0, moon_patches=3,
     polariser_angles=polariser_turn(8, full_turn=True), throughput_degree=2,
 )  # fmt: skip
 
