@@ -303,8 +303,9 @@ def mask_repeats(
 
 
 def _share_points(intensities: TableIntensities, first: int, second: int) -> bool:
-    at = [intensities.point[(intensities.exposure == entry) & intensities.used] for entry in (first, second)]
-    return bool(np.intersect1d(*at).size)
+    of = intensities.exposure
+    one, other = (intensities.point[(of == entry) & intensities.used] for entry in (first, second))
+    return bool(np.intersect1d(one, other).size)
 
 
 def _same_data(intensities: TableIntensities, first: int, second: int) -> bool:
