@@ -124,3 +124,17 @@ def test_target_is_what_the_fit_minimises(scene: Scene) -> None:
     gradient = 2 * target.half_gradient(target.centre) @ step
     assert slope == pytest.approx(gradient, abs=0.02 * target.covariance.shape[0])
     assert isinstance(target, Target)
+
+
+def test_draws_take_their_share_of_errors_that_are_inflated(gaussian: Surrogate) -> None:
+    """A draw with ln f has the data's part of the quadratic form over f²; with ln f = 0 it is the plain one."""
+    inflated = dataclasses.replace(gaussian, inflate=True)
+    rng = np.random.default_rng(4)
+    z = np.column_stack([rng.standard_normal((5, 4)), [0.0, 0.0, 1.0, -1.0, 2.0]])
+    x = gaussian.place(z[:, :4], rng.standard_normal((5, 3)))
+    f = np.exp(inflated.quoted(z)[:, -1])
+    assert f[:2].tolist() == [1.0, 1.0]
+    np.testing.assert_allclose(inflated.weight(z), f**-2, rtol=1e-12)
+    without = dataclasses.replace(gaussian, data=np.zeros_like(gaussian.data))
+    data = gaussian.joint(z[:, :4], x) - without.joint(z[:, :4], x)
+    np.testing.assert_allclose(inflated.joint(z, x), without.joint(z[:, :4], x) + data / f**2, rtol=1e-10)
