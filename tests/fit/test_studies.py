@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from small_run import SMALL
 
 from walop_jax.calibration.matrix import matrices
 from walop_jax.data.records import CalibrationSet
@@ -30,7 +29,9 @@ from walop_jax.model.parameters import values_of
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
-RUN = dataclasses.replace(SMALL, polariser_angles=polariser_turn(8, full_turn=True))
+SMALL = ObservingPlan(
+    grid=6, standard_grid=3, polariser_angles=polariser_turn(8, full_turn=True), moon_patches=4, standards=4
+)
 
 
 class Study(NamedTuple):
@@ -109,8 +110,9 @@ def test_twenty_runs_as_large_as_a_real_one():
     assert abs(found.excess.mean()) < 1.0
 
 
+@pytest.mark.long  # of a single run, against the truth of other code: tests/calibration/test_calibration.py
 def test_three_small_runs():
-    found = study(RUN, range(3))
+    found = study(SMALL, range(3))
     # 210 pulls, of which every set shares its noise: about three standard deviations of mean and rms.
     assert abs(found.pulls.mean()) < 0.25
     assert 0.8 < np.sqrt((found.pulls**2).mean()) < 1.2
@@ -134,7 +136,7 @@ def at_truth(calset: CalibrationSet, truth: Instrument) -> Likelihood:
 
 
 def test_noiseless_data_return_the_truth():
-    calset, truth = simulate(RUN, 4, noiseless=True)
+    calset, truth = simulate(SMALL, 4, noiseless=True)
     likelihood = at_truth(calset, truth)
     model, true = likelihood.model, np.asarray(values_of(truth))
     scale = np.array([p.scale for p in model.parameters])
@@ -165,7 +167,7 @@ def twice(calset: CalibrationSet) -> CalibrationSet:
 
 
 def test_twice_the_data_halve_the_covariance():
-    calset, truth = simulate(RUN, 5)
+    calset, truth = simulate(SMALL, 5)
     information = []
     for data in (calset, twice(calset)):
         model = base_model(data)
@@ -179,6 +181,6 @@ def test_twice_the_data_halve_the_covariance():
 
 def test_a_study_can_fail():
     # A model that cannot follow the optics is not trusted, so the study would stop.
-    calset, _ = simulate(RUN, 6)
+    calset, _ = simulate(SMALL, 6)
     result: FitResult = refit(calset, base_model(calset, plates="fixed_axis"))
     assert not result.trusted

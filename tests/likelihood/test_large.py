@@ -20,7 +20,7 @@ from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
 RUN = ObservingPlan(
-    grid=48, standard_grid=1, standards=0, unpolarised=0, moon_patches=3,
+    grid=72, standard_grid=1, standards=0, unpolarised=0, moon_patches=3,
     polariser_angles=polariser_turn(8, full_turn=True), throughput_degree=2,
 )  # fmt: skip
 
@@ -96,6 +96,7 @@ def made_field(likelihood):
     return (x.min(), x.max(), y.min(), y.max())
 
 
+@pytest.mark.long  # the expansions alone: test_nodes.py; a fit of frames: test_points.py
 def test_frames_and_table_path_agree_to_1e_8(made, monkeypatch):
     """144 of the points: interpolated optics, blocks and a fit from a sample, beside the path that tables take."""
     sample = thinned(made.calset, 144, neighbours=1)

@@ -73,6 +73,7 @@ def test_what_a_new_fit_lacks_is_looked_for_without_trying_other_readings_again(
     assert asked["as_written"] is True
 
 
+@pytest.mark.long  # tests/cli makes the page as well
 def test_a_report(call, fitted: FittedSet, tmp_path: Path):
     told: list[str] = []
     found = write_report(fitted.run, tmp_path / "page.html", progress=told.append)
