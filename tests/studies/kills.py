@@ -61,13 +61,18 @@ class Study:
     """A folder with two sets, a run of the first, and the commands on the second."""
 
     def __init__(self, folder: Path, command: str) -> None:
-        self.folder, self.command, self.here = folder, command, folder / "here"
-        self.here.mkdir()
+        self.command, self.outputs = command, OUTPUTS[command]
         self.sets = [folder / f"set{n}.fits" for n in range(2)]
         for seed, path in enumerate(self.sets, SEED):
             write_calibration_set(path, simulate(SMALL, seed=seed).calset)
+        self.prepare(folder)
+
+    def prepare(self, folder: Path) -> None:
+        """Run with the first input and with the second, and keep what lies there after each."""
+        self.folder, self.here = folder, folder / "here"
+        self.here.mkdir()
         self.run = self.here / "RUN"
-        if command == "sample":
+        if self.command == "sample":
             refit.refit_sets([self.sets[1]], self.run)
         self.do(0)
         self.before = folder / "before"
@@ -95,7 +100,7 @@ class Study:
     def mixed(self) -> str:
         """What is wrong with the results that lie there: they must be all of one run, or all absent."""
         of = set()
-        for name in OUTPUTS[self.command]:
+        for name in self.outputs:
             path = self.run / name
             if not path.exists():
                 of.add("nothing")
@@ -117,7 +122,7 @@ class Study:
             self.do(1)
         except Exception as error:
             return f"the next run fails: {type(error).__name__}: {error}"
-        for name in OUTPUTS[self.command]:
+        for name in self.outputs:
             if not same(content(self.run / name), content(self.after / "RUN" / name)):
                 return f"the next run gives another {name}"
         extra = set(listing(self.here)) ^ set(listing(self.after))
@@ -209,7 +214,7 @@ def small_files(most: int) -> Iterator[None]:
 
 def full(study: Study, count: int) -> tuple[int, list[str]]:
     """Number of runs that met the limit, and what was wrong."""
-    sizes = sorted((study.after / "RUN" / name).stat().st_size for name in OUTPUTS[study.command])
+    sizes = sorted((study.after / "RUN" / name).stat().st_size for name in study.outputs)
     generator, wrong, met = random.Random(0), [], 0
     limits = sorted({0, 1, *(s - 1 for s in sizes), *(generator.randrange(sizes[-1]) for _ in range(count))})
     for limit in limits[:count]:
