@@ -230,7 +230,7 @@ ELSEWHERE = {
     "31": "model/test_compiled.py::test_single_precision_is_refused",
     "38": "diagnosis/test_trust.py::test_a_mistake_in_the_data_is_not_trusted",
     "42": "model/effects/test_effects_contract.py::test_neutral_and_derivatives",
-    "43": "diagnosis/test_detection_limits.py::test_without_rivals_what_is_detected_is_named",
+    "43": "diagnosis/test_detection_limits.py::test_two_effects_that_do_the_same_are_told_as_a_class",
     "44": "cli/test_commands.py::test_no_convergence_no_product",
     "45": "posterior/test_chains.py::test_a_killed_run_loses_one_block_and_ends_up_the_same",
     "46": "posterior/test_chains.py::test_checkpoints_come_back_and_refuse_what_is_not_theirs",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -138,6 +139,22 @@ def test_without_rivals_what_is_detected_is_named(fitted):
     found = detection_limits(fitted, catalogue=CATALOGUE[:1])
     assert found.limits[0].named == found.limits[0].detected[1]
     assert found.separation.shape == (1, 1)
+
+
+class Twin(effect_by_name("wollaston_axis")):
+    """What another effect does, under another name."""
+
+    name: ClassVar[str] = "twin"
+
+
+def test_two_effects_that_do_the_same_are_told_as_a_class(fitted):
+    """Neither can ever be named, and each may be taken for the other."""
+    found = detection_limits(fitted, catalogue=(effect_by_name("wollaston_axis"), Twin))
+    assert {(e.effect, e.taken_for) for e in found.limits} == {
+        ("wollaston_axis", ("twin",)),
+        ("twin", ("wollaston_axis",)),
+    }
+    assert all(e.named == np.inf and 0 < e.detected[0] < np.inf for e in found.limits)
 
 
 def test_twice_the_light_shows_effects_of_half_the_variance(fitted, found):
