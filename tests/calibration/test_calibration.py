@@ -277,7 +277,7 @@ def test_a_product_of_other_physics_is_refused(calibration):
 # ---------------------------------------------------------------------- against sets made outside the project
 
 
-@pytest.mark.parametrize("name", ["a", "b"])
+@pytest.mark.parametrize("name", ["a", pytest.param("b", marks=pytest.mark.long)])
 def test_errors_are_what_the_covariance_says(either_south_set, south_fit, name):
     """Complete model, true values of other code: all parameters at once, and the matrix between the grid points."""
     south = either_south_set(name)

@@ -51,7 +51,7 @@ def overwrite(content: bytes, keyword: str, value: object, hdu: int = 1) -> byte
     for _ in range(hdu):
         start = content.index(b"XTENSION", start + 1)
     place = content.index(keyword.ljust(8).encode() + b"= ", start)
-    card = f"{keyword:8}= {value!s:>20}".ljust(80).encode()
+    card = f"{keyword:8}= {value!s:>20}".ljust(80).encode("latin-1")
     return content[:place] + card + content[place + 80 :]
 
 
@@ -134,3 +134,11 @@ def test_missing_checksums_are_remarked_on(handmade):
     assert not any("checksum" in remark for remark in read_calibration_set(handmade.write()).remarks)
     (remark,) = [r for r in read_calibration_set(handmade.write(checksum=False)).remarks if "checksum" in r]
     assert "damage to the file cannot be noticed" in remark
+
+
+def test_messages_stay_on_one_line_whatever_a_header_holds(handmade):
+    path = handmade.write(checksum=False)
+    path.write_bytes(overwrite(path.read_bytes(), "NAXIS2", "\x1b[2J\n\x85 8"))
+    with pytest.raises(DataError, match=r"NAXIS2: is \\x1b\[2J\\n\\x85 8, no whole number") as caught:
+        read_calibration_set(path)
+    assert str(caught.value).isprintable()

@@ -183,9 +183,14 @@ def test_a_copied_exposure_is_used_once(handmade):
         if name != "EXPOSURE":
             entry[2][1] = entry[2][0]
     counts, errors = (handmade.values("INTENSITIES", name) for name in ("N", "N_ERR"))
+    with pytest.raises(DataError, match=r"MJD: exposures 10 and 11 \(rows 0 and 1, .*different counts"):
+        read_calibration_set(handmade.write())
+    times = handmade.values("EXPOSURES", "MJD").copy()
+    handmade.values("EXPOSURES", "MJD")[:] = 61043.0  # known to the night: two exposures may well share that
     similar = read_calibration_set(handmade.write())
     assert similar.intensities.rows == 24
     assert "exposures 10 and 11 have the same time and settings" in similar.remarks[0]
+    handmade.values("EXPOSURES", "MJD")[:] = times
     counts[3:6], errors[3:6] = counts[:3], errors[:3]
     calset = read_calibration_set(handmade.write())
     assert calset.intensities.rows == 21

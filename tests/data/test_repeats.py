@@ -239,3 +239,22 @@ def test_no_false_alarm_among_many_repetitions(seed):
         remarks_of(dataclasses.replace(calset, intensities=TableIntensities(200, calset.points, **columns)))
         == ()
     )
+
+
+@pytest.mark.parametrize(("copied", "refused"), [(1, False), (2, True)])
+def test_chance_is_that_of_independent_noise(copied, refused):
+    """Rows of four cameras that agree within 0.01 σ, of 25 points: (0.01/√π)⁴ · 25 = e⁻¹⁷ for one of them, which
+    chance may do; (0.01/√π)⁸ · 300 = e⁻³⁶ for two."""
+
+    def partly(n, s):
+        fresh = noise(3)(n, s)
+        fresh[:copied] = n[:copied]
+        return fresh
+
+    calset = again(plain(), slice(4, 5), MJD=second_later, counts=partly)
+    assert int((calset.intensities.exposure == 31).sum()) == 25
+    if refused:
+        with pytest.raises(DataError, match="hold the same noise"):
+            remarks_of(calset)
+    else:
+        assert remarks_of(calset) == ()

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import ClassVar
 
 import numpy as np
 import pytest
 from scipy import stats
+from small_run import SEED, SMALL, small_fit
 
 from walop_jax.calibration.matrix import matrices
 from walop_jax.calibration.records import SMALLEST_DETERMINANT
@@ -24,10 +26,8 @@ from walop_jax.model.effects import effect_by_name
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import effect_context
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
-PLAN = ObservingPlan(grid=6, standard_grid=3, polariser_angles=polariser_turn(9), moon_patches=6, standards=6)
 CHOSEN = (
     "clp_zero",
     "wollaston_axis",
@@ -41,7 +41,7 @@ CATALOGUE = tuple(effect_by_name(name) for name in CHOSEN)
 
 @pytest.fixture(scope="module")
 def fitted() -> FitResult:
-    return refit(simulate(PLAN, seed=5).calset)
+    return small_fit()
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +114,7 @@ def test_what_goes_unnoticed_is_what_a_fit_without_the_effect_gets_wrong(fitted,
     context = effect_context(fitted.model.template, fitted.calset.exposures)
     truth = fitted.model.instrument(fitted.values)
     small = effect_by_name(name).of(context, **{entry.parameter: entry.detected[0]})
-    pair = [simulate(PLAN, seed=5, instrument=truth, effects=e, noiseless=True) for e in ((), (small,))]
+    pair = [simulate(SMALL, seed=SEED, instrument=truth, effects=e, noiseless=True) for e in ((), (small,))]
     x, y = fitted.calset.points.x, fitted.calset.points.y
     setting = Settings.default(len(x), str(fitted.calset.exposures.filter[0]))
 
@@ -141,9 +141,25 @@ def test_without_rivals_what_is_detected_is_named(fitted):
     assert found.separation.shape == (1, 1)
 
 
+class Twin(effect_by_name("wollaston_axis")):
+    """What another effect does, under another name."""
+
+    name: ClassVar[str] = "twin"
+
+
+def test_two_effects_that_do_the_same_are_told_as_a_class(fitted):
+    """Neither can ever be named, and each may be taken for the other."""
+    found = detection_limits(fitted, catalogue=(effect_by_name("wollaston_axis"), Twin))
+    assert {(e.effect, e.taken_for) for e in found.limits} == {
+        ("wollaston_axis", ("twin",)),
+        ("twin", ("wollaston_axis",)),
+    }
+    assert all(e.named == np.inf and 0 < e.detected[0] < np.inf for e in found.limits)
+
+
 def test_twice_the_light_shows_effects_of_half_the_variance(fitted, found):
     """Photon noise alone: four times the electrons halve every amplitude that is detected (read noise aside)."""
-    brighter = refit(simulate(dataclasses.replace(PLAN, electrons=4e6), seed=5).calset)
+    brighter = refit(simulate(dataclasses.replace(SMALL, electrons=4e6), seed=SEED).calset)
     again = detection_limits(brighter, catalogue=CATALOGUE)
     before = {(e.effect, e.parameter): e.detected[0] for e in found.limits}
     after = {(e.effect, e.parameter): e.detected[0] for e in again.limits}

@@ -12,7 +12,7 @@ import pytest
 from walop_jax.data.inspection import inspect
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.diagnosis.mixups import mixups
+from walop_jax.diagnosis.mixups import _angles, mixups
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult
@@ -89,6 +89,22 @@ CASES: dict[str, tuple[Spoil, str]] = {
     "no polariser": (unpolarised, "the calibration polariser was not in the beam"),
     "South labelled North": (lambda c: dataclasses.replace(c, instrument="WALOP-NORTH"), "they came from WALOP-SOUTH"),
 }  # fmt: skip
+
+
+def test_angles_are_rewritten_as_the_remedy_says(calset):
+    """Without a fit: what is tried is what is recommended."""
+    plate, found = calset.exposures.chwp_angle, 0
+    for one in _angles(calset):
+        told = re.fullmatch(r"give (−?)(CLP|CHWP)_ANGLE(?: \+ (\d+)°)?", one.remedy)
+        if told is None:
+            continue
+        name = f"{told[2].lower()}_angle"
+        sign, offset = -1.0 if told[1] else 1.0, float(told[3] or 0.0)
+        changed = getattr(one.change(calset).exposures, name)
+        np.testing.assert_allclose(changed, sign * getattr(calset.exposures, name) + offset, rtol=1e-12)
+        found += 1
+    assert np.isfinite(plate).any()
+    assert found == 14
 
 
 QUICK = "the polariser runs backwards"  # ten seconds each

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from small_run import small_fit
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify
@@ -13,6 +14,7 @@ from walop_jax.calibration.product import read_product, write_product
 from walop_jax.calibration.summary import summary
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.fit import robust
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit, refit
 from walop_jax.fit.robust import field_cells, larger, states
@@ -114,3 +116,19 @@ def test_blocks(clean):
     through = e.clp_in
     assert len(np.unique(states(twice)[through])) == len(np.unique(coarse[through]))
     assert field_cells(calset).max() < 36
+
+
+def test_blocks_that_scatter_widely_make_the_covariance(monkeypatch):
+    """Sandwich written out: far larger than all else, it is the whole answer; B blocks know B − 1 differences."""
+    result = small_fit()
+    rng = np.random.default_rng(1)
+    model, posterior = result.model, result.posterior
+    size, count = np.sqrt(np.diag(posterior.matrix)), 2 * len(model.free)
+    gradients = 100.0 * rng.standard_normal((count, len(size))) * size
+    monkeypatch.setattr(robust, "_gradients", lambda *_: iter([("blocks", gradients)]))
+    found = robust.robust_errors(result.likelihood, result.values, posterior).covariance
+    inverse = np.linalg.inv(posterior.matrix / np.outer(size, size))
+    scaled = gradients / size
+    expected = inverse @ (count / (count - 1) * scaled.T @ scaled) @ inverse
+    # The priors, which are no blocks, are 1e-4 of it.
+    np.testing.assert_allclose(np.diag(found) * size**2, np.diag(expected), rtol=2e-3)

@@ -110,6 +110,7 @@ def test_twenty_runs_as_large_as_a_real_one():
     assert abs(found.excess.mean()) < 1.0
 
 
+@pytest.mark.long  # of a single run, against the truth of other code: tests/calibration/test_calibration.py
 def test_three_small_runs():
     found = study(SMALL, range(3))
     # 210 pulls, of which every set shares its noise: about three standard deviations of mean and rms.

@@ -262,3 +262,27 @@ def test_temporary_names_are_never_in_messages(tmp_path, kind):
     assert ".walop" not in str(caught.value)
     assert str(run) in str(caught.value)
     assert left(tmp_path) == ["run", "run/a.txt", "run/b.txt"]
+
+
+def test_a_full_disk_does_not_keep_the_lock_waiting(tmp_path, monkeypatch):
+    """Not even the name of the holder can be written: the folder is reserved all the same, at once."""
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def late(*_):
+        raise AssertionError("still waiting")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(10)
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "write", full)
+            with output_folder(tmp_path / "run", NAMES) as out:
+                assert out.target == tmp_path / "run"
+                with pytest.raises(DataError, match="is being written by another process"):
+                    fill(tmp_path / "run")
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+    assert left(tmp_path) == []

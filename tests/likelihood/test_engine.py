@@ -232,6 +232,24 @@ def test_posterior_adds_the_priors(likelihood, values):
     np.testing.assert_allclose(found.matrix, matrix[np.ix_(free, free)], rtol=1e-12)
 
 
+def test_a_factor_on_the_errors_leaves_the_priors_alone(likelihood, values):
+    """Errors of the data three times as large: their part of gradient and matrix a ninth."""
+    one, three = likelihood.expand(values), likelihood.expand(values, noise_scale=3.0)
+    rows, select = likelihood.priors, likelihood.model.selection()
+    prior = rows.jacobian(select).T @ rows.jacobian(select)
+    pull = rows.jacobian(select).T @ rows.residuals(values)
+    size = np.sqrt(np.diag(one.matrix))
+    np.testing.assert_allclose(
+        (three.matrix - prior) / np.outer(size, size),
+        (one.matrix - prior) / np.outer(size, size) / 9,
+        atol=1e-12,
+    )
+    np.testing.assert_allclose(
+        (three.gradient - pull) / size, (one.gradient - pull) / size / 9, atol=1e-12 * np.sqrt(one.data)
+    )
+    assert three.data == pytest.approx(one.data, rel=1e-12)
+
+
 # ------------------------------------------------------------------------------------------------ identities
 
 

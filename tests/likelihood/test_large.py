@@ -96,6 +96,7 @@ def made_field(likelihood):
     return (x.min(), x.max(), y.min(), y.max())
 
 
+@pytest.mark.long  # the expansions alone: test_nodes.py; a fit of frames: test_points.py
 def test_frames_and_table_path_agree_to_1e_8(made, monkeypatch):
     """144 of the points: interpolated optics, blocks and a fit from a sample, beside the path that tables take."""
     sample = thinned(made.calset, 144, neighbours=1)

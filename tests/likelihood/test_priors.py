@@ -116,3 +116,12 @@ def test_a_frozen_parameter_is_taken_as_it_is(calset, model):
     one, other = (Likelihood.of(calset, m).expand(frozen.start) for m in (frozen, wide))
     assert (one.chi2, one.dof) == (other.chi2, other.dof)
     assert dataclasses.replace(one, matrix=other.matrix).objective == other.objective
+
+
+def test_degrees_of_freedom_count_free_parameters_alone(calset, model):
+    """Neither the frozen nor the tied ones; three numbers a row, four cameras less a flux."""
+    varied = [p for p in model.parameters if p.free and p.tie is None]
+    assert len(varied) <= len(model.parameters) - 3
+    likelihood = Likelihood.of(calset, model)
+    priors = sum(p.prior is not None for p in varied)
+    assert likelihood.dof == 3 * likelihood.used.sum() + priors - len(varied)

@@ -131,6 +131,7 @@ def seconds(work) -> float:
     return time.perf_counter() - began
 
 
+@pytest.mark.long  # of what only the timings below are made with
 def test_counts_made_in_slabs_are_those_of_the_instrument():
     """What the table is made with: the truth explains it."""
     calset = made(20)

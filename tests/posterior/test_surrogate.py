@@ -124,3 +124,28 @@ def test_target_is_what_the_fit_minimises(scene: Scene) -> None:
     gradient = 2 * target.half_gradient(target.centre) @ step
     assert slope == pytest.approx(gradient, abs=0.02 * target.covariance.shape[0])
     assert isinstance(target, Target)
+
+
+def test_draws_take_their_share_of_errors_that_are_inflated(gaussian: Surrogate) -> None:
+    """A draw with ln f has the data's part of the quadratic form over f²; with ln f = 0 it is the plain one."""
+    inflated = dataclasses.replace(gaussian, inflate=True)
+    rng = np.random.default_rng(4)
+    z = np.column_stack([rng.standard_normal((5, 4)), [0.0, 0.0, 1.0, -1.0, 2.0]])
+    x = gaussian.place(z[:, :4], rng.standard_normal((5, 3)))
+    f = np.exp(inflated.quoted(z)[:, -1])
+    assert f[:2].tolist() == [1.0, 1.0]
+    np.testing.assert_allclose(inflated.weight(z), f**-2, rtol=1e-12)
+    without = dataclasses.replace(gaussian, data=np.zeros_like(gaussian.data))
+    data = gaussian.joint(z[:, :4], x) - without.joint(z[:, :4], x)
+    np.testing.assert_allclose(inflated.joint(z, x), without.joint(z[:, :4], x) + data / f**2, rtol=1e-10)
+
+
+def test_what_was_marginalised_is_drawn_with_the_errors_of_the_draw(gaussian: Surrogate) -> None:
+    """Twice the errors: covariance of the marginalised coefficients given the others, by brute force."""
+    inflated = dataclasses.replace(gaussian, inflate=True)
+    z = np.tile([0.3, -0.2, 0.1, 0.4, np.log(2.0) / inflated.ln_f_unit], (40000, 1))
+    x = inflated.draw(z, np.random.default_rng(6))
+    offset = x - gaussian.centre - z[:, :4] @ gaussian.along.T
+    s = np.linalg.lstsq(gaussian.across, offset.T, rcond=None)[0].T
+    expected = np.linalg.inv(gaussian.data[-3:, -3:] / 4.0 + gaussian.prior[-3:, -3:])
+    np.testing.assert_allclose(np.cov(s, rowvar=False), expected, atol=0.04 * np.diag(expected).max())

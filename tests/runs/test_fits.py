@@ -73,6 +73,7 @@ def test_a_diagnosis_is_that_of_the_command(call, spoilt: Path, tmp_path: Path):
     assert_same_files(tmp_path / "command", tmp_path / "caller")
 
 
+@pytest.mark.long  # tests/paper runs the command as well
 def test_a_comparison(call, fitted: FittedSet, tmp_path: Path, monkeypatch):
     told: list[str] = []
     found = compare.compare_methods([fitted.calset], tmp_path / "caller", seed=3, progress=told.append)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import walop_jax.runs.epoch
 import walop_jax.runs.report
 from walop_jax.calibration.product import read_product, write_product
 from walop_jax.data import builtin_filter
@@ -60,6 +62,18 @@ def test_epochs_of_one_and_the_same_set(call, fitted: FittedSet, tmp_path: Path)
         compare_epochs(fitted.run / "other.fits", [fitted.calset])
 
 
+def test_what_a_new_fit_lacks_is_looked_for_without_trying_other_readings_again(
+    fitted: FittedSet, monkeypatch
+):
+    asked: dict[str, object] = {}
+    doubtful = functools.partial(dataclasses.replace, examined=True, doubts=("odd",))
+    monkeypatch.setattr(walop_jax.runs.epoch, "examined", doubtful)
+    monkeypatch.setattr(walop_jax.runs.epoch, "diagnose", lambda *_, **how: asked.update(how))
+    assert not compare_epochs(fitted.run, [fitted.calset]).found.holds
+    assert asked["as_written"] is True
+
+
+@pytest.mark.long  # tests/cli makes the page as well
 def test_a_report(call, fitted: FittedSet, tmp_path: Path):
     told: list[str] = []
     found = write_report(fitted.run, tmp_path / "page.html", progress=told.append)

@@ -12,6 +12,7 @@ from scipy import stats
 from small_run import SMALL
 from typer.testing import CliRunner
 
+import walop_jax.science.epoch
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify, validity
 from walop_jax.calibration.product import write_product
@@ -19,6 +20,7 @@ from walop_jax.cli.app import app
 from walop_jax.data import write_calibration_set
 from walop_jax.fit.model_builder import model_for
 from walop_jax.fit.refit import refit
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.science.chance import chi2_tail
 from walop_jax.science.epoch import chi2_of_change, epoch, fit_like
 from walop_jax.simulation.simulate import simulate
@@ -154,7 +156,7 @@ def test_a_change_is_found_and_named(first):
     assert found.star_errors["u"]["max"] > 0.05
 
 
-def test_the_new_set_is_fitted_with_the_old_model(first):
+def test_the_new_set_is_fitted_with_the_old_model(first, monkeypatch):
     """Not with its effects alone: plates, degree, choices, priors and what was held are the old model's."""
     truth, old = first
     text = """
@@ -173,7 +175,16 @@ def test_the_new_set_is_fitted_with_the_old_model(first):
     model = model_for(simulate(earlier, seed=5).calset, text)
     size = len(model.names)
     assumed = dataclasses.replace(old, model=model, values=model.start, covariance=1e-12 * np.eye(size))
-    new = fit_like(assumed, simulate(earlier, seed=6, instrument=truth).calset)
+    asked: list[Likelihood] = []
+
+    def fitted(likelihood):
+        asked.append(likelihood)
+        raise RuntimeError("enough")
+
+    monkeypatch.setattr(walop_jax.science.epoch, "fit", fitted)
+    with pytest.raises(RuntimeError, match="enough"):
+        fit_like(assumed, simulate(earlier, seed=6, instrument=truth).calset)
+    (new,) = asked
     assert new.model.template.plates == "fixed_axis"
     assert new.model.template.throughput.degree == 1
     assert new.model.template.effect("blemish").camera == 2

@@ -126,7 +126,7 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
         points = make_points(table("POINTS"), instrument, Place(path, "POINTS"))
         place = Place(path, "INTENSITIES")
         intensities, more = table_intensities(table("INTENSITIES"), exposures, points, sources, place)
-        intensities, repeated = mask_repeats(intensities, exposures)
+        intensities, repeated = mask_repeats(intensities, exposures, path)
         remarks.extend(more + repeated + _idle(intensities, exposures, path))
     compression = None if EXTENSION not in tables else read_compression(tables[EXTENSION], path)
     if compression is None:

@@ -115,15 +115,15 @@ def merge_calibration_sets(*sets: CalibrationSet) -> CalibrationSet:
         # `table` counts the exposures of its own files; a whole of tables alone needs no joint.
         parts.append((table, points, rows))
 
+    names = ", ".join(str(entry_input.path) for entry in sets for entry_input in entry.inputs)
     if len(parts) == 1:
         intensities, points = parts[0][:2]
         if isinstance(intensities, TableIntensities):
-            intensities, repeated = mask_repeats(intensities, exposures)
+            intensities, repeated = mask_repeats(intensities, exposures, names)
             remarks += repeated
     else:
         intensities = JoinedIntensities(tuple(parts), len(exposures))
         points = _stack_points([part[1] for part in parts])
-    names = ", ".join(str(entry_input.path) for entry in sets for entry_input in entry.inputs)
     remarks += check_repeats(intensities, exposures, points, names)
     return CalibrationSet(
         instrument=first.instrument,

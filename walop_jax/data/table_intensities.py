@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from walop_jax.data.records import Block, Exposures, Intensities, Points, Sources
 from walop_jax.data.schema import Place
-from walop_jax.io.errors import rows_text
+from walop_jax.io.errors import fail, rows_text
 
 NEGATIVE = 5.0
 """Counts below minus this many sigma are no bias-subtracted counts but a fault."""
@@ -261,16 +261,21 @@ def _source_rows(
     return rows, [remark] if len(lost) else []
 
 
-def mask_repeats(intensities: TableIntensities, exposures: Exposures) -> tuple[TableIntensities, list[str]]:
+def mask_repeats(
+    intensities: TableIntensities, exposures: Exposures, file: object
+) -> tuple[TableIntensities, list[str]]:
     """Find exposures that are copies of an earlier one and stop using them, lest errors shrink; say which.
 
-    A copy has the same time, settings, points and counts to the last bit. Exposures that share only time
-    and settings are remarked on.
+    A copy has the same time, settings, points and counts to the last bit. Other counts of the same points at the same
+    time and settings are an error where most times differ (raises `DataError` that names `file`), and remarked on
+    where times are too coarse to tell.
     """
     settings = [values for name, values in exposures.columns().items() if name != "EXPOSURE"]
     groups: dict[tuple[str, ...], list[int]] = {}
     for row in np.flatnonzero(np.isfinite(exposures.mjd)):
         groups.setdefault(tuple(str(values[row]) for values in settings), []).append(int(row))
+    times = exposures.mjd[np.isfinite(exposures.mjd)]
+    fine = 2 * len(np.unique(times)) > len(times)
     used = intensities.used.copy()
     remarks: list[str] = []
     alike: list[str] = []
@@ -278,6 +283,15 @@ def mask_repeats(intensities: TableIntensities, exposures: Exposures) -> tuple[T
         for other in others:
             ids = f"exposures {exposures.exposure[first]} and {exposures.exposure[other]}"
             if not _same_data(intensities, first, other):
+                if fine and _share_points(intensities, first, other):
+                    raise fail(
+                        f"{ids} (rows {first} and {other}, counted from 0) have the same time and settings but "
+                        "different counts",
+                        file=file,
+                        extension="EXPOSURES",
+                        column="MJD",
+                        advice="no camera takes two exposures at once: correct the times, or write NaN",
+                    )
                 alike.append(ids)
                 continue
             remarks.append(f"{ids} are the same to the last bit, the second is not used")
@@ -286,6 +300,12 @@ def mask_repeats(intensities: TableIntensities, exposures: Exposures) -> tuple[T
         more = f" (and {len(alike) - 1} pairs more)" if len(alike) > 1 else ""
         remarks.append(f"{alike[0]} have the same time and settings but different counts{more}")
     return intensities.using(used), remarks
+
+
+def _share_points(intensities: TableIntensities, first: int, second: int) -> bool:
+    of = intensities.exposure
+    one, other = (intensities.point[(of == entry) & intensities.used] for entry in (first, second))
+    return bool(np.intersect1d(one, other).size)
 
 
 def _same_data(intensities: TableIntensities, first: int, second: int) -> bool:

@@ -57,6 +57,7 @@ def diagnose(
     catalogue: Sequence[type[Effect]] = EFFECTS,
     seed: int = 0,
     minutes: float = MINUTES,
+    as_written: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Find what `model` (default: the base model) lacks to explain a calibration set.
@@ -64,7 +65,8 @@ def diagnose(
     `catalogue` are the effects that may be named. Of a set with more than `limits.DIAGNOSED_ROWS` (exposure, point)
     pairs, or whose columns would be more than `limits.DIAGNOSED_NUMBERS`, points spread over the field are looked at.
     The search for a further name, or for a free-form term, does not begin after `minutes`; what is left then has no
-    name. Raises what `fit` raises, and `DataError` for data that another reading explains (`mixups`).
+    name. Other readings of the data are not tried where the caller has done that already (`as_written`). Raises what
+    `fit` raises, and `DataError` for data that another reading explains (`mixups`).
     """
     began = time.perf_counter()
     tell = progress or (lambda text: None)
@@ -75,7 +77,8 @@ def diagnose(
     some = thinned(calset, most_points(calset, model.template, amplitudes), neighbours=1)
     if len(some.points) < len(calset.points):
         tell(f"looking at {len(some.points)} of {len(calset.points)} field points")
-    found = _Diagnosing(some, model, catalogue, seed, tell, began + 60.0 * minutes).run(began)
+    until = began + 60.0 * minutes
+    found = _Diagnosing(some, model, catalogue, seed, tell, until, as_written=as_written).run(began)
     return dataclasses.replace(found, points=len(calset.points))
 
 
@@ -107,6 +110,8 @@ class _Diagnosing:
         seed: int,
         tell: Callable[[str], None],
         until: float,
+        *,
+        as_written: bool = False,
     ) -> None:
         self.calset, self.tell, self.until = calset, tell, until
         self.rng = np.random.default_rng(seed)
@@ -117,7 +122,8 @@ class _Diagnosing:
         self.choices: dict[str, Choice] = {}
         tell("fitting the model")
         self.fit: FitResult = fit(Likelihood.of(calset, model))
-        refuse_mixups(self.fit)
+        if not as_written:
+            refuse_mixups(self.fit)
 
     def run(self, began: float) -> Diagnosis:
         before = self.fit

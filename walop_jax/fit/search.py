@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from walop_jax.fit.minimise import Minimum, minimise, newton
 from walop_jax.fit.solver import Request, WhenStale
+from walop_jax.io.errors import fail
 from walop_jax.likelihood import limits, pixels
 from walop_jax.likelihood.expansion import Posterior
 from walop_jax.likelihood.frames import stands_for_pixels, strips_of
@@ -92,7 +93,7 @@ def find_minimum(
 ) -> Found:
     """The minimum of a set from start values that may be far away; of a large one, from that of a sample of it.
 
-    `noise_scale` and `worth` are those of `refit.fit`. Raises ValueError when the exposures cannot determine the
+    `noise_scale` and `worth` are those of `refit.fit`. Raises `DataError` when the exposures cannot determine the
     instrument.
     """
     if not likelihood.layout.large:
@@ -207,8 +208,8 @@ def _minimum_from_afar(
 
 
 def check_identifiable(likelihood: Likelihood) -> None:
-    """Raise ValueError when the exposures cannot determine an instrument at all."""
-    e = likelihood.calset.exposures
+    """Raise `DataError` when the exposures cannot determine an instrument at all."""
+    e, inputs = likelihood.calset.exposures, ", ".join(str(entry.path) for entry in likelihood.calset.inputs)
     through = e.clp_in & (likelihood.census.rows > 0)
     angles = np.unique(np.round(np.mod(e.clp_angle[through], 180.0), 3))
     turning = [e.position(prefix).angle for prefix in likelihood.plan.moving]
@@ -216,12 +217,20 @@ def check_identifiable(likelihood: Likelihood) -> None:
         np.unique(np.nan_to_num(np.stack([np.zeros(len(e)), *turning], axis=1)[through], nan=-1.0), axis=0)
     )
     if len(angles) < 3 and (len(angles) == 0 or states < 3):
-        raise ValueError(
-            f"{len(angles)} distinct polariser angle(s) modulo 180° with usable data: a fit of the instrument needs "
-            "at least 3, better 8 or more spread over 360°"
+        raise fail(
+            f"{len(angles)} distinct polariser angle(s) modulo 180° with usable data",
+            file=inputs,
+            extension="EXPOSURES",
+            column="CLP_ANGLE",
+            advice="a fit of the instrument needs at least 3, better 8 or more spread over 360°",
         )
     if likelihood.layout.points < 2 and likelihood.model.template.throughput.degree > 0:
-        raise ValueError("a single field point: the joint fit over the field needs several points")
+        raise fail(
+            "a single field point",
+            file=inputs,
+            extension="POINTS",
+            advice="the joint fit over the field needs several",
+        )
 
 
 def _order_starts(likelihood: Likelihood) -> Iterator[tuple[str, Vector]]:

@@ -26,7 +26,12 @@ def fail(
     place = " ".join(
         part for part in (str(file) if file else "", f"[{extension}]" if extension else "", column) if part
     )
-    return DataError(f"{place + ': ' if place else ''}{what}{'; ' + advice if advice else ''}")
+    return DataError(printable(f"{place + ': ' if place else ''}{what}{'; ' + advice if advice else ''}"))
+
+
+def printable(text: str) -> str:
+    """The text on one line: what a terminal cannot show (of a damaged header, of a hostile name) as its escape."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 @contextlib.contextmanager

@@ -53,13 +53,22 @@ def _acquired(place: Path, output: object) -> int | None:
             with contextlib.suppress(OSError):
                 os.unlink(place)
             return None
-        with contextlib.suppress(OSError):
-            # The last holder may have removed the file between our opening and locking it.
-            if os.path.samestat(os.fstat(descriptor), os.stat(place)):
-                since = datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")
-                text = f"process {os.getpid()} on {socket.gethostname()} since {since}"
+        if _is_at(descriptor, place):
+            since = datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")
+            # On a full disk the lock holds, but does not say whose it is.
+            with contextlib.suppress(OSError):
                 os.ftruncate(descriptor, 0)
-                os.write(descriptor, text.encode())
-                return descriptor
+                os.write(
+                    descriptor, f"process {os.getpid()} on {socket.gethostname()} since {since}".encode()
+                )
+            return descriptor
         os.close(descriptor)
     return None
+
+
+def _is_at(descriptor: int, place: Path) -> bool:
+    """Whether an open file is still the one of that name: its last holder may have removed it before it was locked."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), os.stat(place))
+    except OSError:
+        return False

@@ -78,7 +78,8 @@ def compare_epochs(
         lacking = None
         if not found.new_trusted:
             tell("looking for what the new fit lacks")
-            lacking = diagnose(calset, result.model, catalogue=catalogue, progress=tell)
+            # Other readings of the data have been tried when its fit was examined.
+            lacking = diagnose(calset, result.model, catalogue=catalogue, as_written=True, progress=tell)
         parents = tuple(entry.sha256 for entry in calset.inputs)
         compared = EpochComparison(found, product.content_hash(), parents, result, lacking)
         if out is not None:

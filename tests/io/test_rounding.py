@@ -1,0 +1,29 @@
+"""Numbers with errors as a reader expects them, typed by hand."""
+
+from __future__ import annotations
+
+import pytest
+
+from walop_jax.io.rounding import probability, two_digits_range, with_error
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "text"),
+    [
+        (0.232268, 0.000241, "0.23227 ± 0.00024"),
+        (-3.14159, 0.0996, "−3.14 ± 0.10"),
+        (12345.6, 78.9, "12346 ± 79"),
+        (12345.6, 789.0, "12350 ± 790"),
+        (1.0, 0.15, "1.00 ± 0.15"),
+        (2.5e-12, 1e-13, "2.50e−12 ± 1.0e−13"),
+        (4.0, 0.0, "4"),
+    ],
+)
+def test_the_error_has_two_digits_and_the_value_ends_where_it_does(value, sigma, text):
+    assert with_error(value, sigma) == text
+
+
+def test_probabilities_and_ranges():
+    assert [probability(p) for p in (0.4321, 2.14e-7, 1e-16)] == ["= 0.43", "= 2.1 × 10⁻⁷", "< 10⁻¹⁵"]
+    assert two_digits_range(0.4, 2.04) == "0.40 … 2.0"
+    assert two_digits_range(0.4, 0.41) == "0.40"

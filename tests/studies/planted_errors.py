@@ -1,0 +1,214 @@
+"""Errors planted one at a time, to see whether the tests of the room notice.
+
+    python tests/studies/planted_errors.py [--only WORD] [--cache FOLDER]
+
+Each error is a line of the package and what it is replaced by: a sign, a factor, an index, a bound. The tree is copied
+to a temporary folder, the error planted there, the tests named beside it are run until the first fails, and the line is
+put back. Printed are the errors that were caught and those that were missed; the exit status is 1 if any was missed.
+`test_planted_errors.py` sees to it that every line is still there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[2]
+COPIED = ("walop_jax", "tests", "fits_data", "pyproject.toml", "README.md", "CITATION.cff", "LICENSE")
+
+
+class Planted(NamedTuple):
+    """A file of the package, a text that occurs in it once, what replaces it, and the tests that should fail."""
+
+    file: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+
+
+def planted(file: str, old: str, new: str, *tests: str) -> Planted:
+    return Planted(file, old, new, tests)
+
+
+_LIKELIHOOD = ("likelihood/test_engine.py", "likelihood/test_flux.py", "likelihood/test_priors.py")
+_REPEATS, _CHAINS = "data/test_repeats.py", "posterior/test_chains.py"
+ERRORS = (
+    # io
+    planted("io/rounding.py", "places = 1 - math.floor", "places = 2 - math.floor", "io/test_rounding.py"),
+    planted("io/fits_structure.py", "_MOST_BLOCKS = 1000", "_MOST_BLOCKS = 10000", "data/test_hostile_headers.py"),
+    # data
+    planted("data/repeats.py", "/ math.sqrt(math.pi)", "* math.sqrt(math.pi)", _REPEATS),
+    planted("data/repeats.py", "return smallest > _NOISE", "return smallest < _NOISE", _REPEATS),
+    planted("data/checks.py", "refuse(np.abs(table[name]) > limit, f", "refuse(table[name] > limit, f",
+            "data/test_bad_inputs.py"),
+    planted("data/table_intensities.py", "isfinite(sigma) & (sigma <= 0)", "isfinite(sigma) & (sigma < 0)",
+            "data/test_bad_input_table.py"),
+    planted("data/table_intensities.py", "_SPOILT = 0.2", "_SPOILT = 0.5", "data/test_bad_input_table.py"),
+    planted("data/table_intensities.py", "counts >= -_NEGATIVE * sigma", "counts >= _NEGATIVE * sigma",
+            "data/test_reading.py"),
+    planted("data/inspection.py", "sigma**2 / np.where(counts > 0, counts, 1.0)",
+            "sigma / np.where(counts > 0, counts, 1.0)", "cli/test_commands.py"),
+    # sky
+    planted("sky/moon.py", "u * cos_2r - q * sin_2r", "u * cos_2r + q * sin_2r", "sky/test_moon.py"),
+    planted("sky/moon.py", "weight = 1.0 / (1.0 + cos_gamma**2)", "weight = 1.0 / (1.0 - cos_gamma**2)",
+            "sky/test_moon.py"),
+    planted("sky/moon.py", "a = v_n - k_n / (1.0 + k_c) * v_c", "a = v_n + k_n / (1.0 + k_c) * v_c",
+            "sky/test_moon.py"),
+    planted("sky/moon.py", "x * cos_r - y * sin_r, x * sin_r + y * cos_r",
+            "x * cos_r + y * sin_r, y * cos_r - x * sin_r", "sky/test_moon.py"),
+    # model
+    planted("model/mueller.py", "(zero, c2 * s2 * (1 - cd), c2**2 * cd + s2**2, c2 * sd)",
+            "(zero, c2 * s2 * (1 - cd), c2**2 * cd + s2**2, -c2 * sd)", "model/test_mueller.py"),
+    planted("model/mueller.py", "(zero, c2, s2, zero), (zero, -s2, c2, zero)",
+            "(zero, c2, -s2, zero), (zero, s2, c2, zero)", "model/test_mueller.py"),
+    planted("model/mueller.py", "k = 1.0 / (1.0 + root)", "k = 1.0 / (2.0 + root)", "model/test_mueller.py"),
+    planted("model/materials.py", "1.07044083", "1.07044038", "model/test_materials.py"),
+    planted("model/materials.py", "QUARTZ_THERMAL = 1.23e-4", "QUARTZ_THERMAL = -1.23e-4",
+            "model/test_materials.py", "model/test_optics.py", "model/effects/test_effects_of_plates.py"),
+    planted("model/elements/collimator.py", "self.diattenuation * 2.0 * ray.x", "self.diattenuation * ray.x",
+            "model/test_field_diattenuator.py", "model/test_light.py", "oracle/test_oracle.py"),
+    planted("model/elements/collimator.py", "one - bend * b**2, bend * a * b, -sine * b",
+            "one - bend * b**2, bend * a * b, sine * b", "model/test_physical.py",
+            "model/effects/test_effects_of_light.py"),
+    planted("model/elements/analyser.py", "jnp.stack([half, extra - along])", "jnp.stack([half, extra + along])",
+            "model/test_light.py"),
+    planted("model/elements/analyser.py", "jnp.stack([kappa, -kappa])", "jnp.stack([kappa, kappa])",
+            "model/test_spectral_element.py", "model/test_light.py", "model/effects/test_effects_of_plates.py"),
+    planted("model/elements/polariser.py", "self.order * reading - self.phase", "self.order * reading + self.phase",
+            "model/effects/test_effects_of_light.py"),
+    planted("model/elements/geometry.py", "self.rate_y * ray.conditions", "self.rate_x * ray.conditions",
+            "model/effects/test_effects_of_light.py", "model/effects/test_effects_of_plates.py"),
+    planted("model/elements/geometry.py", "mueller.rotation(-optics.wedge", "mueller.rotation(optics.wedge",
+            "model/test_oblique.py"),
+    planted("model/cameras.py", "other[a], other[b] = b, a", "other[a], other[b] = a, b",
+            "model/effects/test_effects_of_cameras.py"),
+    planted("model/effects/nonlinearity.py", "1.0 + self.coefficient * counts", "1.0 - self.coefficient * counts",
+            "model/effects/test_effects_of_cameras.py"),
+    planted("model/effects/pedestal.py", "counts + self.level * exposures.median",
+            "counts + self.level", "model/effects/test_effects_of_cameras.py"),
+    planted("model/effects/blemish.py", "(2.0 * self.size**2)", "self.size**2",
+            "model/effects/test_effects_of_cameras.py"),
+    planted("model/effects/camera_gain_drift.py", "1.0 + self.rate * exposures.hours",
+            "1.0 + self.rate * exposures.hours / 24.0", "model/effects/test_effects_of_cameras.py"),
+    # likelihood, covariance, degrees of freedom, engine
+    planted("likelihood/flux.py", "return flux, weighted_counts - flux * weighted_model",
+            "return flux, weighted_counts - best * weighted_model", *_LIKELIHOOD),
+    planted("likelihood/flux.py", "share = shared.summed(columns * along) / xp",
+            "share = 0.999 * shared.summed(columns * along) / xp", *_LIKELIHOOD),
+    planted("likelihood/engine.py", "jacobian @ r, jacobian @ jacobian.T", "jacobian @ r, 1.01 * jacobian @ jacobian.T",
+            *_LIKELIHOOD),
+    planted("likelihood/engine.py", "cross = jnp.einsum(\"pimk,pmt->ikt\", by_site, basis)",
+            "cross = -jnp.einsum(\"pimk,pmt->ikt\", by_site, basis)", *_LIKELIHOOD),
+    planted("likelihood/engine.py", "NEWTON_STEPS = 3", "NEWTON_STEPS = 0",
+            "model/effects/test_effects_of_cameras.py"),
+    planted("likelihood/likelihood.py", "+ int(self.priors.known.sum())", "+ len(self.priors)",
+            "likelihood/test_engine.py", "likelihood/test_priors.py"),
+    planted("likelihood/likelihood.py", "- len(self.model.free)", "- len(self.model.parameters)",
+            "likelihood/test_engine.py", "likelihood/test_priors.py"),
+    planted("likelihood/likelihood.py", "gradient[rows.index] += pull / rows.width",
+            "gradient[rows.index] += pull", "likelihood/test_engine.py"),
+    planted("likelihood/likelihood.py", "matrix = matrix / noise_scale**2", "matrix = matrix / noise_scale",
+            "likelihood/test_engine.py", "likelihood/test_priors.py", "likelihood/test_large.py"),
+    # noise
+    planted("likelihood/noise.py", "np.maximum(counts, 0.0) + self.read_noise**2",
+            "np.maximum(counts, 0.0) + self.read_noise", "likelihood/test_noise.py"),
+    # fit
+    planted("fit/search.py", "start[likelihood.model.index(name)] += sign * one_wave",
+            "start[likelihood.model.index(name)] += one_wave", "fit/test_search.py"),
+    planted("fit/robust.py", "count / (count - 1) * gradients.T", "(count - 1) / count * gradients.T",
+            "fit/test_robust.py"),
+    planted("fit/robust.py", "root[:, known] @ axis", "root[:, known] @ axis.T", "fit/test_robust.py"),
+    # calibration
+    planted("calibration/calibration.py", "0.5 * (result.covariance + result.covariance.T)",
+            "0.25 * (result.covariance + result.covariance.T)", "calibration/test_calibration.py"),
+    planted("calibration/matrix.py", "[np.asarray(part)[: size - missing] for part in result]",
+            "[np.asarray(part)[missing:] for part in result]", "calibration/test_calibration.py"),
+    planted("calibration/calibration.py", "flags[~(condition <= HIGH_CROSSTALK)]", "flags[condition <= HIGH_CROSSTALK]",
+            "calibration/test_calibration.py"),
+    # posterior
+    planted("posterior/surrogate.py", "np.exp(-2.0 * self.ln_f_unit * z[:, -1])",
+            "np.exp(-self.ln_f_unit * z[:, -1])", "posterior/test_surrogate.py"),
+    planted("posterior/surrogate.py", "self.centre + z[:, : self.along.shape[1]] @ self.along.T + s",
+            "self.centre + z[:, : self.along.shape[1]] @ self.along.T - s", "posterior/test_surrogate.py"),
+    planted("posterior/surrogate.py", "mean + np.sqrt(variance) * rng", "mean + variance * rng",
+            "posterior/test_surrogate.py"),
+    planted("posterior/convergence.py", "steps <= LENGTHS * history[2]", "steps <= history[2]", _CHAINS),
+    planted("posterior/convergence.py", "if not np.max(rhat) < LARGEST_RHAT", "if np.max(rhat) < 0", _CHAINS),
+    # science
+    planted("science/estimate.py", "np.where(used, sigma, 1.0) ** 2", "np.where(used, sigma, 1.0)",
+            "science/test_estimate.py"),
+    planted("science/estimate.py", "- rows_used, first) - 2", "- rows_used, first)", "science/test_estimate.py"),
+    planted("science/estimate.py", "return -np.add.reduceat(gain @ change, first)",
+            "return np.add.reduceat(gain @ change, first)", "science/test_estimate.py"),
+    planted("science/polarisation.py", "sin**2 * qq - 2.0 * cos * sin * qu_", "sin**2 * qq + 2.0 * cos * sin * qu_",
+            "science/test_polarisation.py"),
+    planted("science/polarisation.py", "np.mod(np.rad2deg(0.5 * np.arctan2(u, q)), 180.0)",
+            "np.mod(np.rad2deg(0.5 * np.arctan2(q, u)), 180.0)", "science/test_polarisation.py"),
+    # diagnosis
+    planted("diagnosis/score.py", "amplitudes=-w @ z", "amplitudes=w @ z", "diagnosis/test_score.py"),
+    planted("diagnosis/score.py", "jacobian.shape[0] - jacobian.shape[1] - eliminated",
+            "jacobian.shape[0] - jacobian.shape[1]", "diagnosis/test_score.py"),
+    planted("diagnosis/score.py", "- 0.5 * log_det)", "+ 0.5 * log_det)", "diagnosis/test_score.py"),
+    planted("diagnosis/trust.py", "2.0 * min(above, 1.0 - above)", "min(above, 1.0)", "diagnosis/test_trust.py"),
+    planted("diagnosis/trust.py", "variance = 2.0 * (own[0]", "variance = 4.0 * (own[0]", "diagnosis/test_trust.py"),
+    planted("diagnosis/mixups.py", "sign * a + offset", "sign * a - offset", "diagnosis/test_mixups.py"),
+    # paper
+    planted("paper/polynomial.py", "- self.delta[:, None]", "+ self.delta[:, None]", "paper/test_polynomial.py"),
+    planted("paper/polynomial.py", "(s * (1 - t), 0, 1), ((1 - s) * t, 1, 0)",
+            "(s * (1 - t), 1, 0), ((1 - s) * t, 0, 1)", "paper/test_polynomial.py"),
+    # runs and command line
+    planted("runs/refit.py", "if result.converged:", "if True:", "runs/test_refit_run.py", "cli/test_commands.py"),
+)  # fmt: skip
+
+
+def caught(error: Planted, tree: Path, cache: Path) -> tuple[str | None, float]:
+    """The test that failed with the error in the tree, or None; and the time that it took (s)."""
+    began, file = time.perf_counter(), tree / "walop_jax" / error.file
+    text = file.read_text(encoding="utf-8")
+    file.write_text(text.replace(error.old, error.new), encoding="utf-8")
+    try:
+        found = subprocess.run(
+            [sys.executable, "-m", "pytest", "-n", "0", "-x", "-q", "-o", f"cache_dir={cache}",
+             *(f"tests/{name}" for name in error.tests)],
+            cwd=tree, capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": str(tree)},
+        )  # fmt: skip
+    finally:
+        file.write_text(text, encoding="utf-8")
+    failed = [
+        line.split(" - ")[0] for line in found.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))
+    ]
+    if found.returncode not in (0, 1):
+        failed = failed or [f"pytest ended with {found.returncode}"]
+    return (failed[0] if failed else None), time.perf_counter() - began
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", default="", help="errors whose file holds this word")
+    parser.add_argument("--cache", type=Path, default=None, help="folder of compiled code")
+    options = parser.parse_args()
+    chosen = [error for error in ERRORS if options.only in error.file]
+    missed = 0
+    with tempfile.TemporaryDirectory() as name:
+        tree = Path(name)
+        for part in COPIED:
+            source = ROOT / part
+            copy = shutil.copytree if source.is_dir() else shutil.copy2
+            copy(source, tree / part)
+        for error in chosen:
+            found, seconds = caught(error, tree, options.cache or tree / "cache")
+            missed += found is None
+            print(f"{found or 'MISSED'}  {error.file}: {error.old!r}  ({seconds:.0f} s)", flush=True)
+    print(f"{len(chosen)} planted, {len(chosen) - missed} caught, {missed} missed")
+    return int(missed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,161 @@
+"""Is what is trusted right, and what is right trusted? Sealed sets: sound ones, mistakes in the data, hidden effects.
+
+    python tests/studies/trust.py [--sets 300] [--first 0]
+
+A third of the sets each: sound; with one mistake (light left in, the field displaced, a dark camera, errors in another
+unit, a lamp of another temperature, cameras or angles mixed up); with one effect of the catalogue at a size that is
+drawn over two decades. Each is fitted with the base model and examined. A calibration is wrong if the matrix over the
+field is off by more than three times its stated errors (rms over points and elements, against the instrument that made
+the data). Printed is each set, and how many of each kind were trusted or not, right or wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+from small_run import SMALL  # noqa: E402
+
+from walop_jax.calibration.calibration import Calibration  # noqa: E402
+from walop_jax.calibration.matrix import matrices  # noqa: E402
+from walop_jax.data.records import CalibrationSet  # noqa: E402
+from walop_jax.data.settings import Settings  # noqa: E402
+from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
+from walop_jax.diagnosis.trust import examined  # noqa: E402
+from walop_jax.fit.refit import refit  # noqa: E402
+from walop_jax.io.errors import DataError  # noqa: E402
+from walop_jax.model.effects import EFFECTS  # noqa: E402
+from walop_jax.model.instrument import Instrument  # noqa: E402
+from walop_jax.model.parameters import field_declarations, values_of  # noqa: E402
+from walop_jax.simulation.simulate import simulate  # noqa: E402
+
+WRONG = 3.0
+Change = Callable[[CalibrationSet], CalibrationSet]
+
+
+class Judged(NamedTuple):
+    """What was hidden in a set, whether its fit is trusted, and the error of the matrix over the stated one."""
+
+    kind: str
+    what: str
+    trusted: bool
+    off: float
+
+
+def with_block(calset: CalibrationSet, **changed: np.ndarray) -> CalibrationSet:
+    block = dataclasses.replace(calset.intensities.block(0, len(calset.points)), **changed)
+    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
+
+
+def mistakes(rng: np.random.Generator) -> dict[str, Change]:
+    """One mistake of each kind, some of them at a size that is drawn."""
+    size = 10.0 ** rng.uniform(-1.0, 0.5)
+
+    def block(calset: CalibrationSet):
+        return calset.intensities.block(0, len(calset.points))
+
+    def displaced(calset: CalibrationSet) -> CalibrationSet:
+        points = dataclasses.replace(calset.points, x=calset.points.x + 0.01 * size)
+        return with_block(dataclasses.replace(calset, points=points), x=points.x)
+
+    def dark(calset: CalibrationSet) -> CalibrationSet:
+        counts = block(calset).counts.copy()
+        counts[..., rng.integers(4)] = 0.0
+        return with_block(calset, counts=counts)
+
+    def lamp(calset: CalibrationSet) -> CalibrationSet:
+        said = np.where(calset.exposures.kind == "clp", 3200.0, calset.exposures.teff)
+        return dataclasses.replace(calset, exposures=dataclasses.replace(calset.exposures, teff=said))
+
+    def backwards(calset: CalibrationSet) -> CalibrationSet:
+        e = calset.exposures
+        return dataclasses.replace(calset, exposures=dataclasses.replace(e, clp_angle=-e.clp_angle))
+
+    return {
+        "light left in": lambda c: with_block(c, counts=block(c).counts + 2000.0 * size),
+        "field displaced": displaced,
+        "dark camera": dark,
+        "errors too large": lambda c: with_block(c, sigma=100.0 * block(c).sigma),
+        "errors too small": lambda c: with_block(c, sigma=0.01 * block(c).sigma),
+        "lamp of another temperature": lamp,
+        "cameras exchanged": lambda c: with_block(
+            c, counts=block(c).counts[..., [2, 3, 0, 1]], sigma=block(c).sigma[..., [2, 3, 0, 1]]
+        ),
+        "polariser backwards": backwards,
+    }
+
+
+def matrix(instrument: Instrument, calset: CalibrationSet) -> np.ndarray:
+    """Elements of the instrument matrix at the field points."""
+    count, size = len(calset.points), values_of(instrument).size
+    setting = Settings.default(count, "SDSS-r")
+    nothing = np.zeros((size, size))
+    return matrices(instrument, setting, calset.filters, calset.points.x, calset.points.y, nothing)[0]
+
+
+def judged(number: int) -> Judged:
+    """One sealed set, fitted and held against the truth."""
+    rng = np.random.default_rng([number, 77])
+    kind = ("sound", "mistake", "hidden effect")[number % 3]
+    what, effects = "", ()
+    if kind == "hidden effect":
+        effect = EFFECTS[int(rng.integers(len(EFFECTS)))]
+        what, context = effect.name, SMALL.context()
+        neutral = effect.of(context)
+        size = {
+            name: np.asarray(getattr(neutral, name))
+            + 10.0 ** rng.uniform(-1.5, 0.5)
+            * field_declarations(effect)[name].width
+            * rng.standard_normal(np.shape(getattr(neutral, name)))
+            for name in effect.amplitudes()
+        }
+        effects = (effect.of(context, **{n: v.tolist() for n, v in size.items()}),)
+    made = simulate(SMALL, seed=1000 + number, effects=effects)
+    truth, data = made.truth, made.calset
+    if kind == "mistake":
+        chosen = mistakes(rng)
+        what = list(chosen)[int(rng.integers(len(chosen)))]
+        data = chosen[what](data)
+    try:
+        result = examined(refit(data))
+    except (DataError, ValueError):
+        return Judged(kind, what, trusted=False, off=np.inf)
+    calibration = Calibration.from_fit(result)
+    setting = Settings.default(len(made.calset.points), "SDSS-r")
+    x, y = made.calset.points.x, made.calset.points.y
+    found, covariance = calibration.matrix(x, y, setting)
+    error = np.sqrt(np.einsum("pii->pi", covariance))
+    off = float(np.sqrt(np.mean(((found - matrix(truth, made.calset)) / error) ** 2)))
+    return Judged(kind, what, bool(result.trusted), off)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sets", type=int, default=300)
+    parser.add_argument("--first", type=int, default=0)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    found: Counter[tuple[str, str]] = Counter()
+    for number in range(options.first, options.first + options.sets):
+        one = judged(number)
+        cell = f"{'trusted' if one.trusted else 'not trusted'}, {'wrong' if one.off > WRONG else 'right'}"
+        found[one.kind, cell] += 1
+        print(f"{number}: {one.kind} {one.what}: {cell} ({one.off:.2f} × stated)", flush=True)
+    for (kind, cell), times in sorted(found.items()):
+        print(f"{kind}: {cell}: {times}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
