@@ -31,6 +31,21 @@ def _no_cube() -> Cube:
 
 
 @dataclasses.dataclass(frozen=True)
+class Told:
+    """A sentence that was found: kind, place, what it grows with, its amplitude, and what would test it."""
+
+    sentence: str
+    kind: str
+    place: str
+    dependence: tuple[str, ...]
+    value: float
+    sigma: float
+    unit: str
+    words: str
+    tested_by: str
+
+
+@dataclasses.dataclass(frozen=True)
 class Step:
     """One effect that was found, added and confirmed; `parameters` hold (value, sigma, unit).
 
@@ -42,7 +57,8 @@ class Step:
     effect that explain the data as well. `equivalent` are the effects that this data set cannot tell from it,
     `separation` how far (σ) each rival stays from it. `residual_before` and `residual_after` are the residuals
     (data − model, in standard deviations as given; point, exposure, camera) without and with the effect at the time it
-    was added; where another name has been dropped since, they and χ² are of fits without that name.
+    was added; where another name has been dropped since, they and χ² are of fits without that name. `told` are the
+    sentences of an effect without a name (`described`), `nameless` those that are not improbable beside what was found.
     """
 
     effect: str
@@ -63,6 +79,8 @@ class Step:
     separation: dict[str, float] = dataclasses.field(default_factory=dict)
     separated_by: str = ""
     where: dict[str, Any] = dataclasses.field(default_factory=dict)
+    told: tuple[Told, ...] = ()
+    nameless: tuple[str, ...] = ()
     residual_before: Cube = dataclasses.field(default_factory=_no_cube)
     residual_after: Cube = dataclasses.field(default_factory=_no_cube)
 
@@ -213,6 +231,7 @@ class Diagnosis(Displayed):
             for s in self.steps
             if s.equivalent
         ]
+        notes += [f"{told.words}: {told.tested_by}" for s in self.steps for told in s.told]
         notes += [self.unexplained.description] if self.unexplained is not None else []
         notes += [self.caution] if self.caution else []
         return Display(

@@ -11,7 +11,7 @@ sine, a gradient two directions. Groups are short: at most two things are free b
     dependence    none; gradient, r², radial, diagonal, astigmatic over the field; wavelength; time, temperature;
                   harmonics of the angles; one night; one exposure; the counts; the exposure before
 
-A sentence pays for the number of sentences that there are (`price`), and for its length by its evidence.
+A sentence pays for the number of sentences that there are (`rank`), and for its length by its evidence.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from walop_jax.data.records import Exposures
+from walop_jax.diagnosis import naming
 from walop_jax.diagnosis.effect_columns import FEWEST_POINTS, Probe
+from walop_jax.diagnosis.score import ScoreTable
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import Context, Described, Effect
 from walop_jax.model.effects.sentence import Sentence
@@ -48,9 +50,14 @@ def sentences(instrument: Instrument, exposures: Exposures, points: int) -> tupl
     return tuple(_probe(group) for group in sorted(found, key=len))
 
 
-def price(probes: Sequence[Probe]) -> float:
-    """ln of the number of sentences: what each of them pays for being one of so many."""
-    return float(np.log(max(len(probes), 1)))
+def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[naming.Ranked]:
+    """Sentences by evidence, best first; all of them share the prior of one name."""
+    price = float(np.log(max(len(probes), 1)))
+    scored = [(probe, table[probe.name]) for probe in probes]
+    found = [
+        naming.Ranked(Described, p, score, score.log_bayes - price) for p, score in scored if score.testable
+    ]
+    return sorted(found, key=lambda item: -item.log_bayes)
 
 
 def uncovered(

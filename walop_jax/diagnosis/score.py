@@ -261,7 +261,7 @@ class Scorer:
         return Score(
             name=name, statistic=statistic, rank=rank, p_value=float(np.exp(log_p)), log_p=log_p,
             amplitudes=-w @ z, covariance=w @ w.T * noise**2,
-            log_bayes=_log_bayes(gram / noise**2, np.where(alive, scores[at], 0.0) / noise**2, self.space.widths[at]),
+            log_bayes=log_bayes(gram / noise**2, np.where(alive, scores[at], 0.0) / noise**2, self.space.widths[at]),
             surviving=float(share.max(initial=0.0)), testable=rank > 0,
         )  # fmt: skip
 
@@ -295,7 +295,7 @@ class Scorer:
         return smallest
 
 
-def _log_bayes(gram: Matrix, scores: Vector, widths: Vector) -> float:
+def log_bayes(gram: Matrix, scores: Vector, widths: Vector) -> float:
     """ln B = ½ sᵀ (G + Λ⁻¹)⁻¹ s − ½ ln det(1 + Λ^½ G Λ^½): evidence against the base, exact for a linear effect."""
     information = gram * np.outer(widths, widths) + np.eye(len(widths))
     s = scores * widths

@@ -108,6 +108,12 @@ class Described(Effect):
             held.setdefault(Sentence.parsed(text).parameter, []).append(float(amplitude))
         return cls.of(Context(), sentences=sentences, **held)
 
+    def joined(self, other: Described) -> Described:
+        """These sentences and others that it has not."""
+        new = [(s.text, float(a)) for s, a in other.terms() if s.text not in self.sentences]
+        terms = [(s.text, float(a)) for s, a in self.terms()] + new
+        return Described.saying([text for text, _ in terms], [value for _, value in terms])
+
     def labels(self, field: str) -> Sequence[str]:
         """The sentences themselves, without blanks."""
         return [s.label for s in map(Sentence.parsed, self.sentences) if s.parameter == field]
