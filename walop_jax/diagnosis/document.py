@@ -73,6 +73,8 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         },
         "p_value": diagnosis.p_value,
         "remaining_p_value": diagnosis.remaining_p,
+        "noise_scale": _number(diagnosis.noise_scale),
+        "noise_p_value": _number(diagnosis.noise_p),
         "limits": [
             {
                 "effect": limit.effect,

@@ -154,7 +154,7 @@ class Examination:
             names.remove(best.name)
             space, reduce = space.with_base([best.name])
             scores, square = reduce(scores, square)
-            table = Scorer(space, self._rng, draws=0)(scores, square)
+            table = Scorer(space, self._rng, draws=0).after(self.table, scores)
         return needed, table
 
     def _p(self, score: Score) -> float:
@@ -183,6 +183,11 @@ class Examination:
     def alarm(self) -> bool:
         """Whether anything is missing at all."""
         return self.table.p_global < ALARM
+
+    @property
+    def noise_p(self) -> float:
+        """Chance that noise of the stated size alone leaves as much as this fit does."""
+        return float(stats.chi2.sf(self.result.chi2, max(self.result.dof, 1)))
 
     def summary(self) -> tuple[tuple[str, float, float], ...]:
         """Effects with score and corrected p, most significant first."""

@@ -156,7 +156,9 @@ class Diagnosis(Displayed):
     `candidates` are (effect, score, corrected p) in the first examination; `before` is the fit of the model given,
     `after` that of the extended one; `remaining_p` is the significance of what is left at the end. `choices` are other
     descriptions of the instrument that were tried, the best first; none where nothing, or only a name, was missing.
-    `classes` are significant effects that these data cannot tell from others, whether they were added or not.
+    `noise_scale` is the scatter of what no candidate explains over what N_ERR says, `noise_p` the chance that noise of
+    the stated size scatters as much. `classes` are significant effects that these data cannot tell from others, whether
+    they were added or not.
     """
 
     verdict: Outcome
@@ -171,6 +173,8 @@ class Diagnosis(Displayed):
     after: FitResult
     seconds: float
     points: int
+    noise_scale: float = float("nan")
+    noise_p: float = float("nan")
     choices: tuple[Choice, ...] = ()
     classes: tuple[Alike, ...] = ()
 

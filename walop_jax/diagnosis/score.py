@@ -226,11 +226,24 @@ class Scorer:
 
     def __init__(self, space: ScoreSpace, rng: np.random.Generator, draws: int = limits.NULL_DRAWS) -> None:
         self.space = space
-        alive, gram = space.alive(), np.where(np.outer(space.alive(), space.alive()), space.gram, 0.0)
-        self._alive = alive
+        self._alive = space.alive()
         self._whitening = space.whitened
-        self._all = whitening(gram)
-        self._smallest = self._smallest_p(gram, rng, draws)
+        self._smallest = self._smallest_p(rng, draws) if draws else np.zeros(0)
+
+    @cached_property
+    def _gram(self) -> Matrix:
+        return np.where(np.outer(self._alive, self._alive), self.space.gram, 0.0)
+
+    @cached_property
+    def _all(self) -> Matrix:
+        return whitening(self._gram)
+
+    def after(self, earlier: ScoreTable, scores: Vector) -> ScoreTable:
+        """The table of a space that is part of an earlier one, with the noise and the number of trials found there."""
+        noise, trials = earlier.noise_scale, earlier.trials
+        table = tuple(self._score(name, at, scores, noise) for name, at in self.space.places().items())
+        found = min((score.log_p for score in table if score.testable), default=0.0)
+        return ScoreTable(table, noise, corrected_p(found, trials), trials)
 
     def threshold(self, p: float) -> float:
         """ln of the local p that the smallest of all candidates undercuts with probability `p` under the base."""
@@ -277,12 +290,12 @@ class Scorer:
             return (1 + below) / (1 + len(self._smallest)), trials
         return corrected_p(found, trials), trials
 
-    def _smallest_p(self, gram: Matrix, rng: np.random.Generator, draws: int) -> Vector:
+    def _smallest_p(self, rng: np.random.Generator, draws: int) -> Vector:
         """ln of the smallest p among all candidates, drawn under the base."""
         if not self._all.shape[1]:
             return np.zeros(0)
         # Scores s = G W n have covariance G for unit normals n. Seven digits are plenty for what is only counted.
-        root = gram @ self._all
+        root = self._gram @ self._all
         places = self.space.places()
         maps = [root[places[name]].T @ w for name, w in self._whitening.items() if w.shape[1]]
         normal = rng.standard_normal((draws, root.shape[1]), dtype=np.float32)

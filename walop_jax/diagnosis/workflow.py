@@ -127,6 +127,8 @@ class _Diagnosing:
             unexplained=unexplained,
             p_value=first.table.p_global,
             remaining_p=examination.table.p_global,
+            noise_scale=self.fit.noise_scale * examination.table.noise_scale,
+            noise_p=examination.noise_p,
             before=before,
             after=self.fit,
             seconds=time.perf_counter() - began,
@@ -334,7 +336,8 @@ class _Diagnosing:
             if dropped:
                 examination = self._examine(first)
                 self.steps = refitted_in_order(self.steps, first.design, examination.design)
-            if not examination.alarm and self.fit.explains_data:
+            # Errors that are a few per cent too small are no effect: nothing but their size is wrong.
+            if not examination.alarm and (self.fit.explains_data or self.fit.nearly_explains_data):
                 return examination, None
             self.tell("something without a name is left")
             unexplained = self._unexplained(examination)
