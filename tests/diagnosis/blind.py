@@ -38,6 +38,7 @@ SEPARABLE = 5.0  # σ between the truth and its nearest rival above which a name
 CONFOUNDED = 2.0  # below which a class is asked for
 PLAUSIBLE = 5.0  # prior widths that a hidden amplitude may have
 DRAWS = 3000
+KEPT = 60  # scorers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -246,6 +247,8 @@ class Blind:
             left += [probe for probe in told if probe.name not in added]
             names = [p.name for p in left] + [n for n in self.patterns if n not in added]
             draws = DRAWS if not added else 0
+            if len(self._scorers) > KEPT:  # those of the starting model are dear, and always needed
+                self._scorers = {key: value for key, value in self._scorers.items() if not key[0]}
             space = self._space(added).subset(names)
             self._scorers[added, removed] = Scorer(space, np.random.default_rng(7), draws), left
         return self._scorers[added, removed]

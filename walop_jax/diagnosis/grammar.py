@@ -165,6 +165,7 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
                     yield _times(base, *pair)
     yield from _of_plates(instrument, exposures, asked)
     yield from _of_cameras(instrument, asked)
+    yield from _together(instrument, asked)
 
 
 def _times(base: tuple[Sentence, ...], *factors: str) -> tuple[Sentence, ...]:
@@ -265,6 +266,26 @@ def _of_plates(instrument: Instrument, exposures: Exposures, asked: _Asked) -> I
         yield tuple(warm)
 
 
+def _together(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
+    """The same kind at the same place of every arm, or in every camera, each with its own amplitude."""
+    arms, names = instrument.arms, instrument.cameras.names
+    if len(arms) > 1 and len({arm.path for arm in arms}) == 1:
+        for element in arms[0].train():
+            if _acts(element):
+                each = [list(_families("behind", f"{arm.name}.{element.name}")) for arm in arms]
+                yield from (tuple(itertools.chain(*same)) for same in zip(*each, strict=True))
+    plates = [place for place in instrument.places(WavePlate) if "." in place]
+    if len(plates) > 1:
+        yield tuple(Sentence("axis", "of", place) for place in plates)
+    yield tuple(Sentence("gain", "of", name, ("counts",)) for name in names)
+    if asked.over_field:
+        yield tuple(Sentence("light", "in", name) for name in names)
+    if asked.hours:
+        yield tuple(Sentence("afterglow", "in", name) for name in names)
+    pairs = zip(names, instrument.cameras.orthogonal, strict=True)
+    yield tuple(Sentence("light", "in", name, origin=names[j]) for name, j in pairs if names[j] != name)
+
+
 def _of_cameras(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
     cameras, e = instrument.cameras.names, asked.exposures
     polariser = instrument.polariser
@@ -290,8 +311,6 @@ def _of_cameras(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentenc
         for other in cameras:
             if other != camera:
                 yield (Sentence("light", "in", camera, origin=other),)
-    if asked.hours:
-        yield tuple(Sentence("afterglow", "in", camera) for camera in cameras)
     for arm in instrument.arms if len(instrument.arms) > 1 else ():
         gain = (Sentence("gain", "of", arm.name),)
         for factor in (*asked.slow(), *asked.nights()):
