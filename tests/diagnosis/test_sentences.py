@@ -65,6 +65,7 @@ def test_a_film_whose_axis_turns_over_the_field():
     assert told.tested_by
 
 
+@pytest.mark.long
 def test_an_encoder_error_twice_per_turn():
     """Its mimic to first order is polarisation of the telescope: told apart, or told as a class."""
     result = found([Described.saying(["turn of polariser * sin 2 CLP"], [0.08])])
@@ -74,6 +75,7 @@ def test_an_encoder_error_twice_per_turn():
     assert result.verdict == "effect_found"
 
 
+@pytest.mark.long
 def test_halves_that_are_vignetted_differently():
     result = found([Vignetting()])
     names = {step.effect for step in result.steps}
