@@ -246,7 +246,7 @@ class Blind:
             told = grammar.uncovered(self.sentences, catalogue, self.context, self.template)
             left += [probe for probe in told if probe.name not in added]
             names = [p.name for p in left] + [n for n in self.patterns if n not in added]
-            draws = DRAWS if not added else 0
+            draws = DRAWS if not added and not removed else 0
             if len(self._scorers) > KEPT:  # those of the starting model are dear, and always needed
                 self._scorers = {key: value for key, value in self._scorers.items() if not key[0]}
             space = self._space(added).subset(names)
@@ -277,7 +277,10 @@ class Blind:
             scorer, left = self._scorer(tuple(added), scene.removed)
             s, square = self._reduced(s0, square0, tuple(added))
             scores = s[self.space.chosen(scorer.space.names)]
-            table = scorer(scores, square) if table is None else scorer.after(table, scores)
+            if table is None:  # noise and number of trials are those of the whole catalogue, which is dear to draw
+                whole = self._scorer((), ())[0]
+                table = whole(s[self.space.chosen(whole.space.names)], square)
+            table = scorer.after(table, scores) if added or scene.removed else table
             if table.p_global >= ALARM or len(added) >= MOST_STEPS:
                 break
             names = naming.rank(table, [p for p in left if p.name in self.effect_of])
