@@ -27,7 +27,7 @@ from walop_jax.diagnosis.effect_columns import Probe, probes
 from walop_jax.diagnosis.examination import ALARM, Examination
 from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, Measured
 from walop_jax.diagnosis.score import Scorer, ScoreSpace, ScoreTable, separations, whitening
-from walop_jax.diagnosis.workflow import MOST_STEPS
+from walop_jax.diagnosis.workflow import MOST_SENTENCES, MOST_STEPS
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
@@ -83,7 +83,7 @@ OUTSIDE: dict[str, tuple[str, ...]] = {
     "vignetting of half1": ("gain of half1 * ring 3",),
     "cross-talk of read-outs": ("light of O2 in O1",),
     "persistence": ("afterglow in E1",),
-    "quadratic non-linearity": ("gain of O2 * counts",),
+    "quadratic non-linearity": ("gain of O2 * counts", "nonlinearity"),
     "one camera in two exposures": ("gain of E1 * exposure 4", "gain of E1 * exposure 9"),
     "background that varies": (),
     "image shift by the polariser": (),
@@ -108,6 +108,7 @@ def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[s
     drawn = np.random.default_rng(5).standard_normal(len(e))
     patterns = {
         "vignetting of half1": np.maximum(r - 0.22, 0.0)[:, None, None] * (camera[0] + camera[1]),
+        "quadratic non-linearity": (measured.flux / measured.flux.mean())[..., None] ** 2 * camera[2],
         "background that varies": drawn[None, :, None] * np.ones(shape),
         "image shift by the polariser": (
             x[:, None, None] * (camera[0] - camera[2]) + y[:, None, None] * (camera[1] + 0.5 * camera[3])
@@ -127,7 +128,7 @@ def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[s
     polish = (x**3 - 1.5 * x * y + 0.7 * y**2)[point]
     yield "retarder of half2 with a polishing error", said["retardance u behind half2.plate"] * polish
     for name, texts in OUTSIDE.items():
-        if texts and name != "vignetting of half1":
+        if texts and name not in patterns:
             yield name, np.sum([said[text] for text in texts], axis=0)
 
 
@@ -277,7 +278,9 @@ class Blind:
             scorer, left = self._scorer(tuple(added), scene.removed)
             s, square = self._reduced(s0, square0, tuple(added))
             scores = s[self.space.chosen(scorer.space.names)]
-            if table is None:  # noise and number of trials are those of the whole catalogue, which is dear to draw
+            if (
+                table is None
+            ):  # noise and number of trials are those of the whole catalogue, which is dear to draw
                 whole = self._scorer((), ())[0]
                 table = whole(s[self.space.chosen(whole.space.names)], square)
             table = scorer.after(table, scores) if added or scene.removed else table
@@ -288,6 +291,11 @@ class Blind:
             alive = [score for score in table.scores if score.testable and score.name in self.patterns]
             price, least = np.log(len(alive)), min(0.0, max(score.log_bayes for score in alive))
             best = _most_probable(table, names, told, least)
+            if best is not None and best.probe.name not in self.effect_of:
+                best = (
+                    self._sufficient_name(table, names, best, tuple(added), scene.removed, s0, square0)
+                    or best
+                )
             pattern = max(alive, key=lambda score: score.log_bayes)
             strong = table.corrected(pattern) < ALARM
             if strong and (best is None or pattern.log_bayes - price > best.log_bayes + naming.EVEN_ODDS):
@@ -309,7 +317,7 @@ class Blind:
             classes.append(frozenset((close | possible | rivals) - {name, best.probe.name}))
             added.append(best.probe.name)
         assert table is not None
-        missing = nameless or table.p_global < ALARM
+        missing = nameless or table.p_global < ALARM or len(said) > MOST_SENTENCES
         kind = "unexplained" if missing else "effect_found" if added else "consistent"
         verdict = Verdict(kind, tuple(named), tuple(classes), tuple(said))
         if first is None:
@@ -318,6 +326,26 @@ class Blind:
         return dataclasses.replace(
             verdict, first_probe=first.probe.name, amplitudes=score.amplitudes, covariance=score.covariance
         )
+
+    def _sufficient_name(
+        self,
+        table: ScoreTable,
+        names: Sequence[naming.Ranked],
+        sentence: naming.Ranked,
+        added: tuple[str, ...],
+        removed: tuple[str, ...],
+        s0: np.ndarray,
+        square0: float,
+    ) -> naming.Ranked | None:
+        """The best name where it leaves nothing significant while the sentence does."""
+
+        def left(item: naming.Ranked) -> float:
+            scorer, _ = self._scorer((*added, item.probe.name), removed)
+            s, _ = self._reduced(s0, square0, (*added, item.probe.name))
+            return scorer.after(table, s[self.space.chosen(scorer.space.names)]).p_global
+
+        name = next((r for r in names if table.corrected(r.score) < ALARM), None)
+        return name if name is not None and left(sentence) < ALARM <= left(name) else None
 
     def _rivals(self, space: ScoreSpace, best: naming.Ranked, left: Sequence[Probe]) -> set[str]:
         at = space.places()[best.probe.name]
@@ -375,7 +403,7 @@ def _outcome(verdict: Verdict, truth: set[str]) -> str:
     """What is said of something that the catalogue does not hold; `truth` are the sentences that it is."""
     if verdict.kind == "consistent":
         return "not detected"
-    told = {text for group in verdict.said for text in group.split("; ")}
+    told = {*verdict.named, *(text for group in verdict.said for text in group.split("; "))}
     if told & truth:
         return "right"
     if truth & {text for one in verdict.classes for group in one for text in group.split("; ")}:
@@ -415,7 +443,8 @@ def summarise(judged: Sequence[tuple[Scene, Verdict]], known: dict[str, set[str]
             if truth and outcome != "right":
                 confusion[f"removed: {scene.truth[0]}, SNR {ratio}", f"{outcome}: {said}"] += 1
             if scene.separation >= SEPARABLE:
-                rates[f"removed: given another name, SNR {ratio}, separable"].append(found)
+                other = found and set(verdict.named) != {"described"}
+                rates[f"removed: given another name, SNR {ratio}, separable"].append(other)
                 if found:
                     confusion[f"removed: {scene.truth[0]}", said] += 1
         elif scene.kind == "pair":

@@ -251,6 +251,21 @@ class Examination:
         """Sentences that are significant by themselves, best evidence first."""
         return [r for r in self.told if self.table.corrected(r.score) < ALARM]
 
+    def _left(self, item: naming.Ranked) -> float:
+        """Global p of what a linear step of one candidate leaves."""
+        space, scores, square = self._scored
+        space, reduce = space.with_base([item.probe.name])
+        return Scorer(space, self._rng, draws=0).after(self.table, reduce(scores, square)[0]).p_global
+
+    def sentences_before_names(self) -> list[naming.Ranked]:
+        """Sentences that are more probable than every name; none where the best name suffices and they do not."""
+        name = next(iter(self.significant), None)
+        found = self.significant_sentences
+        if name is None or not found:
+            return found
+        found = [item for item in found if item.log_bayes > name.log_bayes]
+        return found if not found or self._left(found[0]) >= ALARM or self._left(name) < ALARM else []
+
     def nameless(self, trial: naming.Trial) -> tuple[str, ...]:
         """Sentences that are not improbable beside what a trial says, by linear steps, the most probable first."""
         own = set(trial.instance.sentences) if isinstance(trial.instance, Described) else set()

@@ -45,7 +45,7 @@ from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import Model, effect_context
 
 MOST_STEPS = 6
-MOST_SENTENCES = 2  # that are refitted at a time
+MOST_SENTENCES = 2  # that are refitted at a time; more than can be one thing that a sentence holds
 LEAST_EVIDENCE = 1.0  # ln B that an effect must be worth to the final model to stay in it
 MINUTES = 20.0  # after which no further name is sought
 POOR_FIT = 1.5  # χ²/dof above which effects that cannot be differentiated are tried
@@ -105,7 +105,7 @@ class _Diagnosing:
         every = grammar.sentences(model.template, calset.exposures, len(calset.points))
         self.sentences = grammar.uncovered(every, self.catalogue, self.context, model.template)
         self.steps: list[Step] = []
-        self.added = 0
+        self.added = self.said = 0
         self.choices: dict[str, Choice] = {}
         tell("fitting the model")
         self.fit: FitResult = fit(Likelihood.of(calset, model))
@@ -116,6 +116,7 @@ class _Diagnosing:
         self.tell("scoring every effect and pattern")
         first = self._examine()
         examination, unexplained = self._conclude(first, self._add_names(first))
+        unexplained = unexplained or self._too_many_sentences(examination)
         steps = tuple(self._finished(step, examination) for step in self.steps)
         verdict: Outcome = "unexplained" if unexplained else "effect_found" if steps else "consistent"
         return Diagnosis(
@@ -155,6 +156,7 @@ class _Diagnosing:
             if added is None:
                 break
             self.added += 1
+            self.said += added == Described.name
             self.tell(f"added {added}; scoring what is left")
             examination = self._examine(examination)
         return examination
@@ -178,9 +180,8 @@ class _Diagnosing:
 
     def _sentences(self, examination: Examination) -> Iterator[naming.Trial]:
         """Sentences that are more probable than every name, by linear steps."""
-        best = max((item.log_bayes for item in examination.significant), default=-np.inf)
-        for item in examination.significant_sentences[:MOST_SENTENCES]:
-            if item.log_bayes > best and self._time_left():
+        for item in examination.sentences_before_names()[:MOST_SENTENCES]:
+            if self._time_left():
                 self.tell(f"trying {item.probe.name}")
                 said, count = naming.shortest(item), len(examination.sentences)
                 yield naming.try_sentences(self.fit, said, self.context, count)
@@ -301,6 +302,13 @@ class _Diagnosing:
             blocks = tuple(block for block in blocks if block != "exposures")
         ready = bool(blocks) and not there and self._time_left()
         return self._with_free_form(examination, found, blocks) if ready else found
+
+    def _too_many_sentences(self, examination: Examination) -> Unexplained | None:
+        """Something that no sentence holds looks like several that are there."""
+        if self.said <= MOST_SENTENCES:
+            return None
+        text = f"{self.said} sentences were needed: they say where it sits, no single one of them what it is"
+        return Unexplained(examination.table.p_global, text, ())
 
     def _with_free_form(
         self, examination: Examination, found: Unexplained, blocks: tuple[str, ...]
