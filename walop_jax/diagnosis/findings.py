@@ -231,9 +231,9 @@ class Diagnosis(Displayed):
                 rows.append((step.effect, name, *texts, unit, f"{step.p_value:.1g}"))
         before, after = (fit.chi2 / max(fit.dof, 1) for fit in (self.before, self.after))
         notes = [
-            f"{s.effect}: these data cannot tell it from {', '.join(s.equivalent)}"
+            f"{s.effect}: these data cannot tell it from {', '.join((*s.equivalent, *s.nameless))}"
             for s in self.steps
-            if s.equivalent
+            if s.equivalent or s.nameless
         ]
         notes += [f"{told.words}: {told.tested_by}" for s in self.steps for told in s.told]
         notes += [self.unexplained.description] if self.unexplained is not None else []

@@ -395,6 +395,6 @@ class _Diagnosing:
             robust_ratio=examination.design.robust_ratio(step.effect),
             equivalent=tuple(sorted(close, key=lambda name: separation.get(name, np.inf))),
             separation=separation,
-            separated_by=effect.separated_by if close else "",
+            separated_by=effect.separated_by if close or step.nameless else "",
             where=location.describe(examination.design, change),
         )
