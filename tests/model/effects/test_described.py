@@ -1,10 +1,14 @@
 """Sentences do what effects of the catalogue do that are known by another name, and what Mueller algebra says."""
 
+import json
+
 import effect_scenes as scenes
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from walop_jax.fit.model_builder import model_without_data
+from walop_jax.fit.model_file import render
 from walop_jax.model import mueller
 from walop_jax.model.carried import left_behind
 from walop_jax.model.effects import Described, effect_by_name
@@ -160,3 +164,18 @@ def test_sentences_are_read_as_they_are_written():
     assert Sentence.parsed("turn of polariser * sin 2 CLP").in_words() == (
         "turn of polariser, as the sine of 2 × the angle of CLP"
     )
+
+
+def test_a_model_file_carries_sentences():
+    """What `diagnose` writes is what `--model` reads: the sentences, their values and priors."""
+    said = ["turn of polariser * x", "light of O2 in O1", "retardance q behind half1.plate * hours"]
+    text = f'[model]\neffects = ["described"]\n[effects.described]\nsentences = {json.dumps(said)}\n'
+    model = model_without_data("WALOP-SOUTH", text)
+    name = "described.turn_of_polariser_*_x"
+    assert model[name].unit == "deg"
+    assert model[name].prior == (0.0, 0.1)
+    moved = model.change(name, start=0.02)
+    again = model_without_data("WALOP-SOUTH", render(moved))
+    assert again.names == moved.names
+    assert again[name].start == 0.02
+    assert again.template.effect("described").sentences == tuple(said)
