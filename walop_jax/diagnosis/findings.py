@@ -212,7 +212,7 @@ class Diagnosis(Displayed):
         return astropy_table(
             {
                 "EFFECT": (np.array([s.effect for s, *_ in found], "U32"), "", "effect"),
-                "PARAMETER": (np.array([name for _, name, *_ in found], "U32"), "", "its parameter"),
+                "PARAMETER": (np.array([name for _, name, *_ in found], "U96"), "", "its parameter"),
                 "VALUE": (np.array([v for _, _, v, _, _ in found], float), "", "fitted value"),
                 "SIGMA": (np.array([s for _, _, _, s, _ in found], float), "", "standard error"),
                 "UNIT": (np.array([u for *_, u in found], "U16"), "", "unit of the numbers of this row"),
