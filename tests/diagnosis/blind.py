@@ -3,7 +3,8 @@
 One design (a simulated calibration set, its Jacobian, the columns of every effect and pattern) spans a space of a
 thousand dimensions; what lies outside is pure noise. Scenes are drawn there: Gaussian noise plus an effect of known
 signal-to-noise ratio behind the projection. They go through the scoring, ranking and separating code of the package.
-Verdicts are written before the truths are opened.
+Verdicts are written before the truths are opened. In some scenes the effect that is hidden is taken out of the
+catalogue: then the sentences that it is are asked for (`EFFECTS`, `in_sentences`), and no other name.
 
     PYTHONPATH=tests python tests/diagnosis/blind.py [scenes per effect and ratio] [OUT.json]
 """
@@ -21,12 +22,12 @@ from pathlib import Path
 import numpy as np
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import naming
+from walop_jax.diagnosis import grammar, naming
 from walop_jax.diagnosis.effect_columns import Probe, probes
 from walop_jax.diagnosis.examination import ALARM, Examination
 from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, Measured
-from walop_jax.diagnosis.score import Candidate, Scorer, ScoreSpace, separations, whitening
-from walop_jax.diagnosis.workflow import MOST_STEPS
+from walop_jax.diagnosis.score import Scorer, ScoreSpace, ScoreTable, separations, whitening
+from walop_jax.diagnosis.workflow import MOST_SENTENCES, MOST_STEPS
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
@@ -37,6 +38,7 @@ SEPARABLE = 5.0  # σ between the truth and its nearest rival above which a name
 CONFOUNDED = 2.0  # below which a class is asked for
 PLAUSIBLE = 5.0  # prior widths that a hidden amplitude may have
 DRAWS = 3000
+KEPT = 60  # scorers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,34 +62,74 @@ class Scene:
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """What the rules say of a scene; `pulls` are those of the first name's amplitudes, for each of its probes."""
+    """What the rules say of a scene; `said` are the sentences that were added, `classes` hold names and sentences."""
 
     kind: str
     named: tuple[str, ...]
     classes: tuple[frozenset[str], ...]
+    said: tuple[str, ...] = ()
     first_probe: str = ""
     amplitudes: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
     covariance: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
 
 
-def outside(measured: Measured) -> Iterator[Candidate]:
-    """Shapes that are in no catalogue."""
+# What each shape outside the catalogue is in sentences; none: no sentence holds it.
+OUTSIDE: dict[str, tuple[str, ...]] = {
+    "film that turns with X": ("turn of polariser * x",),
+    "encoder twice per turn": ("turn of polariser * sin 2 CLP",),
+    "encoder four times per turn": ("turn of polariser * sin 4 CLP",),
+    "encoder wrong in a run of exposures": (),
+    "retarder of half2 with a polishing error": (),
+    "vignetting of half1": ("gain of half1 * ring 3",),
+    "cross-talk of read-outs": ("light of O2 in O1",),
+    "persistence": ("afterglow in E1",),
+    "quadratic non-linearity": ("gain of O2 * counts", "nonlinearity"),
+    "one camera in two exposures": ("gain of E1 * exposure 4", "gain of E1 * exposure 9"),
+    "background that varies": (),
+    "image shift by the polariser": (),
+    "ring": (),
+    "step": (),
+    "six times the angle": ("gain of O1 * cos 6 CLP",),
+    "hysteresis": (),
+    "sky gradient": (),
+}
+
+
+def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[str, np.ndarray]]:
+    """Shapes that are in no catalogue, with their columns; `said` are those of single sentences."""
     e, points = measured.likelihood.calset.exposures, measured.likelihood.calset.points
-    shape = (len(points), len(e), 4)
-    r = np.hypot(points.x, points.y)
+    point, exposure = (np.repeat(at, measured.cameras) for at in np.nonzero(measured.used))
+    shape = (len(points), len(e), measured.cameras)
+    x, y = points.x / 0.3, points.y / 0.3
+    r, camera = np.hypot(points.x, points.y), np.eye(measured.cameras)[:, None, None]
     through = e.clp_in
     angle = np.deg2rad(np.where(through, e.clp_angle, 0.0))
     sky = (e.kind == "moon") & ~through
-    camera = np.eye(4)[:, None, None]
+    drawn = np.random.default_rng(5).standard_normal(len(e))
     patterns = {
+        "vignetting of half1": np.maximum(r - 0.22, 0.0)[:, None, None] * (camera[0] + camera[1]),
+        "quadratic non-linearity": (measured.flux / measured.flux.mean())[..., None] ** 2 * camera[2],
+        "background that varies": drawn[None, :, None] * np.ones(shape),
+        "image shift by the polariser": (
+            x[:, None, None] * (camera[0] - camera[2]) + y[:, None, None] * (camera[1] + 0.5 * camera[3])
+        )
+        * np.where(through, np.cos(angle), 0.0)[None, :, None],
         "ring": np.exp(-((r - 0.2) ** 2) / (2 * 0.03**2))[:, None, None] * camera[2],
         "step": np.where(points.x > 0.05, 1.0, 0.0)[:, None, None] * camera[1],
-        "six times the angle": np.where(through, np.cos(6 * angle), 0.0)[None, :, None] * camera[0],
         "hysteresis": np.where(through & (np.arange(len(e)) % 2 == 0), 1.0, 0.0)[None, :, None] * camera[3],
         "sky gradient": (points.x / 0.3)[:, None, None] * sky[None, :, None] * (camera[0] - camera[1]),
     }
     for name, pattern in patterns.items():
-        yield measured.candidate(name, [np.broadcast_to(pattern, shape)])
+        yield name, measured.candidate(name, [np.broadcast_to(pattern, shape)]).columns[:, 0]
+    yield (
+        "encoder wrong in a run of exposures",
+        said["turn of polariser"] * np.isin(exposure, np.arange(4, 9)),
+    )
+    polish = (x**3 - 1.5 * x * y + 0.7 * y**2)[point]
+    yield "retarder of half2 with a polishing error", said["retardance u behind half2.plate"] * polish
+    for name, texts in OUTSIDE.items():
+        if texts and name not in patterns:
+            yield name, np.sum([said[text] for text in texts], axis=0)
 
 
 class Blind:
@@ -98,8 +140,14 @@ class Blind:
         result = fit(Likelihood.of(calset, model))
         self.rng = np.random.default_rng(seed)
         wanted = list(probes(EFFECTS, effect_context(model.template, calset.exposures)))
-        examination = Examination(result, wanted, self.rng)
+        self.context, self.template = effect_context(model.template, calset.exposures), model.template
+        self.sentences = grammar.sentences(model.template, calset.exposures, len(calset.points))
+        examination = Examination(result, wanted, self.rng, None, self.sentences)
         self.probes: list[Probe] = examination.probes
+        self.in_sentences = {
+            e.name: {t for g in e.probes(self.context) for t in g[0].in_sentences(model.template)}
+            for e in EFFECTS
+        }
         self.effect_of = {p.name: p.effect.name for p in self.probes}
         self.space, self.nuisance = examination.space, examination.common_mode
         self.places = self.space.places()
@@ -107,10 +155,19 @@ class Blind:
         self._root = self.space.gram @ self._whitening
         self.dimension = self._root.shape[1]
         self.outside = {}
-        for shape in outside(examination.design.measured):
-            column = examination.design.projector(examination.design.stacked([shape.columns])[:, 0])
+        single = {
+            text: column
+            for probe in self.sentences
+            for text, column in zip(
+                grammar.said_by(probe), examination.said[probe.name].columns.T, strict=True
+            )
+        }
+        for name, shape in outside(examination.design.measured, single):
+            column = examination.design.projector(examination.design.stacked([shape[:, None]])[:, 0])
             along = self._whitening.T @ (examination.columns.T @ column)
-            self.outside[shape.name] = along, float(column @ column - along @ along)
+            self.outside[name] = along, max(float(column @ column - along @ along), 0.0)
+        explained = {*self.effect_of, *(probe.name for probe in self.sentences)}
+        self.patterns = [name for name in self.space.names if name not in explained]
         self._scorers: dict[tuple[tuple[str, ...], tuple[str, ...]], tuple[Scorer, list[Probe]]] = {}
         self.free = examination.space.free
         self.visible = sorted({p.effect.name for p in self.probes if examination.table[p.name].testable})
@@ -184,12 +241,17 @@ class Blind:
 
     def _scorer(self, added: tuple[str, ...], removed: tuple[str, ...]) -> tuple[Scorer, list[Probe]]:
         if (added, removed) not in self._scorers:
-            space = self._space(added)
-            gone = {self.effect_of[a] for a in added} | set(removed)
+            gone = {self.effect_of[a] for a in added if a in self.effect_of} | set(removed)
             left = [p for p in self.probes if p.effect.name not in gone]
-            names = [p.name for p in left] + [n for n in space.names if n not in self.effect_of]
-            draws = np.random.default_rng(7)
-            self._scorers[added, removed] = Scorer(space.subset(names), draws, DRAWS), left
+            catalogue = [effect for effect in EFFECTS if effect.name not in removed]
+            told = grammar.uncovered(self.sentences, catalogue, self.context, self.template)
+            left += [probe for probe in told if probe.name not in added]
+            names = [p.name for p in left] + [n for n in self.patterns if n not in added]
+            draws = DRAWS if not added and not removed else 0
+            if len(self._scorers) > KEPT:  # those of the starting model are dear, and always needed
+                self._scorers = {key: value for key, value in self._scorers.items() if not key[0]}
+            space = self._space(added).subset(names)
+            self._scorers[added, removed] = Scorer(space, np.random.default_rng(7), draws), left
         return self._scorers[added, removed]
 
     def _space(self, added: tuple[str, ...]) -> ScoreSpace:
@@ -206,34 +268,84 @@ class Blind:
         s0 = self._root @ scene.coordinates
         square0 = float(scene.coordinates @ scene.coordinates) + scene.rest
         added: list[str] = []
+        named: list[str] = []
         classes: list[frozenset[str]] = []
+        said: list[str] = []
+        nameless = False
         first: naming.Ranked | None = None
+        table: ScoreTable | None = None
         while True:
             scorer, left = self._scorer(tuple(added), scene.removed)
             s, square = self._reduced(s0, square0, tuple(added))
-            table = scorer(s[self.space.chosen(scorer.space.names)], square)
+            scores = s[self.space.chosen(scorer.space.names)]
+            if (
+                table is None
+            ):  # noise and number of trials are those of the whole catalogue, which is dear to draw
+                whole = self._scorer((), ())[0]
+                table = whole(s[self.space.chosen(whole.space.names)], square)
+            table = scorer.after(table, scores) if added or scene.removed else table
             if table.p_global >= ALARM or len(added) >= MOST_STEPS:
                 break
-            patterns = [s.log_bayes for s in table.scores if s.testable and s.name not in self.effect_of]
-            least = min(0.0, max(patterns))
-            ranked = [
-                r
-                for r in naming.rank(table, left)
-                if table.corrected(r.score) < ALARM and r.log_bayes > least
-            ]
-            if not ranked:
+            names = naming.rank(table, [p for p in left if p.name in self.effect_of])
+            told = grammar.rank(table, [p for p in left if p.name not in self.effect_of])
+            alive = [score for score in table.scores if score.testable and score.name in self.patterns]
+            price, least = np.log(len(alive)), min(0.0, max(score.log_bayes for score in alive))
+            best = _most_probable(table, names, told, least)
+            if best is not None and best.probe.name not in self.effect_of:
+                best = (
+                    self._sufficient_name(table, names, best, tuple(added), scene.removed, s0, square0)
+                    or best
+                )
+            pattern = max(alive, key=lambda score: score.log_bayes)
+            strong = table.corrected(pattern) < ALARM
+            if strong and (best is None or pattern.log_bayes - price > best.log_bayes + naming.EVEN_ODDS):
+                # What has no name explains more: names must show beside it.
+                nameless = True
+                added.append(pattern.name)
+                continue
+            if best is None:
                 break
-            best = ranked[0]
-            first = first or best
-            close = {r.effect.name for r in ranked[1:] if best.log_bayes - r.log_bayes < naming.EVEN_ODDS}
-            classes.append(frozenset(close | self._rivals(scorer.space, best, left)))
+            name = self.effect_of.get(best.probe.name, "described")
+            if not named:
+                first = best
+            named.append(name)
+            if name == "described":
+                said.append(best.probe.name)
+            close = {r.effect.name for r in names if best.log_bayes - r.log_bayes < naming.EVEN_ODDS}
+            possible = {r.probe.name for r in told if best.log_bayes - r.log_bayes < naming.IMPROBABLE}
+            rivals = self._rivals(scorer.space, best, [p for p in left if p.name in self.effect_of])
+            classes.append(frozenset((close | possible | rivals) - {name, best.probe.name}))
             added.append(best.probe.name)
-        kind = "unexplained" if table.p_global < ALARM else "effect_found" if added else "consistent"
-        names = tuple(self.effect_of[a] for a in added)
+        assert table is not None
+        missing = nameless or table.p_global < ALARM or len(said) > MOST_SENTENCES
+        kind = "unexplained" if missing else "effect_found" if added else "consistent"
+        verdict = Verdict(kind, tuple(named), tuple(classes), tuple(said))
         if first is None:
-            return Verdict(kind, names, tuple(classes))
+            return verdict
         score = first.score
-        return Verdict(kind, names, tuple(classes), first.probe.name, score.amplitudes, score.covariance)
+        return dataclasses.replace(
+            verdict, first_probe=first.probe.name, amplitudes=score.amplitudes, covariance=score.covariance
+        )
+
+    def _sufficient_name(
+        self,
+        table: ScoreTable,
+        names: Sequence[naming.Ranked],
+        sentence: naming.Ranked,
+        added: tuple[str, ...],
+        removed: tuple[str, ...],
+        s0: np.ndarray,
+        square0: float,
+    ) -> naming.Ranked | None:
+        """The best name where it leaves nothing significant while the sentence does."""
+
+        def left(item: naming.Ranked) -> float:
+            scorer, _ = self._scorer((*added, item.probe.name), removed)
+            s, _ = self._reduced(s0, square0, (*added, item.probe.name))
+            return scorer.after(table, s[self.space.chosen(scorer.space.names)]).p_global
+
+        name = next((r for r in names if table.corrected(r.score) < ALARM), None)
+        return name if name is not None and left(sentence) < ALARM <= left(name) else None
 
     def _rivals(self, space: ScoreSpace, best: naming.Ranked, left: Sequence[Probe]) -> set[str]:
         at = space.places()[best.probe.name]
@@ -242,6 +354,20 @@ class Blind:
         length = float(best.score.amplitudes @ space.gram[at, at] @ best.score.amplitudes)
         found = separations(space.subset(others), change[space.chosen(others)], length)
         return {self.effect_of[name] for name, d in found.items() if d < naming.SEPARATION}
+
+
+def _most_probable(
+    table: ScoreTable, names: Sequence[naming.Ranked], told: Sequence[naming.Ranked], least: float
+) -> naming.Ranked | None:
+    """The best name, or a sentence that is clearly more probable."""
+    found = [
+        [r for r in items if table.corrected(r.score) < ALARM and r.log_bayes > least]
+        for items in (names, told)
+    ]
+    name, sentence = (items[0] if items else None for items in found)
+    if sentence is not None and (name is None or sentence.log_bayes > name.log_bayes + naming.EVEN_ODDS):
+        return sentence
+    return name
 
 
 def study(
@@ -263,34 +389,62 @@ def study(
     opened = [scenes[i] for i in order]
     if _seal(opened) != sealed:
         raise RuntimeError("the truths changed while the verdicts were made")
-    return summarise(list(zip(opened, verdicts, strict=True)))
+    return summarise(list(zip(opened, verdicts, strict=True)), blind.in_sentences)
 
 
 def _seal(scenes: Sequence[Scene]) -> bytes:
     return hashlib.sha256(json.dumps([(s.kind, s.truth) for s in scenes]).encode()).digest()
 
 
-def summarise(judged: Sequence[tuple[Scene, Verdict]]) -> dict[str, object]:
-    """Rates over judged scenes, and the confusion of names."""
+OUTCOMES = ("right", "in its class", "wrong name", "wrong sentence", "unexplained", "not detected")
+
+
+def _outcome(verdict: Verdict, truth: set[str]) -> str:
+    """What is said of something that the catalogue does not hold; `truth` are the sentences that it is."""
+    if verdict.kind == "consistent":
+        return "not detected"
+    told = {*verdict.named, *(text for group in verdict.said for text in group.split("; "))}
+    if told & truth:
+        return "right"
+    if truth & {text for one in verdict.classes for group in one for text in group.split("; ")}:
+        return "in its class"
+    if any(name != "described" for name in verdict.named):
+        return "wrong name"
+    # Beside `unexplained` a sentence says where it sits, not what it is.
+    return "wrong sentence" if verdict.said and verdict.kind == "effect_found" else "unexplained"
+
+
+def summarise(judged: Sequence[tuple[Scene, Verdict]], known: dict[str, set[str]]) -> dict[str, object]:
+    """Rates over judged scenes, and the confusion of names; `known` are the sentences of the effects."""
     rates: dict[str, list[bool]] = collections.defaultdict(list)
     pulls: list[float] = []
     confusion: collections.Counter[tuple[str, str]] = collections.Counter()
     for scene, verdict in judged:
-        said = "+".join(verdict.named) + f" [{verdict.kind}]"
+        said = (
+            "+".join([n for n in verdict.named if n != "described"] + list(verdict.said))
+            + f" [{verdict.kind}]"
+        )
         ratio = f"{scene.ratio:g}"
         found = verdict.kind == "effect_found"
         if scene.kind == "null":
             rates["false alarm"].append(verdict.kind != "consistent")
         elif scene.kind == "outside":
-            rates[f"outside: unexplained, SNR {ratio}"].append(verdict.kind == "unexplained")
-            rates[f"outside: unexplained, SNR {ratio}, {scene.truth[0]}"].append(
-                verdict.kind == "unexplained"
-            )
-            if verdict.kind != "unexplained":
-                confusion[f"outside: {scene.truth[0]}", said] += 1
+            outcome = _outcome(verdict, set(OUTSIDE[scene.truth[0]]))
+            for one in OUTCOMES:
+                rates[f"outside: {one}, SNR {ratio}"].append(outcome == one)
+            rates[f"outside: {outcome}, SNR {ratio}, {scene.truth[0]}"].append(True)
+            confusion[f"outside: {scene.truth[0]}, SNR {ratio}", f"{outcome}: {said}"] += 1
         elif scene.kind == "removed":
+            truth = known[scene.truth[0]]
+            outcome = _outcome(verdict, truth)
+            for one in OUTCOMES:
+                what = "removed" if truth else "removed, no sentence holds it"
+                rates[f"{what}: {one}, SNR {ratio}"].append(outcome == one)
+            if truth and outcome != "right":
+                confusion[f"removed: {scene.truth[0]}, SNR {ratio}", f"{outcome}: {said}"] += 1
             if scene.separation >= SEPARABLE:
-                rates[f"removed: given another name, SNR {ratio}, separable"].append(found)
+                other = found and set(verdict.named) != {"described"}
+                rates[f"removed: given another name, SNR {ratio}, separable"].append(other)
                 if found:
                     confusion[f"removed: {scene.truth[0]}", said] += 1
         elif scene.kind == "pair":
@@ -329,7 +483,7 @@ def summarise(judged: Sequence[tuple[Scene, Verdict]]) -> dict[str, object]:
     return {
         "rates": {name: (float(np.mean(v)), len(v)) for name, v in sorted(rates.items())},
         "amplitude pulls": {"rms": float(np.sqrt(np.mean(np.square(pulls)))), "count": len(pulls)},
-        "confusion": [(t, n, c) for (t, n), c in confusion.most_common(60)],
+        "confusion": [(t, n, c) for (t, n), c in confusion.most_common(120)],
     }
 
 

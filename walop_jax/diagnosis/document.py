@@ -32,7 +32,9 @@ def _step(step: Step) -> dict[str, Any]:
         "chi2_after": step.chi2_after,
         "heldout_before": step.heldout_before.mean,
         "heldout_after": step.heldout_after.mean,
+        "sentences": [dataclasses.asdict(told) for told in step.told],
         "equivalent": list(step.equivalent),
+        "nameless": list(step.nameless),
         "separated_by": step.separated_by,
         "where": step.where,
         "heldout_scheme": step.heldout_before.scheme,
@@ -71,6 +73,8 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         },
         "p_value": diagnosis.p_value,
         "remaining_p_value": diagnosis.remaining_p,
+        "noise_scale": _number(diagnosis.noise_scale),
+        "noise_p_value": _number(diagnosis.noise_p),
         "limits": [
             {
                 "effect": limit.effect,

@@ -11,15 +11,24 @@ from jaxtyping import Float
 from scipy import stats
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import naming
+from walop_jax.diagnosis import grammar, naming
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.effect_columns import Probe, effect_candidates
 from walop_jax.diagnosis.findings import Alike, Limit
 from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, number_of_columns, strata
-from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable, separations
+from walop_jax.diagnosis.score import (
+    Projector,
+    Score,
+    Scorer,
+    ScoreSpace,
+    ScoreTable,
+    corrected_p,
+    separations,
+)
+from walop_jax.diagnosis.sentence_columns import sentence_candidates
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import limits
-from walop_jax.model.effects import Effect
+from walop_jax.model.effects import Described, Effect
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations
 
@@ -31,6 +40,7 @@ COMMON_MODE = 0.05  # rms (σ of one intensity) of disturbances that one camera 
 PROBABILITY = 0.95
 MOST_PATTERNS = 8
 MOST_CLASSES = 8
+LEAST_SHARE = 0.1  # of what is missing that an addition must explain
 FLOOR = 1.25  # standard deviations of what is left above which the stated errors are not those of the data
 SAME_COUNTS = 0.01  # relative change of the counts up to which columns are kept
 
@@ -47,8 +57,9 @@ class _Absorbed:
 class Examination:
     """The scores of everything against one fit.
 
-    `named` are the columns of the effects ahead of any projection, `space` and `columns` those of all candidates,
-    effects first, behind it. `ranked` are the effects in order of linear evidence, `patterns` the scores of the
+    `named` and `said` are the columns of effects and of sentences ahead of any projection, `space` and `columns` those
+    of all candidates behind it: effects, sentences, patterns. `ranked` are the effects in order of linear evidence,
+    `told` the sentences, each less what it pays for being one of so many (`grammar`), `patterns` the scores of the
     free-form strata, `blocks` the blocks of the free-form term that can take candidates up. `scorer` has scored all,
     behind the nuisance that single exposures may have.
     """
@@ -59,6 +70,7 @@ class Examination:
         wanted: Sequence[Probe],
         rng: np.random.Generator,
         earlier: Examination | None = None,
+        sentences: Sequence[Probe] = (),
     ) -> None:
         """`earlier` is of a smaller model; its columns serve again where the light has hardly changed."""
         self.result = result
@@ -71,7 +83,17 @@ class Examination:
             else earlier.named
         )
         self.probes = [probe for probe in inactive if probe.name in self.named]
-        candidates = [*(self.named[probe.name] for probe in self.probes), *strata(self.design.measured)]
+        self.sentences = tuple(sentences)
+        self.said = (
+            sentence_candidates(result.likelihood, result.model, result.values, sentences)
+            if earlier is None or not self._is_like(earlier)
+            else earlier.said
+        )
+        candidates = [
+            *(self.named[probe.name] for probe in self.probes),
+            *(self.said[probe.name] for probe in sentences),
+            *strata(self.design.measured),
+        ]
         self.blocks = {candidate.name: candidate.block for candidate in candidates}
         names, widths = [c.name for c in candidates], [c.widths for c in candidates]
         self.columns = self.design.stacked([candidates.pop(0).columns for _ in names])
@@ -91,7 +113,8 @@ class Examination:
         self.scorer = Scorer(self._scored[0], rng)
         self.table: ScoreTable = self.scorer(*self._scored[1:])
         self.ranked = naming.rank(self.table, self.probes)
-        self.patterns = [self.table[name] for name in names[len(self.probes) :]]
+        self.told = grammar.rank(self.table, self.sentences)
+        self.patterns = [self.table[name] for name in names[len(self.probes) + len(self.sentences) :]]
         # Where the base is excluded, a name competes with patterns that have none, not with the base.
         self.least_evidence = min(0.0, max(s.log_bayes for s in self.patterns if s.testable))
 
@@ -116,27 +139,55 @@ class Examination:
         square = np.where(self.space.before[at] > 0, self.space.before[at], np.inf)
         return np.maximum(COMMON_MODE * np.sqrt(points / square), 1e-30)
 
-    def patterns_needed(self) -> list[tuple[str, float]]:
-        """Patterns that together leave nothing significant, with corrected p: the most probable first, one by one."""
+    @cached_property
+    def _beside_patterns(self) -> tuple[list[tuple[str, float]], ScoreTable]:
+        """Patterns that are needed, and the scores of everything with those as nuisances."""
         space, scores, square = self._scored
         names = [score.name for score in self.patterns]
         table, needed = self.table, []
-        while table.p_global < ALARM and len(needed) < MOST_PATTERNS:
-            left = [s for s in table.scores if s.name in names and s.testable and table.corrected(s) < ALARM]
+        while len(needed) < MOST_PATTERNS:
+            left = [s for s in table.scores if s.name in names and s.testable and self._p(s) < ALARM]
             if not left:
                 break
             best = max(left, key=lambda s: s.log_bayes)
-            needed.append((best.name, table.corrected(best)))
+            needed.append((best.name, self._p(best)))
             names.remove(best.name)
             space, reduce = space.with_base([best.name])
             scores, square = reduce(scores, square)
-            table = Scorer(space, self._rng)(scores, square)
-        return needed
+            table = Scorer(space, self._rng, draws=0).after(self.table, scores)
+        return needed, table
+
+    def _p(self, score: Score) -> float:
+        return corrected_p(score.log_p, self.table.trials)
+
+    def patterns_needed(self) -> list[tuple[str, float]]:
+        """Patterns that together leave nothing significant, with corrected p: the most probable first, one by one."""
+        return self._beside_patterns[0]
+
+    def best_pattern(self) -> float:
+        """Evidence of the most probable pattern, less what it pays for being one of several."""
+        alive = [score.log_bayes for score in self.patterns if score.testable]
+        return max(alive, default=-np.inf) - float(np.log(max(len(alive), 1)))
+
+    def stands(self, probes: Sequence[Probe], log_bayes: float) -> bool:
+        """Whether an explanation with this evidence need not fear patterns that have no name.
+
+        It is more probable than any of them, or is significant beside those that are needed.
+        """
+        if log_bayes > self.best_pattern() - naming.EVEN_ODDS:
+            return True
+        table = self._beside_patterns[1]
+        return any(self._p(table[probe.name]) < ALARM for probe in probes if table[probe.name].testable)
 
     @property
     def alarm(self) -> bool:
         """Whether anything is missing at all."""
         return self.table.p_global < ALARM
+
+    @property
+    def noise_p(self) -> float:
+        """Chance that noise of the stated size alone leaves as much as this fit does."""
+        return float(stats.chi2.sf(self.result.chi2, max(self.result.dof, 1)))
 
     def summary(self) -> tuple[tuple[str, float, float], ...]:
         """Effects with score and corrected p, most significant first."""
@@ -194,6 +245,49 @@ class Examination:
             effect = probe.effect.name
             found[effect] = min(by_candidate[probe.name], found.get(effect, np.inf))
         return found
+
+    @cached_property
+    def significant_sentences(self) -> list[naming.Ranked]:
+        """Sentences that are significant by themselves, best evidence first."""
+        return [r for r in self.told if self.table.corrected(r.score) < ALARM]
+
+    def _left(self, item: naming.Ranked) -> float:
+        """Global p of what a linear step of one candidate leaves."""
+        space, scores, square = self._scored
+        space, reduce = space.with_base([item.probe.name])
+        return Scorer(space, self._rng, draws=0).after(self.table, reduce(scores, square)[0]).p_global
+
+    def sentences_before_names(self) -> list[naming.Ranked]:
+        """Sentences that are more probable than every name; none where the best name suffices and they do not."""
+        name = next(iter(self.significant), None)
+        found = self.significant_sentences
+        if name is None or not found:
+            return found
+        found = [item for item in found if item.log_bayes > name.log_bayes]
+        return found if not found or self._left(found[0]) >= ALARM or self._left(name) < ALARM else []
+
+    def nameless(self, trial: naming.Trial) -> tuple[str, ...]:
+        """Sentences that are not improbable beside what a trial says, by linear steps, the most probable first."""
+        own = set(trial.instance.sentences) if isinstance(trial.instance, Described) else set()
+        items = (
+            [r for r in self.told if own & set(grammar.said_by(r.probe))]
+            if own
+            else [r for r in self.ranked if r.effect is trial.effect]
+        )
+        least = max(0.0, items[0].log_bayes - naming.IMPROBABLE) if items else np.inf
+        others = [r for r in self.told if r.log_bayes > least and not own & set(grammar.said_by(r.probe))]
+        return tuple(r.probe.name for r in others[:MOST_CLASSES])
+
+    def is_worth_telling(self, trial: naming.Trial) -> bool:
+        """Whether a trial explains a good part of what is missing, and patterns without a name do not do so better."""
+        evidence = trial.log_bayes / self.floor**2
+        if evidence <= self.least_evidence:
+            return False
+        missing, moved = self.result.chi2 - self.result.dof, self.result.chi2 - trial.fit.chi2
+        if moved < LEAST_SHARE * missing:
+            return False
+        probes = [probe for probe in self.probes if probe.effect is trial.effect]
+        return self.stands(probes, evidence) if probes or trial.effect is Described else True
 
     @cached_property
     def significant(self) -> list[naming.Ranked]:

@@ -31,6 +31,21 @@ def _no_cube() -> Cube:
 
 
 @dataclasses.dataclass(frozen=True)
+class Told:
+    """A sentence that was found: kind, place, what it grows with, its amplitude, and what would test it."""
+
+    sentence: str
+    kind: str
+    place: str
+    dependence: tuple[str, ...]
+    value: float
+    sigma: float
+    unit: str
+    words: str
+    tested_by: str
+
+
+@dataclasses.dataclass(frozen=True)
 class Step:
     """One effect that was found, added and confirmed; `parameters` hold (value, sigma, unit).
 
@@ -42,7 +57,8 @@ class Step:
     effect that explain the data as well. `equivalent` are the effects that this data set cannot tell from it,
     `separation` how far (σ) each rival stays from it. `residual_before` and `residual_after` are the residuals
     (data − model, in standard deviations as given; point, exposure, camera) without and with the effect at the time it
-    was added; where another name has been dropped since, they and χ² are of fits without that name.
+    was added; where another name has been dropped since, they and χ² are of fits without that name. `told` are the
+    sentences of an effect without a name (`described`), `nameless` those that are not improbable beside what was found.
     """
 
     effect: str
@@ -63,6 +79,8 @@ class Step:
     separation: dict[str, float] = dataclasses.field(default_factory=dict)
     separated_by: str = ""
     where: dict[str, Any] = dataclasses.field(default_factory=dict)
+    told: tuple[Told, ...] = ()
+    nameless: tuple[str, ...] = ()
     residual_before: Cube = dataclasses.field(default_factory=_no_cube)
     residual_after: Cube = dataclasses.field(default_factory=_no_cube)
 
@@ -138,7 +156,9 @@ class Diagnosis(Displayed):
     `candidates` are (effect, score, corrected p) in the first examination; `before` is the fit of the model given,
     `after` that of the extended one; `remaining_p` is the significance of what is left at the end. `choices` are other
     descriptions of the instrument that were tried, the best first; none where nothing, or only a name, was missing.
-    `classes` are significant effects that these data cannot tell from others, whether they were added or not.
+    `noise_scale` is the scatter of what no candidate explains over what N_ERR says, `noise_p` the chance that noise of
+    the stated size scatters as much. `classes` are significant effects that these data cannot tell from others, whether
+    they were added or not.
     """
 
     verdict: Outcome
@@ -153,6 +173,8 @@ class Diagnosis(Displayed):
     after: FitResult
     seconds: float
     points: int
+    noise_scale: float = float("nan")
+    noise_p: float = float("nan")
     choices: tuple[Choice, ...] = ()
     classes: tuple[Alike, ...] = ()
 
@@ -190,7 +212,7 @@ class Diagnosis(Displayed):
         return astropy_table(
             {
                 "EFFECT": (np.array([s.effect for s, *_ in found], "U32"), "", "effect"),
-                "PARAMETER": (np.array([name for _, name, *_ in found], "U32"), "", "its parameter"),
+                "PARAMETER": (np.array([name for _, name, *_ in found], "U96"), "", "its parameter"),
                 "VALUE": (np.array([v for _, _, v, _, _ in found], float), "", "fitted value"),
                 "SIGMA": (np.array([s for _, _, _, s, _ in found], float), "", "standard error"),
                 "UNIT": (np.array([u for *_, u in found], "U16"), "", "unit of the numbers of this row"),
@@ -209,10 +231,11 @@ class Diagnosis(Displayed):
                 rows.append((step.effect, name, *texts, unit, f"{step.p_value:.1g}"))
         before, after = (fit.chi2 / max(fit.dof, 1) for fit in (self.before, self.after))
         notes = [
-            f"{s.effect}: these data cannot tell it from {', '.join(s.equivalent)}"
+            f"{s.effect}: these data cannot tell it from {', '.join((*s.equivalent, *s.nameless))}"
             for s in self.steps
-            if s.equivalent
+            if s.equivalent or s.nameless
         ]
+        notes += [f"{told.words}: {told.tested_by}" for s in self.steps for told in s.told]
         notes += [self.unexplained.description] if self.unexplained is not None else []
         notes += [self.caution] if self.caution else []
         return Display(

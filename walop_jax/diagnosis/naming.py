@@ -11,6 +11,7 @@ Equivalence    The change D of the residuals that the named effect makes, projec
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,19 +19,21 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.diagnosis.effect_columns import Probe
-from walop_jax.diagnosis.score import Score, ScoreTable
+from walop_jax.diagnosis.score import Score, ScoreTable, log_bayes
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import Context, Effect
+from walop_jax.model.effects import Context, Described, Effect
 from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.specification import Model, with_effects
 
 SEPARATION = 3.0
 MOST_LEADERS = 5
+MOST_TOGETHER = 4  # sentences of a longer group that are tried by themselves
 MOST_SHAPES = 4  # of one effect from which it is refitted
 REFIT_WITHIN = 8.0  # ln B below the best within which a rival is refitted
 LINEAR_BELOW = 150.0  # ln B above which the linear ranking is not trusted
 EVEN_ODDS = 3.0  # difference in ln B that is no preference
+IMPROBABLE = 6.9  # difference in ln B at which the other has a probability of 10⁻³
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,6 +60,11 @@ class Trial:
     def instance(self) -> Effect:
         """The effect at its fitted values, in standard form."""
         return self.fit.model.instrument(self.fit.values).effect(self.effect.name).standard_form()
+
+
+def names_first(trial: Trial) -> float:
+    """Order of trials: by evidence, but a sentence only where it is clearly more probable than a name."""
+    return -trial.log_bayes + (EVEN_ODDS if trial.effect is Described else 0.0)
 
 
 def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
@@ -109,6 +117,30 @@ def try_effect(base: FitResult, instance: Effect, context: Context, prior_shapes
     return try_model(
         base, type(instance), with_effects(base.model, [instance], context), base.values, prior_shapes
     )
+
+
+def try_sentences(base: FitResult, said: Described, context: Context, count: int) -> Trial:
+    """Add sentences to the fitted model, beside those that it has, and fit again; they are among `count` of them."""
+    model = base.model
+    if Described.name in model.effect_names:
+        earlier = model.instrument(base.values).effect(Described.name)
+        assert isinstance(earlier, Described)
+        said, model = earlier.joined(said), model_without(model, Described.name)
+    return try_model(base, Described, with_effects(model, [said], context), base.values, count)
+
+
+def shortest(item: Ranked) -> Described:
+    """The sentences of a group that are worth their length, with the amplitudes of a linear step."""
+    information = np.linalg.pinv(item.score.covariance, hermitian=True)
+    scores, widths = information @ item.score.amplitudes, item.probe.widths
+    members = range(len(widths))
+    subsets = [
+        list(some) for n in members for some in itertools.combinations(members, n + 1) if n < MOST_TOGETHER
+    ] + [list(members)]
+    worth = [log_bayes(information[np.ix_(some, some)], scores[some], widths[some]) for some in subsets]
+    best = subsets[int(np.argmax(worth))]
+    amplitudes = np.linalg.lstsq(information[np.ix_(best, best)], scores[best], rcond=None)[0]
+    return Described.combine([item.probe.group[i] for i in best], amplitudes)
 
 
 def try_model(

@@ -226,11 +226,24 @@ class Scorer:
 
     def __init__(self, space: ScoreSpace, rng: np.random.Generator, draws: int = limits.NULL_DRAWS) -> None:
         self.space = space
-        alive, gram = space.alive(), np.where(np.outer(space.alive(), space.alive()), space.gram, 0.0)
-        self._alive = alive
+        self._alive = space.alive()
         self._whitening = space.whitened
-        self._all = whitening(gram)
-        self._smallest = self._smallest_p(gram, rng, draws)
+        self._smallest = self._smallest_p(rng, draws) if draws else np.zeros(0)
+
+    @cached_property
+    def _gram(self) -> Matrix:
+        return np.where(np.outer(self._alive, self._alive), self.space.gram, 0.0)
+
+    @cached_property
+    def _all(self) -> Matrix:
+        return whitening(self._gram)
+
+    def after(self, earlier: ScoreTable, scores: Vector) -> ScoreTable:
+        """The table of a space that is part of an earlier one, with the noise and the number of trials found there."""
+        noise, trials = earlier.noise_scale, earlier.trials
+        table = tuple(self._score(name, at, scores, noise) for name, at in self.space.places().items())
+        found = min((score.log_p for score in table if score.testable), default=0.0)
+        return ScoreTable(table, noise, corrected_p(found, trials), trials)
 
     def threshold(self, p: float) -> float:
         """ln of the local p that the smallest of all candidates undercuts with probability `p` under the base."""
@@ -261,7 +274,7 @@ class Scorer:
         return Score(
             name=name, statistic=statistic, rank=rank, p_value=float(np.exp(log_p)), log_p=log_p,
             amplitudes=-w @ z, covariance=w @ w.T * noise**2,
-            log_bayes=_log_bayes(gram / noise**2, np.where(alive, scores[at], 0.0) / noise**2, self.space.widths[at]),
+            log_bayes=log_bayes(gram / noise**2, np.where(alive, scores[at], 0.0) / noise**2, self.space.widths[at]),
             surviving=float(share.max(initial=0.0)), testable=rank > 0,
         )  # fmt: skip
 
@@ -277,12 +290,12 @@ class Scorer:
             return (1 + below) / (1 + len(self._smallest)), trials
         return corrected_p(found, trials), trials
 
-    def _smallest_p(self, gram: Matrix, rng: np.random.Generator, draws: int) -> Vector:
+    def _smallest_p(self, rng: np.random.Generator, draws: int) -> Vector:
         """ln of the smallest p among all candidates, drawn under the base."""
         if not self._all.shape[1]:
             return np.zeros(0)
         # Scores s = G W n have covariance G for unit normals n. Seven digits are plenty for what is only counted.
-        root = gram @ self._all
+        root = self._gram @ self._all
         places = self.space.places()
         maps = [root[places[name]].T @ w for name, w in self._whitening.items() if w.shape[1]]
         normal = rng.standard_normal((draws, root.shape[1]), dtype=np.float32)
@@ -295,7 +308,7 @@ class Scorer:
         return smallest
 
 
-def _log_bayes(gram: Matrix, scores: Vector, widths: Vector) -> float:
+def log_bayes(gram: Matrix, scores: Vector, widths: Vector) -> float:
     """ln B = ½ sᵀ (G + Λ⁻¹)⁻¹ s − ½ ln det(1 + Λ^½ G Λ^½): evidence against the base, exact for a linear effect."""
     information = gram * np.outer(widths, widths) + np.eye(len(widths))
     s = scores * widths

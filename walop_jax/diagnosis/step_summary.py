@@ -12,13 +12,15 @@ from walop_jax.diagnosis import naming
 from walop_jax.diagnosis.change_of_stokes import instrument_matrices, largest_change
 from walop_jax.diagnosis.design import Design, held_out
 from walop_jax.diagnosis.findings import Step
+from walop_jax.model.effects import Described
 
 
 def before_and_after(name: str, before: Design, after: Design) -> dict[str, Any]:
     """The fields of a `Step` that compare the fits without and with an effect."""
     effect = after.fit.model.instrument(after.fit.values).effect(name)
-    # An effect with a number for every exposure cannot predict exposures that it has not seen.
+    # An effect with a number for every exposure, or for one of them, cannot predict exposures that it has not seen.
     many = any(np.size(getattr(effect, f)) > 4 for f in effect.amplitudes())
+    many |= isinstance(effect, Described) and any("exposure" in text for text in effect.sentences)
     scheme = "field blocks" if many else "exposures"
     old, new = (instrument_matrices(design.fit) for design in (before, after))
     return {

@@ -2,8 +2,10 @@
 
 1. Fit the model. 2. Score every effect of the catalogue and every pattern of the free-form basis; global p by Monte
 Carlo. 3. Below `ALARM`: refit the leaders and take the one with the highest evidence that data which took no part in
-the fit confirm, provided that it is significant after correction for all that was tried. Other descriptions of the
-instrument (`choices`) compete with the names where the model is badly off, or no name is found. 4. It joins the
+the fit confirm, provided that it is significant after correction for all that was tried. A sentence (`grammar`) that
+is more probable than every name is added in their place, as effect `described`; what patterns without a name explain
+better is not added at all. Other descriptions of the instrument (`choices`) compete with the names where the model is
+badly off, or no name is found. 4. It joins the
 model, and everything is fitted again. 5. Repeat. 6. Drop names that are not needed beside the others. 7. What no name
 explains is added as a free-form term, labelled, and the verdict is `unexplained`; names that only stood in for it are
 dropped as well. 8. List for each name what the data cannot tell from it, and give the verdict.
@@ -22,7 +24,7 @@ import numpy as np
 
 from walop_jax.data.frames import FrameIntensities
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import location, naming
+from walop_jax.diagnosis import grammar, location, naming
 from walop_jax.diagnosis.change_of_stokes import instrument_matrices, largest_change
 from walop_jax.diagnosis.choices import Choices
 from walop_jax.diagnosis.design import Design, held_out
@@ -33,6 +35,7 @@ from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexp
 from walop_jax.diagnosis.mixups import refuse_mixups
 from walop_jax.diagnosis.score import Score
 from walop_jax.diagnosis.step_summary import before_and_after, refitted_in_order
+from walop_jax.diagnosis.telling import told
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.fit.stand_in import on_field_points
@@ -40,11 +43,12 @@ from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.runner import Runner
 from walop_jax.likelihood.thinning import thinned
-from walop_jax.model.effects import EFFECTS, Context, Effect, FreeForm, OtherDescription
+from walop_jax.model.effects import EFFECTS, Context, Described, Effect, FreeForm, OtherDescription
 from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import Model, effect_context
 
 MOST_STEPS = 6
+MOST_SENTENCES = 2  # that are refitted at a time; more than can be one thing that a sentence holds
 LEAST_EVIDENCE = 1.0  # ln B that an effect must be worth to the final model to stay in it
 MINUTES = 20.0  # after which no further name is sought
 POOR_FIT = 1.5  # χ²/dof above which effects that cannot be differentiated are tried
@@ -73,7 +77,8 @@ def diagnose(
     model = model or base_model(calset)
     calset = _in_points(calset, model, tell)
     context = effect_context(model.template, calset.exposures)
-    amplitudes = sum(len(probe.widths) for probe in all_probes(tuple(catalogue), context))
+    every = grammar.sentences(model.template, calset.exposures, len(calset.points))
+    amplitudes = sum(len(probe.widths) for probe in (*all_probes(tuple(catalogue), context), *every))
     some = thinned(calset, most_points(calset, model.template, amplitudes), neighbours=1)
     if len(some.points) < len(calset.points):
         tell(f"looking at {len(some.points)} of {len(calset.points)} field points")
@@ -118,7 +123,10 @@ class _Diagnosing:
         self.context: Context = effect_context(model.template, calset.exposures)
         self.catalogue = applicable(catalogue, self.context, model.template)
         self.wanted: list[Probe] = list(all_probes(self.catalogue, self.context))
+        every = grammar.sentences(model.template, calset.exposures, len(calset.points))
+        self.sentences = grammar.uncovered(every, self.catalogue, self.context, model.template)
         self.steps: list[Step] = []
+        self.added = self.said = 0
         self.choices: dict[str, Choice] = {}
         tell("fitting the model")
         self.fit: FitResult = fit(Likelihood.of(calset, model))
@@ -130,6 +138,7 @@ class _Diagnosing:
         self.tell("scoring every effect and pattern")
         first = self._examine()
         examination, unexplained = self._conclude(first, self._add_names(first))
+        unexplained = unexplained or self._too_many_sentences(examination)
         steps = tuple(self._finished(step, examination) for step in self.steps)
         verdict: Outcome = "unexplained" if unexplained else "effect_found" if steps else "consistent"
         return Diagnosis(
@@ -141,6 +150,8 @@ class _Diagnosing:
             unexplained=unexplained,
             p_value=first.table.p_global,
             remaining_p=examination.table.p_global,
+            noise_scale=self.fit.noise_scale * examination.table.noise_scale,
+            noise_p=examination.noise_p,
             before=before,
             after=self.fit,
             seconds=time.perf_counter() - began,
@@ -150,13 +161,13 @@ class _Diagnosing:
         )
 
     def _examine(self, earlier: Examination | None = None) -> Examination:
-        return Examination(self.fit, self.wanted, self.rng, earlier)
+        return Examination(self.fit, self.wanted, self.rng, earlier, self.sentences)
 
     # ------------------------------------------------------------------------------------------------ a name
 
     def _add_names(self, examination: Examination) -> Examination:
         """Add names until nothing is missing or none is found; the examination of what they leave."""
-        while examination.alarm and len(self.steps) < MOST_STEPS and self._time_left():
+        while examination.alarm and self.added < MOST_STEPS and self._time_left():
             self.tell(f"p = {examination.table.p_global:.2g}: something is missing; trying names")
             poor = self.fit.chi2 > POOR_FIT * self.fit.dof
             redescribed = any(step.effect == OtherDescription.name for step in self.steps)
@@ -166,6 +177,8 @@ class _Diagnosing:
                 added = self._add_best(examination, iter(()), others=True)
             if added is None:
                 break
+            self.added += 1
+            self.said += added == Described.name
             self.tell(f"added {added}; scoring what is left")
             examination = self._examine(examination)
         return examination
@@ -180,11 +193,20 @@ class _Diagnosing:
             self.tell(f"trying {item.effect.name}")
             shapes = sum(probe.effect is item.effect for probe in examination.probes)
             yield naming.try_shapes(self.fit, item, self.context, shapes)
+        yield from self._sentences(examination)
         if self.fit.chi2 > POOR_FIT * self.fit.dof:
             for effect in self.catalogue:
                 if effect.is_structural() and effect.name not in self.fit.model.effect_names:
                     self.tell(f"trying {effect.name}")
                     yield naming.try_effect(self.fit, effect.neutral(self.context), self.context)
+
+    def _sentences(self, examination: Examination) -> Iterator[naming.Trial]:
+        """Sentences that are more probable than every name, by linear steps."""
+        for item in examination.sentences_before_names()[:MOST_SENTENCES]:
+            if self._time_left():
+                self.tell(f"trying {item.probe.name}")
+                said, count = naming.shortest(item), len(examination.sentences)
+                yield naming.try_sentences(self.fit, said, self.context, count)
 
     def _other_descriptions(self) -> Iterator[naming.Trial]:
         """The instrument described otherwise; what was tried is kept."""
@@ -202,9 +224,9 @@ class _Diagnosing:
         trials = [
             t
             for t in itertools.chain(names, self._other_descriptions() if others else ())
-            if t.fit.converged and t.log_bayes / examination.floor**2 > examination.least_evidence
+            if t.fit.converged and examination.is_worth_telling(t)
         ]
-        trials = self._decided(sorted(trials, key=lambda t: -t.log_bayes))
+        trials = self._decided(sorted(trials, key=naming.names_first))
         for trial in trials:
             even = [
                 t for t in trials if t is not trial and abs(t.log_bayes - trial.log_bayes) < naming.EVEN_ODDS
@@ -268,6 +290,7 @@ class _Diagnosing:
             score=score.statistic if score else examination.result.chi2 - trial.fit.chi2,
             p_value=examination.table.corrected(score) if score else examination.table.p_global,
             log_bayes=trial.log_bayes,
+            nameless=examination.nameless(trial),
             equivalent=close,
             alternatives=trial.alternatives,
             **before_and_after(name, examination.design, Design.of(trial.fit)),
@@ -301,6 +324,13 @@ class _Diagnosing:
             blocks = tuple(block for block in blocks if block != "exposures")
         ready = bool(blocks) and not there and self._time_left()
         return self._with_free_form(examination, found, blocks) if ready else found
+
+    def _too_many_sentences(self, examination: Examination) -> Unexplained | None:
+        """Something that no sentence holds looks like several that are there."""
+        if self.said <= MOST_SENTENCES:
+            return None
+        text = f"{self.said} sentences were needed: they say where it sits, no single one of them what it is"
+        return Unexplained(examination.table.p_global, text, ())
 
     def _with_free_form(
         self, examination: Examination, found: Unexplained, blocks: tuple[str, ...]
@@ -336,7 +366,8 @@ class _Diagnosing:
             if dropped:
                 examination = self._examine(first)
                 self.steps = refitted_in_order(self.steps, first.design, examination.design)
-            if not examination.alarm and self.fit.explains_data:
+            # Errors that are a few per cent too small are no effect: nothing but their size is wrong.
+            if not examination.alarm and (self.fit.explains_data or self.fit.nearly_explains_data):
                 return examination, None
             self.tell("something without a name is left")
             unexplained = self._unexplained(examination)
@@ -380,11 +411,12 @@ class _Diagnosing:
         return dataclasses.replace(
             step,
             parameters=parameters,
+            told=told(self.fit) if step.effect == Described.name else (),
             far=naming.beyond_prior(self.fit, step.effect),
             choices=naming.spoken_choices(effect),
             robust_ratio=examination.design.robust_ratio(step.effect),
             equivalent=tuple(sorted(close, key=lambda name: separation.get(name, np.inf))),
             separation=separation,
-            separated_by=effect.separated_by if close else "",
+            separated_by=effect.separated_by if close or step.nameless else "",
             where=location.describe(examination.design, change),
         )

@@ -16,9 +16,10 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 
 
-def _point_effect_columns(
+def _point_effect_changes(
     instrument: Instrument, plan: Plan, probes: tuple[Effect, ...], point: PointData
-) -> Float[Array, "a d"]:
+) -> tuple[Float[Array, "a e k"], Float[Array, "e k"]]:
+    """Derivatives of the weighted counts at the best flux with respect to amplitudes, and to the flux."""
     neutral, put = with_amplitudes(instrument, probes)
     at_neutral = put(neutral)
     unit = point_prediction(at_neutral, plan, point)
@@ -32,10 +33,22 @@ def _point_effect_columns(
     flat, to_tree = ravel_pytree(neutral)
     change = jax.vmap(lambda one: push(to_tree(one)))(jnp.eye(flat.size)) * point.weight
     _, along = jax.jvp(lambda f: real_counts(at_neutral, plan, unit, f), (flux,), (jnp.ones_like(flux),))
-    projected = project_flux(
-        change, along * point.weight, plan.exposures.flux_known, sharing(instrument, plan)
-    )
-    return -projected.reshape(flat.size, -1)
+    return change, along * point.weight
+
+
+def _point_effect_columns(
+    instrument: Instrument, plan: Plan, probes: tuple[Effect, ...], point: PointData
+) -> Float[Array, "a d"]:
+    change, along = _point_effect_changes(instrument, plan, probes, point)
+    projected = project_flux(change, along, plan.exposures.flux_known, sharing(instrument, plan))
+    return -projected.reshape(len(change), -1)
+
+
+def _effect_changes(
+    instrument: Instrument, plan: Plan, probes: tuple[Effect, ...], data: PointData
+) -> tuple[Float[Array, "p a e k"], Float[Array, "p e k"]]:
+    """As `effect_columns` with the flux held and of the counts; and the derivatives with respect to the flux."""
+    return jax.vmap(_point_effect_changes, in_axes=(None, None, None, 0))(instrument, plan, probes, data)
 
 
 def _effect_columns(
@@ -60,5 +73,6 @@ def _effect_columns_over_shapes(
     )
 
 
+effect_changes = compiled(_effect_changes)
 effect_columns = compiled(_effect_columns)
 effect_columns_over_shapes = compiled(_effect_columns_over_shapes)

@@ -291,6 +291,17 @@ class Likelihood:
         ]
         return np.concatenate(parts)
 
+    def effect_changes(
+        self, values: Vector, probes: tuple[Effect, ...]
+    ) -> tuple[Float[np.ndarray, "p a e k"], Float[np.ndarray, "p e k"]]:
+        """Derivatives of weighted counts, the flux held, to amplitudes of neutral effects and to the flux."""
+        instrument, once = self.model.instrument(values), self._is_small
+        parts = [
+            effect_columns.effect_changes(instrument, self.plan, probes, c, once=once) for c in self.points
+        ]
+        change, along = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
+        return change[: self.layout.points], along[: self.layout.points]
+
     def effect_columns_over_shapes(
         self, values: Vector, probes: Sequence[Effect]
     ) -> Float[np.ndarray, "g d a"]:

@@ -81,16 +81,22 @@ class GhostPart(Component):
 
 
 class ExposurePart(Component):
-    """A share of the response to unpolarised light that is added in some exposures."""
+    """Factors of the counts, or a share of the response to unpolarised light that is added, in some exposures."""
 
     @property
     def exposures_known(self) -> int | None:
         """Number of exposures that it has values for; None: any number."""
         return None
 
-    @abc.abstractmethod
-    def share(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"]:
+    def factors(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"] | float:
+        """Factors of the counts, exposure by exposure."""
+        del exposures, x, y
+        return 1.0
+
+    def share(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"] | float:
         """The share, exposure by exposure."""
+        del exposures, x, y
+        return 0.0
 
 
 class DetectorPart(Component):

@@ -26,6 +26,11 @@ def _one_dimension(t: Float[Array, ...], degree: int) -> list[Float[Array, ...]]
     return values
 
 
+def polynomial(degree: int, t: Float[Array, ...]) -> Float[Array, ...]:
+    """The polynomial of one degree."""
+    return _one_dimension(t, degree)[degree]
+
+
 def basis(
     x: Float[Array, ...], y: Float[Array, ...], degree: int, scale: float = FIELD_SCALE
 ) -> Float[Array, "... t"]:

@@ -262,7 +262,7 @@ def stokes(
     polariser = instrument.polariser
     if polariser is None:
         return light
-    return jnp.where(exposures.clp_in[:, None], polariser.light(exposures.clp_angle), light)
+    return jnp.where(exposures.clp_in[:, None], polariser.light(exposures, x, y), light)
 
 
 def _sight(instrument: Instrument, sight: Sight) -> Sight:
@@ -298,6 +298,7 @@ def counts(
     else:
         result = jnp.einsum("eks,es->ek", vectors[band], light)
     for part in instrument.cameras.exposures:
+        result = result * part.factors(plan.exposures, x, y)
         result = result + vectors[band, :, 0] * part.share(plan.exposures, x, y)
     return result
 

@@ -128,3 +128,26 @@ def polarised(angle: Scalar, extinction: Scalar | float) -> Float[Array, "... 4"
     c = (1.0 - extinction) / (1.0 + extinction)
     two = 2.0 * angle
     return jnp.stack([jnp.ones_like(two), c * jnp.cos(two), c * jnp.sin(two), jnp.zeros_like(two)], axis=-1)
+
+
+def one_retarder(axis: int, delta: Scalar) -> Float[Array, "... 4 4"]:
+    """Rotation of the Poincaré sphere about Stokes axis 1, 2 or 3: a retarder at 0° or 45°, or a circular one (rad)."""
+    j, k = {1: (2, 3), 2: (3, 1), 3: (1, 2)}[axis]
+    eye = jnp.broadcast_to(jnp.eye(4), (*jnp.shape(delta), 4, 4))
+    cos, sin = jnp.cos(delta), jnp.sin(delta)
+    return eye.at[..., j, j].set(cos).at[..., k, k].set(cos).at[..., j, k].set(sin).at[..., k, j].set(-sin)
+
+
+def one_diattenuator(axis: int, d: Scalar) -> Float[Array, "... 4 4"]:
+    """A diattenuator of unit mean transmission along Stokes axis 1, 2 or 3 (Lu & Chipman 1996, eq. 18)."""
+    root = jnp.sqrt(1.0 - d**2)[..., None, None] * jnp.eye(4)
+    return (
+        root.at[..., 0, 0]
+        .set(1.0)
+        .at[..., axis, axis]
+        .set(1.0)
+        .at[..., 0, axis]
+        .set(d)
+        .at[..., axis, 0]
+        .set(d)
+    )

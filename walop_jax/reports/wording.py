@@ -82,6 +82,8 @@ def verdict_of_diagnosis(diagnosis: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _found(step: Mapping[str, Any]) -> str:
+    if step.get("sentences"):
+        return f"something that has no name ({'; '.join(told['words'] for told in step['sentences'])})"
     words, values = effect_in_words(step["effect"]), []
     for name, entry in step["parameters"].items():
         value, sigma = value_and_error(entry["value"], entry["sigma"])
@@ -94,8 +96,14 @@ def _found(step: Mapping[str, Any]) -> str:
 
 
 def _confusions(steps: Sequence[Mapping[str, Any]]) -> list[str]:
-    return [
+    names = [
         f"They cannot tell {step['effect']} from {listed(step['equivalent'])}."
         for step in steps
         if step["equivalent"]
     ]
+    sentences = [
+        f"Beside {step['effect']}, it may as well be: {'; or '.join(step['nameless'])}."
+        for step in steps
+        if step.get("nameless")
+    ]
+    return names + sentences

@@ -12,6 +12,7 @@ from walop_jax.model.effects.clp_ellipticity import ClpEllipticity
 from walop_jax.model.effects.clp_extinction import ClpExtinction
 from walop_jax.model.effects.clp_wobble import ClpWobble
 from walop_jax.model.effects.clp_zero import ClpZero
+from walop_jax.model.effects.described import Described
 from walop_jax.model.effects.etalon import Etalon
 from walop_jax.model.effects.filter_shift import FilterShift
 from walop_jax.model.effects.flexure import Flexure
@@ -71,7 +72,7 @@ EFFECTS: tuple[type[Effect], ...] = (
 
 def effect_by_name(name: str, catalogue: Sequence[type[Effect]] = EFFECTS) -> type[Effect]:
     """The effect of a catalogue by its name; ValueError with the nearest names when there is none."""
-    for effect in (*catalogue, FreeForm, OtherDescription):
+    for effect in (*catalogue, Described, FreeForm, OtherDescription):
         if effect.name == name:
             return effect
     error = unknown_name("effect", name, [effect.name for effect in catalogue])
@@ -87,4 +88,13 @@ def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
     return tuple(sorted(effects, key=lambda effect: order.get(effect.name, len(order))))
 
 
-__all__ = ["EFFECTS", "Context", "Effect", "FreeForm", "OtherDescription", "effect_by_name", "in_order"]
+__all__ = [
+    "EFFECTS",
+    "Context",
+    "Described",
+    "Effect",
+    "FreeForm",
+    "OtherDescription",
+    "effect_by_name",
+    "in_order",
+]

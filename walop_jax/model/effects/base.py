@@ -51,7 +51,7 @@ class Effect(Component):
     from which to look for the effect: groups are alternatives, the members of a group are directions that
     are fitted together and that `combine` turns into one effect. `one_sided` names amplitudes that physics
     keeps above neutral; `over_field` says that only a number of field points can show it; `reference` says where
-    the effect is known from.
+    the effect is known from; `said` are the sentences that it is (`sentence`), none where no sentence holds it.
     """
 
     name: ClassVar[str] = ""
@@ -62,6 +62,7 @@ class Effect(Component):
     revealed_by: ClassVar[str] = ""
     separated_by: ClassVar[str] = ""
     reference: ClassVar[str] = ""
+    said: ClassVar[tuple[str, ...]] = ()
 
     @abc.abstractmethod
     def patch(self, instrument: Instrument) -> Instrument:
@@ -129,6 +130,11 @@ class Effect(Component):
     def choices(self) -> dict[str, Any]:
         """Discrete choices that belong to the description of the effect, e.g. the number of a camera."""
         return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.metadata.get("static")}
+
+    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+        """The sentences that the effect is in an instrument: what it does to first order is a sum of theirs."""
+        del instrument
+        return self.said
 
     def survives(self, wavelength: Float[np.ndarray, " n"], weight: Float[np.ndarray, "b n"]) -> float:
         """Share of the effect that the band integrals leave of it; 1 unless it oscillates with wavelength."""

@@ -58,6 +58,10 @@ class CameraGainDrift(Effect):
         """Any one of the cameras."""
         return tuple((cls(camera=camera),) for camera in range(context.cameras))
 
+    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+        """A gain of one camera."""
+        return (f"gain of {instrument.cameras.names[self.camera]} * hours",)
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Let the gain of the camera drift."""
         camera = check_camera(self, self.camera, instrument.cameras.names)

@@ -53,6 +53,14 @@ class CameraLeakage(Effect):
         "of 3–5 % tell it from the extinction of the polariser, flux levels from stray light"
     )
 
+    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+        """Light of every camera in its neighbour."""
+        names = instrument.cameras.names
+        return tuple(
+            f"light of {names[j]} in {name}"
+            for name, j in zip(names, instrument.cameras.orthogonal, strict=True)
+        )
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Mix the light of orthogonal cameras."""
         return instrument.with_part("mixing", Leakage(self.share, instrument.cameras.orthogonal))

@@ -31,6 +31,7 @@ class ChwpThickness(Effect):
     )
 
     name: ClassVar[str] = "chwp_thickness"
+    said: ClassVar[tuple[str, ...]] = ("thickness of chwp.mgf2", "thickness of chwp.quartz")
     reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = "exposures with the calibration plate in, best in several bands"
     separated_by: ClassVar[str] = "narrow bands: thickness goes with 1/λ, an error of its axis does not"

@@ -27,6 +27,7 @@ class ClpEllipticity(Effect):
     v: Scalar = param(unit="", about="S3 behind the polariser", source=SOURCE, width=0.02, default=0.0)
 
     name: ClassVar[str] = "clp_ellipticity"
+    said: ClassVar[tuple[str, ...]] = ("diattenuation v of polariser",)
     reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = (
         "polariser exposures over the field, with stars or Moon that do not have the offset"

@@ -32,6 +32,7 @@ class ClpExtinction(Effect):
     )
 
     name: ClassVar[str] = "clp_extinction"
+    said: ClassVar[tuple[str, ...]] = ("depolarisation of polariser",)
     reference: ClassVar[str] = SOURCE
     one_sided: ClassVar[tuple[str, ...]] = ("ratio",)
     revealed_by: ClassVar[str] = "polariser exposures together with standards polarised by several per cent"

@@ -41,6 +41,7 @@ class ClpWobble(Effect):
     )
 
     name: ClassVar[str] = "clp_wobble"
+    said: ClassVar[tuple[str, ...]] = ("turn of polariser * cos 1 CLP", "turn of polariser * sin 1 CLP")
     reference: ClassVar[str] = SOURCE
     shape: ClassVar[tuple[str, ...]] = ("phase",)
     starts: ClassVar[tuple[tuple[Mapping[str, Any], ...], ...]] = (({"phase": 0.0}, {"phase": 0.5 * np.pi}),)

@@ -30,6 +30,7 @@ class ClpZero(Effect):
     )
 
     name: ClassVar[str] = "clp_zero"
+    said: ClassVar[tuple[str, ...]] = ("turn of polariser",)
     reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = (
         "polariser exposures together with polarised standards (or a trusted sky angle)"

@@ -42,6 +42,10 @@ class HwpTemperature(Effect):
         "and flexure are odd in the field, this is even"
     )
 
+    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+        """All plates."""
+        return tuple(f"thermal of {place}" for place in instrument.places(WavePlate))
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Let the birefringence of all wave plates change with temperature."""
         for place in instrument.places(WavePlate):

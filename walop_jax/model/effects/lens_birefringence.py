@@ -34,6 +34,7 @@ class LensBirefringence(Effect):
     delta: Scalar = param(unit="wave", about="retardance at 0.3°", source=SOURCE, width=0.005, default=0.0)
 
     name: ClassVar[str] = "lens_birefringence"
+    said: ClassVar[tuple[str, ...]] = ("retardance radial behind collimator",)
     reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = "polariser exposures over the field"
     separated_by: ClassVar[str] = (

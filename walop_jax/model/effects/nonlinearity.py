@@ -64,6 +64,10 @@ class Nonlinearity(Effect):
         """One coefficient per camera."""
         return tuple(f"{field}.n{k}" for k in range(self.coefficient.shape[0]))
 
+    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+        """A gain of every camera."""
+        return tuple(f"gain of {name} * counts" for name in instrument.cameras.names)
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Distort the counts."""
         return instrument.with_part("detectors", Distortion(self.coefficient))

@@ -61,6 +61,10 @@ class Pedestal(Effect):
         """One level per camera."""
         return tuple(f"{field}.n{k}" for k in range(self.level.shape[0]))
 
+    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+        """Light in every camera."""
+        return tuple(f"light in {name}" for name in instrument.cameras.names)
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Add the pedestal."""
         return instrument.with_part("detectors", DiffuseLight(self.level))

@@ -30,6 +30,11 @@ class PlateAxis(Effect):
     where: ClassVar[str]
     reference: ClassVar[str] = SOURCE
 
+    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+        """An axis."""
+        del instrument
+        return (f"axis of {self.where}",)
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Turn the plate."""
         return instrument.changed(self.where, axis=lambda axis: axis + self.angle)

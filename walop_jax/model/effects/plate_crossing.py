@@ -37,6 +37,11 @@ class PlateCrossing(Effect):
         "plate"
     )
 
+    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+        """The axis of one crystal."""
+        del instrument
+        return (f"axis of {self.where}.mgf2",)
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Turn the MgF2 alone."""
         return instrument.changed(f"{self.where}.mgf2", axis=lambda axis: axis + self.angle)

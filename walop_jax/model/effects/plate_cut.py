@@ -57,6 +57,11 @@ class PlateCut(Effect):
         """Either crystal."""
         return tuple((cls(crystal=crystal),) for crystal in CRYSTALS)
 
+    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+        """A cut."""
+        del instrument
+        return (f"cut of {self.where}.{self.crystal}",)
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Tilt the optic axis of the crystal."""
         return instrument.changed(

@@ -31,6 +31,10 @@ class TelescopePolarisation(Effect):
     u: Scalar = param(unit="", about="polarisation added along +45°", source=SOURCE, width=0.002, default=0.0)
 
     name: ClassVar[str] = "telescope_polarisation"
+    said: ClassVar[tuple[str, ...]] = (
+        "diattenuation q ahead of polariser",
+        "diattenuation u ahead of polariser",
+    )
     reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = (
         "unpolarised or known standards, with polariser exposures of the same field points"

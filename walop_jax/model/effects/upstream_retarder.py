@@ -38,6 +38,7 @@ class UpstreamRetarder(Effect):
     axis: Scalar = param(unit="deg", about="fast axis", source=SOURCE, scale=10.0, loose=500.0, default=0.0)
 
     name: ClassVar[str] = "upstream_retarder"
+    said: ClassVar[tuple[str, ...]] = ("retardance q behind collimator", "retardance u behind collimator")
     reference: ClassVar[str] = SOURCE
     shape: ClassVar[tuple[str, ...]] = ("axis",)
     starts: ClassVar[tuple[tuple[Mapping[str, Any], ...], ...]] = (({"axis": 0.0}, {"axis": 45.0}),)

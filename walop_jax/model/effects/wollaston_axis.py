@@ -36,6 +36,12 @@ class WollastonAxis(Effect):
         "from the polariser's zero"
     )
 
+    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+        """Light turned directly ahead of every analyser."""
+        return tuple(
+            f"retardance v behind {arm.name}.{arm.path[-2]}" for arm in instrument.arms if len(arm.path) > 1
+        )
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Turn the analysers of all arms."""
         for arm in instrument.arms:

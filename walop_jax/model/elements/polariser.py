@@ -10,6 +10,7 @@ Limits      ε = 0 is the ideal polariser. What it does to the flux of polarised
 
 from __future__ import annotations
 
+import abc
 from typing import ClassVar
 
 import equinox as eqx
@@ -19,6 +20,7 @@ from jaxtyping import Array, Float
 from walop_jax.model import mueller
 from walop_jax.model.elements.base import Element
 from walop_jax.model.parameters import Component, number
+from walop_jax.model.sources.base import ExposureArrays
 
 Scalar = Float[Array, ""]
 Angles = Float[Array, " e"]
@@ -36,6 +38,16 @@ class EncoderError(Component):
         return jnp.deg2rad(self.amplitude) * jnp.sin(self.order * reading - self.phase)
 
 
+class Film(Component):
+    """What light meets directly behind the polariser, at its angle and only when it is in."""
+
+    @abc.abstractmethod
+    def through(
+        self, light: Float[Array, "e 4"], exposures: ExposureArrays, x: Scalar, y: Scalar
+    ) -> Float[Array, "e 4"]:
+        """Stokes vectors behind it at a field point, one per exposure."""
+
+
 class Polariser(Element):
     """A polariser whose axis is read from an encoder."""
 
@@ -43,6 +55,7 @@ class Polariser(Element):
     zero: Scalar | None = number(unit="deg", about="added to the encoder reading", default=None)
     ellipticity: Scalar | None = number(unit="", about="circular polarisation behind it", default=None)
     encoder: tuple[EncoderError, ...] = ()
+    films: tuple[Film, ...] = ()
 
     kind: ClassVar[str] = "polariser"
     reference: ClassVar[str] = "Goldstein 2003, Polarized Light, ch. 9"
@@ -54,7 +67,11 @@ class Polariser(Element):
             axis = axis + error.error(reading)
         return axis
 
-    def light(self, reading: Angles) -> Float[Array, "e 4"]:
-        """Stokes vectors behind it, per unit of transmitted light."""
-        behind = mueller.polarised(self.axis_of(reading), self.extinction)
-        return behind if self.ellipticity is None else behind.at[:, 3].add(self.ellipticity)
+    def light(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e 4"]:
+        """Stokes vectors behind it at a field point, per unit of transmitted light, one per exposure."""
+        behind = mueller.polarised(self.axis_of(exposures.clp_angle), self.extinction)
+        if self.ellipticity is not None:
+            behind = behind.at[:, 3].add(self.ellipticity)
+        for film in self.films:
+            behind = film.through(behind, exposures, x, y)
+        return behind

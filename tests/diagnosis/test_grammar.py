@@ -1,0 +1,107 @@
+"""The sentences of an instrument: their columns, and the names that are sentences with a history."""
+
+import dataclasses
+
+import builders
+import numpy as np
+import pytest
+import scenes
+from own_instrument import OWN
+
+from walop_jax.data.records import Position
+from walop_jax.diagnosis import grammar
+from walop_jax.diagnosis.effect_columns import applicable, effect_candidates, probes
+from walop_jax.diagnosis.sentence_columns import sentence_candidates
+from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.refit import fit
+from walop_jax.instruments.description import parsed
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.build import build
+from walop_jax.model.effects import EFFECTS, Described
+from walop_jax.model.specification import effect_context
+from walop_jax.simulation.simulate import simulate
+
+HELD = 0.999  # share of the square of what an effect does that its sentences hold
+
+
+@pytest.fixture(scope="module")
+def laid():
+    calset = simulate(scenes.PLAN, seed=11).calset
+    model = base_model(calset)
+    return fit(Likelihood.of(calset, model))
+
+
+@pytest.fixture(scope="module")
+def said(laid):
+    found = grammar.sentences(laid.model.template, laid.calset.exposures, len(laid.calset.points))
+    made = sentence_candidates(laid.likelihood, laid.model, laid.values, found)
+    return {name: candidate.columns for name, candidate in made.items()}
+
+
+def test_names_are_sentences(laid, said):
+    template = laid.model.template
+    context = effect_context(template, laid.calset.exposures)
+    wanted = list(probes(applicable(EFFECTS, context, template), context))
+    wanted = [p for p in wanted if p.group[0].in_sentences(template)]
+    assert len({p.effect for p in wanted}) == 21
+    single = {}
+    for name, columns in said.items():
+        single |= dict(zip(name.split("; "), columns.T, strict=True))
+    theirs = effect_candidates(laid.calset, laid.model, laid.values, wanted)
+    for probe in wanted:
+        texts = [text for text in probe.group[0].in_sentences(template) if text in single]
+        if not texts:
+            assert "chwp" in probe.effect.name, "of the calibration plate, which is never in"
+            continue
+        ours = np.column_stack([single[text] for text in texts])
+        rest = theirs[probe.name].columns
+        left = rest - ours @ np.linalg.lstsq(ours, rest, rcond=None)[0]
+        held = 1.0 - np.sum(left**2) / np.sum(rest**2)
+        print(probe.name, held)
+        assert held > HELD, probe.name
+
+
+def test_columns_are_those_of_the_effect_itself(laid, said):
+    """What is multiplied by a factor afterwards is what the effect with that factor does."""
+    for name in (
+        "turn of polariser * x; turn of polariser * y",
+        "retardance q behind collimator * hours; retardance u behind collimator * hours",
+        "gain of E1 * exposure 3",
+        "diattenuation radial ahead of half2.wedge",
+        "gain of half1 * ring 3; gain of half1 * ring 4; gain of half1 * ring 5; "
+        "gain of half1 * ring 6; gain of half1 * ring 7; gain of half1 * ring 8",
+        "depolarisation of polariser * cos 2 CLP; depolarisation of polariser * sin 2 CLP",
+        "afterglow in O1",
+    ):
+        effect = Described.saying(name.split("; "), [0.0] * len(name.split("; ")))
+        own = Likelihood.of(laid.calset, laid.model, (effect,)).effect_columns(laid.values, (effect,))
+        assert said[name] == pytest.approx(own, rel=1e-7, abs=1e-7 * np.abs(own).max())
+
+
+def test_sentences_that_have_a_name_are_left_to_it(laid):
+    template = laid.model.template
+    context = effect_context(template, laid.calset.exposures)
+    every = grammar.sentences(template, laid.calset.exposures, len(laid.calset.points))
+    left = {p.name for p in grammar.uncovered(every, EFFECTS, context, template)}
+    gone = {p.name for p in every} - left
+    assert "turn of polariser" in gone
+    assert "retardance q behind collimator; retardance u behind collimator" in gone
+    assert "gain of O1 * hours" in gone
+    assert "light of E1 in O1" in left, "leakage is the same in all cameras, this is of one alone"
+    assert "turn of polariser * x; turn of polariser * y" in left
+
+
+def test_grammar_of_another_instrument():
+    """Places, moving elements and cameras are those of the instrument: one arm, a window that turns, two cameras."""
+    turns = [
+        {"clp_angle": float(a), "moving": {"WIN": 10.0 * i}} for i, a in enumerate((0, 40, 80, 120, 160))
+    ]
+    instrument = build(parsed(OWN, "own.toml"))
+    window = Position(np.ones(5, bool), np.array([0.0, 10.0, 20.0, 40.0, 80.0]))
+    exposures = dataclasses.replace(builders.exposures(*turns), moving={"WIN": window})
+    said = {p.name for p in grammar.sentences(instrument, exposures, 25)}
+    assert "retardance q behind window; retardance u behind window" in said
+    assert "depolarisation of window * cos 2 WIN; depolarisation of window * sin 2 WIN" in said
+    assert "axis of main.plate.second" in said
+    assert "light of left in right" in said
+    assert not any("half1" in name or "O1" in name or "ahead of" in name for name in said)

@@ -1,0 +1,98 @@
+"""What nobody has a name for is told in a sentence: kind, place and dependence, with its size."""
+
+import dataclasses
+import json
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import pytest
+import scenes
+from scipy import stats
+
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.diagnosis.document import document
+from walop_jax.diagnosis.workflow import diagnose
+from walop_jax.model.cameras import Transmission
+from walop_jax.model.effects import Described, Effect
+from walop_jax.simulation.observing_plan import ObservingPlan
+from walop_jax.simulation.simulate import simulate
+
+
+class _Edge(Transmission):
+    """Light that is lost beyond some radius, in the cameras of one half alone."""
+
+    def factors(self, x, y):
+        lost = 0.04 * jnp.maximum(jnp.hypot(x, y) - 0.22, 0.0) / 0.2
+        return 1.0 - lost * jnp.array([1.0, 1.0, 0.0, 0.0])
+
+
+class Vignetting(Effect):
+    """One half sees less of the corners: no smooth function of the field, no sentence."""
+
+    strength: float = eqx.field(static=True, default=1.0)
+    name: ClassVar[str] = "hidden_vignetting"
+
+    def patch(self, instrument):
+        return instrument.with_part("transmission", _Edge())
+
+
+def found(hidden, seed=3):
+    calset = simulate(scenes.PLAN, seed=seed, effects=hidden).calset
+    result = diagnose(calset, seed=1)
+    print(
+        json.dumps(
+            [
+                document(result)[k]
+                for k in ("verdict", "steps", "unexplained", "remaining_p_value", "seconds")
+            ],
+            indent=1,
+            ensure_ascii=False,
+        )
+    )
+    return result
+
+
+def test_a_film_whose_axis_turns_over_the_field():
+    result = found([Described.saying(["turn of polariser * x"], [0.05])])
+    assert result.verdict == "effect_found"
+    assert [step.effect for step in result.steps] == ["described"]
+    (told,) = result.steps[0].told
+    assert (told.kind, told.place) == ("turn", "of polariser")
+    assert told.sentence == "turn of polariser * x"
+    assert told.value == pytest.approx(0.05, abs=4 * told.sigma)
+    assert told.unit == "deg"
+    assert told.tested_by
+
+
+@pytest.mark.long
+def test_an_encoder_error_twice_per_turn():
+    """Its mimic to first order is polarisation of the telescope: told apart, or told as a class."""
+    result = found([Described.saying(["turn of polariser * sin 2 CLP"], [0.08])])
+    step = result.steps[0]
+    said = {told.sentence for told in step.told} | {t for text in step.nameless for t in text.split("; ")}
+    assert "turn of polariser * sin 2 CLP" in said
+    assert result.verdict == "effect_found"
+
+
+@pytest.mark.long
+def test_halves_that_are_vignetted_differently():
+    result = found([Vignetting()])
+    names = {step.effect for step in result.steps}
+    assert names <= {"described"}
+    places = {told.place for step in result.steps for told in step.told}
+    assert result.verdict == "unexplained" or places == {"of half1"} or places == {"of half2"}
+
+
+@pytest.mark.long
+def test_errors_five_per_cent_too_small_are_no_effect():
+    """The noise is told, the verdict stays: there is no pattern in it."""
+    calset = simulate(ObservingPlan(), seed=21).calset
+    block = calset.intensities.block(0, len(calset.points))
+    block = dataclasses.replace(block, sigma=block.sigma / 1.05)
+    table = TableIntensities.dense(calset.points, block)
+    result = diagnose(dataclasses.replace(calset, intensities=table), seed=1)
+    assert result.verdict == "consistent"
+    assert result.noise_scale == pytest.approx(1.05, abs=0.02)
+    assert result.noise_p == pytest.approx(stats.chi2.sf(result.before.chi2, result.before.dof))
+    assert result.noise_p < 1e-6, "five per cent of errors show in so many data"

@@ -1,0 +1,181 @@
+"""Sentences do what effects of the catalogue do that are known by another name, and what Mueller algebra says."""
+
+import json
+
+import effect_scenes as scenes
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from walop_jax.fit.model_builder import model_without_data
+from walop_jax.fit.model_file import render
+from walop_jax.model import mueller
+from walop_jax.model.carried import left_behind
+from walop_jax.model.effects import Described, effect_by_name
+from walop_jax.model.effects.sentence import Sentence
+
+
+def said(*sentences, values):
+    return Described.saying(sentences, values)
+
+
+def named(name, **values):
+    return effect_by_name(name).of(scenes.CONTEXT, **values)
+
+
+SAME = {
+    "polariser": (("turn of polariser",), [0.2], ("clp_zero", {"angle": 0.2})),
+    "encoder": (
+        ("turn of polariser * sin 1 CLP", "turn of polariser * cos 1 CLP"),
+        [0.1 * np.cos(0.7), -0.1 * np.sin(0.7)],
+        ("clp_wobble", {"amplitude": 0.1, "phase": 0.7}),
+    ),
+    "retarder": (
+        ("retardance q behind collimator",),
+        [0.03],
+        ("upstream_retarder", {"delta": 0.03, "axis": 0.0}),
+    ),
+    "diagonal retarder": (
+        ("retardance u behind collimator",),
+        [0.03],
+        ("upstream_retarder", {"delta": 0.03, "axis": 45.0}),
+    ),
+    "analysers": (
+        ("retardance v behind half1.plate", "retardance v behind half2.plate"),
+        2.0 * np.deg2rad([0.3, 0.3]),
+        ("wollaston_axis", {"angle": 0.3}),
+    ),
+    "crossing": (("axis of half2.plate.mgf2",), [0.2], ("hwp2_crossing", {"angle": 0.2})),
+    "plate": (("axis of half2.plate",), [0.2], ("hwp2_axis", {"angle": 0.2})),
+    "calibration plate": (("axis of chwp",), [0.2], ("chwp_axis", {"angle": 0.2})),
+    "cut": (("cut of half1.plate.quartz",), [0.2], ("hwp1_axis_cut", {"angle": 0.2, "crystal": "quartz"})),
+    "thickness": (("thickness of chwp.mgf2",), [3.0], ("chwp_thickness", {"mgf2": 3.0, "quartz": 0.0})),
+    "drift": (("gain of E1 * hours",), [0.002], ("camera_gain_drift", {"rate": 0.002, "camera": 1})),
+    "non-linear": (("gain of O2 * counts",), [0.01], ("nonlinearity", {"coefficient": [0, 0, 0.01, 0]})),
+    "pedestal": (("light in E2",), [0.01], ("pedestal", {"level": [0, 0, 0, 0.01]})),
+    "leakage": (
+        ("light of E1 in O1", "light of O1 in E1", "light of E2 in O2", "light of O2 in E2"),
+        [0.003] * 4,
+        ("camera_leakage", {"share": 0.003}),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SAME)
+def test_the_same_by_another_name(case):
+    """Exactly, but for what two shares of light copied back and forth make of each other."""
+    sentences, values, (name, parameters) = SAME[case]
+    ours, theirs = scenes.observe(said(*sentences, values=values)), scenes.observe(named(name, **parameters))
+    change = np.abs(theirs - scenes.observe(plan_of=[named(name, **parameters)])).max()
+    assert change > 1.0
+    assert np.abs(ours - theirs).max() < (0.01 if case == "leakage" else 1e-9) * change
+
+
+FIRST_ORDER = {
+    "telescope": ("diattenuation q ahead of polariser", 1.0, ("telescope_polarisation", "q")),
+    "circular": ("diattenuation v of polariser", 1.0, ("clp_ellipticity", "v")),
+    "lenses": ("retardance radial behind collimator", 2.0 * np.pi, ("lens_birefringence", "delta")),
+}
+
+
+@pytest.mark.parametrize("case", FIRST_ORDER)
+def test_the_same_to_first_order(case):
+    """A mirror takes as much of one polarisation as it adds of the other: that shows in the sky, polarised by 10 %."""
+    sentence, factor, (name, parameter) = FIRST_ORDER[case]
+    small = 1e-4
+
+    def slope(effect_of):
+        up, down = (scenes.observe(effect_of(s * small)) for s in (1, -1))
+        return (up - down).ravel()
+
+    ours = slope(lambda a: said(sentence, values=[factor * a]))
+    theirs = slope(lambda a: named(name, **{parameter: a}))
+    rest = ours - theirs * (ours @ theirs) / (theirs @ theirs)
+    assert np.linalg.norm(rest) < (0.12 if case == "telescope" else 1e-2) * np.linalg.norm(ours)
+    assert ours @ theirs > 0.98 * theirs @ theirs
+
+
+def test_neutral_changes_nothing():
+    sentences = (
+        "depolarisation behind chwp * kelvin", "diattenuation diagonal ahead of half1.plate * colour",
+        "gain of half2 * ring 3", "afterglow in O1", "turn of polariser * x", "retardance u of chwp * cos 2 CHWP",
+        "light in E1 * hours", "gain of O2 * exposure 3", "thermal of half1.plate",
+    )  # fmt: skip
+    effect = said(*sentences, values=[0.0] * len(sentences))
+    assert np.abs(scenes.observe(effect) - scenes.observe(plan_of=[effect])).max() < 1e-9 * scenes.FLUX
+    assert effect.labels("share")[0] == "depolarisation_behind_chwp_*_kelvin"
+
+
+def test_factors_grow_as_they_say():
+    """Twice the field coordinate, twice the effect; a gain in one exposure is a gain in that one alone."""
+    plain, wide = (
+        scenes.observe(said(s, values=[1e-5])) - scenes.observe()
+        for s in ("turn of polariser", "turn of polariser * x")
+    )
+    assert wide == pytest.approx(plain * (scenes.X / 0.3)[:, None, None], rel=1e-4, abs=1e-6)
+    one = scenes.observe(said("gain of O2 * exposure 3", values=[0.01])) / scenes.observe()
+    assert one[:, 3, 2] == pytest.approx(1.01)
+    assert np.delete(one.reshape(2, -1), 3 * 4 + 2, axis=1) == pytest.approx(1.0)
+    ring = scenes.observe(said("gain of half1 * ring 3", values=[0.01])) / scenes.observe()
+    t = (scenes.X**2 + scenes.Y**2) / 0.09 - 1.0
+    assert ring[:, 0, :2] == pytest.approx((1 + 0.01 * (5 * t**3 - 3 * t) / 2)[:, None] * np.ones(2))
+    assert ring[..., 2:] == pytest.approx(1.0)
+
+
+def test_single_axis_matrices_are_the_general_ones():
+    delta, d, none = (jnp.asarray(value) for value in (0.3, 0.2, 0.0))
+    for axis, general in ((1, 0.0), (2, np.pi / 4)):
+        ours, theirs = mueller.one_retarder(axis, delta), mueller.retarder(delta, jnp.asarray(general))
+        assert np.asarray(ours) == pytest.approx(np.asarray(theirs), abs=1e-15)
+    assert np.asarray(mueller.one_retarder(3, delta)) == pytest.approx(
+        np.asarray(mueller.rotation(delta / 2))
+    )
+    ours, theirs = mueller.one_diattenuator(2, d), mueller.diattenuator(none, d)
+    assert np.asarray(ours) == pytest.approx(np.asarray(theirs))
+
+
+def test_what_cannot_be_carried_over_is_said():
+    assert left_behind(scenes.instrument(said("gain of O1 * hours", values=[0.0]))) == ("described",)
+    assert left_behind(scenes.instrument(said("afterglow in O1", values=[0.0]))) == ("described",)
+    assert left_behind(scenes.instrument(said("retardance q behind collimator * r2", values=[0.0]))) == ()
+    assert left_behind(scenes.instrument(said("gain of half1 * ring 4", values=[0.0]))) == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("retardence q behind collimator", "no sentence"),
+        ("turn of polariser * z", "unknown factor 'z'"),
+        ("gain of O3", "nearest: O2"),
+    ],
+)
+def test_what_is_no_sentence_is_an_error(text, message):
+    with pytest.raises(ValueError, match=message):
+        scenes.observe(said(text, values=[0.1]))
+
+
+def test_sentences_are_read_as_they_are_written():
+    for text in (
+        "light of E1 in O1",
+        "retardance v behind half1.plate * hours * x",
+        "gain of O1 * hours 3 to 20.5",
+    ):
+        assert Sentence.parsed(text).text == text
+    assert Sentence.parsed("turn of polariser * sin 2 CLP").in_words() == (
+        "turn of polariser, as the sine of 2 × the angle of CLP"
+    )
+
+
+def test_a_model_file_carries_sentences():
+    """What `diagnose` writes is what `--model` reads: the sentences, their values and priors."""
+    said = ["turn of polariser * x", "light of O2 in O1", "retardance q behind half1.plate * hours"]
+    text = f'[model]\neffects = ["described"]\n[effects.described]\nsentences = {json.dumps(said)}\n'
+    model = model_without_data("WALOP-SOUTH", text)
+    name = "described.turn_of_polariser_*_x"
+    assert model[name].unit == "deg"
+    assert model[name].prior == (0.0, 0.1)
+    moved = model.change(name, start=0.02)
+    again = model_without_data("WALOP-SOUTH", render(moved))
+    assert again.names == moved.names
+    assert again[name].start == 0.02
+    assert again.template.effect("described").sentences == tuple(said)

@@ -1,0 +1,319 @@
+"""All that an instrument may lack, in sentences: kind × place × dependence, from its own train and its exposures.
+
+A *group* of sentences is one candidate of the score test: a linear retarder has two axes, a harmonic a cosine and a
+sine, a gradient two directions. Groups are short: at most two things are free beside the kind.
+
+    kinds         diattenuation, retardance (linear: q and u; circular: v), depolarisation; turn of the polariser; gain
+                  of a camera or of an arm; light of one camera in another, scattered light, afterglow; numbers of
+                  wave plates (axis, cut, thickness, thermal)
+    places        ahead of and behind every element that acts on polarisation, in the common train and in the arms; of
+                  the polariser; of a moving element
+    dependence    none; gradient, r², radial, diagonal, astigmatic over the field; wavelength; time, temperature;
+                  harmonics of the angles; one night; one exposure; the counts; the exposure before
+
+A sentence pays for the number of sentences that there are (`rank`), and for its length by its evidence.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from walop_jax.data.records import Exposures
+from walop_jax.diagnosis import naming
+from walop_jax.diagnosis.effect_columns import FEWEST_POINTS, Probe
+from walop_jax.diagnosis.score import ScoreTable
+from walop_jax.likelihood import limits
+from walop_jax.model.effects import Context, Described, Effect
+from walop_jax.model.effects.sentence import Sentence
+from walop_jax.model.elements import Element, Polariser, WavePlate
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.ray import CONDITIONS, Conditions, Ray
+
+LINEAR = ("diattenuation", "retardance")
+ALONE = ("diattenuation v", "retardance v", "depolarisation")
+NIGHT = 8.0  # hours without an exposure that part two nights
+RINGS = (3, 4, 5, 6, 7, 8)  # the throughput takes up what is smoother
+HARMONICS = (1, 2)
+HARMONICS_OF_ENCODER = (1, 2, 3, 4, 5, 6)
+
+
+def sentences(instrument: Instrument, exposures: Exposures, points: int) -> tuple[Probe, ...]:
+    """All groups that an instrument and its exposures allow, short ones first; `points` counts the field points."""
+    found = dict.fromkeys(_groups(dataclasses.replace(instrument, effects=()), exposures, points))
+    return tuple(_probe(group) for group in sorted(found, key=len))
+
+
+def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[naming.Ranked]:
+    """Sentences by evidence, best first; all of them share the prior of one name."""
+    price = float(np.log(max(len(probes), 1)))
+    scored = [(probe, table[probe.name]) for probe in probes]
+    found = [
+        naming.Ranked(Described, p, score, score.log_bayes - price) for p, score in scored if score.testable
+    ]
+    return sorted(found, key=lambda item: -item.log_bayes)
+
+
+def uncovered(
+    probes: Sequence[Probe], catalogue: Sequence[type[Effect]], context: Context, instrument: Instrument
+) -> tuple[Probe, ...]:
+    """The groups that are no effect of a catalogue by another name: those that none holds as a part."""
+    known = []
+    for effect in catalogue:
+        for group in effect.probes(context):
+            texts = frozenset(group[0].in_sentences(instrument))
+            if len(texts) <= sum(
+                np.size(getattr(one, name)) for one in group for name in effect.amplitudes()
+            ):
+                known.append(texts)
+    return tuple(probe for probe in probes if not any(texts.issuperset(said_by(probe)) for texts in known))
+
+
+def said_by(probe: Probe) -> tuple[str, ...]:
+    """The sentences of a group."""
+    return tuple(text for member in probe.group for text in member.sentences)  # type: ignore[attr-defined]
+
+
+def _probe(group: tuple[Sentence, ...]) -> Probe:
+    members = tuple(Described.of(Context(), sentences=(sentence.text,)) for sentence in group)
+    return Probe("; ".join(sentence.text for sentence in group), Described, members)
+
+
+# -------------------------------------------------------------------------------------------------- the grammar
+
+
+@dataclasses.dataclass(frozen=True)
+class _Asked:
+    """What factors the exposures can tell apart."""
+
+    exposures: Exposures
+    over_field: bool
+    colours: bool
+    hours: bool
+    kelvin: bool
+
+    @classmethod
+    def of(cls, exposures: Exposures, points: int) -> _Asked:
+        """Whether there are several filters, times and temperatures, and points enough for a pattern."""
+
+        def varies(values: np.ndarray) -> bool:
+            return bool(
+                np.isfinite(values).all() and np.ptp(values) > 1e-9 * max(1.0, float(np.abs(values).max()))
+            )
+
+        return cls(
+            exposures,
+            points >= FEWEST_POINTS,
+            len(np.unique(exposures.filter)) > 1,
+            varies(exposures.mjd),
+            varies(exposures.temp),
+        )
+
+    def harmonics(self, prefix: str, orders: Sequence[int]) -> Iterator[tuple[str, str]]:
+        """Cosine and sine of the harmonics that the angles of a moving element can show."""
+        position = self.exposures.position(prefix)
+        angles = np.unique(np.round(np.mod(position.angle[position.inside], 360.0), 3))
+        for order in orders:
+            if len(angles) >= 2 * order + 1:
+                yield f"cos {order} {prefix}", f"sin {order} {prefix}"
+
+    def slow(self) -> Iterator[str]:
+        """Time and temperature."""
+        if self.hours:
+            yield "hours"
+        if self.kelvin:
+            yield "kelvin"
+
+    def nights(self) -> Iterator[str]:
+        """Every night, where there are several."""
+        if not self.hours:
+            return
+        hours = np.sort((self.exposures.mjd - self.exposures.mjd.min()) * 24.0)
+        first = np.flatnonzero(np.diff(hours, prepend=-np.inf) > NIGHT)
+        if len(first) < 2:
+            return
+        for start, stop in itertools.pairwise([*first, len(hours)]):
+            yield f"hours {max(hours[start] - 0.5, 0.0):.2f} to {hours[stop - 1] + 0.5:.2f}"
+
+
+def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterator[tuple[Sentence, ...]]:
+    asked = _Asked.of(exposures, points)
+    yield from _of_polariser(instrument, asked)
+    for where, place, fixed in places(instrument, exposures):
+        for base in _families(where, place):
+            yield from _over_field(base, asked)
+            if not fixed:
+                continue
+            if asked.colours:
+                yield _times(base, "colour")
+            for factor in asked.slow():
+                yield _times(base, factor)
+    for element in instrument.train():
+        if (
+            element.moves
+            and not isinstance(element, Polariser)
+            and exposures.position(element.moves).inside.any()
+        ):
+            for base in _families("of", element.name):
+                for pair in asked.harmonics(element.moves, HARMONICS):
+                    yield _times(base, *pair)
+    yield from _of_plates(instrument, exposures, asked)
+    yield from _of_cameras(instrument, asked)
+    yield from _together(instrument, asked)
+
+
+def _times(base: tuple[Sentence, ...], *factors: str) -> tuple[Sentence, ...]:
+    return tuple(sentence.times(factor) for sentence in base for factor in factors)
+
+
+def _families(where: str, place: str) -> Iterator[tuple[Sentence, ...]]:
+    for kind in LINEAR:
+        yield tuple(Sentence(f"{kind} {axis}", where, place) for axis in "qu")
+    for kind in ALONE:
+        yield (Sentence(kind, where, place),)
+
+
+def _over_field(base: tuple[Sentence, ...], asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
+    yield base
+    if not asked.over_field:
+        return
+    yield _times(base, "x", "y")
+    yield _times(base, "r2")
+    if len(base) == 1:
+        yield _times(base, "x2-y2", "xy")
+        return
+    kind = base[0].kind.split()[0]
+    for axis in ("radial", "diagonal"):
+        yield (dataclasses.replace(base[0], kind=f"{kind} {axis}"),)
+
+
+def _of_polariser(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
+    polariser = instrument.polariser
+    if polariser is None or polariser.moves is None or not asked.exposures.clp_in.any():
+        return
+    turn = (Sentence("turn", "of", polariser.name),)
+    for base in (turn, *(f for f in _families("of", polariser.name) if f[0].kind != "retardance v")):
+        yield from _over_field(base, asked)
+        orders = HARMONICS_OF_ENCODER if base is turn else HARMONICS
+        for pair in asked.harmonics(polariser.moves, orders):
+            yield _times(base, *pair)
+        for factor in asked.slow():
+            yield _times(base, factor)
+    for pair in asked.harmonics(polariser.moves, (1,)) if asked.over_field else ():
+        yield _times(_times(turn, *pair), "x", "y")  # a beam that wanders over a film that is not uniform
+    for night in asked.nights():
+        yield _times(turn, night)
+
+
+def places(instrument: Instrument, exposures: Exposures) -> Iterator[tuple[str, str, bool]]:
+    """Places of the train that differ in what acts on polarisation: preposition, element, and whether it may depend on
+    wavelength, time and temperature there (ahead of the polariser nothing may)."""
+    train, polariser = list(instrument.train()), instrument.polariser
+    if polariser is not None:
+        if not exposures.clp_in.all():
+            yield "ahead of", polariser.name, False
+        yield "behind", polariser.name, True
+    behind = train[len(instrument.telescope()) + (polariser is not None) :]
+    if polariser is None and behind:
+        yield "ahead of", behind[0].name, True
+    for element in behind:
+        if _acts(element) and (element.moves is None or exposures.position(element.moves).inside.any()):
+            yield "behind", element.name, True
+    for arm in instrument.arms:
+        own = list(arm.train())
+        if len(instrument.arms) > 1:
+            yield "ahead of", f"{arm.name}.{own[0].name if own else arm.analyser.name}", True
+        for element in own:
+            if _acts(element):
+                yield "behind", f"{arm.name}.{element.name}", True
+
+
+def _acts(element: Element) -> bool:
+    """Whether an element does anything to polarisation."""
+    one, zero = jnp.ones(1), jnp.zeros(())
+
+    def run(element: Element) -> Any:
+        conditions = Conditions(band_width=0.1 * one, planned=dict.fromkeys(CONDITIONS, one))
+        return element.mueller(Ray.entering(zero, zero, (0.62 * one, conditions)))
+
+    return jax.eval_shape(run, element) is not None
+
+
+def _of_plates(instrument: Instrument, exposures: Exposures, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
+    warm = []
+    for place in instrument.places(WavePlate):
+        arm, _, name = place.rpartition(".")
+        holder = next(a for a in instrument.arms if a.name == arm).elements if arm else instrument.elements
+        plate = next(e for e in holder if e.name == name)
+        assert isinstance(plate, WavePlate)
+        if plate.moves is not None and not exposures.position(plate.moves).inside.any():
+            continue
+        yield (Sentence("axis", "of", place),)
+        warm.append(Sentence("thermal", "of", place))
+        layers = [f"{place}.{layer.name}" for layer in plate.layers]
+        yield tuple(Sentence("thickness", "of", layer) for layer in layers)
+        for layer in layers[1:]:
+            yield (Sentence("axis", "of", layer),)
+        for layer in layers:
+            yield (Sentence("cut", "of", layer),)
+    if warm and asked.kelvin:
+        yield tuple(warm)
+
+
+def _together(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
+    """The same kind at the same place of every arm, or in every camera, each with its own amplitude."""
+    arms, names = instrument.arms, instrument.cameras.names
+    if len(arms) > 1 and len({arm.path for arm in arms}) == 1:
+        for element in arms[0].train():
+            if _acts(element):
+                each = [list(_families("behind", f"{arm.name}.{element.name}")) for arm in arms]
+                yield from (tuple(itertools.chain(*same)) for same in zip(*each, strict=True))
+    plates = [place for place in instrument.places(WavePlate) if "." in place]
+    if len(plates) > 1:
+        yield tuple(Sentence("axis", "of", place) for place in plates)
+    yield tuple(Sentence("gain", "of", name, ("counts",)) for name in names)
+    if asked.over_field:
+        yield tuple(Sentence("light", "in", name) for name in names)
+    if asked.hours:
+        yield tuple(Sentence("afterglow", "in", name) for name in names)
+    pairs = zip(names, instrument.cameras.orthogonal, strict=True)
+    yield tuple(Sentence("light", "in", name, origin=names[j]) for name, j in pairs if names[j] != name)
+
+
+def _of_cameras(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
+    cameras, e = instrument.cameras.names, asked.exposures
+    polariser = instrument.polariser
+    prefixes = [polariser.moves] if polariser is not None and polariser.moves and e.clp_in.any() else []
+    for camera in cameras:
+        gain = (Sentence("gain", "of", camera),)
+        yield _times(gain, "counts")
+        for prefix in prefixes:
+            for pair in asked.harmonics(prefix, HARMONICS_OF_ENCODER):
+                yield _times(gain, *pair)
+        for factor in (*asked.slow(), *asked.nights()):
+            yield _times(gain, factor)
+        if asked.over_field and len(e) <= limits.FREE_EXPOSURES:
+            for number in range(len(e)):
+                yield _times(gain, f"exposure {number}")
+        light = (Sentence("light", "in", camera),)
+        if asked.over_field:
+            yield light
+            for factor in asked.slow():
+                yield _times(light, factor)
+        if asked.hours:
+            yield (Sentence("afterglow", "in", camera),)
+        for other in cameras:
+            if other != camera:
+                yield (Sentence("light", "in", camera, origin=other),)
+    for arm in instrument.arms if len(instrument.arms) > 1 else ():
+        gain = (Sentence("gain", "of", arm.name),)
+        for factor in (*asked.slow(), *asked.nights()):
+            yield _times(gain, factor)
+        if asked.over_field:
+            yield _times(gain, *(f"ring {n}" for n in RINGS))

@@ -1,0 +1,99 @@
+"""Columns of the score test for sentences: derivatives taken once for every kind and place.
+
+What depends on field or exposure by a factor is that derivative times the factor, the flux held; then the flux takes up
+its part.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.diagnosis.effect_columns import Probe
+from walop_jax.diagnosis.freeform import numpy_sharing
+from walop_jax.diagnosis.grammar import said_by
+from walop_jax.diagnosis.score import Candidate
+from walop_jax.likelihood.flux import project_flux
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects import Context, Described
+from walop_jax.model.effects.sentence import NUMBERS, REFERENCE_TEMPERATURE, Sentence
+from walop_jax.model.specification import Model
+
+INNER = ("colour", "counts")  # factors that are not known for point and exposure alone
+
+
+def _core(sentence: Sentence) -> Sentence:
+    """The sentence without what multiplies its derivative point by point and exposure by exposure."""
+    return dataclasses.replace(sentence, factors=tuple(f for f in sentence.factors if f in INNER))
+
+
+def _outer(sentence: Sentence) -> Sentence:
+    """The factors that `_core` leaves out; thermal changes are taken at one kelvin."""
+    factors = tuple(f for f in sentence.factors if f not in INNER)
+    return dataclasses.replace(
+        sentence, factors=(*factors, "kelvin") if sentence.kind == "thermal" else factors
+    )
+
+
+def _batch(sentence: Sentence) -> str:
+    """Sentences whose derivatives cost alike: of crystals, of crystals cut askew, of everything else."""
+    return sentence.kind if sentence.kind in ("cut", "thermal") else str(sentence.kind in NUMBERS)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Laid:
+    """Points along the first axis, exposures along the second."""
+
+    likelihood: Likelihood
+
+    def __getattr__(self, name: str) -> Any:
+        points, e = self.likelihood.calset.points, self.likelihood.plan.exposures
+        if name in ("x", "y"):
+            return getattr(points, name)[:, None]
+        if name == "number":
+            return np.arange(len(e.hours))[None]
+        return np.asarray(getattr(e, name))[None]
+
+    def angle(self, prefix: str) -> Any:
+        """Angle of a moving element, NaN where it is out."""
+        position = self.likelihood.calset.exposures.position(prefix)
+        return np.deg2rad(np.where(position.inside, position.angle, np.nan))[None]
+
+
+def sentence_candidates(
+    likelihood: Likelihood, model: Model, values: Float[np.ndarray, " n"], probes: Sequence[Probe]
+) -> dict[str, Candidate]:
+    """Columns of all groups at the fit `values` of a model, by their names."""
+    said = {text: Sentence.parsed(text) for probe in probes for text in said_by(probe)}
+    batches: dict[str, dict[str, None]] = {}
+    for sentence in said.values():
+        batches.setdefault(_batch(sentence), {})[_core(sentence).text] = None
+    change: dict[str, np.ndarray] = {}
+    along = np.zeros(0)
+    warm = np.full(len(likelihood.calset.exposures), REFERENCE_TEMPERATURE + 1.0)
+    for batch, cores in batches.items():
+        effect, calset = Described.of(Context(), sentences=tuple(cores)), likelihood.calset
+        if batch == "thermal":
+            calset = dataclasses.replace(calset, exposures=dataclasses.replace(calset.exposures, temp=warm))
+        own = Likelihood.of(calset, model, (effect,))
+        found, along = own.effect_changes(values, (effect,))
+        order = [
+            text for f in Described.amplitudes() for text in cores if Sentence.parsed(text).parameter == f
+        ]
+        change |= {text: found[:, i] for i, text in enumerate(order)}
+    used, known = likelihood.used, likelihood.flux_known
+    shared, at = numpy_sharing(likelihood), _Laid(likelihood)
+
+    def column(sentence: Sentence) -> np.ndarray:
+        pattern = np.nan_to_num(np.asarray(_outer(sentence).factor(at)))
+        raw = change[_core(sentence).text] * np.broadcast_to(pattern, used.shape)[..., None]
+        return -project_flux(raw, along, known, shared)[used].reshape(-1)
+
+    columns = {text: column(sentence) for text, sentence in said.items()}
+    return {
+        p.name: Candidate(p.name, np.column_stack([columns[t] for t in said_by(p)]), p.widths) for p in probes
+    }

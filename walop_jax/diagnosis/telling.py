@@ -1,0 +1,79 @@
+"""A sentence told to people: its words with amplitude and error, and the observation that would test it."""
+
+from __future__ import annotations
+
+from walop_jax.diagnosis.findings import Told
+from walop_jax.fit.refit import FitResult
+from walop_jax.io.rounding import value_and_error
+from walop_jax.model.effects import Described
+from walop_jax.model.effects.sentence import FIELD_FACTORS, Sentence
+from walop_jax.model.parameters import field_declarations
+
+_OF_FACTOR = {
+    "hours": "the same exposures in another order, or once more hours later",
+    "kelvin": "the same exposures at another temperature",
+    "colour": "narrow bands, or another filter",
+    "counts": "the same exposures at another flux",
+}
+_OF_KIND = {
+    "afterglow": "a dark exposure after a bright one",
+    "light": "the same field points at another flux, and darks",
+    "gain": "a lamp that does not change, seen by all cameras in turn",
+}
+
+
+def told(result: FitResult) -> tuple[Told, ...]:
+    """The sentences of a fitted model, with their amplitudes."""
+    if Described.name not in result.model.effect_names:
+        return ()
+    effect = result.model.instrument(result.values).effect(Described.name)
+    assert isinstance(effect, Described)
+    found = []
+    for sentence, amplitude in effect.terms():
+        sigma = float(result.sigma[result.model.index(f"{Described.name}.{sentence.label}")])
+        unit = field_declarations(Described)[sentence.parameter].unit
+        value, error = value_and_error(float(amplitude), sigma)
+        kind, *dependence = sentence.in_words().split(", ")
+        found.append(
+            Told(
+                sentence=sentence.text,
+                kind=sentence.kind,
+                place=f"{sentence.where} {sentence.place}",
+                dependence=tuple(dependence),
+                value=float(amplitude),
+                sigma=sigma,
+                unit=unit,
+                words=f"{kind}: {value} ± {error}{' ' if unit else ''}{unit}{''.join(f', {d}' for d in dependence)}",
+                tested_by=tested_by(sentence),
+            )
+        )
+    return tuple(found)
+
+
+def tested_by(sentence: Sentence) -> str:
+    """The observation that would show whether a sentence is true."""
+    advice = []
+    for factor in sentence.factors:
+        if factor in _OF_FACTOR:
+            advice.append(_OF_FACTOR[factor])
+        elif factor.startswith(("cos", "sin")):
+            advice.append(
+                "a full turn at more angles in random order, then with the element mounted turned by 90°"
+            )
+        elif factor.startswith(("hours", "exposure")):
+            advice.append("the same exposures once more")
+        elif factor in FIELD_FACTORS or factor.startswith("ring"):
+            advice.append(
+                "more field points along that direction; dither: what is of the optics stays where it is"
+            )
+    if sentence.kind in _OF_KIND:
+        advice.append(_OF_KIND[sentence.kind])
+    elif sentence.where == "ahead of" and "." not in sentence.place:
+        advice.append("standards at several ROTATOR angles: light through the polariser does not have it")
+    elif sentence.where == "of":
+        advice.append("the same exposures without that element, or with it mounted turned over")
+    else:
+        advice.append(
+            "the calibration plate at 0° and 45°: it turns what is ahead of it, and not what is behind"
+        )
+    return "; ".join(dict.fromkeys(advice))
