@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -37,6 +37,7 @@ from walop_jax.model.specification import Model
 
 GAIN = 10.0
 """Factor by which an alternative must bring down χ²/dof − 1 to be told."""
+SURE = 1.2  # χ²/dof up to which another reading explains the data to the noise
 _COARSE = 0.01  # share of the light that a fit of mixed-up data misses at least
 _POINTS, _FEW = 16, 64  # field points that are looked at; sets of so few are looked at whole
 _STEPS = (1, 6)  # Gauss–Newton steps at the first look, and of the best
@@ -66,13 +67,22 @@ class Alternative:
 
 def refuse_mixups(result: FitResult) -> None:
     """Raise `DataError` with the remedy if a fit leaves what another reading of its data explains."""
-    if result.dof <= 0:
-        return
-    left = result.chi2 / result.dof
-    found = mixups(result.calset, result.model, left)
+    found = mixups_of(result)
     if found:
-        reasons = "; or if ".join(str(one) for one in found)
-        raise DataError(f"the data do not fit (χ²/dof = {left:.3g}), and would if {reasons}")
+        raise refusal(result, found)
+
+
+def mixups_of(result: FitResult) -> tuple[Alternative, ...]:
+    """The readings of the data that explain what a fit leaves, best first."""
+    if result.dof <= 0:
+        return ()
+    return mixups(result.calset, result.model, result.chi2 / result.dof)
+
+
+def refusal(result: FitResult, found: Sequence[Alternative]) -> DataError:
+    """The error of data that other readings explain."""
+    reasons = "; or if ".join(str(one) for one in found)
+    return DataError(f"the data do not fit (χ²/dof = {result.chi2 / result.dof:.3g}), and would if {reasons}")
 
 
 def mixups(calset: CalibrationSet, model: Model, left: float) -> tuple[Alternative, ...]:

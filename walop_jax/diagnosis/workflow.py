@@ -32,7 +32,7 @@ from walop_jax.diagnosis.effect_columns import Probe, applicable
 from walop_jax.diagnosis.effect_columns import probes as all_probes
 from walop_jax.diagnosis.examination import Examination, most_points
 from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexplained
-from walop_jax.diagnosis.mixups import refuse_mixups
+from walop_jax.diagnosis.mixups import SURE, mixups_of, refusal
 from walop_jax.diagnosis.score import Score
 from walop_jax.diagnosis.step_summary import before_and_after, refitted_in_order
 from walop_jax.diagnosis.telling import told
@@ -130,8 +130,9 @@ class _Diagnosing:
         self.choices: dict[str, Choice] = {}
         tell("fitting the model")
         self.fit: FitResult = fit(Likelihood.of(calset, model))
-        if not as_written:
-            refuse_mixups(self.fit)
+        self.readings = () if as_written else mixups_of(self.fit)
+        if self.readings and self.readings[0].explained < SURE:
+            raise refusal(self.fit, self.readings)
 
     def run(self, began: float) -> Diagnosis:
         before = self.fit
@@ -139,6 +140,9 @@ class _Diagnosing:
         first = self._examine()
         examination, unexplained = self._conclude(first, self._add_names(first))
         unexplained = unexplained or self._too_many_sentences(examination)
+        # Another reading that comes near competes with names and with other descriptions of the instrument.
+        if unexplained and self.readings and self.readings[0].explained * self.fit.dof < self.fit.chi2:
+            raise refusal(before, self.readings)
         steps = tuple(self._finished(step, examination) for step in self.steps)
         verdict: Outcome = "unexplained" if unexplained else "effect_found" if steps else "consistent"
         return Diagnosis(
