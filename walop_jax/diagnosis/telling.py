@@ -1,8 +1,10 @@
-"""A sentence told to people: its words with amplitude and error, and the observation that would test it."""
+"""What is found, told to people: sentences with amplitudes and what would test them, and what has no name."""
 
 from __future__ import annotations
 
-from walop_jax.diagnosis.findings import Told
+from walop_jax.diagnosis import location
+from walop_jax.diagnosis.examination import Examination
+from walop_jax.diagnosis.findings import Told, Unexplained
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.rounding import value_and_error
 from walop_jax.model.effects import Described
@@ -48,6 +50,20 @@ def told(result: FitResult) -> tuple[Told, ...]:
             )
         )
     return tuple(found)
+
+
+def unexplained(examination: Examination, patterns: tuple[tuple[str, float], ...]) -> Unexplained:
+    """What an examination leaves without a name: its patterns, and where the residuals sit."""
+    if not examination.alarm:
+        ratio = examination.result.chi2 / examination.result.dof
+        text = f"residuals scatter more than N_ERR says (χ²/dof = {ratio:.3g}) without any pattern that was looked for"
+    elif patterns:
+        text = f"patterns without a name: {'; '.join(f'{name} (p = {p:.1g})' for name, p in patterns)}"
+    else:
+        text = "something is missing, no single pattern is significant by itself"
+    where = location.describe(examination.design, examination.design.residual)
+    text += f". Residuals sit in: cameras {where['camera']}; kinds {where['kind']}; field {where['field']}"
+    return Unexplained(examination.table.p_global, text, patterns)
 
 
 def tested_by(sentence: Sentence) -> str:

@@ -22,7 +22,6 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from walop_jax.data.frames import FrameIntensities
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import grammar, location, naming
 from walop_jax.diagnosis.change_of_stokes import instrument_matrices, largest_change
@@ -35,13 +34,12 @@ from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexp
 from walop_jax.diagnosis.mixups import SURE, mixups_of, refusal
 from walop_jax.diagnosis.score import Score
 from walop_jax.diagnosis.step_summary import before_and_after, refitted_in_order
-from walop_jax.diagnosis.telling import told
+from walop_jax.diagnosis.telling import told, unexplained
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit
-from walop_jax.fit.stand_in import on_field_points
+from walop_jax.fit.stand_in import in_field_points
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.runner import Runner
 from walop_jax.likelihood.thinning import thinned
 from walop_jax.model.effects import EFFECTS, Context, Described, Effect, FreeForm, OtherDescription
 from walop_jax.model.parameters import values_of
@@ -75,7 +73,7 @@ def diagnose(
     began = time.perf_counter()
     tell = progress or (lambda text: None)
     model = model or base_model(calset)
-    calset = _in_points(calset, model, tell)
+    calset = in_field_points(calset, model, tell)
     context = effect_context(model.template, calset.exposures)
     every = grammar.sentences(model.template, calset.exposures, len(calset.points))
     amplitudes = sum(len(probe.widths) for probe in (*all_probes(tuple(catalogue), context), *every))
@@ -85,18 +83,6 @@ def diagnose(
     until = began + 60.0 * minutes
     found = _Diagnosing(some, model, catalogue, seed, tell, until, as_written=as_written).run(began)
     return dataclasses.replace(found, points=len(calset.points))
-
-
-def _in_points(calset: CalibrationSet, model: Model, tell: Callable[[str], None]) -> CalibrationSet:
-    """Whole frames as a set of field points that stands for all pixels; any other set as it is."""
-    likelihood = Likelihood.of(calset, model, runner=Runner(progress=tell))
-    if not (likelihood.layout.large and isinstance(calset.intensities, FrameIntensities)):
-        return calset
-    tell("fitting all pixels")
-    found = on_field_points(fit(likelihood))
-    if found.calset.compression is not None:
-        tell(f"looking at {len(found.calset.points)} field points that stand for all pixels")
-    return found.calset
 
 
 def _promise(choice: Choice) -> tuple[float, float]:
@@ -138,20 +124,20 @@ class _Diagnosing:
         before = self.fit
         self.tell("scoring every effect and pattern")
         first = self._examine()
-        examination, unexplained = self._conclude(first, self._add_names(first))
-        unexplained = unexplained or self._too_many_sentences(examination)
+        examination, nameless = self._conclude(first, self._add_names(first))
+        nameless = nameless or self._too_many_sentences(examination)
         # Another reading that comes near competes with names and with other descriptions of the instrument.
-        if unexplained and self.readings and self.readings[0].explained * self.fit.dof < self.fit.chi2:
+        if nameless and self.readings and self.readings[0].explained * self.fit.dof < self.fit.chi2:
             raise refusal(before, self.readings)
         steps = tuple(self._finished(step, examination) for step in self.steps)
-        verdict: Outcome = "unexplained" if unexplained else "effect_found" if steps else "consistent"
+        verdict: Outcome = "unexplained" if nameless else "effect_found" if steps else "consistent"
         return Diagnosis(
             verdict=verdict,
             steps=steps,
             candidates=first.summary(),
             limits=tuple(examination.limits()),
             untestable=first.untestable(self.catalogue),
-            unexplained=unexplained,
+            unexplained=nameless,
             p_value=first.table.p_global,
             remaining_p=examination.table.p_global,
             noise_scale=self.fit.noise_scale * examination.table.noise_scale,
@@ -304,22 +290,7 @@ class _Diagnosing:
 
     def _unexplained(self, examination: Examination) -> Unexplained:
         patterns = tuple(examination.patterns_needed())
-        if not examination.alarm:
-            ratio = examination.result.chi2 / examination.result.dof
-            text = (
-                f"residuals scatter more than N_ERR says (χ²/dof = {ratio:.3g}) "
-                "without any pattern that was looked for"
-            )
-        elif patterns:
-            listed = "; ".join(f"{name} (p = {p:.1g})" for name, p in patterns)
-            text = f"patterns without a name: {listed}"
-        else:
-            text = "something is missing, no single pattern is significant by itself"
-        where = location.describe(examination.design, examination.design.residual)
-        text += (
-            f". Residuals sit in: cameras {where['camera']}; kinds {where['kind']}; field {where['field']}"
-        )
-        found = Unexplained(examination.table.p_global, text, patterns)
+        found = unexplained(examination, patterns)
         blocks = tuple(
             dict.fromkeys(b for name, _ in patterns if (b := examination.blocks[name]) is not None)
         )
@@ -374,12 +345,12 @@ class _Diagnosing:
             if not examination.alarm and (self.fit.explains_data or self.fit.nearly_explains_data):
                 return examination, None
             self.tell("something without a name is left")
-            unexplained = self._unexplained(examination)
-            if not unexplained.term:
-                return examination, unexplained
+            nameless = self._unexplained(examination)
+            if not nameless.term:
+                return examination, nameless
             dropped = self._drop_what_is_not_needed()
             if not dropped:
-                return self._examine(examination), unexplained
+                return self._examine(examination), nameless
             # Those names only stood in for what has none: what is it without them?
             self._adopt(naming.refit_without(self.fit, FreeForm.name))
 

@@ -6,10 +6,14 @@ import dataclasses
 
 import numpy as np
 
-from walop_jax.fit.refit import FitResult
+from walop_jax.data.frames import FrameIntensities
+from walop_jax.data.records import CalibrationSet
+from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.compression import compressed
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.pixels import PixelPosterior
+from walop_jax.likelihood.runner import Progress, Runner
+from walop_jax.model.specification import Model
 
 FARTHEST = 100.0
 """Standard errors from where the pixels were summed up to which a set that stands for them is good: a thousandth of the
@@ -23,6 +27,18 @@ def on_field_points(result: FitResult) -> FitResult:
     likelihood = Likelihood.of(compressed(result.posterior), result.model, interpolate=False)
     posterior = likelihood.expand(result.values, result.noise_scale)
     return dataclasses.replace(result, likelihood=likelihood, posterior=posterior)
+
+
+def in_field_points(calset: CalibrationSet, model: Model, tell: Progress) -> CalibrationSet:
+    """Whole frames of many pixels as the set that stands for them at their minimum; any other set as it is."""
+    likelihood = Likelihood.of(calset, model, runner=Runner(progress=tell))
+    if not (likelihood.layout.large and isinstance(calset.intensities, FrameIntensities)):
+        return calset
+    tell("fitting all pixels")
+    found = on_field_points(fit(likelihood)).calset
+    if found.compression is not None:
+        tell(f"looking at {len(found.points)} field points that stand for all pixels")
+    return found
 
 
 def moved(result: FitResult) -> float:

@@ -10,12 +10,9 @@ Three layers, each with its own small Jacobian:
 
 Flux           of every (exposure, point) is eliminated (`flux.py`). Where an effect of the detectors D acts, the model
                is D(F a), F follows by Newton steps and ∂D/∂F takes the place of a.
-Exposures      are not compressed beforehand, although light is linear in them. With the flux eliminated what could
-               be kept of a point holds only near one set of values, as F and â depend on them; for 4 cameras × 3
-               Stokes parameters it is 91 numbers per band instead of 200 for 25 exposures. Reading would halve,
-               at the price of an error and of every hook between light and counts. What is kept are the sums over
-               all points near one set of values: 47 standard errors away they leave a thousandth of the way, and a
-               gradient (`slope_equations`) shows it.
+Exposures      are not compressed beforehand, although light is linear in them: with the flux eliminated what could
+               be kept of a point holds only near one set of values, as F and â depend on them. Whole frames, whose
+               counts are smooth over the field, are summed over cells near one set of values instead (`pixels.py`).
 """
 
 from __future__ import annotations
