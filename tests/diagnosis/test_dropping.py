@@ -84,13 +84,14 @@ class Rehearsal(workflow._Diagnosing):
 
     def __init__(self):
         self.calset, self.catalogue = SimpleNamespace(points=()), ()
-        self.fit = Mock(spec=FitResult, explains_data=True, chi2=1.0, dof=1)
-        self.steps, self.choices = [SimpleNamespace(effect="name")], {}
+        self.fit = Mock(spec=FitResult, explains_data=True, chi2=1.0, dof=1, noise_scale=1.0)
+        self.steps, self.choices, self.readings = [SimpleNamespace(effect="name")], {}, ()
+        self.added = self.said = 0
         self.tell, self.until = lambda text: None, float("inf")
 
     def _examine(self, earlier=None):
         examination = Mock(spec=Examination, alarm=bool(self.steps), design=Mock(spec=Design))
-        examination.table = SimpleNamespace(p_global=float(not self.steps))
+        examination.table = SimpleNamespace(p_global=float(not self.steps), noise_scale=1.0)
         for empty in (examination.summary, examination.limits, examination.untestable, examination.classes):
             empty.return_value = ()
         return examination

@@ -53,6 +53,7 @@ def found(hidden, seed=3):
     return result
 
 
+@pytest.mark.long
 def test_a_film_whose_axis_turns_over_the_field():
     result = found([Described.saying(["turn of polariser * x"], [0.05])])
     assert result.verdict == "effect_found"

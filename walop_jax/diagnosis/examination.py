@@ -286,6 +286,9 @@ class Examination:
         missing, moved = self.result.chi2 - self.result.dof, self.result.chi2 - trial.fit.chi2
         if moved < LEAST_SHARE * missing:
             return False
+        # What is left is noise, and was not before: a pattern can only say the same with more numbers.
+        if trial.fit.explains_data and not self.result.explains_data:
+            return True
         probes = [probe for probe in self.probes if probe.effect is trial.effect]
         return self.stands(probes, evidence) if probes or trial.effect is Described else True
 
