@@ -195,7 +195,9 @@ def check_constrained(model: Model, posterior: Posterior) -> None:
 
 def covariance(model: Model, posterior: Posterior) -> Matrix:
     """Covariance of all parameters: the inverse of JᵀJ, priors included, ties expanded."""
-    scale = free_scales(model)
+    # In units of what each parameter is known to by itself: its own precision costs no digits of the inverse.
+    known = np.sqrt(np.clip(np.diag(posterior.matrix), 0.0, None))
+    scale = np.where(known > 0, 1.0 / np.where(known > 0, known, 1.0), free_scales(model))
     scaled = posterior.matrix * np.outer(scale, scale)
     value, vector = np.linalg.eigh(scaled)
     keep = value > value.max(initial=0.0) * 1e-15

@@ -256,14 +256,20 @@ class NormalEquationsSolver(optx.AbstractMinimiser[Vector, Expansion, _State]):
 
 
 def distance_to_minimum(expansion: Expansion) -> tuple[float, float]:
-    """‖(JᵀJ)^(−½) Jᵀr‖ and the condition number of JᵀJ, both in scaled parameters."""
+    """‖(JᵀJ)^(−½) Jᵀr‖ in scaled parameters, and the condition number of JᵀJ with a diagonal of ones.
+
+    How well each parameter is known by itself is no matter of telling them apart: the best scaling is by that, up to the
+    number of parameters (van der Sluis 1969, Numerische Mathematik 14, 14).
+    """
     matrix, gradient = expansion.matrix, expansion.gradient
     if len(gradient) == 0:
         return 0.0, 1.0
     if not (np.isfinite(matrix).all() and np.isfinite(gradient).all()):
         return np.inf, np.inf
+    size = np.sqrt(np.clip(np.diag(matrix), 0.0, None))
+    alone = np.linalg.eigvalsh(matrix / np.outer(size, size)) if (size > 0).all() else np.zeros(1)
+    condition = float(alone[-1] / alone[0]) if alone[0] > 0 else np.inf
     value, vector = np.linalg.eigh(matrix)
-    condition = float(value[-1] / value[0]) if value[0] > 0 else np.inf
     positive = value > value[-1] * 1e-15
     along = vector.T @ gradient
     return float(np.sqrt(np.sum(along[positive] ** 2 / value[positive]))), condition
