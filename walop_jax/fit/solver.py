@@ -258,8 +258,8 @@ class NormalEquationsSolver(optx.AbstractMinimiser[Vector, Expansion, _State]):
 def distance_to_minimum(expansion: Expansion) -> tuple[float, float]:
     """‖(JᵀJ)^(−½) Jᵀr‖ in scaled parameters, and the condition number of JᵀJ with a diagonal of ones.
 
-    How well each parameter is known by itself is no matter of telling them apart: the best scaling is by that, up to the
-    number of parameters (van der Sluis 1969, Numerische Mathematik 14, 14).
+    How well each parameter is known by itself is no matter of telling them apart: the best scaling is by that, up to
+    the number of parameters (van der Sluis 1969, Numerische Mathematik 14, 14).
     """
     matrix, gradient = expansion.matrix, expansion.gradient
     if len(gradient) == 0:
