@@ -92,6 +92,7 @@ class Rehearsal(workflow._Diagnosing):
     def _examine(self, earlier=None):
         examination = Mock(spec=Examination, alarm=bool(self.steps), design=Mock(spec=Design))
         examination.table = SimpleNamespace(p_global=float(not self.steps), noise_scale=1.0)
+        examination.noise_p = 0.5
         for empty in (examination.summary, examination.limits, examination.untestable, examination.classes):
             empty.return_value = ()
         return examination
