@@ -83,7 +83,7 @@ def likelihood_of(calset):
 
 
 def test_structure_is_found_where_it_is(noiseless, cells, monkeypatch):
-    monkeypatch.setattr(residual_map, "main_setting", polariser_only)
+    monkeypatch.setattr(residual_map, "_main_setting", polariser_only)
     west = noiseless.calset.points.x < 0
     likelihood = likelihood_of(with_structure(noiseless, west))
     found = residual_map_at(likelihood, as_values(noiseless.truth))
@@ -115,7 +115,7 @@ def test_noise_alone_makes_corrections_of_the_size_of_their_errors(cells):
 
 def test_structure_below_the_noise_of_a_point_stands_out_of_many(cells, monkeypatch):
     """5·10⁻⁴ in m23: half of the error of a single point, ten times that of the whole map."""
-    monkeypatch.setattr(residual_map, "main_setting", polariser_only)
+    monkeypatch.setattr(residual_map, "_main_setting", polariser_only)
     simulated = simulate(RUN, seed=8)
     noise = simulated.calset.intensities.block(0, 576)
     clean = simulate(RUN, seed=8, noiseless=True)
@@ -134,13 +134,13 @@ def test_structure_below_the_noise_of_a_point_stands_out_of_many(cells, monkeypa
 def test_the_map_is_of_the_setting_with_the_most_exposures():
     plan = dataclasses.replace(RUN, plate=(None, 45.0), moon_patches=0, grid=4)
     e = simulate(plan, seed=1).calset.exposures
-    setting, chosen = residual_map.main_setting(Settings.of(e, ("CHWP",)), e.clp_in)
+    setting, chosen = residual_map._main_setting(Settings.of(e, ("CHWP",)), e.clp_in)
     assert setting.filter[0] == "SDSS-r"
     assert np.isnan(setting.position("CHWP")[0])
     np.testing.assert_array_equal(chosen, ~e.chwp_in)
     only = dataclasses.replace(plan, plate=(45.0,))
     e = simulate(only, seed=1).calset.exposures
-    assert residual_map.main_setting(Settings.of(e, ("CHWP",)), e.clp_in)[0].position("CHWP")[0] == 45.0
+    assert residual_map._main_setting(Settings.of(e, ("CHWP",)), e.clp_in)[0].position("CHWP")[0] == 45.0
 
 
 def test_cells_without_enough_light_hold_no_number(cells):

@@ -108,7 +108,7 @@ def cell_of(grid: Grid, x: Vector, y: Vector) -> Int[np.ndarray, " p"]:
     return row * grid.width + column
 
 
-def main_setting(
+def _main_setting(
     settings: Settings, through: Bool[np.ndarray, " e"]
 ) -> tuple[Settings, Bool[np.ndarray, " e"]]:
     """The setting with the most exposures `through` the polariser, all else out preferred, and its exposures."""
@@ -134,7 +134,7 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
     instrument = likelihood.model.instrument(values)
     nodes, _ = likelihood.nodes(instrument, near)
     exposures = likelihood.calset.exposures
-    setting, chosen = main_setting(Settings.of(exposures, likelihood.plan.moving), exposures.clp_in)
+    setting, chosen = _main_setting(Settings.of(exposures, likelihood.plan.moving), exposures.clp_in)
     grid = cells_for(likelihood.layout.points, likelihood.census if near is None else near.census)
     count = grid.width * grid.height
 
@@ -153,14 +153,14 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
     left = np.zeros((count, n, n))
     i, j = np.triu_indices(n)
     left[:, i, j] = left[:, j, i] = total[2 + n :].T
-    sums = MapSums(chi2=total[0], freedom=total[1], right=total[2 : 2 + n], left=left)
-    return solved_map(grid, setting, sums)
+    sums = _MapSums(chi2=total[0], freedom=total[1], right=total[2 : 2 + n], left=left)
+    return _solved_map(grid, setting, sums)
 
 
 def residual_map_of_pixels(found: FrameSums) -> ResidualMap:
     """The map of what the values leave of whole frames: from the sums of cells, with what is smooth in their middle."""
     likelihood, cells = found.likelihood, found.cells
-    setting, chosen = main_setting(
+    setting, chosen = _main_setting(
         Settings.of(likelihood.calset.exposures, likelihood.plan.moving), likelihood.calset.exposures.clp_in
     )
     blocks = (limits.POINTS_PER_CELL**0.5 / cells.side, max(cells.shape) / limits.MOST_CELLS)
@@ -193,10 +193,10 @@ def residual_map_of_pixels(found: FrameSums) -> ResidualMap:
     sums = [in_blocks(values, together) for values in shaped]
     grid = cells.blocks(together, sums[0].shape)
     chi2, freedom, right, left = (values.reshape(*values.shape[:-2], -1) for values in sums)
-    return solved_map(grid, setting, MapSums(chi2, freedom, right, np.moveaxis(left, 2, 0)))
+    return _solved_map(grid, setting, _MapSums(chi2, freedom, right, np.moveaxis(left, 2, 0)))
 
 
-class MapSums(NamedTuple):
+class _MapSums(NamedTuple):
     """Sums over the pixels of each cell: χ², degrees of freedom, Σ A r and Σ A P Aᵀ."""
 
     chi2: Float[np.ndarray, " c"]
@@ -205,7 +205,7 @@ class MapSums(NamedTuple):
     left: Float[np.ndarray, "c d d"]
 
 
-def solved_map(grid: Grid, setting: Settings, sums: MapSums) -> ResidualMap:
+def _solved_map(grid: Grid, setting: Settings, sums: _MapSums) -> ResidualMap:
     """The map on a grid of cells at one setting, from its normal equations; NaN where these are singular."""
     matrix, n = sums.left, len(sums.right)
     size = np.sqrt(np.diagonal(matrix, axis1=1, axis2=2))

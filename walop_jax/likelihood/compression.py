@@ -1,4 +1,4 @@
-"""A calibration set of a thousand field points that says what all pixels of whole frames say.
+"""A calibration set of some hundred field points that says what all pixels of whole frames say.
 
 Method      Blocks of cells are given n × n field points, at the nodes of the Gauss–Legendre rule; the sums of the cells
             (`cell_sums.py`) are shared between these by their Lagrange polynomials. At each point counts and errors are
@@ -24,7 +24,7 @@ from walop_jax.data.records import Block, CalibrationSet, Compression, Points
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.frames import FrameSums, unit_slopes_at
-from walop_jax.likelihood.pixels import PixelPosterior, information_of, normal_equations
+from walop_jax.likelihood.pixels import PixelPosterior, half_gradient, information_of
 
 Vector = Float[np.ndarray, " n"]
 
@@ -98,15 +98,12 @@ def _with_gradient(
     place: tuple[Vector, Vector],
 ) -> Float[np.ndarray, "p e k"]:
     """The pull at points without what is a change of the flux, with the gradient of all pixels."""
-    matrix = np.moveaxis(
-        information_of(found, *(np.moveaxis(v, 2, 0) for v in (weight, unit))), (2, 3), (0, 1)
-    )
+    matrix = information_of(found, weight.T, unit.T).transpose(3, 2, 0, 1)
     inverse = np.where(weight > 0, 1.0 / np.where(weight > 0, weight, 1.0), 0.0)
     pull = np.einsum("pekl,pel->pek", matrix, inverse * pull)
     slopes = unit_slopes_at(found.likelihood, found.instrument, *place)
     changes = np.einsum("pekl,peln->pekn", matrix, slopes, optimize=True)
-    gradient, _ = normal_equations(found)
-    lacking = -gradient - np.einsum("pekn,pek->n", slopes, pull)
+    lacking = -half_gradient(found) - np.einsum("pekn,pek->n", slopes, pull)
     normal = np.einsum("pekn,pekm->nm", slopes, changes, optimize=True)
     size = np.sqrt(np.diag(normal))
     size = np.where(size > 0, size, 1.0)

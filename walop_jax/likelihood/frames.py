@@ -24,7 +24,7 @@ from walop_jax.likelihood.expansion import Census, OpticsUsed
 from walop_jax.likelihood.field_table import FieldTable, accurate_table
 from walop_jax.likelihood.flux import sharing
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.nodes import TOLERANCE
+from walop_jax.likelihood.nodes import TOLERANCE, in_batches
 from walop_jax.likelihood.points import PointReader
 from walop_jax.likelihood.runner import SlabSums
 from walop_jax.model import chebyshev, light
@@ -121,13 +121,8 @@ def unit_slopes_at(
 
 
 def _at(solve: Any, likelihood: Likelihood, instrument: Instrument, x: Vector, y: Vector) -> Any:
-    parts = []
-    for start in range(0, len(x), limits.SOLVED_TOGETHER):
-        # The last batch is filled up with its last place.
-        inside = np.minimum(np.arange(start, start + limits.SOLVED_TOGETHER), len(x) - 1)
-        points = blank_points(likelihood.points.reader, x[inside], y[inside])
-        parts.append(jax.tree.map(np.asarray, solve(instrument, likelihood.plan, points)))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(x)], *parts)
+    reader = likelihood.points.reader
+    return in_batches(lambda x, y: solve(instrument, likelihood.plan, blank_points(reader, x, y)), x, y)
 
 
 def blank_points(reader: PointReader, x: Vector, y: Vector) -> engine.PointData:

@@ -11,6 +11,9 @@ Tolerance   A relative error ε of all n counts, each known to σ/N, moves a par
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,13 +38,17 @@ _solve = compiled(jax.vmap(rows_and_slopes, in_axes=(None, None, 0, 0)))
 
 def solved_optics(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> Optics:
     """Band rows and their derivatives at field positions (deg): exact."""
+    return in_batches(lambda x, y: _solve(instrument, plan, jnp.asarray(x), jnp.asarray(y)), x, y)
+
+
+def in_batches(solve: Callable[[Vector, Vector], Any], x: Vector, y: Vector) -> Any:
+    """What `solve` gives at field positions (deg), a tree of arrays, solved so many at a time as it is compiled for."""
     parts = []
     for start in range(0, len(x), limits.SOLVED_TOGETHER):
-        # The last batch is filled up with its first place.
+        # The last batch is filled up with its last place.
         inside = np.minimum(np.arange(start, start + limits.SOLVED_TOGETHER), len(x) - 1)
-        parts.append(_solve(instrument, plan, jnp.asarray(x[inside]), jnp.asarray(y[inside])))
-    rows, slopes = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
-    return rows[: len(x)], slopes[: len(x)]
+        parts.append(jax.tree.map(np.asarray, solve(x[inside], y[inside])))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(x)], *parts)
 
 
 def accurate_nodes(

@@ -47,9 +47,8 @@ def expand(
     """
     values = likelihood.runner.processes.agreed("values", np.asarray(values, float))
     found = frame_sums(likelihood, values, every)
-    gradient, matrix = normal_equations(found)
     plain = likelihood.posterior(
-        values, found.chi2, gradient, matrix, noise_scale, found.census, found.optics
+        values, found.chi2, half_gradient(found), gauss_newton(found), noise_scale, found.census, found.optics
     )
     return PixelPosterior(**{f.name: getattr(plain, f.name) for f in dataclasses.fields(plain)}, sums=found)
 
@@ -70,14 +69,13 @@ def information(found: FrameSums, together: int = 1) -> Float[np.ndarray, "k k e
 def information_of(
     found: FrameSums, weight: Float[np.ndarray, "k ..."], unit: Float[np.ndarray, "k ..."]
 ) -> Float[np.ndarray, "k k ..."]:
-    """K from Σ F²/σ² and the counts for light of unit flux, for any places (exposures anywhere among these axes)."""
+    """K from Σ F²/σ² and the counts for light of unit flux, for any places: cameras, exposures, then these."""
     k, likelihood = len(unit), found.likelihood
     shared = sharing(found.instrument, likelihood.plan).cameras
     shared = np.ones((k, k)) if shared is None else np.asarray(shared)
     light = weight * unit
     power = np.einsum("k...,kl->l...", light * unit, shared)
-    known = likelihood.flux_known
-    known = known[:, None, None] if unit.ndim == 4 else known
+    known = likelihood.flux_known.reshape(-1, *(1,) * (unit.ndim - 2))
     share = np.where(~known & (power > 0), light / np.where(power > 0, power, 1.0), 0.0)
     matrix = -np.einsum("kl,k...,l...->kl...", shared, share, light)
     matrix[np.arange(k), np.arange(k)] += weight
@@ -91,25 +89,32 @@ def _on_nodes(found: FrameSums, count: int, together: int) -> Float[np.ndarray, 
     return np.einsum("klerc,cs,rt->stekl", information(found, together), over, up, optimize=True)
 
 
-def normal_equations(found: FrameSums) -> tuple[Vector, Matrix]:
-    """Half gradient of χ² of all pixels and its Gauss–Newton matrix, in all parameters."""
-    size, count = len(found.values), found.smooth.count
+def half_gradient(found: FrameSums) -> Vector:
+    """Half gradient of χ² of all pixels in all parameters."""
+    count = found.smooth.count
     to = chebyshev.to_coefficients(count)
     pull = np.einsum("jike,jt,is->stek", found.moments, to, to, optimize=True)
-    gradient = np.zeros(size)
+    pull = pull.reshape(count**2, *pull.shape[2:])
+    gradient = np.zeros(len(found.values))
     for here, slopes in _slopes_on_nodes(found, count):
-        gradient -= np.einsum("pekn,pek->n", slopes, pull.reshape(-1, *pull.shape[2:])[here], optimize=True)
+        gradient -= np.einsum("pekn,pek->n", slopes, pull[here], optimize=True)
+    return gradient
+
+
+def gauss_newton(found: FrameSums) -> Matrix:
+    """Gauss–Newton matrix of half of χ² of all pixels in all parameters."""
     matrices = _on_nodes(found, NODES, 1)
     if found.every == 1:
         # K of a cell that lies in its middle errs by the square of its side: so blocks of four say by how much.
         left = (found.cells.side**2 - 1) / (3 * found.cells.side**2)
         matrices = (1.0 + left) * matrices - left * _on_nodes(found, NODES, 2)
     matrices = matrices.reshape(NODES**2, *matrices.shape[2:])
+    size = len(found.values)
     matrix = np.zeros((size, size))
     for here, slopes in _slopes_on_nodes(found, NODES):
         weighted = np.einsum("pekl,peln->pekn", matrices[here], slopes, optimize=True)
         matrix += slopes.reshape(-1, size).T @ weighted.reshape(-1, size)
-    return gradient, 0.5 * (matrix + matrix.T)
+    return 0.5 * (matrix + matrix.T)
 
 
 def _slopes_on_nodes(found: FrameSums, count: int) -> Iterator[tuple[slice, Float[np.ndarray, "p e k a"]]]:
