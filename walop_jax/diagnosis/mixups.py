@@ -157,7 +157,7 @@ def _readings(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
         yield Alternative(
             "the calibration polariser was not in the beam",
             "set CLP_IN to F and CLP_ANGLE to NaN, or observe again",
-            _with_exposures(_without_polariser),
+            with_exposures(_without_polariser),
         )
 
 
@@ -218,7 +218,7 @@ def _angles(calset: CalibrationSet) -> Iterator[Alternative]:
             yield Alternative(
                 f"ROTATOR {words}",
                 "correct it (docs: conventions)",
-                _with_exposures(lambda e, change=change: dataclasses.replace(e, rotator=change(e.rotator))),
+                with_exposures(lambda e, change=change: dataclasses.replace(e, rotator=change(e.rotator))),
             )
 
 
@@ -233,7 +233,7 @@ def _fields(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
         ("X and Y are exchanged and run the other way", "give −Y as X, and −X as Y", lambda x, y: (-y, -x)),
     )  # fmt: skip
     for what, remedy, turn in turns:
-        yield Alternative(what, remedy, _with_places(turn))
+        yield Alternative(what, remedy, with_places(turn))
     extent = model.template.field_limit
     far = float(np.hypot(calset.points.x, calset.points.y).max())
     for unit, factor in (("arcmin", 1.0 / 60.0), ("arcsec", 1.0 / 3600.0), ("radians", np.rad2deg(1.0))):
@@ -241,7 +241,7 @@ def _fields(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
             yield Alternative(
                 f"X and Y are in {unit}",
                 "give degrees, or the unit of the columns",
-                _with_places(lambda x, y, factor=factor: (factor * x, factor * y)),
+                with_places(lambda x, y, factor=factor: (factor * x, factor * y)),
             )
 
 
@@ -251,7 +251,9 @@ def _with_cameras(calset: CalibrationSet, order: list[int]) -> CalibrationSet:
     return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
 
 
-def _with_places(turn: Callable[..., tuple[np.ndarray, np.ndarray]]) -> Change:
+def with_places(turn: Callable[..., tuple[np.ndarray, np.ndarray]]) -> Change:
+    """A set with other coordinates: `turn` takes and gives X and Y."""
+
     def change(calset: CalibrationSet) -> CalibrationSet:
         x, y = turn(calset.points.x, calset.points.y)
         points = Points(calset.points.point, x, y)
@@ -270,12 +272,13 @@ def _with_angle(prefix: str, turned: Callable[[np.ndarray], np.ndarray]) -> Chan
         there = dataclasses.replace(e.moving[prefix], angle=turned(e.moving[prefix].angle))
         return dataclasses.replace(e, moving={**e.moving, prefix: there})
 
-    return _with_exposures(change)
+    return with_exposures(change)
 
 
 def _without_polariser(e: Exposures) -> Exposures:
     return dataclasses.replace(e, clp_in=np.zeros(len(e), bool), clp_angle=np.full(len(e), np.nan))
 
 
-def _with_exposures(change: Callable[[Exposures], Exposures]) -> Change:
+def with_exposures(change: Callable[[Exposures], Exposures]) -> Change:
+    """A set with other exposures."""
     return lambda calset: dataclasses.replace(calset, exposures=change(calset.exposures))

@@ -10,6 +10,8 @@ Groups      the squared residuals of each camera, kind, filter and exposure. Beh
                 E Σ r² = tr P_gg,   cov(Σ_g r², Σ_h r²) = 2 ‖P_gh‖²
             for groups g, h. The mean square of a group over that of the rest of the data has mean 1 and the variance
             that follows from these; its p is that of a scaled χ² with these two moments.
+Conditions  the efficient score of every number that the set states of itself: field, filters, colours
+            (`stated_conditions`).
 Repeats     the correlation of what is left of two exposures (`repeated_noise`).
 Errors      χ²/dof far below 1 says that N_ERR is not the error of N; a few per cent off is no matter of the model.
 
@@ -36,6 +38,7 @@ from walop_jax.diagnosis.freeform import strata
 from walop_jax.diagnosis.mixups import refuse_mixups
 from walop_jax.diagnosis.repeated_noise import repeated_noise
 from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable
+from walop_jax.diagnosis.stated_conditions import stated_conditions
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points
 from walop_jax.likelihood import limits
@@ -69,7 +72,13 @@ def examined(result: FitResult, seed: int = 0) -> FitResult:
     if result.errors_too_large and _hold_no_noise(design):
         return dataclasses.replace(result, examined=True, noiseless=True)
     table = pattern_scores(design, seed)
-    doubts = (*_patterns(table), *_groups(design), *repeated_noise(design), *_far_from_pixels(result))
+    doubts = (
+        *stated_conditions(design),
+        *_patterns(table),
+        *_groups(design),
+        *repeated_noise(design),
+        *_far_from_pixels(result),
+    )
     return with_honest_errors(dataclasses.replace(result, examined=True, doubts=doubts))
 
 

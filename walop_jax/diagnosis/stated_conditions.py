@@ -1,0 +1,140 @@
+"""Were the data taken under the conditions that their set states? Its coordinates, filter curves and colours.
+
+A field that is displaced, turned or scaled, a filter curve that is displaced, a lamp of another temperature: each is a
+single number, and a fit takes most of it up in its own parameters, which are then wrong by many standard errors while
+χ² hardly changes. Patterns over field and exposures, of which there are hundreds, miss what is spread over all data.
+So each number has its own efficient score (`score`), with the derivative
+
+    C = [r(θ̂; set with c + h) − r(θ̂; set with c − h)] / 2h
+
+of the whitened residuals r with respect to the number c that the set states, fluxes solved for anew.
+
+Limits      What the free parameters take up whole is told by no residual: with a single filter its displacement, the
+            thicknesses of the plates look the same. One number at a time, by a linear step: the size is a hint.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from walop_jax.data.records import CalibrationSet
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.examination import ALARM
+from walop_jax.diagnosis.mixups import with_exposures, with_places
+from walop_jax.diagnosis.score import Score, Scorer, ScoreSpace, corrected_p
+from walop_jax.io.rounding import value_and_error
+from walop_jax.likelihood.likelihood import Likelihood
+
+_SHOWN = 2
+_STEP = 1e-4  # of the width: what is left out of the derivative is its square
+
+
+class Stated(NamedTuple):
+    """A number that a set states: what it is, its unit, what to check, and the set with it changed.
+
+    `width` is by how much it may be wrong at most; `value` is None where only a change of it has a meaning.
+    """
+
+    what: str
+    unit: str
+    remedy: str
+    width: float
+    changed: Callable[[float], CalibrationSet]
+    value: float | None = None
+
+
+def stated_conditions(design: Design) -> Iterator[str]:
+    """Sentences on the conditions that the residuals of a fit speak against, the clearest first."""
+    scored = condition_scores(design)
+    tried = len([score for _, score in scored if score.testable])
+    odd = [(one, score) for one, score in scored if corrected_p(score.log_p, max(tried, 1)) < ALARM]
+    for one, score in sorted(odd, key=lambda item: item[1].log_p)[:_SHOWN]:
+        size, sigma = float(score.amplitudes[0]), float(np.sqrt(score.covariance[0, 0]))
+        if one.value is None:
+            value, error = value_and_error(size, sigma)
+            is_so = f"changed by {value} ± {error} {one.unit}".rstrip()
+        else:
+            value, error = value_and_error(one.value + size, sigma)
+            is_so = f"{value} ± {error} {one.unit}, not {one.value:g}"
+        yield (
+            f"the residuals ask for {one.what} {is_so} (p = {corrected_p(score.log_p, tried):.2g}): {one.remedy}"
+        )
+
+
+def condition_scores(design: Design) -> list[tuple[Stated, Score]]:
+    """The numbers that a set states, each with the score of changing it."""
+    asked = list(_stated(design.fit.calset))
+    if not asked:
+        return []
+    columns = design.stacked([_column(design, one)[:, None] for one in asked])
+    names = [str(number) for number in range(len(asked))]
+    widths = [np.array([one.width]) for one in asked]
+    space = ScoreSpace.projected(design.projector, names, widths, columns)
+    residual = design.projector(design.residual)
+    table = Scorer(space, np.random.default_rng(), draws=0)(columns.T @ residual, float(residual @ residual))
+    return [(one, table[name]) for one, name in zip(asked, names, strict=True)]
+
+
+def _column(design: Design, one: Stated) -> np.ndarray:
+    def residual(step: float) -> np.ndarray:
+        likelihood = Likelihood.of(one.changed(step), design.fit.model)
+        return likelihood.residuals(design.fit.values)[1][design.measured.used].reshape(-1)
+
+    step = _STEP * one.width
+    return (residual(step) - residual(-step)) / (2.0 * step)
+
+
+def _stated(calset: CalibrationSet) -> Iterator[Stated]:
+    if len(calset.points) > 1:
+        yield from _of_field(calset)
+    for name in calset.filters:
+        yield Stated(
+            f"the wavelengths of filter {name}",
+            "um",
+            "check its curve, and what the polariser exposures were taken through",
+            0.05,
+            lambda step, name=name: _with_wavelength(calset, name, step),
+        )
+    e = calset.exposures
+    for kind in np.unique(e.kind):
+        rows = (e.kind == kind) & np.isfinite(e.teff)
+        for value in np.unique(e.teff[rows]):
+            chosen = rows & (e.teff == value)
+            yield Stated(
+                f"TEFF of exposures of kind {kind}",
+                "K",
+                "check the colour temperature of their light",
+                float(value),
+                lambda step, chosen=chosen: with_exposures(
+                    lambda e: dataclasses.replace(e, teff=e.teff + np.where(chosen, step, 0.0))
+                )(calset),
+                float(value),
+            )
+
+
+def _of_field(calset: CalibrationSet) -> Iterator[Stated]:
+    check = "check X and Y against the frames (docs: conventions)"
+    radius = float(np.hypot(calset.points.x, calset.points.y).max())
+    for what, unit, width, moved in (
+        ("X of all field points", "deg", radius, lambda x, y, h: (x + h, y)),
+        ("Y of all field points", "deg", radius, lambda x, y, h: (x, y + h)),
+        ("the scale of X and Y", "", 1.0, lambda x, y, h: (x * (1 + h), y * (1 + h))),
+        ("the angle of the field", "rad", 1.0, lambda x, y, h: (x - h * y, y + h * x)),
+    ):
+        yield Stated(
+            what,
+            unit,
+            check,
+            width,
+            lambda h, moved=moved: with_places(lambda x, y: moved(x, y, h))(calset),
+        )
+
+
+def _with_wavelength(calset: CalibrationSet, name: str, step: float) -> CalibrationSet:
+    curve = calset.filters[name]
+    moved = dataclasses.replace(curve, wavelength=curve.wavelength + step)
+    return dataclasses.replace(calset, filters={**calset.filters, name: moved})
