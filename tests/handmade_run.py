@@ -19,7 +19,6 @@ from walop_jax.calibration.product import (
 from walop_jax.data import empty_sources
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import InputFile, Points, Site
-from walop_jax.diagnosis.detection_limits import DetectionLimit, DetectionLimits
 from walop_jax.diagnosis.figure_file import (
     DiagnosisFigureData,
     ExposureLabels,
@@ -28,6 +27,7 @@ from walop_jax.diagnosis.figure_file import (
     Shares,
     write_figure_data,
 )
+from walop_jax.diagnosis.limits_found import DetectionLimit, DetectionLimits
 from walop_jax.io.text import json_text
 
 INPUT = "night <b>one</b> & two.fits"

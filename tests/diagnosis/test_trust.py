@@ -99,7 +99,7 @@ def test_a_lamp_of_another_temperature(calset):
     found = refit(dataclasses.replace(warm, exposures=dataclasses.replace(warm.exposures, teff=said)))
     assert found.explains_data
     assert not found.trusted
-    assert "patterns" in found.doubts[0]
+    assert "TEFF of exposures of kind clp" in found.doubts[0]
 
 
 @pytest.mark.parametrize(

@@ -112,6 +112,16 @@ class Design:
         scaled = j / norm
         return -np.linalg.solve(scaled.T @ scaled + 1e-12 * np.eye(len(norm)), scaled.T @ r) / norm
 
+    def taken_up(self, columns: Float[np.ndarray, "_ k"]) -> Float[np.ndarray, "_ k"]:
+        """By how much the free parameters change, at first order, when the data lack the amplitudes of `columns`.
+
+        A column holds the derivative of the rows with respect to an amplitude; the data have it, the model has not.
+        """
+        norm = np.linalg.norm(self.jacobian, axis=0)
+        norm = np.where(norm > 0, norm, 1.0)
+        scaled = self.jacobian / norm
+        return np.linalg.pinv(scaled.T @ scaled, hermitian=True) @ (scaled.T @ columns) / norm[:, None]
+
     def robust_ratio(self, name: str) -> float:
         """Largest ratio of robust to stated errors among the parameters of an effect; NaN when it has none.
 

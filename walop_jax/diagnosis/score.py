@@ -19,12 +19,12 @@ Sources      Rao 1948; Bera & Bilias 2001, J. Stat. Plan. Inference 97, 9 (score
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy import stats
+from scipy import optimize, stats
 
 from walop_jax.likelihood import limits
 
@@ -105,7 +105,7 @@ class ScoreTable:
     def __getitem__(self, name: str) -> Score:
         return self._by_name[name]
 
-    @cached_property
+    @functools.cached_property
     def _by_name(self) -> Mapping[str, Score]:
         return {score.name: score for score in self.scores}
 
@@ -123,6 +123,16 @@ def corrected_p(log_p: float, trials: float) -> float:
     """Šidák correction 1 − (1 − p)^n, from ln p."""
     p = np.exp(max(log_p, -700.0))
     return float(-np.expm1(trials * np.log1p(-min(p, 1.0 - 1e-16))))
+
+
+@functools.cache
+def noncentrality(p: float, rank: int, power: float) -> float:
+    """λ for which the statistic of a candidate, χ'²_rank(λ), undercuts a local `p` with probability `power`."""
+    least = stats.chi2.isf(p, rank)
+    found = optimize.root_scalar(
+        lambda value: stats.ncx2.sf(least, rank, value) - power, bracket=(1e-6, 10.0 * least + 100.0)
+    )
+    return float(found.root)
 
 
 def whitening(gram: Matrix) -> Matrix:
@@ -190,7 +200,7 @@ class ScoreSpace:
         share = np.where(self.before > 0, after / np.where(self.before > 0, self.before, 1.0), 0.0)
         return (share > ABSORBED) & (np.sqrt(after) * self.widths > FAINTEST)
 
-    @cached_property
+    @functools.cached_property
     def whitened(self) -> Mapping[str, Matrix]:
         """By candidate its `whitening`, with no part in it of amplitudes that are not alive."""
         alive, found = self.alive(), {}
@@ -230,11 +240,11 @@ class Scorer:
         self._whitening = space.whitened
         self._smallest = self._smallest_p(rng, draws) if draws else np.zeros(0)
 
-    @cached_property
+    @functools.cached_property
     def _gram(self) -> Matrix:
         return np.where(np.outer(self._alive, self._alive), self.space.gram, 0.0)
 
-    @cached_property
+    @functools.cached_property
     def _all(self) -> Matrix:
         return whitening(self._gram)
 

@@ -20,23 +20,26 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM
 from walop_jax.diagnosis.mixups import with_exposures, with_places
 from walop_jax.diagnosis.score import Score, Scorer, ScoreSpace, corrected_p
+from walop_jax.fit.refit import NEARLY
 from walop_jax.io.rounding import value_and_error
 from walop_jax.likelihood.likelihood import Likelihood
 
-_SHOWN = 2
-_STEP = 1e-4  # of the width: what is left out of the derivative is its square
+_ALIKE = 25.0  # in χ², within which conditions are told together
+STEP = 1e-4  # of the width: what is left out of the derivative is its square
 
 
 class Stated(NamedTuple):
     """A number that a set states: what it is, its unit, what to check, and the set with it changed.
 
     `width` is by how much it may be wrong at most; `value` is None where only a change of it has a meaning.
+    `seen_by_stars`: whether stars are observed under the same condition.
     """
 
     what: str
@@ -45,38 +48,67 @@ class Stated(NamedTuple):
     width: float
     changed: Callable[[float], CalibrationSet]
     value: float | None = None
+    seen_by_stars: bool = False
+
+
+class Scored(NamedTuple):
+    """A number, the score of changing it, and the derivative of the residuals (rows of the design).
+
+    `gain` is by how much the change lowers χ², by a linear step.
+    """
+
+    stated: Stated
+    score: Score
+    column: Float[np.ndarray, " _"]
+    gain: float
 
 
 def stated_conditions(design: Design) -> Iterator[str]:
-    """Sentences on the conditions that the residuals of a fit speak against, the clearest first."""
-    scored = condition_scores(design)
-    tried = len([score for _, score in scored if score.testable])
-    odd = [(one, score) for one, score in scored if corrected_p(score.log_p, max(tried, 1)) < ALARM]
-    for one, score in sorted(odd, key=lambda item: item[1].log_p)[:_SHOWN]:
-        size, sigma = float(score.amplitudes[0]), float(np.sqrt(score.covariance[0, 0]))
-        if one.value is None:
-            value, error = value_and_error(size, sigma)
-            is_so = f"changed by {value} ± {error} {one.unit}".rstrip()
-        else:
-            value, error = value_and_error(one.value + size, sigma)
-            is_so = f"{value} ± {error} {one.unit}, not {one.value:g}"
-        yield (
-            f"the residuals ask for {one.what} {is_so} (p = {corrected_p(score.log_p, tried):.2g}): {one.remedy}"
-        )
+    """A sentence on the conditions that the residuals of a fit speak against, the clearest first.
+
+    Of a fit that does not explain its data only where one condition alone would.
+    """
+    scored = [item for item in condition_scores(design) if item.score.testable]
+    found = [item for item in scored if corrected_p(item.score.log_p, len(scored)) < ALARM]
+    if not found:
+        return
+    found.sort(key=lambda item: item.score.log_p)
+    best, result = found[0].score.statistic, design.fit
+    left = float(np.sum(design.projector(design.residual) ** 2)) - found[0].gain
+    if not result.explains_data and left > NEARLY * design.projector.free:
+        return
+    likely = [item for item in found if item.score.statistic > best - _ALIKE]
+    said = "; or for ".join(_in_words(item.stated, item.score) for item in likely)
+    yield f"the residuals ask for {said} (p = {corrected_p(found[0].score.log_p, len(scored)):.2g})"
 
 
-def condition_scores(design: Design) -> list[tuple[Stated, Score]]:
+def _in_words(stated: Stated, score: Score) -> str:
+    size, sigma = float(score.amplitudes[0]), float(np.sqrt(score.covariance[0, 0]))
+    if stated.value is None:
+        value, error = value_and_error(size, sigma)
+        return f"{stated.what} changed by {value} ± {error} {stated.unit}".rstrip() + f" ({stated.remedy})"
+    value, error = value_and_error(stated.value + size, sigma)
+    return f"{stated.what} {value} ± {error} {stated.unit}, not {stated.value:g} ({stated.remedy})"
+
+
+def condition_scores(design: Design) -> list[Scored]:
     """The numbers that a set states, each with the score of changing it."""
     asked = list(_stated(design.fit.calset))
     if not asked:
         return []
     columns = design.stacked([_column(design, one)[:, None] for one in asked])
+    there = np.flatnonzero(np.any(columns != 0.0, axis=0))  # a number may be stated and not used
+    asked, columns = [asked[i] for i in there], columns[:, there]
+    given = columns.copy()
     names = [str(number) for number in range(len(asked))]
     widths = [np.array([one.width]) for one in asked]
     space = ScoreSpace.projected(design.projector, names, widths, columns)
     residual = design.projector(design.residual)
     table = Scorer(space, np.random.default_rng(), draws=0)(columns.T @ residual, float(residual @ residual))
-    return [(one, table[name]) for one, name in zip(asked, names, strict=True)]
+    return [
+        Scored(one, table[name], column, float(table[name].amplitudes[0] ** 2 * square))
+        for one, name, column, square in zip(asked, names, given.T, np.diag(space.gram), strict=True)
+    ]
 
 
 def _column(design: Design, one: Stated) -> np.ndarray:
@@ -84,7 +116,7 @@ def _column(design: Design, one: Stated) -> np.ndarray:
         likelihood = Likelihood.of(one.changed(step), design.fit.model)
         return likelihood.residuals(design.fit.values)[1][design.measured.used].reshape(-1)
 
-    step = _STEP * one.width
+    step = STEP * one.width
     return (residual(step) - residual(-step)) / (2.0 * step)
 
 
@@ -98,6 +130,7 @@ def _stated(calset: CalibrationSet) -> Iterator[Stated]:
             "check its curve, and what the polariser exposures were taken through",
             0.05,
             lambda step, name=name: _with_wavelength(calset, name, step),
+            seen_by_stars=True,
         )
     e = calset.exposures
     for kind in np.unique(e.kind):

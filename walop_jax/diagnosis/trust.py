@@ -67,7 +67,10 @@ def examined(result: FitResult, seed: int = 0) -> FitResult:
         return dataclasses.replace(result, examined=True)
     if not (result.explains_data or result.nearly_explains_data):
         refuse_mixups(result)
-        return dataclasses.replace(result, examined=True, doubts=tuple(_errors_too_small(result, seed)))
+        doubts = tuple(_errors_too_small(result, seed)) or tuple(
+            stated_conditions(Design.of(_looked_at(result)))
+        )
+        return dataclasses.replace(result, examined=True, doubts=doubts)
     design = Design.of(_looked_at(result))
     if result.errors_too_large and _hold_no_noise(design):
         return dataclasses.replace(result, examined=True, noiseless=True)

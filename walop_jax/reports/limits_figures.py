@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.colors import BoundaryNorm, LogNorm
 from matplotlib.figure import Figure
 
-from walop_jax.diagnosis.detection_limits import DetectionLimits
+from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.diagnosis.naming import SEPARATION
 from walop_jax.reports.style import FONT, QUIET, SMALL, empty_figure, field_axes, plain_numbers
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from walop_jax.diagnosis.detection_limits import DetectionLimits
+from walop_jax.diagnosis.limits_found import DetectionLimits
 
 
 def limits_in_words(found: DetectionLimits | None) -> dict[str, Any] | None:

@@ -16,7 +16,7 @@ from walop_jax.calibration.from_file import read_calibration
 from walop_jax.calibration.product import CalibrationProduct, read_product
 from walop_jax.calibration.summary import PRODUCT
 from walop_jax.data import CalibrationSet, read_calibration_set
-from walop_jax.diagnosis.detection_limits import DetectionLimits
+from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.io.errors import fail, nearest
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.posterior.from_run import locate

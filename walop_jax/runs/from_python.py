@@ -28,8 +28,9 @@ from walop_jax.data.settings import Settings
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.user_tables import InputTable, extended, in_memory, read_input_table
 from walop_jax.diagnosis import workflow
-from walop_jax.diagnosis.detection_limits import DetectionLimits, detection_limits
+from walop_jax.diagnosis.detection_limits import detection_limits
 from walop_jax.diagnosis.findings import Diagnosis
+from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit import refit as fitting
 from walop_jax.fit.model_builder import model_for

@@ -8,7 +8,8 @@ import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from walop_jax.diagnosis.detection_limits import DetectionLimits, detection_limits
+from walop_jax.diagnosis.detection_limits import detection_limits
+from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.refit import refit
 from walop_jax.io.folder import output_folder

@@ -1,0 +1,132 @@
+"""Numbers that a set states wrongly are found in its residuals, with their size; what is not found has a limit."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+from scipy import stats
+from small_run import SEED, SMALL, small_fit
+
+from walop_jax.calibration.matrix_slopes import matrix_slopes
+from walop_jax.data.records import CalibrationSet
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.diagnosis.change_of_stokes import change_of_qu, first_setting
+from walop_jax.diagnosis.condition_limits import condition_limits
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.limits_found import PROBABILITY
+from walop_jax.diagnosis.stated_conditions import condition_scores, stated_conditions
+from walop_jax.diagnosis.trust import examined
+from walop_jax.fit.refit import FitResult, refit
+from walop_jax.simulation.simulate import simulate
+
+
+def moved(calset: CalibrationSet, x: np.ndarray, y: np.ndarray) -> CalibrationSet:
+    block = dataclasses.replace(calset.intensities.block(0, len(calset.points)), x=x, y=y)
+    points = dataclasses.replace(calset.points, x=x, y=y)
+    return dataclasses.replace(calset, points=points, intensities=TableIntensities.dense(points, block))
+
+
+def displaced(calset: CalibrationSet) -> CalibrationSet:
+    return moved(calset, calset.points.x + 0.02, calset.points.y)
+
+
+def turned(calset: CalibrationSet) -> CalibrationSet:
+    x, y = calset.points.x, calset.points.y
+    return moved(calset, x - 0.002 * y, y + 0.002 * x)
+
+
+def shifted(calset: CalibrationSet) -> CalibrationSet:
+    curves = {
+        name: dataclasses.replace(c, wavelength=c.wavelength + 0.004) for name, c in calset.filters.items()
+    }
+    return dataclasses.replace(calset, filters=curves)
+
+
+def cooler(calset: CalibrationSet) -> CalibrationSet:
+    e = calset.exposures
+    teff = np.where(e.kind == "clp", 2800.0, e.teff)
+    return dataclasses.replace(calset, exposures=dataclasses.replace(e, teff=teff))
+
+
+@pytest.mark.parametrize(
+    ("change", "what", "size"),
+    [
+        (displaced, "X of all field points changed by", -0.02),
+        (turned, "the angle of the field changed by", -0.002),
+        (shifted, "the wavelengths of filter SDSS-r changed by", -0.004),
+        (cooler, "TEFF of exposures of kind clp", 5772.0),
+    ],
+)
+def test_a_number_that_is_wrong_is_told_with_its_size(change, what, size):
+    result = examined(refit(change(simulate(SMALL, seed=SEED).calset)))
+    assert not result.trusted
+    (told,) = [text for text in result.doubts if text.startswith(f"the residuals ask for {what}")]
+    value, error = re.search(r"([−\d.]+) ± ([\d.]+)", told).groups()  # type: ignore[union-attr]
+    # A step of a quarter is not a linear one.
+    assert float(value.replace("−", "-")) == pytest.approx(size, abs=4 * float(error) + 0.25 * abs(size))
+
+
+def test_the_score_is_what_a_fit_gains_that_knows_better():
+    """χ² of the set with X corrected, fitted, is smaller by the score, to the order of the step squared."""
+    calset = simulate(SMALL, seed=SEED).calset
+    wrong, right = refit(displaced(calset)), refit(calset)
+    score = next(
+        s for one, s, *_ in condition_scores(Design.of(wrong)) if one.what.startswith("X of all field points")
+    )
+    away = float(score.amplitudes[0]) - -0.02
+    expected = score.statistic - away**2 / score.covariance[0, 0]
+    assert wrong.chi2 - right.chi2 == pytest.approx(expected, rel=0.1)
+
+
+def test_noise_asks_for_no_other_conditions():
+    """Of ten sound sets none; 0.27 % are expected."""
+    for seed in range(50, 60):
+        assert not list(stated_conditions(Design.of(refit(simulate(SMALL, seed=seed).calset))))
+
+
+def test_at_its_limit_a_number_is_found_as_often_as_promised():
+    """Noise drawn into the fitted model, with the number wrong by its limit: 99 of 100 are found, at half of it few."""
+    design = Design.of(small_fit())
+    limits = {one.what: one for one in condition_limits(design)}
+    rng = np.random.default_rng(5)
+    rows = design.rows
+    noise = np.zeros((len(design.residual), 1500))
+    noise[:rows] = rng.standard_normal((rows, noise.shape[1]))
+    checked = 0
+    scored = condition_scores(design)
+    tried = sum(one.score.testable for one in scored)
+    least = 1.0 - (1.0 - 0.0027) ** (1.0 / tried)
+    for stated, score, column, _ in scored:
+        limit = limits[stated.what]
+        if not score.testable:
+            continue
+        left = design.projector(column)
+        along = left @ design.projector(noise) / np.linalg.norm(left)
+        for share, expected in ((1.0, PROBABILITY), (0.5, 0.5)):
+            size = share * limit.detected * np.linalg.norm(left)
+            found = np.mean((along + size) ** 2 > stats.chi2.isf(least, 1))
+            if share == 1.0:
+                assert found == pytest.approx(expected, abs=0.012)
+            else:
+                assert found < expected
+        checked += 1
+    assert checked >= 5
+
+
+def test_the_error_at_the_limit_is_that_of_a_fit_that_is_misled():
+    """q and u off by as much as the matrix of a fit to noiseless counts with X wrong by its limit, to a fifth."""
+    right = small_fit()
+    calset = right.calset
+    limit = next(one for one in condition_limits(Design.of(right)) if one.what.startswith("Y of all"))
+    misled = refit(moved(calset, calset.points.x, calset.points.y + limit.detected), right.model)
+
+    def matrix(result: FitResult) -> np.ndarray:
+        instrument = result.model.instrument(result.values)
+        setting = first_setting(calset, instrument)
+        return matrix_slopes(instrument, setting, calset.filters, calset.points.x, calset.points.y)[0]
+
+    error = change_of_qu(matrix(misled), matrix(right))
+    assert np.nanmax(error) == pytest.approx(limit.error_of_qu[1], rel=0.2)

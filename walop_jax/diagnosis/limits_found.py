@@ -1,0 +1,210 @@
+"""What `detection_limits` finds, as a table, as plain data and in words."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.diagnosis.examination import ALARM
+from walop_jax.io.display import Display, Displayed
+from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.rounding import two_digits, two_digits_range, with_minus_sign
+
+PROBABILITY = 0.99
+
+Vector = Float[np.ndarray, " _"]
+Matrix = Float[np.ndarray, "_ _"]
+
+
+@dataclasses.dataclass(frozen=True)
+class DetectionLimit:
+    """The amplitudes of one parameter of an effect that are detected and named, in its unit.
+
+    `detected` holds the smallest and the largest over the shapes that the effect may have, `named` the largest
+    (infinite where some rival does exactly the same). `taken_for` are the effects for which it may be taken when it is
+    just detected, nearest first. `error_of_qu` is the error that q and u of a star polarised by up to 5 % have from it
+    at the amplitude that is just detected: median and largest over the field; NaN where one exposure does not give
+    both.
+    """
+
+    effect: str
+    parameter: str
+    unit: str
+    detected: tuple[float, float]
+    named: float
+    taken_for: tuple[str, ...]
+    error_of_qu: tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class ConditionLimit:
+    """By how much a number that a set states may be wrong before its residuals show it.
+
+    `detected` in `unit`, infinite where no residual shows it; `error_of_qu` as that of `DetectionLimit`, at `size`:
+    what is just detected, or the most that is plausible where nothing is.
+    """
+
+    what: str
+    unit: str
+    detected: float
+    size: float
+    error_of_qu: tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class DetectionLimits(Displayed):
+    """What a set can show of every effect, and what the effects that it cannot show may do.
+
+    `separation` (row, column) is how far (σ) the effect of the column stays from that of the row when this is just
+    detected. `protection` is, by field point (`x`, `y`, degrees), the largest error of q and u that a single effect
+    can make without being detected, `caused_by` the effect. `untestable` effects leave no trace in these data.
+    `conditions` are what the set states of itself: its field, its filters, the colours of its light.
+    """
+
+    limits: tuple[DetectionLimit, ...]
+    effects: tuple[str, ...]
+    separation: Matrix
+    x: Vector
+    y: Vector
+    protection: Vector
+    caused_by: tuple[str, ...]
+    untestable: tuple[str, ...]
+    conditions: tuple[ConditionLimit, ...] = ()
+
+    def to_table(self) -> Any:
+        """A row for each effect and parameter, the largest error of q and u first, as an astropy table."""
+        rows, nothing = self.limits, ("", "")
+        return astropy_table(
+            {
+                "EFFECT": (np.array([r.effect for r in rows], "U32"), *nothing),
+                "PARAMETER": (np.array([r.parameter for r in rows], "U32"), *nothing),
+                "UNIT": (np.array([r.unit for r in rows], "U16"), "", "of DETECTED and NAMED"),
+                "DETECTED": (
+                    np.array([r.detected for r in rows]).reshape(-1, 2),
+                    "",
+                    "over the shapes: least, most",
+                ),
+                "NAMED": (np.array([r.named for r in rows], float), "", "named alone with 99 % probability"),
+                "QU_ERROR": (
+                    np.array([r.error_of_qu for r in rows]).reshape(-1, 2),
+                    "",
+                    "median, largest over field",
+                ),
+                "TAKEN_FOR": (np.array([", ".join(r.taken_for) for r in rows], "U128"), *nothing),
+            }
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {
+            "probability": PROBABILITY,
+            "alarm": ALARM,
+            "limits": [dataclasses.asdict(entry) for entry in self.limits],
+            "effects": list(self.effects),
+            "separation": self.separation.tolist(),
+            "protection": {
+                "x": self.x.tolist(),
+                "y": self.y.tolist(),
+                "error_of_qu": self.protection.tolist(),
+                "caused_by": list(self.caused_by),
+            },
+            "untestable": list(self.untestable),
+            "conditions": [dataclasses.asdict(entry) for entry in self.conditions],
+        }
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> DetectionLimits:
+        """What `document` describes. Raises KeyError or TypeError for one that it has not made."""
+        protection = document["protection"]
+        return cls(
+            limits=tuple(
+                DetectionLimit(
+                    effect=entry["effect"],
+                    parameter=entry["parameter"],
+                    unit=entry["unit"],
+                    detected=(float(entry["detected"][0]), float(entry["detected"][1])),
+                    named=np.inf if entry["named"] is None else float(entry["named"]),
+                    taken_for=tuple(entry["taken_for"]),
+                    error_of_qu=(_number(entry["error_of_qu"][0]), _number(entry["error_of_qu"][1])),
+                )
+                for entry in document["limits"]
+            ),
+            effects=tuple(document["effects"]),
+            separation=np.array(document["separation"], float).reshape(2 * (len(document["effects"]),)),
+            x=np.array(protection["x"], float),
+            y=np.array(protection["y"], float),
+            protection=np.array(protection["error_of_qu"], float),
+            caused_by=tuple(protection["caused_by"]),
+            untestable=tuple(document["untestable"]),
+            conditions=tuple(
+                ConditionLimit(
+                    entry["what"],
+                    entry["unit"],
+                    np.inf if entry["detected"] is None else float(entry["detected"]),
+                    float(entry["size"]),
+                    (_number(entry["error_of_qu"][0]), _number(entry["error_of_qu"][1])),
+                )
+                for entry in document.get("conditions", ())
+            ),
+        )
+
+    def display(self) -> Display:
+        """The protection level in a sentence, and a row for each effect and parameter."""
+        rows = tuple(
+            (
+                f"{entry.effect}.{entry.parameter}",
+                two_digits_range(*entry.detected),
+                two_digits(entry.named) if np.isfinite(entry.named) else "never",
+                entry.unit,
+                two_digits_range(*(100.0 * value for value in entry.error_of_qu)),
+                ", ".join(entry.taken_for),
+            )
+            for entry in self.limits
+        )
+        rows += tuple(
+            (
+                entry.what,
+                two_digits(entry.detected) if np.isfinite(entry.detected) else "never",
+                "",
+                entry.unit,
+                two_digits_range(*(100.0 * value for value in entry.error_of_qu)),
+                ""
+                if np.isfinite(entry.detected)
+                else f"error at {two_digits(entry.size)} {entry.unit}".rstrip(),
+            )
+            for entry in self.conditions
+        )
+        notes = (f"cannot be seen in these data: {', '.join(self.untestable)}",) if self.untestable else ()
+        return Display(
+            title="What these data can show, with 99 % probability",
+            facts=(("protection level", self.protection_in_words() or "one exposure does not give q and u"),),
+            head=("amplitude", ">detected", ">named", "unit", ">error of q, u (%)", "may be taken for"),
+            rows=rows,
+            notes=notes,
+        )
+
+    def protection_in_words(self) -> str:
+        """The largest error of q and u over the field that goes unnoticed; empty where none is known."""
+        worst = self.worst
+        if worst is None:
+            return ""
+        x, y = (with_minus_sign(f"{value:+.2f}°") for value in (self.x[worst], self.y[worst]))
+        return (
+            f"no single effect of the catalogue can make q or u of a star with p ≤ 5 % wrong by more than "
+            f"{two_digits(100 * self.protection[worst])} % without being detected "
+            f"({two_digits(100 * float(np.nanmedian(self.protection)))} % in the median of the field); "
+            f"the largest would be {self.caused_by[worst]} at ({x}, {y})"
+        )
+
+    @property
+    def worst(self) -> int | None:
+        """The field point where most can go unnoticed; None if one exposure nowhere gives q and u."""
+        return int(np.nanargmax(self.protection)) if np.isfinite(self.protection).any() else None
+
+
+def _number(value: float | None) -> float:
+    return np.nan if value is None else float(value)
