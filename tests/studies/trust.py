@@ -14,6 +14,7 @@ trusted or not, right or wrong.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import sys
 from collections import Counter
@@ -138,8 +139,15 @@ def judged(number: int) -> Judged:
             * rng.standard_normal(np.shape(getattr(neutral, name)))
             for name in effect.amplitudes()
         }
-        effects = (effect.of(context, **{n: v.tolist() for n, v in size.items()}),)
-    made = simulate(SMALL, seed=1000 + number, effects=effects)
+        size |= {name: np.abs(size[name]) for name in effect.one_sided}
+        made = None
+        while made is None:  # what would take more light away than there is is made smaller
+            effects = (effect.of(context, **{n: v.tolist() for n, v in size.items()}),)
+            with contextlib.suppress(ValueError):
+                made = simulate(SMALL, seed=1000 + number, effects=effects)
+            size = {name: value / 2.0 for name, value in size.items()}
+    else:
+        made = simulate(SMALL, seed=1000 + number)
     truth, data = made.truth, made.calset
     if kind == "mistake":
         chosen = mistakes(rng)
