@@ -69,9 +69,9 @@ def _matrices_with_covariance(
     return m[:, 0].reshape(len(m), -1), jnp.einsum("pin,nk,pjk->pij", flat, covariance, flat)
 
 
-_matrices = compiled(_matrices_with_covariance)
-_vectors = compiled(jax.vmap(_point_vectors, in_axes=(None, None, 0, 0)))
-_sky_vectors = compiled(jax.vmap(point_sky_vectors, in_axes=(None, None, 0, 0)))
+_matrices = compiled(_matrices_with_covariance, kept_as="matrices")
+_vectors = compiled(jax.vmap(_point_vectors, in_axes=(None, None, 0, 0)), kept_as="vectors")
+_sky_vectors = compiled(jax.vmap(point_sky_vectors, in_axes=(None, None, 0, 0)), kept_as="sky_vectors")
 
 
 def analysis_vectors(

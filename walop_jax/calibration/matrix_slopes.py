@@ -72,5 +72,7 @@ def _point_effect_slopes(
     return jnp.moveaxis(jax.vmap(lambda one: push(to_tree(one)))(jnp.eye(flat.size)), 0, -1)
 
 
-_all_slopes = compiled(jax.vmap(point_matrix, in_axes=(None, None, 0, 0)))
-_effect_slopes = compiled(jax.vmap(_point_effect_slopes, in_axes=(None, None, None, 0, 0)))
+_all_slopes = compiled(jax.vmap(point_matrix, in_axes=(None, None, 0, 0)), kept_as="slopes")
+_effect_slopes = compiled(
+    jax.vmap(_point_effect_slopes, in_axes=(None, None, None, 0, 0)), kept_as="effect_slopes"
+)

@@ -307,4 +307,4 @@ def _step(size: Any, here: _Information) -> Float[Array, " n"]:
 
 
 # Compiled as a whole: operation by operation they would cost a tenth of a second at the first step.
-_next_region, _next_step = compiled(_region), compiled(_step)
+_next_region, _next_step = compiled(_region, kept_as="region"), compiled(_step, kept_as="step")

@@ -73,6 +73,6 @@ def _effect_columns_over_shapes(
     )
 
 
-effect_changes = compiled(_effect_changes)
-effect_columns = compiled(_effect_columns)
-effect_columns_over_shapes = compiled(_effect_columns_over_shapes)
+effect_changes = compiled(_effect_changes, kept_as="effect_changes")
+effect_columns = compiled(_effect_columns, kept_as="effect_columns")
+effect_columns_over_shapes = compiled(_effect_columns_over_shapes, kept_as="effect_columns_over_shapes")

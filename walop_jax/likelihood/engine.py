@@ -335,18 +335,18 @@ def _incoming(instrument: Instrument, plan: Plan, data: PointData) -> Float[Arra
     )
 
 
-incoming = compiled(_incoming)
+incoming = compiled(_incoming, kept_as="incoming")
 
 
-normal_equations = compiled(_normal_equations)
-slope_equations = compiled(_slope_equations)
-dense_jacobian = compiled(_dense_jacobian)
-residuals = compiled(_residuals)
-prediction = compiled(_prediction)
+normal_equations = compiled(_normal_equations, kept_as="normal_equations")
+slope_equations = compiled(_slope_equations, kept_as="slope_equations")
+dense_jacobian = compiled(_dense_jacobian, kept_as="dense_jacobian")
+residuals = compiled(_residuals, kept_as="residuals")
+prediction = compiled(_prediction, kept_as="prediction")
 
 
 def _detected(instrument: Instrument, plan: Plan, counts: Float[Array, "p e k"]) -> Float[Array, "p e k"]:
     return jax.vmap(light.detected, (None, None, 0))(instrument, plan.exposures, counts)
 
 
-detected = compiled(_detected)
+detected = compiled(_detected, kept_as="detected")

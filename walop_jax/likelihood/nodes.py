@@ -33,7 +33,7 @@ Optics = tuple[Float[np.ndarray, "p b r 4"], Float[np.ndarray, "p o b r 4"]]
 
 TOLERANCE = 2e-10
 
-_solve = compiled(jax.vmap(rows_and_slopes, in_axes=(None, None, 0, 0)))
+_solve = compiled(jax.vmap(rows_and_slopes, in_axes=(None, None, 0, 0)), kept_as="nodes")
 
 
 def solved_optics(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> Optics:

@@ -13,27 +13,49 @@ from typing import Any, TypeVar
 
 import jax
 
+from walop_jax.model import kept_programs
+
 Result = TypeVar("Result")
 
 
-def compiled(function: Callable[..., Result], *, fuse: bool = False) -> Callable[..., Result]:
+def compiled(
+    function: Callable[..., Result], *, fuse: bool = False, kept_as: str = ""
+) -> Callable[..., Result]:
     """`jax.jit` with this package's options; the back end is looked up at the first call, not at import.
 
     A call with `once=True` compiles without optimisation: sooner ready, slower to run. `fuse` leaves the fusion
-    emitters on, for a function without derivatives of the plates.
+    emitters on, for a function without derivatives of the plates. `kept_as` is the name under which the traced program
+    is kept between processes (`kept_programs`), for a function that depends on nothing but its arguments.
     """
+
+    def options(once: bool) -> dict[str, Any] | None:
+        on_cpu = jax.default_backend() == "cpu"
+        chosen: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if on_cpu and not fuse else {}
+        if once:
+            chosen["xla_backend_optimization_level"] = 0
+        return chosen or None
 
     @functools.cache
     def jitted(once: bool) -> Any:
-        on_cpu = jax.default_backend() == "cpu"
-        options: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if on_cpu and not fuse else {}
-        if once:
-            options["xla_backend_optimization_level"] = 0
-        return jax.jit(function, compiler_options=options or None)
+        return jax.jit(function, compiler_options=options(once))
+
+    programs: dict[Any, Any] = {}
+
+    def kept(args: tuple[Any, ...], once: bool) -> Any:
+        """The program for arguments like these, from disk where it is there; None where none is kept."""
+        here = kept_programs.folder()
+        leaves, tree = jax.tree.flatten(args)
+        if here is None:
+            return None
+        at = tree, tuple(kept_programs.kind(leaf) for leaf in leaves), once
+        if at not in programs:
+            programs[at] = kept_programs.program(here, kept_as, function, args, options(once))
+        return programs[at]
 
     @functools.wraps(function)
     def call(*args: Any, once: bool = False) -> Result:
-        return jitted(once)(*args)
+        run = (kept(args, once) if kept_as else None) or jitted(once)
+        return run(*args)
 
     return call
 

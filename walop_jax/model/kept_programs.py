@@ -1,0 +1,153 @@
+"""Traced programs kept on disk beside JAX's cache of compiled code.
+
+JAX keeps compiled code between processes, under the text of the program; but to have the text Python must trace the
+optics with all their derivatives, which takes longer than most fits. So the text (StableHLO, `jax.export`) is kept as
+well, under what it depends on: the name of the function, the structure of its arguments with everything in it that is
+not a number (elements, effects, choices), shapes and types, the source of this package and the versions of what traces
+it. Whatever else an argument holds (a class of a user, a closure) is not kept, and neither is what cannot be exported.
+
+Programs are kept where JAX's cache folder has a folder `programs`, which the command line makes; like compiled code
+they are code: the folder must be the user's own. A file that is damaged is made again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import importlib.metadata
+import io
+import os
+import pickle
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax import export
+
+FOLDER = "programs"
+_DIGEST = hashlib.sha256().digest_size
+_PACKAGES = ("jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy")
+_KNOWN = ("walop_jax", "builtins", "types", "functools", "operator", "_operator", *_PACKAGES)
+_MOST = 500  # programs that are kept, those used last
+_STARTED = time.time()
+"""A source file that is younger is not the code that runs."""
+
+
+class _NotKept(Exception):
+    """A program that depends on more than its key could say."""
+
+
+def folder() -> Path | None:
+    """Where programs are kept; None where they are not."""
+    cache = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    here = Path(cache) / FOLDER if cache else None
+    return here if here is not None and here.is_dir() else None
+
+
+def program(
+    here: Path, name: str, function: Callable[..., Any], args: tuple[Any, ...], options: dict[str, Any] | None
+) -> Callable[..., Any] | None:
+    """What runs `function` on arguments like these: a kept program, or one that is kept from now on.
+
+    None where it cannot be kept.
+    """
+    leaves, tree = jax.tree.flatten(args)
+    try:
+        key = _key(name, tree.unflatten(range(tree.num_leaves)), [kind(leaf) for leaf in leaves])
+        found = _read(here / key)
+        if found is None:
+            found = _traced(function, tree, leaves)
+            _write(here / key, *found)
+    except Exception:  # whatever stands in the way: the call itself shows it, if it matters
+        return None
+    exported, structure = found
+    run, shape = jax.jit(exported.call, compiler_options=options), jax.tree.structure(structure)
+    return lambda *args: shape.unflatten(run(*jax.tree.leaves(args)))
+
+
+def kind(leaf: Any) -> tuple[Any, ...]:
+    """What a program depends on of a number."""
+    seen = jax.typeof(leaf)
+    return seen.shape, str(seen.dtype), bool(seen.weak_type)
+
+
+def _traced(function: Callable[..., Any], tree: Any, leaves: Sequence[Any]) -> tuple[export.Exported, Any]:
+    shapes: list[Any] = []
+
+    def flat(*leaves: Any) -> list[Any]:
+        found, shape = jax.tree.flatten(function(*tree.unflatten(leaves)))
+        shapes.append(shape)
+        return found
+
+    exported = export.export(jax.jit(flat))(*leaves)
+    return exported, shapes[-1].unflatten(range(shapes[-1].num_leaves))
+
+
+def _key(name: str, structure: Any, kinds: Sequence[Any]) -> str:
+    text = io.BytesIO()
+    _Exact(text).dump(structure)
+    flags = os.environ.get("XLA_FLAGS", "")
+    double = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    said = repr((name, kinds, jax.default_backend(), double, flags))
+    return hashlib.sha256(_source() + said.encode() + text.getvalue()).hexdigest()
+
+
+class _Exact(pickle.Pickler):
+    """Equal bytes for equal structures, of classes and functions of this package and its libraries alone."""
+
+    def __init__(self, file: io.BytesIO) -> None:
+        super().__init__(file, protocol=5)
+        self.fast = True  # without references to what came before: these go by identity
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, type) or callable(obj):
+            module = (getattr(obj, "__module__", None) or "").partition(".")[0]
+            if module not in _KNOWN:
+                raise _NotKept(module)
+        return NotImplemented
+
+
+@functools.cache
+def _source() -> bytes:
+    """Digest of the source of this package and the versions of what traces it. Raises `_NotKept`."""
+    root = Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256(sys.version.encode())
+    for package in _PACKAGES:
+        digest.update(f"{package} {importlib.metadata.version(package)}".encode())
+    for path in sorted(root.rglob("*.py")):
+        if path.stat().st_mtime > _STARTED:
+            raise _NotKept(str(path))
+        digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
+    return digest.digest()
+
+
+def _read(path: Path) -> tuple[export.Exported, Any] | None:
+    """A kept program and the structure of its results; None where there is none, or a damaged one."""
+    with contextlib.suppress(OSError):
+        content = path.read_bytes()
+        if hashlib.sha256(content[_DIGEST:]).digest() == content[:_DIGEST]:
+            program, structure = pickle.loads(content[_DIGEST:])
+            os.utime(path)
+            return export.deserialize(bytearray(program)), structure
+    return None
+
+
+def _write(path: Path, program: export.Exported, structure: Any) -> None:
+    """Keep a program, in one step, and no more than there is room for; quietly not where the disk does not take it."""
+    content = pickle.dumps((bytes(program.serialize()), structure), protocol=5)
+    with contextlib.suppress(OSError):
+        handle, name = tempfile.mkstemp(dir=path.parent)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(hashlib.sha256(content).digest() + content)
+            os.replace(name, path)
+        except OSError:
+            os.unlink(name)
+            raise
+        for old in sorted(path.parent.iterdir(), key=lambda path: path.stat().st_mtime)[:-_MOST]:
+            old.unlink()
