@@ -31,7 +31,8 @@ def _point_effect_changes(
 
     _, push = jax.linearize(counts, neutral)
     flat, to_tree = ravel_pytree(neutral)
-    change = jax.vmap(lambda one: push(to_tree(one)))(jnp.eye(flat.size)) * point.weight
+    some = min(limits.AMPLITUDES_AT_ONCE, max(flat.size, 1))
+    change = jax.lax.map(lambda one: push(to_tree(one)), jnp.eye(flat.size), batch_size=some) * point.weight
     _, along = jax.jvp(lambda f: real_counts(at_neutral, plan, unit, f), (flux,), (jnp.ones_like(flux),))
     return change, along * point.weight
 

@@ -111,6 +111,8 @@ FREE_EXPOSURES = 100
 """Exposures of a set up to which a free-form term may have a number for each camera in each of them."""
 PROJECTED_COLUMNS = 128
 """Columns that are projected together: a copy of them is small beside all."""
+AMPLITUDES_AT_ONCE = 32
+"""Amplitudes that are differentiated together: hundreds of them at all exposures of several points take gigabytes."""
 NULL_DRAWS = 10_000
 """Draws of all scores under the base model: probabilities down to 0.002 are counted, not extrapolated."""
 MANY_SHAPES = 8
