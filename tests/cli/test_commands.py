@@ -72,6 +72,7 @@ def test_refit_leaves_results_alone(call, calset_file, run):
     assert (run / "calibration.fits").read_bytes() == before
 
 
+@pytest.mark.long
 def test_a_misfit_is_written_but_not_trusted(call, spoilt_file, tmp_path):
     result = call("refit", spoilt_file, "-o", tmp_path / "run")
     assert result.exit_code == 3

@@ -73,6 +73,7 @@ def start(*arguments: object) -> subprocess.Popen:
     )
 
 
+@pytest.mark.long
 def test_the_calibration_carries_a_residual_map(finished):
     folder, summary = finished
     assert sorted(entry.name for entry in folder.iterdir()) == ["calibration.fits", "summary.json"]
@@ -95,6 +96,7 @@ def test_the_calibration_carries_a_residual_map(finished):
     assert summary["steps"] <= 3
 
 
+@pytest.mark.long
 def test_the_map_stays_with_the_calibration(finished, tmp_path):
     product = read_product(finished[0] / "calibration.fits")
     again = Calibration.from_product(product).to_product()

@@ -24,6 +24,7 @@ def run_folder(call, calset_file: Path, tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_sample_writes_everything_and_resumes(call, run_folder: Path, tmp_path: Path):
     run = tmp_path / "RUN"
     shutil.copytree(run_folder, run)

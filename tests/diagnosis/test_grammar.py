@@ -38,6 +38,7 @@ def said(laid):
     return {name: candidate.columns for name, candidate in made.items()}
 
 
+@pytest.mark.long
 def test_names_are_sentences(laid, said):
     template = laid.model.template
     context = effect_context(template, laid.calset.exposures)

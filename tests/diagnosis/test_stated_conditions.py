@@ -82,8 +82,8 @@ def test_the_score_is_what_a_fit_gains_that_knows_better():
 
 
 def test_noise_asks_for_no_other_conditions():
-    """Of ten sound sets none; 0.27 % are expected."""
-    for seed in range(50, 60):
+    """Of five sound sets none; 0.27 % are expected."""
+    for seed in range(50, 55):
         assert not list(stated_conditions(Design.of(refit(simulate(SMALL, seed=seed).calset))))
 
 

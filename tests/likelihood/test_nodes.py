@@ -78,6 +78,7 @@ def test_fit_ends_at_the_same_place(exact, quick):
     np.testing.assert_allclose(one.sigma, other.sigma, rtol=1e-6)
 
 
+@pytest.mark.long
 def test_optics_that_change_and_ghosts_go_through_the_same_tables():
     """Flexure and temperature make optics of each exposure, ghosts need the opposite point, detectors the flux."""
     effects = [

@@ -155,6 +155,7 @@ def test_two_cameras_are_simulated_and_fitted(two_beams):
     assert np.abs(pulls).max() < 4.5
 
 
+@pytest.mark.long
 def test_two_cameras_are_diagnosed(two_beams):
     """An encoder error is named; effects of elements that are not there are no candidates."""
     wobble = next(kind for kind in EFFECTS if kind.name == "clp_wobble")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pytest
 from astropy.table import Table
 from between_points import WORST, between_points
 from science.truth import TrueInstrument
@@ -137,6 +138,7 @@ def check_pairs(errors, table, limit):
     assert np.all(errors["0 and 45"][:, 0] < limit)
 
 
+@pytest.mark.long
 def test_two_exposures_on_a_cut(south_set, south_fit):
     """As good everywhere as one exposure is expected to be where it holds q and u."""
     south = south_set("b")
@@ -183,6 +185,7 @@ def observe(result, truth, electrons, tmp_path):
     return found, found.qu - sample
 
 
+@pytest.mark.long
 def test_apply_on_light_of_the_true_instrument(either_south_set, south_fit, tmp_path):
     """Errors as large as `apply` says they are.
 
@@ -206,6 +209,7 @@ def test_errors_of_bright_stars_on_set_b(whole_south_set, south_fit, tmp_path):
     assert np.abs(off).max() < 3e-4
 
 
+@pytest.mark.long
 def test_compare_writes_what_it_found(either_south_set, tmp_path):
     from typer.testing import CliRunner
 

@@ -18,6 +18,7 @@ def params(calibration):
     return builders.oracle_params(calibration.model.instrument(calibration.values))
 
 
+@pytest.mark.long
 def test_efficiencies_by_the_oracle(calibration, params):
     wavelength = np.array([0.56, 0.6, 0.62, 0.68])
     found = efficiencies(calibration, 0.25, 0.12, wavelength)

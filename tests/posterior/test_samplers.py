@@ -94,6 +94,7 @@ def test_a_sampler_of_ones_own_is_thirty_lines():
     assert lines <= 40
 
 
+@pytest.mark.long
 def test_a_sampler_of_ones_own_samples_the_surrogate(scene: Scene, tmp_path: Path):
     """The whole way, and against emcee on the same surrogate: means to 4 standard errors, widths to 10 %."""
     result = scene.result

@@ -52,6 +52,7 @@ def test_sets_without_what_the_scheme_needs_say_so(comparison):
     assert comparison.document()["joint_errors_from"] == "covariance"
 
 
+@pytest.mark.long
 def test_plates_and_the_strip(calibration_and_set):
     """Near the lower left corner the instrument is nearly ideal; in the strip only 22.5° helps."""
     calibration, _ = calibration_and_set
