@@ -59,15 +59,31 @@ def program(
     leaves, tree = jax.tree.flatten(args)
     try:
         key = _key(name, tree.unflatten(range(tree.num_leaves)), [kind(leaf) for leaf in leaves])
-        found = _read(here / key)
-        if found is None:
-            found = _traced(function, tree, leaves)
-            _write(here / key, *found)
+        kept = _read(here / key)
+        if kept is None:
+            kept = _traced(function, tree, leaves)
+            _write(here / key, kept)
+        exported, structure = export.deserialize(kept[0]), kept[1]
     except Exception:  # whatever stands in the way: the call itself shows it, if it matters
         return None
-    exported, structure = found
     run, shape = jax.jit(exported.call, compiler_options=options), jax.tree.structure(structure)
     return lambda *args: shape.unflatten(run(*jax.tree.leaves(args)))
+
+
+def answer(name: str, tree: Any, kinds: Sequence[Any], find: Callable[[], Any]) -> Any:
+    """What `find` finds, which depends on nothing but a structure and the kinds of its numbers: kept like a program."""
+    here = folder()
+    if here is None:
+        return find()
+    try:
+        path = here / _key(name, tree.unflatten(range(tree.num_leaves)), kinds)
+        kept = _read(path)
+    except Exception:  # as above
+        return find()
+    if kept is None:
+        kept = find()
+        _write(path, kept)
+    return kept
 
 
 def kind(leaf: Any) -> tuple[Any, ...]:
@@ -76,7 +92,8 @@ def kind(leaf: Any) -> tuple[Any, ...]:
     return seen.shape, str(seen.dtype), bool(seen.weak_type)
 
 
-def _traced(function: Callable[..., Any], tree: Any, leaves: Sequence[Any]) -> tuple[export.Exported, Any]:
+def _traced(function: Callable[..., Any], tree: Any, leaves: Sequence[Any]) -> tuple[bytearray, Any]:
+    """The program as bytes, and the structure of its results."""
     shapes: list[Any] = []
 
     def flat(*leaves: Any) -> list[Any]:
@@ -85,7 +102,7 @@ def _traced(function: Callable[..., Any], tree: Any, leaves: Sequence[Any]) -> t
         return found
 
     exported = export.export(jax.jit(flat))(*leaves)
-    return exported, shapes[-1].unflatten(range(shapes[-1].num_leaves))
+    return exported.serialize(), shapes[-1].unflatten(range(shapes[-1].num_leaves))
 
 
 def _key(name: str, structure: Any, kinds: Sequence[Any]) -> str:
@@ -126,20 +143,19 @@ def _source() -> bytes:
     return digest.digest()
 
 
-def _read(path: Path) -> tuple[export.Exported, Any] | None:
-    """A kept program and the structure of its results; None where there is none, or a damaged one."""
+def _read(path: Path) -> Any:
+    """What is kept under a name; None where there is nothing, or a damaged file."""
     with contextlib.suppress(OSError):
         content = path.read_bytes()
         if hashlib.sha256(content[_DIGEST:]).digest() == content[:_DIGEST]:
-            program, structure = pickle.loads(content[_DIGEST:])
             os.utime(path)
-            return export.deserialize(bytearray(program)), structure
+            return pickle.loads(content[_DIGEST:])
     return None
 
 
-def _write(path: Path, program: export.Exported, structure: Any) -> None:
-    """Keep a program, in one step, and no more than there is room for; quietly not where the disk does not take it."""
-    content = pickle.dumps((bytes(program.serialize()), structure), protocol=5)
+def _write(path: Path, found: Any) -> None:
+    """Keep something, in one step, and no more than there is room for; quietly not where the disk does not take it."""
+    content = pickle.dumps(found, protocol=5)
     with contextlib.suppress(OSError):
         handle, name = tempfile.mkstemp(dir=path.parent)
         try:
