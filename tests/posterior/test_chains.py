@@ -187,7 +187,6 @@ for number in range(there.count() + 1, 13):
 """
 
 
-@pytest.mark.long
 def test_a_killed_run_loses_one_block_and_ends_up_the_same(tmp_path: Path) -> None:
     def run(folder: str, kill_after: int | None = None) -> None:
         command = [sys.executable, "-c", SCRIPT, str(tmp_path / folder)]
