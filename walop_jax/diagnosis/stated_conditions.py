@@ -134,19 +134,20 @@ def _stated(calset: CalibrationSet) -> Iterator[Stated]:
         )
     e = calset.exposures
     for kind in np.unique(e.kind):
-        rows = (e.kind == kind) & np.isfinite(e.teff)
-        for value in np.unique(e.teff[rows]):
-            chosen = rows & (e.teff == value)
-            yield Stated(
-                f"TEFF of exposures of kind {kind}",
-                "K",
-                "check the colour temperature of their light",
-                float(value),
-                lambda step, chosen=chosen: with_exposures(
-                    lambda e: dataclasses.replace(e, teff=e.teff + np.where(chosen, step, 0.0))
-                )(calset),
-                float(value),
-            )
+        chosen = (e.kind == kind) & np.isfinite(e.teff)
+        if not chosen.any():
+            continue
+        typical = float(np.median(e.teff[chosen]))
+        yield Stated(
+            f"TEFF of exposures of kind {kind}",
+            "K",
+            "check the colour temperature of their light",
+            typical,
+            lambda step, chosen=chosen, typical=typical: with_exposures(
+                lambda e: dataclasses.replace(e, teff=e.teff * np.where(chosen, 1.0 + step / typical, 1.0))
+            )(calset),
+            typical if np.ptp(e.teff[chosen]) == 0.0 else None,
+        )
 
 
 def _of_field(calset: CalibrationSet) -> Iterator[Stated]:
