@@ -12,11 +12,11 @@ from small_run import SEED, SMALL, small_fit
 
 from walop_jax.calibration.matrix_slopes import matrix_slopes
 from walop_jax.data.records import CalibrationSet
-from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.change_of_stokes import change_of_qu, first_setting
 from walop_jax.diagnosis.condition_limits import condition_limits
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.limits_found import PROBABILITY
+from walop_jax.diagnosis.mixups import with_places
 from walop_jax.diagnosis.stated_conditions import condition_scores, stated_conditions
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.refit import FitResult, refit
@@ -24,9 +24,7 @@ from walop_jax.simulation.simulate import simulate
 
 
 def moved(calset: CalibrationSet, x: np.ndarray, y: np.ndarray) -> CalibrationSet:
-    block = dataclasses.replace(calset.intensities.block(0, len(calset.points)), x=x, y=y)
-    points = dataclasses.replace(calset.points, x=x, y=y)
-    return dataclasses.replace(calset, points=points, intensities=TableIntensities.dense(points, block))
+    return with_places(lambda *_: (x, y))(calset)
 
 
 def displaced(calset: CalibrationSet) -> CalibrationSet:

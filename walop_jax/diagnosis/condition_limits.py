@@ -14,8 +14,8 @@ from walop_jax.calibration.matrix_slopes import matrix_slopes
 from walop_jax.diagnosis.change_of_stokes import change_of_qu, first_setting
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM
-from walop_jax.diagnosis.limits_found import PROBABILITY, ConditionLimit
-from walop_jax.diagnosis.score import noncentrality
+from walop_jax.diagnosis.limits_found import PROBABILITY, ConditionLimit, over_field
+from walop_jax.diagnosis.score import local_p, noncentrality
 from walop_jax.diagnosis.stated_conditions import STEP, condition_scores
 
 
@@ -31,19 +31,18 @@ def condition_limits(design: Design) -> tuple[ConditionLimit, ...]:
     matrix, slopes = matrix_slopes(instrument, setting, calset.filters, x, y)
     taken_up = design.taken_up(np.column_stack([one.column for one in scored]))
     off = slopes @ (result.model.selection() @ taken_up)
-    least = noncentrality(-np.expm1(np.log1p(-ALARM) / tried), 1, PROBABILITY)
+    least = noncentrality(local_p(ALARM, tried), 1, PROBABILITY)
     found = []
     for number, (stated, score, *_) in enumerate(scored):
         slope = off[..., number]
         if stated.seen_by_stars:
             step = STEP * stated.width
-            changed, same = (stated.changed(h).filters for h in (step, -step))
-            ends = [matrix_slopes(instrument, setting, filters, x, y)[0] for filters in (changed, same)]
-            slope = slope - (ends[0] - ends[1]) / (2.0 * step)
+            above, below = (
+                matrix_slopes(instrument, setting, stated.changed(h).filters, x, y)[0] for h in (step, -step)
+            )
+            slope = slope - (above - below) / (2.0 * step)
         detected = float(np.sqrt(least * score.covariance[0, 0])) if score.testable else np.inf
         size = min(detected, stated.width)
-        error = change_of_qu(matrix, matrix + size * slope)
-        known = error[np.isfinite(error)]
-        worst = (float(np.median(known)), float(known.max())) if known.size else (np.nan, np.nan)
-        found.append(ConditionLimit(stated.what, stated.unit, detected, size, worst))
+        error = over_field(change_of_qu(matrix, matrix + size * slope)[None])
+        found.append(ConditionLimit(stated.what, stated.unit, detected, size, error))
     return tuple(found)

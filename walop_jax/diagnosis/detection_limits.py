@@ -35,7 +35,7 @@ from walop_jax.diagnosis.condition_limits import condition_limits
 from walop_jax.diagnosis.effect_columns import Probe, applicable
 from walop_jax.diagnosis.effect_columns import probes as all_probes
 from walop_jax.diagnosis.examination import ALARM, Examination, most_points
-from walop_jax.diagnosis.limits_found import PROBABILITY, DetectionLimit, DetectionLimits
+from walop_jax.diagnosis.limits_found import PROBABILITY, DetectionLimit, DetectionLimits, over_field
 from walop_jax.diagnosis.naming import SEPARATION
 from walop_jax.diagnosis.score import noncentrality, separations
 from walop_jax.diagnosis.trust import sampled
@@ -176,7 +176,7 @@ def _collected(
                 taken_for=tuple(
                     name for name in sorted(near, key=near.__getitem__) if near[name] < SEPARATION
                 ),
-                error_of_qu=_over_field(errors[members]),
+                error_of_qu=over_field(errors[members]),
             )
         )
     names = tuple(dict.fromkeys(effect.name for effect, _ in groups))
@@ -210,11 +210,3 @@ def _nearest(columns: Sequence[_Column]) -> dict[str, float]:
         for name, value in column.rivals.items():
             found[name] = min(value, found.get(name, np.inf))
     return found
-
-
-def _over_field(errors: Float[np.ndarray, "c p"]) -> tuple[float, float]:
-    """Median and largest over the field, of the worst shape."""
-    known = errors[np.isfinite(errors).any(axis=1)]
-    if not known.size:
-        return float("nan"), float("nan")
-    return float(np.nanmedian(known, axis=1).max()), float(np.nanmax(known))

@@ -208,3 +208,11 @@ class DetectionLimits(Displayed):
 
 def _number(value: float | None) -> float:
     return np.nan if value is None else float(value)
+
+
+def over_field(errors: Float[np.ndarray, "c p"]) -> tuple[float, float]:
+    """Median and largest over the field, of the worst shape."""
+    known = errors[np.isfinite(errors).any(axis=1)]
+    if not known.size:
+        return float("nan"), float("nan")
+    return float(np.nanmedian(known, axis=1).max()), float(np.nanmax(known))

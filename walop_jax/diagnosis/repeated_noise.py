@@ -22,6 +22,7 @@ from scipy import stats
 
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM
+from walop_jax.diagnosis.score import local_p
 
 LEAST = 0.25
 """Correlation below which a common pattern of the optics cannot be told from common noise."""
@@ -75,7 +76,7 @@ def pairs_alike(design: Design) -> list[Pair]:
     correlation = product[first, second] / np.sqrt(own * other)
     # The fit takes something of every exposure: the noise is measured by what it leaves.
     deviate = correlation * np.sqrt(expected[first, second])
-    limit = stats.norm.isf(-np.expm1(np.log1p(-ALARM) / len(first)))
+    limit = stats.norm.isf(local_p(ALARM, len(first)))
     excess = 0.5 * (own / free[first] + other / free[second]) / shared[first, second] - 1.0
     pattern = correlation / np.maximum(1.0 - correlation, 1e-12)
     found = (deviate > limit) & (correlation > LEAST) & (excess < 0.5 * pattern)

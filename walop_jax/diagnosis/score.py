@@ -125,6 +125,11 @@ def corrected_p(log_p: float, trials: float) -> float:
     return float(-np.expm1(trials * np.log1p(-min(p, 1.0 - 1e-16))))
 
 
+def local_p(p: float, trials: float) -> float:
+    """The local p of one of so many candidates that `corrected_p` makes `p`."""
+    return float(-np.expm1(np.log1p(-p) / max(trials, 1)))
+
+
 @functools.cache
 def noncentrality(p: float, rank: int, power: float) -> float:
     """λ for which the statistic of a candidate, χ'²_rank(λ), undercuts a local `p` with probability `power`."""

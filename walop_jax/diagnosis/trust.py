@@ -37,7 +37,7 @@ from walop_jax.diagnosis.examination import ALARM
 from walop_jax.diagnosis.freeform import strata
 from walop_jax.diagnosis.mixups import refuse_mixups
 from walop_jax.diagnosis.repeated_noise import repeated_noise
-from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable
+from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable, local_p
 from walop_jax.diagnosis.stated_conditions import stated_conditions
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points
@@ -205,7 +205,7 @@ def _groups_of(design: Design) -> Mapping[str, Bool[np.ndarray, "1 e k"]]:
 def _groups(design: Design) -> Iterator[str]:
     scores = group_scores(design)
     # A part of the data so small that chance moves it by a quarter is held to a far smaller p by the number of groups.
-    limit = -np.expm1(np.log1p(-ALARM) / max(len(scores), 1))
+    limit = local_p(ALARM, len(scores))
     odd = [s for s in scores if s.p_value < limit and not 1.0 / UNEVEN < s.ratio < UNEVEN]
     if odd:
         odd.sort(key=lambda s: -abs(np.log(max(s.ratio, 1e-12))))

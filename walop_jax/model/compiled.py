@@ -44,9 +44,9 @@ def compiled(
     def kept(args: tuple[Any, ...], once: bool) -> Any:
         """The program for arguments like these, from disk where it is there; None where none is kept."""
         here = kept_programs.folder()
-        leaves, tree = jax.tree.flatten(args)
         if here is None:
             return None
+        leaves, tree = jax.tree.flatten(args)
         at = tree, tuple(kept_programs.kind(leaf) for leaf in leaves), once
         if at not in programs:
             programs[at] = kept_programs.program(here, kept_as, function, args, options(once))
