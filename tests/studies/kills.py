@@ -1,6 +1,6 @@
 """Whole commands that are killed, run side by side, or find the disk full.
 
-    python tests/studies/kills.py [--commands refit sample diagnose] [--states 200] [--full 60] [--kills 0] [--races 0]
+    python tests/studies/kills.py [--commands refit sample …] [--states 200] [--full 60] [--kills 0] [--races 0]
 
 states   A command runs once, and at every operation on files (audit hooks of Python) what lies on the disk is copied.
          Each different state is what a kill at that moment leaves behind: its results must all be of the run before
@@ -40,21 +40,34 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 from runs.conftest import content  # noqa: E402
 from small_run import SEED, SMALL  # noqa: E402
 
-from walop_jax.data import DataError, write_calibration_set  # noqa: E402
+from walop_jax.data import DataError, Grid, write_calibration_set, write_frames  # noqa: E402
+from walop_jax.likelihood import limits  # noqa: E402
 from walop_jax.model.effects import effect_by_name  # noqa: E402
 from walop_jax.posterior import Options  # noqa: E402
-from walop_jax.runs import diagnose, refit, sample  # noqa: E402
+from walop_jax.runs import compress, diagnose, refit, sample  # noqa: E402
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn  # noqa: E402
 from walop_jax.simulation.simulate import simulate  # noqa: E402
 
 DEAD = 4194303  # no process has this number
-COMMANDS = ("refit", "sample", "diagnose")
-OUTPUTS = {"refit": refit.OUTPUTS, "sample": sample.OUTPUTS, "diagnose": diagnose.OUTPUTS}
+COMMANDS = ("refit", "sample", "diagnose", "compress")
+OUTPUTS = {
+    "refit": refit.OUTPUTS,
+    "sample": sample.OUTPUTS,
+    "diagnose": diagnose.OUTPUTS,
+    "compress": ("set.fits",),
+}
 EVENTS = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.truncate", "os.chmod")
 LINES = {
     "refit": ("refit", "{set}", "-o", "{run}", "--overwrite"),
     "sample": ("sample", "{run}", "--overwrite", "--interval", "50", "--maximum-steps", "100", "--moves", "laplace"),
     "diagnose": ("diagnose", "{set}", "-o", "{run}", "--overwrite", "--minutes", "0"),
+    "compress": ("compress", "{set}", "-o", "{run}/set.fits", "--overwrite"),
 }  # fmt: skip
+SIDE = int(limits.LARGE_ABOVE**0.5) + 8  # pixels: frames so large are fitted by sums over cells
+FRAMES = ObservingPlan(
+    grid=SIDE, standard_grid=1, standards=0, unpolarised=0, moon_patches=3,
+    polariser_angles=polariser_turn(11, full_turn=True),
+)  # fmt: skip
 
 
 class Study:
@@ -64,7 +77,10 @@ class Study:
         self.command, self.outputs = command, OUTPUTS[command]
         self.sets = [folder / f"set{n}.fits" for n in range(2)]
         for seed, path in enumerate(self.sets, SEED):
-            write_calibration_set(path, simulate(SMALL, seed=seed).calset)
+            if command == "compress":
+                write_frames(path, simulate(FRAMES, seed=seed).calset, raster(SIDE))
+            else:
+                write_calibration_set(path, simulate(SMALL, seed=seed).calset)
         self.prepare(folder)
 
     def prepare(self, folder: Path) -> None:
@@ -74,6 +90,8 @@ class Study:
         self.run = self.here / "RUN"
         if self.command == "sample":
             refit.refit_sets([self.sets[1]], self.run)
+        if self.command == "compress":
+            self.run.mkdir()
         self.do(0)
         self.before = folder / "before"
         shutil.copytree(self.here, self.before)
@@ -88,6 +106,8 @@ class Study:
         elif self.command == "sample":
             options = Options(interval=50, maximum_steps=100, moves="laplace", seed=number)
             sample.sample_run(self.run, options, overwrite=True)
+        elif self.command == "compress":
+            compress.compress_frames([self.sets[number]], self.run / "set.fits", overwrite=True)
         else:
             catalogue = (effect_by_name("clp_zero"),)
             diagnose.diagnose_sets([self.sets[number]], self.run, overwrite=True, catalogue=catalogue)
@@ -127,6 +147,12 @@ class Study:
                 return f"the next run gives another {name}"
         extra = set(listing(self.here)) ^ set(listing(self.after))
         return f"left behind or missing: {sorted(extra)}" if extra else ""
+
+
+def raster(side: int) -> Grid:
+    """The pixels of a square detector over the whole field."""
+    step = 2 * FRAMES.field / (side - 1)
+    return Grid(side, side, (1.0, 1.0), (-FRAMES.field, -FRAMES.field), ((step, 0.0), (0.0, step)))
 
 
 def same(one: Any, other: Any) -> bool:
