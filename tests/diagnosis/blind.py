@@ -141,13 +141,11 @@ class Blind:
         self.rng = np.random.default_rng(seed)
         wanted = list(probes(EFFECTS, effect_context(model.template, calset.exposures)))
         self.context, self.template = effect_context(model.template, calset.exposures), model.template
-        self.sentences = grammar.sentences(model.template, calset.exposures, len(calset.points))
-        examination = Examination(result, wanted, self.rng, None, self.sentences)
+        every = grammar.sentences(model.template, calset.exposures, len(calset.points))
+        examination = Examination(result, wanted, self.rng, None, every)
+        self.sentences = examination.sentences
         self.probes: list[Probe] = examination.probes
-        self.in_sentences = {
-            e.name: {t for g in e.probes(self.context) for t in g[0].in_sentences(model.template)}
-            for e in EFFECTS
-        }
+        self.in_sentences = {p.name: set(p.group[0].in_sentences(model.template)) for p in self.probes}
         self.effect_of = {p.name: p.effect.name for p in self.probes}
         self.space, self.nuisance = examination.space, examination.common_mode
         self.places = self.space.places()
@@ -314,7 +312,11 @@ class Blind:
             close = {r.effect.name for r in names if best.log_bayes - r.log_bayes < naming.EVEN_ODDS}
             possible = {r.probe.name for r in told if best.log_bayes - r.log_bayes < naming.IMPROBABLE}
             rivals = self._rivals(scorer.space, best, [p for p in left if p.name in self.effect_of])
-            classes.append(frozenset((close | possible | rivals) - {name, best.probe.name}))
+            short = [
+                p for p in left if p.name not in self.effect_of and len(p.widths) <= len(best.probe.widths)
+            ]
+            alike = self._rivals(scorer.space, best, short)
+            classes.append(frozenset((close | possible | rivals | alike) - {name, best.probe.name}))
             added.append(best.probe.name)
         assert table is not None
         missing = nameless or table.p_global < ALARM or len(said) > MOST_SENTENCES
@@ -350,10 +352,14 @@ class Blind:
     def _rivals(self, space: ScoreSpace, best: naming.Ranked, left: Sequence[Probe]) -> set[str]:
         at = space.places()[best.probe.name]
         change = space.gram[:, at] @ best.score.amplitudes
-        others = [p.name for p in left if p.effect is not best.effect]
+        others = [
+            p.name
+            for p in left
+            if p.effect is not best.effect or p.name not in (*self.effect_of, best.probe.name)
+        ]
         length = float(best.score.amplitudes @ space.gram[at, at] @ best.score.amplitudes)
         found = separations(space.subset(others), change[space.chosen(others)], length)
-        return {self.effect_of[name] for name, d in found.items() if d < naming.SEPARATION}
+        return {self.effect_of.get(name, name) for name, d in found.items() if d < naming.SEPARATION}
 
 
 def _most_probable(
@@ -415,7 +421,7 @@ def _outcome(verdict: Verdict, truth: set[str]) -> str:
 
 
 def summarise(judged: Sequence[tuple[Scene, Verdict]], known: dict[str, set[str]]) -> dict[str, object]:
-    """Rates over judged scenes, and the confusion of names; `known` are the sentences of the effects."""
+    """Rates over judged scenes, and the confusion of names; `known` are the sentences of the effects, by probe."""
     rates: dict[str, list[bool]] = collections.defaultdict(list)
     pulls: list[float] = []
     confusion: collections.Counter[tuple[str, str]] = collections.Counter()
@@ -435,7 +441,7 @@ def summarise(judged: Sequence[tuple[Scene, Verdict]], known: dict[str, set[str]
             rates[f"outside: {outcome}, SNR {ratio}, {scene.truth[0]}"].append(True)
             confusion[f"outside: {scene.truth[0]}, SNR {ratio}", f"{outcome}: {said}"] += 1
         elif scene.kind == "removed":
-            truth = known[scene.truth[0]]
+            truth = known[scene.probe]
             outcome = _outcome(verdict, truth)
             for one in OUTCOMES:
                 what = "removed" if truth else "removed, no sentence holds it"

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from scipy import stats
+from score_draws import alarms, noise_scores
 from small_run import SEED, SMALL, small_fit
 
 from walop_jax.calibration.matrix import matrices
@@ -20,7 +20,7 @@ from walop_jax.diagnosis.detection_limits import (
 )
 from walop_jax.diagnosis.effect_columns import probes
 from walop_jax.diagnosis.examination import ALARM, Examination
-from walop_jax.diagnosis.score import Scorer, ScoreSpace
+from walop_jax.diagnosis.score import Scorer
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.instrument import Instrument
@@ -65,11 +65,9 @@ def test_the_alarm_is_raised_with_the_stated_probability(found, examination):
     """Scores drawn with each effect at its limit: 99 % of the draws raise the alarm, at 90 % of it clearly fewer."""
     space = examination.scorer.space
     scorer = Scorer(space, np.random.default_rng(2))
-    value, vector = np.linalg.eigh(space.gram)
-    root = vector * np.sqrt(np.clip(value, 0.0, None))
     threshold = scorer.threshold(ALARM)
     places, draws = space.places(), 2000
-    noise = np.random.default_rng(3).standard_normal((draws, root.shape[1])) @ root.T
+    noise = noise_scores(space, np.random.default_rng(3), draws)
     checked = 0
     for probe in examination.probes:
         limit = next(
@@ -84,19 +82,6 @@ def test_the_alarm_is_raised_with_the_stated_probability(found, examination):
         assert below < 0.985, probe.name
         checked += 1
     assert checked >= 3
-
-
-def alarms(space: ScoreSpace, scores: np.ndarray, threshold: float) -> float:
-    """Share of draws (rows) in which some candidate undercuts the threshold, from its own definition."""
-    alive, smallest = space.alive(), np.zeros(len(scores))
-    for at in space.places().values():
-        chosen = np.arange(at.start, at.stop)[alive[at]]
-        if len(chosen):
-            inverse = np.linalg.pinv(space.gram[np.ix_(chosen, chosen)], rcond=1e-8, hermitian=True)
-            rank = np.linalg.matrix_rank(space.gram[np.ix_(chosen, chosen)], rtol=1e-8, hermitian=True)
-            statistic = np.einsum("di,ij,dj->d", scores[:, chosen], inverse, scores[:, chosen])
-            smallest = np.minimum(smallest, stats.chi2.logsf(statistic, rank))
-    return float(np.mean(smallest < threshold))
 
 
 @pytest.mark.parametrize(

@@ -132,11 +132,11 @@ def effect_candidates(
             start = stop
     for effect in several:
         mine = [probe for probe in wanted if probe.effect is effect]
-        result |= _swept(calset, model, values, mine)
+        result |= swept(calset, model, values, mine)
     return {probe.name: result[probe.name] for probe in wanted if probe.name in result}
 
 
-def _swept(
+def swept(
     calset: CalibrationSet, model: Model, values: Vector, mine: Sequence[Probe]
 ) -> dict[str, Candidate]:
     """Columns of one effect at many shapes: one compiled sweep for each of its discrete choices."""

@@ -83,15 +83,15 @@ class Examination:
             else earlier.named
         )
         self.probes = [probe for probe in inactive if probe.name in self.named]
-        self.sentences = tuple(sentences)
         self.said = (
             sentence_candidates(result.likelihood, result.model, result.values, sentences)
             if earlier is None or not self._is_like(earlier)
             else earlier.said
         )
+        self.sentences = tuple(probe for probe in sentences if probe.name in self.said)
         candidates = [
             *(self.named[probe.name] for probe in self.probes),
-            *(self.said[probe.name] for probe in sentences),
+            *(self.said[probe.name] for probe in self.sentences),
             *strata(self.design.measured),
         ]
         self.blocks = {candidate.name: candidate.block for candidate in candidates}
@@ -267,16 +267,31 @@ class Examination:
         return found if not found or self._left(found[0]) >= ALARM or self._left(name) < ALARM else []
 
     def nameless(self, trial: naming.Trial) -> tuple[str, ...]:
-        """Sentences that are not improbable beside what a trial says, by linear steps, the most probable first."""
+        """Sentences beside what a trial says, by linear steps: not improbable, or no longer and not to be told from it.
+
+        The most probable come first.
+        """
         own = set(trial.instance.sentences) if isinstance(trial.instance, Described) else set()
         items = (
             [r for r in self.told if own & set(grammar.said_by(r.probe))]
             if own
             else [r for r in self.ranked if r.effect is trial.effect]
         )
-        least = max(0.0, items[0].log_bayes - naming.IMPROBABLE) if items else np.inf
-        others = [r for r in self.told if r.log_bayes > least and not own & set(grammar.said_by(r.probe))]
+        if not items:
+            return ()
+        least, alike = max(0.0, items[0].log_bayes - naming.IMPROBABLE), self._alike(items[0])
+        others = [r for r in self.told if r.log_bayes > least or r.probe.name in alike]
+        others = [r for r in others if not own & set(grammar.said_by(r.probe))]
         return tuple(r.probe.name for r in others[:MOST_CLASSES])
+
+    def _alike(self, item: naming.Ranked) -> set[str]:
+        """Sentences no longer than a candidate that the data cannot tell from what it does."""
+        at, amplitudes = self.space.places()[item.probe.name], item.score.amplitudes
+        short = [probe.name for probe in self.sentences if len(probe.widths) <= len(amplitudes)]
+        change = self.space.gram[:, at] @ amplitudes
+        square = float(amplitudes @ self.space.gram[at, at] @ amplitudes)
+        apart = separations(self.space.subset(short), change[self.space.chosen(short)], square)
+        return {name for name, value in apart.items() if value < naming.SEPARATION * self.floor}
 
     def is_worth_telling(self, trial: naming.Trial) -> bool:
         """Whether a trial explains a good part of what is missing, and patterns without a name do not do so better."""

@@ -4,12 +4,13 @@ A *group* of sentences is one candidate of the score test: a linear retarder has
 sine, a gradient two directions. Groups are short: at most two things are free beside the kind.
 
     kinds         diattenuation, retardance (linear: q and u; circular: v), depolarisation; turn of the polariser; gain
-                  of a camera or of an arm; light of one camera in another, scattered light, afterglow; numbers of
-                  wave plates (axis, cut, thickness, thermal)
+                  of a camera or of an arm; light of one camera in another, of the opposite field point, scattered
+                  light, afterglow; numbers of wave plates (axis, cut, thickness, thermal); fringes of the air ahead of
+                  them; displacement of the field; shift of the band; polarisation of the Moon sky or of a star
     places        ahead of and behind every element that acts on polarisation, in the common train and in the arms; of
-                  the polariser; of a moving element
-    dependence    none; gradient, r², radial, diagonal, astigmatic over the field; wavelength; time, temperature;
-                  harmonics of the angles; one night; one exposure; the counts; the exposure before
+                  the polariser; of a moving element; of a source
+    dependence    none; gradient, r², radial, diagonal, astigmatic over the field; wavelength; time, temperature, hour
+                  angle; harmonics of the angles; one night; one exposure; the counts; the exposure before
 
 A sentence pays for the number of sentences that there are (`rank`), and for its length by its evidence.
 """
@@ -31,8 +32,16 @@ from walop_jax.diagnosis.effect_columns import FEWEST_POINTS, Probe
 from walop_jax.diagnosis.score import ScoreTable
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import Context, Described, Effect
-from walop_jax.model.effects.sentence import Sentence
-from walop_jax.model.elements import Element, Polariser, WavePlate
+from walop_jax.model.effects.etalon import GAPS, QUARTER
+from walop_jax.model.effects.sentence import (
+    BAND,
+    DISPLACEMENTS,
+    OPPOSITE,
+    POLARISATION,
+    SKY,
+    Sentence,
+)
+from walop_jax.model.elements import Element, Polariser, PupilMapping, WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.ray import CONDITIONS, Conditions, Ray
 
@@ -123,6 +132,18 @@ class _Asked:
             if len(angles) >= 2 * order + 1:
                 yield f"cos {order} {prefix}", f"sin {order} {prefix}"
 
+    def hour_angle(self) -> Iterator[str]:
+        """The hour angle, where it is not the time."""
+        e = self.exposures
+        if np.isfinite(e.ha).all() and np.ptp(e.ha) > 0:
+            apart = (
+                e.ha - np.polyval(np.polyfit(e.mjd - e.mjd.mean(), e.ha, 1), e.mjd - e.mjd.mean())
+                if self.hours
+                else e.ha
+            )
+            if np.ptp(apart) > 1e-3 * np.ptp(e.ha):
+                yield "hour angle"
+
     def slow(self) -> Iterator[str]:
         """Time and temperature."""
         if self.hours:
@@ -165,6 +186,8 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
                     yield _times(base, *pair)
     yield from _of_plates(instrument, exposures, asked)
     yield from _of_cameras(instrument, asked)
+    yield from _of_field_and_band(instrument, asked)
+    yield from _of_sources(instrument, asked)
     yield from _together(instrument, asked)
 
 
@@ -264,6 +287,43 @@ def _of_plates(instrument: Instrument, exposures: Exposures, asked: _Asked) -> I
             yield (Sentence("cut", "of", layer),)
     if warm and asked.kelvin:
         yield tuple(warm)
+    yield from _fringes([sentence.place for sentence in warm])
+
+
+def _fringes(plates: Sequence[str]) -> Iterator[tuple[Sentence, ...]]:
+    """Cosine and sine of the fringes of an air gap ahead of one plate, and of the same gap ahead of all of them."""
+    for gap in GAPS if plates else ():
+        pairs = [
+            tuple(Sentence("fringes", "of", place, (f"gap {g:g}",)) for g in (gap, gap + QUARTER))
+            for place in plates
+        ]
+        yield from pairs
+        if len(pairs) > 1:
+            yield tuple(itertools.chain(*pairs))
+
+
+def _of_field_and_band(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
+    yield (Sentence("shift", "of", BAND),)
+    for element in instrument.train() if asked.over_field else ():
+        if isinstance(element, PupilMapping):
+            moved = tuple(Sentence(kind, "ahead of", element.name) for kind in DISPLACEMENTS)
+            yield moved
+            for factor in (*asked.slow(), *asked.hour_angle()):
+                yield _times(moved, factor)
+
+
+def _of_sources(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
+    own = tuple(Sentence(kind, "of", SKY) for kind in POLARISATION)
+    moon = np.flatnonzero((asked.exposures.kind == "moon") & ~asked.exposures.clp_in)
+    if moon.size:
+        yield own[2:]
+    each = [_times(own[:2], f"exposure {number}") for number in moon]
+    if 0 < len(each) <= limits.FREE_EXPOSURES:
+        yield from each
+        if len(each) > 1:
+            yield tuple(itertools.chain(*each))
+    for name in instrument.standard.names:
+        yield tuple(Sentence(kind, "of", name.replace(" ", "_")) for kind in POLARISATION[:2])
 
 
 def _together(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
@@ -282,6 +342,8 @@ def _together(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence,
         yield tuple(Sentence("light", "in", name) for name in names)
     if asked.hours:
         yield tuple(Sentence("afterglow", "in", name) for name in names)
+    if asked.over_field:
+        yield tuple(Sentence("light", "in", name, origin=OPPOSITE) for name in names)
     pairs = zip(names, instrument.cameras.orthogonal, strict=True)
     yield tuple(Sentence("light", "in", name, origin=names[j]) for name, j in pairs if names[j] != name)
 
@@ -303,6 +365,7 @@ def _of_cameras(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentenc
                 yield _times(gain, f"exposure {number}")
         light = (Sentence("light", "in", camera),)
         if asked.over_field:
+            yield (Sentence("light", "in", camera, origin=OPPOSITE),)
             yield light
             for factor in asked.slow():
                 yield _times(light, factor)

@@ -7,20 +7,31 @@ its part.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.diagnosis.effect_columns import Probe
+from walop_jax.diagnosis.effect_columns import Probe, swept
 from walop_jax.diagnosis.freeform import numpy_sharing
 from walop_jax.diagnosis.grammar import said_by
 from walop_jax.diagnosis.score import Candidate
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Context, Described
-from walop_jax.model.effects.sentence import NUMBERS, REFERENCE_TEMPERATURE, Sentence
+from walop_jax.model.effects.etalon import LARGEST_GAP, Etalon
+from walop_jax.model.effects.sentence import (
+    DISPLACEMENTS,
+    NUMBERS,
+    OPPOSITE,
+    POLARISATION,
+    REFERENCE_TEMPERATURE,
+    Sentence,
+)
+from walop_jax.model.elements import AirGap
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import Model
 
 INNER = ("colour", "counts")  # factors that are not known for point and exposure alone
@@ -28,20 +39,48 @@ INNER = ("colour", "counts")  # factors that are not known for point and exposur
 
 def _core(sentence: Sentence) -> Sentence:
     """The sentence without what multiplies its derivative point by point and exposure by exposure."""
+    if sentence.kind in POLARISATION:
+        return sentence
     return dataclasses.replace(sentence, factors=tuple(f for f in sentence.factors if f in INNER))
 
 
 def _outer(sentence: Sentence) -> Sentence:
     """The factors that `_core` leaves out; thermal changes are taken at one kelvin."""
-    factors = tuple(f for f in sentence.factors if f not in INNER)
+    factors = tuple(f for f in sentence.factors if f not in _core(sentence).factors)
     return dataclasses.replace(
         sentence, factors=(*factors, "kelvin") if sentence.kind == "thermal" else factors
     )
 
 
 def _batch(sentence: Sentence) -> str:
-    """Sentences whose derivatives cost alike: of crystals, of crystals cut askew, of everything else."""
-    return sentence.kind if sentence.kind in ("cut", "thermal") else str(sentence.kind in NUMBERS)
+    """Sentences whose derivatives cost alike: of crystals, of crystals cut askew, ghosts, of everything else."""
+    if sentence.origin == OPPOSITE:
+        return OPPOSITE
+    plates = sentence.kind in (*NUMBERS, *DISPLACEMENTS, "shift")
+    return sentence.kind if sentence.kind in ("cut", "thermal") else str(plates)
+
+
+class _Fringes(Etalon):
+    """Fringes of the air ahead of one plate."""
+
+    where: str = eqx.field(static=True, default="")
+
+    def patch(self, instrument: Instrument) -> Instrument:
+        """Put the air gap there."""
+        gap = AirGap(self.contrast, self.gap, LARGEST_GAP)
+        return instrument.changed(self.where, air_gaps=lambda gaps: (*gaps, gap))
+
+
+def _fringes(
+    likelihood: Likelihood, model: Model, values: Float[np.ndarray, " n"], said: Iterable[Sentence]
+) -> dict[str, Float[np.ndarray, " d"]]:
+    """Columns of fringes by their texts, swept over the gaps of a plate; without those that the bands blur away."""
+    wanted = []
+    for sentence in said:
+        effect = _Fringes.of(Context(), gap=sentence.gap, where=sentence.place)
+        wanted.append(Probe(sentence.text, _Fringes, (effect,)))
+    found = swept(likelihood.calset, model, values, wanted) if wanted else {}
+    return {name: candidate.columns[:, 0] for name, candidate in found.items()}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,8 +106,10 @@ class _Laid:
 def sentence_candidates(
     likelihood: Likelihood, model: Model, values: Float[np.ndarray, " n"], probes: Sequence[Probe]
 ) -> dict[str, Candidate]:
-    """Columns of all groups at the fit `values` of a model, by their names."""
-    said = {text: Sentence.parsed(text) for probe in probes for text in said_by(probe)}
+    """Columns of the groups at the fit `values` of a model, by name; without fringes that the bands blur away."""
+    every = {text: Sentence.parsed(text) for probe in probes for text in said_by(probe)}
+    said = {text: sentence for text, sentence in every.items() if sentence.kind != "fringes"}
+    columns = _fringes(likelihood, model, values, (s for s in every.values() if s.kind == "fringes"))
     batches: dict[str, dict[str, None]] = {}
     for sentence in said.values():
         batches.setdefault(_batch(sentence), {})[_core(sentence).text] = None
@@ -93,7 +134,9 @@ def sentence_candidates(
         raw = change[_core(sentence).text] * np.broadcast_to(pattern, used.shape)[..., None]
         return -project_flux(raw, along, known, shared)[used].reshape(-1)
 
-    columns = {text: column(sentence) for text, sentence in said.items()}
+    columns |= {text: column(sentence) for text, sentence in said.items()}
     return {
-        p.name: Candidate(p.name, np.column_stack([columns[t] for t in said_by(p)]), p.widths) for p in probes
+        p.name: Candidate(p.name, np.column_stack([columns[t] for t in said_by(p)]), p.widths)
+        for p in probes
+        if all(text in columns for text in said_by(p))
     }

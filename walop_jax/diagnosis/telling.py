@@ -8,11 +8,12 @@ from walop_jax.diagnosis.findings import Told, Unexplained
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.rounding import value_and_error
 from walop_jax.model.effects import Described
-from walop_jax.model.effects.sentence import FIELD_FACTORS, Sentence
+from walop_jax.model.effects.sentence import FIELD_FACTORS, OPPOSITE, Sentence
 from walop_jax.model.parameters import field_declarations
 
 _OF_FACTOR = {
     "hours": "the same exposures in another order, or once more hours later",
+    "hour angle": "the same exposures at other hour angles, in another order",
     "kelvin": "the same exposures at another temperature",
     "colour": "narrow bands, or another filter",
     "counts": "the same exposures at another flux",
@@ -21,6 +22,10 @@ _OF_KIND = {
     "afterglow": "a dark exposure after a bright one",
     "light": "the same field points at another flux, and darks",
     "gain": "a lamp that does not change, seen by all cameras in turn",
+    "fringes": "narrow bands a nanometre apart, or the same band at another temperature",
+    "shift": "narrow bands beside the broad one",
+    "displacement": "the same angles at several hour angles, and a star at known pixels in each",
+    "polarisation": "the same patch or star again at another ROTATOR angle",
 }
 
 
@@ -82,8 +87,11 @@ def tested_by(sentence: Sentence) -> str:
             advice.append(
                 "more field points along that direction; dither: what is of the optics stays where it is"
             )
-    if sentence.kind in _OF_KIND:
-        advice.append(_OF_KIND[sentence.kind])
+    kind = sentence.kind.split()[0]
+    if sentence.origin == OPPOSITE:
+        advice.append("a star dithered over the field: its ghost moves the other way")
+    elif kind in _OF_KIND:
+        advice.append(_OF_KIND[kind])
     elif sentence.where == "ahead of" and "." not in sentence.place:
         advice.append("standards at several ROTATOR angles: light through the polariser does not have it")
     elif sentence.where == "of":

@@ -41,6 +41,7 @@ from walop_jax.fit.stand_in import in_field_points
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.thinning import thinned
+from walop_jax.model.compiled import forget_programs
 from walop_jax.model.effects import EFFECTS, Context, Described, Effect, FreeForm, OtherDescription
 from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import Model, effect_context
@@ -170,6 +171,7 @@ class _Diagnosing:
             self.added += 1
             self.said += added == Described.name
             self.tell(f"added {added}; scoring what is left")
+            forget_programs()  # those of a model with one effect more are others
             examination = self._examine(examination)
         return examination
 

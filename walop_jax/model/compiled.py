@@ -16,6 +16,7 @@ import jax
 from walop_jax.model import kept_programs
 
 Result = TypeVar("Result")
+_clearing: list[Callable[[], None]] = []  # what empties the store of each compiled function
 
 
 def compiled(
@@ -37,9 +38,12 @@ def compiled(
 
     @functools.cache
     def jitted(once: bool) -> Any:
-        return jax.jit(function, compiler_options=options(once))
+        made = jax.jit(function, compiler_options=options(once))
+        _clearing.append(made.clear_cache)  # pyright: ignore[reportAttributeAccessIssue]
+        return made
 
     programs: dict[Any, Any] = {}
+    _clearing.append(programs.clear)
 
     def kept(args: tuple[Any, ...], once: bool) -> Any:
         """The program for arguments like these, from disk where it is there; None where none is kept."""
@@ -58,6 +62,15 @@ def compiled(
         return run(*args)
 
     return call
+
+
+def forget_programs() -> None:
+    """Give back the memory of all programs made so far; what is called again is loaded or compiled anew.
+
+    For a work that goes on with another model, whose programs are others: those of a large set take a gigabyte.
+    """
+    for clear in _clearing:
+        clear()
 
 
 def require_double_precision() -> None:

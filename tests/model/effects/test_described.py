@@ -59,10 +59,39 @@ SAME = {
         [0.003] * 4,
         ("camera_leakage", {"share": 0.003}),
     ),
+    "flexure": (
+        ("displacement x ahead of pupil * hour angle", "displacement y ahead of pupil * hour angle"),
+        [0.002, -0.001],
+        ("flexure", {"rate_x": 0.002, "rate_y": -0.001}),
+    ),
+    "filter": (("shift of band",), [0.002], ("filter_shift", {"wavelength": 0.002})),
+    "fringes": (
+        tuple(f"fringes of {name} * gap 10" for name in ("chwp", "half1.plate", "half2.plate")),
+        [0.003] * 3,
+        ("etalon", {"contrast": 0.003, "gap": 10.0}),
+    ),
+    "ghost": (
+        tuple(f"light of opposite in {name}" for name in ("O1", "E1", "O2", "E2")),
+        [0.003] * 4,
+        ("ghost", {"share": 0.003}),
+    ),
+    "sky": (("polarisation of sky",), [-0.01], ("moon_multiple_scattering", {"p": 0.01})),
+    "patch": (
+        ("polarisation q of sky * exposure 4", "polarisation u of sky * exposure 5"),
+        [0.004, -0.003],
+        ("moon_patch", {"q": [0.004, 0.0], "u": [0.0, -0.003]}),
+    ),
+    "star": (
+        ("polarisation q of blue_star", "polarisation u of blue_star"),
+        [0.004, -0.003],
+        ("standard_outlier", {"source": "blue_star", "q": 0.004, "u": -0.003}),
+    ),
 }
 
 
-@pytest.mark.parametrize("case", quick(SAME, ["retarder", "analysers", "cut", "drift", "leakage"]))
+@pytest.mark.parametrize(
+    "case", quick(SAME, ["retarder", "analysers", "cut", "drift", "leakage", "ghost", "patch", "star"])
+)
 def test_the_same_by_another_name(case):
     """Exactly, but for what two shares of light copied back and forth make of each other."""
     sentences, values, (name, parameters) = SAME[case]
@@ -148,6 +177,11 @@ def test_what_cannot_be_carried_over_is_said():
         ("retardence q behind collimator", "no sentence"),
         ("turn of polariser * z", "unknown factor 'z'"),
         ("gain of O3", "nearest: O2"),
+        ("polarisation q of sky", "of which exposure"),
+        ("polarisation q of green_star", "nearest: polarisation q of"),
+        ("polarisation of blue_star", "unknown sentence 'polarisation of blue_star'"),
+        ("fringes of half1.plate", "of which gap"),
+        ("shift of filter", "unknown place of a shift 'filter'"),
     ],
 )
 def test_what_is_no_sentence_is_an_error(text, message):
@@ -160,6 +194,10 @@ def test_sentences_are_read_as_they_are_written():
         "light of E1 in O1",
         "retardance v behind half1.plate * hours * x",
         "gain of O1 * hours 3 to 20.5",
+        "light of opposite in O1",
+        "displacement x ahead of pupil * hour angle",
+        "fringes of half1.plate * gap 10.0775",
+        "polarisation q of sky * exposure 17",
     ):
         assert Sentence.parsed(text).text == text
     assert Sentence.parsed("turn of polariser * sin 2 CLP").in_words() == (

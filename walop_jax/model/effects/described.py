@@ -8,11 +8,17 @@ Equation    diattenuation, retardance    M → (1 + a f G) M, G the generator al
             depolarisation               q, u, v → (1 − a f) (q, u, v)
             turn                         of the polariser: its axis at a f more than its reading
             gain                         N → N (1 + a f), of one camera or of all cameras of an arm
-            light                        N_k → N_k + a f N_j, of another camera j; of no origin: a f × the median counts
+            light                        N_k → N_k + a f N_j, of another camera j; of no origin: a f × the median
+                                         counts; of opposite: N at (−X, −Y) in the same camera, extended sources only
+            fringes                      of a plate: D = a cos(4π gap cos ϑ / λ) along its axis, ahead of it (`etalon`)
+            displacement                 of what the optics behind see: X → X + a f, or Y
+            shift                        of the band: filters wider than 0.05 µm displaced by a (`filter_shift`)
+            polarisation                 of a star: Q + a, or U, in the equatorial frame; of the Moon sky: degree + a,
+                                         or, in one exposure, q + a, or u, in the frame of the instrument
             afterglow                    N_ke → N_ke + a f N_k of the exposure before
             axis, cut, thickness, thermal   a number of an element, and a added to it
-Symbols     a amplitude, by its unit in `share`, `retardance` (rad), `angle` (deg), `length` (µm) or `number`; f product
-            of the factors of the sentence
+Symbols     a amplitude, by its unit in `share`, `retardance` (rad), `angle` and `displacement` (deg), `length` and
+            `wavelength` (µm) or `number`; f product of the factors of the sentence
 Source      Lu & Chipman 1996, JOSA A 13, 1106: every Mueller matrix near the identity is a product of these
 Neutral     all zero
 Revealed by data that no name explains as well
@@ -33,15 +39,28 @@ from walop_jax.model.effects.base import Context, Effect, Scalar
 from walop_jax.model.effects.described_parts import (
     CrossTalk,
     DetectorTerm,
+    Displaced,
     Gain,
+    OppositeLight,
     Shade,
     Terms,
     TermsOfPolariser,
     Weights,
 )
-from walop_jax.model.effects.sentence import KINDS, NUMBERS, Sentence
-from walop_jax.model.elements import Element
+from walop_jax.model.effects.etalon import LARGEST_GAP
+from walop_jax.model.effects.sentence import (
+    BAND,
+    DISPLACEMENTS,
+    KINDS,
+    NUMBERS,
+    OPPOSITE,
+    POLARISATION,
+    SKY,
+    Sentence,
+)
+from walop_jax.model.elements import AirGap, Element
 from walop_jax.model.parameters import param, unknown_name
+from walop_jax.model.sources import Patches
 
 if TYPE_CHECKING:
     from walop_jax.model.instrument import Instrument
@@ -59,7 +78,9 @@ class Described(Effect):
     share: Float[Array, " a"] = _amplitude("", "share", 0.003)
     retardance: Float[Array, " b"] = _amplitude("rad", "retardance", 0.02)
     angle: Float[Array, " c"] = _amplitude("deg", "angle", 0.1)
+    displacement: Float[Array, " f"] = _amplitude("deg", "displacement in the field", 0.005)
     length: Float[Array, " d"] = _amplitude("um", "length", 5.0)
+    wavelength: Float[Array, " w"] = _amplitude("um", "displacement of the band", 0.003)
     number: Float[Array, " n"] = _amplitude("", "number", 1.0)
     sentences: tuple[str, ...] = eqx.field(static=True, default=(), converter=tuple)
 
@@ -129,8 +150,13 @@ class Described(Effect):
         """Insert what stands in the light path, place by place, and add the rest to the cameras."""
         at: dict[tuple[str, str], list[tuple[Sentence, Scalar]]] = {}
         for sentence, amplitude in self.terms():
-            if sentence.kind in NUMBERS:
+            if sentence.kind in (*NUMBERS, "shift", "fringes"):
                 instrument = _with_number(instrument, sentence, amplitude)
+            elif sentence.kind in POLARISATION:
+                instrument = _with_polarisation(instrument, sentence, amplitude)
+            elif sentence.kind in DISPLACEMENTS:
+                moved = Displaced(name="described", amplitude=amplitude, sentence=sentence)
+                instrument = instrument.inserted(moved, before=sentence.place)
             elif sentence.kind in ("gain", "light", "afterglow"):
                 instrument = _with_camera(instrument, sentence, amplitude)
             else:
@@ -144,7 +170,30 @@ def _with_number(instrument: Instrument, sentence: Sentence, amplitude: Scalar) 
     def added(value: Scalar | None) -> Scalar:
         return amplitude if value is None else value + amplitude
 
+    if sentence.kind == "shift":
+        if sentence.place != BAND:
+            raise unknown_name("place of a shift", sentence.place, (BAND,))
+        return instrument.changed("", filter_shift=added)
+    if sentence.kind == "fringes":
+        gap = AirGap(amplitude, jnp.asarray(sentence.gap), LARGEST_GAP)
+        return instrument.changed(sentence.place, air_gaps=lambda gaps: (*gaps, gap))
     return instrument.changed(sentence.place, **{sentence.kind: added})
+
+
+def _with_polarisation(instrument: Instrument, sentence: Sentence, amplitude: Scalar) -> Instrument:
+    axis = sentence.kind.removeprefix("polarisation").strip()
+    if sentence.place != SKY:
+        names = [name.replace(" ", "_") for name in instrument.standard.names]
+        if sentence.place not in names or not axis:
+            known = [f"polarisation q of {name}" for name in names]
+            raise unknown_name("sentence", f"{sentence.kind} of {sentence.place}", known)
+        row = names.index(sentence.place)
+        return instrument.changed("standard", **{axis: lambda value: value.at[row].add(amplitude)})
+    if not axis:
+        return instrument.changed("sky", missing=lambda p: -amplitude if p is None else p - amplitude)
+    own = {"q": jnp.zeros(1), "u": jnp.zeros(1)} | {axis: jnp.reshape(amplitude, 1)}
+    here = Patches(**own, positions=(sentence.number,))
+    return instrument.changed("sky", patches=lambda there: here if there is None else there.joined(here))
 
 
 def _with_terms(
@@ -177,6 +226,8 @@ def element_at(instrument: Instrument, place: str) -> Element:
 
 def _with_camera(instrument: Instrument, sentence: Sentence, amplitude: Scalar) -> Instrument:
     cameras = cameras_of(instrument, sentence.place)
+    if sentence.origin == OPPOSITE:
+        return instrument.with_part("ghosts", OppositeLight(amplitude, cameras))
     if sentence.kind == "light" and sentence.origin:
         target, origin = cameras.index(1.0), cameras_of(instrument, sentence.origin).index(1.0)
         return instrument.with_part("mixing", CrossTalk(amplitude, target, origin))

@@ -10,10 +10,10 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from walop_jax.model import mueller
-from walop_jax.model.cameras import DetectorPart, ExposurePart, Mixing, Transmission
+from walop_jax.model.cameras import DetectorPart, ExposurePart, GhostPart, Mixing, Transmission
 from walop_jax.model.effects.sentence import Sentence, factor
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.elements.polariser import Film
@@ -121,6 +121,21 @@ class Terms(Element):
         return matrix
 
 
+class Displaced(Element):
+    """A sentence about where the optics behind see the field point."""
+
+    amplitude: Scalar | float = 0.0
+    sentence: Sentence = eqx.field(static=True, default=Sentence("displacement x", "ahead of", "pupil"))
+
+    kind: ClassVar[str] = "described"
+
+    def ray(self, ray: Ray) -> Ray:
+        """The ray from the place that the optics behind see."""
+        by = self.amplitude * self.sentence.factor(_InTrain(ray, 0.0))
+        along = (ray.x + by, ray.y) if self.sentence.kind.endswith("x") else (ray.x, ray.y + by)
+        return ray.moved(*jnp.broadcast_arrays(*along))
+
+
 class TermsOfPolariser(Film):
     """Sentences about the polariser: what the light behind it meets when it is in."""
 
@@ -177,6 +192,17 @@ class CrossTalk(Mixing):
         """Mix the analysis vectors."""
         del x, y
         return vectors.at[:, self.target].add(self.amplitude * vectors[:, self.origin])
+
+
+class OppositeLight(GhostPart):
+    """A share of the light of the opposite field point, for extended sources."""
+
+    amplitude: Scalar
+    cameras: Weights = eqx.field(static=True)
+
+    def seen(self, extended: Bool[Array, " e"], opposite: Float[Array, "e k"]) -> Float[Array, "e k"]:
+        """What the opposite point adds."""
+        return jnp.where(extended[:, None], self.amplitude * opposite * jnp.asarray(self.cameras), 0.0)
 
 
 class DetectorTerm(DetectorPart):

@@ -76,6 +76,11 @@ class Etalon(Effect):
         shift = np.arctan2(sine, cosine) * REFERENCE_WAVELENGTH / (4.0 * np.pi)
         return dataclasses.replace(group[0], contrast=np.hypot(cosine, sine), gap=float(group[0].gap) + shift)
 
+    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+        """Fringes of every plate, of the gap itself and of one a quarter of a fringe wider."""
+        gaps = (float(self.gap), float(self.gap) + QUARTER)
+        return tuple(f"fringes of {p} * gap {gap:g}" for p in instrument.places(WavePlate) for gap in gaps)
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Put an air gap ahead of every wave plate."""
         gap = AirGap(self.contrast, self.gap, LARGEST_GAP)

@@ -38,6 +38,8 @@ class FilterShift(Effect):
         "narrow bands: they fix the thicknesses of the plates, which alone look the same"
     )
 
+    said: ClassVar[tuple[str, ...]] = ("shift of band",)
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Displace broad bands."""
         return instrument.changed(

@@ -38,6 +38,11 @@ class Flexure(Effect):
     revealed_by: ClassVar[str] = "polariser exposures at different hour angles"
     separated_by: ClassVar[str] = "the same polariser angles at several hour angles and at one temperature"
 
+    said: ClassVar[tuple[str, ...]] = (
+        "displacement x ahead of pupil * hour angle",
+        "displacement y ahead of pupil * hour angle",
+    )
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Displace what the mapping to the pupil sees."""
         shift = FieldShift(name=self.name, rate_x=self.rate_x, rate_y=self.rate_y)

@@ -55,6 +55,10 @@ class Ghost(Effect):
         "a star dithered over the field: its ghost moves the other way, flats and throughput do not"
     )
 
+    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+        """Light of the opposite field point in every camera."""
+        return tuple(f"light of opposite in {name}" for name in instrument.cameras.names)
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Add the opposite field point."""
         return instrument.with_part("ghosts", PointGhost(self.share))

@@ -36,6 +36,8 @@ class MoonMultipleScattering(Effect):
         "separate it from the telescope"
     )
 
+    said: ClassVar[tuple[str, ...]] = ("polarisation of sky",)
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Take polarisation away from the sky."""
         return instrument.changed("sky", missing=lambda p: self.p if p is None else p + self.p)

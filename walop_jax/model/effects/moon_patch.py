@@ -57,6 +57,11 @@ class MoonPatch(Effect):
         """None: the exposures belong to the data."""
         return {}
 
+    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+        """Two Stokes parameters for every patch."""
+        del instrument
+        return tuple(f"polarisation {axis} of sky * exposure {n}" for n in self.positions for axis in "qu")
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Add the values of each patch."""
         return instrument.changed("sky", patches=Patches(self.q, self.u, self.positions))

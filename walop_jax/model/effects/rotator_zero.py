@@ -36,6 +36,8 @@ class RotatorZero(Effect):
         "both turn sky against polariser"
     )
 
+    said: ClassVar[tuple[str, ...]] = ("retardance v ahead of polariser",)
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Add to ROTATOR."""
         return instrument.changed(

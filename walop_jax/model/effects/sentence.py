@@ -6,6 +6,7 @@
     turn of polariser * cos 2 CLP               an axis that is turned by an amount that depends on its own reading
     gain of O1 * hours                          a camera that grows more sensitive
     light of E1 in O1                           a share of the counts of one camera in another one
+    polarisation q of HD_14069                  a star that is not what the catalogue says
 
 Kinds of the optics have an axis: q, u (along X, along 45°), v (circular), radial, or diagonal (at 45° to radial; both
 grow with r²). They stand `ahead of` or `behind` an element, or are `of` one that moves, in the beam only when it is.
@@ -32,12 +33,20 @@ OPTICAL = (
 )
 NUMBERS = {"axis": "angle", "cut": "angle", "thickness": "length", "thermal": "number"}
 """Numbers of elements that a sentence can change, and the parameter of the effect that holds the change."""
+DISPLACEMENTS = ("displacement x", "displacement y")
+POLARISATION = ("polarisation q", "polarisation u", "polarisation")
+OPPOSITE = "opposite"  # the field point, as an origin of light
+SKY, BAND = "sky", "band"  # places that are no element
 KINDS: Mapping[str, str] = {
     **{kind: "retardance" if kind.startswith("retardance") else "share" for kind in OPTICAL},
     "turn": "angle",
     "gain": "share",
     "light": "share",
     "afterglow": "share",
+    "fringes": "share",
+    **dict.fromkeys(POLARISATION, "share"),
+    **dict.fromkeys(DISPLACEMENTS, "displacement"),
+    "shift": "wavelength",
     **NUMBERS,
 }
 """Kinds, and the parameter of the effect that holds the amplitude: it has the unit."""
@@ -50,6 +59,7 @@ _RING = re.compile(r"ring (\d+)")
 _HARMONIC = re.compile(r"(cos|sin) (\d+) (\w+)")
 _SPAN = re.compile(r"hours (-?[\d.]+) to (-?[\d.]+)")
 _EXPOSURE = re.compile(r"exposure (\d+)")
+_GAP = re.compile(r"gap ([\d.]+)")
 _SENTENCE = re.compile(
     rf"(?P<kind>{'|'.join(KINDS)})(?: of (?P<origin>\S+))? (?P<where>of|in|ahead of|behind) (?P<place>[^\s*]+)"
 )
@@ -63,6 +73,7 @@ _PLAIN: Mapping[str, Callable[[Any], Any]] = {
     "xy": lambda at: 2.0 * at.x * at.y / FIELD_SCALE**2,
     "colour": lambda at: at.wavelength / REFERENCE_WAVELENGTH - 1.0,
     "hours": lambda at: at.hours,
+    "hour angle": lambda at: at.hour_angle,
     "kelvin": lambda at: at.temperature - REFERENCE_TEMPERATURE,
     "counts": lambda at: 1.0,  # the detector multiplies with its own counts
 }
@@ -74,14 +85,18 @@ _WORDS = {
     "xy": "as 2XY over the field (amplitude at 0.3°)",
     "colour": "growing with wavelength (per unit of λ/0.62 µm − 1)",
     "hours": "growing with time (per hour since the first exposure)",
+    "hour angle": "growing with the hour angle (per hour)",
     "kelvin": "growing with temperature (per kelvin above 10 °C)",
     "counts": "growing with the counts (at 10⁶ electrons)",
 }
 
 
+_FACTORS = (*_PLAIN, "ring N", "cos N PREFIX", "sin N PREFIX", "hours A to B", "exposure N", "gap UM")
+
+
 @dataclasses.dataclass(frozen=True)
 class Sentence:
-    """A kind at a place with its factors; `origin` is the camera that light comes from, where it comes from one."""
+    """A kind at a place with its factors; `origin` is where light comes from: another camera, or `OPPOSITE`."""
 
     kind: str
     where: str
@@ -124,6 +139,26 @@ class Sentence:
         return dataclasses.replace(self, factors=(*self.factors, *factors))
 
     @property
+    def number(self) -> int:
+        """The exposure that it is about. Raises ValueError for a sentence about no single one."""
+        found = [one for f in self.factors if (one := _EXPOSURE.fullmatch(f))]
+        if len(found) != 1:
+            raise ValueError(
+                f"{self.text!r}: say of which exposure, as in '{self.kind} of {self.place} * exposure 7'"
+            )
+        return int(found[0][1])
+
+    @property
+    def gap(self) -> float:
+        """Thickness (µm) of the air whose fringes it is about. Raises ValueError for a sentence without one."""
+        found = [one for f in self.factors if (one := _GAP.fullmatch(f))]
+        if len(found) != 1:
+            raise ValueError(
+                f"{self.text!r}: say of which gap (µm), as in 'fringes of {self.place} * gap 10'"
+            )
+        return float(found[0][1])
+
+    @property
     def field_factors(self) -> tuple[str, ...]:
         """Factors that depend on the field point alone."""
         return tuple(f for f in self.factors if f in FIELD_FACTORS or _RING.fullmatch(f))
@@ -142,8 +177,9 @@ class Sentence:
 
     def in_words(self) -> str:
         """Kind, place and dependence, to be read by people."""
-        origin = f" of {self.origin}" if self.origin else ""
-        return ", ".join((f"{self.kind}{origin} {self.where} {self.place}", *map(_in_words, self.factors)))
+        origin = "the opposite field point" if self.origin == OPPOSITE else self.origin
+        of = f" of {origin}" if origin else ""
+        return ", ".join((f"{self.kind}{of} {self.where} {self.place}", *map(_in_words, self.factors)))
 
 
 def factor(name: str, at: Any) -> Any:
@@ -160,13 +196,14 @@ def factor(name: str, at: Any) -> Any:
         return jnp.where((at.hours >= float(span[1])) & (at.hours < float(span[2])), 1.0, 0.0)
     if one := _EXPOSURE.fullmatch(name):
         return jnp.where(at.number == int(one[1]), 1.0, 0.0)
-    raise unknown_name("factor", name, (*_PLAIN, "ring N", "cos N PREFIX", "sin N PREFIX", "hours A to B"))
+    if _GAP.fullmatch(name):
+        return 1.0  # the fringes themselves know it
+    raise unknown_name("factor", name, _FACTORS)
 
 
 def _check_factor(name: str) -> None:
-    if name not in _PLAIN and not any(p.fullmatch(name) for p in (_RING, _HARMONIC, _SPAN, _EXPOSURE)):
-        known = (*_PLAIN, "ring N", "cos N PREFIX", "sin N PREFIX", "hours A to B", "exposure N")
-        raise unknown_name("factor", name, known)
+    if name not in _PLAIN and not any(p.fullmatch(name) for p in (_RING, _HARMONIC, _SPAN, _EXPOSURE, _GAP)):
+        raise unknown_name("factor", name, _FACTORS)
 
 
 def _in_words(name: str) -> str:
@@ -180,4 +217,6 @@ def _in_words(name: str) -> str:
         )
     if span := _SPAN.fullmatch(name):
         return f"from {span[1]} to {span[2]} h after the first exposure"
+    if gap := _GAP.fullmatch(name):
+        return f"of {gap[1]} µm of air (amplitude at a maximum)"
     return f"in {name} of the list alone (the first is 0)"

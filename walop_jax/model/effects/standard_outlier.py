@@ -47,6 +47,11 @@ class StandardOutlier(Effect):
         """Any one of the stars."""
         return tuple((cls(source=name),) for name in context.sources)
 
+    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+        """The two Stokes parameters of the star."""
+        del instrument
+        return tuple(f"polarisation {axis} of {self.source.replace(' ', '_')}" for axis in "qu")
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Move the values of the star."""
         from walop_jax.model.instrument import NoSuchPlaceError

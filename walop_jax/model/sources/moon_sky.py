@@ -29,6 +29,11 @@ class Patches(Component):
     u: Float[Array, " m"]
     positions: tuple[int, ...] = eqx.field(static=True, default=())
 
+    def joined(self, other: Patches) -> Patches:
+        """These and others; what both have adds up."""
+        q, u = jnp.concatenate([self.q, other.q]), jnp.concatenate([self.u, other.u])
+        return Patches(q, u, (*self.positions, *other.positions))
+
 
 class MoonSky(Source):
     """Singly scattered moonlight, depolarised."""
