@@ -38,7 +38,8 @@ SEPARABLE = 5.0  # σ between the truth and its nearest rival above which a name
 CONFOUNDED = 2.0  # below which a class is asked for
 PLAUSIBLE = 5.0  # prior widths that a hidden amplitude may have
 DRAWS = 3000
-KEPT = 60  # scorers
+KEPT = 150  # scorers
+WITHOUT_ENTRY = 6  # scenes of one kind and ratio
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,6 +93,20 @@ OUTSIDE: dict[str, tuple[str, ...]] = {
     "six times the angle": ("gain of O1 * cos 6 CLP",),
     "hysteresis": (),
     "sky gradient": (),
+    "extinction that depends on the filter": (),
+    "slip of the polariser in one exposure": (),
+    "background that drifts": ("light in O1 * hours",),
+    "camera that warms up": ("gain of E2 * kelvin",),
+    "polariser that creeps": ("turn of polariser * hours",),
+    "beam that wanders over the film": ("turn of polariser * cos 1 CLP * x",),
+    "field that drifts": ("displacement x ahead of pupil * hours",),
+    "encoder three times per turn": ("turn of polariser * sin 3 CLP",),
+    "glue ahead of the Wollaston prism": ("retardance radial behind half1.plate",),
+    "elliptical film": ("diattenuation v of polariser * x",),
+    "dead columns": (),
+    "flat field of the Moon sky": (),
+    "focus that drifts": (),
+    "field point on a polarised star": (),
 }
 
 
@@ -105,6 +120,7 @@ def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[s
     through = e.clp_in
     angle = np.deg2rad(np.where(through, e.clp_angle, 0.0))
     sky = (e.kind == "moon") & ~through
+    narrow = np.where(e.filter == e.filter[0], 0.3, 1.0)
     drawn = np.random.default_rng(5).standard_normal(len(e))
     patterns = {
         "vignetting of half1": np.maximum(r - 0.22, 0.0)[:, None, None] * (camera[0] + camera[1]),
@@ -117,7 +133,15 @@ def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[s
         "ring": np.exp(-((r - 0.2) ** 2) / (2 * 0.03**2))[:, None, None] * camera[2],
         "step": np.where(points.x > 0.05, 1.0, 0.0)[:, None, None] * camera[1],
         "hysteresis": np.where(through & (np.arange(len(e)) % 2 == 0), 1.0, 0.0)[None, :, None] * camera[3],
-        "sky gradient": (points.x / 0.3)[:, None, None] * sky[None, :, None] * (camera[0] - camera[1]),
+        "sky gradient": x[:, None, None] * sky[None, :, None] * (camera[0] - camera[1]),
+        "dead columns": (np.abs(points.x - points.x[0]) < 1e-6)[:, None, None] * camera[1],
+        "flat field of the Moon sky": x[:, None, None] * sky[None, :, None] * camera[1],
+        "focus that drifts": (r**2 / 0.09 - 0.5)[:, None, None]
+        * (e.mjd - e.mjd.mean())[None, :, None]
+        * camera[0],
+        "field point on a polarised star": (np.arange(len(points)) == len(points) // 3)[:, None, None]
+        * sky[None, :, None]
+        * (camera[0] - camera[1]),
     }
     for name, pattern in patterns.items():
         yield name, measured.candidate(name, [np.broadcast_to(pattern, shape)]).columns[:, 0]
@@ -125,10 +149,12 @@ def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[s
         "encoder wrong in a run of exposures",
         said["turn of polariser"] * np.isin(exposure, np.arange(4, 9)),
     )
+    yield "slip of the polariser in one exposure", said["turn of polariser"] * (exposure == 6)
+    yield "extinction that depends on the filter", said["depolarisation of polariser"] * narrow[exposure]
     polish = (x**3 - 1.5 * x * y + 0.7 * y**2)[point]
     yield "retarder of half2 with a polishing error", said["retardance u behind half2.plate"] * polish
     for name, texts in OUTSIDE.items():
-        if texts and name not in patterns:
+        if texts and name not in patterns and set(texts) <= set(said):
             yield name, np.sum([said[text] for text in texts], axis=0)
 
 
@@ -379,16 +405,24 @@ def _most_probable(
 def study(
     blind: Blind, each: int, ratios: Sequence[float] = (6.0, 10.0, 30.0), nulls: int = 200
 ) -> dict[str, object]:
-    """Draw scenes, judge them, then open the truths: the numbers of the acceptance list."""
+    """Draw scenes, judge them, then open the truths: the numbers of the acceptance list.
+
+    Of effects that are not in the catalogue, and of shapes that never were, there are at most `WITHOUT_ENTRY` each.
+    """
+    without_entry = min(each, WITHOUT_ENTRY)
     scenes = [blind.null() for _ in range(nulls)]
     for name in blind.visible:
         drawn = [blind.hidden(name, ratio) for ratio in ratios for _ in range(each)]
-        drawn += [blind.hidden(name, ratio, (name,), "removed") for ratio in ratios[1:] for _ in range(each)]
+        drawn += [
+            blind.hidden(name, ratio, (name,), "removed")
+            for ratio in ratios[-2:]
+            for _ in range(without_entry)
+        ]
         scenes += [scene for scene in drawn if scene is not None]
     scenes += [blind.pair(10.0) for _ in range(each * len(blind.visible) // 2)]
     for shape in blind.outside:
         for ratio in (10.0, 30.0):
-            scenes += [blind.strange(shape, ratio) for _ in range(2 * each)]
+            scenes += [blind.strange(shape, ratio) for _ in range(without_entry)]
     order = blind.rng.permutation(len(scenes))
     sealed = _seal([scenes[i] for i in order])
     verdicts = [blind.judge(scenes[i]) for i in order]
@@ -499,7 +533,7 @@ def main(each: int, output: Path | None) -> None:
     from walop_jax.simulation.simulate import simulate
 
     simulated, _ = simulate(ObservingPlan(), seed=20260)
-    text = json.dumps(study(Blind(simulated), each), indent=1, ensure_ascii=False)
+    text = json.dumps(study(Blind(simulated), each, nulls=1000), indent=1, ensure_ascii=False)
     print(text)
     if output is not None:
         output.write_text(text, encoding="utf-8")

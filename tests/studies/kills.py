@@ -297,12 +297,17 @@ def kills(study: Study, count: int) -> tuple[int, list[str]]:
 
 def races(study: Study, count: int) -> tuple[int, list[str]]:
     """Number of races that one process lost with an error, and what was wrong."""
+    study.put(study.before)
+    alone = start(study)
+    alone.communicate()
     lost, wrong = 0, []
     for _ in range(count):
         study.put(study.before)
         both = [start(study), start(study)]
         told = [process.communicate()[1].decode() for process in both]
-        beaten = [text for process, text in zip(both, told, strict=True) if process.returncode not in (0, 3)]
+        beaten = [
+            text for process, text in zip(both, told, strict=True) if process.returncode != alone.returncode
+        ]
         lost += len(beaten)
         if len(beaten) == 2 or any("is being written by" not in text for text in beaten):
             wrong.append(f"both failed, or not with the name of the other: {told}")

@@ -117,7 +117,7 @@ def matrices_of(instrument: Instrument, calset: CalibrationSet) -> np.ndarray:
     """Rows q, u of the instrument matrix at all field points."""
     x, y, count = calset.points.x, calset.points.y, values_of(instrument).size
     setting = Settings.default(len(x), str(calset.exposures.filter[0]))
-    return matrices(instrument, setting, calset.filters, x, y, np.zeros((count, count)))[0]
+    return matrices(instrument, setting, calset.filters, x, y, np.zeros((count, count)))[0].reshape(-1, 2, 3)
 
 
 def sets(seed: int, most: int) -> Iterator[tuple[str, float]]:

@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from walop_jax.cli.common import (
-    CalsetFiles,
     EffectsOption,
     InstrumentOption,
     JsonOption,
@@ -26,7 +25,13 @@ STAGES = ("reading", "fit", "differentiating", "comparing", "finding what goes")
 
 
 def limits(
-    calsets: CalsetFiles,
+    calsets: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="CALSET...|PLAN.toml",
+            help="Calibration sets (FITS), fitted as one, or an observing plan in place of them.",
+        ),
+    ],
     output: Annotated[
         Path | None,
         typer.Option(
@@ -47,7 +52,8 @@ def limits(
     """Say at which size every effect of the catalogue would be detected and named in calibration sets.
 
     And what those may be that are too small: the largest error of q and u that a single effect can make over
-    the field without being detected. A set made by walop-jax simulate says what an observing plan is worth.
+    the field without being detected. An observing plan (TOML, see walop-jax docs recipes) says the same before any
+    data are taken.
     """
     switch_on_jax()
     from walop_jax.model.effects.own import catalogue_with

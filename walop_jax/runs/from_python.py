@@ -62,6 +62,8 @@ from walop_jax.science.epoch import Epoch
 from walop_jax.science.polarisation import ESTIMATORS
 from walop_jax.science.star_errors import Truth
 from walop_jax.science.stokes_columns import header, stokes_columns
+from walop_jax.simulation.observing_plan import ObservingPlan
+from walop_jax.simulation.simulate import simulate as simulated
 
 Path_ = str | os.PathLike[str]
 SetLike = CalibrationSet | Path_ | Sequence[Path_]
@@ -239,7 +241,7 @@ def epoch(old: CalibrationLike, new: SetLike) -> Epoch:
 
 
 def limits(
-    data: FitResult | SetLike,
+    data: FitResult | ObservingPlan | SetLike,
     model: ModelLike | None = None,
     *,
     catalogue: Sequence[type[Effect]] = EFFECTS,
@@ -248,8 +250,11 @@ def limits(
 ) -> DetectionLimits:
     """At which size effects would be detected and named, and what those may do that are not: `walop-jax limits`.
 
-    `data` is a fit, or what `refit` takes. `limits(...).to_table()` is a row for each effect and parameter.
+    `data` is a fit, an observing plan, or what `refit` takes. `limits(...).to_table()` is a row for each effect and
+    parameter.
     """
+    if isinstance(data, ObservingPlan):
+        data = simulated(data, instrument=data.design, noiseless=True).calset
     fit = data if isinstance(data, FitResult) else refit(data, model, catalogue=catalogue)
     return detection_limits(fit, catalogue=catalogue, seed=seed, progress=progress)
 

@@ -28,6 +28,17 @@ def sets_and_model(
     for a model that does not fit.
     """
     calset = read_calibration_set(*calsets)
+    return calset, model_of(calset, text, model, instrument, catalogue)
+
+
+def model_of(
+    calset: CalibrationSet,
+    text: str,
+    model: str | os.PathLike[str] | None,
+    instrument: str | os.PathLike[str] | None,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
+) -> Model:
+    """The model that `text` asks for, for a set that has been read; arguments and errors as above."""
     design = None if instrument is None else Instrument.read(instrument)
     with errors_naming(model):
-        return calset, model_for(calset, text, design, catalogue)
+        return model_for(calset, text, design, catalogue)

@@ -17,7 +17,9 @@ from walop_jax.io.text import json_text, read_text
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.reports.limits_figures import protection_figure, separation_figure
 from walop_jax.reports.run import LIMITS
-from walop_jax.runs.inputs import sets_and_model
+from walop_jax.runs.inputs import model_of, sets_and_model
+from walop_jax.simulation.plan_file import is_plan, read_plan
+from walop_jax.simulation.simulate import simulate
 
 PROTECTION, SEPARATION = "limits_protection.png", "limits_separation.png"
 OUTPUTS = (LIMITS, PROTECTION, SEPARATION)
@@ -45,7 +47,8 @@ def limits_of_sets(
 ) -> LimitsRun:
     """Fit calibration sets and find what they can show; write the folder `output`, if given.
 
-    A set that was simulated from a plan says what the plan is worth. `instrument` is a shipped one by name or a
+    In place of sets a single observing plan will do (`plan_file`): its counts without noise, the instrument as
+    designed. `instrument` is a shipped one by name or a
     description file (default: what the sets say), `model` a TOML file (default: the base model); `seed` (None: 0) is
     that of the Monte Carlo. `catalogue` are the effects that are looked at. `progress` is told what is being done.
 
@@ -57,7 +60,12 @@ def limits_of_sets(
     reserved = None if output is None else output_folder(output, OUTPUTS, overwrite=overwrite)
     with contextlib.nullcontext() if reserved is None else reserved as out:
         tell("reading")
-        calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
+        plan = read_plan(calsets[0], instrument) if len(calsets) == 1 and is_plan(calsets[0]) else None
+        if plan is not None:
+            calset = simulate(plan, instrument=plan.design, noiseless=True).calset
+            chosen = model_of(calset, text, model, instrument, catalogue)
+        else:
+            calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
         result = examined(refit(calset, chosen, progress=tell))
         if not result.converged:
             raise ValueError(f"the fit did not converge ({result.minimum.message})")
@@ -66,6 +74,7 @@ def limits_of_sets(
             "instrument": result.model.name,
             "effects_of_the_model": list(result.model.effect_names),
             "inputs": [{"path": str(entry.path), "sha256": entry.sha256} for entry in calset.inputs],
+            "plan": None if plan is None else plan.document(),
             "trusted": result.trusted,
             "seed": seed,
         }

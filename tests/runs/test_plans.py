@@ -1,0 +1,75 @@
+"""An observing plan as a file: what it says, what is wrong with it, and what it is worth before any data."""
+
+import numpy as np
+import pytest
+
+from walop_jax.diagnosis.detection_limits import detection_limits
+from walop_jax.fit.refit import refit
+from walop_jax.io.errors import DataError
+from walop_jax.model.effects import effect_by_name
+from walop_jax.runs.limits import limits_of_sets
+from walop_jax.simulation.plan_file import read_plan
+from walop_jax.simulation.simulate import simulate
+
+TEXT = """
+grid = 4
+standard_grid = 2
+polariser_angles = 8
+moon_patches = 3
+standards = 3
+electrons = 5e5
+"""
+CATALOGUE = tuple(effect_by_name(name) for name in ("clp_zero", "wollaston_axis", "pedestal"))
+
+
+@pytest.fixture
+def plan(tmp_path):
+    path = tmp_path / "plan.toml"
+    path.write_text(TEXT)
+    return path
+
+
+def test_a_plan_says_what_it_says(plan):
+    plan.write_text(TEXT + 'plate = ["out", 45]\nfull_turn = true\nfilters = ["SDSS-r", "NB-660"]\n')
+    found = read_plan(plan)
+    assert found.polariser_angles == (0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0)
+    assert found.plate == (None, 45)
+    assert found.filters == ("SDSS-r", "NB-660")
+    assert found.grid**2 + found.standard_grid**2 == len(found.points())
+    assert found.electrons == 5e5
+    plan.write_text("polariser_angles = [0, 30, 75]\n")
+    assert read_plan(plan, "WALOP-NORTH").polariser_angles == (0, 30, 75)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("grids = 4", "nearest: grid"),
+        ("grid = 0", "must be at least 1"),
+        ('filters = ["SDSS-x"]', "SDSS-x"),
+        ('instrument = "WALOP-EAST"', "WALOP-EAST"),
+        ("grid = [", "not valid TOML"),
+        ('grid = "four"', "plan.toml"),
+    ],
+)
+def test_what_is_wrong_is_said_with_the_file(plan, text, message):
+    plan.write_text(text)
+    with pytest.raises(DataError, match=message) as raised:
+        read_plan(plan)
+    assert "plan.toml" in str(raised.value)
+
+
+def test_limits_of_a_plan_are_those_of_data_taken_so(plan, tmp_path):
+    """Noise moves the fit, and with it the limits, by per cents."""
+    found = limits_of_sets([plan], tmp_path / "RUN", catalogue=CATALOGUE)
+    assert found.document["plan"]["grid"] == 4
+    assert found.document["trusted"] is True
+    assumed = read_plan(plan)
+    taken = simulate(assumed, seed=4, instrument=assumed.design)
+    data = detection_limits(refit(taken.calset), catalogue=CATALOGUE)
+    by_plan, by_data = (
+        {(e.effect, e.parameter): e.detected for e in one.limits} for one in (found.found, data)
+    )
+    assert by_plan.keys() == by_data.keys()
+    for key, (least, _) in by_plan.items():  # the most is that of a camera which hardly shows it
+        np.testing.assert_allclose(least, by_data[key][0], rtol=0.1)

@@ -1,0 +1,67 @@
+"""An observing plan as a TOML file: what `ObservingPlan` has, by the same names, and nothing else.
+
+instrument = "WALOP-SOUTH"        # or a description file, beside the plan
+grid = 12
+polariser_angles = 15             # so many over half a turn; or a list of angles (deg)
+full_turn = true                  # those over a full one
+plate = ["out", 0, 45]
+filters = ["SDSS-r", "NB-660"]
+electrons = 5e5
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+from walop_jax.io.errors import errors_naming, fail
+from walop_jax.io.text import parse_toml, read_text
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import unknown_name
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+
+OUT = "out"
+FULL_TURN = "full_turn"
+_KNOWN = (*(field.name for field in dataclasses.fields(ObservingPlan)), FULL_TURN)
+
+
+def is_plan(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is a plan by its name."""
+    return Path(path).suffix.lower() == ".toml"
+
+
+def read_plan(
+    path: str | os.PathLike[str], instrument: str | os.PathLike[str] | None = None
+) -> ObservingPlan:
+    """The plan of a file; `instrument`, a name or a description file, goes before its own.
+
+    Raises `DataError` for a file that cannot be read, for names and values that a plan does not have.
+    """
+    with errors_naming(path):
+        content = parse_toml(read_text(path))
+        for name in content:
+            if name not in _KNOWN:
+                raise unknown_name("entry of a plan", name, _KNOWN)
+        own = content.pop("instrument", None)
+        if instrument is None and own is not None:
+            beside = Path(path).parent / str(own)
+            instrument = beside if beside.suffix == ".toml" else str(own)
+        full_turn = content.pop(FULL_TURN, False)
+        if isinstance(angles := content.get("polariser_angles"), int):
+            content["polariser_angles"] = polariser_turn(angles, full_turn=bool(full_turn))
+        values = {name: _value(value) for name, value in content.items()}
+        try:
+            return ObservingPlan(None if instrument is None else Instrument.read(instrument), **values)
+        except TypeError as error:  # text where a number belongs
+            raise fail(str(error), advice="see `walop-jax docs recipes` for a plan") from None
+
+
+def _value(value: Any) -> Any:
+    """Lists as tuples, and None for what is out."""
+    if isinstance(value, list):
+        return tuple(_value(one) for one in value)
+    if isinstance(value, dict):
+        return {name: _value(one) for name, one in value.items()}
+    return None if value == OUT else value
