@@ -152,7 +152,12 @@ class _Diagnosing:
         )
 
     def _examine(self, earlier: Examination | None = None) -> Examination:
-        return Examination(self.fit, self.wanted, self.rng, earlier, self.sentences)
+        if earlier is None:
+            return Examination(self.fit, self.wanted, self.rng, None, self.sentences)
+        forget_programs()  # of models with fewer effects, and of columns: neither is asked for again
+        found = Examination(self.fit, self.wanted, self.rng, earlier, self.sentences)
+        forget_programs()
+        return found
 
     # ------------------------------------------------------------------------------------------------ a name
 
@@ -171,7 +176,6 @@ class _Diagnosing:
             self.added += 1
             self.said += added == Described.name
             self.tell(f"added {added}; scoring what is left")
-            forget_programs()  # those of a model with one effect more are others
             examination = self._examine(examination)
         return examination
 

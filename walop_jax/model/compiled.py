@@ -16,7 +16,7 @@ import jax
 from walop_jax.model import kept_programs
 
 Result = TypeVar("Result")
-_clearing: list[Callable[[], None]] = []  # what empties the store of each compiled function
+_kept: list[dict[Any, Any]] = []  # programs that came from disk, of every compiled function
 
 
 def compiled(
@@ -38,12 +38,10 @@ def compiled(
 
     @functools.cache
     def jitted(once: bool) -> Any:
-        made = jax.jit(function, compiler_options=options(once))
-        _clearing.append(made.clear_cache)  # pyright: ignore[reportAttributeAccessIssue]
-        return made
+        return jax.jit(function, compiler_options=options(once))
 
     programs: dict[Any, Any] = {}
-    _clearing.append(programs.clear)
+    _kept.append(programs)
 
     def kept(args: tuple[Any, ...], once: bool) -> Any:
         """The program for arguments like these, from disk where it is there; None where none is kept."""
@@ -65,12 +63,13 @@ def compiled(
 
 
 def forget_programs() -> None:
-    """Give back the memory of all programs made so far; what is called again is loaded or compiled anew.
+    """Give back the memory of all programs that JAX holds; what is called again is loaded or compiled anew.
 
-    For a work that goes on with another model, whose programs are others: those of a large set take a gigabyte.
+    For a work that goes on with another model, whose programs are others: those of a large set take gigabytes.
     """
-    for clear in _clearing:
-        clear()
+    for programs in _kept:
+        programs.clear()
+    jax.clear_caches()
 
 
 def require_double_precision() -> None:
