@@ -71,6 +71,12 @@ def unexplained(examination: Examination, patterns: tuple[tuple[str, float], ...
     return Unexplained(examination.table.p_global, text, patterns)
 
 
+def too_many_sentences(examination: Examination, said: int) -> Unexplained:
+    """What is said where so many sentences were needed that none of them is the thing itself."""
+    text = f"{said} sentences were needed: they say where it sits, no single one of them what it is"
+    return Unexplained(examination.table.p_global, text, ())
+
+
 def tested_by(sentence: Sentence) -> str:
     """The observation that would show whether a sentence is true."""
     advice = []

@@ -5,12 +5,10 @@ Carlo. 3. Below `ALARM`: refit the leaders and take the one with the highest evi
 the fit confirm, provided that it is significant after correction for all that was tried. A sentence (`grammar`) that
 is more probable than every name is added in their place, as effect `described`; what patterns without a name explain
 better is not added at all. Other descriptions of the instrument (`choices`) compete with the names where the model is
-badly off, or no name is found. 4. It joins the
-model, and everything is fitted again. 5. Repeat. 6. Drop names that are not needed beside the others. 7. What no name
-explains is added as a free-form term, labelled, and the verdict is `unexplained`; names that only stood in for it are
-dropped as well. 8. List for each name what the data cannot tell from it, and give the verdict.
-
-An effect is named whatever its size; `Step.negligible` says when it does not matter for q and u.
+badly off, or no name is found. 4. It joins the model, and everything is fitted again. 5. Repeat. 6. Drop names that are
+not needed beside the others. 7. What no name explains is added as a free-form term, labelled, and the verdict is
+`unexplained`; names that only stood in for it are dropped as well. 8. List for each name what the data cannot tell from
+it, and give the verdict. Names are given at any size; `Step.negligible` says when it does not matter for q and u.
 """
 
 from __future__ import annotations
@@ -34,7 +32,7 @@ from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexp
 from walop_jax.diagnosis.mixups import SURE, mixups_of, refusal
 from walop_jax.diagnosis.score import Score
 from walop_jax.diagnosis.step_summary import before_and_after, refitted_in_order
-from walop_jax.diagnosis.telling import told, unexplained
+from walop_jax.diagnosis.telling import told, too_many_sentences, unexplained
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.fit.stand_in import in_field_points
@@ -152,11 +150,11 @@ class _Diagnosing:
         )
 
     def _examine(self, earlier: Examination | None = None) -> Examination:
-        if earlier is None:
-            return Examination(self.fit, self.wanted, self.rng, None, self.sentences)
-        forget_programs()  # of models with fewer effects, and of columns: neither is asked for again
+        if earlier is not None:
+            forget_programs()  # of models with fewer effects: they are not asked for again
         found = Examination(self.fit, self.wanted, self.rng, earlier, self.sentences)
-        forget_programs()
+        if earlier is not None:
+            forget_programs()  # of columns
         return found
 
     # ------------------------------------------------------------------------------------------------ a name
@@ -310,8 +308,7 @@ class _Diagnosing:
         """Something that no sentence holds looks like several that are there."""
         if self.said <= MOST_SENTENCES:
             return None
-        text = f"{self.said} sentences were needed: they say where it sits, no single one of them what it is"
-        return Unexplained(examination.table.p_global, text, ())
+        return too_many_sentences(examination, self.said)
 
     def _with_free_form(
         self, examination: Examination, found: Unexplained, blocks: tuple[str, ...]

@@ -7,7 +7,10 @@ there. `tests/model/test_compiled.py` keeps an eye on it. What is called once or
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import functools
+import gc
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -70,6 +73,11 @@ def forget_programs() -> None:
     for programs in _kept:
         programs.clear()
     jax.clear_caches()
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError):  # where the C library is not that of GNU
+        ctypes.CDLL("libc.so.6").malloc_trim(
+            0
+        )  # which keeps what is given back in small pieces, gigabytes of it
 
 
 def require_double_precision() -> None:
