@@ -169,6 +169,8 @@ def test_what_cannot_be_carried_over_is_said():
     assert left_behind(scenes.instrument(said("afterglow in O1", values=[0.0]))) == ("described",)
     assert left_behind(scenes.instrument(said("retardance q behind collimator * r2", values=[0.0]))) == ()
     assert left_behind(scenes.instrument(said("gain of half1 * ring 4", values=[0.0]))) == ()
+    assert left_behind(scenes.instrument(said("light of opposite in O1", values=[0.0]))) == ("described",)
+    assert left_behind(scenes.instrument(said("displacement x ahead of pupil", values=[0.0]))) == ()
 
 
 @pytest.mark.parametrize(
