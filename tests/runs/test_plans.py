@@ -50,6 +50,7 @@ def test_a_plan_says_what_it_says(plan):
         ('instrument = "WALOP-EAST"', "WALOP-EAST"),
         ("grid = [", "not valid TOML"),
         ('grid = "four"', "plan.toml"),
+        ("polariser_angles = [0, 60]\nfull_turn = true", "of no use beside a list"),
     ],
 )
 def test_what_is_wrong_is_said_with_the_file(plan, text, message):

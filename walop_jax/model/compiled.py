@@ -74,10 +74,9 @@ def forget_programs() -> None:
         programs.clear()
     jax.clear_caches()
     gc.collect()
-    with contextlib.suppress(OSError, AttributeError):  # where the C library is not that of GNU
-        ctypes.CDLL("libc.so.6").malloc_trim(
-            0
-        )  # which keeps what is given back in small pieces, gigabytes of it
+    # What is given back in small pieces the GNU library keeps, gigabytes of it; others have no such function.
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 def require_double_precision() -> None:

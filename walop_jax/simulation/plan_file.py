@@ -23,6 +23,7 @@ from walop_jax.model.parameters import unknown_name
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 
 OUT = "out"
+_ANGLES = len(polariser_turn())
 FULL_TURN = "full_turn"
 _KNOWN = (*(field.name for field in dataclasses.fields(ObservingPlan)), FULL_TURN)
 
@@ -48,9 +49,13 @@ def read_plan(
         if instrument is None and own is not None:
             beside = Path(path).parent / str(own)
             instrument = beside if beside.suffix == ".toml" else str(own)
-        full_turn = content.pop(FULL_TURN, False)
-        if isinstance(angles := content.get("polariser_angles"), int):
+        full_turn, angles = content.pop(FULL_TURN, None), content.get("polariser_angles", _ANGLES)
+        if isinstance(angles, int):
             content["polariser_angles"] = polariser_turn(angles, full_turn=bool(full_turn))
+        elif full_turn is not None:
+            raise ValueError(
+                f"{FULL_TURN} is of no use beside a list of angles; give their number, or leave it out"
+            )
         values = {name: _value(value) for name, value in content.items()}
         try:
             return ObservingPlan(None if instrument is None else Instrument.read(instrument), **values)
