@@ -52,7 +52,7 @@ def limits(
     """Say at which size every effect of the catalogue would be detected and named in calibration sets.
 
     And what those may be that are too small: the largest error of q and u that a single effect can make over
-    the field without being detected. An observing plan (TOML, see walop-jax docs recipes) says the same before any
+    the field without being detected. An observing plan (TOML, see walop-jax docs files) says the same before any
     data are taken.
     """
     switch_on_jax()

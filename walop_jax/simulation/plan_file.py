@@ -60,7 +60,7 @@ def read_plan(
         try:
             return ObservingPlan(None if instrument is None else Instrument.read(instrument), **values)
         except TypeError as error:  # text where a number belongs
-            raise fail(str(error), advice="see `walop-jax docs recipes` for a plan") from None
+            raise fail(str(error), advice="see `walop-jax docs files` for a plan") from None
 
 
 def _value(value: Any) -> Any:
