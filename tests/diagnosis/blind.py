@@ -337,12 +337,14 @@ class Blind:
                 said.append(best.probe.name)
             close = {r.effect.name for r in names if best.log_bayes - r.log_bayes < naming.EVEN_ODDS}
             possible = {r.probe.name for r in told if best.log_bayes - r.log_bayes < naming.IMPROBABLE}
-            rivals = self._rivals(scorer.space, best, [p for p in left if p.name in self.effect_of])
-            short = [
-                p for p in left if p.name not in self.effect_of and len(p.widths) <= len(best.probe.widths)
+            others = [
+                p
+                for p in left
+                if (p.name in self.effect_of and p.effect is not best.effect)
+                or (p.name not in self.effect_of and len(p.widths) <= len(best.probe.widths))
             ]
-            alike = self._rivals(scorer.space, best, short)
-            classes.append(frozenset((close | possible | rivals | alike) - {name, best.probe.name}))
+            rivals = self._rivals(scorer.space, best, others)
+            classes.append(frozenset((close | possible | rivals) - {name, best.probe.name}))
             added.append(best.probe.name)
         assert table is not None
         missing = nameless or table.p_global < ALARM or len(said) > MOST_SENTENCES
@@ -378,11 +380,7 @@ class Blind:
     def _rivals(self, space: ScoreSpace, best: naming.Ranked, left: Sequence[Probe]) -> set[str]:
         at = space.places()[best.probe.name]
         change = space.gram[:, at] @ best.score.amplitudes
-        others = [
-            p.name
-            for p in left
-            if p.effect is not best.effect or p.name not in (*self.effect_of, best.probe.name)
-        ]
+        others = [p.name for p in left]
         length = float(best.score.amplitudes @ space.gram[at, at] @ best.score.amplitudes)
         found = separations(space.subset(others), change[space.chosen(others)], length)
         return {self.effect_of.get(name, name) for name, d in found.items() if d < naming.SEPARATION}

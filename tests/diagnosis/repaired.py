@@ -20,17 +20,15 @@ from pathlib import Path
 import jax
 import numpy as np
 from blind_sets import Hiding
+from matrix_at import matrix_at
 
-from walop_jax.calibration.matrix import matrices
 from walop_jax.data.records import CalibrationSet
-from walop_jax.data.settings import Settings
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import with_effects
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
@@ -46,9 +44,7 @@ def matrix_between(instrument: Instrument, calset: CalibrationSet) -> np.ndarray
     side = np.unique(calset.points.x)
     middle = 0.5 * (side[1:] + side[:-1])[:: max(1, len(side) // 8)]
     x, y = (grid.ravel() for grid in np.meshgrid(middle, middle))
-    count = values_of(instrument).size
-    setting = Settings.default(len(x), str(calset.exposures.filter[0]))
-    return matrices(instrument, setting, calset.filters, x, y, np.zeros((count, count)))[0]
+    return matrix_at(instrument, calset, x, y)
 
 
 def mean_square(result: FitResult, truth: np.ndarray) -> float:

@@ -7,12 +7,11 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from matrix_at import matrix_at
 from score_draws import alarms, noise_scores
 from small_run import SEED, SMALL, small_fit
 
-from walop_jax.calibration.matrix import matrices
 from walop_jax.calibration.records import SMALLEST_DETERMINANT
-from walop_jax.data.settings import Settings
 from walop_jax.diagnosis.detection_limits import (
     PROBABILITY,
     DetectionLimits,
@@ -24,7 +23,6 @@ from walop_jax.diagnosis.score import Scorer
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import effect_context
 from walop_jax.simulation.simulate import simulate
 
@@ -100,13 +98,9 @@ def test_what_goes_unnoticed_is_what_a_fit_without_the_effect_gets_wrong(fitted,
     truth = fitted.model.instrument(fitted.values)
     small = effect_by_name(name).of(context, **{entry.parameter: entry.detected[0]})
     pair = [simulate(SMALL, seed=SEED, instrument=truth, effects=e, noiseless=True) for e in ((), (small,))]
-    x, y = fitted.calset.points.x, fitted.calset.points.y
-    setting = Settings.default(len(x), str(fitted.calset.exposures.filter[0]))
 
     def matrix(instrument: Instrument) -> np.ndarray:
-        count = values_of(instrument).size
-        found, _ = matrices(instrument, setting, fitted.calset.filters, x, y, np.zeros((count, count)))
-        return found.reshape(-1, 2, 3)
+        return matrix_at(instrument, fitted.calset).reshape(-1, 2, 3)
 
     without, with_effect = (refit(one.calset) for one in pair)
     assumed, reference = (matrix(r.model.instrument(r.values)) for r in (with_effect, without))

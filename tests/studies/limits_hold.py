@@ -26,11 +26,10 @@ from scipy import stats
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
+from matrix_at import matrix_at  # noqa: E402
 from score_draws import alarms, noise_scores  # noqa: E402
 
-from walop_jax.calibration.matrix import matrices  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
-from walop_jax.data.settings import Settings  # noqa: E402
 from walop_jax.diagnosis import grammar  # noqa: E402
 from walop_jax.diagnosis.change_of_stokes import change_of_qu  # noqa: E402
 from walop_jax.diagnosis.detection_limits import (  # noqa: E402
@@ -45,7 +44,6 @@ from walop_jax.diagnosis.score import separations  # noqa: E402
 from walop_jax.fit.refit import FitResult, refit  # noqa: E402
 from walop_jax.model.effects import EFFECTS  # noqa: E402
 from walop_jax.model.instrument import Instrument  # noqa: E402
-from walop_jax.model.parameters import values_of  # noqa: E402
 from walop_jax.model.specification import effect_context  # noqa: E402
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn  # noqa: E402
 from walop_jax.simulation.simulate import simulate  # noqa: E402
@@ -115,9 +113,7 @@ def scores(result: FitResult, draws: int, named: int) -> dict[str, dict[str, flo
 
 def matrices_of(instrument: Instrument, calset: CalibrationSet) -> np.ndarray:
     """Rows q, u of the instrument matrix at all field points."""
-    x, y, count = calset.points.x, calset.points.y, values_of(instrument).size
-    setting = Settings.default(len(x), str(calset.exposures.filter[0]))
-    return matrices(instrument, setting, calset.filters, x, y, np.zeros((count, count)))[0].reshape(-1, 2, 3)
+    return matrix_at(instrument, calset).reshape(-1, 2, 3)
 
 
 def sets(seed: int, most: int) -> Iterator[tuple[str, float]]:

@@ -28,10 +28,10 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
+from matrix_at import matrix_at  # noqa: E402
 from small_run import SMALL  # noqa: E402
 
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
-from walop_jax.calibration.matrix import matrices  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
 from walop_jax.data.settings import Settings  # noqa: E402
 from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
@@ -39,8 +39,7 @@ from walop_jax.diagnosis.trust import examined  # noqa: E402
 from walop_jax.fit.refit import refit  # noqa: E402
 from walop_jax.io.errors import DataError  # noqa: E402
 from walop_jax.model.effects import EFFECTS  # noqa: E402
-from walop_jax.model.instrument import Instrument  # noqa: E402
-from walop_jax.model.parameters import field_declarations, values_of  # noqa: E402
+from walop_jax.model.parameters import field_declarations  # noqa: E402
 from walop_jax.model.specification import with_effects  # noqa: E402
 from walop_jax.simulation.simulate import simulate  # noqa: E402
 
@@ -115,14 +114,6 @@ def mistakes(rng: np.random.Generator) -> dict[str, Change]:
     }
 
 
-def matrix(instrument: Instrument, calset: CalibrationSet) -> np.ndarray:
-    """Elements of the instrument matrix at the field points."""
-    count, size = len(calset.points), values_of(instrument).size
-    setting = Settings.default(count, "SDSS-r")
-    nothing = np.zeros((size, size))
-    return matrices(instrument, setting, calset.filters, calset.points.x, calset.points.y, nothing)[0]
-
-
 def judged(number: int) -> Judged:
     """One sealed set, fitted and held against the truth."""
     rng = np.random.default_rng([number, 77])
@@ -162,7 +153,7 @@ def judged(number: int) -> Judged:
     x, y = made.calset.points.x, made.calset.points.y
     found, covariance = calibration.matrix(x, y, setting)
     error = np.sqrt(np.einsum("pii->pi", covariance))
-    off = float(np.sqrt(np.mean(((found - matrix(truth, made.calset)) / error) ** 2)))
+    off = float(np.sqrt(np.mean(((found - matrix_at(truth, made.calset)) / error) ** 2)))
     if not result.trusted or off <= WRONG:
         return Judged(kind, what, bool(result.trusted), off)
     right = refit(made.calset, with_effects(result.model, effects, SMALL.context()) if effects else None)

@@ -226,11 +226,8 @@ class Examination:
 
     def classes(self) -> Iterator[Alike]:
         """Which other effects could follow what each significant one would explain, by linear steps."""
-        places, gram = self.space.places(), self.space.gram
         for item in self.significant[:MOST_CLASSES]:
-            at, amplitudes = places[item.probe.name], item.score.amplitudes
-            square = float(amplitudes @ gram[at, at] @ amplitudes)
-            apart = self.nearest(separations(self.space, gram[:, at] @ amplitudes, square))
+            apart = self.nearest(self._apart(item))
             close = {name: value for name, value in apart.items() if value < naming.SEPARATION * self.floor}
             close.pop(item.effect.name, None)
             if close:
@@ -286,12 +283,15 @@ class Examination:
 
     def _alike(self, item: naming.Ranked) -> set[str]:
         """Sentences no longer than a candidate that the data cannot tell from what it does."""
+        apart, length = self._apart(item), len(item.score.amplitudes)
+        limit = naming.SEPARATION * self.floor
+        return {p.name for p in self.sentences if len(p.widths) <= length and apart[p.name] < limit}
+
+    def _apart(self, item: naming.Ranked) -> dict[str, float]:
+        """How far (σ) every candidate stays from what one does at its amplitudes, by linear steps."""
         at, amplitudes = self.space.places()[item.probe.name], item.score.amplitudes
-        short = [probe.name for probe in self.sentences if len(probe.widths) <= len(amplitudes)]
         change = self.space.gram[:, at] @ amplitudes
-        square = float(amplitudes @ self.space.gram[at, at] @ amplitudes)
-        apart = separations(self.space.subset(short), change[self.space.chosen(short)], square)
-        return {name for name, value in apart.items() if value < naming.SEPARATION * self.floor}
+        return separations(self.space, change, float(amplitudes @ change[at]))
 
     def is_worth_telling(self, trial: naming.Trial) -> bool:
         """Whether a trial explains a good part of what is missing, and patterns without a name do not do so better."""

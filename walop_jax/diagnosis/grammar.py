@@ -134,15 +134,13 @@ class _Asked:
 
     def hour_angle(self) -> Iterator[str]:
         """The hour angle, where it is not the time."""
-        e = self.exposures
-        if np.isfinite(e.ha).all() and np.ptp(e.ha) > 0:
-            apart = (
-                e.ha - np.polyval(np.polyfit(e.mjd - e.mjd.mean(), e.ha, 1), e.mjd - e.mjd.mean())
-                if self.hours
-                else e.ha
-            )
-            if np.ptp(apart) > 1e-3 * np.ptp(e.ha):
-                yield "hour angle"
+        angle, time = self.exposures.ha, self.exposures.mjd
+        left = angle - angle.mean()
+        if self.hours:
+            time = time - time.mean()
+            left = left - time * (time @ left) / (time @ time)
+        if np.isfinite(angle).all() and np.ptp(left) > 1e-3 * np.ptp(angle):
+            yield "hour angle"
 
     def slow(self) -> Iterator[str]:
         """Time and temperature."""

@@ -21,7 +21,7 @@ from walop_jax.diagnosis.score import Candidate
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Context, Described
-from walop_jax.model.effects.etalon import LARGEST_GAP, Etalon
+from walop_jax.model.effects.etalon import Etalon, with_air_gap
 from walop_jax.model.effects.sentence import (
     DISPLACEMENTS,
     NUMBERS,
@@ -30,7 +30,6 @@ from walop_jax.model.effects.sentence import (
     REFERENCE_TEMPERATURE,
     Sentence,
 )
-from walop_jax.model.elements import AirGap
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import Model
 
@@ -67,8 +66,7 @@ class _Fringes(Etalon):
 
     def patch(self, instrument: Instrument) -> Instrument:
         """Put the air gap there."""
-        gap = AirGap(self.contrast, self.gap, LARGEST_GAP)
-        return instrument.changed(self.where, air_gaps=lambda gaps: (*gaps, gap))
+        return with_air_gap(instrument, self.where, self.contrast, self.gap)
 
 
 def _fringes(

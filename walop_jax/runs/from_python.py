@@ -63,7 +63,7 @@ from walop_jax.science.polarisation import ESTIMATORS
 from walop_jax.science.star_errors import Truth
 from walop_jax.science.stokes_columns import header, stokes_columns
 from walop_jax.simulation.observing_plan import ObservingPlan
-from walop_jax.simulation.simulate import simulate as simulated
+from walop_jax.simulation.simulate import as_planned
 
 Path_ = str | os.PathLike[str]
 SetLike = CalibrationSet | Path_ | Sequence[Path_]
@@ -254,7 +254,7 @@ def limits(
     parameter.
     """
     if isinstance(data, ObservingPlan):
-        data = simulated(data, instrument=data.design, noiseless=True).calset
+        data = as_planned(data)
     fit = data if isinstance(data, FitResult) else refit(data, model, catalogue=catalogue)
     return detection_limits(fit, catalogue=catalogue, seed=seed, progress=progress)
 

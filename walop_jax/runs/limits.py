@@ -19,7 +19,7 @@ from walop_jax.reports.limits_figures import protection_figure, separation_figur
 from walop_jax.reports.run import LIMITS
 from walop_jax.runs.inputs import model_of, sets_and_model
 from walop_jax.simulation.plan_file import is_plan, read_plan
-from walop_jax.simulation.simulate import simulate
+from walop_jax.simulation.simulate import as_planned
 
 PROTECTION, SEPARATION = "limits_protection.png", "limits_separation.png"
 OUTPUTS = (LIMITS, PROTECTION, SEPARATION)
@@ -62,7 +62,7 @@ def limits_of_sets(
         tell("reading")
         plan = read_plan(calsets[0], instrument) if len(calsets) == 1 and is_plan(calsets[0]) else None
         if plan is not None:
-            calset = simulate(plan, instrument=plan.design, noiseless=True).calset
+            calset = as_planned(plan)
             chosen = model_of(calset, text, model, instrument, catalogue)
         else:
             calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)

@@ -144,6 +144,11 @@ def simulate(
     return Simulated(_with_counts(plan, blank, counts, sigma), truth)
 
 
+def as_planned(plan: ObservingPlan) -> CalibrationSet:
+    """What a plan is worth: the set that the instrument as designed would give, without noise."""
+    return simulate(plan, instrument=plan.design, noiseless=True).calset
+
+
 def _without_light(plan: ObservingPlan, sources: Sources, seed: int, cameras: int) -> CalibrationSet:
     """The calibration set that the plan announces, before any light: counts and errors are 1."""
     points = plan.points()

@@ -41,13 +41,13 @@ from walop_jax.model.effects.described_parts import (
     DetectorTerm,
     Displaced,
     Gain,
-    OppositeLight,
     Shade,
     Terms,
     TermsOfPolariser,
     Weights,
 )
-from walop_jax.model.effects.etalon import LARGEST_GAP
+from walop_jax.model.effects.etalon import with_air_gap
+from walop_jax.model.effects.ghost import PointGhost
 from walop_jax.model.effects.sentence import (
     BAND,
     DISPLACEMENTS,
@@ -58,7 +58,7 @@ from walop_jax.model.effects.sentence import (
     SKY,
     Sentence,
 )
-from walop_jax.model.elements import AirGap, Element
+from walop_jax.model.elements import Element
 from walop_jax.model.parameters import param, unknown_name
 from walop_jax.model.sources import Patches
 
@@ -150,8 +150,11 @@ class Described(Effect):
         """Insert what stands in the light path, place by place, and add the rest to the cameras."""
         at: dict[tuple[str, str], list[tuple[Sentence, Scalar]]] = {}
         for sentence, amplitude in self.terms():
-            if sentence.kind in (*NUMBERS, "shift", "fringes"):
+            if sentence.kind in (*NUMBERS, "shift"):
                 instrument = _with_number(instrument, sentence, amplitude)
+            elif sentence.kind == "fringes":
+                gap = jnp.asarray(sentence.gap)
+                instrument = with_air_gap(instrument, sentence.place, amplitude, gap)
             elif sentence.kind in POLARISATION:
                 instrument = _with_polarisation(instrument, sentence, amplitude)
             elif sentence.kind in DISPLACEMENTS:
@@ -174,9 +177,6 @@ def _with_number(instrument: Instrument, sentence: Sentence, amplitude: Scalar) 
         if sentence.place != BAND:
             raise unknown_name("place of a shift", sentence.place, (BAND,))
         return instrument.changed("", filter_shift=added)
-    if sentence.kind == "fringes":
-        gap = AirGap(amplitude, jnp.asarray(sentence.gap), LARGEST_GAP)
-        return instrument.changed(sentence.place, air_gaps=lambda gaps: (*gaps, gap))
     return instrument.changed(sentence.place, **{sentence.kind: added})
 
 
@@ -227,7 +227,7 @@ def element_at(instrument: Instrument, place: str) -> Element:
 def _with_camera(instrument: Instrument, sentence: Sentence, amplitude: Scalar) -> Instrument:
     cameras = cameras_of(instrument, sentence.place)
     if sentence.origin == OPPOSITE:
-        return instrument.with_part("ghosts", OppositeLight(amplitude, cameras))
+        return instrument.with_part("ghosts", PointGhost(amplitude * jnp.asarray(cameras)))
     if sentence.kind == "light" and sentence.origin:
         target, origin = cameras.index(1.0), cameras_of(instrument, sentence.origin).index(1.0)
         return instrument.with_part("mixing", CrossTalk(amplitude, target, origin))

@@ -10,10 +10,10 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from walop_jax.model import mueller
-from walop_jax.model.cameras import DetectorPart, ExposurePart, GhostPart, Mixing, Transmission
+from walop_jax.model.cameras import DetectorPart, ExposurePart, Mixing, Transmission
 from walop_jax.model.effects.sentence import Sentence, factor
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.elements.polariser import Film
@@ -192,17 +192,6 @@ class CrossTalk(Mixing):
         """Mix the analysis vectors."""
         del x, y
         return vectors.at[:, self.target].add(self.amplitude * vectors[:, self.origin])
-
-
-class OppositeLight(GhostPart):
-    """A share of the light of the opposite field point, for extended sources."""
-
-    amplitude: Scalar
-    cameras: Weights = eqx.field(static=True)
-
-    def seen(self, extended: Bool[Array, " e"], opposite: Float[Array, "e k"]) -> Float[Array, "e k"]:
-        """What the opposite point adds."""
-        return jnp.where(extended[:, None], self.amplitude * opposite * jnp.asarray(self.cameras), 0.0)
 
 
 class DetectorTerm(DetectorPart):

@@ -83,7 +83,12 @@ class Etalon(Effect):
 
     def patch(self, instrument: Instrument) -> Instrument:
         """Put an air gap ahead of every wave plate."""
-        gap = AirGap(self.contrast, self.gap, LARGEST_GAP)
         for place in instrument.places(WavePlate):
-            instrument = instrument.changed(place, air_gaps=lambda gaps: (*gaps, gap))
+            instrument = with_air_gap(instrument, place, self.contrast, self.gap)
         return instrument
+
+
+def with_air_gap(instrument: Instrument, place: str, contrast: Scalar, gap: Scalar) -> Instrument:
+    """The instrument with one more air gap (µm) ahead of a wave plate."""
+    own = AirGap(contrast, gap, LARGEST_GAP)
+    return instrument.changed(place, air_gaps=lambda gaps: (*gaps, own))

@@ -30,9 +30,9 @@ SOURCE = "reflections between detector and window: expected size"
 
 
 class PointGhost(GhostPart):
-    """A share of the light of the opposite field point, for extended sources."""
+    """A share of the light of the opposite field point, for extended sources: one, or one for each camera."""
 
-    share: Scalar
+    share: Scalar | Float[Array, " k"]
 
     def seen(self, extended: Bool[Array, " e"], opposite: Float[Array, "e k"]) -> Float[Array, "e k"]:
         """What the opposite point adds."""

@@ -141,22 +141,19 @@ class Sentence:
     @property
     def number(self) -> int:
         """The exposure that it is about. Raises ValueError for a sentence about no single one."""
-        found = [one for f in self.factors if (one := _EXPOSURE.fullmatch(f))]
-        if len(found) != 1:
-            raise ValueError(
-                f"{self.text!r}: say of which exposure, as in '{self.kind} of {self.place} * exposure 7'"
-            )
-        return int(found[0][1])
+        return int(self._stated(_EXPOSURE, "of which exposure", "exposure 7"))
 
     @property
     def gap(self) -> float:
         """Thickness (µm) of the air whose fringes it is about. Raises ValueError for a sentence without one."""
-        found = [one for f in self.factors if (one := _GAP.fullmatch(f))]
+        return float(self._stated(_GAP, "of which gap (µm)", "gap 10"))
+
+    def _stated(self, pattern: re.Pattern[str], what: str, example: str) -> str:
+        """What the only factor of a form says."""
+        found = [one[1] for f in self.factors if (one := pattern.fullmatch(f))]
         if len(found) != 1:
-            raise ValueError(
-                f"{self.text!r}: say of which gap (µm), as in 'fringes of {self.place} * gap 10'"
-            )
-        return float(found[0][1])
+            raise ValueError(f"{self.text!r}: say {what}, as in '{self.kind} of {self.place} * {example}'")
+        return found[0]
 
     @property
     def field_factors(self) -> tuple[str, ...]:
