@@ -90,7 +90,24 @@ SAME = {
 
 
 @pytest.mark.parametrize(
-    "case", quick(SAME, ["retarder", "analysers", "cut", "drift", "leakage", "ghost", "patch", "star"])
+    "case",
+    quick(
+        SAME,
+        [
+            "retarder",
+            "analysers",
+            "cut",
+            "drift",
+            "leakage",
+            "flexure",
+            "filter",
+            "fringes",
+            "ghost",
+            "sky",
+            "patch",
+            "star",
+        ],
+    ),
 )
 def test_the_same_by_another_name(case):
     """Exactly, but for what two shares of light copied back and forth make of each other."""
