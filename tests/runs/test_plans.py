@@ -74,3 +74,7 @@ def test_limits_of_a_plan_are_those_of_data_taken_so(plan, tmp_path):
     assert by_plan.keys() == by_data.keys()
     for key, (least, _) in by_plan.items():  # the most is that of a camera which hardly shows it
         np.testing.assert_allclose(least, by_data[key][0], rtol=0.1)
+    conditions = {one.what: one.detected for one in data.conditions}
+    assert len(conditions) >= 5
+    for one in found.found.conditions:
+        np.testing.assert_allclose(one.detected, conditions[one.what], rtol=0.1, err_msg=one.what)

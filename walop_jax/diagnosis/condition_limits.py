@@ -33,7 +33,7 @@ def condition_limits(design: Design) -> tuple[ConditionLimit, ...]:
     off = slopes @ (result.model.selection() @ taken_up)
     least = noncentrality(local_p(ALARM, tried), 1, PROBABILITY)
     found = []
-    for number, (stated, score, *_) in enumerate(scored):
+    for number, (stated, score, _, square) in enumerate(scored):
         slope = off[..., number]
         if stated.seen_by_stars:
             step = STEP * stated.width
@@ -41,7 +41,8 @@ def condition_limits(design: Design) -> tuple[ConditionLimit, ...]:
                 matrix_slopes(instrument, setting, stated.changed(h).filters, x, y)[0] for h in (step, -step)
             )
             slope = slope - (above - below) / (2.0 * step)
-        detected = float(np.sqrt(least * score.covariance[0, 0])) if score.testable else np.inf
+        # Of errors as stated, not of the residuals: a plan has none.
+        detected = float(np.sqrt(least / square)) if score.testable else np.inf
         size = min(detected, stated.width)
         error = over_field(change_of_qu(matrix, matrix + size * slope)[None])
         found.append(ConditionLimit(stated.what, stated.unit, detected, size, error))

@@ -54,13 +54,18 @@ class Stated(NamedTuple):
 class Scored(NamedTuple):
     """A number, the score of changing it, and the derivative of the residuals (rows of the design).
 
-    `gain` is by how much the change lowers χ², by a linear step.
+    `square` is the square of what the model leaves of the derivative: information, in errors as stated.
     """
 
     stated: Stated
     score: Score
     column: Float[np.ndarray, " _"]
-    gain: float
+    square: float
+
+    @property
+    def gain(self) -> float:
+        """By how much the change lowers χ², by a linear step."""
+        return float(self.score.amplitudes[0] ** 2 * self.square)
 
 
 def stated_conditions(design: Design) -> Iterator[str]:
@@ -106,7 +111,7 @@ def condition_scores(design: Design) -> list[Scored]:
     residual = design.projector(design.residual)
     table = Scorer(space, np.random.default_rng(), draws=0)(columns.T @ residual, float(residual @ residual))
     return [
-        Scored(one, table[name], column, float(table[name].amplitudes[0] ** 2 * square))
+        Scored(one, table[name], column, float(square))
         for one, name, column, square in zip(asked, names, given.T, np.diag(space.gram), strict=True)
     ]
 
