@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import functools
 import hashlib
 import json
 import sys
@@ -27,6 +28,7 @@ from walop_jax.diagnosis.effect_columns import Probe, probes
 from walop_jax.diagnosis.examination import ALARM, Examination
 from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, Measured
 from walop_jax.diagnosis.score import Scorer, ScoreSpace, ScoreTable, separations, whitening
+from walop_jax.diagnosis.two_steps import Behind, name_first
 from walop_jax.diagnosis.workflow import MOST_SENTENCES, MOST_STEPS
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
@@ -310,16 +312,16 @@ class Blind:
             table = scorer.after(table, scores) if added or scene.removed else table
             if table.p_global >= ALARM or len(added) >= MOST_STEPS:
                 break
-            names = naming.rank(table, [p for p in left if p.name in self.effect_of])
-            told = grammar.rank(table, [p for p in left if p.name not in self.effect_of])
+            names, told = self._ranked(table, left)
             alive = [score for score in table.scores if score.testable and score.name in self.patterns]
             price, least = np.log(len(alive)), min(0.0, max(score.log_bayes for score in alive))
             best = _most_probable(table, names, told, least)
             if best is not None and best.probe.name not in self.effect_of:
-                best = (
-                    self._sufficient_name(table, names, best, tuple(added), scene.removed, s0, square0)
-                    or best
+                significant = [r for r in names if table.corrected(r.score) < ALARM]
+                behind = functools.partial(
+                    self._behind, table, added=tuple(added), removed=scene.removed, s0=s0, square0=square0
                 )
+                best = significant[0] if name_first(significant, best, behind, ALARM) else best
             pattern = max(alive, key=lambda score: score.log_bayes)
             strong = table.corrected(pattern) < ALARM
             if strong and (best is None or pattern.log_bayes - price > best.log_bayes + naming.EVEN_ODDS):
@@ -335,7 +337,7 @@ class Blind:
             named.append(name)
             if name == "described":
                 said.append(best.probe.name)
-            close = {r.effect.name for r in names if best.log_bayes - r.log_bayes < naming.EVEN_ODDS}
+            close = {r.effect.name for r in names if best.log_bayes - r.log_bayes < naming.IMPROBABLE}
             possible = {r.probe.name for r in told if best.log_bayes - r.log_bayes < naming.IMPROBABLE}
             others = [
                 p
@@ -357,25 +359,23 @@ class Blind:
             verdict, first_probe=first.probe.name, amplitudes=score.amplitudes, covariance=score.covariance
         )
 
-    def _sufficient_name(
-        self,
-        table: ScoreTable,
-        names: Sequence[naming.Ranked],
-        sentence: naming.Ranked,
-        added: tuple[str, ...],
-        removed: tuple[str, ...],
-        s0: np.ndarray,
-        square0: float,
-    ) -> naming.Ranked | None:
-        """The best name where it leaves nothing significant while the sentence does."""
+    def _behind(
+        self, table: ScoreTable, item: naming.Ranked, added: tuple[str, ...], removed: tuple[str, ...],
+        s0: np.ndarray, square0: float,
+    ) -> Behind:  # fmt: skip
+        """What is left to be told behind a linear step."""
+        added = (*added, item.probe.name)
+        scorer, left = self._scorer(added, removed)
+        s, _ = self._reduced(s0, square0, added)
+        table = scorer.after(table, s[self.space.chosen(scorer.space.names)])
+        return Behind(*self._ranked(table, left), table.p_global)
 
-        def left(item: naming.Ranked) -> float:
-            scorer, _ = self._scorer((*added, item.probe.name), removed)
-            s, _ = self._reduced(s0, square0, (*added, item.probe.name))
-            return scorer.after(table, s[self.space.chosen(scorer.space.names)]).p_global
-
-        name = next((r for r in names if table.corrected(r.score) < ALARM), None)
-        return name if name is not None and left(sentence) < ALARM <= left(name) else None
+    def _ranked(
+        self, table: ScoreTable, left: Sequence[Probe]
+    ) -> tuple[list[naming.Ranked], list[naming.Ranked]]:
+        """Names and sentences by evidence."""
+        names = naming.rank(table, [p for p in left if p.name in self.effect_of])
+        return names, grammar.rank(table, [p for p in left if p.name not in self.effect_of])
 
     def _rivals(self, space: ScoreSpace, best: naming.Ranked, left: Sequence[Probe]) -> set[str]:
         at = space.places()[best.probe.name]

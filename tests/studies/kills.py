@@ -282,7 +282,9 @@ def kills(study: Study, count: int) -> tuple[int, list[str]]:
     began = time.perf_counter()
     start(study).communicate()
     whole, generator, wrong, killed = time.perf_counter() - began, random.Random(1), [], 0
-    for _ in range(count):
+    for number in range(count):
+        if number and number % 10 == 0:
+            print(f"    {number} tried, {killed} killed, wrong {len(wrong)}", flush=True)
         study.put(study.before)
         process = start(study)
         with contextlib.suppress(subprocess.TimeoutExpired):

@@ -26,6 +26,7 @@ from walop_jax.diagnosis.score import (
     separations,
 )
 from walop_jax.diagnosis.sentence_columns import sentence_candidates
+from walop_jax.diagnosis.two_steps import Behind, name_first
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import Described, Effect
@@ -248,20 +249,21 @@ class Examination:
         """Sentences that are significant by themselves, best evidence first."""
         return [r for r in self.told if self.table.corrected(r.score) < ALARM]
 
-    def _left(self, item: naming.Ranked) -> float:
-        """Global p of what a linear step of one candidate leaves."""
+    def _behind(self, item: naming.Ranked) -> Behind:
+        """What is left to be told when one candidate has joined the base, by a linear step."""
         space, scores, square = self._scored
         space, reduce = space.with_base([item.probe.name])
-        return Scorer(space, self._rng, draws=0).after(self.table, reduce(scores, square)[0]).p_global
+        table = Scorer(space, self._rng, draws=0).after(self.table, reduce(scores, square)[0])
+        probes = [probe for probe in self.probes if probe.effect is not item.effect]
+        said = [probe for probe in self.sentences if probe is not item.probe]
+        return Behind(naming.rank(table, probes), grammar.rank(table, said), table.p_global)
 
     def sentences_before_names(self) -> list[naming.Ranked]:
-        """Sentences that are more probable than every name; none where the best name suffices and they do not."""
-        name = next(iter(self.significant), None)
-        found = self.significant_sentences
-        if name is None or not found:
-            return found
-        found = [item for item in found if item.log_bayes > name.log_bayes]
-        return found if not found or self._left(found[0]) >= ALARM or self._left(name) < ALARM else []
+        """Sentences that are more probable than every name; none where names suffice and they do not (`two_steps`)."""
+        names, found = self.significant, self.significant_sentences
+        if names:
+            found = [item for item in found if item.log_bayes > names[0].log_bayes]
+        return [] if found and name_first(names, found[0], self._behind, ALARM) else found
 
     def nameless(self, trial: naming.Trial) -> tuple[str, ...]:
         """Sentences beside what a trial says, by linear steps: not improbable, or no longer and not to be told from it.

@@ -5,7 +5,7 @@ Evidence       Laplace: ln B = ½ (O_base − O_g) − ½ (ln det H_g − ln det
 Equivalence    The change D of the residuals that the named effect makes, projected off the other parameters, is fitted
                by each rival; the length of what the rival cannot follow is the separation in standard deviations
                (Atkinson & Fedorov 1975, Biometrika 62, 57). Below `SEPARATION` the data cannot tell the two apart, nor
-               when the evidence of their refits differs by less than `EVEN_ODDS`.
+               when the evidence of their refits differs by less than `IMPROBABLE`.
 """
 
 from __future__ import annotations
@@ -170,6 +170,14 @@ def try_shapes(base: FitResult, item: Ranked, context: Context, shapes: int) -> 
     alike = [t for t in trials if t.fit.converged and t.log_bayes > best.log_bayes - EVEN_ODDS]
     told = dict.fromkeys(in_words(t.instance) for t in alike if _differ(t, best))
     return dataclasses.replace(best, alternatives=tuple(told))
+
+
+def with_rivals(trial: Trial, trials: Sequence[Trial]) -> tuple[Trial, tuple[str, ...]]:
+    """A trial with other shapes of its effect that are as probable, and the other effects that are not improbable."""
+    apart = [(t, abs(t.log_bayes - trial.log_bayes)) for t in trials if t is not trial]
+    same = [in_words(t.instance) for t, far in apart if t.effect is trial.effect and far < EVEN_ODDS]
+    rivals = [t.effect.name for t, far in apart if t.effect is not trial.effect and far < IMPROBABLE]
+    return dataclasses.replace(trial, alternatives=(*trial.alternatives, *same)), tuple(rivals)
 
 
 def _differ(one: Trial, other: Trial) -> bool:

@@ -222,13 +222,7 @@ class _Diagnosing:
         ]
         trials = self._decided(sorted(trials, key=naming.names_first))
         for trial in trials:
-            even = [
-                t for t in trials if t is not trial and abs(t.log_bayes - trial.log_bayes) < naming.EVEN_ODDS
-            ]
-            same = [naming.in_words(t.instance) for t in even if t.effect is trial.effect]
-            trial = dataclasses.replace(trial, alternatives=(*trial.alternatives, *same))
-            close = tuple(t.effect.name for t in even if t.effect is not trial.effect)
-            step = self._step(examination, trial, close)
+            step = self._step(examination, *naming.with_rivals(trial, trials))
             if step.confirmed:
                 # A further change of the description joins those before.
                 earlier = next((s for s in self.steps if s.effect == step.effect), None)

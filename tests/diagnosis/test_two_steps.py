@@ -1,0 +1,65 @@
+"""A sentence that holds a part of two effects at once does not come before them; one that holds the truth does.
+
+Columns are unit vectors and prior widths large, so that the evidence of a direction is half the square of what it
+holds, less a constant: the numbers are those of plain geometry.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from walop_jax.diagnosis.two_steps import Behind, name_first
+
+A, B, ELSEWHERE = np.eye(3)
+PRICE = 3.0  # of one amplitude
+LEAST = 9.0  # square that is significant
+
+
+class Geometry:
+    """Two names and a sentence, each a direction, before residuals."""
+
+    def __init__(self, said: np.ndarray, residual: np.ndarray) -> None:
+        self.directions = {"a": A, "b": B, "sentence": said / np.linalg.norm(said)}
+        self.residual = residual
+
+    def ranked(self, names: tuple[str, ...], taken: np.ndarray | None = None) -> list:
+        found = []
+        for name in names:
+            d, r = self.directions[name], self.residual
+            if taken is not None:
+                d = d - taken * (taken @ d)
+                r = r - taken * (taken @ r)
+                if np.linalg.norm(d) < 1e-9:
+                    continue
+                d = d / np.linalg.norm(d)
+            found.append(SimpleNamespace(name=name, effect=name, log_bayes=0.5 * (d @ r) ** 2 - PRICE))
+        return sorted(found, key=lambda item: -item.log_bayes)
+
+    def behind(self, item: SimpleNamespace) -> Behind:
+        d = self.directions[item.name]
+        left = self.residual - d * (d @ self.residual)
+        p = 0.5 if left @ left < LEAST else 1e-6
+        return Behind(self.ranked(("a", "b"), d), self.ranked(("sentence",), d), p)
+
+    def name_first(self) -> bool:
+        names, sentence = self.ranked(("a", "b")), self.ranked(("sentence",))[0]
+        assert sentence.log_bayes > names[0].log_bayes
+        return name_first(names, sentence, self.behind, 0.0027)
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_two_effects_come_before_a_sentence_that_holds_a_part_of_each(share):
+    assert Geometry(A + B + share * ELSEWHERE, 10.0 * (A + B)).name_first()
+
+
+def test_a_sentence_that_holds_all_comes_before_two_names():
+    assert not Geometry(A + B, 10.0 * (A + B)).name_first()
+    assert not Geometry(A + B + ELSEWHERE, 10.0 * (A + B + ELSEWHERE)).name_first()
+
+
+def test_a_name_that_suffices_comes_before_a_sentence_that_does_not():
+    geometry = Geometry(A + B, 10.0 * A)
+    names, sentence = geometry.ranked(("a", "b")), geometry.ranked(("sentence",))[0]
+    assert name_first(names, sentence, geometry.behind, 0.0027)
+    assert not name_first([], sentence, geometry.behind, 0.0027)
