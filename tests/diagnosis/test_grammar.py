@@ -11,7 +11,7 @@ from own_instrument import OWN
 from walop_jax.data.records import Position
 from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.effect_columns import applicable, effect_candidates, probes
-from walop_jax.diagnosis.sentence_columns import sentence_candidates
+from walop_jax.diagnosis.sentence_columns import all_candidates, sentence_candidates
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.instruments.description import parsed
@@ -90,6 +90,20 @@ def test_columns_are_those_of_the_effect_itself(laid, said):
         effect = Described.saying(name.split("; "), [0.0] * len(name.split("; ")))
         own = Likelihood.of(laid.calset, laid.model, (effect,)).effect_columns(laid.values, (effect,))
         assert said[name] == pytest.approx(own, rel=1e-7, abs=1e-7 * np.abs(own).max())
+
+
+def test_columns_of_effects_that_are_plain_sums_are_those_of_the_effects(laid):
+    """Added up from sentences, and differentiated with the effect itself in the light path."""
+    template = laid.model.template
+    context = effect_context(template, laid.calset.exposures)
+    plain = [effect for effect in EFFECTS if effect.neutral(context).sums(template)]
+    wanted = [next(probes([effect], context)) for effect in plain]
+    assert {probe.effect.name for probe in wanted} == {"etalon", "flexure", "hwp_temperature"}
+    summed, _ = all_candidates(laid.likelihood, laid.model, laid.values, wanted, ())
+    direct = effect_candidates(laid.calset, laid.model, laid.values, wanted)
+    for probe in wanted:
+        own = direct[probe.name].columns
+        assert summed[probe.name].columns == pytest.approx(own, rel=1e-7, abs=1e-7 * np.abs(own).max())
 
 
 def test_sentences_that_have_a_name_are_left_to_it(laid):

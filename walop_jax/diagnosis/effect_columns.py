@@ -107,11 +107,20 @@ def _can_show(calset: CalibrationSet, instrument: Instrument, effect: Effect) ->
     return all(np.isfinite(stated[name]).any() for name in asked if name in stated)
 
 
+def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Probe]) -> list[Probe]:
+    """The probes of effects that a set can show; shapes of one effect need the same."""
+    shown: dict[type[Effect], bool] = {}
+    for probe in wanted:
+        if probe.effect not in shown:
+            shown[probe.effect] = _can_show(calset, instrument, probe.group[0])
+    return [probe for probe in wanted if shown[probe.effect]]
+
+
 def effect_candidates(
     calset: CalibrationSet, model: Model, values: Vector, wanted: Sequence[Probe]
 ) -> dict[str, Candidate]:
     """Columns of all probes at the fit `values` of `model`, by probe name; without those that the bands blur away."""
-    wanted = [probe for probe in wanted if _can_show(calset, model.template, probe.group[0])]
+    wanted = showable(calset, model.template, wanted)
     number = Counter(p.effect for p in wanted)
     several = {effect for effect, count in number.items() if count > limits.MANY_SHAPES}
     result: dict[str, Candidate] = {}

@@ -13,7 +13,7 @@ from scipy import stats
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import grammar, naming
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.effect_columns import Probe, effect_candidates
+from walop_jax.diagnosis.effect_columns import Probe
 from walop_jax.diagnosis.findings import Alike, Limit
 from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, number_of_columns, strata
 from walop_jax.diagnosis.score import (
@@ -25,7 +25,7 @@ from walop_jax.diagnosis.score import (
     corrected_p,
     separations,
 )
-from walop_jax.diagnosis.sentence_columns import sentence_candidates
+from walop_jax.diagnosis.sentence_columns import all_candidates
 from walop_jax.diagnosis.two_steps import Behind, name_first
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import limits
@@ -78,17 +78,12 @@ class Examination:
         active = result.model.effect_names
         self.design = Design.of(result)
         inactive = [probe for probe in wanted if probe.effect.name not in active]
-        self.named = (
-            effect_candidates(result.calset, result.model, result.values, inactive)
+        self.named, self.said = (
+            all_candidates(result.likelihood, result.model, result.values, inactive, sentences)
             if earlier is None or not self._is_like(earlier)
-            else earlier.named
+            else (earlier.named, earlier.said)
         )
         self.probes = [probe for probe in inactive if probe.name in self.named]
-        self.said = (
-            sentence_candidates(result.likelihood, result.model, result.values, sentences)
-            if earlier is None or not self._is_like(earlier)
-            else earlier.said
-        )
         self.sentences = tuple(probe for probe in sentences if probe.name in self.said)
         candidates = [
             *(self.named[probe.name] for probe in self.probes),

@@ -7,14 +7,14 @@ its part.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.diagnosis.effect_columns import Probe, swept
+from walop_jax.diagnosis.effect_columns import Probe, effect_candidates, showable, swept
 from walop_jax.diagnosis.freeform import numpy_sharing
 from walop_jax.diagnosis.grammar import said_by
 from walop_jax.diagnosis.score import Candidate
@@ -105,7 +105,59 @@ def sentence_candidates(
     likelihood: Likelihood, model: Model, values: Float[np.ndarray, " n"], probes: Sequence[Probe]
 ) -> dict[str, Candidate]:
     """Columns of the groups at the fit `values` of a model, by name; without fringes that the bands blur away."""
-    every = {text: Sentence.parsed(text) for probe in probes for text in said_by(probe)}
+    return said_candidates(probes, sentence_columns(likelihood, model, values, said_in(probes)))
+
+
+def all_candidates(
+    likelihood: Likelihood,
+    model: Model,
+    values: Float[np.ndarray, " n"],
+    effects: Sequence[Probe],
+    sentences: Sequence[Probe],
+) -> tuple[dict[str, Candidate], dict[str, Candidate]]:
+    """Columns of effects and of sentences by name; those of an effect that is a plain sum of sentences serve twice."""
+    calset = likelihood.calset
+    sums = {probe.name: _sums(probe, model.template) for probe in showable(calset, model.template, effects)}
+    texts = [text for one in sums.values() for each in one for text in each]
+    columns = sentence_columns(likelihood, model, values, [*said_in(sentences), *texts])
+    named = effect_candidates(calset, model, values, [p for p in effects if not sums.get(p.name)])
+    named |= {
+        probe.name: Candidate(
+            probe.name,
+            np.column_stack([np.sum([columns[t] for t in each], axis=0) for each in sums[probe.name]]),
+            probe.widths,
+        )
+        for probe in effects
+        if sums.get(probe.name) and all(t in columns for each in sums[probe.name] for t in each)
+    }
+    ordered = {probe.name: named[probe.name] for probe in effects if probe.name in named}
+    return ordered, said_candidates(sentences, columns)
+
+
+def _sums(probe: Probe, instrument: Instrument) -> list[tuple[str, ...]]:
+    """The sentences of each amplitude of a probe, member by member; none where they are no plain sums."""
+    return [each for member in probe.group for each in member.sums(instrument)]
+
+
+def said_in(probes: Sequence[Probe]) -> list[str]:
+    """All sentences of some groups."""
+    return [text for probe in probes for text in said_by(probe)]
+
+
+def said_candidates(probes: Sequence[Probe], columns: Mapping[str, np.ndarray]) -> dict[str, Candidate]:
+    """The groups all of whose sentences have columns."""
+    return {
+        p.name: Candidate(p.name, np.column_stack([columns[t] for t in said_by(p)]), p.widths)
+        for p in probes
+        if all(text in columns for text in said_by(p))
+    }
+
+
+def sentence_columns(
+    likelihood: Likelihood, model: Model, values: Float[np.ndarray, " n"], texts: Sequence[str]
+) -> dict[str, Float[np.ndarray, " d"]]:
+    """Columns of sentences at the fit `values` of a model; without fringes that the bands blur away."""
+    every = {text: Sentence.parsed(text) for text in texts}
     said = {text: sentence for text, sentence in every.items() if sentence.kind != "fringes"}
     columns = _fringes(likelihood, model, values, (s for s in every.values() if s.kind == "fringes"))
     batches: dict[str, dict[str, None]] = {}
@@ -132,9 +184,4 @@ def sentence_candidates(
         raw = change[_core(sentence).text] * np.broadcast_to(pattern, used.shape)[..., None]
         return -project_flux(raw, along, known, shared)[used].reshape(-1)
 
-    columns |= {text: column(sentence) for text, sentence in said.items()}
-    return {
-        p.name: Candidate(p.name, np.column_stack([columns[t] for t in said_by(p)]), p.widths)
-        for p in probes
-        if all(text in columns for text in said_by(p))
-    }
+    return columns | {text: column(sentence) for text, sentence in said.items()}

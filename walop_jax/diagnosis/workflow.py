@@ -80,7 +80,7 @@ def diagnose(
     if len(some.points) < len(calset.points):
         tell(f"looking at {len(some.points)} of {len(calset.points)} field points")
     until = began + 60.0 * minutes
-    found = _Diagnosing(some, model, catalogue, seed, tell, until, as_written=as_written).run(began)
+    found = _Diagnosing(some, model, catalogue, every, seed, tell, until, as_written=as_written).run(began)
     return dataclasses.replace(found, points=len(calset.points))
 
 
@@ -97,6 +97,7 @@ class _Diagnosing:
         calset: CalibrationSet,
         model: Model,
         catalogue: Sequence[type[Effect]],
+        sentences: Sequence[Probe],
         seed: int,
         tell: Callable[[str], None],
         until: float,
@@ -108,8 +109,7 @@ class _Diagnosing:
         self.context: Context = effect_context(model.template, calset.exposures)
         self.catalogue = applicable(catalogue, self.context, model.template)
         self.wanted: list[Probe] = list(all_probes(self.catalogue, self.context))
-        every = grammar.sentences(model.template, calset.exposures, len(calset.points))
-        self.sentences = grammar.uncovered(every, self.catalogue, self.context, model.template)
+        self.sentences = grammar.uncovered(sentences, self.catalogue, self.context, model.template)
         self.steps: list[Step] = []
         self.added = self.said = 0
         self.choices: dict[str, Choice] = {}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import functools
 from collections.abc import Iterator
 from functools import cached_property
 
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.records import Block, CalibrationSet, Exposures
+from walop_jax.data.records import Block, CalibrationSet, Exposures, Site
 from walop_jax.likelihood.engine import PointData
 from walop_jax.likelihood.layout import Layout
 from walop_jax.model.plan import Plan
@@ -68,8 +69,7 @@ class PointReader:
         rows = np.flatnonzero((e.kind == "moon") & ~e.clp_in)
         if not rows.size:
             return rows, np.zeros(0), np.zeros(0)
-        ra, dec = moon_direction(e.mjd[rows], self.calset.site)
-        return rows, ra, dec
+        return rows, *_moon_at(tuple(e.mjd[rows].tolist()), self.calset.site)
 
     def sky_polarisation(self, x: Vector, y: Vector) -> Float[np.ndarray, "p e 2"]:
         """(q, u) in the ICS of the Moon sky for δ = 1 at field points; 0 in exposures of other kinds."""
@@ -141,6 +141,12 @@ class StreamedPoints(MeasuredPoints):
         """The chunks of one slab, counted from 0."""
         size = self.layout.slab
         return self.reader.chunks(number * size, (number + 1) * size, self.layout.chunk)
+
+
+@functools.lru_cache(maxsize=32)
+def _moon_at(mjd: tuple[float, ...], site: Site) -> tuple[Vector, Vector]:
+    """Where the Moon stands: the same set is brought together with many models."""
+    return moon_direction(np.array(mjd), site)
 
 
 def measured_points(calset: CalibrationSet, layout: Layout, floor: float = 0.0) -> MeasuredPoints:

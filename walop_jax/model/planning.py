@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 
 import jax
@@ -15,7 +16,7 @@ from walop_jax.data.settings import Settings
 from walop_jax.model.dependence import needs
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan, blank_exposures, exposure_arrays, hours_of
-from walop_jax.model.quadrature import band_rule
+from walop_jax.model.quadrature import Rule, band_rule
 from walop_jax.model.ray import CONDITIONS, Conditions
 from walop_jax.model.sources import ExposureArrays
 
@@ -86,6 +87,17 @@ def plan_for_settings(instrument: Instrument, settings: Settings, filters: Mappi
     return _plan(instrument, settings, np.zeros(len(settings)), filters, blank, lambda band: band[:, None])
 
 
+def _rule(curve: FilterCurve, path_difference: float) -> Rule:
+    """The nodes of a band and their weights."""
+    return _known_rule(tuple(curve.wavelength.tolist()), tuple(curve.throughput.tolist()), path_difference)
+
+
+@functools.lru_cache(maxsize=256)
+def _known_rule(wavelength: tuple[float, ...], throughput: tuple[float, ...], path_difference: float) -> Rule:
+    """Plans of one set are made for many models, most of which ask for the same nodes."""
+    return band_rule(np.array(wavelength), np.array(throughput), path_difference=path_difference)
+
+
 def _plan(
     instrument: Instrument,
     settings: Settings,
@@ -110,12 +122,7 @@ def _plan(
     index = {key: i for i, key in enumerate(bands)}
 
     groups = sorted({(name, moment) for _, name, moment, _ in bands})
-    rules = {
-        name: band_rule(
-            filters[name].wavelength, filters[name].throughput, path_difference=asked.path_difference
-        )
-        for name, _ in groups
-    }
+    rules = {name: _rule(filters[name], asked.path_difference) for name, _ in groups}
     width = {name: equivalent_width(filters[name]) for name in rules}
     offset, start = {}, 0
     for group in groups:

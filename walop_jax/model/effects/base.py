@@ -136,6 +136,11 @@ class Effect(Component):
         del instrument
         return self.said
 
+    def sums(self, instrument: Instrument) -> tuple[tuple[str, ...], ...]:
+        """For each amplitude the sentences whose sum it is to first order, factor one each; none if not so plain."""
+        del instrument
+        return ()
+
     def survives(self, wavelength: Float[np.ndarray, " n"], weight: Float[np.ndarray, "b n"]) -> float:
         """Share of the effect that the band integrals leave of it; 1 unless it oscillates with wavelength."""
         return 1.0

@@ -27,10 +27,12 @@ Revealed by data that no name explains as well
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -72,6 +74,13 @@ def _amplitude(unit: str, about: str, width: float) -> Any:
     return param(unit=unit, about=about, source=f"{SOURCE}; width: expected size", width=width)
 
 
+@functools.lru_cache(maxsize=64)
+def _zeros(count: int) -> Float[Array, " n"]:
+    """So many zeros; there are thousands of sentences that say nothing yet."""
+    with jax.ensure_compile_time_eval():
+        return jnp.zeros(count)
+
+
 class Described(Effect):
     """Sentences about what is missing, each with an amplitude in the parameter of its unit."""
 
@@ -105,7 +114,9 @@ class Described(Effect):
             if name not in known:
                 raise unknown_name(f"parameter of {cls.name}", name, (*known, "sentences"))
         arrays = {
-            name: jnp.broadcast_to(jnp.asarray(values.get(name, 0.0), float), (held.count(name),))
+            name: jnp.broadcast_to(jnp.asarray(values[name], float), (held.count(name),))
+            if name in values
+            else _zeros(held.count(name))
             for name in known
         }
         return cls(**arrays, sentences=sentences)

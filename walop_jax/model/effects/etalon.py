@@ -81,6 +81,10 @@ class Etalon(Effect):
         gaps = (float(self.gap), float(self.gap) + QUARTER)
         return tuple(f"fringes of {p} * gap {gap:g}" for p in instrument.places(WavePlate) for gap in gaps)
 
+    def sums(self, instrument: Instrument) -> tuple[tuple[str, ...], ...]:
+        """The fringes of all plates together."""
+        return (tuple(f"fringes of {p} * gap {float(self.gap):g}" for p in instrument.places(WavePlate)),)
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Put an air gap ahead of every wave plate."""
         for place in instrument.places(WavePlate):

@@ -43,6 +43,10 @@ class Flexure(Effect):
         "displacement y ahead of pupil * hour angle",
     )
 
+    def sums(self, instrument: Instrument) -> tuple[tuple[str, ...], ...]:
+        """Each rate is a sentence."""
+        return tuple((text,) for text in self.in_sentences(instrument))
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Displace what the mapping to the pupil sees."""
         shift = FieldShift(name=self.name, rate_x=self.rate_x, rate_y=self.rate_y)

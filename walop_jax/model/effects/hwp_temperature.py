@@ -46,6 +46,10 @@ class HwpTemperature(Effect):
         """All plates."""
         return tuple(f"thermal of {place}" for place in instrument.places(WavePlate))
 
+    def sums(self, instrument: Instrument) -> tuple[tuple[str, ...], ...]:
+        """All plates alike."""
+        return (self.in_sentences(instrument),)
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Let the birefringence of all wave plates change with temperature."""
         for place in instrument.places(WavePlate):
