@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import equinox as eqx
@@ -70,11 +71,11 @@ class _Fringes(Etalon):
 
 
 def _fringes(
-    likelihood: Likelihood, model: Model, values: Float[np.ndarray, " n"], said: Iterable[Sentence]
+    likelihood: Likelihood, model: Model, values: Float[np.ndarray, " n"], every: Mapping[str, Sentence]
 ) -> dict[str, Float[np.ndarray, " d"]]:
     """Columns of fringes by their texts, swept over the gaps of a plate; without those that the bands blur away."""
     wanted = []
-    for sentence in said:
+    for sentence in (s for s in every.values() if s.kind == "fringes"):
         effect = _Fringes.of(Context(), gap=sentence.gap, where=sentence.place)
         wanted.append(Probe(sentence.text, _Fringes, (effect,)))
     found = swept(likelihood.calset, model, values, wanted) if wanted else {}
@@ -115,12 +116,23 @@ def all_candidates(
     effects: Sequence[Probe],
     sentences: Sequence[Probe],
 ) -> tuple[dict[str, Candidate], dict[str, Candidate]]:
-    """Columns of effects and of sentences by name; those of an effect that is a plain sum of sentences serve twice."""
+    """Columns of effects and of sentences by name; those of an effect that is a plain sum of sentences serve twice.
+
+    Loading, compiling and computing them keep one core busy: of a small set a second one works beside it. (Of a large
+    one a batch takes gigabytes.)
+    """
     calset = likelihood.calset
     sums = {probe.name: _sums(probe, model.template) for probe in showable(calset, model.template, effects)}
     texts = [text for one in sums.values() for each in one for text in each]
-    columns = sentence_columns(likelihood, model, values, [*said_in(sentences), *texts])
-    named = effect_candidates(calset, model, values, [p for p in effects if not sums.get(p.name)])
+    others = [probe for probe in effects if not sums.get(probe.name)]
+    said = _parsed([*said_in(sentences), *texts])
+    with ThreadPoolExecutor(1) as beside:
+        fringes = beside.submit(_fringes, likelihood, model, values, said)
+        direct = beside.submit(effect_candidates, calset, model, values, others)
+        if not likelihood.is_small:
+            direct.result()
+        columns = _without_fringes(likelihood, model, values, said) | fringes.result()
+        named = direct.result()
     named |= {
         probe.name: Candidate(
             probe.name,
@@ -157,9 +169,19 @@ def sentence_columns(
     likelihood: Likelihood, model: Model, values: Float[np.ndarray, " n"], texts: Sequence[str]
 ) -> dict[str, Float[np.ndarray, " d"]]:
     """Columns of sentences at the fit `values` of a model; without fringes that the bands blur away."""
-    every = {text: Sentence.parsed(text) for text in texts}
+    said = _parsed(texts)
+    return _fringes(likelihood, model, values, said) | _without_fringes(likelihood, model, values, said)
+
+
+def _parsed(texts: Iterable[str]) -> dict[str, Sentence]:
+    return {text: Sentence.parsed(text) for text in texts}
+
+
+def _without_fringes(
+    likelihood: Likelihood, model: Model, values: Float[np.ndarray, " n"], every: Mapping[str, Sentence]
+) -> dict[str, Float[np.ndarray, " d"]]:
+    """Columns of all sentences that are not of fringes."""
     said = {text: sentence for text, sentence in every.items() if sentence.kind != "fringes"}
-    columns = _fringes(likelihood, model, values, (s for s in every.values() if s.kind == "fringes"))
     batches: dict[str, dict[str, None]] = {}
     for sentence in said.values():
         batches.setdefault(_batch(sentence), {})[_core(sentence).text] = None
@@ -184,4 +206,4 @@ def sentence_columns(
         raw = change[_core(sentence).text] * np.broadcast_to(pattern, used.shape)[..., None]
         return -project_flux(raw, along, known, shared)[used].reshape(-1)
 
-    return columns | {text: column(sentence) for text, sentence in said.items()}
+    return {text: column(sentence) for text, sentence in said.items()}

@@ -284,7 +284,7 @@ class Likelihood:
 
     def effect_columns(self, values: Vector, probes: tuple[Effect, ...]) -> Float[np.ndarray, "d a"]:
         """Derivatives of the used residuals with respect to the amplitudes of neutral effects added to the model."""
-        instrument, once = self.model.instrument(values), self._is_small
+        instrument, once = self.model.instrument(values), self.is_small
         parts = [
             _rows(effect_columns.effect_columns(instrument, self.plan, probes, c, once=once), c)
             for c in self.points
@@ -295,7 +295,7 @@ class Likelihood:
         self, values: Vector, probes: tuple[Effect, ...]
     ) -> tuple[Float[np.ndarray, "p a e k"], Float[np.ndarray, "p e k"]]:
         """Derivatives of weighted counts, the flux held, to amplitudes of neutral effects and to the flux."""
-        instrument, once = self.model.instrument(values), self._is_small
+        instrument, once = self.model.instrument(values), self.is_small
         parts = [
             effect_columns.effect_changes(instrument, self.plan, probes, c, once=once) for c in self.points
         ]
@@ -312,14 +312,14 @@ class Likelihood:
         for chunk in self.points:
             cube = np.asarray(
                 effect_columns.effect_columns_over_shapes(
-                    instrument, self.plan, stacked, chunk, once=self._is_small
+                    instrument, self.plan, stacked, chunk, once=self.is_small
                 )
             )
             parts.append(np.stack([_rows(one, chunk) for one in cube]))
         return np.concatenate(parts, axis=1)
 
     @property
-    def _is_small(self) -> bool:
+    def is_small(self) -> bool:
         """Whether columns that are asked for once or twice are compiled for longer than they are computed."""
         return self.layout.points * len(self.flux_known) <= limits.COMPILED_ONCE
 
