@@ -94,9 +94,9 @@ def whole_south_set(shared_data: Path) -> Callable[[str], SouthSet]:
     return functools.partial(SouthSet.of, shared_data)
 
 
-@pytest.fixture(params=["cut", "whole"])
+@pytest.fixture(params=["cut", pytest.param("whole", marks=pytest.mark.long)])
 def either_south_set(request: pytest.FixtureRequest) -> Callable[[str], SouthSet]:
-    """Cut and whole sets in turn: for what holds on both alike."""
+    """Cuts, and where there is time whole sets: for what holds on both alike."""
     return request.getfixturevalue({"cut": "south_set", "whole": "whole_south_set"}[request.param])
 
 

@@ -290,6 +290,7 @@ def test_errors_are_what_the_covariance_says(either_south_set, south_fit, name):
     assert np.sqrt(np.mean(found.pulls**2)) < 2.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "limit"),
     [

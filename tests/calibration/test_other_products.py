@@ -213,3 +213,22 @@ def test_quality_in_words():
         assert text in meaning
     assert len(Quality(16 | 8192).meanings) == 2
     assert Quality(0).meanings == ()
+
+
+@pytest.mark.parametrize("name", ["RESIDUAL_ERR", "RESIDUAL_CHI2"])
+def test_a_map_with_a_part_missing_is_refused(calset, tmp_path, name):
+    write_product(tmp_path / "p.fits", product_of(calset, 2, {}))
+    with fits.open(tmp_path / "p.fits") as hdus:
+        del hdus[name]
+        hdus.writeto(tmp_path / "short.fits")
+    with pytest.raises(DataError, match=f"{name}.*missing"):
+        read_product(tmp_path / "short.fits")
+
+
+def test_a_changed_map_is_found_out(calset, tmp_path):
+    write_product(tmp_path / "p.fits", product_of(calset, 2, {}))
+    with fits.open(tmp_path / "p.fits") as hdus:
+        hdus["RESIDUAL"].data[0, 0, 0] += 1.0
+        hdus.writeto(tmp_path / "changed.fits", checksum=True)
+    with pytest.raises(DataError, match="not what was written"):
+        read_product(tmp_path / "changed.fits")

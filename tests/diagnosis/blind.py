@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import grammar, naming
+from walop_jax.diagnosis import grammar, history, naming
 from walop_jax.diagnosis.effect_columns import Probe, probes
 from walop_jax.diagnosis.examination import ALARM, Examination
 from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, Measured
@@ -33,7 +33,7 @@ from walop_jax.diagnosis.workflow import MOST_SENTENCES, MOST_STEPS
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import EFFECTS
+from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.specification import effect_context
 
 SEPARABLE = 5.0  # σ between the truth and its nearest rival above which a name is asked for
@@ -270,15 +270,23 @@ class Blind:
             gone = {self.effect_of[a] for a in added if a in self.effect_of} | set(removed)
             left = [p for p in self.probes if p.effect.name not in gone]
             catalogue = [effect for effect in EFFECTS if effect.name not in removed]
-            told = grammar.uncovered(self.sentences, catalogue, self.context, self.template)
-            left += [probe for probe in told if probe.name not in added]
-            names = [p.name for p in left] + [n for n in self.patterns if n not in added]
+            every = self.sentences, catalogue, self.context, self.template
+            left += [probe for probe in history.uncovered(*every) if probe.name not in added]
+            parts = [one for one in self._parts(removed) if one[0].name not in added]
+            names = [p.name for p in (*left, *(p for p, _ in parts))] + [
+                n for n in self.patterns if n not in added
+            ]
             draws = DRAWS if not added and not removed else 0
             if len(self._scorers) > KEPT:  # those of the starting model are dear, and always needed
                 self._scorers = {key: value for key, value in self._scorers.items() if not key[0]}
             space = self._space(added).subset(names)
             self._scorers[added, removed] = Scorer(space, np.random.default_rng(7), draws), left
         return self._scorers[added, removed]
+
+    @functools.cache  # noqa: B019
+    def _parts(self, removed: tuple[str, ...]) -> tuple[tuple[Probe, frozenset[type[Effect]]], ...]:
+        catalogue = [effect for effect in EFFECTS if effect.name not in removed]
+        return history.parts(self.sentences, catalogue, self.context, self.template)
 
     def _space(self, added: tuple[str, ...]) -> ScoreSpace:
         space = self.space.with_base([SINGLE_EXPOSURES], self.nuisance)[0]
@@ -346,7 +354,9 @@ class Blind:
                 or (p.name not in self.effect_of and len(p.widths) <= len(best.probe.widths))
             ]
             rivals = self._rivals(scorer.space, best, others)
-            classes.append(frozenset((close | possible | rivals) - {name, best.probe.name}))
+            parts = [one for one in self._parts(scene.removed) if one[0].name in scorer.space.names]
+            partly = set(naming.held_in_part(table, parts, best))
+            classes.append(frozenset((close | possible | rivals | partly) - {name, best.probe.name}))
             added.append(best.probe.name)
         assert table is not None
         missing = nameless or table.p_global < ALARM or len(said) > MOST_SENTENCES

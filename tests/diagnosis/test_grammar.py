@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import scenes
 from own_instrument import OWN
+from quick import quick
 
 from walop_jax.data.records import Position
-from walop_jax.diagnosis import grammar
+from walop_jax.diagnosis import grammar, history
 from walop_jax.diagnosis.effect_columns import applicable, effect_candidates, probes
 from walop_jax.diagnosis.sentence_columns import all_candidates, sentence_candidates
 from walop_jax.fit.model_builder import base_model
@@ -17,7 +18,7 @@ from walop_jax.fit.refit import fit
 from walop_jax.instruments.description import parsed
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.build import build
-from walop_jax.model.effects import EFFECTS, Described
+from walop_jax.model.effects import EFFECTS, Described, effect_by_name
 from walop_jax.model.specification import effect_context
 from walop_jax.simulation.simulate import simulate
 
@@ -86,19 +87,22 @@ def test_names_are_sentences(laid, said):
 
 def test_columns_are_those_of_the_effect_itself(laid, said):
     """What is multiplied by a factor afterwards is what the effect with that factor does."""
-    for name in LISTED:
-        effect = Described.saying(name.split("; "), [0.0] * len(name.split("; ")))
-        own = Likelihood.of(laid.calset, laid.model, (effect,)).effect_columns(laid.values, (effect,))
+    each = {name: Described.saying(name.split("; "), [0.0] * len(name.split("; "))) for name in LISTED}
+    whole = Likelihood.of(laid.calset, laid.model, tuple(each.values()))
+    columns = whole.effect_columns(laid.values, tuple(each.values()))
+    ends = np.cumsum([said[name].shape[1] for name in LISTED])
+    for name, own in zip(LISTED, np.split(columns, ends[:-1], axis=1), strict=True):
         assert said[name] == pytest.approx(own, rel=1e-7, abs=1e-7 * np.abs(own).max())
 
 
-def test_columns_of_effects_that_are_plain_sums_are_those_of_the_effects(laid):
+@pytest.mark.parametrize("name", quick(["etalon", "flexure", "hwp_temperature"], ["hwp_temperature"]))
+def test_columns_of_effects_that_are_plain_sums_are_those_of_the_effects(laid, name):
     """Added up from sentences, and differentiated with the effect itself in the light path."""
     template = laid.model.template
     context = effect_context(template, laid.calset.exposures)
-    plain = [effect for effect in EFFECTS if effect.neutral(context).sums(template)]
-    wanted = [next(probes([effect], context)) for effect in plain]
-    assert {probe.effect.name for probe in wanted} == {"etalon", "flexure", "hwp_temperature"}
+    effect = effect_by_name(name)
+    assert effect.neutral(context).sums(template)
+    wanted = [next(probes([effect], context))]
     summed, _ = all_candidates(laid.likelihood, laid.model, laid.values, wanted, ())
     direct = effect_candidates(laid.calset, laid.model, laid.values, wanted)
     for probe in wanted:
@@ -110,13 +114,30 @@ def test_sentences_that_have_a_name_are_left_to_it(laid):
     template = laid.model.template
     context = effect_context(template, laid.calset.exposures)
     every = grammar.sentences(template, laid.calset.exposures, len(laid.calset.points))
-    left = {p.name for p in grammar.uncovered(every, EFFECTS, context, template)}
+    left = {p.name for p in history.uncovered(every, EFFECTS, context, template)}
     gone = {p.name for p in every} - left
     assert "turn of polariser" in gone
     assert "retardance q behind collimator; retardance u behind collimator" in gone
     assert "gain of O1 * hours" in gone
     assert "light of E1 in O1" in left, "leakage is the same in all cameras, this is of one alone"
     assert "turn of polariser * x; turn of polariser * y" in left
+
+
+def test_parts_of_effects_stand_for_them(laid):
+    """One Moon patch of all, the light in one camera of four: no sentences of their own, but no longer than one."""
+    template = laid.model.template
+    context = effect_context(template, laid.calset.exposures)
+    every = grammar.sentences(template, laid.calset.exposures, len(laid.calset.points))
+    found = {
+        p.name: {e.name for e in effects} for p, effects in history.parts(every, EFFECTS, context, template)
+    }
+    assert found["light in O1"] == {"pedestal"}
+    patches = [name for name in found if name.startswith("polarisation q of sky * exposure")]
+    assert len(patches) == 4
+    assert all(found[name] == {"moon_patch"} for name in patches)
+    left = {p.name for p in history.uncovered(every, EFFECTS, context, template)}
+    assert not left & set(found)
+    assert "turn of polariser" not in found, "this is clp_zero as a whole"
 
 
 def test_grammar_of_another_instrument():

@@ -4,16 +4,19 @@ Columns are unit vectors and prior widths large, so that the evidence of a direc
 holds, less a constant: the numbers are those of plain geometry.
 """
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
+from walop_jax.diagnosis.effect_columns import Probe
+from walop_jax.diagnosis.naming import Ranked
+from walop_jax.diagnosis.score import Score
 from walop_jax.diagnosis.two_steps import Behind, name_first
+from walop_jax.model.effects import Described, effect_by_name
 
 A, B, ELSEWHERE = np.eye(3)
 PRICE = 3.0  # of one amplitude
 LEAST = 9.0  # square that is significant
+KINDS = {"a": effect_by_name("clp_zero"), "b": effect_by_name("ghost"), "sentence": Described}
 
 
 class Geometry:
@@ -23,7 +26,7 @@ class Geometry:
         self.directions = {"a": A, "b": B, "sentence": said / np.linalg.norm(said)}
         self.residual = residual
 
-    def ranked(self, names: tuple[str, ...], taken: np.ndarray | None = None) -> list:
+    def ranked(self, names: tuple[str, ...], taken: np.ndarray | None = None) -> list[Ranked]:
         found = []
         for name in names:
             d, r = self.directions[name], self.residual
@@ -33,11 +36,13 @@ class Geometry:
                 if np.linalg.norm(d) < 1e-9:
                     continue
                 d = d / np.linalg.norm(d)
-            found.append(SimpleNamespace(name=name, effect=name, log_bayes=0.5 * (d @ r) ** 2 - PRICE))
+            square, one = float(d @ r) ** 2, np.ones(1)
+            score = Score(name, square, 1, 0.0, 0.0, one, np.eye(1), 0.0, 1.0, True)
+            found.append(Ranked(KINDS[name], Probe(name, KINDS[name], ()), score, 0.5 * square - PRICE))
         return sorted(found, key=lambda item: -item.log_bayes)
 
-    def behind(self, item: SimpleNamespace) -> Behind:
-        d = self.directions[item.name]
+    def behind(self, item: Ranked) -> Behind:
+        d = self.directions[item.probe.name]
         left = self.residual - d * (d @ self.residual)
         p = 0.5 if left @ left < LEAST else 1e-6
         return Behind(self.ranked(("a", "b"), d), self.ranked(("sentence",), d), p)

@@ -66,6 +66,7 @@ def test_paper_and_joint_model_on_a_cut(south_set, south_fit):
     assert np.all(rms["grid", "paper"] > rms["grid", "joint"])
 
 
+@pytest.mark.long
 def test_paper_and_joint_model_on_set_a(whole_south_set, south_fit):
     """The issue of this package in numbers."""
     south = whole_south_set("a")
@@ -138,7 +139,6 @@ def check_pairs(errors, table, limit):
     assert np.all(errors["0 and 45"][:, 0] < limit)
 
 
-@pytest.mark.long
 def test_two_exposures_on_a_cut(south_set, south_fit):
     """As good everywhere as one exposure is expected to be where it holds q and u."""
     south = south_set("b")
@@ -147,6 +147,7 @@ def test_two_exposures_on_a_cut(south_set, south_fit):
     check_pairs(errors_of_pairs(south_fit(south), truth), truth.table, WORST * expected.max() / 100)
 
 
+@pytest.mark.long
 def test_two_exposures_on_set_b(whole_south_set, south_fit):
     """0.01 %, and twice that where a pair keeps the zone."""
     south = whole_south_set("b")
@@ -202,6 +203,7 @@ def test_apply_on_light_of_the_true_instrument(either_south_set, south_fit, tmp_
         assert chi2.max() < stats.chi2.isf(1e-3 / len(chi2), 2)
 
 
+@pytest.mark.long
 def test_errors_of_bright_stars_on_set_b(whole_south_set, south_fit, tmp_path):
     """p ≤ 5 %, calibration alone, the strip without u included."""
     south = whole_south_set("b")

@@ -30,7 +30,7 @@ from matrix_at import matrix_at  # noqa: E402
 from score_draws import alarms, noise_scores  # noqa: E402
 
 from walop_jax.data.records import CalibrationSet  # noqa: E402
-from walop_jax.diagnosis import grammar  # noqa: E402
+from walop_jax.diagnosis import grammar, history  # noqa: E402
 from walop_jax.diagnosis.change_of_stokes import change_of_qu  # noqa: E402
 from walop_jax.diagnosis.detection_limits import (  # noqa: E402
     PROBABILITY,
@@ -77,7 +77,7 @@ def scores(result: FitResult, draws: int, named: int) -> dict[str, dict[str, flo
     context = effect_context(template, calset.exposures)
     every = list(probes(EFFECTS, context))
     said = grammar.sentences(template, calset.exposures, len(calset.points))
-    said = grammar.uncovered(said, EFFECTS, context, template)
+    said = history.uncovered(said, EFFECTS, context, template)
     names = Examination(result, every, np.random.default_rng(0))
     whole = Examination(result, every, np.random.default_rng(0), None, said)
     p = float(np.exp(names.scorer.threshold(ALARM)))

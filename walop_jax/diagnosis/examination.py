@@ -72,23 +72,35 @@ class Examination:
         rng: np.random.Generator,
         earlier: Examination | None = None,
         sentences: Sequence[Probe] = (),
+        parts: Sequence[tuple[Probe, frozenset[type[Effect]]]] = (),
     ) -> None:
-        """`earlier` is of a smaller model; its columns serve again where the light has hardly changed."""
+        """`earlier` is of a smaller model; its columns serve again where the light has hardly changed.
+
+        `parts` are sentences that are told as the effects that hold them (`history.parts`).
+        """
         self.result = result
         active = result.model.effect_names
         self.design = Design.of(result)
         inactive = [probe for probe in wanted if probe.effect.name not in active]
+        every = [*sentences, *(probe for probe, _ in parts)]
         self.named, self.said = (
-            all_candidates(result.likelihood, result.model, result.values, inactive, sentences)
+            all_candidates(result.likelihood, result.model, result.values, inactive, every)
             if earlier is None or not self._is_like(earlier)
             else (earlier.named, earlier.said)
         )
         self.probes = [probe for probe in inactive if probe.name in self.named]
         self.sentences = tuple(probe for probe in sentences if probe.name in self.said)
+        self.parts = [
+            (probe, {effect for effect in effects if effect.name not in active})
+            for probe, effects in parts
+            if probe.name in self.said
+        ]
+        patterns = list(strata(self.design.measured))
         candidates = [
             *(self.named[probe.name] for probe in self.probes),
             *(self.said[probe.name] for probe in self.sentences),
-            *strata(self.design.measured),
+            *(self.said[probe.name] for probe, _ in self.parts),
+            *patterns,
         ]
         self.blocks = {candidate.name: candidate.block for candidate in candidates}
         names, widths = [c.name for c in candidates], [c.widths for c in candidates]
@@ -110,7 +122,7 @@ class Examination:
         self.table: ScoreTable = self.scorer(*self._scored[1:])
         self.ranked = naming.rank(self.table, self.probes)
         self.told = grammar.rank(self.table, self.sentences)
-        self.patterns = [self.table[name] for name in names[len(self.probes) + len(self.sentences) :]]
+        self.patterns = [self.table[name] for name in names[len(names) - len(patterns) :]]
         # Where the base is excluded, a name competes with patterns that have none, not with the base.
         self.least_evidence = min(0.0, max(s.log_bayes for s in self.patterns if s.testable))
 
@@ -265,18 +277,27 @@ class Examination:
 
         The most probable come first.
         """
-        own = set(trial.instance.sentences) if isinstance(trial.instance, Described) else set()
-        items = (
-            [r for r in self.told if own & set(grammar.said_by(r.probe))]
-            if own
-            else [r for r in self.ranked if r.effect is trial.effect]
-        )
-        if not items:
+        item, own = self._linear(trial), _sentences_of(trial)
+        if item is None:
             return ()
-        least, alike = max(0.0, items[0].log_bayes - naming.IMPROBABLE), self._alike(items[0])
+        least, alike = max(0.0, item.log_bayes - naming.IMPROBABLE), self._alike(item)
         others = [r for r in self.told if r.log_bayes > least or r.probe.name in alike]
         others = [r for r in others if not own & set(grammar.said_by(r.probe))]
         return tuple(r.probe.name for r in others[:MOST_CLASSES])
+
+    def held_in_part(self, trial: naming.Trial) -> tuple[str, ...]:
+        """Effects that, were all but a part of them zero, would not be improbable beside what a trial says."""
+        item = self._linear(trial)
+        if item is None:
+            return ()
+        return naming.held_in_part(self.table, self.parts, item)
+
+    def _linear(self, trial: naming.Trial) -> naming.Ranked | None:
+        """What a trial says, as it was ranked by linear steps."""
+        own = _sentences_of(trial)
+        if own:
+            return next((r for r in self.told if own & set(grammar.said_by(r.probe))), None)
+        return next((r for r in self.ranked if r.effect is trial.effect), None)
 
     def _alike(self, item: naming.Ranked) -> set[str]:
         """Sentences no longer than a candidate that the data cannot tell from what it does."""
@@ -308,6 +329,10 @@ class Examination:
     def significant(self) -> list[naming.Ranked]:
         """Effects that are significant by themselves, best evidence first."""
         return [r for r in self.ranked if self.table.corrected(r.score) < ALARM]
+
+
+def _sentences_of(trial: naming.Trial) -> set[str]:
+    return set(trial.instance.sentences) if isinstance(trial.instance, Described) else set()
 
 
 def most_points(calset: CalibrationSet, instrument: Instrument, amplitudes: int) -> int:

@@ -31,7 +31,7 @@ from walop_jax.diagnosis import naming
 from walop_jax.diagnosis.effect_columns import FEWEST_POINTS, Probe
 from walop_jax.diagnosis.score import ScoreTable
 from walop_jax.likelihood import limits
-from walop_jax.model.effects import Context, Described, Effect
+from walop_jax.model.effects import Context, Described
 from walop_jax.model.effects.etalon import GAPS, QUARTER
 from walop_jax.model.effects.sentence import (
     BAND,
@@ -67,21 +67,6 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[naming.Ranked]:
         naming.Ranked(Described, p, score, score.log_bayes - price) for p, score in scored if score.testable
     ]
     return sorted(found, key=lambda item: -item.log_bayes)
-
-
-def uncovered(
-    probes: Sequence[Probe], catalogue: Sequence[type[Effect]], context: Context, instrument: Instrument
-) -> tuple[Probe, ...]:
-    """The groups that are no effect of a catalogue by another name: those that none holds as a part."""
-    known = []
-    for effect in catalogue:
-        for group in effect.probes(context):
-            texts = frozenset(group[0].in_sentences(instrument))
-            if len(texts) <= sum(
-                np.size(getattr(one, name)) for one in group for name in effect.amplitudes()
-            ):
-                known.append(texts)
-    return tuple(probe for probe in probes if not any(texts.issuperset(said_by(probe)) for texts in known))
 
 
 def said_by(probe: Probe) -> tuple[str, ...]:

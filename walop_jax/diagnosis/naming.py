@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -178,6 +179,24 @@ def with_rivals(trial: Trial, trials: Sequence[Trial]) -> tuple[Trial, tuple[str
     same = [in_words(t.instance) for t, far in apart if t.effect is trial.effect and far < EVEN_ODDS]
     rivals = [t.effect.name for t, far in apart if t.effect is not trial.effect and far < IMPROBABLE]
     return dataclasses.replace(trial, alternatives=(*trial.alternatives, *same)), tuple(rivals)
+
+
+def held_in_part(
+    table: ScoreTable, parts: Sequence[tuple[Probe, Collection[type[Effect]]]], item: Ranked
+) -> tuple[str, ...]:
+    """Effects of which a part, by itself, is not improbable beside an item; parts share the prior of their effect."""
+    count = Counter(effect for _, effects in parts for effect in effects)
+    least = max(0.0, item.log_bayes - IMPROBABLE)
+    return tuple(
+        dict.fromkeys(
+            effect.name
+            for probe, effects in parts
+            for effect in effects
+            if effect is not item.effect
+            and table[probe.name].testable
+            and table[probe.name].log_bayes - float(np.log(count[effect])) > least
+        )
+    )
 
 
 def _differ(one: Trial, other: Trial) -> bool:

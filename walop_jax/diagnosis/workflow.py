@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import grammar, location, naming
+from walop_jax.diagnosis import grammar, history, location, naming
 from walop_jax.diagnosis.change_of_stokes import instrument_matrices, largest_change
 from walop_jax.diagnosis.choices import Choices
 from walop_jax.diagnosis.design import Design, held_out
@@ -109,7 +109,9 @@ class _Diagnosing:
         self.context: Context = effect_context(model.template, calset.exposures)
         self.catalogue = applicable(catalogue, self.context, model.template)
         self.wanted: list[Probe] = list(all_probes(self.catalogue, self.context))
-        self.sentences = grammar.uncovered(sentences, self.catalogue, self.context, model.template)
+        every = sentences, self.catalogue, self.context, model.template
+        self.sentences = history.uncovered(*every)
+        self.parts = history.parts(*every)
         self.steps: list[Step] = []
         self.added = self.said = 0
         self.choices: dict[str, Choice] = {}
@@ -152,7 +154,7 @@ class _Diagnosing:
     def _examine(self, earlier: Examination | None = None) -> Examination:
         if earlier is not None:
             forget_programs()  # of models with fewer effects: they are not asked for again
-        found = Examination(self.fit, self.wanted, self.rng, earlier, self.sentences)
+        found = Examination(self.fit, self.wanted, self.rng, earlier, self.sentences, self.parts)
         if earlier is not None:
             forget_programs()  # of columns
         return found
@@ -279,7 +281,7 @@ class _Diagnosing:
             p_value=examination.table.corrected(score) if score else examination.table.p_global,
             log_bayes=trial.log_bayes,
             nameless=examination.nameless(trial),
-            equivalent=close,
+            equivalent=tuple(dict.fromkeys((*close, *examination.held_in_part(trial)))),
             alternatives=trial.alternatives,
             **before_and_after(name, examination.design, Design.of(trial.fit)),
         )
