@@ -466,6 +466,7 @@ def summarise(judged: Sequence[tuple[Scene, Verdict]], known: dict[str, set[str]
     """Rates over judged scenes, and the confusion of names; `known` are the sentences of the effects, by probe."""
     rates: dict[str, list[bool]] = collections.defaultdict(list)
     pulls: list[float] = []
+    mistakes: list[str] = []
     confusion: collections.Counter[tuple[str, str]] = collections.Counter()
     for scene, verdict in judged:
         said = (
@@ -511,6 +512,8 @@ def summarise(judged: Sequence[tuple[Scene, Verdict]], known: dict[str, set[str]
             rates[f"detected, SNR {ratio}"].append(verdict.kind != "consistent")
             wrong = found and truth not in told
             rates[f"confident and wrong, SNR {ratio}"].append(wrong)
+            if wrong:
+                mistakes.append(f"{scene.probe}, SNR {ratio}: {said}, class {', '.join(sorted(told))}")
             if scene.separation >= SEPARABLE:
                 rates[f"top-1 right, SNR {ratio}, separable"].append(first == truth)
                 rates[f"exactly the truth, SNR {ratio}, separable"].append(
@@ -531,6 +534,7 @@ def summarise(judged: Sequence[tuple[Scene, Verdict]], known: dict[str, set[str]
     return {
         "rates": {name: (float(np.mean(v)), len(v)) for name, v in sorted(rates.items())},
         "amplitude pulls": {"rms": float(np.sqrt(np.mean(np.square(pulls)))), "count": len(pulls)},
+        "mistakes": mistakes,
         "confusion": [(t, n, c) for (t, n), c in confusion.most_common(120)],
     }
 
