@@ -9,12 +9,21 @@ import numpy as np
 import pytest
 from astropy import units as u
 from astropy.coordinates import SkyCoord
+from astropy.time import Time
+from astropy.utils import iers
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from science.truth import TrueInstrument
 
 from walop_jax.data import DataError, Site, read_calibration_set
-from walop_jax.sky.moon import moon_direction, moon_sky, rayleigh_sky, sky_to_instrument, standard_rotation
+from walop_jax.sky.moon import (
+    earth_rotation,
+    moon_direction,
+    moon_sky,
+    rayleigh_sky,
+    sky_to_instrument,
+    standard_rotation,
+)
 
 CENTRE = (np.zeros(1), np.zeros(1))
 
@@ -146,6 +155,16 @@ def test_nothing_is_downloaded(monkeypatch):
     # times before, inside and beyond the tables of Earth rotation
     ra, dec = moon_direction(np.array([40000.0, 61043.85, 75000.0]), SITE)
     assert np.all(np.isfinite([ra, dec]))
+
+
+def test_earth_rotation_is_that_of_the_library():
+    ours, theirs = earth_rotation(), iers.IERS_B.open()
+    times = Time(np.array([41000.3, 51544.5, 60000.25, 60600.9]), format="mjd")
+    np.testing.assert_array_equal(ours.ut1_utc(times), theirs.ut1_utc(times))
+    for one, other in zip(ours.pm_xy(times), theirs.pm_xy(times), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert "e_UT1_UTC" in theirs.colnames, "read by the library itself"
+    assert "e_UT1_UTC" not in ours.colnames, "read by numpy"
 
 
 def test_bad_skies_are_refused():

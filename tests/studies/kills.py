@@ -32,14 +32,13 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
-
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from runs.conftest import content  # noqa: E402
 from small_run import SEED, SMALL  # noqa: E402
 
+from walop_jax.cli.common import switch_on_jax  # noqa: E402
 from walop_jax.data import DataError, Grid, write_calibration_set, write_frames  # noqa: E402
 from walop_jax.likelihood import limits  # noqa: E402
 from walop_jax.posterior import Options  # noqa: E402
@@ -326,7 +325,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, count in {"states": 200, "full": 60, "kills": 0, "races": 0}.items():
         parser.add_argument(f"--{name}", type=int, default=count)
     options = parser.parse_args(arguments)
-    jax.config.update("jax_enable_x64", True)
+    switch_on_jax()  # as the commands do: programs that were kept differ from others in the last digits
     warnings.simplefilter("ignore")
     sys.addaudithook(_hook)
     bad = 0
