@@ -129,6 +129,23 @@ def test_rosenbrock_from_the_usual_start(policy):
     np.testing.assert_allclose(found.x, 1.0, atol=1e-7)
 
 
+def test_a_curved_valley_that_a_prior_closes_is_gone_along():
+    """Of flux × throughput only the product is seen. Gauss–Newton steps alone take 147.
+
+    By symmetry both end at the root of k² x (x² − 1) + (x − m) = 0.
+    """
+    k, m = 30.0, 1.9
+    valley = Squares(
+        lambda x: np.array([k * (x[0] * x[1] - 1.0), x[0] - m, x[1] - m]),
+        lambda x: np.array([[k * x[1], k * x[0]], [1.0, 0.0], [0.0, 1.0]]),
+    )
+    (root,) = (z.real for z in np.roots([k**2, 0.0, 1.0 - k**2, -m]) if z.real > 0.5)
+    found = minimise(valley, np.array([2.0, 0.5]), np.ones(2), tolerance=1e-8)
+    assert found.converged
+    np.testing.assert_allclose(found.x, root, atol=1e-7)
+    assert found.steps < 40
+
+
 def test_the_steps_are_those_of_optimistix():
     """Its Levenberg–Marquardt on the residuals themselves, with the same region, for as many steps: the same place."""
 

@@ -81,15 +81,14 @@ def product(*effects: Effect) -> np.ndarray:
     """(point, plate, 6): what a calibration with these effects says of the instrument."""
     device = instrument(*effects)
     nothing = np.zeros((values_of(device).size,) * 2)
-    found = []
-    for plate in (np.nan, PLATE):
-        n = len(X)
-        settings = Settings(
-            filter=np.full(n, "band"), teff=np.full(n, np.nan), temperature=np.full(n, TEMP),
-            hour_angle=np.full(n, HA), positions={"CHWP": np.full(n, plate)},
-        )  # fmt: skip
-        found.append(matrices(device, settings, {"band": CURVE}, X, Y, nothing)[0])
-    return np.stack(found, axis=1)
+    plate = np.tile([np.nan, PLATE], len(X))
+    n = len(plate)
+    settings = Settings(
+        filter=np.full(n, "band"), teff=np.full(n, np.nan), temperature=np.full(n, TEMP),
+        hour_angle=np.full(n, HA), positions={"CHWP": plate},
+    )  # fmt: skip
+    found = matrices(device, settings, {"band": CURVE}, np.repeat(X, 2), np.repeat(Y, 2), nothing)[0]
+    return found.reshape(len(X), 2, -1)
 
 
 def make(name: str, **values) -> Effect:

@@ -25,7 +25,7 @@ from walop_jax.fit.solver import (
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
 
-MAXIMUM_STEPS = 60
+MAXIMUM_STEPS = 120
 TOLERANCE = 1e-4
 
 
