@@ -41,8 +41,9 @@ def fitted(name: str, start: int) -> Fitted:
     for _ in range(12):
 
         def evaluate(x, request, noise=noise):
-            r, j = data.residuals(x) / noise, data.jacobian(x) / noise
-            return Expansion(float(r @ r), j.T @ r, j.T @ j)
+            with np.errstate(over="ignore", invalid="ignore"):  # a trial far away is no place to stay
+                r, j = data.residuals(x) / noise, data.jacobian(x) / noise
+                return Expansion(float(r @ r), j.T @ r, j.T @ j)
 
         found = minimise(evaluate, at, scale, maximum_steps=500, tolerance=1e-9)
         at, before = found.x, noise
@@ -94,4 +95,5 @@ def test_from_the_first_start_and_never_a_wrong_answer_called_converged():
         good = digits(found.minimum.x, data.parameters) >= 6
         right += [name] * good
         assert good or not found.minimum.converged, name
+    print(len(right), "of", len(MODELS))
     assert len(right) >= 24

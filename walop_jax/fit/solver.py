@@ -8,15 +8,10 @@ Step        (JᵀJ + λ)⁻¹ Jᵀr with λ following optimistix' classical trus
 Matrix      is most of the work of a pass. A policy says when it is computed: `AtEveryStep`, or `WhenStale`: a step
             leaves as much of the distance as the matrix changes on the way there, relatively; where more than a share
             of it is left, or a step led upwards, the matrix serves no more.
-Curvature   JᵀJ leaves out Σ r ∂²r, which is what bends a valley that the data leave open and a prior closes: throughput
-            and flux, where the throughput of all cameras may be multiplied by one smooth function. Steps then close in
-            by some tens of per cent only. After `PATIENCE` places what is left out is estimated, in the soft directions
-            alone, from the change of the gradient along the steps (`secant`).
 Stop        scaled gradient ‖(JᵀJ)^(−½) Jᵀr‖ < `atol`: the distance to the minimum in units of the standard
             error. A solver's own "success" is not asked: it can be wrong on data that are not whitened, on NaN, or on
             a step of size zero.
-Source      `SOURCE`: the method and its trust region; the structured secant is that of Dennis, Gay & Welsch 1981, ACM
-            TOMS 7, 348.
+Source      `SOURCE`: the method and its trust region.
 """
 
 from __future__ import annotations
@@ -45,10 +40,6 @@ LARGEST_CONDITION = 1e14
 ROUNDING = 1e-12  # of an objective: near the end two of them differ by less
 STALE = 0.05  # of the distance left by a step
 SMALLEST_STEP = 1e-14  # of the trust region
-PATIENCE = 12  # places looked at before curvature is estimated; most searches end at six to eight
-SOFT = (
-    100.0  # eigenvalue of the matrix, in units of the priors, up to which little but these holds a direction
-)
 # Share of the predicted reduction above which λ falls. With 0.99 a problem that is a little curved keeps its λ and with
 # it a slow end: directions that the data hardly see then take forty steps.
 WELL_PREDICTED = 0.75
@@ -161,7 +152,7 @@ class TrustRegion(optx.AbstractSearch):
 class _State(NamedTuple):
     """Between two steps: the expansion at the best place so far, and the next place to look at."""
 
-    places: int  # that were looked at
+    first: bool
     trial: Vector
     looked_at: float  # objective of the last one
     expansion: Any
@@ -172,7 +163,6 @@ class _State(NamedTuple):
     condition: float
     terminate: bool
     result: optx.RESULTS
-    bend: Matrix  # estimate of what the matrix leaves out
 
 
 class NormalEquationsSolver(optx.AbstractMinimiser[Vector, Expansion, _State]):
@@ -194,37 +184,27 @@ class NormalEquationsSolver(optx.AbstractMinimiser[Vector, Expansion, _State]):
         """Nothing is known yet: the first step looks at `y` itself."""
         region = self.search.init(jnp.zeros(len(y)), None)
         return _State(
-            places=0, trial=y, looked_at=np.nan, expansion=None, own_matrix=True,
+            first=True, trial=y, looked_at=np.nan, expansion=None, own_matrix=True,
             every_matrix=self.matrix.at_trials, region=region, distance=np.inf, condition=np.inf,
-            terminate=False, result=RESULTS.successful, bend=np.zeros((len(y), len(y))),
+            terminate=False, result=RESULTS.successful,
         )  # fmt: skip
 
     def step(
         self, fn: Any, y: Vector, args: Any, options: Any, state: _State, tags: Any
     ) -> tuple[Vector, _State, Expansion]:
         """Look at the trial place, go there if it is better, and choose the next one."""
-        first = state.places == 0
-        with_matrix = first or state.every_matrix
+        with_matrix = state.first or state.every_matrix
         _, trial = fn(state.trial, Request(state.expansion, with_matrix))
-        state = state._replace(looked_at=trial.objective, places=state.places + 1)
-        if first and not np.isfinite(trial.objective):
+        state = state._replace(looked_at=trial.objective)
+        if state.first and not np.isfinite(trial.objective):
             return y, state._replace(expansion=trial, terminate=True, result=RESULTS.nonfinite), trial
         here = trial if state.expansion is None else state.expansion
         size, accept, region = _next_region(
-            self.search,
-            first,
-            y,
-            state.trial,
-            _information(here, state.bend),
-            _information(trial),
-            state.region,
+            self.search, state.first, y, state.trial, _information(here), _information(trial), state.region
         )
-        state = state._replace(region=region, expansion=here)
+        state = state._replace(first=False, region=region, expansion=here)
         if bool(accept):
-            moved = self._moved(fn, state, trial, with_matrix)
-            if state.places > PATIENCE:
-                moved = moved._replace(bend=secant(state.bend, state.trial - y, here, moved.expansion))
-            state, y = moved, state.trial
+            state, y = self._moved(fn, state, trial, with_matrix), state.trial
         elif not with_matrix:
             # A matrix that leads upwards serves no more.
             if not state.own_matrix:
@@ -234,7 +214,7 @@ class NormalEquationsSolver(optx.AbstractMinimiser[Vector, Expansion, _State]):
             if float(size) < SMALLEST_STEP:
                 state = state._replace(terminate=True, result=RESULTS.stagnation)
             else:
-                step = _next_step(size, _information(state.expansion, state.bend))
+                step = _next_step(size, _information(state.expansion))
                 state = state._replace(trial=y + np.asarray(step))
         return y, state, state.expansion
 
@@ -308,39 +288,9 @@ class _Information(NamedTuple):
         return optx.FunctionInfo.EvalGradHessian(0.5 * self.objective, self.gradient, operator)
 
 
-def _information(expansion: Expansion, bend: Matrix | None = None) -> _Information:
-    """With the curvature that the matrix leaves out, unless the two together have no minimum."""
+def _information(expansion: Expansion) -> _Information:
     objective = expansion.objective if np.isfinite(expansion.objective) else np.inf
-    matrix = expansion.matrix
-    if bend is not None and bend.any():
-        whole = matrix + bend
-        if np.linalg.eigvalsh(whole)[0] > 0.0:
-            matrix = whole
-    return _Information(objective, expansion.gradient, matrix)
-
-
-def secant(bend: Matrix, step: Vector, before: Expansion, after: Expansion) -> Matrix:
-    """The curvature beyond the matrix in soft directions, so that both map the last step to the change of the gradient.
-
-    The smallest symmetric change of the last estimate `bend`, which is scaled down first where it was too large. (In
-    stiff directions the change of a gradient is made by what is of third order, and says nothing.)
-    """
-    value, vector = np.linalg.eigh(after.matrix)
-    soft = vector[:, value < SOFT]
-    whole = after.gradient - before.gradient
-    step, change, missing = (soft @ (soft.T @ v) for v in (step, whole, whole - after.matrix @ step))
-    along = float(change @ step)
-    if not along > 0.0:
-        return bend
-    expected = float(step @ bend @ step)
-    if expected != 0.0:
-        bend = bend * min(1.0, abs(float(step @ missing) / expected))
-    left = missing - bend @ step
-    return (
-        bend
-        + (np.outer(left, change) + np.outer(change, left)) / along
-        - float(left @ step) * np.outer(change, change) / along**2
-    )
+    return _Information(objective, expansion.gradient, expansion.matrix)
 
 
 def _region(
