@@ -24,7 +24,11 @@ def test_verdicts_on_hidden_effects(blind):
     assert rates["detected, SNR 10"][0] >= 0.95
     assert rates["top-1 right, SNR 10, separable"][0] >= 0.85
     assert rates["confident and wrong, SNR 10"][0] <= 0.05
-    outside = sum(rates[f"outside: {one}, SNR 10"][0] for one in ("right", "in its class", "unexplained"))
-    assert outside >= 0.8
+    # Of things that are in no catalogue half are sentences. At this ratio another one often describes the data as well;
+    # what must not happen is that it is called by a name.
+    held = sum(rates[f"outside: {one}, SNR 10"][0] for one in ("right", "in its class"))
+    assert held >= 0.4
+    assert rates["outside: wrong name, SNR 10"][0] <= 0.15
+    assert rates["pair: both named or in a class"][0] >= 0.8
     assert rates["removed: wrong name, SNR 10"][0] <= 0.1
     assert 0.7 < found["amplitude pulls"]["rms"] < 1.3
