@@ -389,7 +389,7 @@ class _Diagnosing:
             far=naming.beyond_prior(self.fit, step.effect),
             choices=naming.spoken_choices(effect),
             robust_ratio=examination.design.robust_ratio(step.effect),
-            equivalent=tuple(sorted(close, key=lambda name: separation.get(name, np.inf))),
+            equivalent=tuple(sorted(close, key=lambda name: (separation.get(name, np.inf), name))),
             separation=separation,
             separated_by=effect.separated_by if close or step.nameless else "",
             where=location.describe(examination.design, change),

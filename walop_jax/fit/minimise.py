@@ -25,9 +25,8 @@ from walop_jax.fit.solver import (
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
 
-MAXIMUM_STEPS = (
-    200  # a curved valley that only a prior closes (throughput and flux) may take more than a hundred
-)
+MAXIMUM_STEPS = 200
+"""Along a curved valley that only a prior closes (throughput and flux) there may be more than a hundred."""
 TOLERANCE = 1e-4
 
 
