@@ -19,6 +19,7 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -269,13 +270,10 @@ class Blind:
         if (added, removed) not in self._scorers:
             gone = {self.effect_of[a] for a in added if a in self.effect_of} | set(removed)
             left = [p for p in self.probes if p.effect.name not in gone]
-            catalogue = [effect for effect in EFFECTS if effect.name not in removed]
-            every = self.sentences, catalogue, self.context, self.template
-            left += [probe for probe in history.uncovered(*every) if probe.name not in added]
-            parts = [one for one in self._parts(removed) if one[0].name not in added]
-            names = [p.name for p in (*left, *(p for p, _ in parts))] + [
-                n for n in self.patterns if n not in added
-            ]
+            left += [probe for probe in self._sentences(removed) if probe.name not in added]
+            parts = [probe for probe, _ in self._parts(removed)]
+            names = [*(probe.name for probe in (*left, *parts)), *self.patterns]
+            names = [name for name in names if name not in added]
             draws = DRAWS if not added and not removed else 0
             if len(self._scorers) > KEPT:  # those of the starting model are dear, and always needed
                 self._scorers = {key: value for key, value in self._scorers.items() if not key[0]}
@@ -284,9 +282,17 @@ class Blind:
         return self._scorers[added, removed]
 
     @functools.cache  # noqa: B019
+    def _sentences(self, removed: tuple[str, ...]) -> tuple[Probe, ...]:
+        return history.uncovered(*self._grammar(removed))
+
+    @functools.cache  # noqa: B019
     def _parts(self, removed: tuple[str, ...]) -> tuple[tuple[Probe, frozenset[type[Effect]]], ...]:
+        return history.parts(*self._grammar(removed))
+
+    def _grammar(self, removed: tuple[str, ...]) -> tuple[Any, ...]:
+        """All sentences, and what the catalogue holds without some effects."""
         catalogue = [effect for effect in EFFECTS if effect.name not in removed]
-        return history.parts(self.sentences, catalogue, self.context, self.template)
+        return self.sentences, catalogue, self.context, self.template
 
     def _space(self, added: tuple[str, ...]) -> ScoreSpace:
         space = self.space.with_base([SINGLE_EXPOSURES], self.nuisance)[0]
