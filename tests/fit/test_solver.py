@@ -11,7 +11,14 @@ import optimistix as optx
 import pytest
 
 from walop_jax.fit.minimise import minimise
-from walop_jax.fit.solver import WELL_PREDICTED, AtEveryStep, NormalEquationsSolver, TrustRegion, WhenStale
+from walop_jax.fit.solver import (
+    WELL_PREDICTED,
+    AtEveryStep,
+    NormalEquationsSolver,
+    TrustRegion,
+    WhenStale,
+    distance_to_minimum,
+)
 
 RESULTS = optx.RESULTS
 
@@ -207,3 +214,14 @@ def test_nothing_to_vary_is_a_minimum():
     )
     assert found.converged
     assert found.steps == 1
+
+
+def test_the_unit_of_a_parameter_does_not_move_the_minimum_closer():
+    """A residual that hangs on one parameter by 10⁻⁹ is as far from the minimum as one that hangs on it by 1."""
+    jacobian, residuals = np.array([[1.0, 0.0], [1.0, 1.0]]), np.array([0.0, 3.0])
+    for unit in (1.0, 1e-9):
+        j = jacobian * [1.0, unit]
+        distance, condition = distance_to_minimum(Expansion(9.0, j.T @ residuals, j.T @ j))
+        # r lies in the plane of both columns: the distance is all of |r| = 3.
+        assert distance == pytest.approx(3.0, rel=1e-6)
+        assert condition == pytest.approx((1.0 + 0.5**0.5) / (1.0 - 0.5**0.5), rel=1e-6)

@@ -262,16 +262,18 @@ def distance_to_minimum(expansion: Expansion) -> tuple[float, float]:
     the number of parameters (van der Sluis 1969, Numerische Mathematik 14, 14).
     """
     matrix, gradient = expansion.matrix, expansion.gradient
-    if len(gradient) == 0:
-        return 0.0, 1.0
     if not (np.isfinite(matrix).all() and np.isfinite(gradient).all()):
         return np.inf, np.inf
+    # In units of what each is known to: in others a parameter that the data hardly see would fall below the rounding.
     size = np.sqrt(np.clip(np.diag(matrix), 0.0, None))
-    alone = np.linalg.eigvalsh(matrix / np.outer(size, size)) if (size > 0).all() else np.zeros(1)
-    condition = float(alone[-1] / alone[0]) if alone[0] > 0 else np.inf
-    value, vector = np.linalg.eigh(matrix)
+    seen = size > 0
+    if not seen.any():
+        return 0.0, np.inf if len(gradient) else 1.0
+    unit = size[seen]
+    value, vector = np.linalg.eigh(matrix[np.ix_(seen, seen)] / np.outer(unit, unit))
+    condition = float(value[-1] / value[0]) if seen.all() and value[0] > 0 else np.inf
     positive = value > value[-1] * 1e-15
-    along = vector.T @ gradient
+    along = vector.T @ (gradient[seen] / unit)
     return float(np.sqrt(np.sum(along[positive] ** 2 / value[positive]))), condition
 
 
