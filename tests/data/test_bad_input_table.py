@@ -228,7 +228,7 @@ ELSEWHERE = {
     "35": "diagnosis/test_mixups.py::test_every_mix_up_is_told_with_its_remedy",
     "37": "paper/test_full_moon.py::test_a_patch_that_is_not_rayleigh_is_found_and_does_no_harm",
     "31": "model/test_compiled.py::test_single_precision_is_refused",
-    "38": "diagnosis/test_trust.py::test_a_mistake_in_the_data_is_not_trusted",
+    "38": "fit/test_outliers.py::test_cosmic_rays_are_flagged_and_nothing_else",
     "42": "model/effects/test_effects_contract.py::test_neutral_and_derivatives",
     "43": "diagnosis/test_detection_limits.py::test_two_effects_that_do_the_same_are_told_as_a_class",
     "44": "cli/test_commands.py::test_no_convergence_no_product",
@@ -240,7 +240,7 @@ ELSEWHERE = {
     "50": "likelihood/test_large.py::test_memory_is_bounded_by_what_is_allowed",
     "51": "likelihood/test_runner.py::test_a_dead_process_is_an_error_in_the_others",
     "52": "calibration/test_product.py::test_what_is_not_as_written_is_refused",
-    "53": "runs/test_tables.py::test_what_cannot_be_is_said_before_any_work",
+    "53": "runs/test_tables.py::test_a_filter_that_the_calibration_does_not_cover_is_refused_unless_forced",
     "54": "cli/test_program.py::test_a_path_that_is_not_utf_8",
     "55": "data/test_hostile_headers.py::test_impossible_counts_are_refused_by_name",
 }

@@ -127,6 +127,30 @@ def test_what_cannot_be_is_said_before_any_work(fitted: FittedSet, catalogue: Pa
         tabulate_matrix(fitted.run / "other.fits", catalogue, tmp_path / "o.fits")
 
 
+def test_a_filter_that_the_calibration_does_not_cover_is_refused_unless_forced(
+    call, fitted: FittedSet, catalogue: Path, tmp_path: Path
+):
+    """The curve of a second filter is in the product, but none of its exposures was taken in it."""
+    curves = {"r2": fitted.calibration.filter_curve("SDSS-r"), **fitted.calibration.filters}
+    wider = dataclasses.replace(fitted.calibration, filters=curves)
+    write_product(tmp_path / "calibration.fits", wider.to_product())
+    table = Table.read(catalogue)
+    table["FILTER"] = np.where(np.arange(6) == 3, "r2", "SDSS-r")
+    table.write(other := tmp_path / "other.fits")
+    arguments = ("apply", tmp_path, other, "-o", tmp_path / "o.fits")
+    refused = call(*arguments)
+    assert refused.exit_code == 1
+    assert (
+        "other.fits: FILTER: row 3 (counted from 0): r2; the calibration was made in SDSS-r" in refused.stderr
+    )
+    assert not (tmp_path / "o.fits").exists()
+    forced = call(*arguments, "--force")
+    assert forced.exit_code == 0, forced.stderr
+    flag = Table.read(tmp_path / "o.fits")["FLAG"]
+    both = int(Quality.VALIDITY_FORCED | Quality.BEYOND_SETTINGS)
+    assert (flag & both).tolist() == [0, 0, 0, both, 0, 0]
+
+
 @pytest.mark.parametrize("command", ["matrix", "apply"])
 def test_an_output_stays_as_it_is(fitted: FittedSet, points: Path, catalogue: Path, tmp_path: Path, command):
     function, source = (tabulate_matrix, points) if command == "matrix" else (apply_to_catalogue, catalogue)

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from walop_jax.calibration.matrix import matrices
 from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, ParameterTable, Verdict, in_ascii
@@ -217,14 +217,17 @@ class Calibration(Displayed):
         low_x, low_y = self.field[0] - margin, self.field[2] - margin
         high_x, high_y = self.field[1] + margin, self.field[3] + margin
         flags[(x < low_x) | (x > high_x) | (y < low_y) | (y > high_y)] |= Quality.BEYOND_FIELD
-        flags[~np.isin(settings.filter, np.unique(self.exposures.filter))] |= Quality.BEYOND_SETTINGS
+        flags[self.beyond_settings(settings)] |= Quality.BEYOND_SETTINGS
+        return flags
+
+    def beyond_settings(self, settings: Settings) -> Bool[np.ndarray, " p"]:
+        """Which settings have a filter, or where that matters a temperature, that the exposures do not cover."""
+        beyond = ~np.isin(settings.filter, np.unique(self.exposures.filter))
         if "temperature" in needs(self.model.template).conditions:
             low, high = np.nanmin(self.exposures.temp), np.nanmax(self.exposures.temp)
-            beyond = (settings.temperature < low - TEMPERATURE_MARGIN) | (
-                settings.temperature > high + TEMPERATURE_MARGIN
-            )
-            flags[beyond] |= Quality.BEYOND_SETTINGS
-        return flags
+            beyond |= settings.temperature < low - TEMPERATURE_MARGIN
+            beyond |= settings.temperature > high + TEMPERATURE_MARGIN
+        return beyond
 
     def maps(self, size: int = MAP_SIZE) -> MatrixMaps:
         """The matrix over the field on a regular grid, for a look at it.

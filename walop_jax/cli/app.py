@@ -21,6 +21,7 @@ COMMANDS = (
     "simulate",
     "refit",
     "compress",
+    "clip",
     "diagnose",
     "limits",
     "sample",

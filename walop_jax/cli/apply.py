@@ -34,6 +34,11 @@ SaturationOption = Annotated[
     typer.Option("--saturation", metavar="ELECTRONS", help="Counts from here on are not used (FLAG 256)."),
 ]
 
+ForceOption = Annotated[
+    bool,
+    typer.Option("--force", help="Also stars whose filter or temperature it does not cover (FLAG 2048)."),
+]
+
 STAGES = ("reading", "tabulating", "writing")
 
 
@@ -45,6 +50,7 @@ def apply(
     saturation: SaturationOption = None,
     posterior: PosteriorOption = None,
     effects: EffectsOption = None,
+    force: ForceOption = False,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
     json: JsonOption = False,
@@ -59,8 +65,8 @@ def apply(
     Errors hold photon noise and calibration; Q_COLOUR and U_COLOUR say what ignoring TEFF does. FLAG: 16 a
     direction of (q, u) is hardly measured, 32 beyond the calibrated field (no result a quarter beyond), 64
     filter, temperature or colour that the calibration has not seen, 128 a camera is missing, 256 flagged or
-    saturated counts, 16384 no result, 131072 intensities that disagree with the calibration by more than noise
-    and half a per cent; bits of the calibration itself are added to all rows.
+    saturated counts, 2048 used with --force, 16384 no result, 131072 intensities that disagree with the
+    calibration by more than noise and half a per cent; bits of the calibration itself are added to all rows.
     """
     switch_on_jax()
     from walop_jax.model.effects.own import catalogue_with
@@ -79,6 +85,7 @@ def apply(
             estimator=debias,
             saturation=saturation,
             posterior=posterior,
+            force=force,
             overwrite=overwrite,
             progress=tell,
             effects=catalogue_with(effects),

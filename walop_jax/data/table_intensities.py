@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data.records import Block, Exposures, Intensities, Points, Sources
+from walop_jax.data.records import Block, DataFlag, Exposures, Intensities, Points, Sources
 from walop_jax.data.schema import Place
 from walop_jax.io.errors import fail, rows_text
 
@@ -62,8 +62,24 @@ class TableIntensities(Intensities):
             used=np.ones(len(point), dtype=bool),
         )
 
+    @classmethod
+    def of(cls, intensities: Intensities, points: Points) -> TableIntensities:
+        """The intensities of all `points` as a table: as they are, or the used part of any others."""
+        return (
+            intensities
+            if isinstance(intensities, cls)
+            else cls.dense(points, intensities.block(0, len(points)))
+        )
+
     def using(self, used: Bool[np.ndarray, " r"]) -> TableIntensities:
         """Return the same rows with another choice of which take part."""
+        return self._with(self.flag, used)
+
+    def flagged(self, rows: Bool[np.ndarray, " r"], flag: DataFlag) -> TableIntensities:
+        """Return the same rows, of which some have a further flag and take no part."""
+        return self._with(self.flag | np.where(rows, int(flag), 0), self.used & ~rows)
+
+    def _with(self, flag: Int[np.ndarray, " r"], used: Bool[np.ndarray, " r"]) -> TableIntensities:
         return TableIntensities(
             self.exposures,
             self.points,
@@ -72,7 +88,7 @@ class TableIntensities(Intensities):
             source=self.source,
             counts=self.counts,
             sigma=self.sigma,
-            flag=self.flag,
+            flag=flag,
             used=used,
         )
 

@@ -36,21 +36,14 @@ def write_calibration_set(
     Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only,
     for fewer than two cameras, and if a name cannot be written in FITS (ASCII only).
     """
-    intensities = _as_table(calset)
+    intensities = TableIntensities.of(calset.intensities, calset.points)
     with atomic_path(path, overwrite=overwrite) as temporary:
         sign_and_write(_table_hdus(calset, intensities, path), temporary)
 
 
 def set_hdus(calset: CalibrationSet, path: object) -> list[Any]:
     """The HDUs of a calibration set as tables; errors name `path`."""
-    return _table_hdus(calset, _as_table(calset), path)
-
-
-def _as_table(calset: CalibrationSet) -> TableIntensities:
-    intensities = calset.intensities
-    if isinstance(intensities, TableIntensities):
-        return intensities
-    return TableIntensities.dense(calset.points, intensities.block(0, len(calset.points)))
+    return _table_hdus(calset, TableIntensities.of(calset.intensities, calset.points), path)
 
 
 def _table_hdus(calset: CalibrationSet, intensities: TableIntensities, path: object) -> list[Any]:

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.fit.outliers import BEYOND, MOST, outlying
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
@@ -26,6 +27,7 @@ class Misfit:
     """Mean squared normalised residual per intensity in each group, and rms disagreement of matrix elements.
 
     With the flux eliminated, noise alone gives 1 − 1/K per intensity of K cameras (1 where the flux is known).
+    `outliers` is the share of (exposure, point) pairs that lie off by themselves (`outliers.outlying`).
     """
 
     camera: Mapping[str, float]
@@ -35,6 +37,7 @@ class Misfit:
     matrix_element: Mapping[str, float]
     worst_exposure: tuple[int, float]
     worst_point: tuple[int, float, float, float]
+    outliers: float = 0.0
 
     def sentences(self) -> tuple[str, ...]:
         """The disagreement in words, the largest of each kind first."""
@@ -44,7 +47,12 @@ class Misfit:
             return ", ".join(f"{name} {format(value, form)}" for name, value in order)
 
         point, x, y, value = self.worst_point
+        clip = (
+            f"{100 * self.outliers:.2g} % of the rows lie more than {BEYOND:g} standard errors off: if these are "
+            "cosmic rays or stars, walop-jax clip flags them"
+        )
         return (
+            *([clip] if 0.0 < self.outliers <= MOST else []),
             f"mean squared residual by camera: {ranked(self.camera, '.3g')}",
             f"by kind: {ranked(self.kind, '.3g')}; by filter: {ranked(self.filter, '.3g')}; "
             f"by calibration plate: {ranked(self.calibration_plate, '.3g')}",
@@ -98,6 +106,7 @@ def misfit_at(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Misfit
             float(points.y[worst]),
             float(per_point[worst]),
         ),
+        outliers=float(outlying(likelihood, values).sum() / max(used.sum(), 1)),
     )
 
 

@@ -32,6 +32,7 @@ BITS = (
     Quality.BEYOND_SETTINGS,
     Quality.CAMERA_MISSING,
     Quality.SATURATED,
+    Quality.VALIDITY_FORCED,
     Quality.NO_STOKES,
     Quality.DISAGREES,
 )
@@ -60,6 +61,7 @@ def apply_to_catalogue(
     estimator: str = ESTIMATORS[0],
     saturation: float | None = None,
     posterior: str | os.PathLike[str] | None = None,
+    force: bool = False,
     overwrite: bool = False,
     effects: Sequence[type[Effect]] = EFFECTS,
     progress: Callable[[str], None] | None = None,
@@ -68,9 +70,10 @@ def apply_to_catalogue(
 
     `product` is a calibration product or the folder of a run; `estimator` is one of `ESTIMATORS`; counts
     (electrons) from `saturation` on are not used; with `posterior` (a `posterior.nc`) mean and covariance are those
-    of its draws. `effects` are those that its model may have. `progress` is told what is being done. Raises
-    `DataError` for files that cannot be read or written and as `science.apply` does; ValueError for an unknown
-    estimator and a saturation that is not above 0.
+    of its draws; with `force` also stars whose filter or temperature the calibration does not cover. `effects` are
+    those that its model may have. `progress` is told what is being done. Raises `DataError` for files that cannot be
+    read or written and as `science.apply` does; ValueError for an unknown estimator and a saturation that is not
+    above 0.
     """
     began = time.perf_counter()
     tell = progress or (lambda text: None)
@@ -90,7 +93,7 @@ def apply_to_catalogue(
     tell("tabulating the analysis vectors")
     calibration = held.calibration if posterior is None else with_moments(held.calibration, posterior)
     with errors_naming(catalogue):
-        stars = apply(calibration, rows, lambda done, all_: tell(f"{done} of {all_} rows"))
+        stars = apply(calibration, rows, lambda done, all_: tell(f"{done} of {all_} rows"), force=force)
     tell("writing")
     columns = stokes_columns(stars, rows.star, estimator)
     content = held.product.content_hash()

@@ -172,18 +172,20 @@ def apply(
     estimator: str = ESTIMATORS[0],
     saturation: float = math.inf,
     posterior: Path_ | None = None,
+    force: bool = False,
 ) -> Any:
     """Stokes parameters of stars from their intensities, as an astropy table: `walop-jax apply`.
 
     `catalogue` is a path, an astropy table, or columns by name: X, Y, N, N_ERR and those that the command knows (docs:
     files). Counts (electrons) from `saturation` on are not used; `estimator` is that of the degree of polarisation, MAS
-    or WK; with `posterior` (a `posterior.nc`) mean and covariance are those of its draws.
+    or WK; with `posterior` (a `posterior.nc`) mean and covariance are those of its draws; with `force` also stars whose
+    filter or temperature the calibration does not cover.
     """
     there, table = _calibration(calibration), _table(catalogue, {})
     chosen = there if posterior is None else with_moments(there, posterior)
     rows = read_catalogue(table, there.model.template.patched(), saturation, always_in=there.always_in)
     with errors_naming(table.path):
-        stars = apply_to_rows(chosen, rows)
+        stars = apply_to_rows(chosen, rows, force=force)
     cards = header(there.to_product().content_hash(), estimator, float(np.mean(np.isfinite(rows.rotator))))
     return extended(table, stokes_columns(stars, rows.star, estimator), cards)
 

@@ -27,6 +27,7 @@ from walop_jax.model import carried, light
 from walop_jax.model.parameters import with_values
 from walop_jax.science.chance import chi2_tail
 from walop_jax.science.estimate import calibration_shift, estimate_with
+from walop_jax.science.validity import check_validity
 
 MOST_SETTINGS = 200
 ILL_POSED = 10.0  # ratio of the errors of the two principal directions from which FLAG 16 is set
@@ -65,15 +66,22 @@ class Stars:
 
 
 def apply(
-    calibration: Calibration, catalogue: Catalogue, progress: Callable[[int, int], None] | None = None
+    calibration: Calibration,
+    catalogue: Catalogue,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    force: bool = False,
 ) -> Stars:
     """Stokes parameters of all stars of a catalogue.
 
-    `progress` is told how many rows of how many are done. Raises `DataError` for a filter that nobody knows and
-    for a catalogue with more optical settings than can be tabulated.
+    `progress` is told how many rows of how many are done. Raises `DataError` for a filter that nobody knows, for a
+    catalogue with more optical settings than can be tabulated, and, unless `force` is given, for what the calibration
+    does not cover (`check_validity`).
     """
     vectors = AnalysisVectors(calibration)
     settings, setting_of = _settings(vectors, catalogue)
+    if not force:
+        check_validity(calibration, catalogue.points.settings)
     counts = linearised(calibration, catalogue.counts)
     offset, slope = _rotator_zero(vectors)
     order = np.argsort(catalogue.star, kind="stable")
@@ -263,6 +271,7 @@ def _flags(
     settings = points.settings[rows]
     bits = vectors.calibration.flags(points.x[rows], points.y[rows], settings)
     bits[_outside(vectors, catalogue, rows)] |= Quality.BEYOND_FIELD
+    bits[vectors.calibration.beyond_settings(settings)] |= Quality.VALIDITY_FORCED
     bits[settings.teff < COOLEST] |= Quality.BEYOND_SETTINGS
     bits[~np.isfinite(counts * catalogue.sigma[rows]).all(axis=1)] |= Quality.CAMERA_MISSING
     bits[catalogue.spoilt[rows]] |= Quality.SATURATED

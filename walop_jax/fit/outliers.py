@@ -1,0 +1,98 @@
+"""Single intensities that neither model nor noise explain: cosmic rays, stars in a patch of sky.
+
+Equation    |r| > c s √(1 − 1/K),  s = max(1, 1.4826 median |r| / √(1 − 1/K))
+Symbols     r normalised residual of a camera, K cameras, c the number of standard errors, s how much more the residuals
+            of this fit scatter than stated, by their median absolute deviation: it does not see the outliers
+Source      clipping: Yahil & Vidal 1977, ApJ 214, 347; the eliminated flux takes one of K degrees of freedom of a row
+Limits      noise alone, c = 5: one row of 440 000 of four cameras. More than `MOST` of the rows are no outliers but
+            what the model lacks
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from walop_jax.data.records import CalibrationSet, DataFlag
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.refit import FitResult, fit
+from walop_jax.fit.search import FAR_OFF
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.specification import Model
+
+BEYOND = 5.0  # standard errors
+LEAST = 3.0  # standard errors: with less, noise would be clipped and the errors of the rest with it
+MOST = 0.05  # share of the rows
+_GAUSSIAN = 1.4826  # standard deviation over median absolute deviation
+
+
+@dataclasses.dataclass(frozen=True)
+class Clipped:
+    """A calibration set whose outlying rows are flagged, and the fit of what is left.
+
+    `rows` is how many (exposure, point) pairs were flagged, of `used` that took part before.
+    """
+
+    calset: CalibrationSet
+    result: FitResult
+    rows: int
+    used: int
+
+    @property
+    def share(self) -> float:
+        """Flagged rows of all that took part."""
+        return self.rows / max(self.used, 1)
+
+    @property
+    def too_many(self) -> bool:
+        """Whether so many rows lie off that it is the model that lacks something."""
+        return self.share > MOST
+
+
+def outlying(likelihood: Likelihood, values: np.ndarray, beyond: float = BEYOND) -> Bool[np.ndarray, "p e"]:
+    """Used rows of which a camera lies more than `beyond` standard errors from a model; `values` is a full vector."""
+    return _distance(likelihood, values) > beyond
+
+
+def clipped(calset: CalibrationSet, model: Model | None = None, beyond: float = BEYOND) -> Clipped:
+    """Flag (BAD_PIXEL) what lies `beyond` standard errors off, fit what is left, and again until nothing does.
+
+    The farthest go first, down to half of their distance: what is large enough bends a fit, and good rows then lie off
+    as well. As long as it does, errors are taken as large as what is left. Stops where more than `MOST` of the rows
+    are flagged. Raises ValueError for `beyond` below `LEAST`, and what `fit` raises.
+    """
+    if not beyond >= LEAST:
+        raise ValueError(f"{beyond:g} standard errors: noise itself lies so far off; at least {LEAST:g}")
+    model = model or base_model(calset)
+    table = TableIntensities.of(calset.intensities, calset.points)
+    used, values = int(table.used.sum()), None
+    while True:
+        calset = dataclasses.replace(calset, intensities=table)
+        likelihood = Likelihood.of(calset, model)
+        scale = _left(likelihood, likelihood.model.start if values is None else values)
+        bent = scale**2 > FAR_OFF
+        result = fit(likelihood, noise_scale=scale if bent else None)
+        values = result.values
+        found = Clipped(calset, result, used - int(table.used.sum()), used)
+        off = _distance(likelihood, values)[table.point, table.exposure]
+        if off.max(initial=0.0) > beyond and not found.too_many:
+            table = table.flagged(table.used & (off > max(beyond, 0.5 * off.max())), DataFlag.BAD_PIXEL)
+        elif not bent or found.too_many:
+            return found
+
+
+def _left(likelihood: Likelihood, values: np.ndarray) -> float:
+    """Root mean square of the normalised residuals."""
+    return float(np.sqrt(np.mean(likelihood.residuals(values)[1][likelihood.used] ** 2)))
+
+
+def _distance(likelihood: Likelihood, values: np.ndarray) -> Float[np.ndarray, "p e"]:
+    """How far the worst camera of every row lies off, in standard errors; 0 where unused."""
+    _, residual = likelihood.residuals(values)
+    used = likelihood.used
+    residual = np.abs(residual) / np.sqrt(1.0 - 1.0 / likelihood.cameras)
+    scatter = _GAUSSIAN * float(np.median(residual[used])) if used.any() else 1.0
+    return np.where(used, residual.max(axis=-1) / max(1.0, scatter), 0.0)
