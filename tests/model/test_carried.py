@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from quick import quick
 
-from walop_jax.calibration.matrix import matrices
+from walop_jax.calibration.matrix import matrices, sky_vectors
 from walop_jax.data.records import Sources
 from walop_jax.data.settings import Settings
 from walop_jax.likelihood import engine
-from walop_jax.model import carried, mueller
+from walop_jax.model import carried, light, mueller
 from walop_jax.model.build import nominal_instrument
 from walop_jax.model.cameras import DetectorPart
 from walop_jax.model.effects import EFFECTS, FreeForm, effect_by_name
@@ -25,7 +25,7 @@ from walop_jax.model.elements import Element
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import number, param, values_of
 from walop_jax.model.plan import with_median
-from walop_jax.model.planning import plan_for
+from walop_jax.model.planning import plan_for, plan_for_settings
 from walop_jax.model.ray import Ray
 
 # Stars of known (q, u), from which the linear coefficients of each camera follow exactly.
@@ -77,17 +77,29 @@ def matrix_of_counts(counts: np.ndarray) -> np.ndarray:
     return np.concatenate(rows, axis=-1)
 
 
-def product(*effects: Effect) -> np.ndarray:
-    """(point, plate, 6): what a calibration with these effects says of the instrument."""
-    device = instrument(*effects)
-    nothing = np.zeros((values_of(device).size,) * 2)
-    plate = np.tile([np.nan, PLATE], len(X))
+def settings(plate: np.ndarray) -> Settings:
     n = len(plate)
-    settings = Settings(
+    return Settings(
         filter=np.full(n, "band"), teff=np.full(n, np.nan), temperature=np.full(n, TEMP),
         hour_angle=np.full(n, HA), positions={"CHWP": plate},
     )  # fmt: skip
-    found = matrices(device, settings, {"band": CURVE}, np.repeat(X, 2), np.repeat(Y, 2), nothing)[0]
+
+
+def product(*effects: Effect) -> np.ndarray:
+    """(point, plate, 6): what a calibration with these effects says of the instrument."""
+    device = instrument(*effects)
+    plan = plan_for_settings(device, settings(np.array([np.nan, PLATE])), {"band": CURVE})
+    vectors = sky_vectors(device, plan, X, Y)[:, np.asarray(plan.band_of)[:, 0]]
+    found = light.instrument_matrix(jnp.asarray(vectors), device.cameras.pairs)
+    return np.asarray(found).reshape(len(X), 2, -1)
+
+
+def with_errors(*effects: Effect) -> np.ndarray:
+    """The same by the way that gives errors as well, whose derivatives take long to compile."""
+    device = instrument(*effects)
+    nothing = np.zeros((values_of(device).size,) * 2)
+    plates = settings(np.tile([np.nan, PLATE], len(X)))
+    found = matrices(device, plates, {"band": CURVE}, np.repeat(X, 2), np.repeat(Y, 2), nothing)[0]
     return found.reshape(len(X), 2, -1)
 
 
@@ -165,6 +177,16 @@ def test_every_effect_is_one_of_these():
 
 def test_without_effects():
     assert product() == pytest.approx(matrix_of_counts(star_counts()), abs=1e-12)
+    assert with_errors() == pytest.approx(product(), abs=1e-12)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "group", [*IN_THE_PRODUCT, OF_THE_SOURCE, DETECTORS], ids=lambda group: next(iter(group))
+)
+def test_errors_change_no_matrix(group):
+    effects = tuple(make(name, **values) for name, values in group.items())
+    np.testing.assert_allclose(with_errors(*effects), product(*effects), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -111,29 +111,42 @@ def test_unknown_value_lists_the_nearest(kind: type[Effect]):
         kind.of(scenes.CONTEXT, no_such_thing=1.0)
 
 
-@pytest.mark.parametrize("kind", with_parameters, ids=lambda kind: kind.name)
-def test_neutral_and_derivatives(kind: type[Effect]):
+# In company one compilation serves all; each alone shows that none leans on what another one asks for.
+@pytest.mark.parametrize(
+    "kinds",
+    [with_parameters, *(pytest.param([kind], marks=pytest.mark.long) for kind in with_parameters)],
+    ids=lambda kinds: kinds[0].name if len(kinds) == 1 else "all",
+)
+def test_neutral_and_derivatives(kinds: list[type[Effect]]):
     """Neutral changes nothing; every amplitude does something; forward derivative = central difference."""
-    probe = kind.probes(scenes.CONTEXT)[0][0]
-    layout = scenes.plan([probe])
+    probes = [kind.probes(scenes.CONTEXT)[0][0] for kind in kinds]
+    layout = scenes.plan(probes)
     data = scenes.points(layout)
-    names = kind.amplitudes()
-    neutral, unravel = ravel_pytree({name: getattr(probe, name) for name in names})
-    step = 1e-3 * np.concatenate(
-        [np.full(np.size(getattr(probe, n)), field_declarations(kind)[n].width) for n in names]
+    neutral, unravel = ravel_pytree(
+        [{name: getattr(probe, name) for name in probe.amplitudes()} for probe in probes]
     )
+    labels = [
+        (probe.name, name, field_declarations(type(probe))[name].width)
+        for probe in probes
+        for name in sorted(probe.amplitudes())  # the order of a dictionary's leaves
+        for _ in range(np.size(getattr(probe, name)))
+    ]
+    step = 1e-3 * np.array([width for *_, width in labels])
 
     def counts(amplitudes: jax.Array) -> jax.Array:
-        effect = dataclasses.replace(probe, **unravel(amplitudes))
-        return scenes.counts(scenes.instrument(effect), layout, data)
+        effects = [
+            dataclasses.replace(probe, **values)
+            for probe, values in zip(probes, unravel(amplitudes), strict=True)
+        ]
+        return scenes.counts(scenes.instrument(*effects), layout, data)
 
     moved = neutral + np.concatenate([np.zeros((1, len(step))), np.diag(step), -np.diag(step)])
-    values, slope = compiled(lambda v: (jax.vmap(counts)(v), jax.jacfwd(counts)(v[0])))(jnp.asarray(moved))
-    without = scenes.observe(plan_of=[probe])
+    values, slope = compiled(lambda v: (jax.lax.map(counts, v), jax.jacfwd(counts)(v[0])))(jnp.asarray(moved))
+    without = scenes.observe(plan_of=probes)
     assert np.abs(np.asarray(values[0]) - without).max() < 1e-12 * scenes.FLUX
     plus, minus = np.split(np.asarray(values[1:]), 2)
-    for i, width in enumerate(step * 1e3):
-        derivative = np.asarray(slope[..., i]) * width
-        assert np.abs(derivative / without).max() > 1e-6, f"amplitude {i} does nothing"
+    for i, label in enumerate(labels):
+        derivative = np.asarray(slope[..., i]) * step[i] * 1e3
+        assert np.abs(derivative / without).max() > 1e-6, f"{label} does nothing"
         difference = (plus[i] - minus[i]) / 2e-3
-        assert np.abs(difference - derivative).max() < 1e-5 * np.abs(derivative).max()
+        assert np.abs(difference - derivative).max() < 1e-5 * np.abs(derivative).max(), label
