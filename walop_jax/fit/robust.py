@@ -96,8 +96,9 @@ def _gradients(likelihood: Likelihood, values: Vector) -> Iterator[tuple[str, Fl
     by_exposure = np.zeros((len(calset.exposures), select.shape[1]))
     by_cell, first = np.zeros((int(cell.max(initial=0)) + 1, select.shape[1])), 0
     for chunk in likelihood.points:
-        _, residual = (np.asarray(part) for part in engine.residuals(instrument, likelihood.plan, chunk))
-        slope = np.asarray(engine.dense_jacobian(instrument, likelihood.plan, chunk))
+        found = engine.linearised_residuals(instrument, likelihood.plan, chunk)
+        residual, slope = (np.asarray(part) for part in found)
+        residual = residual.reshape(chunk.counts.shape)
         rows = slope.reshape(*residual.shape, -1)
         # Points that fill the last chunk have no weight, and so no gradient.
         parts = np.einsum("pekn,pek->pen", rows, residual) @ select

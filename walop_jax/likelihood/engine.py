@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -57,9 +57,9 @@ class PointData(NamedTuple):
 class Normal(NamedTuple):
     """χ², and with respect to all parameters its half gradient Jᵀr and Gauss–Newton matrix JᵀJ."""
 
-    chi2: Float[Array, ""]
-    gradient: Vector
-    matrix: Float[Array, "n n"]
+    chi2: Float[Any, ""]
+    gradient: Float[Any, " n"]
+    matrix: Float[Any, "n n"]
 
 
 def field_sites(instrument: Instrument, point: PointData) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
@@ -318,14 +318,27 @@ def _prediction(
     return jax.vmap(point_prediction, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
 
 
-def _dense_jacobian(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p d n"]:
-    """Derivatives of all residuals with respect to all parameters: for tables, not for whole frames."""
-    _, local = jax.vmap(_point_jacobian, in_axes=(None, None, 0))(instrument, plan, data)
+def _linearised_residuals(
+    instrument: Instrument, plan: Plan, data: PointData
+) -> tuple[Float[Array, "p d"], Float[Array, "p d n"]]:
+    """All residuals and their derivatives with respect to all parameters: for tables, not for whole frames."""
+    residual, local = jax.vmap(_point_jacobian, in_axes=(None, None, 0))(instrument, plan, data)
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
     count = linear.plain_positions(instrument).size
-    return jax.vmap(lambda columns, at: linear.to_all(instrument, columns[:count], columns[count:], at))(
+    slope = jax.vmap(lambda columns, at: linear.to_all(instrument, columns[:count], columns[count:], at))(
         local, basis
     )
+    return residual, slope
+
+
+def dense_equations(instrument: Instrument, plan: Plan, data: PointData) -> Normal:
+    """As `normal_equations`, from all rows: of small sets, for which one program is then enough.
+
+    Compiling the optics with their derivatives takes longer than the fit of a table does.
+    """
+    residual, slope = (np.asarray(part) for part in linearised_residuals(instrument, plan, data))
+    r, jacobian = residual.reshape(-1), slope.reshape(-1, slope.shape[-1])
+    return Normal(r @ r, jacobian.T @ r, jacobian.T @ jacobian)
 
 
 def _incoming(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p e 4"]:
@@ -340,7 +353,7 @@ incoming = compiled(_incoming, kept_as="incoming")
 
 normal_equations = compiled(_normal_equations, kept_as="normal_equations")
 slope_equations = compiled(_slope_equations, kept_as="slope_equations")
-dense_jacobian = compiled(_dense_jacobian, kept_as="dense_jacobian")
+linearised_residuals = compiled(_linearised_residuals, kept_as="linearised_residuals")
 residuals = compiled(_residuals, kept_as="residuals")
 prediction = compiled(_prediction, kept_as="prediction")
 

@@ -140,7 +140,11 @@ class Likelihood:
         (data, gradient, matrix), census = self._total(
             "χ², gradient and matrix",
             f"matrix {values.tobytes().hex()}",
-            lambda chunk: engine.normal_equations(instrument, self.plan, chunk, nodes),
+            lambda chunk: (
+                engine.dense_equations(instrument, self.plan, chunk)
+                if nodes is None and self.is_small
+                else engine.normal_equations(instrument, self.plan, chunk, nodes)
+            ),
             ((), (n,), (n, n)),
         )
         return self.posterior(values, float(data), gradient, matrix, noise_scale, census, optics)
@@ -279,7 +283,9 @@ class Likelihood:
         Rows run over points, then exposures, then cameras, as in `residuals(values)[1][self.used]`.
         """
         instrument, select = self.model.instrument(values), self.model.selection()
-        parts = [_rows(engine.dense_jacobian(instrument, self.plan, c), c) @ select for c in self.points]
+        parts = [
+            _rows(engine.linearised_residuals(instrument, self.plan, c)[1], c) @ select for c in self.points
+        ]
         return np.concatenate(parts)
 
     def effect_columns(self, values: Vector, probes: tuple[Effect, ...]) -> Float[np.ndarray, "d a"]:
@@ -320,7 +326,7 @@ class Likelihood:
 
     @property
     def is_small(self) -> bool:
-        """Whether columns that are asked for once or twice are compiled for longer than they are computed."""
+        """Whether what is asked for a few times is compiled for longer than it is computed."""
         return self.layout.points * len(self.flux_known) <= limits.COMPILED_ONCE
 
     def stokes(self, values: Vector) -> Float[np.ndarray, "p e 4"]:

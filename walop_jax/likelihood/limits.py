@@ -101,7 +101,8 @@ TRUST_ROWS = 20_000
 DIAGNOSED_NUMBERS = 120_000_000
 """Numbers that the columns of a diagnosis may hold: 1 GB, of which there are four copies at most."""
 COMPILED_ONCE = 6000
-"""(Exposure, point) pairs of a set up to which columns of effects are compiled without optimisation."""
+"""(Exposure, point) pairs of a set up to which compiling takes longer than computing: columns of effects are then
+compiled without optimisation, and the matrix of a fit is made from the rows of a program that is needed anyway."""
 CHOICE_ROWS = 6000
 """(Exposure, point) pairs on which other descriptions of an instrument are compared before any of them is fitted."""
 MANY_POINTS = 4
