@@ -46,30 +46,29 @@ def frames(tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _compiled_once(tmp_path_factory):
-    """The processes of this module share a cache of compiled code."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("WALOP_JAX_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
+@pytest.fixture(scope="module")
+def start(tmp_path_factory):
+    """Start a command in a process of its own; those of this module share a cache of compiled code."""
+    cache = str(tmp_path_factory.mktemp("cache"))
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "WALOP_JAX_CACHE": cache}
+
+    def process(*arguments: object) -> subprocess.Popen:
+        command = [sys.executable, "-c", LARGE, *map(str, arguments)]
+        return subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+        )
+
+    return process
 
 
 @pytest.fixture(scope="module")
-def finished(frames, tmp_path_factory):
+def finished(frames, start, tmp_path_factory):
     """A run in a process of its own, not interrupted."""
     folder = tmp_path_factory.mktemp("runs") / "whole"
     process = start("refit", frames, "-o", folder, "--json")
     out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
     return folder, json.loads(out)
-
-
-def start(*arguments: object) -> subprocess.Popen:
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    command = [sys.executable, "-c", LARGE, *map(str, arguments)]
-    return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    )
 
 
 @pytest.mark.long
@@ -109,7 +108,7 @@ def test_the_map_stays_with_the_calibration(finished, tmp_path):
 
 
 @pytest.mark.long
-def test_a_killed_fit_goes_on_where_it_was(frames, finished, tmp_path):
+def test_a_killed_fit_goes_on_where_it_was(frames, finished, start, tmp_path):
     run = tmp_path / "run"
     process = start("refit", frames, "-o", run)
     deadline = time.monotonic() + 200
@@ -136,7 +135,7 @@ def test_a_killed_fit_goes_on_where_it_was(frames, finished, tmp_path):
 
 
 @pytest.mark.long
-def test_two_processes_write_one_calibration(frames, finished, tmp_path):
+def test_two_processes_write_one_calibration(frames, finished, start, tmp_path):
     with socket.socket() as one:
         one.bind(("localhost", 0))
         port = one.getsockname()[1]
@@ -172,6 +171,7 @@ def test_small_memory_changes_nothing(call, frames, tmp_path, monkeypatch):
     assert found[0]["parameters"] == found[1]["parameters"]
 
 
+@pytest.mark.long
 def test_sampling_so_many_points_is_refused_with_advice(call, finished, monkeypatch):
     monkeypatch.setattr(limits, "LARGE_ABOVE", 0)
     monkeypatch.setattr(limits, "INTERPOLATE_ABOVE", 0)

@@ -54,7 +54,7 @@ def cooler(calset: CalibrationSet) -> CalibrationSet:
     [
         (displaced, "X of all field points changed by", -0.02),
         (turned, "the angle of the field changed by", -0.002),
-        (shifted, "the wavelengths of filter SDSS-r changed by", -0.004),
+        pytest.param(shifted, "the wavelengths of filter SDSS-r changed by", -0.004, marks=pytest.mark.long),
         (cooler, "TEFF of exposures of kind clp", 5772.0),
     ],
 )

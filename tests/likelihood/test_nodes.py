@@ -6,6 +6,7 @@ import effect_scenes as scenes
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_run import WITH_PLATE
 
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
@@ -16,14 +17,9 @@ from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.dependence import optical_indices
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.parameters import leaves, values_of
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
 FIELD = Rectangle(np.full(2, -0.3), np.full(2, 0.3))
-SMALL = ObservingPlan(
-    grid=6, standard_grid=3, polariser_angles=polariser_turn(8, full_turn=True), plate=(None, 45.0),
-    moon_patches=4, standards=2, unpolarised=1,
-)  # fmt: skip
 
 
 def same(one, other, rtol=1e-8):
@@ -45,7 +41,7 @@ def scales(instrument):
 
 @pytest.fixture(scope="module")
 def simulated():
-    return simulate(SMALL, seed=4)
+    return simulate(WITH_PLATE, seed=4)
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,9 @@ from walop_jax.runs.limits import limits_of_sets
 from walop_jax.simulation.plan_file import read_plan
 from walop_jax.simulation.simulate import simulate
 
+# As many exposures and points as `small_run.SMALL`: compiled for one, compiled for both.
 TEXT = """
-grid = 4
+grid = 5
 standard_grid = 2
 polariser_angles = 8
 moon_patches = 3
@@ -63,7 +64,7 @@ def test_what_is_wrong_is_said_with_the_file(plan, text, message):
 def test_limits_of_a_plan_are_those_of_data_taken_so(plan, tmp_path):
     """Noise moves the fit, and with it the limits, by per cents."""
     found = limits_of_sets([plan], tmp_path / "RUN", catalogue=CATALOGUE)
-    assert found.document["plan"]["grid"] == 4
+    assert found.document["plan"]["grid"] == 5
     assert found.document["trusted"] is True
     assumed = read_plan(plan)
     taken = simulate(assumed, seed=4, instrument=assumed.design)
