@@ -104,8 +104,8 @@ def test_error_is_measured(exact, simulated, monkeypatch):
     monkeypatch.setattr(limits, "NODES_PER_SIDE", (8,))
     table, stated = nodes.accurate_nodes(simulated.truth, plan, FIELD, scale)
     assert table is None
-    assert nodes.TOLERANCE < stated < 0.01
-    monkeypatch.setattr(nodes, "TOLERANCE", 0.01)
+    assert nodes.TOLERANCE < stated < 0.05
+    monkeypatch.setattr(nodes, "TOLERANCE", 0.05)
     table, again = nodes.accurate_nodes(simulated.truth, plan, FIELD, scale)
     assert again == stated
     x, y = np.random.default_rng(3).uniform(-0.3, 0.3, (2, limits.SOLVED_TOGETHER))
