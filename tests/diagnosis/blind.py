@@ -147,7 +147,7 @@ def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[s
         * (camera[0] - camera[1]),
     }
     for name, pattern in patterns.items():
-        yield name, measured.candidate(name, [np.broadcast_to(pattern, shape)]).columns[:, 0]
+        yield name, measured.column(np.broadcast_to(pattern, shape))
     yield (
         "encoder wrong in a run of exposures",
         said["turn of polariser"] * np.isin(exposure, np.arange(4, 9)),

@@ -12,6 +12,7 @@ from small_run import SEED, SMALL, small_fit
 
 from walop_jax.calibration.matrix_slopes import matrix_slopes
 from walop_jax.data.records import CalibrationSet
+from walop_jax.diagnosis import stated_conditions as conditions
 from walop_jax.diagnosis.change_of_stokes import change_of_qu, first_setting
 from walop_jax.diagnosis.condition_limits import condition_limits
 from walop_jax.diagnosis.design import Design
@@ -65,6 +66,16 @@ def test_a_number_that_is_wrong_is_told_with_its_size(change, what, size):
     value, error = re.search(r"([−\d.]+) ± ([\d.]+)", told).groups()  # type: ignore[union-attr]
     # A step of a quarter is not a linear one.
     assert float(value.replace("−", "-")) == pytest.approx(size, abs=4 * float(error) + 0.25 * abs(size))
+
+
+def test_scale_and_angle_are_sums_of_both_coordinates():
+    """As differences of two sets that are scaled and turned."""
+    design = Design.of(small_fit())
+    asked = [one for one in conditions._stated(small_fit().calset) if one.along is not None]
+    assert [one.unit for one in asked] == ["deg", "deg", "", "rad"]
+    for one, column in zip(asked, conditions._columns(design, asked), strict=True):
+        exact = conditions._column(design, one)
+        np.testing.assert_allclose(column, exact, rtol=0, atol=1e-5 * np.abs(exact).max())
 
 
 def test_the_score_is_what_a_fit_gains_that_knows_better():

@@ -95,7 +95,7 @@ class Examination:
             for probe, effects in parts
             if probe.name in self.said
         ]
-        patterns = list(strata(self.design.measured))
+        patterns = [self.design.measured.candidate(stratum) for stratum in strata(self.design.measured)]
         candidates = [
             *(self.named[probe.name] for probe in self.probes),
             *(self.said[probe.name] for probe in self.sentences),

@@ -20,7 +20,8 @@ The columns carry the unit "share of the unpolarised counts of the camera".
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -111,10 +112,49 @@ class Measured:
         shared = self.shared.cameras if self.shared.cameras is not None else np.ones((self.cameras,) * 2)
         return [k for k in range(self.cameras) if shared[k, k + 1 :].any()]
 
-    def candidate(self, name: str, patterns: list[Cube], block: str | None = None) -> Candidate:
-        """A stratum of patterns, and the block of the free-form term that can take it up."""
-        columns = np.column_stack([self.column(p) for p in patterns])
-        return Candidate(name, columns, np.full(columns.shape[1], WIDTH), block)
+    def candidate(self, stratum: Stratum) -> Candidate:
+        """The columns of a stratum, row by row."""
+        if stratum.name == SINGLE_EXPOSURES:
+            columns = self.gains()
+        else:
+            one = np.eye(self.cameras)
+            columns = np.column_stack(
+                [
+                    self.column(p[..., None] * one[k])
+                    for k, p in zip(stratum.camera, stratum.patterns, strict=True)
+                ]
+            )
+        return Candidate(stratum.name, columns, stratum.widths, stratum.block)
+
+
+class Stratum(NamedTuple):
+    """Patterns of gains of single cameras, each of shape (points or 1, exposures or 1), and the camera of each.
+
+    `block` is the block of the free-form term that can take it up.
+    """
+
+    name: str
+    camera: Sequence[int]
+    patterns: Sequence[Float[np.ndarray, "_ _"]]
+    block: str | None = None
+
+    @property
+    def widths(self) -> Float[np.ndarray, " _"]:
+        """Prior standard deviations of the amplitudes."""
+        return np.full(len(self.camera), WIDTH)
+
+    @classmethod
+    def of_all(
+        cls,
+        cameras: Sequence[int],
+        name: str,
+        patterns: Sequence[Float[np.ndarray, "_ _"]],
+        block: str | None = None,
+    ) -> Stratum:
+        """Each pattern in each of these cameras."""
+        return cls(
+            name, [k for _ in patterns for k in cameras], [p for p in patterns for _ in cameras], block
+        )
 
 
 def number_of_columns(calset: CalibrationSet, instrument: Instrument) -> int:
@@ -135,17 +175,14 @@ def _positions(e: Exposures, prefix: str) -> np.ndarray:
     return np.array([f"{a:g}" if i else "out" for i, a in zip(position.inside, position.angle, strict=True)])
 
 
-def strata(measured: Measured) -> Iterator[Candidate]:
+def strata(measured: Measured) -> Iterator[Stratum]:
     """All strata that the exposures of the set allow."""
     e, points = measured.likelihood.calset.exposures, measured.likelihood.calset.points
     names = measured.likelihood.model.template.cameras.names
+    every = range(len(names))
     # Calibration plates that are put in at one or two angles are compared as groups, below.
     further = [(f" {prefix}", prefix) for prefix in measured.likelihood.plan.moving if prefix in e.moving]
     turning = [("θ", POLARISER), *further]
-    shape = (len(points), len(e), len(names))
-
-    def _camera(k: int) -> Float[np.ndarray, "1 1 k"]:
-        return np.eye(len(names))[k][None, None]
 
     smooth = np.asarray(legendre.basis(jnp.asarray(points.x), jnp.asarray(points.y), SMOOTH))
     fine = np.asarray(legendre.basis(jnp.asarray(points.x), jnp.asarray(points.y), FINE))[
@@ -156,8 +193,8 @@ def strata(measured: Measured) -> Iterator[Candidate]:
     stokes = measured.likelihood.stokes(measured.values)
     for k, camera in enumerate(names):
         for i, element in ((1, "q"), (2, "u")):
-            patterns = [(term[:, None] * stokes[..., i])[..., None] * _camera(k) for term in smooth.T]
-            yield measured.candidate(f"vector {element} of {camera}", patterns, "vectors")
+            patterns = [term[:, None] * stokes[..., i] for term in smooth.T]
+            yield Stratum.of_all([k], f"vector {element} of {camera}", patterns, "vectors")
         for symbol, prefix in turning:
             position = e.position(prefix)
             through = position.inside & measured.used.any(axis=0)
@@ -166,23 +203,11 @@ def strata(measured: Measured) -> Iterator[Candidate]:
                 if len(np.unique(np.round(np.mod(position.angle[through], 360.0), 3))) < 2 * harmonic + 1:
                     continue
                 waves = [np.where(through, wave(harmonic * angle), 0.0) for wave in (np.cos, np.sin)]
-                patterns = [
-                    (term[:, None] * wave[None, :])[..., None] * _camera(k)
-                    for term in smooth.T[:3]
-                    for wave in waves
-                ]
+                patterns = [term[:, None] * wave for term in smooth.T[:3] for wave in waves]
                 block = "harmonics" if prefix == POLARISER else "exposures"
-                yield measured.candidate(f"{harmonic}{symbol} of {camera}", patterns, block)
-        yield measured.candidate(
-            f"fine structure of {camera}",
-            [np.broadcast_to(term[:, None, None] * _camera(k), shape) for term in fine.T],
-            "fine",
-        )
-        yield measured.candidate(
-            f"rings of {camera}",
-            [np.broadcast_to(ring[:, None, None] * _camera(k), shape) for ring in rings.T],
-            "fine",
-        )
+                yield Stratum.of_all([k], f"{harmonic}{symbol} of {camera}", patterns, block)
+        yield Stratum.of_all([k], f"fine structure of {camera}", [t[:, None] for t in fine.T], "fine")
+        yield Stratum.of_all([k], f"rings of {camera}", [ring[:, None] for ring in rings.T], "fine")
     for name, quantity, block in (
         ("time", e.mjd[None, :], "exposures"),
         ("temperature", e.temp[None, :], "exposures"),
@@ -194,42 +219,30 @@ def strata(measured: Measured) -> Iterator[Candidate]:
         quantity = quantity - np.nanmean(known)
         spread = np.nanstd(quantity)
         if np.isfinite(spread) and spread > 1e-9 * max(1.0, float(np.nanmax(np.abs(quantity)))):
-            scaled = np.nan_to_num(quantity / spread)
-            patterns = [np.broadcast_to(scaled[..., None] * _camera(k), shape) for k in range(len(names))]
-            yield measured.candidate(name, patterns, block)
+            yield Stratum.of_all(every, name, [np.nan_to_num(quantity / spread)], block)
     positions = [(prefix.lower(), _positions(e, prefix)) for prefix in measured.likelihood.plan.moving]
     for name, label, block in (
         ("kind", e.kind, "exposures"),
         ("filter", e.filter, None),
         *((("plate" if prefix == "chwp" else prefix), label, None) for prefix, label in positions),
     ):
-        groups = np.unique(label)
         patterns = [
-            np.where((label == group)[None, :, None], stokes[..., i : i + 1], 0.0) * _camera(k)
-            for group in groups[1:]
-            for i in range(3)
-            for k in range(len(names))
+            np.where(label == group, stokes[..., i], 0.0) for group in np.unique(label)[1:] for i in range(3)
         ]
         if patterns:
-            yield measured.candidate(name, patterns, block)
+            yield Stratum.of_all(every, name, patterns, block)
     sky_gradients = [
-        np.where((e.kind == group)[None, :, None], term[:, None, None], 0.0) * _camera(k)
+        np.where(e.kind == group, term[:, None], 0.0)
         for group in np.unique(e.kind)[1:]
         for term in smooth.T[1:3]
-        for k in range(len(names))
     ]
     if sky_gradients:
-        yield measured.candidate("kind, over the field", sky_gradients)
+        yield Stratum.of_all(every, "kind, over the field", sky_gradients)
     if measured.has_gains:
-        yield Candidate(
-            SINGLE_EXPOSURES, measured.gains(), np.full(len(measured.gained) * len(e), WIDTH), "exposures"
-        )
+        alone = list(np.eye(len(e))[:, None])
+        yield Stratum.of_all(measured.gained, SINGLE_EXPOSURES, alone, "exposures")
     state = states(measured.likelihood.calset)
-    several = len(np.unique(state)) < len(state)
-    patterns = [
-        np.broadcast_to((state == number)[None, :, None] * _camera(k), shape)
-        for number in (np.unique(state) if several else ())
-        for k in measured.gained
-    ]
-    if patterns:
-        yield measured.candidate(STATES, patterns)
+    several = np.unique(state) if len(np.unique(state)) < len(state) else ()
+    if len(several) and measured.gained:
+        patterns = [np.where(state == number, 1.0, 0.0)[None] for number in several]
+        yield Stratum.of_all(measured.gained, STATES, patterns)

@@ -7,7 +7,8 @@ So each number has its own efficient score (`score`), with the derivative
 
     C = [r(θ̂; set with c + h) − r(θ̂; set with c − h)] / 2h
 
-of the whitened residuals r with respect to the number c that the set states, fluxes solved for anew.
+of the whitened residuals r with respect to the number c that the set states, fluxes solved for anew. A row knows of the
+field only its own place, so that scale and angle are sums of X and Y, row by row.
 
 Limits      What the free parameters take up whole is told by no residual: with a single filter its displacement, the
             thicknesses of the plates look the same. One number at a time, by a linear step: the size is a hint.
@@ -16,7 +17,7 @@ Limits      What the free parameters take up whole is told by no residual: with 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -39,7 +40,8 @@ class Stated(NamedTuple):
     """A number that a set states: what it is, its unit, what to check, and the set with it changed.
 
     `width` is by how much it may be wrong at most; `value` is None where only a change of it has a meaning.
-    `seen_by_stars`: whether stars are observed under the same condition.
+    `seen_by_stars`: whether stars are observed under the same condition. `along` is how the places of the field points
+    (x, y) change with a number that is about them.
     """
 
     what: str
@@ -49,6 +51,7 @@ class Stated(NamedTuple):
     changed: Callable[[float], CalibrationSet]
     value: float | None = None
     seen_by_stars: bool = False
+    along: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]] | None = None
 
 
 class Scored(NamedTuple):
@@ -101,7 +104,7 @@ def condition_scores(design: Design) -> list[Scored]:
     asked = list(_stated(design.fit.calset))
     if not asked:
         return []
-    columns = design.stacked([_column(design, one)[:, None] for one in asked])
+    columns = design.stacked([column[:, None] for column in _columns(design, asked)])
     there = np.flatnonzero(np.any(columns != 0.0, axis=0))  # a number may be stated and not used
     asked, columns = [asked[i] for i in there], columns[:, there]
     given = columns.copy()
@@ -114,6 +117,18 @@ def condition_scores(design: Design) -> list[Scored]:
         Scored(one, table[name], column, float(square))
         for one, name, column, square in zip(asked, names, given.T, np.diag(space.gram), strict=True)
     ]
+
+
+def _columns(design: Design, asked: Sequence[Stated]) -> Iterator[Float[np.ndarray, " _"]]:
+    by_place: list[Float[np.ndarray, " _"]] = []
+    for one in asked:
+        if one.along is None:
+            yield _column(design, one)
+            continue
+        if not by_place:
+            by_place = [_column(design, field) for field in _of_field(design.fit.calset, 2)]
+        (in_x, in_y), (by_x, by_y) = one.along, by_place
+        yield in_x[design.point] * by_x + in_y[design.point] * by_y
 
 
 def _column(design: Design, one: Stated) -> np.ndarray:
@@ -155,21 +170,24 @@ def _stated(calset: CalibrationSet) -> Iterator[Stated]:
         )
 
 
-def _of_field(calset: CalibrationSet) -> Iterator[Stated]:
+def _of_field(calset: CalibrationSet, count: int = 4) -> Iterator[Stated]:
+    """The first of the numbers that places of the field hang on: X, Y, scale, angle."""
     check = "check X and Y against the frames (docs: conventions)"
-    radius = float(np.hypot(calset.points.x, calset.points.y).max())
-    for what, unit, width, moved in (
-        ("X of all field points", "deg", radius, lambda x, y, h: (x + h, y)),
-        ("Y of all field points", "deg", radius, lambda x, y, h: (x, y + h)),
-        ("the scale of X and Y", "", 1.0, lambda x, y, h: (x * (1 + h), y * (1 + h))),
-        ("the angle of the field", "rad", 1.0, lambda x, y, h: (x - h * y, y + h * x)),
-    ):
+    x, y = calset.points.x, calset.points.y
+    radius, one = float(np.hypot(x, y).max()), np.ones(len(x))
+    for what, unit, width, along in (
+        ("X of all field points", "deg", radius, (one, 0.0 * one)),
+        ("Y of all field points", "deg", radius, (0.0 * one, one)),
+        ("the scale of X and Y", "", 1.0, (x, y)),
+        ("the angle of the field", "rad", 1.0, (-y, x)),
+    )[:count]:
         yield Stated(
             what,
             unit,
             check,
             width,
-            lambda h, moved=moved: with_places(lambda x, y: moved(x, y, h))(calset),
+            lambda h, a=along: with_places(lambda x, y: (x + h * a[0], y + h * a[1]))(calset),
+            along=along,
         )
 
 

@@ -34,10 +34,10 @@ from scipy import stats
 
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM
-from walop_jax.diagnosis.freeform import strata
 from walop_jax.diagnosis.mixups import refuse_mixups
+from walop_jax.diagnosis.pattern_scores import pattern_scores
 from walop_jax.diagnosis.repeated_noise import repeated_noise
-from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace, ScoreTable, local_p
+from walop_jax.diagnosis.score import Projector, ScoreTable, local_p
 from walop_jax.diagnosis.stated_conditions import stated_conditions
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points
@@ -124,17 +124,6 @@ def sampled(result: FitResult, most: int) -> FitResult:
         return result
     calset = thinned(result.calset, most, neighbours=1)
     return dataclasses.replace(result, likelihood=Likelihood.of(calset, result.model))
-
-
-def pattern_scores(design: Design, seed: int = 0) -> ScoreTable:
-    """The scores of all patterns that the exposures allow, against a fit."""
-    candidates = list(strata(design.measured))
-    names, widths = [c.name for c in candidates], [c.widths for c in candidates]
-    columns = design.stacked([candidates.pop(0).columns for _ in names])
-    space = ScoreSpace.projected(design.projector, names, widths, columns)
-    residual = design.projector(design.residual)
-    scorer = Scorer(space, np.random.default_rng(seed))
-    return scorer(columns.T @ residual, float(residual @ residual))
 
 
 def _patterns(table: ScoreTable) -> Iterator[str]:

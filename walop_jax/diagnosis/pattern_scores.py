@@ -1,0 +1,102 @@
+"""The scores of all patterns against a fit, from one number for each exposure at a point instead of each intensity.
+
+Equation    A pattern of camera k changes the counts of that camera alone: its column is v (e_k − m m_k) in every row,
+                C_aᵀC_b = Σ v_a v_b (δ_kl − m_k m_l),   QᵀC_a = Σ v_a (Q_k − m_k (m·Q))
+            and behind the base G = CᵀC − (QᵀC)ᵀ(QᵀC).
+Symbols     a, b patterns of the cameras k, l; v = flux × unpolarised counts per flux / error × pattern; m = expected
+            counts / errors of what has a flux in common, of unit length, 0 where the flux is known; Q orthonormal basis
+            of the derivatives with respect to the free parameters
+Source      `score`, `freeform`
+Limits      The difference leaves 10⁻¹⁶ of the square of a column; what has less than `score.ABSORBED` left plays no
+            part. Where exposures have a flux in common their rows hang together, and all columns are written out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.freeform import Measured, Stratum, strata
+from walop_jax.diagnosis.score import Scorer, ScoreSpace, ScoreTable
+
+Vector = Float[np.ndarray, " _"]
+
+
+def pattern_scores(design: Design, seed: int = 0) -> ScoreTable:
+    """The scores of all patterns that the exposures allow, against a fit."""
+    found = list(strata(design.measured))
+    alone = design.measured.shared.exposures is None
+    space, scores, square = (_from_rows if alone else _from_columns)(design, found)
+    return Scorer(space, np.random.default_rng(seed))(scores, square)
+
+
+def _from_columns(design: Design, found: list[Stratum]) -> tuple[ScoreSpace, Vector, float]:
+    """Space, C̃ᵀr and r·r from columns of all intensities."""
+    columns = design.stacked([design.measured.candidate(stratum).columns for stratum in found])
+    space = ScoreSpace.projected(design.projector, *_names_and_widths(found), columns)
+    residual = design.projector(design.residual)
+    return space, columns.T @ residual, float(residual @ residual)
+
+
+def _from_rows(design: Design, found: list[Stratum]) -> tuple[ScoreSpace, Vector, float]:
+    """The same from the rows of exposures and points."""
+    measured, scale = design.measured, design.fit.noise_scale
+    camera = np.concatenate([stratum.camera for stratum in found])
+    together = measured.shared.cameras
+    together = np.ones((measured.cameras,) * 2) if together is None else np.asarray(together)
+    along = _unit_model(measured)
+    change = _changes(measured, found, camera) / scale
+
+    gram = -together[np.ix_(camera, camera)] * _square(change * along[:, camera])
+    for k in range(measured.cameras):
+        own = np.flatnonzero(camera == k)
+        gram[np.ix_(own, own)] += _square(change[:, own])
+    residual = design.projector(design.residual)
+    base = np.empty((design.projector.basis.shape[1], len(camera)))
+    scores = np.empty(len(camera))
+    for k in range(measured.cameras):
+        own = np.flatnonzero(camera == k)
+        for rows, out in ((design.projector.basis, base), (residual[:, None], scores[None])):
+            cube = rows[: design.rows].reshape(len(along), measured.cameras, -1)
+            flux = np.einsum("rc,rcn->rn", along * together[k], cube)
+            out[:, own] = -(cube[:, k] - along[:, k, None] * flux).T @ change[:, own]
+    before = np.diag(gram).copy()
+    space = ScoreSpace(
+        *(tuple(part) for part in zip(*((s.name, len(s.camera)) for s in found), strict=True)),
+        widths=np.concatenate([stratum.widths for stratum in found]),
+        before=before,
+        gram=gram - base.T @ base,
+        free=design.projector.free,
+    )
+    return space, scores, float(residual @ residual)
+
+
+def _names_and_widths(found: list[Stratum]) -> tuple[list[str], list[Vector]]:
+    return [stratum.name for stratum in found], [stratum.widths for stratum in found]
+
+
+def _square(columns: Float[np.ndarray, "r a"]) -> Float[np.ndarray, "a a"]:
+    return columns.T @ columns
+
+
+def _unit_model(measured: Measured) -> Float[np.ndarray, "r k"]:
+    """Weighted model of every used row, of unit length over the cameras with a flux in common; 0 where it is known."""
+    power = measured.shared.summed(measured.model**2)
+    unit = measured.model / np.sqrt(np.where(power > 0, power, 1.0))
+    return np.where(measured.known[:, None], 0.0, unit)[measured.used]
+
+
+def _changes(
+    measured: Measured, found: list[Stratum], camera: Int[np.ndarray, " a"]
+) -> Float[np.ndarray, "r a"]:
+    """What every pattern does to its camera in every used row, in standard errors."""
+    size = measured.flux[..., None] * measured.level[:, None, :] * measured.weight
+    size, used = size[measured.used], measured.used
+    points, exposures = np.nonzero(used)
+    changes = np.empty((len(size), len(camera)), order="F")
+    patterns = (pattern for stratum in found for pattern in stratum.patterns)
+    for a, (k, pattern) in enumerate(zip(camera, patterns, strict=True)):
+        there = np.broadcast_to(pattern, used.shape)[points, exposures]
+        np.multiply(size[:, k], there, out=changes[:, a])
+    return changes
