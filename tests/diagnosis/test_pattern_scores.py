@@ -30,6 +30,12 @@ def test_rows_are_columns(scale, apart):
     design = Design.of(dataclasses.replace(fit, posterior=posterior))
     design = arms_apart(design) if apart else design
     found = list(strata(design.measured))
+    one = np.eye(design.measured.cameras)
+    for stratum in found:  # with the flux eliminated as in a fit
+        columns = design.measured.candidate(stratum).columns
+        for a, (k, pattern) in enumerate(zip(stratum.camera, stratum.patterns, strict=True)):
+            exact = design.measured.column(pattern[..., None] * one[k])
+            np.testing.assert_allclose(columns[:, a], exact, rtol=0, atol=1e-12 * np.abs(exact).max())
     one, scores, square = pattern_scores._from_rows(design, found)
     other, expected, total = pattern_scores._from_columns(design, found)
     assert (one.names, one.sizes, one.free) == (other.names, other.sizes, other.free)

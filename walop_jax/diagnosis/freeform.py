@@ -21,6 +21,7 @@ The columns carry the unit "share of the unpolarised counts of the camera".
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -75,32 +76,6 @@ class Measured:
         change = self.flux[..., None] * pattern * self.level[:, None, :] * self.weight
         return -project_flux(change, self.model, self.known, self.shared)[self.used].reshape(-1)
 
-    def gains(self) -> Float[np.ndarray, "_ _"]:
-        """Columns of the gains of the cameras in every exposure, but the last of each flux (that one is the flux)."""
-        if self.shared.exposures is not None:
-            return self._gains_of_groups()
-        change = self.flux[..., None] * self.level[:, None, :] * self.weight
-        alone = np.moveaxis(change[..., None] * np.eye(self.cameras), 2, 0)
-        each = np.moveaxis(project_flux(alone, self.model, self.known, self.shared), 0, 2)
-        row = np.cumsum(self.used).reshape(self.used.shape) - 1
-        points, exposures = np.nonzero(self.used)
-        columns = np.zeros((self.cameras * len(points), len(self.gained) * self.used.shape[1]))
-        for i, k in enumerate(self.gained):
-            for channel in range(self.cameras):
-                rows = self.cameras * row[points, exposures] + channel
-                columns[rows, len(self.gained) * exposures + i] = -each[points, exposures, k, channel]
-        return columns
-
-    def _gains_of_groups(self) -> Float[np.ndarray, "_ _"]:
-        """The same where exposures have a flux in common: a gain of one changes what is left of the others."""
-        columns = []
-        for exposure in range(self.used.shape[1]):
-            for k in self.gained:
-                pattern = np.zeros((1, self.used.shape[1], self.cameras))
-                pattern[0, exposure, k] = 1.0
-                columns.append(self.column(pattern))
-        return np.column_stack(columns)
-
     @property
     def has_gains(self) -> bool:
         """Whether exposures are seen at so many field points that gains of single ones are not all there is."""
@@ -112,18 +87,46 @@ class Measured:
         shared = self.shared.cameras if self.shared.cameras is not None else np.ones((self.cameras,) * 2)
         return [k for k in range(self.cameras) if shared[k, k + 1 :].any()]
 
+    @property
+    def together(self) -> Float[np.ndarray, "k k"]:
+        """1 for two cameras with a flux in common."""
+        shared = self.shared.cameras
+        return np.ones((self.cameras,) * 2) if shared is None else np.asarray(shared)
+
+    @cached_property
+    def unit_model(self) -> Float[np.ndarray, "r k"]:
+        """Weighted model of every used row, of unit length over the cameras with a flux in common; 0 if that is known.
+
+        Where exposures have no flux in common, a row without the part along it is what elimination of the flux leaves.
+        """
+        power = self.shared.summed(self.model**2)
+        unit = self.model / np.sqrt(np.where(power > 0, power, 1.0))
+        return np.where(self.known[:, None], 0.0, unit)[self.used]
+
+    def changes(self, strata: Sequence[Stratum]) -> Float[np.ndarray, "r a"]:
+        """What every pattern does to its camera in every used row, in standard errors, the flux held."""
+        size = (self.flux[..., None] * self.level[:, None, :] * self.weight)[self.used]
+        points, exposures = np.nonzero(self.used)
+        each = [(k, pattern) for one in strata for k, pattern in zip(one.camera, one.patterns, strict=True)]
+        changes = np.empty((len(size), len(each)), order="F")
+        for a, (k, pattern) in enumerate(each):
+            there = np.broadcast_to(pattern, self.used.shape)[points, exposures]
+            np.multiply(size[:, k], there, out=changes[:, a])
+        return changes
+
     def candidate(self, stratum: Stratum) -> Candidate:
-        """The columns of a stratum, row by row."""
-        if stratum.name == SINGLE_EXPOSURES:
-            columns = self.gains()
+        """The columns of a stratum, intensity by intensity."""
+        camera, one = np.asarray(stratum.camera), np.eye(self.cameras)
+        if self.shared.exposures is None:
+            changes, m = self.changes([stratum]), self.unit_model
+            columns = np.empty((len(m), self.cameras, len(camera)))
+            for c in range(self.cameras):
+                left = one[c, camera] - self.together[c, camera] * m[:, c, None] * m[:, camera]
+                np.multiply(-changes, left, out=columns[:, c])
+            columns = columns.reshape(-1, len(camera))
         else:
-            one = np.eye(self.cameras)
-            columns = np.column_stack(
-                [
-                    self.column(p[..., None] * one[k])
-                    for k, p in zip(stratum.camera, stratum.patterns, strict=True)
-                ]
-            )
+            patterns = zip(camera, stratum.patterns, strict=True)
+            columns = np.column_stack([self.column(pattern[..., None] * one[k]) for k, pattern in patterns])
         return Candidate(stratum.name, columns, stratum.widths, stratum.block)
 
 

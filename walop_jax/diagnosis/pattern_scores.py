@@ -14,10 +14,11 @@ Limits      The difference leaves 10⁻¹⁶ of the square of a column; what has
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
+from walop_jax.diagnosis import tall
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.freeform import Measured, Stratum, strata
+from walop_jax.diagnosis.freeform import Stratum, strata
 from walop_jax.diagnosis.score import Scorer, ScoreSpace, ScoreTable
 
 Vector = Float[np.ndarray, " _"]
@@ -43,15 +44,13 @@ def _from_rows(design: Design, found: list[Stratum]) -> tuple[ScoreSpace, Vector
     """The same from the rows of exposures and points."""
     measured, scale = design.measured, design.fit.noise_scale
     camera = np.concatenate([stratum.camera for stratum in found])
-    together = measured.shared.cameras
-    together = np.ones((measured.cameras,) * 2) if together is None else np.asarray(together)
-    along = _unit_model(measured)
-    change = _changes(measured, found, camera) / scale
+    together, along = measured.together, measured.unit_model
+    change = measured.changes(found) / scale
 
-    gram = -together[np.ix_(camera, camera)] * _square(change * along[:, camera])
+    products = -together[np.ix_(camera, camera)] * tall.gram(change * along[:, camera])
     for k in range(measured.cameras):
         own = np.flatnonzero(camera == k)
-        gram[np.ix_(own, own)] += _square(change[:, own])
+        products[np.ix_(own, own)] += tall.gram(change[:, own])
     residual = design.projector(design.residual)
     base = np.empty((design.projector.basis.shape[1], len(camera)))
     scores = np.empty(len(camera))
@@ -61,12 +60,12 @@ def _from_rows(design: Design, found: list[Stratum]) -> tuple[ScoreSpace, Vector
             cube = rows[: design.rows].reshape(len(along), measured.cameras, -1)
             flux = np.einsum("rc,rcn->rn", along * together[k], cube)
             out[:, own] = -(cube[:, k] - along[:, k, None] * flux).T @ change[:, own]
-    before = np.diag(gram).copy()
+    before = np.diag(products).copy()
     space = ScoreSpace(
         *(tuple(part) for part in zip(*((s.name, len(s.camera)) for s in found), strict=True)),
         widths=np.concatenate([stratum.widths for stratum in found]),
         before=before,
-        gram=gram - base.T @ base,
+        gram=products - base.T @ base,
         free=design.projector.free,
     )
     return space, scores, float(residual @ residual)
@@ -74,29 +73,3 @@ def _from_rows(design: Design, found: list[Stratum]) -> tuple[ScoreSpace, Vector
 
 def _names_and_widths(found: list[Stratum]) -> tuple[list[str], list[Vector]]:
     return [stratum.name for stratum in found], [stratum.widths for stratum in found]
-
-
-def _square(columns: Float[np.ndarray, "r a"]) -> Float[np.ndarray, "a a"]:
-    return columns.T @ columns
-
-
-def _unit_model(measured: Measured) -> Float[np.ndarray, "r k"]:
-    """Weighted model of every used row, of unit length over the cameras with a flux in common; 0 where it is known."""
-    power = measured.shared.summed(measured.model**2)
-    unit = measured.model / np.sqrt(np.where(power > 0, power, 1.0))
-    return np.where(measured.known[:, None], 0.0, unit)[measured.used]
-
-
-def _changes(
-    measured: Measured, found: list[Stratum], camera: Int[np.ndarray, " a"]
-) -> Float[np.ndarray, "r a"]:
-    """What every pattern does to its camera in every used row, in standard errors."""
-    size = measured.flux[..., None] * measured.level[:, None, :] * measured.weight
-    size, used = size[measured.used], measured.used
-    points, exposures = np.nonzero(used)
-    changes = np.empty((len(size), len(camera)), order="F")
-    patterns = (pattern for stratum in found for pattern in stratum.patterns)
-    for a, (k, pattern) in enumerate(zip(camera, patterns, strict=True)):
-        there = np.broadcast_to(pattern, used.shape)[points, exposures]
-        np.multiply(size[:, k], there, out=changes[:, a])
-    return changes

@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import optimize, stats
 
+from walop_jax.diagnosis.tall import change_in_place, gram
 from walop_jax.likelihood import limits
 
 Vector = Float[np.ndarray, " _"]
@@ -169,15 +170,13 @@ class ScoreSpace:
     ) -> ScoreSpace:
         """The space of candidates whose columns stand side by side; these are projected in place."""
         before = np.einsum("dk,dk->k", columns, columns)
-        for first in range(0, columns.shape[1], limits.PROJECTED_COLUMNS):
-            some = columns[:, first : first + limits.PROJECTED_COLUMNS]
-            some[:] = projector(some)
+        change_in_place(projector, columns)
         return cls(
             names=tuple(names),
             sizes=tuple(len(w) for w in widths),
             widths=np.concatenate(widths),
             before=before,
-            gram=columns.T @ columns,
+            gram=gram(columns),
             free=projector.free,
         )
 

@@ -69,6 +69,11 @@ def usual_threads() -> int:
     devices = len(jax.local_devices())
     if devices > 1 or jax.default_backend() != "cpu":
         return 2 * devices  # one computes while the next one is read
+    return cores()
+
+
+def cores() -> int:
+    """Number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

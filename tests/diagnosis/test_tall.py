@@ -1,0 +1,31 @@
+"""Products in pieces are those of numpy in one, whatever the order in memory and the number of threads."""
+
+import numpy as np
+import pytest
+
+from walop_jax.diagnosis import tall
+from walop_jax.likelihood import limits
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("count", [1, 7, 8, 30])
+def test_pieces_make_the_whole(order, count, monkeypatch):
+    monkeypatch.setattr(limits, "COLUMNS_TOGETHER", 7)
+    monkeypatch.setattr(limits, "PROJECTED_COLUMNS", 7)
+    columns = np.asarray(np.random.default_rng(count).standard_normal((50, count)), order=order)
+    found = tall.gram(columns)
+    np.testing.assert_allclose(found, columns.T @ columns, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(found, found.T)
+    monkeypatch.setattr(tall, "cores", lambda: 1)
+    np.testing.assert_array_equal(tall.gram(columns), found)
+    changed = columns.copy(order="K")
+    tall.change_in_place(lambda some: 2.0 * some, changed)
+    np.testing.assert_array_equal(changed, 2.0 * columns)
+
+
+def test_an_error_in_a_piece_is_an_error():
+    def refuse(some):
+        raise ValueError("not these")
+
+    with pytest.raises(ValueError, match="not these"):
+        tall.change_in_place(refuse, np.ones((3, 2)))
