@@ -24,12 +24,14 @@ LEAST_COMPILED = 0.1  # seconds: what compiles faster is not worth a file
 QUICK_COMPILATION = (
     "--xla_backend_optimization_level=0"  # half the time; results differ by 10⁻¹³ of the counts
 )
+SLOW = Path(__file__).parent / "slow_tests.txt"
 OPTIONS = {"long": "studies that take minutes", "benchmark": "timings"}
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     for name, what in OPTIONS.items():
         parser.addoption(f"--{name}", action="store_true", default=False, help=f"run {what} as well")
+    parser.addoption("--fast", action="store_true", default=False, help="leave out what takes seconds")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -50,6 +52,12 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = str(LEAST_COMPILED)
 
 
+def slow_tests() -> set[str]:
+    """Tests that `--fast` leaves out, by file and function."""
+    lines = SLOW.read_text(encoding="utf-8").splitlines()
+    return {line for line in lines if line and not line.startswith("#")}
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Workers begin at tests of different rooms and steal from each other: fixtures are made once, as a rule."""
@@ -65,6 +73,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         for item in items:
             if item.get_closest_marker(name):
                 item.add_marker(pytest.mark.skip(reason=f"{what}: run with --{name}"))
+    if config.getoption("--fast"):
+        slow = slow_tests()
+        for item in items:
+            if item.nodeid.split("[")[0].removeprefix("tests/") in slow:
+                item.add_marker(pytest.mark.skip(reason="takes seconds: run without --fast"))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -7,6 +7,7 @@ Covariance   C_m = J C_θ Jᵀ with the exact J; the throughput series enters th
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from jaxtyping import Array, Float
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.likelihood import limits, linear
+from walop_jax.likelihood.runner import usual_threads
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
@@ -132,11 +134,16 @@ def in_chunks(
     if size is None:
         few, many = limits.MATRIX_POINTS
         size = few if count <= few else many
-    parts = []
-    for start in range(0, count, size):
+
+    def solved(start: int) -> list[np.ndarray]:
         slices = [column[start : start + size] for column in columns]
         missing = size - len(slices[0])
         # Padding with the last row keeps the arithmetic as tame as that of the data.
         result = function(*(jnp.asarray(np.pad(part, (0, missing), mode="edge")) for part in slices))
-        parts.append([np.asarray(part)[: size - missing] for part in result])
+        return [np.asarray(part)[: size - missing] for part in result]
+
+    # The first slice compiles; a slice keeps one core busy.
+    parts = [solved(0)]
+    with ThreadPoolExecutor(usual_threads()) as pool:
+        parts += pool.map(solved, range(size, count, size))
     return tuple(np.concatenate(parts) for parts in zip(*parts, strict=True))

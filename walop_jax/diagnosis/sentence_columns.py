@@ -19,6 +19,7 @@ from walop_jax.diagnosis.effect_columns import Probe, effect_candidates, showabl
 from walop_jax.diagnosis.freeform import numpy_sharing
 from walop_jax.diagnosis.grammar import said_by
 from walop_jax.diagnosis.score import Candidate
+from walop_jax.likelihood import limits
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Context, Described
@@ -129,7 +130,7 @@ def all_candidates(
     with ThreadPoolExecutor(1) as beside:
         fringes = beside.submit(_fringes, likelihood, model, values, said)
         direct = beside.submit(effect_candidates, calset, model, values, others)
-        if not likelihood.is_small:
+        if likelihood.pairs > limits.SIDE_BY_SIDE:
             direct.result()
         columns = _without_fringes(likelihood, model, values, said) | fringes.result()
         named = direct.result()

@@ -142,7 +142,7 @@ class Likelihood:
             f"matrix {values.tobytes().hex()}",
             lambda chunk: (
                 engine.dense_equations(instrument, self.plan, chunk)
-                if nodes is None and self.is_small
+                if nodes is None and self.pairs <= limits.FITTED_FROM_ROWS
                 else engine.normal_equations(instrument, self.plan, chunk, nodes)
             ),
             ((), (n,), (n, n)),
@@ -326,8 +326,13 @@ class Likelihood:
 
     @property
     def is_small(self) -> bool:
-        """Whether what is asked for a few times is compiled for longer than it is computed."""
-        return self.layout.points * len(self.flux_known) <= limits.COMPILED_ONCE
+        """Whether columns that are asked for once or twice are compiled for longer than they are computed."""
+        return self.pairs <= limits.COMPILED_ONCE
+
+    @property
+    def pairs(self) -> int:
+        """Number of (exposure, point) pairs, used or not."""
+        return self.layout.points * len(self.flux_known)
 
     def stokes(self, values: Vector) -> Float[np.ndarray, "p e 4"]:
         """Stokes vectors that enter the instrument, per unit flux."""

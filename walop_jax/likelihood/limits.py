@@ -101,8 +101,12 @@ TRUST_ROWS = 20_000
 DIAGNOSED_NUMBERS = 120_000_000
 """Numbers that the columns of a diagnosis may hold: 1 GB, of which there are four copies at most."""
 COMPILED_ONCE = 6000
-"""(Exposure, point) pairs of a set up to which compiling takes longer than computing: columns of effects are then
-compiled without optimisation, and the matrix of a fit is made from the rows of a program that is needed anyway."""
+"""(Exposure, point) pairs of a set up to which columns of effects are compiled without optimisation."""
+FITTED_FROM_ROWS = 20_000
+"""(Exposure, point) pairs of a set up to which the matrix of a fit is made from its rows, by a program that errors and
+trust need anyway: to compile or to load another one takes longer. The rows take 100 MB at most."""
+SIDE_BY_SIDE = 20_000
+"""(Exposure, point) pairs of a set up to which columns are computed by two threads: each needs half a gigabyte then."""
 CHOICE_ROWS = 6000
 """(Exposure, point) pairs on which other descriptions of an instrument are compared before any of them is fitted."""
 MANY_POINTS = 4
