@@ -53,7 +53,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def slow_tests() -> set[str]:
-    """Tests that `--fast` leaves out, by file and function."""
+    """Tests that `--fast` leaves out: files, or file::function."""
     lines = SLOW.read_text(encoding="utf-8").splitlines()
     return {line for line in lines if line and not line.startswith("#")}
 
@@ -76,7 +76,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if config.getoption("--fast"):
         slow = slow_tests()
         for item in items:
-            if item.nodeid.split("[")[0].removeprefix("tests/") in slow:
+            name = item.nodeid.split("[")[0].removeprefix("tests/")
+            if name in slow or name.split("::")[0] in slow:
                 item.add_marker(pytest.mark.skip(reason="takes seconds: run without --fast"))
 
 

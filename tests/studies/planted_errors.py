@@ -3,7 +3,7 @@
     python tests/studies/planted_errors.py [--only WORD] [--cache FOLDER]
 
 Each error is a line of the package and what it is replaced by: a sign, a factor, an index, a bound. The tree is copied
-to a temporary folder, the error planted there, the tests named beside it are run until the first fails, and the line is
+to a temporary folder, the error planted there, the tests named beside it (of the fast suite) are run until the first fails, and the line is
 put back. Printed are the errors that were caught and those that were missed; the exit status is 1 if any was missed.
 `test_planted_errors.py` sees to it that every line is still there.
 """
@@ -176,7 +176,7 @@ def caught(error: Planted, tree: Path, cache: Path) -> tuple[str | None, float]:
     file.write_text(text.replace(error.old, error.new), encoding="utf-8")
     try:
         found = subprocess.run(
-            [sys.executable, "-m", "pytest", "-n", "0", "-x", "-q", "-o", f"cache_dir={cache}",
+            [sys.executable, "-m", "pytest", "-n", "0", "-x", "-q", "--fast", "-o", f"cache_dir={cache}",
              *(f"tests/{name}" for name in error.tests)],
             cwd=tree, capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": str(tree)},
         )  # fmt: skip
