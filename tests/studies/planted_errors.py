@@ -3,8 +3,9 @@
     python tests/studies/planted_errors.py [--only WORD] [--cache FOLDER]
 
 Each error is a line of the package and what it is replaced by: a sign, a factor, an index, a bound. The tree is copied
-to a temporary folder, the error planted there, the tests named beside it (of the fast suite) are run until the first fails, and the line is
-put back. Printed are the errors that were caught and those that were missed; the exit status is 1 if any was missed.
+to a temporary folder, the error planted there, those tests named beside it that belong to the fast suite are run until
+the first fails, and the line is put back. Printed are the errors that were caught and those that were missed; the exit
+status is 1 if any was missed.
 `test_planted_errors.py` sees to it that every line is still there.
 """
 
