@@ -56,7 +56,7 @@ def cooler(calset: CalibrationSet) -> CalibrationSet:
         (displaced, "X of all field points changed by", -0.02),
         (turned, "the angle of the field changed by", -0.002),
         pytest.param(shifted, "the wavelengths of filter SDSS-r changed by", -0.004, marks=pytest.mark.long),
-        (cooler, "TEFF of exposures of kind clp", 5772.0),
+        pytest.param(cooler, "TEFF of exposures of kind clp", 5772.0, marks=pytest.mark.long),
     ],
 )
 def test_a_number_that_is_wrong_is_told_with_its_size(change, what, size):

@@ -139,6 +139,7 @@ def check_pairs(errors, table, limit):
     assert np.all(errors["0 and 45"][:, 0] < limit)
 
 
+@pytest.mark.long
 def test_two_exposures_on_a_cut(south_set, south_fit):
     """As good everywhere as one exposure is expected to be where it holds q and u."""
     south = south_set("b")

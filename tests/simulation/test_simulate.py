@@ -232,9 +232,9 @@ def test_without_noise_nothing_is_left():
 @pytest.mark.parametrize(
     ("name", "values"),
     [
-        ("clp_wobble", {"amplitude": 0.06, "phase": 1.1}),
+        pytest.param("clp_wobble", {"amplitude": 0.06, "phase": 1.1}, marks=pytest.mark.long),
         ("ghost", {"share": 0.01}),
-        ("pedestal", {"level": 0.01}),
+        pytest.param("pedestal", {"level": 0.01}, marks=pytest.mark.long),
         ("nonlinearity", {"coefficient": 0.02}),
         ("standard_outlier", {"source": "STD01", "q": 0.003}),
     ],

@@ -1,9 +1,10 @@
 """Single intensities that neither model nor noise explain: cosmic rays, stars in a patch of sky.
 
-Equation    |r| > c s √(1 − 1/K),  s = max(1, 1.4826 median |r| / √(1 − 1/K))
-Symbols     r normalised residual of a camera, K cameras, c the number of standard errors, s how much more the residuals
-            of this fit scatter than stated, by their median absolute deviation: it does not see the outliers
-Source      clipping: Yahil & Vidal 1977, ApJ 214, 347; the eliminated flux takes one of K degrees of freedom of a row
+Equation    |r| > c s v,  s = max(1, 1.4826 median |r / v|),  v² = independent data of a row / K
+Symbols     r normalised residual of a camera, K cameras, v what is left of its standard error with the flux eliminated
+            (v² = 1 − 1/K for one flux, 1 where it is known), c the number of standard errors, s how much more the
+            residuals of this fit scatter than stated, by their median absolute deviation: it does not see the outliers
+Source      clipping: Yahil & Vidal 1977, ApJ 214, 347
 Limits      noise alone, c = 5: one row of 440 000 of four cameras. More than `MOST` of the rows are no outliers but
             what the model lacks
 """
@@ -93,6 +94,6 @@ def _distance(likelihood: Likelihood, values: np.ndarray) -> Float[np.ndarray, "
     """How far the worst camera of every row lies off, in standard errors; 0 where unused."""
     _, residual = likelihood.residuals(values)
     used = likelihood.used
-    residual = np.abs(residual) / np.sqrt(1.0 - 1.0 / likelihood.cameras)
+    residual = np.abs(residual) / np.sqrt(likelihood.data_per_row / likelihood.cameras)[:, None]
     scatter = _GAUSSIAN * float(np.median(residual[used])) if used.any() else 1.0
     return np.where(used, residual.max(axis=-1) / max(1.0, scatter), 0.0)
