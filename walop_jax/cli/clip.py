@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -14,6 +13,7 @@ from walop_jax.cli.common import (
     InstrumentOption,
     JsonOption,
     ModelOption,
+    OutputSet,
     OverwriteOption,
     QuietOption,
     print_json,
@@ -27,9 +27,7 @@ STAGES = ("reading", "fitting", "writing")
 
 def clip(
     calsets: CalsetFiles,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="SET.fits", help="Calibration set to write (FITS).")
-    ],
+    output: OutputSet,
     sigma: Annotated[
         float,
         typer.Option(

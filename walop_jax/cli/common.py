@@ -28,6 +28,9 @@ CalsetFiles = Annotated[
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable result to stdout, nothing else.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors.")]
+OutputSet = Annotated[
+    Path, typer.Option("--output", "-o", metavar="SET.fits", help="Calibration set to write (FITS).")
+]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace outputs that exist.")]
 SeedOption = Annotated[int | None, typer.Option("--seed", help="Seed of random numbers (default: 0).")]
 ModelOption = Annotated[

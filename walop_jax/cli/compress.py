@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
 
 from walop_jax.cli.common import (
@@ -14,6 +11,7 @@ from walop_jax.cli.common import (
     JsonOption,
     MemoryOption,
     ModelOption,
+    OutputSet,
     OverwriteOption,
     QuietOption,
     print_json,
@@ -27,9 +25,7 @@ STAGES = ("reading", "preparing the fit", "compressing")
 
 def compress(
     calsets: CalsetFiles,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="SET.fits", help="Calibration set to write (FITS).")
-    ],
+    output: OutputSet,
     model: ModelOption = None,
     instrument: InstrumentOption = None,
     effects: EffectsOption = None,

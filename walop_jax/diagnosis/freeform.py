@@ -84,8 +84,7 @@ class Measured:
     @property
     def gained(self) -> list[int]:
         """Cameras that have a gain beside the flux."""
-        shared = self.shared.cameras if self.shared.cameras is not None else np.ones((self.cameras,) * 2)
-        return [k for k in range(self.cameras) if shared[k, k + 1 :].any()]
+        return [k for k in range(self.cameras) if self.together[k, k + 1 :].any()]
 
     @property
     def together(self) -> Float[np.ndarray, "k k"]:

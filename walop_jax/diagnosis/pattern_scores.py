@@ -20,6 +20,7 @@ from walop_jax.diagnosis import tall
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.freeform import Stratum, strata
 from walop_jax.diagnosis.score import Scorer, ScoreSpace, ScoreTable
+from walop_jax.likelihood.flux import project_flux
 
 Vector = Float[np.ndarray, " _"]
 
@@ -35,7 +36,8 @@ def pattern_scores(design: Design, seed: int = 0) -> ScoreTable:
 def _from_columns(design: Design, found: list[Stratum]) -> tuple[ScoreSpace, Vector, float]:
     """Space, C̃ᵀr and r·r from columns of all intensities."""
     columns = design.stacked([design.measured.candidate(stratum).columns for stratum in found])
-    space = ScoreSpace.projected(design.projector, *_names_and_widths(found), columns)
+    names, widths = [stratum.name for stratum in found], [stratum.widths for stratum in found]
+    space = ScoreSpace.projected(design.projector, names, widths, columns)
     residual = design.projector(design.residual)
     return space, columns.T @ residual, float(residual @ residual)
 
@@ -52,24 +54,19 @@ def _from_rows(design: Design, found: list[Stratum]) -> tuple[ScoreSpace, Vector
         own = np.flatnonzero(camera == k)
         products[np.ix_(own, own)] += tall.gram(change[:, own])
     residual = design.projector(design.residual)
-    base = np.empty((design.projector.basis.shape[1], len(camera)))
-    scores = np.empty(len(camera))
+    rows = np.column_stack([design.projector.basis, residual])[: design.rows]
+    rows = project_flux(rows.T.reshape(-1, *along.shape), along, shared=measured.shared)
+    both = np.empty((len(rows), len(camera)))
     for k in range(measured.cameras):
         own = np.flatnonzero(camera == k)
-        for rows, out in ((design.projector.basis, base), (residual[:, None], scores[None])):
-            cube = rows[: design.rows].reshape(len(along), measured.cameras, -1)
-            flux = np.einsum("rc,rcn->rn", along * together[k], cube)
-            out[:, own] = -(cube[:, k] - along[:, k, None] * flux).T @ change[:, own]
-    before = np.diag(products).copy()
+        both[:, own] = -rows[..., k] @ change[:, own]
+    base, scores = both[:-1], both[-1]
     space = ScoreSpace(
-        *(tuple(part) for part in zip(*((s.name, len(s.camera)) for s in found), strict=True)),
+        names=tuple(stratum.name for stratum in found),
+        sizes=tuple(len(stratum.camera) for stratum in found),
         widths=np.concatenate([stratum.widths for stratum in found]),
-        before=before,
+        before=np.diag(products).copy(),
         gram=products - base.T @ base,
         free=design.projector.free,
     )
     return space, scores, float(residual @ residual)
-
-
-def _names_and_widths(found: list[Stratum]) -> tuple[list[str], list[Vector]]:
-    return [stratum.name for stratum in found], [stratum.widths for stratum in found]

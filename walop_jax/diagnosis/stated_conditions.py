@@ -120,15 +120,14 @@ def condition_scores(design: Design) -> list[Scored]:
 
 
 def _columns(design: Design, asked: Sequence[Stated]) -> Iterator[Float[np.ndarray, " _"]]:
-    by_place: list[Float[np.ndarray, " _"]] = []
+    of_field = [one for one in asked if one.along is not None]
+    by_place = [_column(design, one) for one in of_field[:2]]  # X and Y come first
     for one in asked:
         if one.along is None:
             yield _column(design, one)
-            continue
-        if not by_place:
-            by_place = [_column(design, field) for field in _of_field(design.fit.calset, 2)]
-        (in_x, in_y), (by_x, by_y) = one.along, by_place
-        yield in_x[design.point] * by_x + in_y[design.point] * by_y
+        else:
+            (in_x, in_y), (by_x, by_y) = one.along, by_place
+            yield in_x[design.point] * by_x + in_y[design.point] * by_y
 
 
 def _column(design: Design, one: Stated) -> np.ndarray:
@@ -170,8 +169,7 @@ def _stated(calset: CalibrationSet) -> Iterator[Stated]:
         )
 
 
-def _of_field(calset: CalibrationSet, count: int = 4) -> Iterator[Stated]:
-    """The first of the numbers that places of the field hang on: X, Y, scale, angle."""
+def _of_field(calset: CalibrationSet) -> Iterator[Stated]:
     check = "check X and Y against the frames (docs: conventions)"
     x, y = calset.points.x, calset.points.y
     radius, one = float(np.hypot(x, y).max()), np.ones(len(x))
@@ -180,7 +178,7 @@ def _of_field(calset: CalibrationSet, count: int = 4) -> Iterator[Stated]:
         ("Y of all field points", "deg", radius, (0.0 * one, one)),
         ("the scale of X and Y", "", 1.0, (x, y)),
         ("the angle of the field", "rad", 1.0, (-y, x)),
-    )[:count]:
+    ):
         yield Stated(
             what,
             unit,

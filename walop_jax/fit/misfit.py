@@ -106,7 +106,7 @@ def misfit_at(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Misfit
             float(points.y[worst]),
             float(per_point[worst]),
         ),
-        outliers=float(outlying(likelihood, values).sum() / max(used.sum(), 1)),
+        outliers=float(outlying(likelihood, residual).sum() / max(used.sum(), 1)),
     )
 
 

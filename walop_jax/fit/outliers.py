@@ -53,9 +53,11 @@ class Clipped:
         return self.share > MOST
 
 
-def outlying(likelihood: Likelihood, values: np.ndarray, beyond: float = BEYOND) -> Bool[np.ndarray, "p e"]:
-    """Used rows of which a camera lies more than `beyond` standard errors from a model; `values` is a full vector."""
-    return _distance(likelihood, values) > beyond
+def outlying(
+    likelihood: Likelihood, residual: Float[np.ndarray, "p e k"], beyond: float = BEYOND
+) -> Bool[np.ndarray, "p e"]:
+    """Used rows of which a camera lies more than `beyond` standard errors off, of the normalised residuals."""
+    return _distance(likelihood, residual) > beyond
 
 
 def clipped(calset: CalibrationSet, model: Model | None = None, beyond: float = BEYOND) -> Clipped:
@@ -69,30 +71,25 @@ def clipped(calset: CalibrationSet, model: Model | None = None, beyond: float = 
         raise ValueError(f"{beyond:g} standard errors: noise itself lies so far off; at least {LEAST:g}")
     model = model or base_model(calset)
     table = TableIntensities.of(calset.intensities, calset.points)
-    used, values = int(table.used.sum()), None
+    used, values = int(table.used.sum()), model.start
     while True:
         calset = dataclasses.replace(calset, intensities=table)
         likelihood = Likelihood.of(calset, model)
-        scale = _left(likelihood, likelihood.model.start if values is None else values)
+        left = likelihood.residuals(values)[1][likelihood.used]
+        scale = float(np.sqrt(np.mean(left**2)))
         bent = scale**2 > FAR_OFF
         result = fit(likelihood, noise_scale=scale if bent else None)
         values = result.values
         found = Clipped(calset, result, used - int(table.used.sum()), used)
-        off = _distance(likelihood, values)[table.point, table.exposure]
+        off = _distance(likelihood, likelihood.residuals(values)[1])[table.point, table.exposure]
         if off.max(initial=0.0) > beyond and not found.too_many:
             table = table.flagged(table.used & (off > max(beyond, 0.5 * off.max())), DataFlag.BAD_PIXEL)
         elif not bent or found.too_many:
             return found
 
 
-def _left(likelihood: Likelihood, values: np.ndarray) -> float:
-    """Root mean square of the normalised residuals."""
-    return float(np.sqrt(np.mean(likelihood.residuals(values)[1][likelihood.used] ** 2)))
-
-
-def _distance(likelihood: Likelihood, values: np.ndarray) -> Float[np.ndarray, "p e"]:
+def _distance(likelihood: Likelihood, residual: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "p e"]:
     """How far the worst camera of every row lies off, in standard errors; 0 where unused."""
-    _, residual = likelihood.residuals(values)
     used = likelihood.used
     residual = np.abs(residual) / np.sqrt(likelihood.data_per_row / likelihood.cameras)[:, None]
     scatter = _GAUSSIAN * float(np.median(residual[used])) if used.any() else 1.0

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.write import write_calibration_set
 from walop_jax.fit.refit import FitResult, refit
+from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import fail
 from walop_jax.io.heartbeat import repeated
 from walop_jax.io.text import read_text
@@ -46,8 +46,7 @@ def compress_frames(
     """
     tell = progress or (lambda text: None)
     text = "" if model is None else read_text(model)
-    if Path(output).exists() and not overwrite:
-        raise fail("exists already", file=output, advice="give another name, or --overwrite")
+    check_output(output, overwrite=overwrite)
     tell("reading")
     calset, chosen = sets_and_model(calsets, text, model, instrument, catalogue)
     with repeated(tell) as say:

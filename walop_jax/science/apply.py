@@ -270,8 +270,8 @@ def _flags(
     points = catalogue.points
     settings = points.settings[rows]
     bits = vectors.calibration.flags(points.x[rows], points.y[rows], settings)
+    bits[bits & Quality.BEYOND_SETTINGS > 0] |= Quality.VALIDITY_FORCED
     bits[_outside(vectors, catalogue, rows)] |= Quality.BEYOND_FIELD
-    bits[vectors.calibration.beyond_settings(settings)] |= Quality.VALIDITY_FORCED
     bits[settings.teff < COOLEST] |= Quality.BEYOND_SETTINGS
     bits[~np.isfinite(counts * catalogue.sigma[rows]).all(axis=1)] |= Quality.CAMERA_MISSING
     bits[catalogue.spoilt[rows]] |= Quality.SATURATED

@@ -20,12 +20,13 @@ def check_validity(calibration: Calibration, settings: Settings) -> None:
         return
     seen = np.unique(calibration.exposures.filter)
     other = ~np.isin(settings.filter, seen)
-    column, rows = ("FILTER", other) if other.any() else ("TEMP", beyond)
     if other.any():
+        column, rows = "FILTER", other
         what = (
             f"{', '.join(np.unique(settings.filter[other]))}; the calibration was made in {', '.join(seen)}"
         )
     else:
+        column, rows = "TEMP", beyond
         low, high = np.nanmin(calibration.exposures.temp), np.nanmax(calibration.exposures.temp)
         what = f"the calibration was made between {low:.1f} and {high:.1f} Celsius"
     raise DataError(
