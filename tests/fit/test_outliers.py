@@ -64,6 +64,17 @@ def test_many_are_no_outliers(clean):
     assert clipped(calset).too_many
 
 
+def test_cameras_that_are_exchanged_are_no_outliers(clean):
+    """All rows lie off alike: nothing is flagged for ever, and the fit says that it explains nothing."""
+    table = TableIntensities.of(clean.intensities, clean.points)
+    order = [1, 0, 2, 3]
+    swapped = TableIntensities.dense(clean.points, clean.intensities.block(0, len(clean.points)))
+    swapped.counts[:], swapped.sigma[:] = table.counts[:, order], table.sigma[:, order]
+    found = clipped(dataclasses.replace(clean, intensities=swapped))
+    assert not found.result.trusted
+    assert any("far off" in text for text in found.result.warnings)
+
+
 def test_a_fit_tells_that_there_are_some(clean):
     calset, hit = with_hits(clean, 0.02, 30.0)
     misfit = describe(fit(Likelihood.of(calset, small_fit().model)))

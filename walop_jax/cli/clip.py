@@ -46,8 +46,9 @@ def clip(
     SET.fits holds the same rows, with FLAG 2 where a camera lies more than N standard errors off; flagged rows are not
     used by any command. The set is fitted anew until nothing lies off any more.
 
-    What the model lacks lies off as well, but in many rows: if these are more than 5 %, the set is written with a
-    warning, exit code 3. Look for the cause with walop-jax diagnose then, on the set as it was.
+    What the model lacks lies off as well, but in many rows: if these are more than 5 %, or the fit of what is left is
+    not to be trusted, the set is written with a warning, exit code 3. Look for the cause with walop-jax diagnose then,
+    on the set as it was.
     """
     switch_on_jax()
     from walop_jax.model.effects.own import catalogue_with
@@ -76,5 +77,7 @@ def clip(
             f"{100 * found.share:.2g} % of the rows lie off: that is not single intensities but something that the "
             "model lacks; walop-jax diagnose looks for it"
         )
-    if found.too_many or not found.result.converged:
+    for sentence in found.result.warnings:
+        warn(f"the fit of what is left: {sentence}")
+    if found.too_many or not found.result.trusted:
         raise typer.Exit(UNTRUSTED)

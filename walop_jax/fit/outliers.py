@@ -65,7 +65,8 @@ def clipped(calset: CalibrationSet, model: Model | None = None, beyond: float = 
 
     The farthest go first, down to half of their distance: what is large enough bends a fit, and good rows then lie off
     as well. As long as it does, errors are taken as large as what is left. Stops where more than `MOST` of the rows
-    are flagged. Raises ValueError for `beyond` below `LEAST`, and what `fit` raises.
+    are flagged, and where all of them lie off alike: that is for `FitResult.warnings` to say. Raises ValueError for
+    `beyond` below `LEAST`, and what `fit` raises.
     """
     if not beyond >= LEAST:
         raise ValueError(f"{beyond:g} standard errors: noise itself lies so far off; at least {LEAST:g}")
@@ -75,17 +76,23 @@ def clipped(calset: CalibrationSet, model: Model | None = None, beyond: float = 
     while True:
         calset = dataclasses.replace(calset, intensities=table)
         likelihood = Likelihood.of(calset, model)
-        left = likelihood.residuals(values)[1][likelihood.used]
-        scale = float(np.sqrt(np.mean(left**2)))
-        bent = scale**2 > FAR_OFF
-        result = fit(likelihood, noise_scale=scale if bent else None)
+        square = _mean_square(likelihood, likelihood.residuals(values)[1])
+        bent = square > FAR_OFF
+        result = fit(likelihood, noise_scale=float(np.sqrt(square)) if bent else None)
         values = result.values
+        residual = likelihood.residuals(values)[1]
         found = Clipped(calset, result, used - int(table.used.sum()), used)
-        off = _distance(likelihood, likelihood.residuals(values)[1])[table.point, table.exposure]
-        if off.max(initial=0.0) > beyond and not found.too_many:
-            table = table.flagged(table.used & (off > max(beyond, 0.5 * off.max())), DataFlag.BAD_PIXEL)
-        elif not bent or found.too_many:
+        off = _distance(likelihood, residual)[table.point, table.exposure]
+        if found.too_many:
             return found
+        if off.max(initial=0.0) > beyond:
+            table = table.flagged(table.used & (off > max(beyond, 0.5 * off.max())), DataFlag.BAD_PIXEL)
+        elif not bent or _mean_square(likelihood, residual) > FAR_OFF:
+            return found
+
+
+def _mean_square(likelihood: Likelihood, residual: Float[np.ndarray, "p e k"]) -> float:
+    return float(np.mean(residual[likelihood.used] ** 2))
 
 
 def _distance(likelihood: Likelihood, residual: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "p e"]:
