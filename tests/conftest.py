@@ -21,9 +21,9 @@ from walop_jax.data import read_calibration_set  # noqa: E402
 from walop_jax.fit.refit import FitResult, refit  # noqa: E402
 
 LEAST_COMPILED = 0.1  # seconds: what compiles faster is not worth a file
-QUICK_COMPILATION = (
-    "--xla_backend_optimization_level=0"  # half the time; results differ by 10⁻¹³ of the counts
-)
+# Half the time; results differ by 10⁻¹³ of the counts. The second is newer than the oldest JAX that will do.
+QUICK_COMPILATION = "--xla_backend_optimization_level=0"
+QUICK_OPTIMISATION = "jax_optimization_level"
 SLOW = Path(__file__).parent / "slow_tests.txt"
 OPTIONS = {"long": "studies that take minutes", "benchmark": "timings"}
 
@@ -41,6 +41,9 @@ def pytest_configure(config: pytest.Config) -> None:
     """
     if not config.getoption("--benchmark"):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK_COMPILATION}".strip()
+        if hasattr(jax.config, QUICK_OPTIMISATION):
+            jax.config.update(QUICK_OPTIMISATION, "O0")
+            os.environ[QUICK_OPTIMISATION.upper()] = "O0"
     cache = getattr(config, "cache", None)
     if cache is None:
         return

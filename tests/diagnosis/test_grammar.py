@@ -37,6 +37,9 @@ LISTED = (
     "polarisation q of sky * exposure 13; polarisation u of sky * exposure 13",
     "shift of band",
 )
+QUICK = (
+    LISTED[:3] + LISTED[5:7] + LISTED[9:10]
+)  # without derivatives of crystals and ghosts, which take half a minute
 HELD = 0.999  # share of the square of what an effect does that its sentences hold
 
 
@@ -49,11 +52,11 @@ def laid():
 
 @pytest.fixture(scope="module")
 def said(laid, request):
-    """Columns of the listed groups; of all of them where there is time."""
+    """Columns of some listed groups; of all that there are where there is time."""
     found = grammar.sentences(laid.model.template, laid.calset.exposures, len(laid.calset.points))
     if not request.config.getoption("--long"):
-        found = [probe for probe in found if probe.name in LISTED]
-        assert len(found) == len(LISTED)
+        found = [probe for probe in found if probe.name in QUICK]
+        assert len(found) == len(QUICK)
     made = sentence_candidates(laid.likelihood, laid.model, laid.values, found)
     return {name: candidate.columns for name, candidate in made.items()}
 
@@ -87,11 +90,12 @@ def test_names_are_sentences(laid, said):
 
 def test_columns_are_those_of_the_effect_itself(laid, said):
     """What is multiplied by a factor afterwards is what the effect with that factor does."""
-    each = {name: Described.saying(name.split("; "), [0.0] * len(name.split("; "))) for name in LISTED}
+    listed = [name for name in LISTED if name in said]
+    each = {name: Described.saying(name.split("; "), [0.0] * len(name.split("; "))) for name in listed}
     whole = Likelihood.of(laid.calset, laid.model, tuple(each.values()))
     columns = whole.effect_columns(laid.values, tuple(each.values()))
-    ends = np.cumsum([said[name].shape[1] for name in LISTED])
-    for name, own in zip(LISTED, np.split(columns, ends[:-1], axis=1), strict=True):
+    ends = np.cumsum([said[name].shape[1] for name in listed])
+    for name, own in zip(listed, np.split(columns, ends[:-1], axis=1), strict=True):
         assert said[name] == pytest.approx(own, rel=1e-7, abs=1e-7 * np.abs(own).max())
 
 

@@ -145,6 +145,7 @@ def test_right_data_and_effects_are_no_mix_up(calset):
     assert mixups(dataclasses.replace(calset, intensities=table), model, left=1e3) == ()
 
 
+@pytest.mark.long
 def test_errors_that_are_far_too_small_are_told_from_a_wrong_model(calset):
     block = calset.intensities.block(0, len(calset.points))
     table = TableIntensities.dense(calset.points, dataclasses.replace(block, sigma=block.sigma / 100.0))

@@ -133,6 +133,7 @@ def test_what_cannot_be_interpolated_is_solved_point_by_point(simulated, exact, 
     assert likelihood.expand(values, near=found).data == found.data
 
 
+@pytest.mark.long
 def test_as_many_nodes_as_nearby_are_tried_first(quick, monkeypatch):
     here = quick.expand(quick.model.start)
     tried, through = [], FieldTable.through

@@ -51,6 +51,7 @@ def test_its_gradient_is_that_of_finite_differences(
     assert np.abs(at_the_fit).max() < 0.02 < np.abs(gradient).max()
 
 
+@pytest.mark.long
 def test_chunks_make_no_difference(scene: Scene, density: Density, place: np.ndarray) -> None:
     """Four chunks, the last of them padded, are the same as one."""
     one = scene.result.likelihood

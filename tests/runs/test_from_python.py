@@ -130,6 +130,7 @@ def test_trace_ends_with_the_counts_of_the_command(call, fitted):
     assert [f"{value:.6f}" for value in counts] == text.split()[1:5]
 
 
+@pytest.mark.long
 def test_limits_as_a_table():
     zero = walop.effect_by_name("clp_zero")
     table = walop.limits(small_fit(), catalogue=(zero,)).to_table()

@@ -316,7 +316,7 @@ def documented_command(name: str) -> list[str]:
 @pytest.mark.parametrize(
     ("name", "truth"),
     [
-        ("walop_south_small", "walop_south_small_truth"),
+        pytest.param("walop_south_small", "walop_south_small_truth", marks=pytest.mark.long),
         ("walop_south_hidden", "walop_south_hidden_sealed"),
     ],
 )

@@ -34,6 +34,7 @@ def fit(path, *names: str, start=()):
     return found, here.chi2, likelihood.dof
 
 
+@pytest.mark.long
 def test_clp_wobble(either_south_set):
     start = (("clp_wobble.amplitude", 0.05), ("clp_wobble.phase", 0.8))
     found, chi2, dof = fit(either_south_set("c").path, "clp_wobble", start=start)
