@@ -11,7 +11,14 @@ from quick import quick
 
 from walop_jax.calibration import residual_map
 from walop_jax.calibration.residual_map import residual_map_of_pixels
-from walop_jax.data import Grid, read_calibration_set, write_calibration_set, write_frames
+from walop_jax.data import (
+    Grid,
+    merge_calibration_sets,
+    read_calibration_set,
+    write_calibration_set,
+    write_frames,
+)
+from walop_jax.data.merge import without_frames
 from walop_jax.data.raw_rows import RowReader, float64
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
@@ -150,6 +157,50 @@ def test_what_is_not_smooth_or_not_linear_goes_pixel_by_pixel(likelihood):
     )
 
 
+# --------------------------------------------------------------------------------------- a table beside the frames
+
+
+@pytest.fixture(scope="module")
+def with_stars(path):
+    """Frames, and standard stars in a table; the table first, so that exposures of frames are not the first ones."""
+    plan = dataclasses.replace(RUN, grid=3, standards=2, unpolarised=1, standard_grid=3, moon_patches=0)
+    stars = simulate(plan, seed=12).calset
+    calset = merge_calibration_sets(stars, read_calibration_set(path))
+    assert 0 < np.sum(calset.exposures.kind == "standard") < len(stars.exposures)
+    return Likelihood.of(calset, base_model(calset, throughput_degree=2), interpolate=True)
+
+
+def test_frames_and_a_table_are_gone_through_each_in_its_way(with_stars):
+    model = with_stars.model
+    assert stands_for_pixels(with_stars, model.start)
+    sigma = np.array([p.prior[1] if p.prior else p.scale for p in model.parameters])
+    values = model.start + 0.1 * sigma * np.random.default_rng(2).standard_normal(
+        len(sigma)
+    ) * model.selection().any(1)
+    assert_same(pixels.expand(with_stars, values), with_stars.expand(values))
+
+
+def test_the_set_that_stands_for_frames_keeps_the_table_beside_them(with_stars, monkeypatch):
+    monkeypatch.setattr(limits, "LARGE_ABOVE", 0)
+    calset = with_stars.calset
+    found = fit(Likelihood.of(calset, with_stars.model, interpolate=True))
+    assert isinstance(found.posterior, pixels.PixelPosterior)
+    small = compressed(found.posterior)
+    assert small.compression.pixels == SIDE**2
+    table = without_frames(calset)
+    last = small.intensities.block(len(small.points) - len(table.points), len(small.points))
+    own = table.intensities.block(0, len(table.points))
+    for name in ("x", "y", "used", "source"):
+        np.testing.assert_array_equal(getattr(last, name), getattr(own, name))
+    np.testing.assert_array_equal(last.counts[own.used], own.counts[own.used])
+    again = fit(Likelihood.of(small, with_stars.model, interpolate=False))
+    free = found.sigma > 0
+    np.testing.assert_allclose((again.values - found.values)[free] / found.sigma[free], 0.0, atol=2e-3)
+    np.testing.assert_allclose(again.sigma[free] / found.sigma[free], 1.0, atol=5e-3)
+    ours = residual_map_of_pixels(found.posterior.sums)
+    assert np.isfinite(ours.values).all()
+
+
 def test_cells_cover_frames_of_any_shape():
     cells = Cells.of(Grid(300, 71, (1.0, 1.0), (0.0, 0.0), ((1e-3, 0.0), (0.0, 1e-3))))
     assert (cells.side, cells.shape) == (3, (24, 100))
@@ -218,7 +269,7 @@ def test_it_comes_back_from_its_file(stand_in, fitted, tmp_path):
     record = again.compression
     assert record is not None
     assert record.pixels == SIDE**2
-    assert record.chi2 == fitted.posterior.sums.chi2
+    assert record.chi2 == fitted.posterior.data
     assert record.frames[0].sha256 == fitted.calset.inputs[0].sha256
     assert any("stand for" in text for text in again.remarks)
     block, other = (one.intensities.block(0, len(one.points)) for one in (stand_in, again))

@@ -160,9 +160,9 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
 def residual_map_of_pixels(found: FrameSums) -> ResidualMap:
     """The map of what the values leave of whole frames: from the sums of cells, with what is smooth in their middle."""
     likelihood, cells = found.likelihood, found.cells
-    setting, chosen = _main_setting(
-        Settings.of(likelihood.calset.exposures, likelihood.plan.moving), likelihood.calset.exposures.clp_in
-    )
+    exposures = likelihood.calset.exposures
+    seen = found.sums.used.any(axis=(1, 2))  # not those of a table beside the frames
+    setting, chosen = _main_setting(Settings.of(exposures, likelihood.plan.moving), exposures.clp_in & seen)
     blocks = (limits.POINTS_PER_CELL**0.5 / cells.side, max(cells.shape) / limits.MOST_CELLS)
     together = int(np.ceil(max(1.0, *blocks)))
     s, t = np.meshgrid(*cells.middles())

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int
 
 from walop_jax.data.frames import FrameIntensities, Grid
 from walop_jax.data.records import (
@@ -63,6 +64,28 @@ class JoinedIntensities(Intensities):
             return empty_block(np.zeros(0), np.zeros(0), self.exposures, self.cameras)
         fields = [field.name for field in dataclasses.fields(Block)]
         return Block(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in fields})
+
+
+def frames_among(calset: CalibrationSet) -> tuple[FrameIntensities, Int[np.ndarray, " r"]] | None:
+    """The frames of a set and the exposures (positions) that they hold; None where there are none, or on two grids."""
+    whole = calset.intensities
+    if isinstance(whole, FrameIntensities):
+        return whole, np.arange(len(calset.exposures))
+    parts = whole.parts if isinstance(whole, JoinedIntensities) else ()
+    found = [(part, exposures) for part, _, exposures in parts if isinstance(part, FrameIntensities)]
+    return found[0] if len(found) == 1 else None
+
+
+def without_frames(calset: CalibrationSet) -> CalibrationSet | None:
+    """What a set holds beside its frames, with the exposures of all of it; None where there is nothing."""
+    whole = calset.intensities
+    parts = whole.parts if isinstance(whole, JoinedIntensities) else ()
+    beside = tuple(part for part in parts if not isinstance(part[0], FrameIntensities))
+    if not beside:
+        return None
+    points = _stack_points([points for _, points, _ in beside])
+    intensities = JoinedIntensities(beside, len(calset.exposures))
+    return dataclasses.replace(calset, points=points, intensities=intensities)
 
 
 def merge_calibration_sets(*sets: CalibrationSet) -> CalibrationSet:

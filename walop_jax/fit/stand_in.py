@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from walop_jax.data.frames import FrameIntensities
+from walop_jax.data.merge import frames_among
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.compression import compressed
@@ -32,7 +32,7 @@ def on_field_points(result: FitResult) -> FitResult:
 def in_field_points(calset: CalibrationSet, model: Model, tell: Progress) -> CalibrationSet:
     """Whole frames of many pixels as the set that stands for them at their minimum; any other set as it is."""
     likelihood = Likelihood.of(calset, model, runner=Runner(progress=tell))
-    if not (likelihood.layout.large and isinstance(calset.intensities, FrameIntensities)):
+    if not (likelihood.layout.large and frames_among(calset) is not None):
         return calset
     tell("fitting all pixels")
     found = on_field_points(fit(likelihood)).calset

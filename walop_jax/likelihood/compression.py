@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import legendre
 
+from walop_jax.data.merge import without_frames
 from walop_jax.data.records import Block, CalibrationSet, Compression, Points
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.likelihood import limits
@@ -48,7 +49,10 @@ def _shares(edges: Vector) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "
 
 
 def compressed(posterior: PixelPosterior) -> CalibrationSet:
-    """The calibration set of field points that stands for all pixels, near the values of a posterior."""
+    """The calibration set of field points that stands for all pixels, near the values of a posterior.
+
+    The rows of a table beside the frames are in it as they are.
+    """
     found = posterior.sums
     cells, likelihood = found.cells, found.likelihood
     (s, over), (t, up) = (_shares(edges) for edges in cells.edges())
@@ -70,13 +74,13 @@ def compressed(posterior: PixelPosterior) -> CalibrationSet:
     flux = np.where(likelihood.flux_known, 1.0, mean)[..., None]
     counts = np.where(used[..., None], flux * (unit + pull / safe), 0.0)
     sigma = np.where(used[..., None], flux / np.sqrt(safe), 1.0)
-    points = Points(np.arange(len(x), dtype=np.int32), x, y)
-    block = Block(x, y, counts, sigma, used, np.full(used.shape, -1))
     calset = likelihood.calset
+    block = _with_table(Block(x, y, counts, sigma, used, np.full(used.shape, -1)), without_frames(calset))
+    points = Points(np.arange(len(block.x), dtype=np.int32), block.x, block.y)
     names = [parameter.name for parameter in likelihood.model.parameters]
     record = Compression(
-        pixels=len(calset.points),
-        chi2=found.chi2,
+        pixels=cells.grid.width * cells.grid.height,
+        chi2=posterior.data,
         dof=posterior.dof,
         values=dict(zip(names, found.values.tolist(), strict=True)),
         frames=calset.inputs,
@@ -88,6 +92,15 @@ def compressed(posterior: PixelPosterior) -> CalibrationSet:
         compression=record,
         remarks=(),
     )
+
+
+def _with_table(block: Block, beside: CalibrationSet | None) -> Block:
+    """The block with the rows of a table that stands beside the frames, as they are."""
+    if beside is None:
+        return block
+    table = beside.intensities.block(0, len(beside.points))
+    fields = [field.name for field in dataclasses.fields(Block)]
+    return Block(**{name: np.concatenate([getattr(block, name), getattr(table, name)]) for name in fields})
 
 
 def _with_gradient(

@@ -27,6 +27,29 @@ class Census(NamedTuple):
         """Number of intensities used."""
         return self.cameras * int(self.rows.sum())
 
+    def joined(self, other: Census) -> Census:
+        """What is used of two parts of a set."""
+        (a, b, c, d), (e, f, g, h) = self.field, other.field
+        return Census(self.rows + other.rows, (min(a, e), max(b, f), min(c, g), max(d, h)), self.cameras)
+
+
+class DataTerms(NamedTuple):
+    """χ² of the data, its half gradient and its Gauss–Newton matrix in all parameters, no priors; what was used."""
+
+    data: float
+    gradient: Vector
+    matrix: Matrix
+    census: Census
+
+    def joined(self, other: DataTerms) -> DataTerms:
+        """The terms of two parts of a set."""
+        return DataTerms(
+            self.data + other.data,
+            self.gradient + other.gradient,
+            self.matrix + other.matrix,
+            self.census.joined(other.census),
+        )
+
 
 class OpticsUsed(NamedTuple):
     """How optics were found: on so many nodes per side, with that error between them; None: point by point."""

@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from walop_jax.data.frames import FrameIntensities, Grid
+from walop_jax.data.frames import Grid
+from walop_jax.data.merge import frames_among
 from walop_jax.data.raw_rows import RowReader
 from walop_jax.data.records import Block
 from walop_jax.likelihood import engine, limits
@@ -183,20 +184,22 @@ class FrameSums:
 
 def strips_of(likelihood: Likelihood) -> int:
     """Number of strips of image rows in which the frames of a set are gone through."""
-    intensities = likelihood.calset.intensities
-    assert isinstance(intensities, FrameIntensities)
-    cells = Cells.of(intensities.grid)
+    found = frames_among(likelihood.calset)
+    assert found is not None
+    cells = Cells.of(found[0].grid)
     return -(-cells.shape[0] // _cell_rows(cells))
 
 
 def stands_for_pixels(likelihood: Likelihood, values: Vector) -> bool:
-    """Whether cells can stand for the pixels of a set: counts linear in a flux of their own, smooth over the frames."""
-    instrument, intensities = likelihood.model.instrument(values), likelihood.calset.intensities
-    if not isinstance(intensities, FrameIntensities) or not light.is_linear(instrument):
+    """Whether cells can stand for the pixels of a set: counts linear in a flux of their own, smooth over the frames.
+
+    There may be a table beside the frames.
+    """
+    instrument, found = likelihood.model.instrument(values), frames_among(likelihood.calset)
+    if found is None or not light.is_linear(instrument) or likelihood.plan.exposures.shared is not None:
         return False
-    if likelihood.plan.exposures.shared is not None:
-        return False
-    return _series(likelihood, instrument, Cells.of(intensities.grid))[0] is not None
+    frames, exposures = found
+    return _series(likelihood, instrument, Cells.of(frames.grid), exposures)[0] is not None
 
 
 def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameSums:
@@ -205,11 +208,12 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
     Raises `DataError` for what cannot be read, and for errors that are not positive; ValueError where the counts
     are not smooth over the field.
     """
-    intensities = likelihood.calset.intensities
-    assert isinstance(intensities, FrameIntensities)
-    cells, runner = Cells.of(intensities.grid), likelihood.runner
+    among = frames_among(likelihood.calset)
+    assert among is not None
+    frames, exposures = among
+    cells, runner = Cells.of(frames.grid), likelihood.runner
     instrument = likelihood.model.instrument(values)
-    smooth, off = _series(likelihood, instrument, cells)
+    smooth, off = _series(likelihood, instrument, cells, exposures)
     if smooth is None:
         raise ValueError(f"no series of the counts over the field: off by {off:.2g}")
     columns, rows = cells.shape[1], _cell_rows(cells)
@@ -218,10 +222,13 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
     # Beyond the frame there are no pixels: any place will do.
     s = np.minimum((np.arange(width) + 0.5) * cells.size[0] - 1.0, 1.0)
     across = jnp.asarray(chebyshev.polynomials(s, smooth.count).T)
-    series = _coefficients(smooth)
-    known, together = jnp.asarray(likelihood.flux_known), sharing(instrument, likelihood.plan).cameras
-    shapes = _shapes(likelihood, rows, columns)
-    read = RowReader(intensities, height, width)
+    series = _coefficients(smooth)[..., exposures]
+    known, together = (
+        jnp.asarray(likelihood.flux_known[exposures]),
+        sharing(instrument, likelihood.plan).cameras,
+    )
+    shapes = _shapes(likelihood.cameras, len(exposures), rows, columns)
+    read = RowReader(frames, height, width)
 
     def work(number: int) -> SlabSums:
         top = strips[number] * height
@@ -231,17 +238,27 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
         along = jnp.asarray(chebyshev.polynomials(t, smooth.count))
         found = strip_sums(pixels, jnp.asarray(series), across, along, jnp.zeros(cells.side), known, together)
         if int(found.impossible):
-            intensities.block(top * cells.grid.width, bottom * cells.grid.width)  # says which
+            frames.block(top * cells.grid.width, bottom * cells.grid.width)  # says which
         flat = np.concatenate([np.ravel(np.asarray(leaf)[..., :columns]) for leaf in found.cells])
         return SlabSums(np.ravel(found.moments), np.full(4, -np.inf), {number: flat})
 
     step = height * cells.grid.width * every
-    layout = dataclasses.replace(likelihood.layout, slab=step, chunk=step)
+    pixels = cells.grid.width * cells.grid.height
+    layout = dataclasses.replace(likelihood.layout, points=pixels, slab=step, chunk=step)
     key = f"cells {values.tobytes().hex()} every {every}"
     total = runner.total("summing pixels", key, work, layout)
+    count = len(likelihood.flux_known)
     sums = _assembled(total.parts, shapes, cells.shape[0], every)
-    moments = total.sums.reshape(series.shape)
+    sums = CellSums(*(_in_places(array, exposures, count, axis=-3) for array in sums))
+    moments = _in_places(total.sums.reshape(series.shape), exposures, count, axis=-1)
     return FrameSums(likelihood, values, cells, sums, moments, every, smooth, OpticsUsed(smooth.count, off))
+
+
+def _in_places(values: np.ndarray, exposures: Int[np.ndarray, " r"], count: int, *, axis: int) -> np.ndarray:
+    """Sums of some exposures among those of all, of which there are `count`; zeros for the others."""
+    whole = np.zeros((*values.shape[:axis], count, *values.shape[axis:][1:]))
+    np.moveaxis(whole, axis, 0)[exposures] = np.moveaxis(values, axis, 0)
+    return whole
 
 
 def _cell_rows(cells: Cells) -> int:
@@ -249,12 +266,23 @@ def _cell_rows(cells: Cells) -> int:
     return max(1, limits.STRIP_ROWS // cells.side)
 
 
-def _series(likelihood: Likelihood, instrument: Instrument, cells: Cells) -> tuple[FieldTable | None, float]:
+def _series(
+    likelihood: Likelihood, instrument: Instrument, cells: Cells, exposures: Int[np.ndarray, " r"]
+) -> tuple[FieldTable | None, float]:
+    """The series of everything, accurate for these exposures, and how accurate."""
+
     def exact(s: Vector, t: Vector) -> Smooth:
         return smooth_at(likelihood, instrument, *cells.field(s, t))
 
     def error(found: Smooth, truth: Smooth) -> float:
-        off = [float(np.abs(one - other).max()) for one, other in zip(found, truth, strict=True)]
+        off = [
+            float(np.abs(one - other).max())
+            for one, other in (
+                (found.unit[..., exposures], truth.unit[..., exposures]),
+                (found.vectors, truth.vectors),
+                (found.stokes[:, exposures], truth.stokes[:, exposures]),
+            )
+        ]
         return max(off) if np.all(np.isfinite(off)) else float("nan")
 
     return accurate_table(exact, FRAME, limits.NODES_PER_SIDE, TOLERANCE, error)
@@ -265,9 +293,8 @@ def _coefficients(table: FieldTable) -> Float[np.ndarray, "j i k e"]:
     return np.swapaxes(unit.reshape(table.count, table.count, *unit.shape[1:]), 0, 1)
 
 
-def _shapes(likelihood: Likelihood, rows: int, columns: int) -> list[tuple[int, ...]]:
-    e, k = len(likelihood.flux_known), likelihood.cameras
-    return [(k, e, rows, columns)] * 2 + [(e, rows, columns)] * 3
+def _shapes(cameras: int, exposures: int, rows: int, columns: int) -> list[tuple[int, ...]]:
+    return [(cameras, exposures, rows, columns)] * 2 + [(exposures, rows, columns)] * 3
 
 
 def _assembled(parts: dict[int, Vector], shapes: list[tuple[int, ...]], height: int, every: int) -> CellSums:

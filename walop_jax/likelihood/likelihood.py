@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.likelihood import effect_columns, engine, limits
-from walop_jax.likelihood.expansion import Census, OpticsUsed, Posterior
+from walop_jax.likelihood.expansion import Census, DataTerms, OpticsUsed, Posterior
 from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.layout import Layout
 from walop_jax.likelihood.nodes import accurate_nodes
@@ -135,6 +135,11 @@ class Likelihood:
         model cannot explain. `near` is an earlier expansion at similar values, which saves the search for nodes.
         """
         values = self._agreed(values)
+        terms, optics = self.data_terms(values, near)
+        return self.posterior(values, terms, noise_scale, optics)
+
+    def data_terms(self, values: Vector, near: Posterior | None = None) -> tuple[DataTerms, OpticsUsed]:
+        """What the data say at a full vector of parameter values; `near` as for `expand`."""
         instrument, n = self.model.instrument(values), len(values)
         nodes, optics = self.nodes(instrument, near)
         (data, gradient, matrix), census = self._total(
@@ -147,24 +152,17 @@ class Likelihood:
             ),
             ((), (n,), (n, n)),
         )
-        return self.posterior(values, float(data), gradient, matrix, noise_scale, census, optics)
+        return DataTerms(float(data), gradient, matrix, census), optics
 
     def posterior(
-        self,
-        values: Vector,
-        data: float,
-        gradient: Vector,
-        matrix: Float[np.ndarray, "n n"],
-        noise_scale: float,
-        census: Census,
-        optics: OpticsUsed,
+        self, values: Vector, terms: DataTerms, noise_scale: float, optics: OpticsUsed
     ) -> Posterior:
-        """The posterior from χ² of the data, its half gradient and its Gauss–Newton matrix in all parameters."""
-        matrix, at, select = matrix / noise_scale**2, self.priors.index, self.model.selection()
+        """The posterior from what the data say."""
+        at, select = self.priors.index, self.model.selection()
+        matrix = terms.matrix / noise_scale**2
         matrix[at, at] += self.priors.width**-2
-        return self._posterior(
-            values, data, gradient, select.T @ matrix @ select, noise_scale, census, optics
-        )
+        free = select.T @ matrix @ select
+        return self._posterior(values, terms.data, terms.gradient, free, noise_scale, terms.census, optics)
 
     def slope(self, values: Vector, near: Posterior) -> Posterior:
         """As `expand`, with the matrix of an expansion nearby: a third of the time, where optics are interpolated."""

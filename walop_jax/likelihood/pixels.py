@@ -18,8 +18,9 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.data.merge import without_frames
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.expansion import Posterior
+from walop_jax.likelihood.expansion import DataTerms, Posterior
 from walop_jax.likelihood.flux import sharing
 from walop_jax.likelihood.frames import FRAME, FrameSums, frame_sums, unit_slopes_at
 from walop_jax.likelihood.likelihood import Likelihood
@@ -43,13 +44,17 @@ def expand(
 ) -> PixelPosterior:
     """As `Likelihood.expand`, by one pass over all pixels of frames, or over one strip in `every`.
 
+    A table beside the frames is gone through row by row.
+
     Raises what `frame_sums` raises.
     """
     values = likelihood.runner.processes.agreed("values", np.asarray(values, float))
     found = frame_sums(likelihood, values, every)
-    plain = likelihood.posterior(
-        values, found.chi2, half_gradient(found), gauss_newton(found), noise_scale, found.census, found.optics
-    )
+    terms = DataTerms(found.chi2, half_gradient(found), gauss_newton(found), found.census)
+    beside = without_frames(likelihood.calset)
+    if beside is not None:
+        terms = terms.joined(Likelihood.of(beside, likelihood.model).data_terms(values)[0])
+    plain = likelihood.posterior(values, terms, noise_scale, found.optics)
     return PixelPosterior(**{f.name: getattr(plain, f.name) for f in dataclasses.fields(plain)}, sums=found)
 
 
