@@ -303,8 +303,9 @@ def _join_tables(
 
 def _fresh(ids: np.ndarray) -> np.ndarray:
     """Keep identifiers at their first appearance and give repeated ones new numbers."""
-    _, first = np.unique(ids, return_index=True)
-    repeated = np.setdiff1d(np.arange(len(ids)), first)
+    order = np.argsort(ids, kind="stable")  # of pixels, numbered already: at once
+    sorted_ids = ids[order]
+    repeated = np.sort(order[1:][sorted_ids[1:] == sorted_ids[:-1]])
     fresh = ids.copy()
     fresh[repeated] = ids.max() + 1 + np.arange(len(repeated))
     return fresh
