@@ -59,6 +59,7 @@ def quick(simulated):
     return Likelihood.of(simulated.calset, base_model(simulated.calset), interpolate=True)
 
 
+@pytest.mark.long
 def test_expansion_agrees(simulated, exact, quick):
     """Calibration plate in and out, Moon sky, standards of several temperatures; at the truth and away from it."""
     for values in (exact.model.start, np.asarray(values_of(simulated.truth))):

@@ -28,6 +28,7 @@ from walop_jax.likelihood import limits, pixels
 from walop_jax.likelihood.compression import compressed
 from walop_jax.likelihood.frames import Cells, stands_for_pixels
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.thinning import thinned
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.effects.blemish import Blemish
 from walop_jax.model.specification import effect_context, with_effects
@@ -180,6 +181,24 @@ def test_frames_and_a_table_are_gone_through_each_in_its_way(with_stars):
     assert_same(pixels.expand(with_stars, values), with_stars.expand(values))
 
 
+@pytest.mark.parametrize("most", [100, 17, 12])
+def test_a_sample_of_frames_and_a_table_has_points_of_both(with_stars, most):
+    calset = with_stars.calset
+    table = without_frames(calset).points
+    sample = thinned(calset, most, neighbours=1)
+    assert most // 2 < len(sample.points) <= most
+    ids, count = sample.points.point, SIDE**2
+    assert len(set(ids.tolist())) == len(ids)
+    of_table = np.isin(ids, calset.points.point[count:])
+    assert of_table.sum() == min(len(table), most // 2)
+    block = sample.intensities.block(0, len(ids))
+    np.testing.assert_array_equal([block.x, block.y], [sample.points.x, sample.points.y])
+    stars = calset.exposures.kind == "standard"
+    assert block.used[of_table][:, stars].any()
+    assert not block.used[~of_table][:, stars].any()
+
+
+@pytest.mark.long
 def test_the_set_that_stands_for_frames_keeps_the_table_beside_them(with_stars, monkeypatch):
     monkeypatch.setattr(limits, "LARGE_ABOVE", 0)
     calset = with_stars.calset

@@ -160,12 +160,8 @@ def test_every_effect_is_in_a_group():
     )
 
 
-QUICK = ("field and band",)  # the others take half a minute each
-
-
-@pytest.mark.parametrize(
-    "group", [g if g in QUICK else pytest.param(g, marks=pytest.mark.long) for g in GROUPS]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("group", GROUPS)
 def test_a_fit_has_the_derivatives_of_its_formula(group):
     """Every parameter of the base model and of every effect; none of them is without influence."""
     rng = np.random.default_rng(3)

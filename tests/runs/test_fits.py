@@ -26,6 +26,7 @@ def fail(*args: object, **more: object) -> None:
     raise OSError("No space left on device")
 
 
+@pytest.mark.long
 def test_a_fit(call, fitted: FittedSet, tmp_path: Path, monkeypatch):
     told: list[str] = []
     found = refit.refit_sets([fitted.calset], tmp_path / "caller", progress=told.append)

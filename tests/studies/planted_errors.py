@@ -115,8 +115,8 @@ ERRORS = (
             "likelihood/test_engine.py", "likelihood/test_priors.py"),
     planted("likelihood/likelihood.py", "gradient[rows.index] += pull / rows.width",
             "gradient[rows.index] += pull", "likelihood/test_engine.py"),
-    planted("likelihood/likelihood.py", "matrix, at, select = matrix / noise_scale**2,",
-            "matrix, at, select = matrix / noise_scale,",
+    planted("likelihood/likelihood.py", "matrix = terms.matrix / noise_scale**2",
+            "matrix = terms.matrix / noise_scale",
             "likelihood/test_engine.py", "likelihood/test_priors.py", "likelihood/test_large.py"),
     # noise
     planted("likelihood/noise.py", "np.maximum(counts, 0.0) + self.read_noise**2",

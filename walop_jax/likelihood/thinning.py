@@ -8,6 +8,7 @@ import math
 import numpy as np
 from jaxtyping import Float, Int
 
+from walop_jax.data.merge import without_frames
 from walop_jax.data.records import Block, CalibrationSet, Intensities, Points
 from walop_jax.likelihood import limits
 
@@ -44,21 +45,33 @@ def thinned(calset: CalibrationSet, most: int, neighbours: int = limits.NEIGHBOU
     """A set of at most `most` of the points: runs of at least `neighbours` spread evenly over all of them.
 
     There are 16 runs or more and 128 at most, so they are shorter or longer than that in a very small or a very large
-    sample. A set that is not larger than that comes back as it is.
+    sample. A set that is not larger than that comes back as it is. A table beside whole frames, which may hold all that
+    there is of a kind of exposure, is in it with all of its points, or with half as many as there may be.
     """
     n = len(calset.points)
     if n <= most:
         return calset
     fewest, largest = limits.RUNS
     length = max(1, min(max(neighbours, most // largest), most // fewest))
-    # Multiples of the golden section are in step with no raster.
-    places = np.mod(np.arange(max(1, most // length)) * 0.6180339887498949, 1.0)
-    starts = np.unique((places * (n // length)).astype(int)) * length
+    beside = without_frames(calset)
+    last = 0 if beside is None else len(beside.points)
+    if last <= most // 2:
+        of_table = n - length * np.arange(math.ceil(last / length), 0, -1)
+    else:
+        of_table = n - last + _spread(last, most // 2, length)
+    starts = _spread(n - last, most - length * len(of_table), length)
+    starts = np.append(starts[starts + length <= min(of_table, default=n)], of_table)
     index = (starts[:, None] + np.arange(length)).ravel()
     points = Points(*(getattr(calset.points, f.name)[index] for f in dataclasses.fields(Points)))
     return dataclasses.replace(
         calset, points=points, intensities=RunsOfPoints(calset.intensities, starts, length)
     )
+
+
+def _spread(points: int, most: int, length: int) -> Int[np.ndarray, " s"]:
+    """The first points of runs spread evenly; multiples of the golden section are in step with no raster."""
+    places = np.mod(np.arange(max(1, most // length)) * 0.6180339887498949, 1.0)
+    return np.unique((places * (points // length)).astype(int)) * length
 
 
 def median_counts(calset: CalibrationSet) -> Float[np.ndarray, "e k"]:
