@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
@@ -100,6 +101,8 @@ def test_the_map_stays_with_the_calibration(finished, tmp_path):
     again = Calibration.from_product(product).to_product()
     # Maps are computed anew, by a program that came another way: equal to rounding.
     np.testing.assert_allclose(again.maps.values, product.maps.values, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(again.maps.errors, product.maps.errors, rtol=1e-9, atol=0)
+    assert dataclasses.replace(again, maps=product.maps).content_hash() == product.content_hash()
     write_product(tmp_path / "copy.fits", again)
     copy = read_product(tmp_path / "copy.fits")
     assert copy.content_hash() == again.content_hash()

@@ -62,8 +62,7 @@ class JoinedIntensities(Intensities):
                 pieces.append(whole)
         if not pieces:
             return empty_block(np.zeros(0), np.zeros(0), self.exposures, self.cameras)
-        fields = [field.name for field in dataclasses.fields(Block)]
-        return Block(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in fields})
+        return Block.joined(pieces)
 
 
 def frames_among(calset: CalibrationSet) -> tuple[FrameIntensities, Int[np.ndarray, " r"]] | None:
@@ -77,11 +76,11 @@ def frames_among(calset: CalibrationSet) -> tuple[FrameIntensities, Int[np.ndarr
 
 
 def without_frames(calset: CalibrationSet) -> CalibrationSet | None:
-    """What a set holds beside its frames, with the exposures of all of it; None where there is nothing."""
+    """What a set holds beside its frames, with the exposures of all of it; None with no frames or nothing else."""
     whole = calset.intensities
     parts = whole.parts if isinstance(whole, JoinedIntensities) else ()
     beside = tuple(part for part in parts if not isinstance(part[0], FrameIntensities))
-    if not beside:
+    if len(beside) in (0, len(parts)):
         return None
     points = _stack_points([points for _, points, _ in beside])
     intensities = JoinedIntensities(beside, len(calset.exposures))

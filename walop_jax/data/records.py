@@ -6,7 +6,7 @@ import dataclasses
 import enum
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -214,6 +214,12 @@ class Block:
     sigma: Float[np.ndarray, "p e k"]
     used: Bool[np.ndarray, "p e"]
     source: Int[np.ndarray, "p e"]
+
+    @classmethod
+    def joined(cls, blocks: Sequence[Block]) -> Block:
+        """The field points of some blocks, one after the other."""
+        names = [field.name for field in dataclasses.fields(cls)]
+        return cls(**{name: np.concatenate([getattr(block, name) for block in blocks]) for name in names})
 
 
 @dataclasses.dataclass(frozen=True)

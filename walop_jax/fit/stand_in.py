@@ -6,10 +6,10 @@ import dataclasses
 
 import numpy as np
 
-from walop_jax.data.merge import frames_among
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.compression import compressed
+from walop_jax.likelihood.frames import stands_for_pixels
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.pixels import PixelPosterior
 from walop_jax.likelihood.runner import Progress, Runner
@@ -32,7 +32,7 @@ def on_field_points(result: FitResult) -> FitResult:
 def in_field_points(calset: CalibrationSet, model: Model, tell: Progress) -> CalibrationSet:
     """Whole frames of many pixels as the set that stands for them at their minimum; any other set as it is."""
     likelihood = Likelihood.of(calset, model, runner=Runner(progress=tell))
-    if not (likelihood.layout.large and frames_among(calset) is not None):
+    if not (likelihood.layout.large and stands_for_pixels(likelihood, model.start)):
         return calset
     tell("fitting all pixels")
     found = on_field_points(fit(likelihood)).calset

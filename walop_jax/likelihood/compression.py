@@ -75,7 +75,10 @@ def compressed(posterior: PixelPosterior) -> CalibrationSet:
     counts = np.where(used[..., None], flux * (unit + pull / safe), 0.0)
     sigma = np.where(used[..., None], flux / np.sqrt(safe), 1.0)
     calset = likelihood.calset
-    block = _with_table(Block(x, y, counts, sigma, used, np.full(used.shape, -1)), without_frames(calset))
+    block = Block(x, y, counts, sigma, used, np.full(used.shape, -1))
+    beside = without_frames(calset)
+    if beside is not None:
+        block = Block.joined([block, beside.intensities.block(0, len(beside.points))])
     points = Points(np.arange(len(block.x), dtype=np.int32), block.x, block.y)
     names = [parameter.name for parameter in likelihood.model.parameters]
     record = Compression(
@@ -92,15 +95,6 @@ def compressed(posterior: PixelPosterior) -> CalibrationSet:
         compression=record,
         remarks=(),
     )
-
-
-def _with_table(block: Block, beside: CalibrationSet | None) -> Block:
-    """The block with the rows of a table that stands beside the frames, as they are."""
-    if beside is None:
-        return block
-    table = beside.intensities.block(0, len(beside.points))
-    fields = [field.name for field in dataclasses.fields(Block)]
-    return Block(**{name: np.concatenate([getattr(block, name), getattr(table, name)]) for name in fields})
 
 
 def _with_gradient(

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from walop_jax.data.frames import Grid
+from walop_jax.data.frames import FrameIntensities, Grid
 from walop_jax.data.merge import frames_among
 from walop_jax.data.raw_rows import RowReader
 from walop_jax.data.records import Block
@@ -182,11 +182,16 @@ class FrameSums:
         return Census(rows, (low_x, high_x, low_y, high_y), self.likelihood.cameras)
 
 
-def strips_of(likelihood: Likelihood) -> int:
-    """Number of strips of image rows in which the frames of a set are gone through."""
+def _frames(likelihood: Likelihood) -> tuple[FrameIntensities, Int[np.ndarray, " r"]]:
+    """The frames of a set that has some, and the exposures (positions) that they hold."""
     found = frames_among(likelihood.calset)
     assert found is not None
-    cells = Cells.of(found[0].grid)
+    return found
+
+
+def strips_of(likelihood: Likelihood) -> int:
+    """Number of strips of image rows in which the frames of a set are gone through."""
+    cells = Cells.of(_frames(likelihood)[0].grid)
     return -(-cells.shape[0] // _cell_rows(cells))
 
 
@@ -208,9 +213,7 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
     Raises `DataError` for what cannot be read, and for errors that are not positive; ValueError where the counts
     are not smooth over the field.
     """
-    among = frames_among(likelihood.calset)
-    assert among is not None
-    frames, exposures = among
+    frames, exposures = _frames(likelihood)
     cells, runner = Cells.of(frames.grid), likelihood.runner
     instrument = likelihood.model.instrument(values)
     smooth, off = _series(likelihood, instrument, cells, exposures)
@@ -223,10 +226,8 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
     s = np.minimum((np.arange(width) + 0.5) * cells.size[0] - 1.0, 1.0)
     across = jnp.asarray(chebyshev.polynomials(s, smooth.count).T)
     series = _coefficients(smooth)[..., exposures]
-    known, together = (
-        jnp.asarray(likelihood.flux_known[exposures]),
-        sharing(instrument, likelihood.plan).cameras,
-    )
+    known = jnp.asarray(likelihood.flux_known[exposures])
+    together = sharing(instrument, likelihood.plan).cameras
     shapes = _shapes(likelihood.cameras, len(exposures), rows, columns)
     read = RowReader(frames, height, width)
 

@@ -26,9 +26,7 @@ class RunsOfPoints(Intensities):
             first, origin = number * self.length, int(self.starts[number])
             low, high = max(start, first) - first, min(stop, first + self.length) - first
             blocks.append(self.whole.block(origin + low, origin + high))
-        return Block(
-            *(np.concatenate([getattr(b, f.name) for b in blocks]) for f in dataclasses.fields(Block))
-        )
+        return Block.joined(blocks)
 
     @property
     def cameras(self) -> int:
