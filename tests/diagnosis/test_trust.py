@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from scipy import stats
+from small_run import SMALL
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.records import Quality
@@ -19,8 +20,6 @@ from walop_jax.fit import refit as fitting
 from walop_jax.fit.refit import FitResult
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate
-
-PLAN = ObservingPlan(grid=8)
 
 
 def refit(calset: CalibrationSet) -> FitResult:
@@ -79,7 +78,7 @@ def noisy_camera(calset: CalibrationSet) -> CalibrationSet:
 
 @pytest.fixture(scope="module")
 def calset() -> CalibrationSet:
-    return simulate(PLAN, seed=7).calset
+    return simulate(SMALL, seed=7).calset
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +92,7 @@ def test_a_fit_of_what_the_model_describes_is_trusted(clean):
 
 def test_a_lamp_of_another_temperature(calset):
     """3200 K given as 5772 K: χ²/dof stays at 1, the matrix is off by half a per cent."""
-    plan = dataclasses.replace(PLAN, teff=3200.0)
+    plan = dataclasses.replace(SMALL, teff=3200.0)
     warm = simulate(plan, seed=7).calset
     said = np.where(warm.exposures.kind == "clp", 5772.0, warm.exposures.teff)
     found = refit(dataclasses.replace(warm, exposures=dataclasses.replace(warm.exposures, teff=said)))
@@ -106,7 +105,7 @@ def test_a_lamp_of_another_temperature(calset):
     ("mistake", "says"),
     [
         (background, "does not explain the data"),
-        (displaced, "patterns that noise does not make"),
+        (displaced, "the residuals ask for X of all field points changed by −0.01"),
         (dark, "camera O2"),
         (hundredfold, "N_ERR is not the standard error"),
         (variances, "N_ERR is not the standard error"),
@@ -122,7 +121,31 @@ def test_a_mistake_in_the_data_is_not_trusted(
     assert says in "; ".join(found.warnings)
 
 
-def test_errors_a_few_per_cent_off_are_no_matter_of_the_model(calset, clean):
+def test_chi2_a_few_per_cent_too_large_is_trusted_only_without_doubts(clean):
+    """10⁴ degrees of freedom: χ²/dof = 1.1 is 7 standard deviations, 1.2 more than errors are put down to."""
+
+    def found(ratio: float, **changed) -> FitResult:
+        data = 1e4 * ratio - (clean.chi2 - clean.posterior.data)
+        posterior = dataclasses.replace(clean.posterior, data=data, dof=10_000)
+        return dataclasses.replace(clean, posterior=posterior, **changed)
+
+    assert found(1.1).chi2 == pytest.approx(11_000)
+    cases = [
+        (found(1.0), (True, False, True)),
+        (found(1.1), (False, True, True)),
+        (found(1.1, doubts=("a camera",)), (False, False, False)),
+        (found(1.1, examined=False), (False, False, False)),
+        (found(1.2), (False, False, False)),
+    ]
+    for one, expected in cases:
+        assert (one.explains_data, one.noise_only, one.trusted) == expected
+
+
+@pytest.mark.long
+def test_errors_a_few_per_cent_off_are_no_matter_of_the_model():
+    """On a set so large that χ² shows it."""
+    calset = simulate(ObservingPlan(grid=8), seed=7).calset
+    clean = refit(calset)
     found = refit(with_data(calset, sigma=0.93 * block(calset).sigma))
     assert not found.explains_data
     assert found.noise_only
@@ -133,9 +156,9 @@ def test_errors_a_few_per_cent_off_are_no_matter_of_the_model(calset, clean):
     assert 1.0 < ratio < 1.5
 
 
-def test_squares_of_groups_follow_their_distribution(clean):
+def test_squares_of_groups_follow_their_distribution(south_set, south_fit):
     """Over draws of noise the p of every group is uniform: its moments are those of projected noise."""
-    design = Design.of(clean)
+    design = Design.of(south_fit(south_set("a")))
     rng, p = np.random.default_rng(3), []
     used = design.measured.used
     unit = design.measured.model[used]
@@ -166,6 +189,6 @@ def test_an_examination_changes_no_value(calset, clean):
 
 
 def test_a_plan_without_noise_is_not_held_against_its_errors(clean):
-    found = refit(simulate(PLAN, seed=7, noiseless=True).calset)
+    found = refit(simulate(SMALL, seed=7, noiseless=True).calset)
     assert (found.noiseless, found.trusted, found.warnings) == (True, True, ())
     np.testing.assert_allclose(found.sigma[found.sigma > 0], clean.sigma[clean.sigma > 0], rtol=0.1)

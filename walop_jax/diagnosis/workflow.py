@@ -49,6 +49,7 @@ MOST_SENTENCES = 2  # that are refitted at a time; more than can be one thing th
 LEAST_EVIDENCE = 1.0  # ln B that an effect must be worth to the final model to stay in it
 MINUTES = 20.0  # after which no further name is sought
 POOR_FIT = 1.5  # χ²/dof above which effects that cannot be differentiated are tried
+_SMALL = 200  # field points up to which programs of earlier models may stay: half a gigabyte
 
 
 def diagnose(
@@ -152,10 +153,11 @@ class _Diagnosing:
         )
 
     def _examine(self, earlier: Examination | None = None) -> Examination:
-        if earlier is not None:
+        large = len(self.calset.points) > _SMALL
+        if earlier is not None and large:
             forget_programs()  # of models with fewer effects: they are not asked for again
         found = Examination(self.fit, self.wanted, self.rng, earlier, self.sentences, self.parts)
-        if earlier is not None:
+        if earlier is not None and large:
             forget_programs()  # of columns
         return found
 
