@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 from south_sets import CUTS
 
+from walop_jax.cli.common import CACHE_VARIABLE, cache_folder
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -106,16 +108,19 @@ def test_refit_as_a_process(calset_file, tmp_path):
     assert json.loads(done.stdout)["trusted"] is True
     assert done.stderr == ""
     assert any(cache.iterdir())
-    # Where no folder can be made the run goes on without one.
+
+
+def test_where_no_cache_can_be_kept_a_command_goes_on_without(call, run, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    blocked = str(tmp_path / "file" / "cache")
-    points = tmp_path / "p.csv"
-    points.write_text("X,Y\n0,0\n")
-    asked = program(
-        "matrix", tmp_path / "run", "--points", points, "-o", tmp_path / "o.csv", WALOP_JAX_CACHE=blocked
-    )
-    assert asked.returncode == 0, asked.stderr
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file" / "cache"))
+    assert cache_folder() is None
+    (tmp_path / "p.csv").write_text("X,Y\n0,0\n")
+    asked = call("matrix", run, "--points", tmp_path / "p.csv", "-o", tmp_path / "o.csv")
+    assert asked.exit_code == 0, asked.stderr
     assert "M22" in (tmp_path / "o.csv").read_text()
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "made" / "cache"))
+    assert cache_folder() == tmp_path / "made" / "cache"
+    assert (tmp_path / "made" / "cache").is_dir()
 
 
 def test_a_reader_that_has_gone_is_no_error(calset_file):

@@ -145,6 +145,7 @@ print(json.dumps({"values": found.values.tolist(), "sigma": found.sigma.tolist()
     assert (one["seen"], other["seen"]) == (13, 12)
 
 
+@pytest.mark.long
 def test_a_dead_process_is_an_error_in_the_others():
     code = (
         PLAN

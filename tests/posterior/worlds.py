@@ -57,8 +57,8 @@ class Worlds:
     def __init__(self) -> None:
         self.blank = simulate(PLAN, seed=5).calset
         self.model = prior_model(self.blank)
-        self.likelihood = Likelihood.of(self.blank, self.model)
         points = self.blank.points
+        self.likelihood = self._likelihood(self.blank)
         self.block = self.blank.intensities.block(0, len(points))
 
     def draw(self, rng: np.random.Generator) -> World:
@@ -75,7 +75,11 @@ class Worlds:
         counts = expected + sigma * rng.standard_normal(expected.shape)
         block = dataclasses.replace(self.block, counts=counts, sigma=sigma)
         calset = dataclasses.replace(self.blank, intensities=TableIntensities.dense(self.blank.points, block))
-        return World(Likelihood.of(calset, self.model), truth)
+        return World(self._likelihood(calset), truth)
+
+    def _likelihood(self, calset: CalibrationSet) -> Likelihood:
+        """Of all points at once: a sampler asks for it thousands of times."""
+        return Likelihood.of(calset, self.model, points_per_chunk=len(calset.points))
 
 
 def ecdf_band(count: int, level: float = 0.95, grid: int = 100, draws: int = 4000, seed: int = 1) -> float:

@@ -61,6 +61,17 @@ def test_what_is_wrong_is_said_with_the_file(plan, text, message):
     assert "plan.toml" in str(raised.value)
 
 
+def test_a_plan_has_limits_before_any_data(plan, tmp_path):
+    found = limits_of_sets([plan], tmp_path / "RUN", catalogue=CATALOGUE[:1])
+    assert found.document["plan"]["grid"] == 5
+    assert found.document["trusted"] is True
+    (entry,) = (one for one in found.found.limits if one.effect == "clp_zero")
+    # N photons behind a polariser tell its angle to 1/(2 √N) rad: 5·10⁵ in four cameras, at 29 points and 8 angles.
+    photons = np.rad2deg(0.5 / np.sqrt(5e5 * 4 * 29 * 8))
+    assert photons < entry.detected[0] < 30 * photons
+
+
+@pytest.mark.long
 def test_limits_of_a_plan_are_those_of_data_taken_so(plan, tmp_path):
     """Noise moves the fit, and with it the limits, by per cents."""
     found = limits_of_sets([plan], tmp_path / "RUN", catalogue=CATALOGUE)
