@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from frame_run import frame_run
 
 from walop_jax.calibration import residual_map
 from walop_jax.calibration.matrix import analysis_vectors
@@ -19,13 +20,9 @@ from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.parameters import values_of
 from walop_jax.model.planning import plan_for_settings
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
-RUN = ObservingPlan(
-    grid=24, standard_grid=1, standards=0, unpolarised=0, moon_patches=3,
-    polariser_angles=polariser_turn(8, full_turn=True), throughput_degree=2,
-)  # fmt: skip
+RUN = frame_run(24)
 BROKEN = np.array([3e-4, -2e-4, 5e-4, -4e-4, 1e-4, 6e-4, 2e-3])
 
 

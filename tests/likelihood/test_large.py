@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from frame_run import frame_run
 
 from walop_jax.fit import misfit, search
 from walop_jax.fit.minimise import minimise
@@ -16,13 +17,9 @@ from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.thinning import thinned
 from walop_jax.model.parameters import with_values
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
-RUN = ObservingPlan(
-    grid=72, standard_grid=1, standards=0, unpolarised=0, moon_patches=3,
-    polariser_angles=polariser_turn(8, full_turn=True), throughput_degree=2,
-)  # fmt: skip
+RUN = frame_run(72)
 
 
 @pytest.fixture(scope="module")

@@ -6,18 +6,15 @@ import dataclasses
 
 import numpy as np
 import pytest
+from frame_run import frame_run
 
 from walop_jax.fit.model_builder import base_model
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.layout import Layout, bytes_per_point
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
-RUN = ObservingPlan(
-    grid=20, standard_grid=1, standards=0, unpolarised=0, moon_patches=2, polariser_angles=polariser_turn(6),
-    throughput_degree=2,
-)  # fmt: skip
+RUN = frame_run(20)
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from astropy.io import fits
+from frame_run import frame_run
 
 from walop_jax.calibration import residual_map
 from walop_jax.calibration.residual_map import residual_map_of_pixels
@@ -31,14 +32,10 @@ from walop_jax.likelihood.thinning import thinned
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.effects.blemish import Blemish
 from walop_jax.model.specification import effect_context, with_effects
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
 SIDE = 72
-RUN = ObservingPlan(
-    grid=SIDE, standard_grid=1, standards=0, unpolarised=0, moon_patches=3,
-    polariser_angles=polariser_turn(8, full_turn=True), throughput_degree=2,
-)  # fmt: skip
+RUN = frame_run(SIDE)
 
 
 def frames_of(calset, path, *, dtype="f4"):
@@ -60,10 +57,15 @@ def likelihood(path):
 
 
 @pytest.fixture(scope="module")
-def truth_values(likelihood):
+def usual(likelihood):
+    """The fit that goes pixel by pixel."""
+    return fit(likelihood)
+
+
+@pytest.fixture(scope="module")
+def truth_values(usual):
     """A place some standard errors from the minimum."""
-    found = fit(likelihood)
-    return found.values + 2.0 * found.sigma
+    return usual.values + 2.0 * usual.sigma
 
 
 @pytest.fixture(scope="module")
@@ -245,8 +247,7 @@ def stand_in(fitted):
     return compressed(fitted.posterior)
 
 
-def test_the_fit_of_the_sums_ends_where_the_usual_one_ends(fitted, likelihood):
-    usual = fit(likelihood)
+def test_the_fit_of_the_sums_ends_where_the_usual_one_ends(fitted, usual):
     free = usual.sigma > 0
     np.testing.assert_allclose((fitted.values - usual.values)[free] / usual.sigma[free], 0, atol=1e-3)
     assert fitted.chi2 == pytest.approx(usual.chi2, abs=1e-3)

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 import pytest
+from frame_run import frame_run
 
 from walop_jax.data import Grid, read_calibration_set, write_frames
 from walop_jax.data.records import Intensities
@@ -18,15 +19,11 @@ from walop_jax.likelihood.layout import bytes_per_point
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.points import PointReader, PointsInMemory, StreamedPoints
 from walop_jax.likelihood.thinning import thinned
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 from walop_jax.sky.moon import moon_sky
 
 SIDE = 9
-RUN = ObservingPlan(
-    grid=SIDE, standard_grid=1, standards=0, unpolarised=0, moon_patches=3,
-    polariser_angles=polariser_turn(8, full_turn=True), throughput_degree=2,
-)  # fmt: skip
+RUN = frame_run(SIDE)
 STEP = 2 * RUN.field / (SIDE - 1)
 GRID = Grid(SIDE, SIDE, (1.0, 1.0), (-RUN.field, -RUN.field), ((STEP, 0.0), (0.0, STEP)))
 

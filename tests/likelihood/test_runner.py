@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from frame_run import frame_run
 
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
@@ -22,13 +23,9 @@ from walop_jax.likelihood.journal import Journal
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.processes import LostProcessError, Processes
 from walop_jax.likelihood.runner import Runner
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
-RUN = ObservingPlan(
-    grid=40, standard_grid=1, standards=0, unpolarised=0, moon_patches=3,
-    polariser_angles=polariser_turn(6, full_turn=True), throughput_degree=2,
-)  # fmt: skip
+RUN = frame_run(40)
 PLAN = """
 import jax
 jax.config.update("jax_enable_x64", True)
