@@ -136,7 +136,7 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
     exposures = likelihood.calset.exposures
     setting, chosen = _main_setting(Settings.of(exposures, likelihood.plan.moving), exposures.clp_in)
     grid = cells_for(likelihood.layout.points, likelihood.census if near is None else near.census)
-    count = grid.width * grid.height
+    count = grid.pixels
 
     def work(number: int) -> SlabSums:
         chunks = likelihood.points.slab(number)

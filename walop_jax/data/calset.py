@@ -222,7 +222,7 @@ def _frames(
             advice="give standards in a table, in another file",
         )
     grid, stack = frame_stack(images, len(exposures), path, 4 if version == 1 else None)
-    width, total = grid.width, grid.width * grid.height
+    width, total = grid.width, grid.pixels
     corners = (0, width - 1, total - width, total - 1)
     x, y = (np.concatenate(parts) for parts in zip(*(grid.xy(n, n + 1) for n in corners), strict=True))
     make_points({"POINT": np.arange(4), "X": x, "Y": y}, instrument, Place(path, "N0"))

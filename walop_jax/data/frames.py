@@ -32,6 +32,11 @@ class Grid:
     value: tuple[float, float]
     matrix: tuple[tuple[float, float], tuple[float, float]]
 
+    @property
+    def pixels(self) -> int:
+        """Number of pixels."""
+        return self.width * self.height
+
     def xy(self, start: int, stop: int) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
         """Return the field coordinates (degrees) of the points `start:stop`."""
         row, column = np.divmod(np.arange(start, stop), self.width)
@@ -42,7 +47,7 @@ class Grid:
     @functools.cached_property
     def points(self) -> Points:
         """All pixels as field points, numbered from 0."""
-        x, y = self.xy(0, self.width * self.height)
+        x, y = self.xy(0, self.pixels)
         return Points(point=np.arange(len(x), dtype=np.int32), x=x, y=y)
 
 
@@ -156,10 +161,8 @@ class FrameIntensities(Intensities):
         """Number of used (exposure, pixel) pairs; the first call reads all frames, slab by slab."""
         if self._rows is None:
             step = max(1, _SLAB // max(1, self.exposures))
-            total = self.grid.width * self.grid.height
-            self._rows = sum(
-                int(np.count_nonzero(self.block(start, start + step).used)) for start in range(0, total, step)
-            )
+            starts = range(0, self.grid.pixels, step)
+            self._rows = sum(int(np.count_nonzero(self.block(start, start + step).used)) for start in starts)
         return self._rows
 
     def block(self, start: int, stop: int) -> Block:
@@ -167,7 +170,7 @@ class FrameIntensities(Intensities):
 
         Raises `DataError` for an error that is zero or negative on an unflagged pixel.
         """
-        start, stop, _ = slice(start, stop).indices(self.grid.width * self.grid.height)
+        start, stop, _ = slice(start, stop).indices(self.grid.pixels)
         stop = max(start, stop)
         block = empty_block(*self.grid.xy(start, stop), self.exposures, self.cameras)
         first = 0

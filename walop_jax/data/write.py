@@ -181,7 +181,7 @@ def write_frames(
 
     Raises `DataError` as `write_calibration_set` does, and if points and grid differ in number.
     """
-    if len(calset.points) != grid.width * grid.height:
+    if len(calset.points) != grid.pixels:
         raise fail(
             f"{len(calset.points)} points for {grid.width} × {grid.height} pixels",
             file=path,

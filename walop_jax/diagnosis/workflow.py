@@ -153,11 +153,11 @@ class _Diagnosing:
         )
 
     def _examine(self, earlier: Examination | None = None) -> Examination:
-        large = len(self.calset.points) > _SMALL
-        if earlier is not None and large:
+        forgetting = earlier is not None and len(self.calset.points) > _SMALL
+        if forgetting:
             forget_programs()  # of models with fewer effects: they are not asked for again
         found = Examination(self.fit, self.wanted, self.rng, earlier, self.sentences, self.parts)
-        if earlier is not None and large:
+        if forgetting:
             forget_programs()  # of columns
         return found
 

@@ -82,7 +82,7 @@ def compressed(posterior: PixelPosterior) -> CalibrationSet:
     points = Points(np.arange(len(block.x), dtype=np.int32), block.x, block.y)
     names = [parameter.name for parameter in likelihood.model.parameters]
     record = Compression(
-        pixels=cells.grid.width * cells.grid.height,
+        pixels=cells.grid.pixels,
         chi2=posterior.data,
         dof=posterior.dof,
         values=dict(zip(names, found.values.tolist(), strict=True)),

@@ -244,8 +244,7 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
         return SlabSums(np.ravel(found.moments), np.full(4, -np.inf), {number: flat})
 
     step = height * cells.grid.width * every
-    pixels = cells.grid.width * cells.grid.height
-    layout = dataclasses.replace(likelihood.layout, points=pixels, slab=step, chunk=step)
+    layout = dataclasses.replace(likelihood.layout, points=cells.grid.pixels, slab=step, chunk=step)
     key = f"cells {values.tobytes().hex()} every {every}"
     total = runner.total("summing pixels", key, work, layout)
     count = len(likelihood.flux_known)
