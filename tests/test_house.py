@@ -33,7 +33,6 @@ ROOMS = (
 OWNERS = {
     "astropy": {"io", "data", "sky", "calibration", "diagnosis"},
     "optimistix": {"fit"},
-    "scipy": {"calibration", "diagnosis"},
     "emcee": {"posterior"},
     "arviz": {"posterior"},
     "matplotlib": {"reports"},
@@ -44,7 +43,7 @@ OWNERS = {
 }
 # Imported by nobody: tools of the tests, and what there is no need of.
 STRANGERS = {"pandas", "elli", "beartype", "hypothesis", "pytest", "oracle", "tests"}
-LONGEST = 400
+LONGEST = 600  # a question, not a goal: split by idea, never by length
 MACHINE = re.compile(r"""/(?:home|root|work|tmp|Users|opt|mnt|data)/|[A-Z]:\\\\|\.\./shared|file://""")
 
 
@@ -152,7 +151,6 @@ FAULTS = {
     "from ..cli import main": "model must not know cli",
     "from astropy.io import fits": "may import astropy",
     "import matplotlib.pyplot as plt": "may import matplotlib",
-    "from scipy import optimize": "may import scipy",
     "import pandas": "pandas has no business",
     "from walop_jax.attic import junk": "attic is no room",
     "print('here')": "prints",
