@@ -229,7 +229,8 @@ def test_keys_of_the_sampling():
     from walop_jax.runs.sample import OUTPUTS
 
     assert (
-        unexplained(keys_written("walop_jax.posterior.output", "report"), section("files", "Posterior")) == []
+        unexplained(keys_written("walop_jax.posterior.result", "document"), section("files", "Posterior"))
+        == []
     )
     assert [name for name in OUTPUTS if name not in section("files", "RUN")] == []
 

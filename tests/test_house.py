@@ -36,6 +36,7 @@ OWNERS = {
     "emcee": {"posterior"},
     "arviz": {"posterior"},
     "matplotlib": {"reports"},
+    "corner": {"reports"},
     "jinja2": {"reports"},
     "typer": {"cli"},
     "rich": {"cli"},

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from walop_jax.fit.refit import FitResult, fit
-from walop_jax.posterior.surrogate import Surrogate
-from walop_jax.posterior.surrogate_builder import build_surrogate
-from walop_jax.posterior.target import Target
+from walop_jax.posterior import Surrogate, Target, build_surrogate
 
 from .worlds import World, Worlds
 

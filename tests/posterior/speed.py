@@ -46,9 +46,7 @@ def measure(path: Path, nuts_draws: int, plain_steps: int) -> dict[str, Any]:
     from walop_jax.fit.model_builder import base_model
     from walop_jax.fit.refit import fit
     from walop_jax.likelihood.likelihood import Likelihood
-    from walop_jax.posterior import Options, build_surrogate, sample
-    from walop_jax.posterior.nuts import Nuts
-    from walop_jax.posterior.target import Target, exact_density
+    from walop_jax.posterior import Nuts, Options, Target, build_surrogate, exact_density, sample
 
     calset = read_calibration_set(path)
     likelihood = Likelihood.of(calset, base_model(calset))

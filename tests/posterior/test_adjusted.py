@@ -9,9 +9,7 @@ import numpy as np
 from walop_jax.likelihood.expansion import STATED
 from walop_jax.model.build import nominal_instrument
 from walop_jax.model.specification import Model, Parameter, make_model
-from walop_jax.posterior.adjusted import with_errors_of
-from walop_jax.posterior.convergence import Convergence
-from walop_jax.posterior.result import PosteriorSample
+from walop_jax.posterior import Convergence, PosteriorSample, sandwich_adjusted
 
 # Three parameters, the third tied to the first.
 TIES = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0]])
@@ -48,7 +46,7 @@ def test_draws_have_the_covariance_that_is_wanted():
     normal = normal @ np.linalg.inv(np.linalg.cholesky(np.cov(normal, rowvar=False))).T
     free = np.array([10.0, -3.0]) + normal @ np.linalg.cholesky(STATED_COVARIANCE[:2, :2]).T
     before = sample((free @ TIES.T).reshape(2, 500, 3), np.cov((free @ TIES.T), rowvar=False))
-    after = with_errors_of(before, tied_model(), STATED_COVARIANCE, WANTED, "residuals")
+    after = sandwich_adjusted(before, tied_model(), STATED_COVARIANCE, WANTED, "residuals")
     flat = after.draws.reshape(-1, 3)
     np.testing.assert_allclose(np.cov(flat, rowvar=False), WANTED, rtol=1e-10)
     np.testing.assert_allclose(after.covariance, WANTED, rtol=1e-10)
@@ -61,5 +59,5 @@ def test_draws_have_the_covariance_that_is_wanted():
 def test_the_same_covariance_changes_nothing():
     draws = np.random.default_rng(1).standard_normal((1, 50, 2)) @ TIES.T
     before = sample(draws, STATED_COVARIANCE)
-    after = with_errors_of(before, tied_model(), STATED_COVARIANCE, STATED_COVARIANCE, "the same")
+    after = sandwich_adjusted(before, tied_model(), STATED_COVARIANCE, STATED_COVARIANCE, "the same")
     np.testing.assert_allclose(after.draws, draws, rtol=0, atol=1e-12)

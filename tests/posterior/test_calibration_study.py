@@ -26,8 +26,7 @@ from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.parameters import with_values
 from walop_jax.model.planning import plan_for_settings
-from walop_jax.posterior import Options, sample
-from walop_jax.posterior.target import Target
+from walop_jax.posterior import Options, Target, sample
 
 from .worlds import World, Worlds, band_statistic, ecdf_band
 

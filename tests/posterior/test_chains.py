@@ -15,11 +15,7 @@ import numpy as np
 import pytest
 
 from walop_jax.io.errors import DataError
-from walop_jax.posterior.checkpoint import Checkpoints
-from walop_jax.posterior.convergence import assess, r_hat
-from walop_jax.posterior.density import Density
-from walop_jax.posterior.ensemble import MOVES, Emcee
-from walop_jax.posterior.surrogate import Surrogate
+from walop_jax.posterior import MOVES, Checkpoints, Density, Emcee, Surrogate, assess, r_hat
 
 MARK = {"data": "a", "model": "b"}
 
@@ -169,9 +165,7 @@ def test_checkpoints_come_back_and_refuse_what_is_not_theirs(gaussian: Surrogate
 
 SCRIPT = """
 import sys, numpy as np
-from walop_jax.posterior.checkpoint import Checkpoints
-from walop_jax.posterior.density import Density
-from walop_jax.posterior.ensemble import Emcee
+from walop_jax.posterior import Checkpoints, Density, Emcee
 f = Density(4, lambda z: -0.5 * z @ z, batch=lambda z: -0.5 * np.sum(z**2, axis=1))
 there = Checkpoints(sys.argv[1], {"data": "a"})
 there.folder.mkdir(exist_ok=True)

@@ -11,13 +11,12 @@ import pytest
 WRITERS = {
     "posterior": """
         import arviz
-        from walop_jax.posterior import output
-        from walop_jax.posterior.output import write_posterior
-        output.inference_data = lambda sample: arviz.from_dict(posterior={"a": np.zeros((4, 20000)) + sample})
+        from walop_jax.posterior import files, write_posterior
+        files.inference_data = lambda sample: arviz.from_dict(posterior={"a": np.zeros((4, 20000)) + sample})
         write = lambda path: write_posterior(path, 1.0, overwrite=True)
     """,
     "checkpoint": """
-        from walop_jax.posterior.checkpoint import Checkpoints
+        from walop_jax.posterior import Checkpoints
         def write(path):
             there = Checkpoints(path.parent, {})
             there.block_path = lambda number: path

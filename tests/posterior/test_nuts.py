@@ -16,8 +16,7 @@ from walop_jax.data import read_calibration_set
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.posterior import Options, sample
-from walop_jax.posterior.target import Target
+from walop_jax.posterior import Options, Target, sample
 
 DRAWS = 4000
 

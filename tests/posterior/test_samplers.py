@@ -12,13 +12,23 @@ import pytest
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.io.errors import DataError
-from walop_jax.posterior import SAMPLERS, Density, Options, Sampler, Stretch, sample
-from walop_jax.posterior.checkpoint import Checkpoints
-from walop_jax.posterior.ensemble import Emcee
-from walop_jax.posterior.ensembles import Ensembles
-from walop_jax.posterior.output import inference_data, intervals, read_draws, report, write_posterior
-from walop_jax.posterior.propagate import with_moments
-from walop_jax.posterior.samplers import make_sampler
+from walop_jax.posterior import (
+    SAMPLERS,
+    Checkpoints,
+    Density,
+    Emcee,
+    Ensembles,
+    Nuts,
+    Options,
+    Sampler,
+    Stretch,
+    inference_data,
+    make_sampler,
+    read_draws,
+    sample,
+    with_moments,
+    write_posterior,
+)
 
 from .conftest import Scene
 
@@ -104,7 +114,7 @@ def test_a_sampler_of_ones_own_samples_the_surrogate(scene: Scene, tmp_path: Pat
     assert short.make_sampler().name == "metropolis"
     cut = sample(result, dataclasses.replace(short, parameters=None), folder=tmp_path / "chain")
     assert not cut.trusted
-    assert cut.sampler == report(cut)["sampler"] == "metropolis"
+    assert cut.sampler == cut.document()["sampler"] == "metropolis"
     assert inference_data(cut).posterior.attrs["sampler"] == "metropolis"
     assert cut.chains.shape[:3] == (2, 320, 1)
     with pytest.raises(DataError, match=r"other sampler \(metropolis \w+ → emcee"):
@@ -116,8 +126,6 @@ def test_a_sampler_of_ones_own_samples_the_surrogate(scene: Scene, tmp_path: Pat
 def test_nuts_samples_the_exact_posterior_of_everything(scene: Scene, tmp_path: Path):
     """Too short to be trusted, long enough to see that all free parameters move by their standard errors."""
     pytest.importorskip("blackjax")
-    from walop_jax.posterior.nuts import Nuts
-
     result = scene.result
     options = Options(sampler=Nuts(warm_up=40), seed=1, interval=50, maximum_steps=50, checks=16)
     found = sample(result, options, folder=tmp_path / "chain")
@@ -133,8 +141,8 @@ def test_nuts_samples_the_exact_posterior_of_everything(scene: Scene, tmp_path: 
     ratio = np.sqrt(np.diag(found.covariance))[free] / result.sigma[free]
     assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.2)
     assert np.sqrt(np.mean(((found.mean - result.values)[free] / result.sigma[free]) ** 2)) < 0.5
-    assert np.isfinite(intervals(found)["ESS"][0]).all()
-    assert report(found)["surrogate"] is None
+    assert np.isfinite(found.intervals()["ESS"][0]).all()
+    assert found.document()["surrogate"] is None
     np.testing.assert_allclose(
         found.chains[..., 0].ravel(),
         found.draws[..., result.model.names.index(found.sampled[0])].ravel(),

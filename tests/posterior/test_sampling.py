@@ -11,15 +11,23 @@ import pytest
 from quick import quick
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import matrices
+from walop_jax.calibration.matrix import matrices, matrix_draws
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import write_columns
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.posterior import Options, PosteriorSample, sample, sampling
-from walop_jax.posterior.output import inference_data, intervals, read_draws, report, write_posterior
-from walop_jax.posterior.propagate import matrix_draws, with_draws, with_moments
+from walop_jax.posterior import (
+    Options,
+    PosteriorSample,
+    inference_data,
+    read_draws,
+    sample,
+    sampling,
+    with_draws,
+    with_moments,
+    write_posterior,
+)
 
 from .conftest import Scene
 
@@ -115,7 +123,7 @@ def test_inflation_finds_the_noise_as_stated(scene: Scene) -> None:
     expected = 0.5 * np.log(scene.result.posterior.data / (measured - len(scene.target.free)))
     assert inflated.ln_f.mean() == pytest.approx(expected, abs=1.0 / np.sqrt(measured))
     assert inflated.ln_f.std() == pytest.approx(1.0 / np.sqrt(2 * measured), rel=0.15)
-    assert "noise.ln_f" in intervals(inflated)["NAME"][0]
+    assert "noise.ln_f" in inflated.intervals()["NAME"][0]
 
 
 def test_posterior_file_table_and_report(posterior: PosteriorSample, tmp_path: Path) -> None:
@@ -132,7 +140,7 @@ def test_posterior_file_table_and_report(posterior: PosteriorSample, tmp_path: P
     assert data.posterior["half1.wedge"].shape == posterior.draws.shape[:2]
     assert data.posterior.attrs["converged"] == 1
 
-    columns = intervals(posterior)
+    columns = posterior.intervals()
     row = list(columns["NAME"][0]).index("half2.wedge")
     low, middle, high = (columns[name][0][row] for name in ("LOW95", "MEDIAN", "HIGH95"))
     sigma = columns["SIGMA"][0][row]
@@ -142,7 +150,7 @@ def test_posterior_file_table_and_report(posterior: PosteriorSample, tmp_path: P
         write_columns(tmp_path / name, columns, {"TRUSTED": True})
         table = read_input_table(tmp_path / name)
         assert {"NAME", "MEDIAN", "LOW68", "HIGH68", "LOW95", "HIGH95"} <= set(table.names)
-    assert report(posterior)["trusted"] is True
+    assert posterior.document()["trusted"] is True
 
 
 def test_matrix_by_draws_agrees_with_the_covariance(

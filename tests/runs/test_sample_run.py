@@ -13,8 +13,7 @@ import walop_jax.runs.sample
 from walop_jax.calibration.product import read_product
 from walop_jax.fit.refit import FitResult, covariance
 from walop_jax.io.errors import DataError
-from walop_jax.posterior import Options, Progress
-from walop_jax.posterior.from_run import fit_of_run
+from walop_jax.posterior import Options, Progress, fit_of_run
 from walop_jax.runs.refit import refit_sets
 from walop_jax.runs.sample import OUTPUTS, sample_run
 

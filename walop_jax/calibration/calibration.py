@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.calibration.matrix import matrices
+from walop_jax.calibration.matrix import matrices, matrix_draws
 from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, ParameterTable, Verdict, in_ascii
 from walop_jax.calibration.records import Quality, ResidualMap
 from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter, single_wavelength
@@ -54,7 +54,8 @@ TEMPERATURE_MARGIN = 2.0  # K beyond the temperatures of the exposures
 class Calibration(Displayed):
     """An instrument as fitted: model, values and covariance of all parameters, and where they come from.
 
-    `field` is (smallest x, largest x, smallest y, largest y) in degrees of the points that were used.
+    `field` is (smallest x, largest x, smallest y, largest y) in degrees of the points that were used. With `draws` of a
+    posterior, matrices and their covariance are means over these instead of the linear propagation of `covariance`.
     """
 
     model: Model
@@ -69,6 +70,7 @@ class Calibration(Displayed):
     field: tuple[float, float, float, float]
     inputs: tuple[InputFile, ...] = ()
     residuals: ResidualMap | None = None
+    draws: Float[np.ndarray, "d n"] | None = None
 
     @classmethod
     def from_fit(cls, result: FitResult, residuals: ResidualMap | None = None) -> Calibration:
@@ -161,6 +163,10 @@ class Calibration(Displayed):
         self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings
     ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
         filters = {str(name): self.filter_curve(str(name)) for name in np.unique(settings.filter)}
+        if self.draws is not None:
+            drawn = matrix_draws(self.model, self.draws, settings, filters, x, y)
+            away = drawn - drawn.mean(axis=0)
+            return drawn.mean(axis=0), np.einsum("dpi,dpj->pij", away, away) / (len(drawn) - 1)
         instrument = self.model.instrument(self.values)
         return matrices(instrument, settings, filters, x, y, self.covariance)
 

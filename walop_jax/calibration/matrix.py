@@ -24,6 +24,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import with_values
 from walop_jax.model.plan import Plan, with_numbers
 from walop_jax.model.planning import plan_for_settings
+from walop_jax.model.specification import Model
 
 Scalar = Float[Array, ""]
 
@@ -124,6 +125,26 @@ def matrices(
             lambda *part, plan=plan: _matrices(instrument, plan, cov, *part), *(c[rows] for c in columns)
         )
     return values, errors
+
+
+def matrix_draws(
+    model: Model,
+    draws: Float[np.ndarray, "d n"],
+    settings: Settings,
+    filters: Mapping[str, FilterCurve],
+    x: Float[np.ndarray, " p"],
+    y: Float[np.ndarray, " p"],
+) -> Float[np.ndarray, "d p m"]:
+    """Elements of the instrument matrix at field positions (deg) for every draw of all parameters."""
+    pairs = model.template.cameras.pairs
+    result = np.empty((len(draws), len(x), 3 * len(pairs)))
+    for setting, rows in settings.distinct():
+        plan = plan_for_settings(model.template, setting, filters)
+        for i, values in enumerate(draws):
+            vectors = sky_vectors(model.instrument(values), plan, x[rows], y[rows])[:, 0]
+            matrix = light.instrument_matrix(jnp.asarray(vectors), pairs)
+            result[i, rows] = np.asarray(matrix).reshape(len(rows), -1)
+    return result
 
 
 def in_chunks(

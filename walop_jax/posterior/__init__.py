@@ -3,27 +3,62 @@
 This room samples and says how far to believe it. It draws no figures, and knows no FITS.
 """
 
-from walop_jax.posterior.convergence import Convergence
-from walop_jax.posterior.density import Density
-from walop_jax.posterior.result import Options, PosteriorSample, Progress
-from walop_jax.posterior.samplers import SAMPLERS, Sampler, State, Stretch
-from walop_jax.posterior.sampling import sample
-from walop_jax.posterior.surrogate import Surrogate
-from walop_jax.posterior.surrogate_accuracy import Accuracy
-from walop_jax.posterior.surrogate_builder import build_surrogate
+from walop_jax.posterior.convergence import Convergence, assess, r_hat
+from walop_jax.posterior.emcee import MOVES, Emcee
+from walop_jax.posterior.files import (
+    Checkpoints,
+    digest_of_fit,
+    inference_data,
+    read_draws,
+    read_inference_data,
+    with_draws,
+    with_moments,
+    write_posterior,
+)
+from walop_jax.posterior.nuts import Nuts
+from walop_jax.posterior.result import Options, PosteriorSample, Progress, Report
+from walop_jax.posterior.run import fit_of_run, locate
+from walop_jax.posterior.samplers import SAMPLERS, Density, Sampler, State, Stretch, make_sampler
+from walop_jax.posterior.sampling import Ensembles, sample, sandwich_adjusted
+from walop_jax.posterior.surrogate import Accuracy, Surrogate, build_surrogate, compare_with_exact
+from walop_jax.posterior.target import Target, choose_sampled, exact_density, near_linear
 
 __all__ = [
+    "MOVES",
     "SAMPLERS",
     "Accuracy",
+    "Checkpoints",
     "Convergence",
     "Density",
+    "Emcee",
+    "Ensembles",
+    "Nuts",
     "Options",
     "PosteriorSample",
     "Progress",
+    "Report",
     "Sampler",
     "State",
     "Stretch",
     "Surrogate",
+    "Target",
+    "assess",
     "build_surrogate",
+    "choose_sampled",
+    "compare_with_exact",
+    "digest_of_fit",
+    "exact_density",
+    "fit_of_run",
+    "inference_data",
+    "locate",
+    "make_sampler",
+    "near_linear",
+    "r_hat",
+    "read_draws",
+    "read_inference_data",
     "sample",
+    "sandwich_adjusted",
+    "with_draws",
+    "with_moments",
+    "write_posterior",
 ]

@@ -24,8 +24,7 @@ from jaxtyping import Array
 
 from walop_jax.io.errors import fail
 from walop_jax.model.compiled import compiled
-from walop_jax.posterior.density import Density
-from walop_jax.posterior.samplers import Sampler, State, Stretch
+from walop_jax.posterior.samplers import Density, Sampler, State, Stretch
 
 TARGET_ACCEPTANCE = 0.8
 DOUBLINGS = 3

@@ -1,4 +1,4 @@
-"""What is asked of a sampler and what it answers."""
+"""Options of sampling, its progress, and its result: a posterior with draws, intervals and verdict."""
 
 from __future__ import annotations
 
@@ -15,18 +15,21 @@ from walop_jax.io.rounding import value_and_error
 from walop_jax.likelihood.expansion import STATED
 from walop_jax.posterior.convergence import Chains, Convergence
 from walop_jax.posterior.samplers import Sampler, make_sampler
-from walop_jax.posterior.surrogate_accuracy import Accuracy
-from walop_jax.posterior.target import LARGEST_SAMPLED
+from walop_jax.posterior.surrogate import Accuracy
+from walop_jax.posterior.target import INFLATION, LARGEST_SAMPLED
 
 Vector = Float[np.ndarray, " n"]
+Column = tuple[np.ndarray, str, str]  # values, unit, description
 
 BURN_IN = 0.2  # share of the steps that is not used
+LEVELS = {"68": (0.1587, 0.8413), "95": (0.0228, 0.9772)}
+"""Quantiles of the intervals: ± 1 and ± 2 standard deviations of a normal distribution."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """How to sample. `interval` is the length of a block, hence of what a kill can lose, in steps; whole blocks are
-    done, so that there are never more steps than `maximum_steps`.
+    """Options of `sample`. `interval` is the length of a block, hence of what a kill can lose, in steps; whole blocks
+    are done, so that there are never more steps than `maximum_steps`.
 
     `sampler` is a name (`emcee`, `nuts`), `FILE.py:CLASS`, or a `Sampler`; `walkers` and `moves` are options of emcee,
     `walkers` 0 standing for twice the number of sampled coefficients, at least 64. `parameters` names what is
@@ -73,7 +76,7 @@ class Options:
 
 
 class Progress(NamedTuple):
-    """What a progress bar shows: what is being done, how much of it is done (0 … 1), τ in steps, ESS."""
+    """Contents of a progress bar: the stage, the share of it that is done (0 … 1), τ in steps, effective samples."""
 
     stage: str
     share: float
@@ -92,12 +95,11 @@ class PosteriorSample(Displayed):
     included; `mean` and `covariance` use every kept step. `chains` are of the coefficients `sampled`, those that
     figures show. `accuracy` is that of the surrogate, None where the exact posterior was sampled; `trusted` needs
     convergence, a surrogate that is exact enough, and a fit that is trusted (`of_trusted_fit`). `errors_from` says
-    what their spread was made from: the stated errors of the data, or, as for the fit, what it leaves (`adjusted`).
-    `counts` are what the sampler counted, `fit` the `digest_of_fit` of what was sampled around.
+    what their spread was made from: the stated errors of the data or, as for the fit, its residuals
+    (`sandwich_adjusted`). `counts` are those of the sampler, `fit` is the `digest_of_fit` of the fit sampled around.
     """
 
     sampler: str
-
     names: tuple[str, ...]
     units: tuple[str, ...]
     draws: Float[np.ndarray, "e d n"]
@@ -120,17 +122,17 @@ class PosteriorSample(Displayed):
 
     @property
     def trusted(self) -> bool:
-        """Whether the posterior may be believed."""
+        """True for a posterior that was sampled well, around a fit that is trusted."""
         return self.of_trusted_fit and self.sampled_well
 
     @property
     def sampled_well(self) -> bool:
-        """Whether the draws are of the posterior, whatever that is worth."""
+        """True where the draws are of the posterior, whatever the fit is worth."""
         return self.convergence.converged and (self.accuracy is None or self.accuracy.exact_enough)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What does not hold, in words."""
+        """Sentences about everything that does not hold."""
         found = [] if self.convergence.converged else [self.convergence.message(self.seconds_per_step)]
         if not self.of_trusted_fit:
             found.insert(
@@ -152,7 +154,7 @@ class PosteriorSample(Displayed):
 
     @property
     def comparison(self) -> str:
-        """How what was sampled compares with the exact posterior, in words."""
+        """A sentence that compares the sampled density with the exact posterior."""
         a = self.accuracy
         if a is None:
             return f"sampled with {self.sampler} from the exact posterior of all coefficients"
@@ -160,6 +162,11 @@ class PosteriorSample(Displayed):
             f"against the exact posterior at {a.count} draws: means within {abs(a.shift[1]):.3f} σ, "
             f"widths within {100 * abs(a.width[1] - 1):.1f} %"
         )
+
+    @property
+    def varying(self) -> list[int]:
+        """Positions of the coefficients that vary; tied ones do, frozen ones do not."""
+        return [i for i in range(len(self.names)) if np.ptp(self.draws[:, :, i]) > 0]
 
     @property
     def seconds_per_step(self) -> float:
@@ -171,11 +178,43 @@ class PosteriorSample(Displayed):
         i = self.names.index(name)
         return float(self.mean[i]), float(np.sqrt(self.covariance[i, i]))
 
-    def to_table(self) -> Any:
-        """Median, error, 68 and 95 % intervals of every coefficient that varies, as an astropy table."""
-        from walop_jax.posterior.output import intervals  # which writes what stands here
+    def intervals(self) -> dict[str, Column]:
+        """Median, 68 and 95 % intervals of every coefficient that varies, as columns with unit and description.
 
-        return astropy_table(intervals(self), {"TRUSTED": self.trusted})
+        τ, effective samples and R-hat are NaN for coefficients that are not sampled but drawn from their conditional
+        distribution.
+        """
+        varies = self.varying
+        values = self.draws.reshape(-1, len(self.names))[:, varies]
+        names, units = [self.names[i] for i in varies], [self.units[i] for i in varies]
+        if self.ln_f is not None:
+            values = np.concatenate([values, self.ln_f.reshape(-1, 1)], axis=1)
+            names, units = [*names, INFLATION], [*units, ""]
+        deviation = np.sqrt(np.diag(self.covariance))[varies]
+        deviation = np.append(deviation, values[:, len(varies) :].std(axis=0))
+        columns: dict[str, Column] = {
+            "NAME": (np.array(names), "", "coefficient"),
+            "UNIT": (np.array(units), "", "unit of the numbers in this row"),
+            "MEDIAN": (np.median(values, axis=0), "", "posterior median"),
+            "SIGMA": (deviation, "", "posterior standard deviation"),
+        }
+        for label, levels in LEVELS.items():
+            for side, level in zip(("LOW", "HIGH"), levels, strict=True):
+                about = f"{'lower' if side == 'LOW' else 'upper'} end of the {label} % interval"
+                columns[f"{side}{label}"] = np.quantile(values, level, axis=0), "", about
+        v = self.convergence
+        for name, numbers, about in (
+            ("TAU", v.tau, "autocorrelation time in steps"),
+            ("ESS", v.ess, "effective samples"),
+            ("RHAT", v.rhat, "R-hat between ensembles"),
+        ):
+            known = dict(zip(v.names, numbers, strict=True))
+            columns[name] = np.array([known.get(name_, np.nan) for name_ in names]), "", about
+        return columns
+
+    def to_table(self) -> Any:
+        """The columns of `intervals` as an astropy table."""
+        return astropy_table(self.intervals(), {"TRUSTED": self.trusted})
 
     def display(self) -> Display:
         """The verdict on the chains and the sampled coefficients."""
@@ -193,3 +232,35 @@ class PosteriorSample(Displayed):
             rows=tuple(rows),
             notes=(self.comparison, *self.warnings),
         )
+
+    def document(self) -> dict[str, Any]:
+        """The content of `sample.json`, as plain data."""
+        v, a = self.convergence, self.accuracy
+        return {
+            "sampler": self.sampler,
+            "errors_from": self.errors_from,
+            "trusted": self.trusted,
+            "converged": v.converged,
+            "message": v.message(self.seconds_per_step),
+            "warnings": list(self.warnings),
+            "steps": v.steps,
+            "walkers": int(self.chains.shape[2]),
+            "ensembles": int(self.chains.shape[0]),
+            "acceptance": self.acceptance,
+            "autocorrelation_steps": {n: float(t) for n, t in zip(v.names, v.tau, strict=True)},
+            "autocorrelation_history": list(v.history),
+            "effective_samples": {n: float(t) for n, t in zip(v.names, v.ess, strict=True)},
+            "r_hat": {n: float(t) for n, t in zip(v.names, v.rhat, strict=True)},
+            "sampler_counts": dict(self.counts),
+            "surrogate": None
+            if a is None
+            else {
+                "draws_checked": a.count,
+                "spread": a.spread,
+                "efficiency": a.efficiency,
+                "largest_shift_sigma": list(a.shift),
+                "largest_width_factor": list(a.width),
+            },
+            "seconds": self.seconds,
+            "fingerprint": self.fingerprint,
+        }

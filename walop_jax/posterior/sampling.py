@@ -1,4 +1,4 @@
-"""`sample`: from a fit to a posterior, block by block, with checkpoints and a verdict."""
+"""`sample`: from a fit to a posterior, by independent ensembles of one sampler, with checkpoints and a verdict."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import dataclasses
 import inspect
 import os
 import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -16,21 +19,126 @@ from walop_jax.fit.refit import FitResult, covariance
 from walop_jax.io.errors import fail
 from walop_jax.io.software import versions_of
 from walop_jax.likelihood.expansion import STATED
-from walop_jax.posterior.adjusted import with_errors_of
-from walop_jax.posterior.checkpoint import Checkpoints, digest, digest_of_fit
-from walop_jax.posterior.convergence import Convergence
-from walop_jax.posterior.ensembles import Ensembles, numbers_of
-from walop_jax.posterior.exact import ExactPosterior
-from walop_jax.posterior.result import Options, PosteriorSample, Progress, Report
-from walop_jax.posterior.samplers import Sampler
-from walop_jax.posterior.surrogate import Surrogate
-from walop_jax.posterior.surrogate_accuracy import check
-from walop_jax.posterior.surrogate_builder import build_surrogate
-from walop_jax.posterior.target import Target, choose_sampled
+from walop_jax.model.specification import Model
+from walop_jax.posterior.convergence import Chains, Convergence, assess
+from walop_jax.posterior.files import Checkpoints, digest, digest_of_fit
+from walop_jax.posterior.result import BURN_IN, Options, PosteriorSample, Progress, Report
+from walop_jax.posterior.samplers import Density, Sampler, State, Stretch
+from walop_jax.posterior.surrogate import Surrogate, build_surrogate, compare_with_exact
+from walop_jax.posterior.target import ExactPosterior, Target, choose_sampled
 
-Vector = Float[np.ndarray, " n"]
+Monitored = Callable[[Chains], Chains]
+Covariance = Float[np.ndarray, "n n"]
 
 SOFTWARE = ("walop-jax", "jax", "jaxlib", "numpy")
+
+
+class Ensembles:
+    """The ensembles of a run and what they have stored so far: every `thin`-th step of blocks of `interval` steps."""
+
+    def __init__(
+        self, sampler: Sampler, density: Density, options: Options, checkpoints: Checkpoints | None = None
+    ) -> None:
+        """Takes up what is in `checkpoints`, or starts."""
+        self.sampler, self.density = sampler, density
+        self.options, self.checkpoints = options, checkpoints
+        self.thin = options.thin or sampler.thin
+        self.blocks: list[list[Stretch]] = []
+        self.seconds = 0.0
+        for number in range(1, 1 + (0 if checkpoints is None else checkpoints.count())):
+            assert checkpoints is not None
+            self.states, blocks, seconds = checkpoints.load_block(number)
+            self.blocks.append(blocks)
+            self.seconds += seconds
+        if not self.blocks:
+            began = time.perf_counter()
+            seeds = [(options.seed, number) for number in range(options.ensembles)]
+            self.states: list[State] = [_arrays(sampler.start(density, seed)) for seed in seeds]
+            self.seconds = time.perf_counter() - began
+
+    @property
+    def steps(self) -> int:
+        """Number of steps done, burn-in included."""
+        return len(self.blocks) * self.options.interval
+
+    @property
+    def acceptance(self) -> float:
+        """Share of proposals accepted in the steps that are stored."""
+        return float(np.mean([stretch.acceptance for block in self.blocks for stretch in block]))
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What the sampler counted, all ensembles together."""
+        total: Counter[str] = Counter()
+        for block in self.blocks:
+            for stretch in block:
+                total.update(stretch.counts)
+        return dict(total)
+
+    def go_on(self) -> None:
+        """One more block."""
+        began, options = time.perf_counter(), self.options
+        states, stretches = [], []
+        for state in self.states:
+            state, stretch = self.sampler.advance(self.density, state, options.interval)
+            states.append(_arrays(state))
+            stretches.append(self._stored(stretch))
+        seconds = time.perf_counter() - began
+        self.states, self.seconds = states, self.seconds + seconds
+        self.blocks.append(stretches)
+        if self.checkpoints is not None:
+            self.checkpoints.save_block(len(self.blocks), states, stretches, seconds)
+
+    def _stored(self, stretch: Stretch) -> Stretch:
+        n, k = self.options.interval, self.density.dimension
+        shape = np.shape(stretch.positions)
+        rest = (np.shape(stretch.log_density), np.shape(stretch.acceptance))
+        if len(shape) != 3 or (shape[0], shape[2]) != (n, k) or rest != (shape[:2], shape[:2]):
+            raise fail(
+                f"the sampler {self.sampler.name!r} gave positions of shape {shape} and numbers of shapes {rest}",
+                advice=f"for {n} steps of {k} coordinates it must be (steps, walkers, coordinates) = ({n}, …, {k}), "
+                "and (steps, walkers)",
+            )
+        stored = (np.array(part[self.thin - 1 :: self.thin], float) for part in stretch[:3])
+        return Stretch(*stored, counts=stretch.counts)
+
+    def kept(self) -> tuple[Chains, Float[np.ndarray, "e t w"]]:
+        """Stored positions and ln p after burn-in."""
+        z = np.concatenate([np.stack([s.positions for s in block]) for block in self.blocks], axis=1)
+        lnp = np.concatenate([np.stack([s.log_density for s in block]) for block in self.blocks], axis=1)
+        first = int(BURN_IN * z.shape[1])
+        return z[:, first:], lnp[:, first:]
+
+    def until_converged(
+        self, names: Sequence[str], monitored: Monitored = np.asarray, report: Report | None = None
+    ) -> Convergence:
+        """Go on until the rules of convergence hold or another block would exceed `maximum_steps`; returns the verdict.
+
+        Judged are the quantities that `monitored` makes of positions, under their `names`.
+        """
+        while True:
+            verdict = None
+            if self.blocks:
+                verdict = assess(monitored(self.kept()[0]), tuple(names), self.thin)
+                if verdict.converged or self.steps + self.options.interval > self.options.maximum_steps:
+                    return verdict
+            if report is not None:
+                goal = self.options.maximum_steps if verdict is None else self.steps + verdict.needed
+                done = min(self.steps / max(goal, 1), 1.0)
+                report(Progress("sampling", done, *numbers_of(verdict)))
+            self.go_on()
+
+
+def _arrays(state: Mapping[str, Any]) -> State:
+    """A state as it comes back from a checkpoint."""
+    return {name: np.asarray(value) for name, value in state.items()}
+
+
+def numbers_of(verdict: Convergence | None) -> tuple[float, float]:
+    """Worst τ and fewest effective samples, for a progress bar; NaN before the first verdict."""
+    if verdict is None:
+        return float("nan"), float("nan")
+    return verdict.history[2], float(np.min(verdict.ess))
 
 
 def fingerprint(target: Target, options: Options) -> dict[str, str]:
@@ -84,8 +192,8 @@ def sample(
     interruption. Raises `DataError` for a folder that holds a run already while `resume` is False, or one of
     other data, model, priors, sampler, settings or versions; ValueError where there is nothing to sample.
 
-    Around a fit whose errors come from what it leaves (`errors_from`), chains are those of the stated errors, and draws
-    and covariance are spread as the errors of the fit are (`adjusted`).
+    Around a fit whose errors come from its residuals (`errors_from`), chains are those of the stated errors, and draws
+    and covariance are `sandwich_adjusted`.
     """
     options = options or Options()
     report = report or (lambda progress: None)
@@ -94,7 +202,9 @@ def sample(
             result, covariance=covariance(result.model, result.posterior), errors_from=STATED
         )
         found = sample(stated, options, folder=folder, resume=resume, report=report)
-        return with_errors_of(found, result.model, stated.covariance, result.covariance, result.errors_from)
+        return sandwich_adjusted(
+            found, result.model, stated.covariance, result.covariance, result.errors_from
+        )
     sampler, target = options.make_sampler(), Target(result)
     checkpoints = None
     if folder is not None:
@@ -110,7 +220,7 @@ def sample(
         posterior, seconds = _surrogate(target, options, checkpoints, report)
     report(Progress("starting", 0.0))
     ensembles = Ensembles(sampler, posterior.density(), options, checkpoints)
-    verdict = ensembles.until_converged(posterior.quoted_names, posterior.quoted, report)
+    verdict = ensembles.until_converged(posterior.monitored_names, posterior.monitored, report)
     report(Progress("comparing with the exact posterior", 1.0, *numbers_of(verdict)))
     finished = _finish(target, posterior, ensembles, verdict, seconds)
     fit = digest_of_fit(result.calset.inputs, result.model.names, result.values)
@@ -159,7 +269,7 @@ def _finish(
     accuracy = None
     if isinstance(posterior, Surrogate):
         checked = z.reshape(-1, d)[_evenly(e * n * w, options.checks)]
-        accuracy = check(target, posterior, checked, rng)
+        accuracy = compare_with_exact(target, posterior, checked, rng)
     mean, spread = posterior.moments(z.reshape(-1, d)[:: max(1, e * n * w // 50_000)])
     select = target.model.selection()
     shown = len(posterior.sampled) + int(posterior.inflate)
@@ -173,8 +283,8 @@ def _finish(
         ln_f=flat[:, :, -1] * posterior.ln_f_unit if posterior.inflate else None,
         mean=target.values(mean),
         covariance=select @ spread @ select.T,
-        chains=posterior.quoted(z)[..., :shown],
-        sampled=posterior.quoted_names[:shown],
+        chains=posterior.monitored(z)[..., :shown],
+        sampled=posterior.monitored_names[:shown],
         thin=ensembles.thin,
         convergence=verdict,
         accuracy=accuracy,
@@ -183,3 +293,29 @@ def _finish(
         seconds=seconds + ensembles.seconds,
         fingerprint={} if checkpoints is None else dict(checkpoints.fingerprint),
     )
+
+
+def sandwich_adjusted(
+    sample: PosteriorSample, model: Model, stated: Covariance, robust: Covariance, errors_from: str
+) -> PosteriorSample:
+    """A sample with its draws spread as the robust covariance of a fit, for data that scatter more than they state.
+
+    Equation    θ' = m + Ω (θ − m),  Ω = L_C L_H⁻¹,  L_C L_Cᵀ = C,  L_H L_Hᵀ = H⁻¹
+    Symbols     θ draws under the stated errors, m their mean; H⁻¹ (`stated`) covariance of the fit under the stated
+                errors; C (`robust`) that from residuals (`fit.robust`), both of all parameters of the model
+    Source      open-faced sandwich: Shaby 2014, Journal of Computational and Graphical Statistics 23, 853
+    Limits      C = H⁻¹: nothing changes. Ω is not the symmetric root of that paper but lower triangular; both give
+                draws of covariance C where those of the sampler have H⁻¹, and what is skew in them stays skew. Chains
+                stay as they were sampled.
+
+    `errors_from` names the origin of C in the result.
+    """
+    free, ties = model.free, model.selection()
+    at = np.ix_(free, free)
+    unit = np.sqrt(np.diag(stated)[free])
+    lower, upper = (np.linalg.cholesky(matrix[at] / np.outer(unit, unit)) for matrix in (stated, robust))
+    omega = unit[:, None] * np.linalg.solve(lower.T, upper.T).T / unit
+    away = (sample.draws - sample.mean)[..., free] @ omega.T
+    draws = sample.mean + away @ ties.T
+    covariance = ties @ omega @ sample.covariance[at] @ omega.T @ ties.T
+    return dataclasses.replace(sample, draws=draws, covariance=covariance, errors_from=errors_from)

@@ -1,4 +1,4 @@
-"""A fast stand-in for the exact posterior, and how far it may be trusted.
+"""The surrogate: a polynomial form of the exact posterior, built from exact residuals and compared with it.
 
 Near the fit the residuals are polynomials: with the sampled coefficients in whitened coordinates z and the
 near-linear ones in whitened coordinates s,
@@ -6,7 +6,7 @@ near-linear ones in whitened coordinates s,
     x = x̂ + A z + (C_λφ C_φφ⁻¹) A z + S s          A Aᵀ = C_φφ,  S Sᵀ = C_λλ − C_λφ C_φφ⁻¹ C_φλ   (Laplace)
     r(z, s) ≈ r₀ + Γ y,    y = (h, s),    h = (1, z_i, z_i z_j, and z_i z_j z_k where the model bends most)
 
-Γ is fitted by least squares to exact residuals at design points (`building`). Only the Gram matrix of the
+Γ is fitted by least squares to exact residuals at design points (`build_surrogate`). Only the Gram matrix of the
 exact residuals is kept, so χ² = yᵀ Q y costs the same for 10⁴ and 10⁹ data. s is marginalised:
 
     −2 ln p(z) = h (Q_hh − Q_hs Q_ss⁻¹ Q_sh) h + z · ∇_z ln det H_ss
@@ -19,7 +19,7 @@ gradients g.
 With noise inflation the errors of the data are times f, and Q_ss = D/f² + P is diagonal in the common
 eigenvectors of D and P; − n ln f is added, ln f having the prior N(0, 1). Its coordinate is ln f √(2n).
 
-`accuracy.check` compares with the exact posterior, all coefficients together, at draws of the surrogate's.
+`compare_with_exact` compares it with the exact posterior, all coefficients together, at draws of the surrogate's.
 
 Source   Laplace marginals: Tierney & Kadane 1986, JASA 81, 82. Compression as in reduced-order quadrature:
          Canizares et al. 2013, Phys. Rev. D 87, 124005.
@@ -29,17 +29,24 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import itertools
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.model.compiled import compiled
-from walop_jax.posterior.density import Density
-from walop_jax.posterior.target import INFLATION, LN_F_WIDTH
+from walop_jax.posterior.samplers import Density
+from walop_jax.posterior.target import INFLATION, LN_F_WIDTH, Target, choose_sampled
 
 Matrix = Float[np.ndarray, "..."]
 Draws = Float[np.ndarray, "n k"]
+
+OVERSAMPLING = 1.5  # design points per feature
+LEAST = 1.1  # pairs of points ±u per odd feature, and per even feature: a pair measures one of each
+SPREAD = 1.2  # of the design, in standard errors
+BENT = 8  # directions that get cubic terms
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,11 +118,11 @@ class Surrogate:
         return Density(self.dimension, one, arrays, batch=many)
 
     @property
-    def quoted_names(self) -> tuple[str, ...]:
+    def monitored_names(self) -> tuple[str, ...]:
         """Names of what is sampled, as people quote it."""
         return (*(self.names[i] for i in self.sampled), *((INFLATION,) if self.inflate else ()))
 
-    def quoted(self, z: Float[np.ndarray, "... k"]) -> Float[np.ndarray, "... q"]:
+    def monitored(self, z: Float[np.ndarray, "... k"]) -> Float[np.ndarray, "... q"]:
         """The sampled coefficients themselves (and ln f) at sampled coordinates."""
         k = self.along.shape[1]
         physical = self.centre[self.sampled] + z[..., :k] @ self.along[self.sampled].T
@@ -195,3 +202,179 @@ def _inflated(
     pull = weight[:, None] * (h @ by_data.T) + h @ by_prior.T
     chi2 = chi2 - jnp.sum(pull**2 / precision, axis=1) + jnp.sum(jnp.log(precision), axis=1)
     return -0.5 * (chi2 + (ln_f / LN_F_WIDTH) ** 2) - measured * ln_f
+
+
+def _axes(covariance: Matrix, scale: Float[np.ndarray, " k"]) -> Matrix:
+    """A with A Aᵀ = covariance, columns along the principal axes in the units of `scale`."""
+    value, vector = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return scale[:, None] * vector * np.sqrt(np.clip(value, value.max(initial=0.0) * 1e-15, None))
+
+
+def _coordinates(target: Target, sampled: Int[np.ndarray, " k"]) -> tuple[Matrix, Matrix]:
+    rest = np.setdiff1d(np.arange(len(target.free)), sampled)
+    c, scale = target.covariance, target.scale
+    own = _axes(c[np.ix_(sampled, sampled)], scale[sampled])
+    follow = np.linalg.solve(own, c[np.ix_(sampled, rest)]).T  # C_λφ A⁻ᵀ
+    along, across = np.zeros((len(c), len(sampled))), np.zeros((len(c), len(rest)))
+    along[sampled], along[rest] = own, follow
+    across[rest] = _axes(c[np.ix_(rest, rest)] - follow @ follow.T, scale[rest])
+    return along, across
+
+
+def _design(rng: np.random.Generator, odd: int, even: int, width: int) -> Draws:
+    """Points ±u with u normal: odd and even parts of the residuals separate."""
+    pairs = max(0.5 * OVERSAMPLING * (odd + even), LEAST * max(odd, even)) + 1.0
+    half = SPREAD * rng.standard_normal((int(np.ceil(pairs)), width))
+    return np.concatenate([half, -half])
+
+
+def _gram(target: Target, x: Float[np.ndarray, "m f"], progress: Callable[[int, int], None] | None) -> Matrix:
+    """Gram matrix of (r₀, r(x_1) − r₀, r(x_2) − r₀, …) over all data."""
+    gram, chunks = np.zeros((len(x) + 1, len(x) + 1)), target.likelihood.points
+    for number, chunk in enumerate(chunks):
+        first = target.residuals(target.centre, chunk)
+        rows = np.empty((len(x) + 1, first.size))
+        rows[0] = first
+        for m, here in enumerate(x, start=1):
+            rows[m] = target.residuals(here, chunk) - first
+            if progress is not None:
+                progress(number * len(x) + m, len(chunks) * len(x))
+        gram += rows @ rows.T
+    return gram
+
+
+def build_surrogate(
+    target: Target,
+    *,
+    sampled: Int[np.ndarray, " k"] | None = None,
+    order: int = 3,
+    inflate: bool = False,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Surrogate:
+    """Fit the surrogate to exact residuals at about 1.5 design points per feature; `order` 2 or 3.
+
+    Raises ValueError for other orders.
+    """
+    if order not in (2, 3):
+        raise ValueError(f"order {order}: the surrogate is of order 2 or 3")
+    sampled = choose_sampled(target) if sampled is None else sampled
+    along, across = _coordinates(target, sampled)
+    k, s = along.shape[1], across.shape[1]
+    pairs = np.array(list(itertools.combinations_with_replacement(range(k), 2)), int).reshape(-1, 2)
+    bent = np.sort(np.argsort(-target.bending(along))[:BENT]).tolist() if order == 3 else []
+    triples = np.array(list(itertools.combinations_with_replacement(bent, 3)), int).reshape(-1, 3)
+    odd, even = k + len(triples) + s, 1 + len(pairs)
+    n_features = odd + even
+    design = _design(np.random.default_rng([seed, 20]), odd, even, k + s)
+    x = target.centre + design[:, :k] @ along.T + design[:, k:] @ across.T
+    y = np.concatenate(
+        [np.asarray(features_of(*(jnp.asarray(a) for a in (design[:, :k], pairs, triples)))), design[:, k:]],
+        axis=1,
+    )
+    q, r = np.linalg.qr(y)
+    inverse = np.linalg.solve(r, q.T)
+    gram = _gram(target, x, progress)
+    data = inverse @ gram[1:, 1:] @ inverse.T
+    cross = inverse @ gram[1:, 0]
+    data[0] += cross
+    data[:, 0] += cross
+    data[0, 0] += gram[0, 0]
+    prior = _prior_form(target, along, across, n_features)
+    h = n_features - s
+    linear, share = _common_axes(data[h:, h:], prior[h:, h:])
+    slope, skew = _determinant_slopes(target, along, across)
+    return Surrogate(
+        names=target.names, sampled=sampled, centre=target.centre, along=along, across=across, pairs=pairs,
+        triples=triples, data=0.5 * (data + data.T), prior=prior, linear=linear, share=share,
+        slope=slope, skew=skew, measured=target.measured, inflate=inflate,
+    )  # fmt: skip
+
+
+def _prior_form(target: Target, along: Matrix, across: Matrix, n_features: int) -> Matrix:
+    """Q of priors and loose pulls: they are linear in x, hence exact."""
+    first = target.prior_rows(target.centre)
+    rows = np.zeros((len(first), n_features))
+    rows[:, 0] = first
+    rows[:, 1 : 1 + along.shape[1]] = target.prior_slopes(along)
+    rows[:, n_features - across.shape[1] :] = target.prior_slopes(across)
+    return rows.T @ rows
+
+
+def _determinant_slopes(
+    target: Target, along: Matrix, across: Matrix
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " s"]]:
+    """Derivatives of ln det H_ss along both kinds of coordinates.
+
+    Columns of `across` make H_ss the unit matrix.
+    """
+    total, twice = np.zeros(len(target.centre)), 2.0 * target.half_gradient(target.centre)
+    for step in across.T:
+        up, down = (target.half_gradient(target.centre + sign * step) for sign in (1, -1))
+        total += up + down - twice
+    return total @ along, total @ across
+
+
+def _common_axes(data: Matrix, prior: Matrix) -> tuple[Matrix, Float[np.ndarray, " s"]]:
+    """W with Wᵀ (D + P) W = 1 and Wᵀ D W diagonal."""
+    if len(data) == 0:
+        return np.zeros((0, 0)), np.zeros(0)
+    root = np.linalg.inv(np.linalg.cholesky(data + prior)).T
+    share, vector = np.linalg.eigh(root.T @ data @ root)
+    return root @ vector, np.clip(share, 0.0, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Accuracy:
+    """The surrogate against the exact posterior at `count` draws of the former, all coefficients together.
+
+    `spread` is the standard deviation of ln(exact/surrogate), `efficiency` the effective share of importance
+    weights. The exact posterior has means that differ by `shift` standard deviations and widths that differ
+    by the factor `width` from those of the surrogate: the worst of all coefficients, ± one standard error.
+    """
+
+    count: int
+    spread: float
+    efficiency: float
+    shift: tuple[str, float, float]
+    width: tuple[str, float, float]
+
+    @property
+    def exact_enough(self) -> bool:
+        """True where sampling the surrogate is sampling the posterior: means to 0.1 σ, widths to 5 %."""
+        shift, width = (
+            abs(value) - 3.0 * error
+            for value, error in (self.shift[1:], (self.width[1] - 1.0, self.width[2]))
+        )
+        return bool(np.isfinite(self.spread)) and self.efficiency > 0.5 and shift < 0.1 and width < 0.05
+
+
+def compare_with_exact(target: Target, surrogate: Surrogate, z: Draws, rng: np.random.Generator) -> Accuracy:
+    """Compare with the exact posterior at coordinates z, which are draws of the surrogate's posterior.
+
+    With ρ = ln(exact/surrogate) and a standardised coefficient t, to first order the exact mean is off by
+    Cov(ρ, t) and the exact variance by the factor 1 + Cov(ρ, t²).
+    """
+    x, weight = surrogate.draw(z, rng), surrogate.weight(z)
+    exact = [
+        w * target.data(one) + float(np.sum(target.prior_rows(one) ** 2))
+        for w, one in zip(weight, x, strict=True)
+    ]
+    ln_ratio = -0.5 * (np.array(exact) - surrogate.joint(z, x))
+    ln_ratio = ln_ratio - ln_ratio.mean()
+    importance = np.exp(np.clip(ln_ratio, -50.0, 50.0))
+    t = (x - x.mean(axis=0)) / x.std(axis=0)
+
+    def worst(product: Float[np.ndarray, "n f"]) -> tuple[str, float, float]:
+        mean, error = product.mean(axis=0), product.std(axis=0) / np.sqrt(len(z))
+        i = int(np.argmax(np.abs(mean)))
+        return surrogate.names[i], float(mean[i]), float(error[i])
+
+    shift, variance = worst(ln_ratio[:, None] * t), worst(ln_ratio[:, None] * (t**2 - 1.0))
+    return Accuracy(
+        count=len(z),
+        spread=float(np.std(ln_ratio)),
+        efficiency=float(importance.mean() ** 2 / np.mean(importance**2)),
+        shift=shift,
+        width=(variance[0], 1.0 + 0.5 * variance[1], 0.5 * variance[2]),
+    )

@@ -9,6 +9,7 @@ closed form (`surrogate`) and drawn afterwards.
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -22,7 +23,7 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import engine
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import unknown_name, with_values
-from walop_jax.posterior.density import Density
+from walop_jax.posterior.samplers import Density
 
 Vector = Float[np.ndarray, " f"]
 LARGEST_SAMPLED = 20
@@ -90,6 +91,22 @@ class Target:
         """Normalised residuals of priors and loose pulls: linear in x."""
         return self.likelihood.priors.residuals(self.values(x))
 
+    def prior_slopes(self, steps: Float[np.ndarray, "f m"]) -> Float[np.ndarray, "k m"]:
+        """Changes of `prior_rows` along the columns of `steps`."""
+        first = self.prior_rows(self.centre)
+        changes = [self.prior_rows(self.centre + step) - first for step in steps.T]
+        return np.array(changes).reshape(-1, len(first)).T
+
+    def bending(self, steps: Float[np.ndarray, "f m"]) -> Float[np.ndarray, " m"]:
+        """Departure of the residuals from linear at each column of `steps`: squared norm of their second order."""
+        total = np.zeros(steps.shape[1])
+        for chunk in self.likelihood.points:
+            here = self.residuals(self.centre, chunk)
+            for m, step in enumerate(steps.T):
+                up, down = (self.residuals(self.centre + sign * step, chunk) for sign in (1, -1))
+                total[m] += np.sum((0.5 * (up + down) - here) ** 2)
+        return total
+
     def half_gradient(self, x: Vector) -> Vector:
         """Half the gradient of the objective."""
         return self.likelihood.expand(self.values(x), self.noise_scale, self._near).gradient
@@ -110,8 +127,7 @@ def exact_density(target: Target, inflate: bool = False) -> Density:
     The data go through it chunk by chunk, however many there are: the memory of a gradient is that of one chunk.
     """
     likelihood = target.likelihood
-    offset = target.prior_rows(target.centre)
-    slope = np.stack([target.prior_rows(target.centre + column) - offset for column in target.root.T], axis=1)
+    offset, slope = target.prior_rows(target.centre), target.prior_slopes(target.root)
     linear = (target.values(target.centre), target.model.selection() @ target.root, offset, slope)
     chunks = jax.tree.map(lambda *parts: jnp.stack(parts), *likelihood.points)
     arrays = (target.model.template, likelihood.plan, chunks, *(jnp.asarray(a) for a in linear))
@@ -157,25 +173,61 @@ def exact_density(target: Target, inflate: bool = False) -> Density:
     return Density(free + int(inflate), value, arrays, gradient=with_gradient)
 
 
+@dataclasses.dataclass(frozen=True)
+class ExactPosterior:
+    """Coordinates w with x = x̂ + L w, as in `exact_density`; nothing is marginalised but the fluxes.
+
+    `sampled` are the positions of the coefficients that figures show; all of them are sampled.
+    """
+
+    target: Target
+    sampled: Int[np.ndarray, " k"]
+    inflate: bool = False
+
+    def density(self) -> Density:
+        """The density of the coordinates."""
+        return exact_density(self.target, self.inflate)
+
+    @property
+    def ln_f_unit(self) -> float:
+        """What ln f changes by per unit of its coordinate."""
+        return self.target.ln_f_unit
+
+    @property
+    def _order(self) -> Int[np.ndarray, " f"]:
+        rest = np.setdiff1d(np.arange(len(self.target.free)), self.sampled)
+        return np.concatenate([self.sampled, rest])
+
+    @property
+    def monitored_names(self) -> tuple[str, ...]:
+        """Names of all free parameters: those that figures show, ln f, the others."""
+        names = [self.target.names[i] for i in self._order]
+        k = len(self.sampled)
+        return (*names[:k], *((INFLATION,) if self.inflate else ()), *names[k:])
+
+    def monitored(self, z: Float[np.ndarray, "... k"]) -> Float[np.ndarray, "... q"]:
+        """The free parameters (and ln f), in the order of their names."""
+        free, k = len(self.target.free), len(self.sampled)
+        x = self.target.centre + z[..., :free] @ self.target.root.T
+        x = x[..., self._order]
+        return np.concatenate([x[..., :k], z[..., free:] * self.ln_f_unit, x[..., k:]], axis=-1)
+
+    def draw(self, z: Float[np.ndarray, "n k"], rng: np.random.Generator) -> Float[np.ndarray, "n f"]:
+        """Free parameters at sampled coordinates; nothing is left to be drawn."""
+        return self.target.centre + z[:, : len(self.target.free)] @ self.target.root.T
+
+    def moments(
+        self, z: Float[np.ndarray, "n k"]
+    ) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, "f f"]]:
+        """Mean and covariance of all free parameters over draws."""
+        x = self.draw(z, np.random.default_rng(0))
+        return x.mean(axis=0), np.cov(x, rowvar=False).reshape(2 * (x.shape[1],))
+
+
 def near_linear(target: Target) -> Int[np.ndarray, " s"]:
     """Positions, among the free parameters, of throughput coefficients and catalogue values."""
     chosen = np.concatenate([target.model.positions(component) for component in NEAR_LINEAR])
     return np.flatnonzero(np.isin(target.free, chosen))
-
-
-def bending(target: Target, k: int) -> float:
-    """How far the residuals are from linear along parameter k: norm of the second order at one σ.
-
-    The other parameters follow as the covariance of the fit says.
-    """
-    step = target.covariance[:, k] / np.sqrt(target.covariance[k, k])
-    total = 0.0
-    for chunk in target.likelihood.points:
-        here, up, down = (
-            target.residuals(x, chunk) for x in (target.centre, target.centre + step, target.centre - step)
-        )
-        total += float(np.sum((0.5 * (up + down) - here) ** 2))
-    return total**0.5
 
 
 def choose_sampled(
@@ -193,8 +245,9 @@ def choose_sampled(
     else:
         chosen = np.setdiff1d(np.arange(len(target.free)), near_linear(target))
     if len(chosen) > limit:
-        bent = np.array([bending(target, int(k)) for k in chosen])
-        chosen = np.sort(chosen[np.argsort(-bent)[:limit]])
+        # One σ of each; the other parameters follow as the covariance of the fit says.
+        steps = target.covariance[:, chosen] / np.sqrt(np.diag(target.covariance)[chosen])
+        chosen = np.sort(chosen[np.argsort(-target.bending(steps))[:limit]])
     if len(chosen) == 0:
         raise ValueError("no free physics coefficient to sample: free at least one in the model file")
     return chosen

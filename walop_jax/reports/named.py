@@ -19,8 +19,7 @@ from walop_jax.data import CalibrationSet, read_calibration_set
 from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.io.errors import fail, nearest
 from walop_jax.model.effects import EFFECTS, Effect
-from walop_jax.posterior.from_run import locate
-from walop_jax.posterior.output import read_inference_data
+from walop_jax.posterior import locate, read_inference_data
 from walop_jax.reports import (
     accuracy_figures,
     figures,

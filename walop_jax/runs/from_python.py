@@ -45,9 +45,8 @@ from walop_jax.model.trace import Sightline, Stage
 from walop_jax.model.trace import trace as trace_stages
 from walop_jax.paper.comparison import Comparison
 from walop_jax.paper.comparison import compare as compare_with_paper
-from walop_jax.posterior import Options, PosteriorSample
+from walop_jax.posterior import Options, PosteriorSample, with_draws, with_moments
 from walop_jax.posterior import sample as sample_fit
-from walop_jax.posterior.propagate import with_draws, with_moments
 from walop_jax.runs.certify import Certificate, certify_product
 from walop_jax.runs.compare import compare_methods
 from walop_jax.runs.diagnose import diagnose_sets

@@ -14,7 +14,7 @@ from walop_jax.data.user_tables import read_input_table, table_format, write_out
 from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import errors_naming
 from walop_jax.model.effects import EFFECTS, Effect
-from walop_jax.posterior.propagate import with_draws
+from walop_jax.posterior import with_draws
 from walop_jax.runs.left_out import left_out_cards, left_out_sentences
 from walop_jax.runs.written_table import WrittenTable
 

@@ -61,7 +61,7 @@ class Run(Displayed):
         path = self.folder / POSTERIOR
         if not path.exists():
             return None
-        from walop_jax.posterior.output import read_inference_data
+        from walop_jax.posterior import read_inference_data
 
         return read_inference_data(path)
 

@@ -18,11 +18,16 @@ from walop_jax.io.folder import OutputFolder, output_folder
 from walop_jax.io.plain_tables import write_columns
 from walop_jax.io.text import json_text, read_text
 from walop_jax.model.effects import EFFECTS, Effect
-from walop_jax.posterior import Options, PosteriorSample, sample
-from walop_jax.posterior.checkpoint import Checkpoints, digest_of_fit
-from walop_jax.posterior.from_run import fit_of_run
-from walop_jax.posterior.output import intervals, report, write_posterior
-from walop_jax.posterior.result import Report
+from walop_jax.posterior import (
+    Checkpoints,
+    Options,
+    PosteriorSample,
+    Report,
+    digest_of_fit,
+    fit_of_run,
+    sample,
+    write_posterior,
+)
 from walop_jax.reports.posterior_figures import (
     MOST_IN_CORNER,
     corner_figure,
@@ -83,7 +88,7 @@ def sample_run(
         table = product.parameters
         fitted = digest_of_fit(product.inputs, table.name.tolist(), table.value)
         posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted, fit=fitted)
-        summary = report(posterior)
+        summary = posterior.document()
         _write(out, product, posterior, summary, catalogue)
     return SampledRun(posterior, summary)
 
@@ -102,7 +107,7 @@ def _write(
     with out.filled(names) as folder:
         write_posterior(folder / POSTERIOR, posterior)
         for name in (INTERVALS_FITS, INTERVALS):
-            write_columns(folder / name, intervals(posterior), notes)
+            write_columns(folder / name, posterior.intervals(), notes)
         shown, draws = _in_corner(posterior, product)
         save_figure(folder / CORNER, corner_figure(draws, shown, [units.get(name, "") for name in shown]))
         trace = trace_figure(

@@ -1,7 +1,4 @@
-"""From the folder of a run back to its fit.
-
-The data are found, checked and fitted once more from where it ended.
-"""
+"""The folder of a run: its data, found again, and its fit, made again from where it ended."""
 
 from __future__ import annotations
 

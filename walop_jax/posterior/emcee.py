@@ -23,8 +23,7 @@ import emcee
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.posterior.density import Density
-from walop_jax.posterior.samplers import Sampler, State, Stretch
+from walop_jax.posterior.samplers import Density, Sampler, State, Stretch
 
 MOVES = ("laplace", "de", "stretch")
 JUMPS = 0.1  # share of γ = 1 among differential evolution

@@ -1,0 +1,314 @@
+"""The files of a posterior: `posterior.nc`, which is ArviZ InferenceData, and the folder of its checkpoints.
+
+posterior.nc   draws of every coefficient that varies. Walkers of an ensemble are not independent chains, so a chain
+               here is an ensemble: its draws are all walkers at steps spread evenly over the run. R-hat and effective
+               sample sizes are those of `convergence`, kept as attributes.
+Checkpoints    a folder of HDF5 files, one per block of steps, each appearing whole or not at all.
+
+    surrogate.h5       the surrogate, where that is sampled, so that a resumed run samples the very same function
+    block-000001.h5    positions and ln p of all ensembles; the state of the sampler at its end
+
+Every checkpoint carries the fingerprint of data, model, priors, sampler, settings and versions. It is written beside
+its place, flushed and renamed, and never touched again: a kill at any moment loses the block being computed.
+Nothing is ever overwritten by a run with another fingerprint.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import json
+import os
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.data.records import InputFile
+from walop_jax.io.atomic import atomic_path
+from walop_jax.io.errors import fail
+from walop_jax.posterior.convergence import arviz
+from walop_jax.posterior.result import PosteriorSample
+from walop_jax.posterior.samplers import State, Stretch
+from walop_jax.posterior.surrogate import Surrogate
+from walop_jax.posterior.target import INFLATION
+
+DRAWS = 200  # of a posterior, that stand for it in matrices
+FORMAT = 2  # of the checkpoints
+SURROGATE = "surrogate.h5"
+_STATE = "state."
+_ARRAYS = ("positions", "log_density", "acceptance")
+_ADVICE = "sample into another folder, or start anew with --overwrite"
+_AGAIN = "run walop-jax sample again"
+
+
+def digest(*parts: Any) -> str:
+    """SHA-256 of arrays, texts and numbers."""
+    total = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, np.ndarray) and part.dtype.kind not in "OUS":
+            total.update(f"{part.dtype.str}{part.shape}".encode() + np.ascontiguousarray(part).tobytes())
+        else:
+            total.update(repr(part.tolist() if isinstance(part, np.ndarray) else part).encode() + b"\n")
+    return total.hexdigest()
+
+
+def digest_of_fit(inputs: Sequence[InputFile], names: Sequence[str], values: np.ndarray) -> str:
+    """Digest that tells a fit from all others: of its data, its parameters and their values, to the last bit."""
+    return digest(sorted(entry.sha256 for entry in inputs), list(names), np.asarray(values, float))
+
+
+# ------------------------------------------------------------------------------------------- posterior.nc
+
+
+def inference_data(sample: PosteriorSample) -> Any:
+    """ArviZ InferenceData: one variable per coefficient that varies, under its name, with its unit."""
+    varies = sample.varying
+    posterior = {sample.names[i]: sample.draws[:, :, i] for i in varies}
+    if sample.ln_f is not None:
+        posterior[INFLATION] = sample.ln_f
+    data = arviz().from_dict(posterior=posterior, sample_stats={"lp": sample.log_posterior})
+    for i in varies:
+        data.posterior[sample.names[i]].attrs["units"] = sample.units[i] or "1"
+    v = sample.convergence
+    for k, name in enumerate(v.names):
+        if name not in data.posterior:  # it never moved
+            continue
+        evidence = {"autocorrelation_steps": v.tau[k], "effective_samples": v.ess[k], "r_hat": v.rhat[k]}
+        data.posterior[name].attrs.update({key: float(value) for key, value in evidence.items()})
+        data.posterior[name].attrs["sampled_by"] = sample.sampler
+    data.posterior.attrs.update(
+        {
+            "sampler": sample.sampler,
+            "converged": int(v.converged),
+            "trusted": int(sample.trusted),
+            "verdict": v.message() if sample.of_trusted_fit else "the fit is not trusted",
+            "steps": v.steps,
+            "acceptance": sample.acceptance,
+            "fingerprint": json.dumps(sample.fingerprint),
+            "fit": sample.fit,
+            "fixed": json.dumps(
+                {n: float(sample.draws[0, 0, i]) for i, n in enumerate(sample.names) if i not in varies}
+            ),
+        }
+    )
+    if sample.accuracy is not None:
+        numbers = {"efficiency": sample.accuracy.efficiency, "spread": sample.accuracy.spread}
+        data.posterior.attrs.update({f"surrogate_{key}": value for key, value in numbers.items()})
+    return data
+
+
+def write_posterior(
+    path: str | os.PathLike[str], sample: PosteriorSample, *, overwrite: bool = False
+) -> None:
+    """Write `posterior.nc` (netCDF 4), a group for each of ArviZ's.
+
+    It appears whole or not at all. Raises `DataError` as `atomic_path` does.
+    """
+    import h5netcdf
+    from xarray.backends import H5NetCDFStore
+
+    data = inference_data(sample)
+
+    def fill(file: h5py.File) -> None:
+        with warnings.catch_warnings(), h5netcdf.File(file, "a") as content:
+            warnings.simplefilter("ignore")
+            for group in data.groups():
+                data[group].dump_to_store(H5NetCDFStore(content, group=group, mode="a"))
+
+    _write_hdf5(path, fill, overwrite=overwrite)
+
+
+def _write_hdf5(path: str | os.PathLike[str], fill: Callable[[h5py.File], None], *, overwrite: bool) -> None:
+    """Write an HDF5 file that `fill` fills, in memory first: HDF5 does not survive a disk that is full."""
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        fill(file)
+    with atomic_path(path, overwrite=overwrite) as temporary:
+        temporary.write_bytes(buffer.getbuffer())
+
+
+def read_inference_data(path: str | os.PathLike[str]) -> Any:
+    """A `posterior.nc` as ArviZ InferenceData; `DataError` if it cannot be read."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return arviz().from_netcdf(str(path), engine="h5netcdf")
+    except Exception as error:
+        raise fail(f"cannot be read: {error}", file=path, advice=_AGAIN) from error
+
+
+def read_draws(
+    path: str | os.PathLike[str], names: tuple[str, ...], fit: str | None = None
+) -> Float[np.ndarray, "d n"]:
+    """Draws of the parameters `names`, all chains one after the other; fixed ones keep their value.
+
+    `fit` is the `digest_of_fit` that was sampled around; None: whichever. Raises `DataError` for a file that cannot be
+    read, is of another model or another fit, or may not be trusted.
+    """
+    data = read_inference_data(path)
+    try:
+        posterior = data.posterior
+        fixed = json.loads(posterior.attrs["fixed"])
+        trusted = bool(posterior.attrs["trusted"])
+        held = {str(name): np.asarray(posterior[name].values).ravel() for name in posterior.data_vars}
+    except Exception as error:
+        raise fail(f"cannot be read: {error}", file=path, advice=_AGAIN) from error
+    held.pop(INFLATION, None)
+    if set(held) | set(fixed) != set(names):
+        odd = sorted((set(held) | set(fixed)) ^ set(names))
+        raise fail(f"is of another model ({', '.join(odd[:3])})", file=path, advice=_AGAIN)
+    if fit is not None and posterior.attrs.get("fit") != fit:
+        advice = "give the posterior of this calibration, or run walop-jax sample again"
+        raise fail("is of another fit with the same parameters", file=path, advice=advice)
+    if not trusted:
+        advice = "see the warnings of the fit, or go on with walop-jax sample --resume"
+        raise fail(f"is not to be trusted: {posterior.attrs['verdict']}", file=path, advice=advice)
+    count = len(next(iter(held.values())))
+    return np.stack([held.get(name, np.full(count, fixed.get(name, np.nan))) for name in names], axis=1)
+
+
+def with_draws(
+    calibration: Calibration, path: str | os.PathLike[str], count: int = DRAWS, seed: int = 0
+) -> Calibration:
+    """The calibration with `count` draws of a `posterior.nc`, over which its matrices are averaged.
+
+    `DataError` for a file of another model or another fit, or not trusted.
+    """
+    draws = _draws_of(calibration, path)
+    chosen = np.random.default_rng(seed).permutation(len(draws))[:count]
+    return dataclasses.replace(calibration, draws=draws[chosen])
+
+
+def with_moments(calibration: Calibration, path: str | os.PathLike[str]) -> Calibration:
+    """The calibration with mean and covariance of all draws of a `posterior.nc` in place of the fit's.
+
+    For linear propagation, star by star. `DataError` as in `with_draws`.
+    """
+    draws = _draws_of(calibration, path)
+    return dataclasses.replace(calibration, values=draws.mean(axis=0), covariance=np.cov(draws, rowvar=False))
+
+
+def _draws_of(calibration: Calibration, path: str | os.PathLike[str]) -> Float[np.ndarray, "d n"]:
+    names = calibration.model.names
+    return read_draws(path, names, digest_of_fit(calibration.inputs, names, calibration.values))
+
+
+# -------------------------------------------------------------------------------------------- checkpoints
+
+
+class Checkpoints:
+    """The checkpoint folder of one run."""
+
+    def __init__(self, folder: str | os.PathLike[str], fingerprint: Mapping[str, str]) -> None:
+        self.folder = Path(folder)
+        self.fingerprint = dict(fingerprint)
+
+    def block_path(self, number: int) -> Path:
+        """The file of block `number`, counted from 1."""
+        return self.folder / f"block-{number:06d}.h5"
+
+    def count(self) -> int:
+        """Number of blocks up to the first gap."""
+        number = 0
+        while self.block_path(number + 1).exists():
+            number += 1
+        return number
+
+    def exists(self) -> bool:
+        """True where a run has left a surrogate or a block."""
+        return (self.folder / SURROGATE).exists() or self.count() > 0
+
+    def clear(self) -> None:
+        """Remove the checkpoints of an earlier run.
+
+        The surrogate last, so that what is left is still whole.
+        """
+        blocks = sorted(self.folder.glob("block-*.h5"), reverse=True)
+        unfinished = self.folder.glob(".walop-*.h5")  # what a kill in the middle of writing leaves
+        for path in (*blocks, *unfinished, self.folder / SURROGATE):
+            path.unlink(missing_ok=True)
+
+    # --------------------------------------------------------------------------------------- the surrogate
+
+    def save_surrogate(self, surrogate: Surrogate, extra: Mapping[str, float]) -> None:
+        """Write the surrogate, and numbers about its making."""
+        arrays = {f.name: getattr(surrogate, f.name) for f in dataclasses.fields(surrogate)}
+        names = json.dumps(list(arrays.pop("names")))
+        self._write(self.folder / SURROGATE, arrays, {"names": names, **extra})
+
+    def load_surrogate(self) -> tuple[Surrogate, dict[str, Any]]:
+        """The surrogate as it was saved, and the numbers beside it."""
+        arrays, extra = self._read(self.folder / SURROGATE)
+        names = tuple(json.loads(extra.pop("names")))
+        scalars = {"measured": int(arrays.pop("measured")), "inflate": bool(arrays.pop("inflate"))}
+        return Surrogate(names=names, **scalars, **arrays), extra
+
+    # ------------------------------------------------------------------------------------------- the blocks
+
+    def save_block(
+        self, number: int, states: Sequence[State], stretches: Sequence[Stretch], seconds: float
+    ) -> None:
+        """Write one block of all ensembles, with their states at its end."""
+        arrays = {name: np.stack([getattr(s, name) for s in stretches]) for name in _ARRAYS}
+        arrays |= {f"{_STATE}{name}": np.stack([state[name] for state in states]) for name in states[0]}
+        counts = json.dumps([dict(stretch.counts) for stretch in stretches])
+        self._write(self.block_path(number), arrays, {"seconds": seconds, "counts": counts})
+
+    def load_block(self, number: int) -> tuple[list[State], list[Stretch], float]:
+        """One block of all ensembles, their states at its end, and the seconds that it took."""
+        arrays, extra = self._read(self.block_path(number))
+        counts = json.loads(extra["counts"])
+        stretches = [
+            Stretch(*(arrays[name][i] for name in _ARRAYS), counts=counts[i]) for i in range(len(counts))
+        ]
+        kept = {name.removeprefix(_STATE): a for name, a in arrays.items() if name.startswith(_STATE)}
+        states: list[State] = [{name: array[i] for name, array in kept.items()} for i in range(len(counts))]
+        return states, stretches, float(extra["seconds"])
+
+    def check(self) -> None:
+        """Raise `DataError` if what is here was sampled from, or with, anything else."""
+        surrogate = self.folder / SURROGATE
+        self._read(surrogate if surrogate.exists() else self.block_path(1))
+
+    # -------------------------------------------------------------------------------------------- the files
+
+    def _write(self, path: Path, arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        content = digest(*(np.asarray(arrays[name]) for name in sorted(arrays)))
+        own = {"format": FORMAT, "fingerprint": json.dumps(self.fingerprint), "content": content}
+
+        def fill(file: h5py.File) -> None:
+            file.attrs.update(own | dict(attributes))
+            for name, value in arrays.items():
+                file.create_dataset(name, data=value)
+
+        _write_hdf5(path, fill, overwrite=False)
+
+    def _read(self, path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+        try:
+            with h5py.File(path, "r") as file:
+                attributes: dict[str, Any] = {str(key): value for key, value in file.attrs.items()}
+                arrays = {str(name): np.asarray(file[str(name)]) for name in file}
+        except (OSError, RuntimeError, KeyError) as error:
+            raise fail(f"cannot be read: {error}", file=path, advice=_ADVICE) from error
+        if attributes.pop("format", None) != FORMAT:
+            raise fail("is a checkpoint of another format", file=path, advice=_ADVICE)
+        if attributes.pop("content", None) != digest(*(arrays[name] for name in sorted(arrays))):
+            raise fail("the content is not what was written", file=path, advice=_ADVICE)
+        before: dict[str, str] = json.loads(str(attributes.pop("fingerprint", "{}")))
+        keys = sorted({*before, *self.fingerprint})
+        changed = [key for key in keys if before.get(key) != self.fingerprint.get(key)]
+        if changed:
+            what = ", ".join(
+                f"{k} ({before.get(k, 'none')[:12]} → {self.fingerprint.get(k, 'none')[:12]})"
+                for k in changed
+            )
+            raise fail(f"was sampled with other {what}", file=path, advice=_ADVICE)
+        return arrays, attributes
