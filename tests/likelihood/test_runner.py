@@ -15,6 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from frame_run import frame_run
+from jax import monitoring
+from small_run import SEED, SMALL
 
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
@@ -312,3 +314,22 @@ def test_small_sets_are_neither_shared_nor_kept(tmp_path):
     small = made(runner=runner)
     assert not small.layout.large
     assert small.runner == Runner(runner.threads, progress=print)
+
+
+def test_a_pass_leaves_its_programs_to_what_comes_after_it():
+    """A device that is asked for by name is part of what JAX knows a program by: on one device none is."""
+    calset = simulate(SMALL, seed=SEED).calset
+    likelihood = Likelihood.of(calset, base_model(calset))
+    values, built = likelihood.model.start, []
+
+    def heard(event, seconds, **about):
+        if event.endswith("jaxpr_trace_duration"):
+            built.append(about.get("fun_name", ""))
+
+    likelihood.expand(values)
+    monitoring.register_event_duration_secs_listener(heard)
+    try:
+        likelihood.jacobian(values)
+    finally:
+        monitoring.unregister_event_duration_listener(heard)
+    assert not [name for name in built if "residuals" in name]

@@ -149,6 +149,10 @@ class Runner:
 
         def on_device(entry: tuple[int, int]) -> SlabSums:
             place, number = entry
+            if (
+                len(devices) == 1
+            ):  # programs belong to the device that was asked for: without asking they are shared
+                return work(number)
             with jax.default_device(devices[place % len(devices)]):
                 return work(number)
 

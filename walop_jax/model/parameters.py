@@ -178,8 +178,11 @@ def _key(entry: Any) -> str:
 def values_of(component: Component) -> Vector:
     """The parameters of a component as one vector."""
     arrays = jax.tree_util.tree_leaves(component)
-    chosen = [jnp.ravel(arrays[i]) for i, _ in parameter_places(component)]
-    return jnp.concatenate(chosen) if chosen else jnp.zeros(0)
+    chosen = [arrays[i] for i, _ in parameter_places(component)]
+    if not any(isinstance(array, jax.core.Tracer) for array in chosen):
+        # By numpy: operations of JAX outside of a program are each compiled as one of their own.
+        return jnp.asarray(np.concatenate([np.zeros(0), *map(np.ravel, chosen)]))
+    return jnp.concatenate([jnp.ravel(array) for array in chosen])
 
 
 def shapes_of(tree: Any) -> tuple[Any, Shapes]:
@@ -193,17 +196,20 @@ def of_shapes(structure: Any, shapes: Shapes) -> Any:
     return jax.tree_util.tree_unflatten(structure, [jax.ShapeDtypeStruct(s, d) for s, d in shapes])
 
 
-def with_values(component: AnyComponent) -> Callable[[Vector], AnyComponent]:
-    """The function that puts a vector of parameters in the place of those of a component."""
+def with_values(component: AnyComponent) -> Callable[[Vector | np.ndarray], AnyComponent]:
+    """The function that puts a vector of parameters in the place of those of a component.
+
+    A vector of numpy is cut by numpy, without a program.
+    """
     arrays, structure = jax.tree_util.tree_flatten(component)
     places = [i for i, _ in parameter_places(component)]
     shapes = [np.shape(arrays[i]) for i in places]
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]
 
-    def replaced(values: Vector) -> AnyComponent:
-        filled = list(arrays)
-        for i, part, shape in zip(places, jnp.split(values, ends), shapes, strict=True) if places else ():
-            filled[i] = part.reshape(shape)
+    def replaced(values: Vector | np.ndarray) -> AnyComponent:
+        filled, split = list(arrays), np.split if isinstance(values, np.ndarray) else jnp.split
+        for i, part, shape in zip(places, split(values, ends), shapes, strict=True) if places else ():
+            filled[i] = jnp.asarray(part.reshape(shape))
         return jax.tree_util.tree_unflatten(structure, filled)
 
     return replaced

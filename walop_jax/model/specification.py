@@ -133,7 +133,7 @@ class Model:
 
     def instrument(self, values: Vector | None = None) -> Instrument:
         """The instrument at a full vector of values (default: start values)."""
-        return with_values(self.template)(jnp.asarray(self.start if values is None else values))
+        return with_values(self.template)(np.asarray(self.start if values is None else values, float))
 
 
 def series_indices(instrument: Instrument) -> tuple[int, ...]:
