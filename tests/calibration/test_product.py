@@ -21,8 +21,55 @@ from walop_jax.calibration.product import (
 )
 from walop_jax.data import DataError, read_calibration_set
 from walop_jax.data.frames import Grid
+from walop_jax.fit.model_builder import model_without_data
+from walop_jax.fit.model_file import render
+from walop_jax.model.effects import Context, Described
+from walop_jax.model.effects.sentence import OPTICAL
+from walop_jax.model.specification import with_effects
 
 NAN = float("nan")
+STARS = [("HD_14069", 0.01, 0.02)]
+HEADS = (
+    *(f"{kind} behind half1.plate" for kind in OPTICAL),
+    "turn of polariser",
+    "gain of O1",
+    "gain of half2",
+    "light of E1 in O1",
+    "light of opposite in O1",
+    "light in E2",
+    "afterglow in O1",
+    "fringes of half1.plate * gap 10.0775",
+    "polarisation q of sky * exposure 4",
+    "polarisation u of HD_14069",
+    "polarisation of sky",
+    "displacement x ahead of pupil",
+    "displacement y ahead of pupil",
+    "shift of band",
+    "axis of half2.plate.mgf2",
+    "cut of chwp.quartz",
+    "thickness of half1.plate.mgf2",
+    "thermal of chwp",
+)
+FACTORS = (
+    "x",
+    "y",
+    "r2",
+    "x2-y2",
+    "xy",
+    "colour",
+    "hours",
+    "hour angle",
+    "kelvin",
+    "counts",
+    "ring 3",
+    "cos 2 CLP",
+    "sin 1 CHWP",
+    "hours 3 to 20.5",
+    "hours -0.5 to 2",
+    "exposure 12",
+    "x * hours",
+)
+TOLD = (*HEADS, *(f"{head} * {factor}" for head, factor in zip(HEADS, FACTORS, strict=False)))
 
 
 @pytest.fixture
@@ -66,6 +113,38 @@ def path(product, tmp_path):
     path = tmp_path / "calibration.fits"
     write_product(path, product)
     return path
+
+
+def test_parameters_of_every_description_come_back(product, tmp_path):
+    """Every kind at a place and every factor, as a diagnosis names them: in the product and in its model."""
+    effect = Described.saying(TOLD, np.arange(len(TOLD)) / 7e3)
+    model = with_effects(model_without_data("WALOP-SOUTH", standards=STARS), [effect], Context())
+    names = [name for name in model.names if name.startswith("described.")]
+    assert len(set(names)) == len(TOLD)
+    n = len(names)
+    table = ParameterTable(
+        name=np.array(names),
+        value=np.arange(n) / 7.0,
+        sigma=np.ones(n),
+        unit=np.array([model[name].unit for name in names]),
+        prior_mean=np.zeros(n),
+        prior_width=np.ones(n),
+        free=np.ones(n, bool),
+    )
+    path, lines = tmp_path / "found.fits", tuple(map(in_ascii, render(model).splitlines()))
+    write_product(path, dataclasses.replace(product, parameters=table, covariance=np.eye(n), model=lines))
+    again = read_product(path)
+    assert again.parameters.name.tolist() == names
+    carried = model_without_data("WALOP-SOUTH", "\n".join(again.model), standards=STARS)
+    assert carried.names == model.names
+    assert carried.start == pytest.approx(model.start)
+
+
+def test_a_name_that_could_not_be_read_is_not_written(product, tmp_path):
+    names = np.array(["pupil.magnification", "collimator q", "throughput.n0.p00"])
+    odd = dataclasses.replace(product, parameters=dataclasses.replace(product.parameters, name=names))
+    with pytest.raises(DataError, match="'collimator q' is not a parameter name"):
+        write_product(tmp_path / "odd.fits", odd)
 
 
 def assert_equal(one, other):

@@ -60,6 +60,7 @@ from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.fits_reading import UNREADABLE, OpenFile, one_line, open_fits
 from walop_jax.likelihood.expansion import STATED
+from walop_jax.model.parameters import NAME
 
 __all__ = [
     "PRODVERS",
@@ -100,7 +101,8 @@ def write_product(
 ) -> None:
     """Write a calibration product with checksums; the file appears whole or not at all.
 
-    Raises `DataError` if the file exists and `overwrite` is False, and if the folder is missing or read-only.
+    Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only, and for a
+    parameter whose name could not be read again.
     """
     with atomic_path(path, overwrite=overwrite) as temporary:
         sign_and_write(_hdus(product, path), temporary)
@@ -108,6 +110,9 @@ def write_product(
 
 def _hdus(product: CalibrationProduct, path: object) -> list[Any]:
     parameters = product.parameters
+    for name in parameters.name.tolist():
+        if not NAME.fullmatch(name):
+            raise fail(f"{name!r} is not a parameter name", file=path, extension="PARAMETERS", column="NAME")
     tables = {
         "PARAMETERS": {name: getattr(parameters, name.lower()) for name in _RULES["PARAMETERS"]},
         "FILTERS": filter_columns(product.filters),
@@ -283,7 +288,7 @@ def _parameters(table: dict[str, Any] | None, place: Place) -> ParameterTable:
     for name in names:
         if names.count(name) > 1:
             raise place.fail(f"{name!r} is there twice", "NAME", "make the product again")
-        if not re.fullmatch(r"[\w.+-]+", name):
+        if not NAME.fullmatch(name):
             raise place.fail(f"{name!r} is not a parameter name", "NAME", "make the product again")
     for column in ("VALUE", "SIGMA"):
         if not np.all(np.isfinite(table[column])):

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
@@ -26,6 +27,9 @@ NUMBER = "walop_jax.number"
 
 Vector = Float[Array, " n"]
 Shapes = tuple[tuple[tuple[int, ...], str], ...]
+NAME = re.compile(r"[A-Za-z0-9_.+*-]+")
+"""The names that a parameter may have, in a model as in every file that is written or read."""
+
 AnyComponent = TypeVar("AnyComponent", bound="Component")
 
 

@@ -19,7 +19,7 @@ from walop_jax.model.conventions import EXTINCTION
 from walop_jax.model.effects import effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import leaves, unknown_name, values_of, with_values
+from walop_jax.model.parameters import NAME, leaves, unknown_name, values_of, with_values
 
 Vector = Float[np.ndarray, " n"]
 
@@ -55,6 +55,8 @@ class Model:
     def __post_init__(self) -> None:
         names = self.names
         for p in self.parameters:
+            if not NAME.fullmatch(p.name):
+                raise ValueError(f"parameter {p.name!r}: a name has letters, digits and _ . + - * only")
             if not np.isfinite(p.start):
                 raise ValueError(f"parameter {p.name}: start value {p.start} is not finite")
             if p.prior is not None and not (np.isfinite(p.prior[0]) and p.prior[1] > 0):

@@ -1,5 +1,6 @@
 """Sentences do what effects of the catalogue do that are known by another name, and what Mueller algebra says."""
 
+import itertools
 import json
 
 import effect_scenes as scenes
@@ -12,7 +13,8 @@ from walop_jax.fit.model_file import render
 from walop_jax.model import mueller
 from walop_jax.model.carried import left_behind
 from walop_jax.model.effects import Described, effect_by_name
-from walop_jax.model.effects.sentence import Sentence
+from walop_jax.model.effects.sentence import _PLAIN, KINDS, Sentence
+from walop_jax.model.parameters import NAME
 
 
 def said(*sentences, values):
@@ -225,6 +227,14 @@ def test_sentences_are_read_as_they_are_written():
     assert Sentence.parsed("turn of polariser * sin 2 CLP").in_words() == (
         "turn of polariser, as the sine of 2 × the angle of CLP"
     )
+
+
+def test_every_kind_with_every_factor_is_a_parameter_name():
+    plain = (*_PLAIN, "ring 3", "cos 2 CLP", "sin 1 CHWP", "hours -0.5 to 20.5", "exposure 12", "gap 10.0775")
+    for kind, factor in itertools.product(KINDS, plain):
+        description = Sentence(kind, "behind", "half1.plate", (factor, "x"), "O1")
+        assert Sentence.parsed(description.text) == description
+        assert NAME.fullmatch(f"described.{description.label}")
 
 
 def test_a_model_file_carries_sentences():
