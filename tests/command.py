@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from walop_jax.cli.app import app
+from walop_jax.commands.program import app
 
 Call = Callable[..., Any]  # gives a `Result`: typer brings its own click, or uses an installed one
 

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
 from walop_jax.cli.app import COMMANDS
+
 from walop_jax.cli.docs import about, pages
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -29,6 +29,7 @@ ROOMS = (
     "reports",
     "runs",
     "cli",
+    "commands",
 )
 OWNERS = {
     "astropy": {"io", "data", "sky", "calibration", "diagnosis"},
@@ -38,8 +39,8 @@ OWNERS = {
     "matplotlib": {"reports"},
     "corner": {"reports"},
     "jinja2": {"reports"},
-    "typer": {"cli"},
-    "rich": {"cli"},
+    "typer": {"cli", "commands"},
+    "rich": {"cli", "commands"},
     "tomlkit": {"cli", "model", "fit"},
 }
 # Imported by nobody: tools of the tests, and what there is no need of.
@@ -53,9 +54,9 @@ def files() -> list[Path]:
 
 
 def room_of(module: str) -> str | None:
-    """The room of a dotted module name; None for the package's door itself."""
+    """The room of a dotted module name; None for the package's door itself, and for `python -m`."""
     parts = module.split(".")
-    return parts[1] if len(parts) > 1 else None
+    return parts[1] if len(parts) > 1 and parts[1] != "__main__" else None
 
 
 def imports(tree: ast.AST, module: str, is_package: bool) -> Iterator[tuple[int, str]]:
@@ -91,7 +92,7 @@ def complaints(source: str, module: str, is_package: bool = False) -> list[str]:
             found.append(f"{where}: only {sorted(OWNERS[top])} may import {top}")
         if top in STRANGERS:
             found.append(f"{where}: {top} has no business in the package")
-    if room != "cli":
+    if room not in ("cli", "commands"):
         for node in ast.walk(ast.parse(source)):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print":
                 found.append(f"{module}:{node.lineno}: prints; that is the business of cli")

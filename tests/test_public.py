@@ -52,7 +52,7 @@ COMMANDS = (
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_function_has_the_name_of_its_command(name: str):
-    from walop_jax.cli.app import COMMANDS as commands
+    from walop_jax.commands import COMMANDS as commands
 
     assert name in commands
     assert callable(getattr(walop_jax, name))

@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 
 import pytest
-
 from walop_jax.cli.app import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]

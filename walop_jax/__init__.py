@@ -22,6 +22,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from walop_jax.calibration.calibration import Calibration
     from walop_jax.calibration.residual_map import residual_map
+    from walop_jax.commands.certify import certify
+    from walop_jax.commands.refit import refit
+    from walop_jax.commands.simulate import simulate
     from walop_jax.data.from_arrays import from_arrays
     from walop_jax.data.settings import Settings
     from walop_jax.data.write import write_calibration_set
@@ -40,20 +43,17 @@ if TYPE_CHECKING:
     from walop_jax.posterior import Options
     from walop_jax.runs.from_python import (
         apply,
-        certify,
         compare,
         diagnose,
         epoch,
         limits,
         matrix,
-        refit,
         report,
         sample,
         trace,
     )
     from walop_jax.runs.reading import Run, read
     from walop_jax.simulation.observing_plan import ObservingPlan
-    from walop_jax.simulation.simulate import simulate
 
 __version__ = "0.1.0"
 
@@ -111,7 +111,7 @@ _HOME = {
     "Sightline": ("model.trace", "Sightline"),
     "apply": ("runs.from_python", "apply"),
     "base_model": ("fit.model_builder", "base_model"),
-    "certify": ("runs.from_python", "certify"),
+    "certify": ("commands.certify", "certify"),
     "compare": ("runs.from_python", "compare"),
     "describe_misfit": ("fit.misfit", "describe"),
     "diagnose": ("runs.from_python", "diagnose"),
@@ -123,11 +123,11 @@ _HOME = {
     "nominal_instrument": ("model.build", "nominal_instrument"),
     "param": ("model.parameters", "param"),
     "read": ("runs.reading", "read"),
-    "refit": ("runs.from_python", "refit"),
+    "refit": ("commands.refit", "refit"),
     "report": ("runs.from_python", "report"),
     "residual_map": ("calibration.residual_map", "residual_map"),
     "sample": ("runs.from_python", "sample"),
-    "simulate": ("simulation.simulate", "simulate"),
+    "simulate": ("commands.simulate", "simulate"),
     "trace": ("runs.from_python", "trace"),
     "with_effects": ("model.specification", "with_effects"),
     "write_calibration_set": ("data.write", "write_calibration_set"),

@@ -6,8 +6,9 @@ import re
 
 import pytest
 
-from walop_jax.cli.app import COMMANDS
-from walop_jax.cli.common import step_counter
+from walop_jax.commands import COMMANDS
+from walop_jax.commands.program import step_counter
+from walop_jax.io.heartbeat import Stage
 
 RANDOM = ("simulate", "sample", "diagnose", "limits", "compare")
 
@@ -44,10 +45,10 @@ def test_help_tells_exit_codes_and_completion(call):
 def test_steps_are_counted():
     say = step_counter(("reading", "fitting"))
     assert say("waking up") == "waking up"
-    assert say("reading a.fits") == "step 1 of 2: reading a.fits"
-    assert say("χ² 12") == "step 1 of 2: χ² 12"
-    assert say("fitting") == "step 2 of 2: fitting"
-    assert say("reading again") == "step 2 of 2: reading again"
+    assert say(Stage("a.fits is read", "reading")) == "step 1 of 2: a.fits is read"
+    assert say("fitting begins with a χ² of 12") == "step 1 of 2: fitting begins with a χ² of 12"
+    assert say(Stage("minimum", "fitting")) == "step 2 of 2: minimum"
+    assert say(Stage("again", "reading")) == "step 2 of 2: again"
 
 
 def test_cite_as_bibtex(call):

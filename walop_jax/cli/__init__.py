@@ -1,28 +1,12 @@
-"""The command line: parse, call one function per command, print. Nothing is computed here.
-
-Heavy imports stand inside the commands, so that help appears at once.
-"""
+"""Commands that have not moved to the room `commands` yet."""
 
 from __future__ import annotations
 
-import os
-import sys
+import importlib
 
 INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
 
 
 def main() -> None:
-    """Run the program: the entry point. An interrupt ends it with one line, from the first import on."""
-    # Before numpy is imported. Its matrices have a hundred rows here: threads cost more than they give
-    # (a refit of 169 points took 8.9 s with them, 6.1 s without, on two cores). JAX has its own threads.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # A path may hold bytes that are no text.
-    sys.stdout.reconfigure(errors="backslashreplace")  # pyright: ignore[reportAttributeAccessIssue]
-    try:
-        from walop_jax.cli.app import app
-
-        app()
-    except KeyboardInterrupt:
-        sys.stderr.write("walop-jax: error: interrupted; nothing was left half-written\n")
-        raise SystemExit(INTERRUPTED) from None
+    """Run the program."""
+    importlib.import_module("walop_jax.commands").main()

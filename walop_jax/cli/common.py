@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import inspect
 import os
 import sys
 import time
@@ -78,6 +79,26 @@ PosteriorOption = Annotated[
 OutputTable = Annotated[
     Path, typer.Option("--output", "-o", metavar="OUT", help="Table to write (.fits, .csv, .ecsv).")
 ]
+
+
+_UNUSED_SEED = Annotated[int | None, typer.Option("--seed", hidden=True)]
+
+
+def accepting_seed(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with `--seed`, which every command takes: not shown, and without effect, where nothing is random."""
+    signature = inspect.signature(command, eval_str=True)
+    if "seed" in signature.parameters:
+        return command
+
+    @functools.wraps(command)
+    def run(*args: Any, seed: int | None = None, **kwargs: Any) -> None:
+        del seed
+        command(*args, **kwargs)
+
+    seed = inspect.Parameter("seed", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=_UNUSED_SEED)
+    run.__signature__ = signature.replace(parameters=[*signature.parameters.values(), seed])  # type: ignore[attr-defined]
+    run.__annotations__ = {name: p.annotation for name, p in run.__signature__.parameters.items()}  # type: ignore[attr-defined]
+    return run
 
 
 UNTRUSTED = 3

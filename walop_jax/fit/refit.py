@@ -21,6 +21,7 @@ from walop_jax.fit.parameter_table import HEAD, parameter_notes, parameter_rows,
 from walop_jax.fit.robust import robust_errors
 from walop_jax.fit.search import find_minimum, free_scales
 from walop_jax.io.display import Display, Displayed
+from walop_jax.io.heartbeat import Stage
 from walop_jax.io.software import software_versions
 from walop_jax.likelihood.expansion import STATED, Posterior
 from walop_jax.likelihood.journal import Journal, fingerprint
@@ -319,7 +320,8 @@ def refit(
     journal = None if folder is None else _journal(Path(folder), calset, model, crew)
     runner = Runner(processes=crew, progress=progress, journal=journal)
     likelihood = Likelihood.of(calset, model, memory=memory, runner=runner)
-    runner.tell(f"preparing the fit; data will take {likelihood.layout.memory / 1e9:.2g} GB")
+    size = f"{likelihood.layout.memory / 1e9:.2g} GB"
+    runner.tell(Stage(f"preparing the fit; data will take {size}", "fitting"))
     return with_honest_errors(fit(likelihood))
 
 

@@ -12,6 +12,18 @@ Tell = Callable[[str], None]
 EVERY = 15.0  # s
 
 
+class Stage(str):
+    """A message of progress that begins a stage of the work: `stage` is its name, whatever the message says."""
+
+    stage: str
+
+    def __new__(cls, text: str, stage: str) -> Stage:
+        """Make the message `text`, which begins `stage`."""
+        self = super().__new__(cls, text)
+        self.stage = stage
+        return self
+
+
 @contextlib.contextmanager
 def repeated(tell: Tell, every: float = EVERY) -> Generator[Tell, None, None]:
     """A function that tells what is being done, and tells it again, with how long, after `every` s of silence.

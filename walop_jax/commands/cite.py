@@ -1,0 +1,50 @@
+"""`walop-jax cite`: where the physics of a model comes from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from walop_jax.commands.command import Argument, Job, Option, Outcome, command
+from walop_jax.commands.inputs import catalogue_of
+from walop_jax.commands.options import Effects, PathLike
+from walop_jax.io.errors import errors_naming
+
+if TYPE_CHECKING:
+    from walop_jax.model.references import Reference
+
+RUN = Argument("Run, or its calibration.fits; default: the base model.", "[RUN]", Path)
+
+
+@command()
+def cite(
+    job: Job,
+    run: Annotated[PathLike | None, RUN] = None,
+    *,
+    bibtex: Annotated[bool, Option("As BibTeX entries.")] = False,
+    effects: Effects = None,
+) -> Outcome[tuple[Reference, ...]]:
+    """List the sources of the physics in a fitted model, effects included."""
+    from walop_jax import __version__
+    from walop_jax.calibration.calibration import model_of_product
+    from walop_jax.calibration.from_file import product_path
+    from walop_jax.calibration.product import read_product
+    from walop_jax.fit import solver
+    from walop_jax.fit.model_builder import model_without_data
+    from walop_jax.model.bibtex import bibtex as entries
+    from walop_jax.model.build import nominal_instrument
+    from walop_jax.model.references import Reference, references
+
+    if run is None:
+        model = model_without_data(nominal_instrument())
+    else:
+        path = product_path(run)
+        with errors_naming(path):
+            model = model_of_product(read_product(path), catalogue_of(effects))
+    found = (*references(model), Reference("fit", solver.SOURCE))
+    lines = [f"{entry.what}: {entry.source}" for entry in found]
+    return Outcome(
+        found,
+        lambda: [{"what": entry.what, "source": entry.source} for entry in found],
+        lambda: entries(found, __version__) if bibtex else "\n".join(lines),
+    )

@@ -1,0 +1,75 @@
+"""`walop-jax clip`: a calibration set with its outliers flagged."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+from walop_jax.commands.command import Job, Option, Outcome, command
+from walop_jax.commands.inputs import IN_MEMORY, catalogue_of, set_and_model
+from walop_jax.commands.options import Effects, InstrumentLike, ModelLike, SetFile, Sets
+from walop_jax.io.errors import fail
+from walop_jax.io.heartbeat import Stage
+
+if TYPE_CHECKING:
+    from walop_jax.fit.outliers import Clipped
+
+SIGMA = Option("Standard errors beyond which a row is flagged, at least 3.", "N")
+
+
+@command(stages=("reading", "fitting", "writing"), writes="file")
+def clip(
+    job: Job,
+    data: Sets,
+    *,
+    output: SetFile = None,
+    sigma: Annotated[float, SIGMA] = 5.0,
+    model: ModelLike = None,
+    instrument: InstrumentLike = None,
+    effects: Effects = None,
+) -> Outcome[Clipped]:
+    """Flag single intensities that lie far from a fit of all others: cosmic rays, stars in a patch of sky.
+
+    SET.fits holds the same rows, with FLAG 2 where a camera lies more than N standard errors off; flagged rows are not
+    used by any command. The set is fitted anew until nothing lies off any more.
+
+    What the model lacks lies off as well, but in many rows: if these are more than 5 %, or the fit of what is left is
+    not to be trusted, the set is written with a warning, exit code 3. Look for the cause with walop-jax diagnose then,
+    on the set as it was.
+
+    In Python: the set (`calset`), the fit (`result`) and the number of `rows` that were flagged. Raises `DataError` for
+    frames and for what was compressed, ValueError for `sigma` below 3.
+    """
+    from walop_jax.data.table_intensities import TableIntensities
+    from walop_jax.data.write import write_calibration_set
+    from walop_jax.fit.outliers import clipped
+
+    job.tell("reading", "reading")
+    calset, chosen = set_and_model(data, model, instrument, catalogue_of(effects))
+    if not isinstance(calset.intensities, TableIntensities) or calset.compression is not None:
+        raise fail(
+            "cannot be clipped",
+            file=calset.inputs[0].path if calset.inputs else IN_MEMORY,
+            advice="only tables of intensities can; of frames the reduction flags cosmic rays, in FLAG",
+        )
+    with job.repeated() as say:
+        say(Stage("fitting", "fitting"))
+        found = clipped(calset, chosen, sigma)
+    job.tell("writing", "writing")
+    if output is not None:
+        write_calibration_set(output, found.calset, overwrite=job.overwrite)
+    share = f"{100 * found.share:.2g} %"
+    warnings = [f"the fit of what is left: {sentence}" for sentence in found.result.warnings]
+    if found.too_many:
+        warnings.insert(
+            0,
+            f"{share} of the rows lie off: that is not single intensities but something that the "
+            "model lacks; walop-jax diagnose looks for it",
+        )
+    ratio = found.result.chi2 / max(found.result.dof, 1)
+    return Outcome(
+        found,
+        lambda: {"output": str(output), "sigma": sigma, "clipped": found.rows, "used": found.used},
+        lambda: f"{found.rows} of {found.used} rows flagged ({share}), χ²/dof {ratio:.4f}: {output}",
+        warnings=warnings,
+        trusted=found.result.trusted and not found.too_many,
+    )

@@ -1,0 +1,253 @@
+"""What makes a function a command: the record that it works with, the outcome that it returns, and a decorator.
+
+The body of a command takes a `Job` and its own arguments, and returns an `Outcome`. The decorator makes two faces of
+it: the Python function, which takes `overwrite`, `progress` and `seed` beside those arguments and returns the value;
+and the command of the program, whose options are the annotated parameters (`program.py`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import inspect
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+
+from walop_jax.commands import door
+from walop_jax.io.heartbeat import Stage
+
+if TYPE_CHECKING:
+    from walop_jax.io.folder import OutputFolder
+
+T = TypeVar("T")
+Tell = Callable[[str], None]
+Writers = Mapping[str, Callable[[Path], object]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """A parameter as an option of the program: `--name VALUE`, or `-o` as well; a `bool` is a switch.
+
+    `kind` is the type of what is typed (default: that of the annotation). `required` holds on the command line only,
+    where results that are not written would be lost.
+    """
+
+    help: str
+    metavar: str | None = None
+    kind: Any = None
+    short: str = ""
+    required: bool = False
+    least: float | None = None
+
+
+class Argument(Option):
+    """A parameter as an argument of the program, by its position."""
+
+
+class UsageError(ValueError):
+    """Arguments that cannot be meant; exit code 2 on the command line. `option` is the one that is wrong."""
+
+    def __init__(self, message: str, option: str | None = None) -> None:
+        super().__init__(message)
+        self.option = option
+
+
+def _silent(text: str) -> None:
+    pass
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """How a command is to work, apart from its own arguments.
+
+    `overwrite`: replace outputs that exist. `seed`: of random numbers. `progress` is told what is being done. `folder`
+    is the reserved folder of results (None: nothing is written). `typed`: on the command line, not from Python.
+    """
+
+    overwrite: bool = False
+    seed: int = 0
+    progress: Tell = _silent
+    folder: OutputFolder | None = None
+    typed: bool = False
+    began: float = dataclasses.field(default_factory=time.perf_counter)
+
+    def tell(self, text: str, stage: str = "") -> None:
+        """Say what is being done; `stage` is the one of the command that begins with it."""
+        self.progress(Stage(text, stage) if stage else text)
+
+    @property
+    def seconds(self) -> float:
+        """The time since the command began."""
+        return time.perf_counter() - self.began
+
+    @contextlib.contextmanager
+    def repeated(self) -> Iterator[Tell]:
+        """`progress`, told again where nothing new can be said for long."""
+        from walop_jax.io.heartbeat import repeated
+
+        with repeated(self.progress) as say:
+            yield say
+
+    @contextlib.contextmanager
+    def reserved(self, output: str | os.PathLike[str] | None, names: Sequence[str]) -> Iterator[Job]:
+        """The job with the folder `output` reserved for the files `names` (None: nothing is written)."""
+        if output is None:
+            yield self
+            return
+        from walop_jax.io.folder import output_folder
+
+        with output_folder(output, names, overwrite=self.overwrite) as folder:
+            yield dataclasses.replace(self, folder=folder)
+
+    def use_jax(self) -> None:
+        """Switch JAX on, for commands that most often do without it."""
+        if self.typed:
+            from walop_jax.commands.program import switch_on_jax
+
+            switch_on_jax()
+
+
+def _nothing() -> Writers:
+    return {}
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome(Generic[T]):
+    """What a command has found: `value` for Python; the rest is worked out when it is asked for.
+
+    `document` is the result as plain data, `text` as a terminal shows it. `files` write the files of the output folder,
+    each given its path; the document is written as the file `saved_as`. `warnings` are sentences to bear in mind.
+    `failure` says what has gone wrong (exit code 1), `trusted` whether the result can be used (exit code 3 if not).
+    `silent`: nothing of it is shown.
+    """
+
+    value: T
+    document: Callable[[], Any]
+    text: Callable[[], str]
+    files: Callable[[], Writers] = _nothing
+    saved_as: str = ""
+    warnings: Sequence[str] = ()
+    failure: str = ""
+    trusted: bool = True
+    silent: bool = False
+
+    @functools.cached_property
+    def content(self) -> Any:
+        """The document, made once."""
+        return self.document()
+
+    def save(self, folder: OutputFolder, drop: Sequence[str] = ()) -> None:
+        """Put all files into the output folder: they appear together, or none does."""
+        from walop_jax.io.text import json_text
+
+        with folder.filled(drop=drop) as temporary:
+            for name, write in self.files().items():
+                write(temporary / name)
+            if self.saved_as:
+                (temporary / self.saved_as).write_text(json_text(self.content), encoding="utf-8")
+
+
+COMMON = {
+    "overwrite": (False, Option("Replace outputs that exist.")),
+    "progress": (None, None),
+    "seed": (0, Option("Seed of random numbers (default: 0).", kind=int)),
+}
+"""The parameters that every command takes in Python, with their defaults, and their options."""
+
+OLDER = {"catalogue": "effects", "estimator": "debias", "filter_name": "filter"}
+"""Names that arguments have had, and have still."""
+
+
+class Command(Generic[T]):
+    """A command: called, it is the Python function; `job` and `run` are what the program calls."""
+
+    def __init__(
+        self,
+        body: Callable[..., Outcome[T]],
+        stages: Sequence[str],
+        writes: Sequence[str] | Literal["file"] | None,
+        random: bool,
+        jax: bool,
+        given: Callable[[tuple[Any, ...], dict[str, Any]], tuple[tuple[Any, ...], dict[str, Any]]] | None,
+    ) -> None:
+        functools.update_wrapper(self, body)
+        self.name = body.__name__
+        self.body, self.stages, self.writes, self.random, self.jax = body, tuple(stages), writes, random, jax
+        self._given = given
+        self.own = tuple(inspect.signature(body).parameters.values())[1:]
+
+    @property
+    def __signature__(self) -> inspect.Signature:
+        """The signature of the Python function."""
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        common = [
+            inspect.Parameter(name, keyword, default=default, annotation=kind)
+            for (name, (default, _)), kind in zip(COMMON.items(), ("bool", "Tell | None", "int"), strict=True)
+            if name != "overwrite" or self.writes is not None
+        ]
+        own = list(self.own)
+        rest = [own.pop()] if own and own[-1].kind is inspect.Parameter.VAR_KEYWORD else []
+        return inspect.Signature([*own, *common, *rest])
+
+    @functools.cached_property
+    def options(self) -> dict[str, Option]:
+        """What the program can be given, by parameter: its own options, then those that all commands share."""
+        found = {}
+        for parameter in self.own:
+            for note in getattr(door.annotation(self.body, parameter), "__metadata__", ()):
+                if isinstance(note, Option):
+                    found[parameter.name] = note
+        return found
+
+    def __call__(self, *args: Any, **kwargs: Any) -> T:
+        """The value of the outcome."""
+        if self._given is not None:
+            args, kwargs = self._given(args, kwargs)
+        for old, new in OLDER.items():
+            if (
+                old in kwargs
+                and old not in self.__signature__.parameters
+                and new in self.__signature__.parameters
+            ):
+                kwargs[new] = kwargs.pop(old)
+        bound = door.bound(self.name, self.__signature__, self.body, args, kwargs)
+        common = {name: bound.pop(name) for name in COMMON if name in bound}
+        common["progress"] = common.get("progress") or _silent
+        return self.run(Job(**common), bound).value
+
+    def run(self, job: Job, arguments: dict[str, Any]) -> Outcome[T]:
+        """Do the work, with results written as they are asked for."""
+        output = arguments.get("output")
+        if self.writes == "file" and output is not None:
+            from walop_jax.io.atomic import check_output
+
+            check_output(output, overwrite=job.overwrite)
+        names = () if self.writes is None or self.writes == "file" else self.writes
+        rest = [p.name for p in self.own if p.kind is inspect.Parameter.VAR_KEYWORD]
+        more = {name: value for key in rest for name, value in arguments.pop(key, {}).items()}
+        with job.reserved(output if names else None, names) as reserved:
+            found = self.body(reserved, **arguments, **more)
+            if reserved.folder is not None:
+                found.save(reserved.folder)
+        return found
+
+
+def command(
+    *,
+    stages: Sequence[str] = (),
+    writes: Sequence[str] | Literal["file"] | None = None,
+    random: bool = False,
+    jax: bool = True,
+    given: Callable[..., Any] | None = None,
+) -> Callable[[Callable[..., Outcome[T]]], Command[T]]:
+    """Make a command of a body `(job, …) -> Outcome`.
+
+    `stages` are those that its progress goes through, in their order; `writes` the files of its output folder, or
+    "file" if `output` is a single file; () if the body looks after its outputs itself. `random`: its seed matters.
+    `jax`: it computes. `given` may rearrange the arguments of a call in Python.
+    """
+    return lambda body: Command(body, stages, writes, random, jax, given)

@@ -1,0 +1,193 @@
+"""The public door: what a caller gives to a function, held against what the function asks for.
+
+An unknown keyword is an error with the nearest names, a wrong kind of argument one with what was given and what is
+wanted, before anything is done.
+"""
+
+from __future__ import annotations
+
+import builtins
+import collections.abc
+import functools
+import inspect
+import numbers
+import os
+import sys
+import types
+import typing
+from collections.abc import Callable, Mapping
+from typing import Any
+
+WORDS = {
+    "CalibrationSet": "a calibration set",
+    "Model": "a model",
+    "Calibration": "a calibration",
+    "FitResult": "a fit",
+    "Run": "a run",
+    "Instrument": "an instrument",
+    "ObservingPlan": "an observing plan",
+    "PathLike": "a path",
+    "Sequence": "several in a list",
+    "Mapping": "a dict",
+    "Callable": "a function",
+    "NoneType": "None",
+    "str": "a text",
+    "float": "a number",
+    "int": "a whole number",
+    "bool": "True or False",
+}
+"""Kinds of arguments, as messages name them."""
+
+
+class _Names(dict[str, Any]):
+    """The names that an annotation may use: of its module, of Python, and the public ones, loaded when asked for.
+
+    Those that are imported for type checkers only, and are not public, stand for anything.
+    """
+
+    load = True
+
+    def __missing__(self, name: str) -> Any:
+        import walop_jax
+
+        if hasattr(builtins, name):
+            return getattr(builtins, name)
+        return getattr(walop_jax, name, Any) if self.load else Any
+
+
+class _Light(_Names):
+    """The same without loading anything."""
+
+    load = False
+
+
+def annotation(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
+    """The annotation of a parameter, evaluated as far as it can be without loading anything heavy."""
+    text = parameter.annotation
+    return eval(text, {}, _Light(vars(sys.modules[function.__module__]))) if isinstance(text, str) else text
+
+
+def bound(
+    name: str, signature: inspect.Signature, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Any
+) -> dict[str, Any]:
+    """The arguments of a call by name, with defaults. Raises TypeError, in a sentence, for what does not fit."""
+    parameters = signature.parameters
+    kinds = {p.kind for p in parameters.values()}
+    if inspect.Parameter.VAR_KEYWORD not in kinds:
+        for key in kwargs:
+            if key not in parameters:
+                from walop_jax.io.errors import nearest
+
+                raise TypeError(f"{name}: there is no argument {key!r}; {nearest(key, parameters)}")
+    try:
+        found = signature.bind(*args, **kwargs)
+    except TypeError as error:
+        raise TypeError(f"{name}: {error}; the arguments are {_listed(signature)}") from None
+    hints = {key: _kind(function, p) for key, p in parameters.items() if key in found.arguments}
+    wrong = {
+        key: value
+        for key, value in found.arguments.items()
+        if parameters[key].kind not in (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+        and value is not parameters[key].default
+        and not _fits(value, hints[key])
+    }
+    for key, value in wrong.items():
+        swapped = [other for other in wrong if other != key and _fits(value, hints[other])]
+        advice = f"; exchange {key} and {swapped[0]}" if swapped else ""
+        raise TypeError(f"{name}: {key} is {_described(value)}, but {_wanted(hints[key])} is wanted{advice}")
+    found.apply_defaults()
+    return dict(found.arguments)
+
+
+def checked(function: Callable[..., Any], name: str) -> Callable[..., Any]:
+    """The function with its arguments looked at before the call."""
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def run(*args: Any, **kwargs: Any) -> Any:
+        bound(name, signature, function, args, kwargs)
+        return function(*args, **kwargs)
+
+    run.__module__, run.__qualname__ = "walop_jax", name  # where it is found again, by pickle as well
+    return run
+
+
+def _listed(signature: inspect.Signature) -> str:
+    return ", ".join(signature.parameters)
+
+
+def _kind(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
+    """The kind of argument that a parameter asks for; Any where that cannot be told."""
+    found, module = parameter.annotation, function.__module__
+    for _ in range(4):
+        if isinstance(found, str):
+            found = eval(found, {}, _Names(vars(sys.modules[module])))
+        elif typing.get_origin(found) is typing.Annotated:
+            found = typing.get_args(found)[0]
+        elif isinstance(
+            found, typing.ForwardRef
+        ):  # an alias of the options: its texts name what is imported there
+            found, module = found.__forward_arg__, "walop_jax.commands.options"
+    return found
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Whether a value is of a kind, as far as that can be told: a doubt is no error."""
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if origin is typing.Annotated:
+        return _fits(value, inner[0])
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(value, one) for one in inner)
+    if origin is typing.Literal:
+        return value in inner
+    if kind is None or kind is types.NoneType:
+        return value is None
+    if origin is type:
+        return isinstance(value, type)
+    if origin is collections.abc.Callable:
+        return callable(value)
+    kind = origin or kind
+    if kind in (collections.abc.Sequence, collections.abc.Collection, list, tuple):
+        if isinstance(value, str | bytes | Mapping) or not isinstance(value, collections.abc.Iterable):
+            return False
+        one = inner[0] if inner and kind is not tuple else Any
+        return not isinstance(value, list | tuple) or all(_fits(entry, one) for entry in value)
+    if kind is float:
+        return isinstance(value, numbers.Real) or _is_scalar(value)
+    if kind is int:
+        return isinstance(value, numbers.Integral) or _is_scalar(value)
+    if kind is bool:
+        return isinstance(value, bool | int) or type(value).__name__ == "bool"
+    if not isinstance(kind, type) or kind.__module__.startswith("jaxtyping"):
+        return True
+    return isinstance(value, kind)
+
+
+def _is_scalar(value: Any) -> bool:
+    return getattr(value, "shape", None) == ()
+
+
+def _described(value: Any) -> str:
+    """A value as a message names it."""
+    name = type(value).__name__
+    if isinstance(value, str | os.PathLike):
+        return f"the path {os.fspath(value)!r}" if isinstance(value, os.PathLike) else f"the text {value!r}"
+    if isinstance(value, bool | int | float) or value is None:
+        return repr(value)
+    return WORDS.get(name, f"a {name}")
+
+
+def _wanted(kind: Any) -> str:
+    """A kind as a message names it."""
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if origin is typing.Annotated:
+        return _wanted(inner[0])
+    if origin in (typing.Union, types.UnionType):
+        words = list(dict.fromkeys(_wanted(one) for one in inner if one is not types.NoneType))
+        if "a path" in words and "a text" in words:
+            words.remove("a text")
+        return " or ".join(words)
+    if origin is typing.Literal:
+        return " or ".join(repr(one) for one in inner)
+    name = getattr(origin or kind, "__name__", str(kind))
+    return WORDS.get(name, f"a {name}")

@@ -1,0 +1,94 @@
+"""`walop-jax model`: the model as a file to look at and to change."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from walop_jax.commands.command import Argument, Job, Option, Outcome, command
+from walop_jax.commands.inputs import catalogue_of, design_of, set_of
+from walop_jax.commands.options import Effects, InstrumentLike, PathLike
+from walop_jax.io.display import Display, Displayed
+
+if TYPE_CHECKING:
+    from walop_jax.data.records import CalibrationSet
+    from walop_jax.model.specification import Model
+
+SETS = Argument("Calibration sets that the model is for: standards, gauges.", "[CALSET...]", list[Path])
+FILE = Option("File to write; default: stdout.", "MODEL.toml", Path, "-o")
+EFFECT = Option("Add an effect; may be repeated.", "NAME", list[str])
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class ModelFile(Displayed):
+    """A model, its TOML text, and the file that it was written to (None: to no file)."""
+
+    model: Model
+    text: str
+    path: Path | None
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {
+            "instrument": self.model.name,
+            "effects": list(self.model.effect_names),
+            "output": None if self.path is None else str(self.path),
+            "parameters": {
+                p.name: {
+                    "start": p.start,
+                    "unit": p.unit,
+                    "prior": None if p.prior is None else list(p.prior),
+                    "free": p.free,
+                    "tie": p.tie,
+                    "about": p.about,
+                }
+                for p in self.model.parameters
+            },
+        }
+
+    def display(self) -> Display:
+        """Where it is and how large."""
+        where = self.model.name if self.path is None else self.path
+        return Display(
+            f"{where}: {len(self.model.parameters)} parameters, {len(self.model.free)} of them free"
+        )
+
+
+@command(writes="file")
+def model(
+    job: Job,
+    calsets: Annotated[CalibrationSet | PathLike | Sequence[PathLike] | None, SETS] = None,
+    *,
+    output: Annotated[PathLike | None, FILE] = None,
+    instrument: InstrumentLike = None,
+    effect: Annotated[Sequence[str] | None, EFFECT] = None,
+    effects: Effects = None,
+) -> Outcome[ModelFile]:
+    """Write the base model as a file: every parameter with unit, start, prior, free or not.
+
+    With calibration sets, the model that `refit` would fit to them. Change the file and give it to
+    `refit --model`.
+
+    In Python: a `ModelFile`, whose `model` is the model and `text` the file. Raises ValueError, with the nearest names,
+    for an unknown instrument or effect, and for an instrument that is not the sets'.
+    """
+    from walop_jax.fit.model_builder import effects_text, model_for, model_without_data
+    from walop_jax.fit.model_file import render
+    from walop_jax.io.atomic import atomic_path
+    from walop_jax.model.build import nominal_instrument
+
+    catalogue = catalogue_of(effects)
+    changes = effects_text(effect or ())
+    design = design_of(instrument)
+    if calsets:
+        made = model_for(set_of(calsets, design), changes, design, catalogue)
+    else:
+        made = model_without_data(design or nominal_instrument(), changes, catalogue=catalogue)
+    text = render(made)
+    if output is not None:
+        with atomic_path(output, overwrite=job.overwrite) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    found = ModelFile(made, text, None if output is None else Path(output))
+    return Outcome(found, found.document, lambda: text if output is None else found.display().text())

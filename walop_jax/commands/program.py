@@ -1,0 +1,308 @@
+"""The program `walop-jax`: options parsed, one function called for each command, its outcome printed."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import inspect
+import os
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from walop_jax.commands import COMMANDS, INTERRUPTED
+from walop_jax.commands.command import COMMON, Argument, Command, Job, Option, Outcome, UsageError
+
+CACHE_VARIABLE = "WALOP_JAX_CACHE"
+DEBUG_VARIABLE = "WALOP_JAX_DEBUG"
+LINE_EVERY = 10.0  # s, of progress that is no terminal's
+UNTRUSTED = 3
+"""Exit code of a command that has written a result which is not to be trusted."""
+
+HELP = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
+EXIT_CODES = (
+    "Exit codes: 0 done; 1 not done, or a check that does not hold, with one line on stderr; 2 wrong usage; 3 done, "
+    "but the result is not to be trusted; 130 interrupted."
+)
+QUIET = Option("Print nothing but warnings and errors.", short="-q", kind=bool)
+JSON = Option("Machine-readable result to stdout, nothing else.", kind=bool)
+
+app = typer.Typer(
+    name="walop-jax",
+    help="Calibrate the WALOP imaging polarimeters with one differentiable model of the instrument.\n\n"
+    "To begin: walop-jax refit CALSET -o RUN, then walop-jax report RUN.",
+    no_args_is_help=True,
+    context_settings=HELP,
+    epilog=EXIT_CODES,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+
+def _show_version(wanted: bool) -> bool:
+    if wanted:
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            typer.echo(version("walop-jax"))
+        except PackageNotFoundError:
+            typer.echo("unknown")
+        raise typer.Exit
+    return wanted
+
+
+@app.callback()
+def _program(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+# ------------------------------------------------------------------------------------- a command as typer sees it
+
+
+def _paragraphs(function: Callable[..., Any]) -> str:
+    """The docstring of a command without its line ends: the terminal wraps paragraphs, not the source."""
+    text = inspect.cleandoc(function.__doc__ or "").partition("\n\nIn Python:")[0]
+    return "\n\n".join(" ".join(part.split()) for part in text.split("\n\n"))
+
+
+def _in_short(function: Callable[..., Any]) -> str:
+    """The first sentence of a command's docstring, up to a colon or semicolon: its line in the list."""
+    return re.split(r"[:;.](?:\s|$)", _paragraphs(function))[0] + "."
+
+
+def _parameter(name: str, option: Option, default: Any, hidden: bool = False) -> inspect.Parameter:
+    """A parameter of the function that typer is given."""
+    kind = option.kind or type(default)
+    needed = default is inspect.Parameter.empty or option.required
+    if default is None and not option.required:
+        kind = kind | None
+    shown: dict[str, Any] = {"help": option.help, "metavar": option.metavar, "hidden": hidden}
+    shown |= {} if option.least is None else {"min": option.least}
+    if isinstance(option, Argument):
+        note = typer.Argument(**shown)
+    else:
+        names = (f"--{name.replace('_', '-')}", *([option.short] if option.short else []))
+        note = typer.Option(*names, **shown)
+    return inspect.Parameter(
+        name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=inspect.Parameter.empty if needed else default,
+        annotation=Annotated[kind, note],
+    )
+
+
+def _function(command: Command[Any]) -> Callable[..., None]:
+    """What typer calls: a function whose signature is made of the options of a command."""
+    defaults = {p.name: p.default for p in inspect.signature(command.body).parameters.values()}
+    parameters = [_parameter(name, option, defaults[name]) for name, option in command.options.items()]
+    for name, (default, option) in COMMON.items():
+        if option is not None and (name != "overwrite" or command.writes is not None):
+            parameters.append(_parameter(name, option, default, name == "seed" and not command.random))
+    parameters += [_parameter("quiet", QUIET, False), _parameter("json", JSON, False)]
+
+    def run(**given: Any) -> None:
+        _guarded(command, given)
+
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {p.name: p.annotation for p in parameters}
+    return run
+
+
+def _guarded(command: Command[Any], given: dict[str, Any]) -> None:
+    """Run a command, with every error turned into one line on stderr and an exit code.
+
+    With the environment variable WALOP_JAX_DEBUG set, errors keep their traceback.
+    """
+    try:
+        _run(command, given)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader of stdout has gone (`| head`): not an error, and Python must not complain at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise typer.Exit(1) from None
+    except KeyboardInterrupt:
+        complain("interrupted; nothing was left half-written")
+        raise typer.Exit(INTERRUPTED) from None
+    except MemoryError:
+        complain("out of memory: use fewer field points, or a machine with more")
+        raise typer.Exit(1) from None
+    except UsageError as error:
+        option = error.option and (
+            error.option.upper() if isinstance(command.options.get(error.option), Argument)
+            else f"--{error.option.replace('_', '-')}"
+        )  # fmt: skip
+        raise typer.BadParameter(str(error), param_hint=option) from None
+    except Exception as error:
+        if _is_interrupt(error):  # that came while a compiled library was imported
+            complain("interrupted; nothing was left half-written")
+            raise typer.Exit(INTERRUPTED) from None
+        if os.environ.get(DEBUG_VARIABLE) or type(error).__module__.split(".")[0] in ("typer", "click"):
+            raise
+        expected = isinstance(error, ValueError | OSError)
+        hint = "" if expected else f" (unexpected {type(error).__name__}; {DEBUG_VARIABLE}=1 shows where)"
+        complain(f"{error}{hint}")
+        raise typer.Exit(1) from None
+
+
+def _run(command: Command[Any], given: dict[str, Any]) -> None:
+    quiet, json = given.pop("quiet"), given.pop("json")
+    common = {name: given.pop(name) for name in COMMON if name in given}
+    if command.jax:
+        switch_on_jax()
+    with progress(quiet or json, command.stages) as tell:
+        found = command.run(Job(progress=tell, typed=True, **common), given)
+    if not found.silent:
+        _show(found, quiet, json)
+
+
+def _show(found: Outcome[Any], quiet: bool, json: bool) -> None:
+    """Print an outcome, and end with its exit code."""
+    for sentence in found.warnings:
+        warn(sentence)
+    if json:
+        from walop_jax.io.text import json_text
+
+        typer.echo(json_text(found.content), nl=False)
+    elif not quiet and (text := found.text()):
+        typer.echo(text.removesuffix("\n"))
+    if found.failure:
+        sys.stdout.flush()
+        complain(found.failure)
+        raise typer.Exit(1)
+    if not found.trusted:
+        raise typer.Exit(UNTRUSTED)
+
+
+def _is_interrupt(error: BaseException) -> bool:
+    """Whether an error was made of an interrupt by whoever caught it first."""
+    before: BaseException | None = error
+    for _ in range(20):
+        if before is None or isinstance(before, KeyboardInterrupt):
+            break
+        before = before.__cause__ or before.__context__
+    return isinstance(before, KeyboardInterrupt)
+
+
+# ----------------------------------------------------------------------------------------------------- the terminal
+
+
+def complain(message: str) -> None:
+    """Print an error as one line on stderr."""
+    typer.echo(f"walop-jax: error: {' '.join(message.split())}", err=True)
+
+
+def warn(message: str) -> None:
+    """Print a warning as one line on stderr."""
+    typer.echo(f"walop-jax: warning: {' '.join(message.split())}", err=True)
+
+
+@contextlib.contextmanager
+def progress(quiet: bool, stages: Sequence[str] = ()) -> Iterator[Callable[[str], None]]:
+    """Give a function that shows on stderr what is being done and for how long: on a terminal in a line that goes.
+
+    Elsewhere a line is printed when there has been none for `LINE_EVERY` seconds. `stages` are those of the work, in
+    their order: they are counted. A message that knows its share of the work (`share`) moves a bar.
+    """
+    if quiet:
+        yield lambda message: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    numbered = step_counter(stages)
+    if not console.is_terminal:
+        began = told = time.monotonic()
+
+        def line(message: str) -> None:
+            nonlocal told
+            now, text = time.monotonic(), numbered(message)
+            if now - told >= LINE_EVERY:
+                told = now
+                typer.echo(f"{now - began:.0f} s: {text}", err=True)
+
+        yield line
+        return
+    columns = (SpinnerColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False))
+    with Progress(*columns, console=console, transient=True) as shown:
+        task = shown.add_task("", total=None)
+        yield lambda message: shown.update(task, description=numbered(message))
+
+
+def step_counter(stages: Sequence[str]) -> Callable[[str], str]:
+    """Give a function that puts "step n of m" ahead of messages, n being that of the last stage that has begun."""
+    reached = 0
+
+    def numbered(message: str) -> str:
+        nonlocal reached
+        stage = getattr(message, "stage", None)
+        if stage in stages:
+            reached = max(reached, stages.index(stage) + 1)
+        return f"step {reached} of {len(stages)}: {message}" if reached else message
+
+    return numbered
+
+
+# --------------------------------------------------------------------------------------------- the compiled programs
+
+
+def cache_folder() -> Path | None:
+    """Where compiled code is kept between runs; None when that is switched off or impossible.
+
+    WALOP_JAX_CACHE names the folder ("off": none), otherwise it is walop-jax/xla in the user's cache folder.
+    """
+    chosen = os.environ.get(CACHE_VARIABLE, "")
+    if chosen.lower() in ("off", "0", "none"):
+        return None
+    try:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(chosen) if chosen else Path(base) / "walop-jax" / "xla"
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # no home
+        return None
+    return folder if os.access(folder, os.W_OK | os.X_OK) else None
+
+
+def switch_on_jax() -> None:
+    """Import JAX with float64 and with the cache of compiled code, which makes later runs start fast."""
+    import jax
+
+    from walop_jax.model import kept_programs
+
+    jax.config.update("jax_enable_x64", True)
+    folder = cache_folder()
+    if folder is not None:
+        with contextlib.suppress(OSError):
+            (folder / kept_programs.FOLDER).mkdir(exist_ok=True)
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+        jax.config.update("jax_raise_persistent_cache_errors", False)
+
+
+for _name in COMMANDS:
+    if importlib.util.find_spec(f"walop_jax.commands.{_name}") is None:
+        _old = getattr(importlib.import_module(f"walop_jax.cli.{_name}"), _name)
+        from walop_jax.cli.common import accepting_seed, guarded
+
+        app.command(
+            _name.replace("_", "-"), context_settings=HELP, help=_paragraphs(_old), short_help=_in_short(_old)
+        )(guarded(accepting_seed(_old)))
+        continue
+    _command = getattr(importlib.import_module(f"walop_jax.commands.{_name}"), _name)
+    app.command(
+        _name.replace("_", "-"),
+        context_settings=HELP,
+        help=_paragraphs(_command),
+        short_help=_in_short(_command),
+    )(_function(_command))

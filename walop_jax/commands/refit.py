@@ -1,0 +1,161 @@
+"""`walop-jax refit`: the joint fit of calibration sets, resumed where it was interrupted."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from walop_jax.commands.command import Job, Option, Outcome, Writers, command
+from walop_jax.commands.inputs import catalogue_of, in_bytes, set_and_model
+from walop_jax.commands.options import Effects, Folder, InstrumentLike, Memory, ModelLike, PathLike, Sets
+
+if TYPE_CHECKING:
+    from walop_jax.fit.refit import FitResult
+    from walop_jax.likelihood.processes import Processes
+
+ProcessesOption = Option(
+    "Share a large set with other processes that run the same command; auto: as Slurm or Open MPI say.",
+    "INDEX/COUNT@HOST:PORT",
+    str,
+)
+
+
+@command(stages=("reading", "fitting", "mapping"), writes=())
+def refit(
+    job: Job,
+    data: Sets,
+    model: ModelLike = None,
+    *,
+    output: Folder = None,
+    instrument: InstrumentLike = None,
+    effects: Effects = None,
+    memory: Memory = 2.0,
+    processes: Annotated[Processes | str | None, ProcessesOption] = None,
+    folder: PathLike | None = None,
+) -> Outcome[FitResult]:
+    """Fit all field points of calibration sets jointly: RUN/calibration.fits and RUN/summary.json.
+
+    RUN is created if necessary. If it holds a calibration already, the command stops unless --overwrite is given;
+    then these two files are replaced and all others stay.
+
+    A fit that does not converge leaves RUN/summary.failed.json, no calibration, and exit code 1. One that
+    converges but is not to be trusted (it does not explain the data, a parameter lies far from its prior, the
+    residuals hold patterns or differ between parts of the data) is written with TRUSTED = F and warnings, exit
+    code 3.
+
+    Sets of more than 65536 points (whole frames) are read in slabs on every pass. Finished slabs are kept in
+    RUN/partial until the end, so that the same command resumes an interrupted fit. The calibration then holds a map of
+    what the smooth model leaves.
+
+    In Python: the fit. Without `output`, finished slabs are kept in `folder` (default: nowhere), and the same call
+    goes on from them. Raises `DataError` for data that cannot be trusted, ValueError for a model that does not fit.
+    """
+    from walop_jax.calibration.calibration import Calibration
+    from walop_jax.calibration.product import write_product
+    from walop_jax.calibration.residual_map import residual_map
+    from walop_jax.calibration.summary import FAILED, PARTIAL, PRODUCT, SUMMARY, summary
+    from walop_jax.diagnosis.trust import examined
+    from walop_jax.fit.misfit import describe
+    from walop_jax.fit.refit import refit as fit
+    from walop_jax.io.atomic import atomic_path
+    from walop_jax.io.temporary import remove
+    from walop_jax.io.text import json_text
+
+    if output is not None and folder is not None:
+        raise ValueError("with output, finished slabs are kept in its folder partial: leave folder out")
+    with _crew(processes) as crew:
+        first = crew.index == 0
+        tell = job.progress if first or not job.typed else lambda text: None
+        job = dataclasses.replace(job, progress=tell)
+        # Of several processes the first one writes; it alone holds the folder.
+        with job.reserved(output if first else None, (PRODUCT, SUMMARY)) as job:
+            job.tell("reading", "reading")
+            calset, chosen = set_and_model(data, model, instrument, catalogue_of(effects), output=output)
+            kept = folder if output is None else Path(output) / PARTIAL
+            with job.repeated() as say:
+                result = examined(
+                    fit(calset, chosen, folder=kept, progress=say, memory=in_bytes(memory), processes=crew)
+                )
+            wanted = output is not None
+            mapped = wanted and result.likelihood.layout.large and result.converged
+            residuals = residual_map(result) if mapped else None
+            misfit = describe(result) if wanted and first and not result.explains_data else None
+            seconds = job.seconds
+
+            def files() -> Writers:
+                product = Calibration.from_fit(result, residuals).to_product()
+                return {PRODUCT: lambda path: write_product(path, product)}
+
+            found = Outcome(
+                result,
+                lambda: summary(result, seconds=seconds, misfit=misfit, residuals=residuals) | {"seed": job.seed},
+                lambda: "\n".join((
+                    dataclasses.replace(result.display(), notes=result.notes).text(),
+                    f"{'trusted' if result.trusted else 'NOT trusted'}: {output}   ({seconds:.1f} s)",
+                )),
+                files,
+                saved_as=SUMMARY,
+                warnings=(*result.warnings, *(() if misfit is None else misfit.sentences())),
+                trusted=result.trusted,
+                silent=not first,
+            )  # fmt: skip
+            if not result.converged:
+                found = dataclasses.replace(
+                    found,
+                    text=str,
+                    warnings=(),
+                    failure=f"{output}: the fit did not converge ({result.minimum.message}); see {FAILED} there",
+                )
+            if job.folder is None:
+                return found
+            job.tell("mapping the field", "mapping")
+            if result.converged:
+                found.save(job.folder, drop=(FAILED, PARTIAL))
+                return found
+            job.folder.path.mkdir(exist_ok=True)
+            with atomic_path(job.folder.path / FAILED, overwrite=True) as temporary:
+                temporary.write_text(json_text(found.content), encoding="utf-8")
+            remove(job.folder.path / PARTIAL)
+            return found
+
+
+@contextlib.contextmanager
+def _crew(processes: Processes | str | None) -> Iterator[Processes]:
+    """The processes of a computation; a text says where they are to be joined.
+
+    When one that was joined here fails it ends at once, with its line of error: the others notice that it has gone.
+    """
+    from walop_jax.likelihood.processes import Processes, join, leave_at_once
+
+    if not isinstance(processes, str):
+        yield processes or Processes()
+        return
+
+    with _standard_output_to_error():
+        crew = join(processes)
+    try:
+        yield crew
+    except BaseException as error:
+        from walop_jax.commands.program import complain
+
+        complain(f"process {crew.index} of {crew.count}: {error or type(error).__name__}")
+        sys.stderr.flush()
+        leave_at_once(1)
+
+
+@contextlib.contextmanager
+def _standard_output_to_error() -> Iterator[None]:
+    """What a library prints by itself must not end up in the machine-readable result."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
