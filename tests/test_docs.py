@@ -211,7 +211,7 @@ def test_keys_of_the_summary():
 
 
 def test_keys_of_the_diagnosis():
-    names = keys_written("walop_jax.diagnosis.document", "document", "_step")
+    names = keys_written("walop_jax.diagnosis.findings", "document", "_step")
     names |= keys_written("walop_jax.diagnosis.location", "describe")
     assert unexplained(names, section("files", "diagnosis.json")) == []
 

@@ -1,8 +1,9 @@
-"""A blind suite at the level of scores: thousands of hidden effects through the rules of `diagnose`, no refits.
+"""A blind suite at the level of scores: thousands of hidden effects through the search of `diagnose`, no refits.
 
 One design (a simulated calibration set, its Jacobian, the columns of every effect and pattern) spans a space of a
 thousand dimensions; what lies outside is pure noise. Scenes are drawn there: Gaussian noise plus an effect of known
-signal-to-noise ratio behind the projection. They go through the scoring, ranking and separating code of the package.
+signal-to-noise ratio behind the projection. They go through the search that `diagnose` runs (`diagnosis.search`), with
+its judge by linear steps in the place of the one that fits.
 Verdicts are written before the truths are opened. In some scenes the effect that is hidden is taken out of the
 catalogue: then the sentences that it is are asked for (`EFFECTS`, `in_sentences`), and no other name.
 
@@ -19,22 +20,21 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import grammar, history, naming
+from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.effect_columns import Probe, probes
-from walop_jax.diagnosis.examination import ALARM, Examination
+from walop_jax.diagnosis.examination import Evidence, Ranked, examine
 from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, Measured
-from walop_jax.diagnosis.score import Scorer, ScoreSpace, ScoreTable, separations, whitening
-from walop_jax.diagnosis.two_steps import Behind, name_first
-from walop_jax.diagnosis.workflow import MOST_SENTENCES, MOST_STEPS
+from walop_jax.diagnosis.policy import POLICY
+from walop_jax.diagnosis.score import Scorer, separations, whitening
+from walop_jax.diagnosis.search import Found, Linear, joined, search
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects import EFFECTS, Described
 from walop_jax.model.specification import effect_context
 
 SEPARABLE = 5.0  # σ between the truth and its nearest rival above which a name is asked for
@@ -171,12 +171,12 @@ class Blind:
         wanted = list(probes(EFFECTS, effect_context(model.template, calset.exposures)))
         self.context, self.template = effect_context(model.template, calset.exposures), model.template
         every = grammar.sentences(model.template, calset.exposures, len(calset.points))
-        examination = Examination(result, wanted, self.rng, None, every)
+        examination = examine(result, wanted, self.rng, None, every)
         self.sentences = examination.sentences
-        self.probes: list[Probe] = examination.probes
+        self.probes = list(examination.probes)
         self.in_sentences = {p.name: set(p.group[0].in_sentences(model.template)) for p in self.probes}
         self.effect_of = {p.name: p.effect.name for p in self.probes}
-        self.space, self.nuisance = examination.space, examination.common_mode
+        self.space = examination.bare
         self.places = self.space.places()
         self._whitening = whitening(self.space.gram)
         self._root = self.space.gram @ self._whitening
@@ -195,7 +195,11 @@ class Blind:
             self.outside[name] = along, max(float(column @ column - along @ along), 0.0)
         explained = {*self.effect_of, *(probe.name for probe in self.sentences)}
         self.patterns = [name for name in self.space.names if name not in explained]
-        self._scorers: dict[tuple[tuple[str, ...], tuple[str, ...]], tuple[Scorer, list[Probe]]] = {}
+        self._behind_nuisance, self._reduce = self.space.with_base(
+            [SINGLE_EXPOSURES], examination.common_mode
+        )
+        self.evidence: Evidence = examination
+        self._scorers: dict[tuple[str, ...], Scorer] = {}
         self.free = examination.space.free
         self.visible = sorted({p.effect.name for p in self.probes if examination.table[p.name].testable})
         self._testable = {p.name for p in self.probes if examination.table[p.name].testable}
@@ -266,107 +270,52 @@ class Blind:
 
     # --------------------------------------------------------------------------------------------------- judging
 
-    def _scorer(self, added: tuple[str, ...], removed: tuple[str, ...]) -> tuple[Scorer, list[Probe]]:
-        if (added, removed) not in self._scorers:
-            gone = {self.effect_of[a] for a in added if a in self.effect_of} | set(removed)
-            left = [p for p in self.probes if p.effect.name not in gone]
-            left += [probe for probe in self._sentences(removed) if probe.name not in added]
-            parts = [probe for probe, _ in self._parts(removed)]
-            names = [*(probe.name for probe in (*left, *parts)), *self.patterns]
-            names = [name for name in names if name not in added]
-            draws = DRAWS if not added and not removed else 0
-            if len(self._scorers) > KEPT:  # those of the starting model are dear, and always needed
-                self._scorers = {key: value for key, value in self._scorers.items() if not key[0]}
-            space = self._space(added).subset(names)
-            self._scorers[added, removed] = Scorer(space, np.random.default_rng(7), draws), left
-        return self._scorers[added, removed]
-
     @functools.cache  # noqa: B019
-    def _sentences(self, removed: tuple[str, ...]) -> tuple[Probe, ...]:
-        return history.uncovered(*self._grammar(removed))
-
-    @functools.cache  # noqa: B019
-    def _parts(self, removed: tuple[str, ...]) -> tuple[tuple[Probe, frozenset[type[Effect]]], ...]:
-        return history.parts(*self._grammar(removed))
-
-    def _grammar(self, removed: tuple[str, ...]) -> tuple[Any, ...]:
-        """All sentences, and what the catalogue holds without some effects."""
+    def _start(self, removed: tuple[str, ...]) -> Evidence:
+        """What is asked of a scene, without what is not in the catalogue; the residuals are those of the design."""
         catalogue = [effect for effect in EFFECTS if effect.name not in removed]
-        return self.sentences, catalogue, self.context, self.template
+        every = self.sentences, catalogue, self.context, self.template
+        names = [p for p in self.probes if p.effect.name not in removed]
+        said, parts = grammar.uncovered(*every), grammar.parts(*every)
+        asked = [*(p.name for p in (*names, *said)), *(p.name for p, _ in parts), *self.patterns]
+        space = self._behind_nuisance.subset(asked)
+        scorer = Scorer(space, np.random.default_rng(7), 0 if removed else DRAWS)
+        return dataclasses.replace(
+            self.evidence, scorer=scorer, probes=names, sentences=said, parts=parts, patterns=self.patterns
+        )
 
-    def _space(self, added: tuple[str, ...]) -> ScoreSpace:
-        space = self.space.with_base([SINGLE_EXPOSURES], self.nuisance)[0]
-        return space.with_base(list(added))[0] if added else space
-
-    def _reduced(self, s: np.ndarray, square: float, added: tuple[str, ...]) -> tuple[np.ndarray, float]:
-        space, reduce = self.space.with_base([SINGLE_EXPOSURES], self.nuisance)
-        s, square = reduce(s, square)
-        return space.with_base(list(added))[1](s, square) if added else (s, square)
+    def _evidence(self, scene: Scene) -> Evidence:
+        """The scores of a scene; noise and number of trials are those of the whole catalogue, which is dear to draw."""
+        scores, square = self._reduce(
+            self._root @ scene.coordinates, float(scene.coordinates @ scene.coordinates) + scene.rest
+        )
+        whole, start = self._start(()), self._start(scene.removed)
+        table = whole.scorer(scores[self._behind_nuisance.chosen(whole.space.names)], square)
+        scores = scores[self._behind_nuisance.chosen(start.space.names)]
+        if scene.removed:
+            table = start.scorer.after(table, scores)
+        return dataclasses.replace(
+            start, scores=scores, square=square, table=table, chi2=square, dof=start.space.free
+        )
 
     def judge(self, scene: Scene) -> Verdict:
-        """The workflow's rules with linear steps in place of refits."""
-        s0 = self._root @ scene.coordinates
-        square0 = float(scene.coordinates @ scene.coordinates) + scene.rest
-        added: list[str] = []
+        """What the search finds."""
         named: list[str] = []
-        classes: list[frozenset[str]] = []
         said: list[str] = []
-        nameless = False
-        first: naming.Ranked | None = None
-        table: ScoreTable | None = None
-        while True:
-            scorer, left = self._scorer(tuple(added), scene.removed)
-            s, square = self._reduced(s0, square0, tuple(added))
-            scores = s[self.space.chosen(scorer.space.names)]
-            if (
-                table is None
-            ):  # noise and number of trials are those of the whole catalogue, which is dear to draw
-                whole = self._scorer((), ())[0]
-                table = whole(s[self.space.chosen(whole.space.names)], square)
-            table = scorer.after(table, scores) if added or scene.removed else table
-            if table.p_global >= ALARM or len(added) >= MOST_STEPS:
-                break
-            names, told = self._ranked(table, left)
-            alive = [score for score in table.scores if score.testable and score.name in self.patterns]
-            price, least = np.log(len(alive)), min(0.0, max(score.log_bayes for score in alive))
-            best = _most_probable(table, names, told, least)
-            if best is not None and best.probe.name not in self.effect_of:
-                significant = [r for r in names if table.corrected(r.score) < ALARM]
-                behind = functools.partial(
-                    self._behind, table, added=tuple(added), removed=scene.removed, s0=s0, square0=square0
-                )
-                best = significant[0] if name_first(significant, best, behind, ALARM) else best
-            pattern = max(alive, key=lambda score: score.log_bayes)
-            strong = table.corrected(pattern) < ALARM
-            if strong and (best is None or pattern.log_bayes - price > best.log_bayes + naming.EVEN_ODDS):
-                # What has no name explains more: names must show beside it.
-                nameless = True
-                added.append(pattern.name)
-                continue
-            if best is None:
-                break
-            name = self.effect_of.get(best.probe.name, "described")
-            if not named:
-                first = best
+        classes: list[frozenset[str]] = []
+        last = self._evidence(scene)
+        first: Ranked | None = None
+        for found, before, left in search(last, Cached(self._scorers, scene.removed), POLICY):
+            last, item = left, found.trial.item
+            assert item is not None
+            first, name = first or item, item.effect.name
             named.append(name)
-            if name == "described":
-                said.append(best.probe.name)
-            close = {r.effect.name for r in names if best.log_bayes - r.log_bayes < naming.IMPROBABLE}
-            possible = {r.probe.name for r in told if best.log_bayes - r.log_bayes < naming.IMPROBABLE}
-            others = [
-                p
-                for p in left
-                if (p.name in self.effect_of and p.effect is not best.effect)
-                or (p.name not in self.effect_of and len(p.widths) <= len(best.probe.widths))
-            ]
-            rivals = self._rivals(scorer.space, best, others)
-            parts = [one for one in self._parts(scene.removed) if one[0].name in scorer.space.names]
-            partly = set(naming.held_in_part(table, parts, best))
-            classes.append(frozenset((close | possible | rivals | partly) - {name, best.probe.name}))
-            added.append(best.probe.name)
-        assert table is not None
-        missing = nameless or table.p_global < ALARM or len(said) > MOST_SENTENCES
-        kind = "unexplained" if missing else "effect_found" if added else "consistent"
+            if item.effect is Described:
+                said.append(item.probe.name)
+            told = {*found.rivals, *found.parts, *found.nameless, *before.close(item)}
+            classes.append(frozenset(told - {name, item.probe.name}))
+        missing = last.alarm or len(said) > POLICY.most_sentences
+        kind = "unexplained" if missing else "effect_found" if named else "consistent"
         verdict = Verdict(kind, tuple(named), tuple(classes), tuple(said))
         if first is None:
             return verdict
@@ -375,45 +324,23 @@ class Blind:
             verdict, first_probe=first.probe.name, amplitudes=score.amplitudes, covariance=score.covariance
         )
 
-    def _behind(
-        self, table: ScoreTable, item: naming.Ranked, added: tuple[str, ...], removed: tuple[str, ...],
-        s0: np.ndarray, square0: float,
-    ) -> Behind:  # fmt: skip
-        """What is left to be told behind a linear step."""
-        added = (*added, item.probe.name)
-        scorer, left = self._scorer(added, removed)
-        s, _ = self._reduced(s0, square0, added)
-        table = scorer.after(table, s[self.space.chosen(scorer.space.names)])
-        return Behind(*self._ranked(table, left), table.p_global)
 
-    def _ranked(
-        self, table: ScoreTable, left: Sequence[Probe]
-    ) -> tuple[list[naming.Ranked], list[naming.Ranked]]:
-        """Names and sentences by evidence."""
-        names = naming.rank(table, [p for p in left if p.name in self.effect_of])
-        return names, grammar.rank(table, [p for p in left if p.name not in self.effect_of])
+class Cached(Linear):
+    """Steps of scenes are alike: their scorers are kept."""
 
-    def _rivals(self, space: ScoreSpace, best: naming.Ranked, left: Sequence[Probe]) -> set[str]:
-        at = space.places()[best.probe.name]
-        change = space.gram[:, at] @ best.score.amplitudes
-        others = [p.name for p in left]
-        length = float(best.score.amplitudes @ space.gram[at, at] @ best.score.amplitudes)
-        found = separations(space.subset(others), change[space.chosen(others)], length)
-        return {self.effect_of.get(name, name) for name, d in found.items() if d < naming.SEPARATION}
+    def __init__(self, scorers: dict[tuple[str, ...], Scorer], removed: tuple[str, ...]) -> None:
+        self.scorers, self.added = scorers, removed
 
-
-def _most_probable(
-    table: ScoreTable, names: Sequence[naming.Ranked], told: Sequence[naming.Ranked], least: float
-) -> naming.Ranked | None:
-    """The best name, or a sentence that is clearly more probable."""
-    found = [
-        [r for r in items if table.corrected(r.score) < ALARM and r.log_bayes > least]
-        for items in (names, told)
-    ]
-    name, sentence = (items[0] if items else None for items in found)
-    if sentence is not None and (name is None or sentence.log_bayes > name.log_bayes + naming.EVEN_ODDS):
-        return sentence
-    return name
+    def adopted(self, state: Evidence, found: Found) -> Evidence:
+        """As `Linear`, with the scorer of another scene where it went the same way."""
+        item = found.trial.item
+        assert item is not None
+        self.added = (*self.added, item.probe.name)
+        after = joined(state, item, self.scorers.get(self.added))
+        if len(self.scorers) > KEPT:
+            self.scorers.clear()
+        self.scorers[self.added] = after.scorer
+        return after
 
 
 def study(

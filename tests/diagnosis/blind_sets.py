@@ -21,8 +21,9 @@ import numpy as np
 
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.effect_columns import Probe, effect_candidates, probes
-from walop_jax.diagnosis.examination import ALARM, Examination
+from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import Diagnosis
+from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
@@ -49,7 +50,7 @@ class Hiding:
         self.design = Design.of(self.fit)
         self.context = effect_context(self.fit.model.template, calset.exposures)
         every = list(probes(EFFECTS, self.context))
-        examination = Examination(self.fit, every, np.random.default_rng(0))
+        examination = examine(self.fit, every, np.random.default_rng(0))
         self.probes = [p for p in examination.probes if examination.table[p.name].testable]
         self.names = sorted({p.effect.name for p in self.probes})
 
@@ -136,7 +137,7 @@ def report(entries: list[dict[str, Any]]) -> dict[str, Any]:
             continue
         told = set(e["named"][:1]) | set(e["classes"][0] if e["classes"] else [])
         found, ratio = e["verdict"] == "effect_found", f"SNR {e['ratio']:g}"
-        rates[f"detected, {ratio}"].append(e["p"] < ALARM)
+        rates[f"detected, {ratio}"].append(e["p"] < POLICY.alarm)
         rates[f"top-1, {ratio}"].append(e["named"][:1] == [e["truth"]])
         rates[f"truth named or in its class, {ratio}"].append(e["truth"] in told)
         rates[f"exactly the truth, {ratio}"].append(found and e["named"] == [e["truth"]])

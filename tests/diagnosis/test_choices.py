@@ -8,8 +8,8 @@ import pytest
 from scenes import PLAN
 
 from walop_jax.diagnosis.choices import Choices
-from walop_jax.diagnosis.document import document
-from walop_jax.diagnosis.findings import Choice
+from walop_jax.diagnosis.findings import Choice, document
+from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit
@@ -91,7 +91,7 @@ def fitted(plan, change: str, seed: int = 5) -> FitResult:
 def best_of(result: FitResult) -> Choice | None:
     """The change that gains most in χ²."""
     context = effect_context(result.model.template, result.calset.exposures)
-    choices = Choices(result, context, lambda: True, lambda text: None)
+    choices = Choices(result, context, POLICY, lambda: True, lambda text: None)
     assert all(trial.instance.change in choices.tried for trial in choices.trials())
     fitted_ones = [one for one in choices.tried.values() if np.isfinite(one.better_by)]
     return max(fitted_ones, key=lambda one: one.better_by, default=None)

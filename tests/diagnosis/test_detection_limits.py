@@ -18,7 +18,7 @@ from walop_jax.diagnosis.detection_limits import (
     detection_limits,
 )
 from walop_jax.diagnosis.effect_columns import probes
-from walop_jax.diagnosis.examination import ALARM, Examination
+from walop_jax.diagnosis.examination import ALARM, Examination, examine
 from walop_jax.diagnosis.score import Scorer
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.model.effects import effect_by_name
@@ -50,7 +50,7 @@ def found(fitted) -> DetectionLimits:
 @pytest.fixture(scope="module")
 def examination(fitted) -> Examination:
     context = effect_context(fitted.model.template, fitted.calset.exposures)
-    return Examination(fitted, list(probes(CATALOGUE, context)), np.random.default_rng(1))
+    return examine(fitted, list(probes(CATALOGUE, context)), np.random.default_rng(1))
 
 
 def test_every_effect_has_a_limit_or_is_named_as_beyond_these_data(found):

@@ -14,6 +14,7 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.figure_data import figure_data
 from walop_jax.diagnosis.findings import Unexplained
+from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
@@ -79,41 +80,32 @@ def test_a_dropped_effect_is_one_of_those_not_found(strong):
     assert "clp_zero" in strong.steps[0].separation
 
 
-class Rehearsal(workflow._Diagnosing):
+class Rehearsal(workflow.Refit):
     """A diagnosis with parts played by dummies: something is missing as long as a name stands that is not needed."""
 
     def __init__(self):
-        self.calset, self.catalogue = SimpleNamespace(points=()), ()
         self.fit = Mock(spec=FitResult, explains_data=True, chi2=1.0, dof=1, noise_scale=1.0)
-        self.steps, self.choices, self.readings = [SimpleNamespace(effect="name")], {}, ()
-        self.added = self.said = 0
-        self.tell, self.until = lambda text: None, float("inf")
+        self.steps, self.policy = [SimpleNamespace(effect="name")], POLICY
+        self.tell = lambda text: None
 
-    def _examine(self, earlier=None):
-        examination = Mock(spec=Examination, alarm=bool(self.steps), design=Mock(spec=Design))
-        examination.table = SimpleNamespace(p_global=float(not self.steps), noise_scale=1.0)
-        examination.noise_p = 0.5
-        for empty in (examination.summary, examination.limits, examination.untestable, examination.classes):
-            empty.return_value = ()
-        return examination
-
-    def _trials(self, examination):
-        return iter(())
-
-    def _add_best(self, examination, trials, *, others):
-        return None
+    def examined(self, earlier=None):
+        state = Mock(spec=Examination, alarm=bool(self.steps), design=Mock(spec=Design))
+        state.table = SimpleNamespace(p_global=float(not self.steps), noise_scale=1.0)
+        return state
 
     def _drop_what_is_not_needed(self):
         dropped, self.steps = bool(self.steps), []
         return dropped
 
-    def _unexplained(self, examination):
-        return Unexplained(examination.table.p_global, "", ())
+    def _unexplained(self, state):
+        return Unexplained(state.table.p_global, "", ())
 
 
 def test_what_has_no_name_is_asked_of_the_model_without_needless_names():
-    found = Rehearsal().run(0.0)
-    assert (found.verdict, found.unexplained, found.remaining_p) == ("consistent", None, 1.0)
+    judge = Rehearsal()
+    first = judge.examined()
+    state, nameless = judge.conclusion(first, first)
+    assert (nameless, judge.steps, state.table.p_global) == (None, [], 1.0)
 
 
 @pytest.mark.long

@@ -10,7 +10,7 @@ from own_instrument import OWN
 from quick import quick
 
 from walop_jax.data.records import Position
-from walop_jax.diagnosis import grammar, history
+from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.effect_columns import applicable, effect_candidates, probes
 from walop_jax.diagnosis.sentence_columns import all_candidates, sentence_candidates
 from walop_jax.fit.model_builder import base_model
@@ -118,7 +118,7 @@ def test_sentences_that_have_a_name_are_left_to_it(laid):
     template = laid.model.template
     context = effect_context(template, laid.calset.exposures)
     every = grammar.sentences(template, laid.calset.exposures, len(laid.calset.points))
-    left = {p.name for p in history.uncovered(every, EFFECTS, context, template)}
+    left = {p.name for p in grammar.uncovered(every, EFFECTS, context, template)}
     gone = {p.name for p in every} - left
     assert "turn of polariser" in gone
     assert "retardance q behind collimator; retardance u behind collimator" in gone
@@ -133,13 +133,13 @@ def test_parts_of_effects_stand_for_them(laid):
     context = effect_context(template, laid.calset.exposures)
     every = grammar.sentences(template, laid.calset.exposures, len(laid.calset.points))
     found = {
-        p.name: {e.name for e in effects} for p, effects in history.parts(every, EFFECTS, context, template)
+        p.name: {e.name for e in effects} for p, effects in grammar.parts(every, EFFECTS, context, template)
     }
     assert found["light in O1"] == {"pedestal"}
     patches = [name for name in found if name.startswith("polarisation q of sky * exposure")]
     assert len(patches) == 4
     assert all(found[name] == {"moon_patch"} for name in patches)
-    left = {p.name for p in history.uncovered(every, EFFECTS, context, template)}
+    left = {p.name for p in grammar.uncovered(every, EFFECTS, context, template)}
     assert not left & set(found)
     assert "turn of polariser" not in found, "this is clp_zero as a whole"
 

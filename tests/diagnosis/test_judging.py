@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matrix_at import matrix_at
 from scenes import PLAN
 from scipy import integrate, stats
 
@@ -14,11 +15,12 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import upper_limit
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.freeform import Measured, strata
+from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import FreeForm, effect_by_name
+from walop_jax.model.effects import Described, FreeForm, effect_by_name
 from walop_jax.model.effects.free_form import BLOCKS
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.simulation.simulate import simulate
@@ -148,7 +150,8 @@ def test_many_names_and_weak_errors_call_for_caution():
     def caution(*steps, far=None):
         named = [SimpleNamespace(effect=name, robust_ratio=ratio, far=far or {}) for name, ratio in steps]
         after = SimpleNamespace(calset=SimpleNamespace(points=range(9)))
-        return Diagnosis.caution.fget(SimpleNamespace(steps=named, after=after, points=9))
+        known = SimpleNamespace(steps=named, after=after, points=9, policy=POLICY, ended=False)
+        return Diagnosis.caution.fget(known)
 
     assert caution() == caution(("a", 1.1), ("b", float("nan"))) == ""
     assert "3 names" in caution(*((name, 1.0) for name in "abc"))
@@ -171,3 +174,62 @@ def test_what_has_no_name_stays_unexplained_and_is_carried_along():
     assert "harmonics" in found.unexplained.term
     assert found.unexplained.chi2_after < found.unexplained.chi2_before
     assert found.after.explains_data
+
+
+def slipped(seed=1):
+    """A set in which every setting of the polariser is off by an amount of its own, 0.05° rms: no name says that."""
+    stated = np.array(PLAN.polariser_angles)
+    true = stated + np.random.default_rng(5).normal(0.0, 0.05, len(stated))
+    simulated = simulate(dataclasses.replace(PLAN, polariser_angles=tuple(true.tolist())), seed=seed)
+    e = simulated.calset.exposures
+    nearest = np.abs(e.clp_angle[:, None] - true).argmin(axis=1)
+    angle = np.where(e.clp_in, stated[nearest], e.clp_angle)
+    exposures = dataclasses.replace(e, clp_angle=angle)
+    return simulated, dataclasses.replace(simulated.calset, exposures=exposures)
+
+
+PATTERNS = tuple(f"vector {element} of {camera}" for element in "qu" for camera in ("O1", "E1", "O2", "E2"))
+
+
+def test_patterns_that_hold_at_no_other_setting_do_not_predict_it():
+    """Errors of single settings are smooth over the field: they predict parts of it that they have not seen."""
+    _, calset = slipped()
+    slips = Design.of(fit(Likelihood.of(calset, base_model(calset))))
+    assert slips.fit.chi2 > 1.5 * slips.fit.dof
+    assert not naming.predicts_unseen(slips, PATTERNS, POLICY)
+
+
+def test_patterns_of_the_optics_predict_settings_that_they_have_not_seen():
+    hidden = Described.saying(["retardance u behind half1.plate * xy"], [0.02])
+    calset = simulate(PLAN, seed=1, effects=[hidden]).calset
+    optics = Design.of(fit(Likelihood.of(calset, base_model(calset))))
+    assert naming.predicts_unseen(optics, PATTERNS, POLICY)
+
+
+@pytest.mark.long
+def test_a_term_that_makes_the_matrix_worse_is_described_and_left_out():
+    simulated, calset = slipped()
+    found = diagnose(calset)
+    assert found.verdict == "unexplained"
+    assert found.unexplained.term == ()
+    side = np.unique(calset.points.x)
+    x, y = (grid.ravel() for grid in np.meshgrid(*[0.5 * (side[1:] + side[:-1])] * 2))
+    truth, bare, left = (
+        matrix_at(instrument, calset, x, y)
+        for instrument in (
+            simulated.truth,
+            *(result.model.instrument(result.values) for result in (found.before, found.after)),
+        )
+    )
+    assert np.std(left - truth) < 1.1 * np.std(bare - truth)
+
+
+@pytest.mark.long
+def test_a_name_that_only_borrows_is_told_as_a_part():
+    """A retardance of the collimator that follows the hour angle: displacements of the field can follow a part."""
+    hidden = Described.saying(["retardance q behind collimator * hour angle"], [0.012])
+    calset = simulate(PLAN, seed=3, effects=[hidden]).calset
+    model = base_model(calset)
+    found = diagnose(calset, model, catalogue=(effect_by_name("flexure"),))
+    assert found.verdict == "unexplained"
+    assert not [step for step in found.steps if step.effect == "flexure"]

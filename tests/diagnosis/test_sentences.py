@@ -11,7 +11,7 @@ import scenes
 from scipy import stats
 
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.diagnosis.document import document
+from walop_jax.diagnosis.findings import document
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.model.cameras import Transmission
 from walop_jax.model.effects import Described, Effect

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from walop_jax.diagnosis.effect_columns import Probe
-from walop_jax.diagnosis.naming import Ranked
+from walop_jax.diagnosis.examination import Behind, Ranked, name_first
 from walop_jax.diagnosis.score import Score
-from walop_jax.diagnosis.two_steps import Behind, name_first
 from walop_jax.model.effects import Described, effect_by_name
 
 A, B, ELSEWHERE = np.eye(3)
@@ -50,7 +49,7 @@ class Geometry:
     def name_first(self) -> bool:
         names, sentence = self.ranked(("a", "b")), self.ranked(("sentence",))[0]
         assert sentence.log_bayes > names[0].log_bayes
-        return name_first(names, sentence, self.behind, 0.0027)
+        return name_first(names, sentence, self.behind)
 
 
 @pytest.mark.parametrize("share", [0.5, 1.0])
@@ -66,5 +65,5 @@ def test_a_sentence_that_holds_all_comes_before_two_names():
 def test_a_name_that_suffices_comes_before_a_sentence_that_does_not():
     geometry = Geometry(A + B, 10.0 * A)
     names, sentence = geometry.ranked(("a", "b")), geometry.ranked(("sentence",))[0]
-    assert name_first(names, sentence, geometry.behind, 0.0027)
-    assert not name_first([], sentence, geometry.behind, 0.0027)
+    assert name_first(names, sentence, geometry.behind)
+    assert not name_first([], sentence, geometry.behind)

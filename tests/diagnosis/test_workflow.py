@@ -12,9 +12,9 @@ from scenes import PLAN
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data import read_calibration_set
 from walop_jax.diagnosis.design import Design, exposure_folds, field_folds, held_out
-from walop_jax.diagnosis.document import document
 from walop_jax.diagnosis.effect_columns import probes
-from walop_jax.diagnosis.examination import Examination
+from walop_jax.diagnosis.examination import examine
+from walop_jax.diagnosis.findings import document
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit, refit
@@ -115,7 +115,7 @@ def test_cost_of_the_scores_of_the_whole_catalogue(either_south_set):
         began = time.perf_counter()
         result = fit(Likelihood.of(calset, model))
         middle = time.perf_counter()
-        Examination(result, wanted, np.random.default_rng(0))
+        examine(result, wanted, np.random.default_rng(0))
         seconds[label] = middle - began, time.perf_counter() - middle
         print(f"{label}: refit {seconds[label][0]:.2f} s, scores {seconds[label][1]:.2f} s")
     assert seconds["warm"][1] <= 10 * seconds["warm"][0]

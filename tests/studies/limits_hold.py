@@ -30,7 +30,7 @@ from matrix_at import matrix_at  # noqa: E402
 from score_draws import alarms, noise_scores  # noqa: E402
 
 from walop_jax.data.records import CalibrationSet  # noqa: E402
-from walop_jax.diagnosis import grammar, history  # noqa: E402
+from walop_jax.diagnosis import grammar  # noqa: E402
 from walop_jax.diagnosis.change_of_stokes import change_of_qu  # noqa: E402
 from walop_jax.diagnosis.detection_limits import (  # noqa: E402
     PROBABILITY,
@@ -38,8 +38,8 @@ from walop_jax.diagnosis.detection_limits import (  # noqa: E402
     detection_limits,
 )
 from walop_jax.diagnosis.effect_columns import Probe, probes  # noqa: E402
-from walop_jax.diagnosis.examination import ALARM, Examination  # noqa: E402
-from walop_jax.diagnosis.naming import SEPARATION  # noqa: E402
+from walop_jax.diagnosis.examination import Examination, examine  # noqa: E402
+from walop_jax.diagnosis.policy import POLICY  # noqa: E402
 from walop_jax.diagnosis.score import separations  # noqa: E402
 from walop_jax.fit.refit import FitResult, refit  # noqa: E402
 from walop_jax.model.effects import EFFECTS  # noqa: E402
@@ -77,12 +77,12 @@ def scores(result: FitResult, draws: int, named: int) -> dict[str, dict[str, flo
     context = effect_context(template, calset.exposures)
     every = list(probes(EFFECTS, context))
     said = grammar.sentences(template, calset.exposures, len(calset.points))
-    said = history.uncovered(said, EFFECTS, context, template)
-    names = Examination(result, every, np.random.default_rng(0))
-    whole = Examination(result, every, np.random.default_rng(0), None, said)
-    p = float(np.exp(names.scorer.threshold(ALARM)))
-    space, full, rng = whole.scorer.space, whole.space, np.random.default_rng(1)
-    noise, threshold = noise_scores(space, rng, draws), whole.scorer.threshold(ALARM)
+    said = grammar.uncovered(said, EFFECTS, context, template)
+    names = examine(result, every, np.random.default_rng(0))
+    whole = examine(result, every, np.random.default_rng(0), None, said)
+    p = float(np.exp(names.scorer.threshold(POLICY.alarm)))
+    space, full, rng = whole.space, whole.bare, np.random.default_rng(1)
+    noise, threshold = noise_scores(space, rng, draws), whole.scorer.threshold(POLICY.alarm)
     noise_in_full = noise_scores(full, rng, named)
     places = full.places()
     found: dict[str, dict[str, float]] = {}
@@ -101,7 +101,7 @@ def scores(result: FitResult, draws: int, named: int) -> dict[str, dict[str, flo
                 square = float(estimate @ full.gram[at, at] @ estimate)
                 apart = names.nearest(separations(full, full.gram[:, at] @ estimate, square))
                 del apart[probe.effect.name]
-                alone += min(apart.values()) > SEPARATION
+                alone += min(apart.values()) > POLICY.separation
             return alone / len(noise_in_full)
 
         found[probe.effect.name] = {"found": amplitude_at(detected, limit.detected)}
@@ -123,8 +123,8 @@ def sets(seed: int, most: int) -> Iterator[tuple[str, float]]:
     limits = detection_limits(reference)
     calset = reference.calset
     every = list(probes(EFFECTS, effect_context(reference.model.template, calset.exposures)))
-    names = Examination(reference, every, np.random.default_rng(0))
-    p = float(np.exp(names.scorer.threshold(ALARM)))
+    names = examine(reference, every, np.random.default_rng(0))
+    p = float(np.exp(names.scorer.threshold(POLICY.alarm)))
     without = refit(simulate(PLAN, seed=seed, instrument=truth).calset)
     start = matrices_of(without.model.instrument(without.values), calset)
     bare = matrices_of(truth, calset)

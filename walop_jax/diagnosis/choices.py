@@ -20,6 +20,7 @@ from jaxtyping import Float
 from walop_jax.diagnosis import naming
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.findings import Choice
+from walop_jax.diagnosis.policy import Policy
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
@@ -28,9 +29,7 @@ from walop_jax.model.alternatives import JOINED, alternatives, other_curves
 from walop_jax.model.effects import Context, OtherDescription
 from walop_jax.model.specification import Model, with_effects
 
-MOST_FITTED = 4
 NO_DIFFERENCE = 1e-6  # change of the residuals, in standard deviations, that is none
-LEAST_GAIN = 12.0  # in χ² behind one linear step, above which a change is worth a fit
 Vector = Float[np.ndarray, " n"]
 
 
@@ -55,9 +54,15 @@ class Choices:
     """All changes of the description of one fit: first screened, then the best of them fitted."""
 
     def __init__(
-        self, result: FitResult, context: Context, going_on: Callable[[], bool], tell: Callable[[str], None]
+        self,
+        result: FitResult,
+        context: Context,
+        policy: Policy,
+        going_on: Callable[[], bool],
+        tell: Callable[[str], None],
     ) -> None:
-        self.result, self.context, self.going_on, self.tell = result, context, going_on, tell
+        self.result, self.context, self.policy = result, context, policy
+        self.going_on, self.tell = going_on, tell
         template = dataclasses.replace(result.model.template, effects=())
         if OtherDescription.name in result.model.effect_names:
             described = result.model.template.effect(OtherDescription.name)
@@ -74,6 +79,7 @@ class Choices:
             trial = self._fitted(one)
             if trial is None:
                 continue
+            assert trial.fit is not None
             gain = self.result.posterior.objective - trial.fit.posterior.objective
             scale = self.result.noise_scale**2
             self.tried[one.sentence] = dataclasses.replace(
@@ -102,7 +108,8 @@ class Choices:
                 found.append(one)
                 self.tried[sentence] = Choice(sentence, one.left)
         found.sort(key=lambda one: one.left)
-        promising = [one for one in found if (1.0 - one.left) * given > LEAST_GAIN][:MOST_FITTED]
+        promising = [one for one in found if (1.0 - one.left) * given > self.policy.least_gain]
+        promising = promising[: self.policy.descriptions_fitted]
         curves = [one for one in found if one.sentence in self.curves and one not in promising]
         return [*promising, *curves]
 

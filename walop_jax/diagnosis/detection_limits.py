@@ -4,11 +4,11 @@ Everything is linear algebra on the columns of the score test (`score`), at a fi
 
 Detected    An effect of amplitude ε has the statistic T ~ χ'²_k(λ) with λ = ε² G (G the Gram element of its column
             behind the projection). The alarm is raised where the smallest p of all candidates undercuts p*, which noise
-            does with probability `ALARM`; ε is that for which T does so with probability `PROBABILITY`.
+            does with probability `Policy.alarm`; ε is that for which T does so with probability `PROBABILITY`.
 Named       A rival that does its best to follow the effect stays √S ε from it (`score.separations`). The effect is
-            named alone where the amplitude found, ε ± 1/√G, leaves every rival `SEPARATION` or more away with
-            probability `PROBABILITY`: ε ≥ SEPARATION/√S + z/√G; below that it is told with those for which it may be
-            taken.
+            named alone where the amplitude found, ε ± 1/√G, leaves every rival `Policy.separation` or more away with
+            probability `PROBABILITY`: ε ≥ d/√S + z/√G with d that separation; below it is told with those for which
+            it may be taken.
 Protection  A calibration without the effect takes up a part of it: δθ = (JᵀJ)⁻¹JᵀC ε. Stars are seen through
             m + ε ∂m/∂ε and calibrated with m + δθ ∂m/∂θ; the difference at the amplitude that is just detected is the
             largest error of q and u that the effect can make without being noticed. The level over all effects has a
@@ -35,9 +35,9 @@ from walop_jax.diagnosis.change_of_stokes import change_of_qu, first_setting
 from walop_jax.diagnosis.condition_limits import condition_limits
 from walop_jax.diagnosis.effect_columns import Probe, applicable
 from walop_jax.diagnosis.effect_columns import probes as all_probes
-from walop_jax.diagnosis.examination import ALARM, Examination, most_points
+from walop_jax.diagnosis.examination import Examination, examine, most_points
 from walop_jax.diagnosis.limits_found import PROBABILITY, DetectionLimit, DetectionLimits, over_field
-from walop_jax.diagnosis.naming import SEPARATION
+from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.score import noncentrality, separations
 from walop_jax.diagnosis.trust import sampled
 from walop_jax.fit.refit import FitResult
@@ -72,8 +72,8 @@ def detection_limits(
         on_field_points(result), most_points(calset, template, sum(len(probe.widths) for probe in wanted))
     )
     tell("differentiating every effect")
-    examination = Examination(result, wanted, np.random.default_rng(seed))
-    p = float(np.exp(examination.scorer.threshold(ALARM)))
+    examination = examine(result, wanted, np.random.default_rng(seed))
+    p = float(np.exp(examination.scorer.threshold(POLICY.alarm)))
     tell("comparing the effects")
     columns = [c for probe in examination.probes for c in _columns(examination, probe, p)]
     tell("finding what goes unnoticed")
@@ -94,7 +94,7 @@ class _Column:
 
 
 def _columns(examination: Examination, probe: Probe, p: float) -> list[_Column]:
-    space, full = examination.scorer.space, examination.space
+    space, full = examination.scorer.space, examination.bare
     at, alive, rank = space.places()[probe.name], space.alive(), space.whitened[probe.name].shape[1]
     found = []
     for number, place in enumerate(range(at.start, at.stop)):
@@ -109,7 +109,7 @@ def _columns(examination: Examination, probe: Probe, p: float) -> list[_Column]:
         if nearest <= np.sqrt(_ABSORBED * square):
             named = np.inf
         elif np.isfinite(nearest):
-            named = max(detected, SEPARATION / nearest + stats.norm.ppf(PROBABILITY) / np.sqrt(square))
+            named = max(detected, POLICY.separation / nearest + stats.norm.ppf(PROBABILITY) / np.sqrt(square))
         rivals = {name: value * detected for name, value in apart.items()}
         found.append(_Column(probe, number, probe.parameters[number], detected, float(named), rivals))
     return found
@@ -176,7 +176,7 @@ def _collected(
                 detected=(min(c.detected for c in mine), max(c.detected for c in mine)),
                 named=max(c.named for c in mine),
                 taken_for=tuple(
-                    name for name in sorted(near, key=near.__getitem__) if near[name] < SEPARATION
+                    name for name in sorted(near, key=near.__getitem__) if near[name] < POLICY.separation
                 ),
                 error_of_qu=over_field(errors[members]),
             )

@@ -1,33 +1,49 @@
-"""One examination of a fit: its design, the scores of every effect and pattern, and the names in order of evidence."""
+"""What a fit lacks, by linear algebra: the scores of all candidates, their order of evidence, and who does the same.
+
+Evidence      Of a candidate alone: ln B of the score test (`score.log_bayes`). Alternative shapes of an effect share
+              its prior, sentences share that of one name.
+Two steps     A sentence may hold a part of two effects at once, and alone be more probable than either. Compared are
+              ln B(first) + ln B(second behind first) − ln(names), the second step of a name being a name, that of a
+              sentence anything. Where two names are the more probable, the sentence does not come before them.
+Separation    The change D of the residuals that a candidate makes at its amplitudes, projected off the other
+              parameters, is fitted by each rival; the length of what the rival cannot follow is the separation in
+              standard deviations (Atkinson & Fedorov 1975, Biometrika 62, 57). Below `Policy.separation` the data
+              cannot tell the two apart, nor when their evidence differs by less than `Policy.improbable`.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+import itertools
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import grammar, naming
+from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.effect_columns import Probe
 from walop_jax.diagnosis.findings import Alike, Limit
 from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, number_of_columns, strata
+from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.score import (
+    Candidate,
     Projector,
     Score,
     Scorer,
     ScoreSpace,
     ScoreTable,
     corrected_p,
+    log_bayes,
     separations,
 )
 from walop_jax.diagnosis.sentence_columns import all_candidates
-from walop_jax.diagnosis.two_steps import Behind, name_first
-from walop_jax.fit.refit import FitResult
+from walop_jax.fit.refit import SUSPECT_SIGMA, FitResult
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import Described, Effect
 from walop_jax.model.instrument import Instrument
@@ -35,126 +51,215 @@ from walop_jax.model.parameters import field_declarations
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
+Parts = Sequence[tuple[Probe, Collection[type[Effect]]]]
 
-ALARM = 0.0027  # three standard deviations
-COMMON_MODE = 0.05  # rms (σ of one intensity) of disturbances that one camera in one exposure may have
-PROBABILITY = 0.95
-MOST_PATTERNS = 8
-MOST_CLASSES = 8
-LEAST_SHARE = 0.1  # of what is missing that an addition must explain
-FLOOR = 1.25  # standard deviations of what is left above which the stated errors are not those of the data
-SAME_COUNTS = 0.01  # relative change of the counts up to which columns are kept
+ALARM = POLICY.alarm
 
 
 @dataclasses.dataclass(frozen=True)
-class _Absorbed:
-    """What the parameters of an active effect absorb: the projection without them, and the columns' share of it."""
+class Ranked:
+    """An effect or a sentence with its best probe, and its evidence; `others` are shapes that may be as good."""
 
-    rest: Projector
-    basis: Matrix
-    columns: Matrix  # basisᵀ C
+    effect: type[Effect]
+    probe: Probe
+    score: Score
+    log_bayes: float
+    others: tuple[tuple[Probe, Score], ...] = ()
 
 
-class Examination:
-    """The scores of everything against one fit.
+# ------------------------------------------------------------------------------------------- order of evidence
 
-    `named` and `said` are the columns of effects and of sentences ahead of any projection, `space` and `columns` those
-    of all candidates behind it: effects, sentences, patterns. `ranked` are the effects in order of linear evidence,
-    `told` the sentences, each less what it pays for being one of so many (`grammar`), `patterns` the scores of the
-    free-form strata, `blocks` the blocks of the free-form term that can take candidates up. `scorer` has scored all,
-    behind the nuisance that single exposures may have.
+
+def rank(table: ScoreTable, probes: Sequence[Probe], policy: Policy = POLICY) -> list[Ranked]:
+    """Effects by evidence, best first; alternative shapes share the prior of their effect."""
+    by_effect: dict[type[Effect], list[tuple[Probe, Score]]] = {}
+    for probe in probes:
+        by_effect.setdefault(probe.effect, []).append((probe, table[probe.name]))
+    ranked = []
+    for effect, shapes in by_effect.items():
+        alive = [(p, s) for p, s in shapes if s.testable and follow_physics(p, s, policy)]
+        if not alive:
+            continue
+        alive.sort(key=lambda item: -item[1].log_bayes)
+        (probe, score), best = alive[0], alive[0][1].log_bayes
+        mean = float(np.logaddexp.reduce([s.log_bayes for _, s in alive]) - np.log(len(shapes)))
+        others = [
+            item
+            for item in alive[1 : policy.most_shapes]
+            if item[1].log_bayes > best - max(policy.within, 0.2 * best)
+        ]
+        ranked.append(Ranked(effect, probe, score, mean, tuple(others)))
+    return sorted(ranked, key=lambda item: -item.log_bayes)
+
+
+def rank_sentences(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
+    """Sentences by evidence, best first; all of them share the prior of one name."""
+    price = float(np.log(max(len(probes), 1)))
+    scored = [(probe, table[probe.name]) for probe in probes]
+    found = [Ranked(Described, p, score, score.log_bayes - price) for p, score in scored if score.testable]
+    return sorted(found, key=lambda item: -item.log_bayes)
+
+
+def leaders(ranked: Sequence[Ranked], policy: Policy = POLICY) -> list[Ranked]:
+    """Candidates whose linear evidence is too close to the best to leave them out."""
+    if not ranked:
+        return []
+    best, reach = ranked[0].log_bayes, policy.within
+    if best > policy.linear_below:
+        reach = max(reach, policy.linear_share * best)
+    return [item for item in ranked[: policy.most_leaders] if item.log_bayes > best - reach]
+
+
+def follow_physics(probe: Probe, score: Score, policy: Policy = POLICY) -> bool:
+    """Whether a linear step leaves one-sided amplitudes on their side, within `Policy.separation`."""
+    sigma = np.sqrt(np.clip(np.diag(score.covariance), 0.0, None))
+    return bool(np.all((score.amplitudes >= -policy.separation * sigma)[probe.one_sided]))
+
+
+def shortest(item: Ranked, most: int = POLICY.most_together) -> Described:
+    """The sentences of a group that are worth their length, with the amplitudes of a linear step."""
+    information = np.linalg.pinv(item.score.covariance, hermitian=True)
+    scores, widths = information @ item.score.amplitudes, item.probe.widths
+    members = range(len(widths))
+    subsets = [list(some) for n in members for some in itertools.combinations(members, n + 1) if n < most]
+    subsets.append(list(members))
+    worth = [log_bayes(information[np.ix_(some, some)], scores[some], widths[some]) for some in subsets]
+    best = subsets[int(np.argmax(worth))]
+    amplitudes = np.linalg.lstsq(information[np.ix_(best, best)], scores[best], rcond=None)[0]
+    return Described.combine([item.probe.group[i] for i in best], amplitudes)
+
+
+class Behind(NamedTuple):
+    """Names and sentences in order of evidence, and the global p of what is left, once one of them is in the model."""
+
+    names: Sequence[Ranked]
+    sentences: Sequence[Ranked]
+    p_global: float
+
+
+def name_first(
+    names: Sequence[Ranked],
+    sentence: Ranked,
+    behind: Callable[[Ranked], Behind],
+    policy: Policy = POLICY,
+) -> bool:
+    """Whether significant `names` come before a more probable sentence.
+
+    They do where the best of them leaves nothing significant and the sentence does, or where two of them are more
+    probable than the sentence with whatever is best behind it.
     """
 
-    def __init__(
-        self,
-        result: FitResult,
-        wanted: Sequence[Probe],
-        rng: np.random.Generator,
-        earlier: Examination | None = None,
-        sentences: Sequence[Probe] = (),
-        parts: Sequence[tuple[Probe, frozenset[type[Effect]]]] = (),
-    ) -> None:
-        """`earlier` is of a smaller model; its columns serve again where the light has hardly changed.
+    def worth(first: Ranked, second: Sequence[Ranked], count: int) -> float:
+        gain = max((item.log_bayes for item in second), default=0.0) - float(np.log(max(count, 1)))
+        return first.log_bayes + max(gain, 0.0)
 
-        `parts` are sentences that are told as the effects that hold them (`history.parts`).
-        """
-        self.result = result
-        active = result.model.effect_names
-        self.design = Design.of(result)
-        inactive = [probe for probe in wanted if probe.effect.name not in active]
-        every = [*sentences, *(probe for probe, _ in parts)]
-        self.named, self.said = (
-            all_candidates(result.likelihood, result.model, result.values, inactive, every)
-            if earlier is None or not self._is_like(earlier)
-            else (earlier.named, earlier.said)
-        )
-        self.probes = [probe for probe in inactive if probe.name in self.named]
-        self.sentences = tuple(probe for probe in sentences if probe.name in self.said)
-        self.parts = [
-            (probe, {effect for effect in effects if effect.name not in active})
-            for probe, effects in parts
-            if probe.name in self.said
-        ]
-        patterns = [self.design.measured.candidate(stratum) for stratum in strata(self.design.measured)]
-        candidates = [
-            *(self.named[probe.name] for probe in self.probes),
-            *(self.said[probe.name] for probe in self.sentences),
-            *(self.said[probe.name] for probe, _ in self.parts),
-            *patterns,
-        ]
-        self.blocks = {candidate.name: candidate.block for candidate in candidates}
-        names, widths = [c.name for c in candidates], [c.widths for c in candidates]
-        self.columns = self.design.stacked([candidates.pop(0).columns for _ in names])
-        self._absorbed = {}
-        for name in active:
-            rest, basis = self.design.without(name)
-            self._absorbed[name] = _Absorbed(rest, basis, basis.T @ self.columns)
-        self.space = ScoreSpace.projected(self.design.projector, names, widths, self.columns)
-        r = self.design.projector(self.design.residual)
-        self._scored = self.space, self.columns.T @ r, float(r @ r)
-        self.common_mode = np.zeros(0)
-        if SINGLE_EXPOSURES in names:
-            self.common_mode = self._common_mode()
-            space, reduce = self.space.with_base([SINGLE_EXPOSURES], self.common_mode)
-            self._scored = space, *reduce(*self._scored[1:])
-        self._rng = rng
-        self.scorer = Scorer(self._scored[0], rng)
-        self.table: ScoreTable = self.scorer(*self._scored[1:])
-        self.ranked = naming.rank(self.table, self.probes)
-        self.told = grammar.rank(self.table, self.sentences)
-        self.patterns = [self.table[name] for name in names[len(names) - len(patterns) :]]
-        # Where the base is excluded, a name competes with patterns that have none, not with the base.
-        self.least_evidence = min(0.0, max(s.log_bayes for s in self.patterns if s.testable))
+    if not names:
+        return False
+    said = behind(sentence)
+    least = worth(sentence, [*said.names[:1], *said.sentences[:1]], len(said.names))
+    for name in leaders(names, policy):
+        left = behind(name)
+        if name is names[0] and said.p_global < policy.alarm <= left.p_global:
+            return True
+        if worth(name, left.names[:1], len(left.names)) > least:
+            return True
+    return False
+
+
+# --------------------------------------------------------------------------------------------------- evidence
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Evidence:
+    """What every candidate would explain of one set of residuals, beyond what the base parameters do.
+
+    `scorer` holds the space of all candidates behind the nuisance that single exposures may have, `scores` are C̃ᵀr and
+    `square` r·r there. `probes` are effects, `sentences` what else can be said, `parts` sentences that are told as the
+    effects that hold them (`grammar.parts`), `patterns` the names of patterns without a name. `chi2` and `dof` are
+    those of the fit.
+    """
+
+    scorer: Scorer
+    scores: Vector
+    square: float
+    table: ScoreTable
+    probes: Sequence[Probe]
+    sentences: Sequence[Probe]
+    parts: Parts
+    patterns: Sequence[str]
+    chi2: float
+    dof: int
+    policy: Policy = POLICY
+
+    @property
+    def space(self) -> ScoreSpace:
+        """The space that was scored."""
+        return self.scorer.space
+
+    @cached_property
+    def ranked(self) -> list[Ranked]:
+        """Effects in order of evidence."""
+        return rank(self.table, self.probes, self.policy)
+
+    @cached_property
+    def told(self) -> list[Ranked]:
+        """Sentences in order of evidence, each less what it pays for being one of so many."""
+        return rank_sentences(self.table, self.sentences)
+
+    @cached_property
+    def significant(self) -> list[Ranked]:
+        """Effects that are significant by themselves, best evidence first."""
+        return [r for r in self.ranked if self.table.corrected(r.score) < self.policy.alarm]
+
+    @cached_property
+    def significant_sentences(self) -> list[Ranked]:
+        """Sentences that are significant by themselves, best evidence first."""
+        return [r for r in self.told if self.table.corrected(r.score) < self.policy.alarm]
+
+    @property
+    def alarm(self) -> bool:
+        """Whether anything is missing at all."""
+        return self.table.p_global < self.policy.alarm
+
+    @property
+    def poor(self) -> bool:
+        """Whether so much is missing that what cannot be differentiated is worth trying."""
+        return self.chi2 > self.policy.poor_fit * self.dof
 
     @property
     def floor(self) -> float:
         """What is left behind everything that was looked for, in standard deviations of the data as stated; 1 or more.
 
-        Above `FLOOR` no candidate explains the data to within N_ERR. Evidence and separations then count in this unit:
-        in that of photons everything would be certain.
+        Above `Policy.floor` no candidate explains the data to within N_ERR. Evidence and separations then count in this
+        unit: in that of photons everything would be certain.
         """
-        return self.table.noise_scale if self.table.noise_scale > FLOOR else 1.0
+        return self.table.noise_scale if self.table.noise_scale > self.policy.floor else 1.0
 
-    def _is_like(self, earlier: Examination) -> bool:
-        """Whether the expected counts differ so little that derivatives with respect to anything else do as well."""
-        ours, theirs = self.design.measured.model, earlier.design.measured.model
-        return bool(np.linalg.norm(ours - theirs) < SAME_COUNTS * np.linalg.norm(theirs))
+    @cached_property
+    def _pattern_scores(self) -> list[Score]:
+        return [score for score in map(self.table.__getitem__, self.patterns) if score.testable]
 
-    def _common_mode(self) -> Vector:
-        """Prior widths of the gains of single exposures that amount to `COMMON_MODE` per intensity."""
-        at = self.space.places()[SINGLE_EXPOSURES]
-        points = np.repeat(self.design.measured.used.sum(axis=0), len(self.design.measured.gained))
-        square = np.where(self.space.before[at] > 0, self.space.before[at], np.inf)
-        return np.maximum(COMMON_MODE * np.sqrt(points / square), 1e-30)
+    @cached_property
+    def least_evidence(self) -> float:
+        """Evidence that a name needs: where the base is excluded it competes with patterns that have none."""
+        return min(0.0, max((s.log_bayes for s in self._pattern_scores), default=0.0))
+
+    @property
+    def best_pattern(self) -> float:
+        """Evidence of the most probable pattern, less what it pays for being one of several."""
+        alive = [score.log_bayes for score in self._pattern_scores]
+        return max(alive, default=-np.inf) - float(np.log(max(len(alive), 1)))
+
+    def _p(self, score: Score) -> float:
+        return corrected_p(score.log_p, self.table.trials)
 
     @cached_property
     def _beside_patterns(self) -> tuple[list[tuple[str, float]], ScoreTable]:
         """Patterns that are needed, and the scores of everything with those as nuisances."""
-        space, scores, square = self._scored
-        names = [score.name for score in self.patterns]
-        table, needed = self.table, []
-        while len(needed) < MOST_PATTERNS:
-            left = [s for s in table.scores if s.name in names and s.testable and self._p(s) < ALARM]
+        space, scores, square = self.space, self.scores, self.square
+        names, table, needed = list(self.patterns), self.table, []
+        while len(needed) < self.policy.most_patterns:
+            left = [s for s in map(table.__getitem__, names) if s.testable and self._p(s) < self.policy.alarm]
             if not left:
                 break
             best = max(left, key=lambda s: s.log_bayes)
@@ -162,40 +267,112 @@ class Examination:
             names.remove(best.name)
             space, reduce = space.with_base([best.name])
             scores, square = reduce(scores, square)
-            table = Scorer(space, self._rng, draws=0).after(self.table, scores)
+            table = Scorer(space, np.random.default_rng(0), draws=0).after(self.table, scores)
         return needed, table
-
-    def _p(self, score: Score) -> float:
-        return corrected_p(score.log_p, self.table.trials)
 
     def patterns_needed(self) -> list[tuple[str, float]]:
         """Patterns that together leave nothing significant, with corrected p: the most probable first, one by one."""
         return self._beside_patterns[0]
 
-    def best_pattern(self) -> float:
-        """Evidence of the most probable pattern, less what it pays for being one of several."""
-        alive = [score.log_bayes for score in self.patterns if score.testable]
-        return max(alive, default=-np.inf) - float(np.log(max(len(alive), 1)))
-
-    def stands(self, probes: Sequence[Probe], log_bayes: float) -> bool:
+    def stands(self, probes: Sequence[Probe], evidence: float) -> bool:
         """Whether an explanation with this evidence need not fear patterns that have no name.
 
         It is more probable than any of them, or is significant beside those that are needed.
         """
-        if log_bayes > self.best_pattern() - naming.EVEN_ODDS:
+        if evidence > self.best_pattern - self.policy.even_odds:
             return True
         table = self._beside_patterns[1]
-        return any(self._p(table[probe.name]) < ALARM for probe in probes if table[probe.name].testable)
+        return any(
+            self._p(table[probe.name]) < self.policy.alarm for probe in probes if table[probe.name].testable
+        )
 
-    @property
-    def alarm(self) -> bool:
-        """Whether anything is missing at all."""
-        return self.table.p_global < ALARM
+    def is_worth_telling(self, effect: type[Effect], evidence: float, left: float, *, noise: bool) -> bool:
+        """Whether an addition explains a good part of what is missing, and patterns without a name do not do better.
 
-    @property
-    def noise_p(self) -> float:
-        """Chance that noise of the stated size alone leaves as much as this fit does."""
-        return float(stats.chi2.sf(self.result.chi2, max(self.result.dof, 1)))
+        `left` is its χ², `noise` says whether that is what noise alone would leave.
+        """
+        evidence /= self.floor**2
+        if evidence <= self.least_evidence:
+            return False
+        if self.chi2 - left < self.policy.least_share * (self.chi2 - self.dof):
+            return False
+        # What is left is noise, and was not before: a pattern can only say the same with more numbers.
+        if noise and not explains(self.chi2, self.dof):
+            return True
+        probes = [probe for probe in self.probes if probe.effect is effect]
+        return self.stands(probes, evidence) if probes or effect is Described else True
+
+    def behind(self, item: Ranked) -> Behind:
+        """What is left to be told when one candidate has joined the base, by a linear step."""
+        space, reduce = self.space.with_base([item.probe.name])
+        scorer = Scorer(space, np.random.default_rng(0), draws=0)
+        table = scorer.after(self.table, reduce(self.scores, self.square)[0])
+        probes = [probe for probe in self.probes if probe.effect is not item.effect]
+        said = [probe for probe in self.sentences if probe is not item.probe]
+        return Behind(rank(table, probes, self.policy), rank_sentences(table, said), table.p_global)
+
+    def sentences_before_names(self) -> list[Ranked]:
+        """Sentences that are more probable than every name; none where names suffice and they do not."""
+        names, found = self.significant, self.significant_sentences
+        if names:
+            found = [item for item in found if item.log_bayes > names[0].log_bayes]
+        return [] if found and name_first(names, found[0], self.behind, self.policy) else found
+
+    # ------------------------------------------------------------------------------- what cannot be told apart
+
+    def apart(self, item: Ranked) -> dict[str, float]:
+        """How far (σ) every candidate stays from what one does at its amplitudes, by linear steps."""
+        at, amplitudes = self.space.places()[item.probe.name], item.score.amplitudes
+        change = self.space.gram[:, at] @ amplitudes
+        return separations(self.space, change, float(amplitudes @ change[at]))
+
+    def nearest(self, by_candidate: Mapping[str, float]) -> dict[str, float]:
+        """The smallest number of each effect among those of its probes."""
+        found: dict[str, float] = {}
+        for probe in self.probes:
+            effect = probe.effect.name
+            found[effect] = min(by_candidate[probe.name], found.get(effect, np.inf))
+        return found
+
+    def close(self, item: Ranked) -> tuple[str, ...]:
+        """Effects that could follow what a candidate would explain, by linear steps; the nearest first."""
+        apart = self.nearest(self.apart(item))
+        apart.pop(item.effect.name, None)
+        close = {name: s for name, s in apart.items() if s < self.policy.separation * self.floor}
+        return tuple(sorted(close, key=close.__getitem__))
+
+    def nameless(self, item: Ranked, own: Collection[str] = ()) -> tuple[str, ...]:
+        """Sentences beside a candidate that are not improbable, or no longer and not to be told from it.
+
+        The most probable come first; `own` are the sentences that it is.
+        """
+        least, apart = max(0.0, item.log_bayes - self.policy.improbable), self.apart(item)
+        length, limit = len(item.score.amplitudes), self.policy.separation * self.floor
+        alike = {p.name for p in self.sentences if len(p.widths) <= length and apart[p.name] < limit}
+        others = [r for r in self.told if r.log_bayes > least or r.probe.name in alike]
+        others = [r for r in others if not set(own) & set(grammar.said_by(r.probe))]
+        return tuple(r.probe.name for r in others[: self.policy.most_classes])
+
+    def held_in_part(self, item: Ranked) -> tuple[str, ...]:
+        """Effects of which a part, by itself, is not improbable beside a candidate; parts share the prior of theirs."""
+        count = Counter(effect for _, effects in self.parts for effect in effects)
+        least = max(0.0, item.log_bayes - self.policy.improbable)
+        return tuple(
+            dict.fromkeys(
+                effect.name
+                for probe, effects in self.parts
+                for effect in effects
+                if effect is not item.effect
+                and self.table[probe.name].testable
+                and self.table[probe.name].log_bayes - float(np.log(count[effect])) > least
+            )
+        )
+
+    def classes(self) -> Iterator[Alike]:
+        """Which other effects could follow what each significant one would explain, by linear steps."""
+        for item in self.significant[: self.policy.most_classes]:
+            if close := self.close(item):
+                yield Alike(item.effect.name, close, item.effect.separated_by)
 
     def summary(self) -> tuple[tuple[str, float, float], ...]:
         """Effects with score and corrected p, most significant first."""
@@ -211,8 +388,58 @@ class Examination:
             value, sigma = float(item.score.amplitudes[0]), float(np.sqrt(item.score.covariance[0, 0]))
             unit = field_declarations(item.effect)[names[0]].unit
             one_sided = names[0] in item.effect.one_sided
-            below = upper_limit(value, sigma, one_sided=one_sided)
+            below = upper_limit(value, sigma, one_sided=one_sided, probability=self.policy.limit)
             yield Limit(item.effect.name, names[0], unit, value, sigma, below)
+
+
+def explains(chi2: float, dof: float) -> bool:
+    """Whether χ² is what noise alone would give, as `FitResult.explains_data` has it."""
+    return dof > 0 and chi2 - dof < SUSPECT_SIGMA * np.sqrt(2.0 * dof)
+
+
+def upper_limit(value: float, sigma: float, *, one_sided: bool, probability: float = POLICY.limit) -> float:
+    """Size that an amplitude stays below with a probability, for a flat prior (positive when one-sided)."""
+    if one_sided:
+        below_zero = stats.norm.cdf(-value / sigma)
+        return float(value + sigma * stats.norm.ppf(below_zero + probability * (1.0 - below_zero)))
+    return float(stats.foldnorm.ppf(probability, abs(value) / sigma, scale=sigma))
+
+
+# ----------------------------------------------------------------------------------------------- of one fit
+
+
+@dataclasses.dataclass(frozen=True)
+class _Absorbed:
+    """What the parameters of an active effect absorb: the projection without them, and the columns' share of it."""
+
+    rest: Projector
+    basis: Matrix
+    columns: Matrix  # basisᵀ C
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Examination(Evidence):
+    """The evidence of one fit, and where it comes from.
+
+    `named` and `said` are the columns of effects and of sentences ahead of any projection, `bare` and `columns` those
+    of all candidates behind it, ahead of the nuisance of single exposures with prior widths `common_mode`. `blocks`
+    are the blocks of the free-form term that can take candidates up.
+    """
+
+    result: FitResult
+    design: Design
+    named: Mapping[str, Candidate]
+    said: Mapping[str, Candidate]
+    blocks: Mapping[str, str | None]
+    bare: ScoreSpace
+    columns: Matrix
+    common_mode: Vector
+    absorbed: Mapping[str, _Absorbed]
+
+    @property
+    def noise_p(self) -> float:
+        """Chance that noise of the stated size alone leaves as much as this fit does."""
+        return float(stats.chi2.sf(self.chi2, max(self.dof, 1)))
 
     def untestable(self, catalogue: Sequence[type[Effect]]) -> tuple[str, ...]:
         """Effects that these data cannot show at any plausible size."""
@@ -224,115 +451,100 @@ class Examination:
 
     def separation(self, name: str, change: Vector) -> dict[str, float]:
         """How far (σ) each rival stays from an active effect that changes the residuals (data rows) by `change`."""
-        own = self._absorbed[name]
+        own = self.absorbed[name]
         whole = np.pad(change, (0, len(self.design.residual) - len(change)))
         projected = own.rest(whole)
-        space = dataclasses.replace(self.space, gram=self.space.gram + own.columns.T @ own.columns)
+        space = dataclasses.replace(self.bare, gram=self.bare.gram + own.columns.T @ own.columns)
         scores = self.columns.T @ projected + own.columns.T @ (own.basis.T @ projected)
         found = self.nearest(separations(space, scores, float(projected @ projected)))
         return {rival: apart / self.floor for rival, apart in found.items()}
 
-    def classes(self) -> Iterator[Alike]:
-        """Which other effects could follow what each significant one would explain, by linear steps."""
-        for item in self.significant[:MOST_CLASSES]:
-            apart = self.nearest(self._apart(item))
-            close = {name: value for name, value in apart.items() if value < naming.SEPARATION * self.floor}
-            close.pop(item.effect.name, None)
-            if close:
-                yield Alike(
-                    item.effect.name, tuple(sorted(close, key=close.__getitem__)), item.effect.separated_by
-                )
-
-    def nearest(self, by_candidate: Mapping[str, float]) -> dict[str, float]:
-        """The smallest number of each effect among those of its probes."""
-        found: dict[str, float] = {}
-        for probe in self.probes:
-            effect = probe.effect.name
-            found[effect] = min(by_candidate[probe.name], found.get(effect, np.inf))
-        return found
-
-    @cached_property
-    def significant_sentences(self) -> list[naming.Ranked]:
-        """Sentences that are significant by themselves, best evidence first."""
-        return [r for r in self.told if self.table.corrected(r.score) < ALARM]
-
-    def _behind(self, item: naming.Ranked) -> Behind:
-        """What is left to be told when one candidate has joined the base, by a linear step."""
-        space, scores, square = self._scored
-        space, reduce = space.with_base([item.probe.name])
-        table = Scorer(space, self._rng, draws=0).after(self.table, reduce(scores, square)[0])
-        probes = [probe for probe in self.probes if probe.effect is not item.effect]
-        said = [probe for probe in self.sentences if probe is not item.probe]
-        return Behind(naming.rank(table, probes), grammar.rank(table, said), table.p_global)
-
-    def sentences_before_names(self) -> list[naming.Ranked]:
-        """Sentences that are more probable than every name; none where names suffice and they do not (`two_steps`)."""
-        names, found = self.significant, self.significant_sentences
-        if names:
-            found = [item for item in found if item.log_bayes > names[0].log_bayes]
-        return [] if found and name_first(names, found[0], self._behind, ALARM) else found
-
-    def nameless(self, trial: naming.Trial) -> tuple[str, ...]:
-        """Sentences beside what a trial says, by linear steps: not improbable, or no longer and not to be told from it.
-
-        The most probable come first.
-        """
-        item, own = self._linear(trial), _sentences_of(trial)
-        if item is None:
-            return ()
-        least, alike = max(0.0, item.log_bayes - naming.IMPROBABLE), self._alike(item)
-        others = [r for r in self.told if r.log_bayes > least or r.probe.name in alike]
-        others = [r for r in others if not own & set(grammar.said_by(r.probe))]
-        return tuple(r.probe.name for r in others[:MOST_CLASSES])
-
-    def held_in_part(self, trial: naming.Trial) -> tuple[str, ...]:
-        """Effects that, were all but a part of them zero, would not be improbable beside what a trial says."""
-        item = self._linear(trial)
-        if item is None:
-            return ()
-        return naming.held_in_part(self.table, self.parts, item)
-
-    def _linear(self, trial: naming.Trial) -> naming.Ranked | None:
-        """What a trial says, as it was ranked by linear steps."""
-        own = _sentences_of(trial)
-        if own:
-            return next((r for r in self.told if own & set(grammar.said_by(r.probe))), None)
-        return next((r for r in self.ranked if r.effect is trial.effect), None)
-
-    def _alike(self, item: naming.Ranked) -> set[str]:
-        """Sentences no longer than a candidate that the data cannot tell from what it does."""
-        apart, length = self._apart(item), len(item.score.amplitudes)
-        limit = naming.SEPARATION * self.floor
-        return {p.name for p in self.sentences if len(p.widths) <= length and apart[p.name] < limit}
-
-    def _apart(self, item: naming.Ranked) -> dict[str, float]:
-        """How far (σ) every candidate stays from what one does at its amplitudes, by linear steps."""
-        at, amplitudes = self.space.places()[item.probe.name], item.score.amplitudes
-        change = self.space.gram[:, at] @ amplitudes
-        return separations(self.space, change, float(amplitudes @ change[at]))
-
-    def is_worth_telling(self, trial: naming.Trial) -> bool:
-        """Whether a trial explains a good part of what is missing, and patterns without a name do not do so better."""
-        evidence = trial.log_bayes / self.floor**2
-        if evidence <= self.least_evidence:
-            return False
-        missing, moved = self.result.chi2 - self.result.dof, self.result.chi2 - trial.fit.chi2
-        if moved < LEAST_SHARE * missing:
-            return False
-        # What is left is noise, and was not before: a pattern can only say the same with more numbers.
-        if trial.fit.explains_data and not self.result.explains_data:
-            return True
-        probes = [probe for probe in self.probes if probe.effect is trial.effect]
-        return self.stands(probes, evidence) if probes or trial.effect is Described else True
-
-    @cached_property
-    def significant(self) -> list[naming.Ranked]:
-        """Effects that are significant by themselves, best evidence first."""
-        return [r for r in self.ranked if self.table.corrected(r.score) < ALARM]
+    def is_like(self, design: Design) -> bool:
+        """Whether the counts that another fit expects differ so little that derivatives with respect to others do."""
+        ours, theirs = self.design.measured.model, design.measured.model
+        return bool(np.linalg.norm(ours - theirs) < self.policy.same_counts * np.linalg.norm(ours))
 
 
-def _sentences_of(trial: naming.Trial) -> set[str]:
-    return set(trial.instance.sentences) if isinstance(trial.instance, Described) else set()
+def examine(
+    result: FitResult,
+    wanted: Sequence[Probe],
+    rng: np.random.Generator,
+    earlier: Examination | None = None,
+    sentences: Sequence[Probe] = (),
+    parts: Parts = (),
+    policy: Policy = POLICY,
+) -> Examination:
+    """Score effects that a model has not, sentences, `parts` of effects (`grammar.parts`) and patterns against a fit.
+
+    `earlier` is of a smaller model; its columns serve again where the light has hardly changed.
+    """
+    active, design = result.model.effect_names, Design.of(result)
+    inactive = [probe for probe in wanted if probe.effect.name not in active]
+    every = [*sentences, *(probe for probe, _ in parts)]
+    named, said = (
+        (earlier.named, earlier.said)
+        if earlier is not None and earlier.is_like(design)
+        else all_candidates(result.likelihood, result.model, result.values, inactive, every)
+    )
+    probes = [probe for probe in inactive if probe.name in named]
+    sentences = tuple(probe for probe in sentences if probe.name in said)
+    known = [
+        (probe, {effect for effect in effects if effect.name not in active})
+        for probe, effects in parts
+        if probe.name in said
+    ]
+    patterns = [design.measured.candidate(stratum) for stratum in strata(design.measured)]
+    candidates = [
+        *(named[probe.name] for probe in probes),
+        *(said[probe.name] for probe in sentences),
+        *(said[probe.name] for probe, _ in known),
+        *patterns,
+    ]
+    blocks = {candidate.name: candidate.block for candidate in candidates}
+    names, widths = [c.name for c in candidates], [c.widths for c in candidates]
+    columns = design.stacked([candidates.pop(0).columns for _ in names])
+    absorbed = {}
+    for name in active:
+        rest, basis = design.without(name)
+        absorbed[name] = _Absorbed(rest, basis, basis.T @ columns)
+    bare = ScoreSpace.projected(design.projector, names, widths, columns)
+    r = design.projector(design.residual)
+    space, scores, square, common_mode = bare, columns.T @ r, float(r @ r), np.zeros(0)
+    if SINGLE_EXPOSURES in names:
+        common_mode = _common_mode(bare, design, policy.common_mode)
+        space, reduce = bare.with_base([SINGLE_EXPOSURES], common_mode)
+        scores, square = reduce(scores, square)
+    scorer = Scorer(space, rng)
+    return Examination(
+        scorer=scorer,
+        scores=scores,
+        square=square,
+        table=scorer(scores, square),
+        probes=probes,
+        sentences=sentences,
+        parts=known,
+        patterns=[pattern.name for pattern in patterns],
+        chi2=result.chi2,
+        dof=result.dof,
+        policy=policy,
+        result=result,
+        design=design,
+        named=named,
+        said=said,
+        blocks=blocks,
+        bare=bare,
+        columns=columns,
+        common_mode=common_mode,
+        absorbed=absorbed,
+    )
+
+
+def _common_mode(space: ScoreSpace, design: Design, rms: float) -> Vector:
+    """Prior widths of the gains of single exposures that amount to `rms` per intensity."""
+    at = space.places()[SINGLE_EXPOSURES]
+    points = np.repeat(design.measured.used.sum(axis=0), len(design.measured.gained))
+    square = np.where(space.before[at] > 0, space.before[at], np.inf)
+    return np.maximum(rms * np.sqrt(points / square), 1e-30)
 
 
 def most_points(calset: CalibrationSet, instrument: Instrument, amplitudes: int) -> int:
@@ -344,11 +556,3 @@ def most_points(calset: CalibrationSet, instrument: Instrument, amplitudes: int)
     exposures = len(calset.exposures)
     numbers = exposures * calset.cameras * columns
     return max(1, min(limits.DIAGNOSED_ROWS // exposures, limits.DIAGNOSED_NUMBERS // numbers))
-
-
-def upper_limit(value: float, sigma: float, *, one_sided: bool) -> float:
-    """Size that an amplitude stays below with 95 % probability, for a flat prior (positive when one-sided)."""
-    if one_sided:
-        below_zero = stats.norm.cdf(-value / sigma)
-        return float(value + sigma * stats.norm.ppf(below_zero + PROBABILITY * (1.0 - below_zero)))
-    return float(stats.foldnorm.ppf(PROBABILITY, abs(value) / sigma, scale=sigma))

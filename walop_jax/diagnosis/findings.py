@@ -1,29 +1,26 @@
-"""What a diagnosis finds, as values."""
+"""What a diagnosis finds: values, words, and the content of `diagnosis.json` (docs: files)."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from walop_jax.diagnosis.design import HeldOut
+from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.rounding import value_and_error
+from walop_jax.model.effects import Described
+from walop_jax.model.effects.sentence import FIELD_FACTORS, OPPOSITE, Sentence
+from walop_jax.model.parameters import field_declarations
 
 Outcome = Literal["consistent", "effect_found", "unexplained"]
 Cube = Float[np.ndarray, "p e k"]
-
-NEGLIGIBLE = (
-    1e-4  # change of calibrated q and u (0.01 %) that does not matter for an instrument good to 0.1 %
-)
-MOST_NAMES = 2  # names above which a single effect that nobody thought of is as likely
-LARGEST_ROBUST_RATIO = (
-    1.5  # of errors that allow for common disturbances of an exposure, to errors that do not
-)
 
 
 def _no_cube() -> Cube:
@@ -92,7 +89,7 @@ class Step:
     @property
     def negligible(self) -> bool:
         """Whether the effect hardly matters for calibrated q and u."""
-        return self.change_of_qu < NEGLIGIBLE
+        return self.change_of_qu < POLICY.negligible
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,7 +109,8 @@ class Unexplained:
     """What is left and has no name; `term` are the blocks of the free-form term that was added for it.
 
     `chi2_before` and `chi2_after` are without and with that term, `change_of_qu` is what it changes in calibrated q
-    and u of a star with p ≤ 5 %.
+    and u of a star with p ≤ 5 %. `useless` says that such a term was not added because it does not predict what it has
+    not seen, `parts` are names that were taken out again because they explain a part only, with what they leave.
     """
 
     p_value: float
@@ -122,6 +120,23 @@ class Unexplained:
     chi2_before: float = float("nan")
     chi2_after: float = float("nan")
     change_of_qu: float = float("nan")
+    useless: bool = False
+    parts: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> str:
+        """The description, and what was left out of the model."""
+        said = [self.description]
+        if self.parts:
+            said.append(
+                f"explains a part and may stand in for something else, not added: {'; '.join(self.parts)}"
+            )
+        if self.useless:
+            said.append(
+                "a term without a name does not predict settings and parts of the field that it has not seen: it was "
+                "left out of the model"
+            )
+        return ". ".join(said)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,18 +192,25 @@ class Diagnosis(Displayed):
     noise_p: float = float("nan")
     choices: tuple[Choice, ...] = ()
     classes: tuple[Alike, ...] = ()
+    policy: Policy = POLICY
+    ended: bool = False
 
     @property
     def caution(self) -> str:
         """What to bear in mind with these findings; empty when there is nothing."""
         parts = []
+        if self.ended:
+            parts.append(
+                f"the search ended after {self.policy.minutes:g} minutes with this model, the best so far: allow more "
+                "minutes, or start from it as --model"
+            )
         looked_at = len(self.after.calset.points)
         if looked_at < self.points:
             parts.append(
                 f"{looked_at} of {self.points} field points were looked at, and fitted: refit all of them with the "
                 "model found"
             )
-        if len(self.steps) > MOST_NAMES:
+        if len(self.steps) > self.policy.most_names:
             parts.append(
                 f"{len(self.steps)} names were needed: something that is not in the catalogue can look like several "
                 "that are"
@@ -198,11 +220,11 @@ class Diagnosis(Displayed):
         ]
         if far:
             parts.append(f"far beyond its prior, which was widened: {', '.join(far)}")
-        weak = [s.effect for s in self.steps if s.robust_ratio > LARGEST_ROBUST_RATIO]
+        weak = [s.effect for s in self.steps if s.robust_ratio > self.policy.largest_robust_ratio]
         if weak:
             parts.append(
-                f"errors of {', '.join(weak)} are too small by more than a factor {LARGEST_ROBUST_RATIO} if single "
-                "exposures have disturbances of their own"
+                f"errors of {', '.join(weak)} are too small by more than a factor "
+                f"{self.policy.largest_robust_ratio:g} if single exposures have disturbances of their own"
             )
         return "; ".join(parts)
 
@@ -236,7 +258,7 @@ class Diagnosis(Displayed):
             if s.equivalent or s.nameless
         ]
         notes += [f"{told.words}: {told.tested_by}" for s in self.steps for told in s.told]
-        notes += [self.unexplained.description] if self.unexplained is not None else []
+        notes += [self.unexplained.words] if self.unexplained is not None else []
         notes += [self.caution] if self.caution else []
         return Display(
             title=f"Diagnosis: {self.verdict}",
@@ -249,3 +271,178 @@ class Diagnosis(Displayed):
             rows=tuple(rows),
             notes=tuple(notes),
         )
+
+
+# --------------------------------------------------------------------------------- sentences, told to people
+
+_OF_FACTOR = {
+    "hours": "the same exposures in another order, or once more hours later",
+    "hour angle": "the same exposures at other hour angles, in another order",
+    "kelvin": "the same exposures at another temperature",
+    "colour": "narrow bands, or another filter",
+    "counts": "the same exposures at another flux",
+}
+_OF_KIND = {
+    "afterglow": "a dark exposure after a bright one",
+    "light": "the same field points at another flux, and darks",
+    "gain": "a lamp that does not change, seen by all cameras in turn",
+    "fringes": "narrow bands a nanometre apart, or the same band at another temperature",
+    "shift": "narrow bands beside the broad one",
+    "displacement": "the same angles at several hour angles, and a star at known pixels in each",
+    "polarisation": "the same patch or star again at another ROTATOR angle",
+}
+
+
+def told(result: FitResult) -> tuple[Told, ...]:
+    """The sentences of a fitted model, with their amplitudes."""
+    if Described.name not in result.model.effect_names:
+        return ()
+    effect = result.model.instrument(result.values).effect(Described.name)
+    assert isinstance(effect, Described)
+    found = []
+    for sentence, amplitude in effect.terms():
+        sigma = float(result.sigma[result.model.index(f"{Described.name}.{sentence.label}")])
+        unit = field_declarations(Described)[sentence.parameter].unit
+        value, error = value_and_error(float(amplitude), sigma)
+        kind, *dependence = sentence.in_words().split(", ")
+        found.append(
+            Told(
+                sentence=sentence.text,
+                kind=sentence.kind,
+                place=f"{sentence.where} {sentence.place}",
+                dependence=tuple(dependence),
+                value=float(amplitude),
+                sigma=sigma,
+                unit=unit,
+                words=f"{kind}: {value} ± {error}{' ' if unit else ''}{unit}{''.join(f', {d}' for d in dependence)}",
+                tested_by=tested_by(sentence),
+            )
+        )
+    return tuple(found)
+
+
+def tested_by(sentence: Sentence) -> str:
+    """The observation that would show whether a sentence is true."""
+    advice = []
+    for factor in sentence.factors:
+        if factor in _OF_FACTOR:
+            advice.append(_OF_FACTOR[factor])
+        elif factor.startswith(("cos", "sin")):
+            advice.append(
+                "a full turn at more angles in random order, then with the element mounted turned by 90°"
+            )
+        elif factor.startswith(("hours", "exposure")):
+            advice.append("the same exposures once more")
+        elif factor in FIELD_FACTORS or factor.startswith("ring"):
+            advice.append(
+                "more field points along that direction; dither: what is of the optics stays where it is"
+            )
+    kind = sentence.kind.split()[0]
+    if sentence.origin == OPPOSITE:
+        advice.append("a star dithered over the field: its ghost moves the other way")
+    elif kind in _OF_KIND:
+        advice.append(_OF_KIND[kind])
+    elif sentence.where == "ahead of" and "." not in sentence.place:
+        advice.append("standards at several ROTATOR angles: light through the polariser does not have it")
+    elif sentence.where == "of":
+        advice.append("the same exposures without that element, or with it mounted turned over")
+    else:
+        advice.append(
+            "the calibration plate at 0° and 45°: it turns what is ahead of it, and not what is behind"
+        )
+    return "; ".join(dict.fromkeys(advice))
+
+
+# ------------------------------------------------------------------------------------------ as plain data
+
+DIAGNOSIS = "diagnosis.json"
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _step(step: Step) -> dict[str, Any]:
+    return {
+        "effect": step.effect,
+        "parameters": {
+            name: {"value": value, "sigma": 0.0, "unit": ""} for name, value in step.choices.items()
+        }
+        | {
+            name: {"value": value, "sigma": sigma, "unit": unit}
+            for name, (value, sigma, unit) in step.parameters.items()
+        },
+        "alternatives": list(step.alternatives),
+        "score": step.score,
+        "p_value": step.p_value,
+        "chi2_before": step.chi2_before,
+        "chi2_after": step.chi2_after,
+        "heldout_before": step.heldout_before.mean,
+        "heldout_after": step.heldout_after.mean,
+        "sentences": [dataclasses.asdict(told) for told in step.told],
+        "equivalent": list(step.equivalent),
+        "nameless": list(step.nameless),
+        "separated_by": step.separated_by,
+        "where": step.where,
+        "heldout_scheme": step.heldout_before.scheme,
+        "confirmed": step.confirmed,
+        "log_bayes": step.log_bayes,
+        "change_of_qu": _number(step.change_of_qu),
+        "negligible": step.negligible,
+        "robust_error_ratio": _number(step.robust_ratio),
+        "separation_sigma": {
+            name: value
+            for name, value in sorted(step.separation.items(), key=lambda s: s[1])
+            if math.isfinite(value)
+        },
+    }
+
+
+def document(diagnosis: Diagnosis) -> dict[str, Any]:
+    """The content of diagnosis.json."""
+    unexplained = diagnosis.unexplained
+    return {
+        "verdict": diagnosis.verdict,
+        "steps": [_step(step) for step in diagnosis.steps],
+        "candidates": [
+            {"effect": name, "score": score, "p_value": p} for name, score, p in diagnosis.candidates
+        ],
+        "unexplained": None
+        if unexplained is None
+        else {
+            "p_value": unexplained.p_value,
+            "description": unexplained.words,
+            "patterns": [{"pattern": name, "p_value": p} for name, p in unexplained.patterns],
+            "free_form": list(unexplained.term),
+            "chi2_before": _number(unexplained.chi2_before),
+            "chi2_after": _number(unexplained.chi2_after),
+            "change_of_qu": _number(unexplained.change_of_qu),
+            "parts": list(unexplained.parts),
+        },
+        "p_value": diagnosis.p_value,
+        "remaining_p_value": diagnosis.remaining_p,
+        "noise_scale": _number(diagnosis.noise_scale),
+        "noise_p_value": _number(diagnosis.noise_p),
+        "limits": [
+            {
+                "effect": limit.effect,
+                "parameter": limit.parameter,
+                "unit": limit.unit,
+                "value": limit.value,
+                "sigma": limit.sigma,
+                "below_95": limit.below,
+            }
+            for limit in diagnosis.limits
+        ],
+        "choices": [
+            {"change": choice.change, "left": choice.left, "better_by": _number(choice.better_by)}
+            for choice in diagnosis.choices
+        ],
+        "classes": [dataclasses.asdict(alike) for alike in diagnosis.classes],
+        "cannot_be_tested": list(diagnosis.untestable),
+        "chi2_per_dof_before": diagnosis.before.chi2 / max(diagnosis.before.dof, 1),
+        "chi2_per_dof_after": diagnosis.after.chi2 / max(diagnosis.after.dof, 1),
+        "caution": diagnosis.caution,
+        "policy": diagnosis.policy.document(),
+        "seconds": diagnosis.seconds,
+    }

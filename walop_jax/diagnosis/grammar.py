@@ -12,7 +12,8 @@ sine, a gradient two directions. Groups are short: at most two things are free b
     dependence    none; gradient, r², radial, diagonal, astigmatic over the field; wavelength; time, temperature, hour
                   angle; harmonics of the angles; one night; one exposure; the counts; the exposure before
 
-A sentence pays for the number of sentences that there are (`rank`), and for its length by its evidence.
+A sentence pays for the number of sentences that there are, and for its length by its evidence. Names are sentences
+with a history: which groups an effect of the catalogue already is (`uncovered`), or holds (`parts`).
 """
 
 from __future__ import annotations
@@ -27,11 +28,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from walop_jax.data.records import Exposures
-from walop_jax.diagnosis import naming
 from walop_jax.diagnosis.effect_columns import FEWEST_POINTS, Probe
-from walop_jax.diagnosis.score import ScoreTable
 from walop_jax.likelihood import limits
-from walop_jax.model.effects import Context, Described
+from walop_jax.model.effects import Context, Described, Effect
 from walop_jax.model.effects.etalon import GAPS, QUARTER
 from walop_jax.model.effects.sentence import (
     BAND,
@@ -59,16 +58,6 @@ def sentences(instrument: Instrument, exposures: Exposures, points: int) -> tupl
     return tuple(_probe(group) for group in sorted(found, key=len))
 
 
-def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[naming.Ranked]:
-    """Sentences by evidence, best first; all of them share the prior of one name."""
-    price = float(np.log(max(len(probes), 1)))
-    scored = [(probe, table[probe.name]) for probe in probes]
-    found = [
-        naming.Ranked(Described, p, score, score.log_bayes - price) for p, score in scored if score.testable
-    ]
-    return sorted(found, key=lambda item: -item.log_bayes)
-
-
 def said_by(probe: Probe) -> tuple[str, ...]:
     """The sentences of a group."""
     return tuple(text for member in probe.group for text in member.sentences)  # type: ignore[attr-defined]
@@ -77,6 +66,46 @@ def said_by(probe: Probe) -> tuple[str, ...]:
 def _probe(group: tuple[Sentence, ...]) -> Probe:
     members = tuple(Described.of(Context(), sentences=(sentence.text,)) for sentence in group)
     return Probe("; ".join(sentence.text for sentence in group), Described, members)
+
+
+# ------------------------------------------------------------------------------------- names that are sentences
+
+
+def uncovered(
+    probes: Sequence[Probe], catalogue: Sequence[type[Effect]], context: Context, instrument: Instrument
+) -> tuple[Probe, ...]:
+    """The groups that are no effect of a catalogue by another name: those that none holds as a part."""
+    known = [texts for texts, _ in _known(catalogue, context, instrument)]
+    return tuple(probe for probe in probes if not any(texts.issuperset(said_by(probe)) for texts in known))
+
+
+def parts(
+    probes: Sequence[Probe], catalogue: Sequence[type[Effect]], context: Context, instrument: Instrument
+) -> tuple[tuple[Probe, frozenset[type[Effect]]], ...]:
+    """The groups that are a part of effects, and none of them as a whole: one patch of all, the light in one camera."""
+    known = _known(catalogue, context, instrument)
+    found = []
+    for probe in probes:
+        said = frozenset(said_by(probe))
+        holders = frozenset(effect for texts, effect in known if texts > said)
+        if holders and not any(texts == said for texts, _ in known):
+            found.append((probe, holders))
+    return tuple(found)
+
+
+def _known(
+    catalogue: Sequence[type[Effect]], context: Context, instrument: Instrument
+) -> list[tuple[frozenset[str], type[Effect]]]:
+    """What the effects are in sentences, shape by shape, each with an amplitude of its own."""
+    found = []
+    for effect in catalogue:
+        for group in effect.probes(context):
+            texts = frozenset(group[0].in_sentences(instrument))
+            if len(texts) <= sum(
+                np.size(getattr(one, name)) for one in group for name in effect.amplitudes()
+            ):
+                found.append((texts, effect))
+    return found
 
 
 # -------------------------------------------------------------------------------------------------- the grammar

@@ -1,99 +1,69 @@
-"""The name: refits of the leading candidates, their evidence, and who cannot be told from whom.
+"""Exact fits of what a diagnosis tries, adds and drops.
 
 Evidence       Laplace: ln B = ½ (O_base − O_g) − ½ (ln det H_g − ln det H_base) − Σ ln w, with O the objective (χ² of
                data and priors), H half its Hessian and w the prior widths of the added parameters.
-Equivalence    The change D of the residuals that the named effect makes, projected off the other parameters, is fitted
-               by each rival; the length of what the rival cannot follow is the separation in standard deviations
-               (Atkinson & Fedorov 1975, Biometrika 62, 57). Below `SEPARATION` the data cannot tell the two apart, nor
-               when the evidence of their refits differs by less than `IMPROBABLE`.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections import Counter
 from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from walop_jax.diagnosis.effect_columns import Probe
-from walop_jax.diagnosis.score import Score, ScoreTable, log_bayes
+from walop_jax.diagnosis.change_of_stokes import instrument_matrices, largest_change
+from walop_jax.diagnosis.design import Design, held_out
+from walop_jax.diagnosis.examination import Ranked
+from walop_jax.diagnosis.findings import Step
+from walop_jax.diagnosis.freeform import strata
+from walop_jax.diagnosis.grammar import said_by
+from walop_jax.diagnosis.policy import Policy
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
+from walop_jax.fit.robust import field_cells, states
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Context, Described, Effect
 from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.specification import Model, with_effects
 
-SEPARATION = 3.0
-MOST_LEADERS = 5
-MOST_TOGETHER = 4  # sentences of a longer group that are tried by themselves
-MOST_SHAPES = 4  # of one effect from which it is refitted
-REFIT_WITHIN = 8.0  # ln B below the best within which a rival is refitted
-LINEAR_BELOW = 150.0  # ln B above which the linear ranking is not trusted
-EVEN_ODDS = 3.0  # difference in ln B that is no preference
-IMPROBABLE = 6.9  # difference in ln B at which the other has a probability of 10⁻³
-
-
-@dataclasses.dataclass(frozen=True)
-class Ranked:
-    """An effect with its best probe: evidence averaged over its alternative shapes; `others` may be as good."""
-
-    effect: type[Effect]
-    probe: Probe
-    score: Score
-    log_bayes: float
-    others: tuple[tuple[Probe, Score], ...] = ()
-
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
-    """An effect that was added and refitted; `alternatives` are other shapes of it that do as well, in words."""
+    """An addition to a model that was tried: its evidence (ln B), and what it leaves, χ² and whether that is noise.
+
+    `item` is its linear step, `linear` the evidence of that (NaN where there was none). `fit` is None until it has been
+    fitted. `alternatives` are other shapes of the effect that do as well, in words.
+    """
 
     effect: type[Effect]
-    fit: FitResult
-    log_bayes: float
+    evidence: float
+    left: float
+    noise: bool
+    item: Ranked | None = None
+    linear: float = float("nan")
+    fit: FitResult | None = None
     alternatives: tuple[str, ...] = ()
+
+    @classmethod
+    def of_fit(cls, effect: type[Effect], fit: FitResult, evidence: float) -> Trial:
+        """A trial without a linear step."""
+        return cls(effect, evidence, fit.chi2, fit.explains_data, fit=fit)
 
     @property
     def instance(self) -> Effect:
         """The effect at its fitted values, in standard form."""
+        assert self.fit is not None
         return self.fit.model.instrument(self.fit.values).effect(self.effect.name).standard_form()
 
-
-def names_first(trial: Trial) -> float:
-    """Order of trials: by evidence, but a sentence only where it is clearly more probable than a name."""
-    return -trial.log_bayes + (EVEN_ODDS if trial.effect is Described else 0.0)
-
-
-def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
-    """Effects by evidence, best first; alternative shapes share the prior of their effect."""
-    by_effect: dict[type[Effect], list[tuple[Probe, Score]]] = {}
-    for probe in probes:
-        by_effect.setdefault(probe.effect, []).append((probe, table[probe.name]))
-    ranked = []
-    for effect, shapes in by_effect.items():
-        alive = [(p, s) for p, s in shapes if s.testable and follow_physics(p, s)]
-        if not alive:
-            continue
-        alive.sort(key=lambda item: -item[1].log_bayes)
-        (probe, score), best = alive[0], alive[0][1].log_bayes
-        bayes = np.array([s.log_bayes for _, s in alive])
-        mean = float(np.logaddexp.reduce(bayes) - np.log(len(shapes)))
-        others = [
-            item for item in alive[1:MOST_SHAPES] if item[1].log_bayes > best - max(REFIT_WITHIN, 0.2 * best)
-        ]
-        ranked.append(Ranked(effect, probe, score, mean, tuple(others)))
-    return sorted(ranked, key=lambda item: -item.log_bayes)
-
-
-def leaders(ranked: Sequence[Ranked]) -> list[Ranked]:
-    """Candidates whose linear evidence is too close to the best to decide without a refit."""
-    best = ranked[0].log_bayes
-    reach = max(REFIT_WITHIN, 0.6 * best) if best > LINEAR_BELOW else REFIT_WITHIN
-    return [item for item in ranked[:MOST_LEADERS] if item.log_bayes > best - reach]
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The sentences that it is, where it has no name."""
+        if self.effect is not Described:
+            return ()
+        if self.fit is None:
+            return () if self.item is None else said_by(self.item.probe)
+        return self.instance.sentences  # type: ignore[attr-defined]
 
 
 def _log_determinant(result: FitResult) -> float:
@@ -130,20 +100,6 @@ def try_sentences(base: FitResult, said: Described, context: Context, count: int
     return try_model(base, Described, with_effects(model, [said], context), base.values, count)
 
 
-def shortest(item: Ranked) -> Described:
-    """The sentences of a group that are worth their length, with the amplitudes of a linear step."""
-    information = np.linalg.pinv(item.score.covariance, hermitian=True)
-    scores, widths = information @ item.score.amplitudes, item.probe.widths
-    members = range(len(widths))
-    subsets = [
-        list(some) for n in members for some in itertools.combinations(members, n + 1) if n < MOST_TOGETHER
-    ] + [list(members)]
-    worth = [log_bayes(information[np.ix_(some, some)], scores[some], widths[some]) for some in subsets]
-    best = subsets[int(np.argmax(worth))]
-    amplitudes = np.linalg.lstsq(information[np.ix_(best, best)], scores[best], rcond=None)[0]
-    return Described.combine([item.probe.group[i] for i in best], amplitudes)
-
-
 def try_model(
     base: FitResult, effect: type[Effect], model: Model, values: Float[np.ndarray, " n"], prior_shapes: int
 ) -> Trial:
@@ -157,55 +113,35 @@ def try_model(
         worth=base.posterior.objective,
     )
     bayes = log_evidence_ratio(base, result) - (float(np.log(prior_shapes)) if prior_shapes > 1 else 0.0)
-    return Trial(effect, result, bayes)
+    return Trial.of_fit(effect, result, bayes)
 
 
-def try_shapes(base: FitResult, item: Ranked, context: Context, shapes: int) -> Trial:
+def try_shapes(base: FitResult, item: Ranked, context: Context, shapes: int, policy: Policy) -> Trial:
     """Refit an effect from the amplitudes of its linear steps at the shapes that may be best, and keep the best."""
     places = ((item.probe, item.score), *item.others)
     trials = [
         try_effect(base, item.effect.combine(probe.group, score.amplitudes), context, shapes)
         for probe, score in places
     ]
-    best = max(trials, key=lambda t: t.log_bayes if t.fit.converged else -np.inf)
-    alike = [t for t in trials if t.fit.converged and t.log_bayes > best.log_bayes - EVEN_ODDS]
-    told = dict.fromkeys(in_words(t.instance) for t in alike if _differ(t, best))
+    best = max(trials, key=lambda t: t.evidence if _converged(t) else -np.inf)
+    alike = [t for t in trials if _converged(t) and t.evidence > best.evidence - policy.even_odds]
+    told = dict.fromkeys(in_words(t.instance) for t in alike if _differ(t, best, policy.separation))
     return dataclasses.replace(best, alternatives=tuple(told))
 
 
-def with_rivals(trial: Trial, trials: Sequence[Trial]) -> tuple[Trial, tuple[str, ...]]:
-    """A trial with other shapes of its effect that are as probable, and the other effects that are not improbable."""
-    apart = [(t, abs(t.log_bayes - trial.log_bayes)) for t in trials if t is not trial]
-    same = [in_words(t.instance) for t, far in apart if t.effect is trial.effect and far < EVEN_ODDS]
-    rivals = [t.effect.name for t, far in apart if t.effect is not trial.effect and far < IMPROBABLE]
-    return dataclasses.replace(trial, alternatives=(*trial.alternatives, *same)), tuple(rivals)
+def _converged(trial: Trial) -> bool:
+    return trial.fit is not None and trial.fit.converged
 
 
-def held_in_part(
-    table: ScoreTable, parts: Sequence[tuple[Probe, Collection[type[Effect]]]], item: Ranked
-) -> tuple[str, ...]:
-    """Effects of which a part, by itself, is not improbable beside an item; parts share the prior of their effect."""
-    count = Counter(effect for _, effects in parts for effect in effects)
-    least = max(0.0, item.log_bayes - IMPROBABLE)
-    return tuple(
-        dict.fromkeys(
-            effect.name
-            for probe, effects in parts
-            for effect in effects
-            if effect is not item.effect
-            and table[probe.name].testable
-            and table[probe.name].log_bayes - float(np.log(count[effect])) > least
-        )
-    )
-
-
-def _differ(one: Trial, other: Trial) -> bool:
+def _differ(one: Trial, other: Trial, separation: float) -> bool:
+    assert one.fit is not None
+    assert other.fit is not None
     if one.instance.choices() != other.instance.choices():
         return True
     at = one.fit.model.positions(one.effect.name)
     sigma = np.maximum(one.fit.sigma[at], other.fit.sigma[at])
     away = np.asarray(values_of(one.instance)) - np.asarray(values_of(other.instance))
-    return bool(np.any(np.abs(away) > SEPARATION * np.where(sigma > 0, sigma, np.inf)))
+    return bool(np.any(np.abs(away) > separation * np.where(sigma > 0, sigma, np.inf)))
 
 
 def in_words(effect: Effect) -> str:
@@ -219,12 +155,6 @@ def in_words(effect: Effect) -> str:
 def spoken_choices(effect: Effect) -> dict[str, Any]:
     """Discrete choices that mean something to a reader: a camera, a crystal, a star."""
     return {name: value for name, value in effect.choices().items() if isinstance(value, int | str)}
-
-
-def follow_physics(probe: Probe, score: Score) -> bool:
-    """Whether a linear step leaves one-sided amplitudes on their side, within `SEPARATION` standard deviations."""
-    sigma = np.sqrt(np.clip(np.diag(score.covariance), 0.0, None))
-    return bool(np.all((score.amplitudes >= -SEPARATION * sigma)[probe.one_sided]))
 
 
 def amplitude_positions(model: Model, name: str) -> list[int]:
@@ -314,3 +244,95 @@ def signature(result: FitResult, name: str, context: Context) -> Float[np.ndarra
         bare = result.likelihood.residuals(values)[1]
     change = bare - result.likelihood.residuals(result.values)[1]
     return change[result.likelihood.used].reshape(-1) / result.noise_scale
+
+
+# ------------------------------------------------------------------------------- what an effect does, by two fits
+
+
+def before_and_after(name: str, before: Design, after: Design) -> dict[str, Any]:
+    """The fields of a `Step` that compare the fits without and with an effect."""
+    effect = after.fit.model.instrument(after.fit.values).effect(name)
+    # An effect with a number for every exposure, or for one of them, cannot predict exposures that it has not seen.
+    many = any(np.size(getattr(effect, f)) > 4 for f in effect.amplitudes())
+    many |= isinstance(effect, Described) and any("exposure" in text for text in effect.sentences)
+    scheme = "field blocks" if many else "exposures"
+    old, new = (instrument_matrices(design.fit) for design in (before, after))
+    return {
+        "chi2_before": before.fit.chi2,
+        "chi2_after": after.fit.chi2,
+        "heldout_before": held_out(before, scheme),
+        "heldout_after": held_out(after, scheme),
+        "change_of_qu": largest_change(old, new),
+        "residual_before": before.measured.residual,
+        "residual_after": after.measured.residual,
+    }
+
+
+def refitted_in_order(steps: Sequence[Step], start: Design, end: Design) -> list[Step]:
+    """The steps as they lead, one after the other, from one fit to another that has no effects beside theirs.
+
+    The models between the two are fitted again; what belongs to the discovery of an effect stays.
+    """
+    fits = [end.fit] if steps else []
+    for step in reversed(steps[1:]):
+        fits.append(refit_without(fits[-1], step.effect))
+    compared, before = [], start
+    for step, result in zip(steps, reversed(fits), strict=True):
+        after = end if result is end.fit else Design.of(result)
+        compared.append(dataclasses.replace(step, **before_and_after(step.effect, before, after)))
+        before = after
+    return compared
+
+
+def predicts_unseen(design: Design, patterns: Collection[str], policy: Policy) -> bool:
+    """Whether patterns without a name predict states and parts of the field that it has not seen.
+
+    One Gauss–Newton step of everything, with and without the patterns, from all data but those of a unit gives the
+    density of that unit, ln p = −½ (dᵀΣ⁻¹d + ln det Σ), Σ = s² (1 + A H⁻¹ Aᵀ): it is broad where the step leaves it
+    open, and s² is the χ²/dof that a model leaves, 1 or more. Units are states (exposures that differ in nothing but
+    the filter), and the cells of the field. The mean gain must exceed `Policy.useful` times its standard error over the
+    units, for both: a term that only follows what each setting of an element does by itself predicts the field, and no
+    other setting.
+
+    Symbols     d prediction error of the unit, A its rows of the Jacobian, H normal matrix of all others and priors
+    """
+    terms = [design.measured.candidate(one) for one in strata(design.measured) if one.name in patterns]
+    widths = np.concatenate([one.widths for one in terms])
+    own = design.stacked([one.columns for one in terms])
+    prior = np.zeros((len(widths), design.jacobian.shape[1]))
+    rows = np.vstack([np.hstack([design.jacobian, own]), np.hstack([prior, np.diag(1.0 / widths)])])
+    residual = np.append(design.residual, np.zeros(len(widths)))
+    calset = design.fit.calset
+    for unit in (states(calset)[design.exposure], field_cells(calset)[design.point]):
+        before = _predictive_density(design.jacobian, design.residual, unit, design.projector.free)
+        after = _predictive_density(rows, residual, unit, design.projector.free)
+        gain = after - before
+        if len(gain) < 2 or gain.mean() < policy.useful * gain.std(ddof=1) / np.sqrt(len(gain)):
+            return False
+    return True
+
+
+def _predictive_density(
+    rows: Float[np.ndarray, "r n"],
+    residual: Float[np.ndarray, " r"],
+    unit: Int[np.ndarray, " d"],
+    free: int,
+) -> Float[np.ndarray, " u"]:
+    """ln p of the data rows of each unit as all the others predict them; rows beyond those of `unit` are priors."""
+    norm = np.linalg.norm(rows, axis=0)
+    scaled = rows / np.where(norm > 0, norm, 1.0)
+    ridge = 1e-12 * np.eye(len(norm))
+    gram, along = scaled.T @ scaled + ridge, scaled.T @ residual
+    step = np.linalg.solve(gram, along)
+    scale = max(1.0, float(residual @ residual - along @ step) / max(free, 1))
+    whole = np.linalg.slogdet(gram)[1]
+    found = []
+    for one in np.unique(unit):
+        a, r = scaled[: len(unit)][unit == one], residual[: len(unit)][unit == one]
+        rest = gram - a.T @ a
+        d = r - a @ np.linalg.solve(rest, along - a.T @ r)
+        pull = a.T @ d
+        square = d @ d - pull @ np.linalg.solve(gram, pull)
+        spread = whole - np.linalg.slogdet(rest)[1]
+        found.append(-0.5 * (square / scale + spread + len(r) * free / len(unit) * np.log(scale)))
+    return np.array(found)

@@ -1,38 +1,43 @@
 """The workflow: alarm, name, addition, until the data are explained or what is left has no name.
 
-1. Fit the model. 2. Score every effect of the catalogue and every pattern of the free-form basis; global p by Monte
-Carlo. 3. Below `ALARM`: refit the leaders and take the one with the highest evidence that data which took no part in
-the fit confirm, provided that it is significant after correction for all that was tried. A sentence (`grammar`) that
-is more probable than every name is added in their place, as effect `described`; what patterns without a name explain
-better is not added at all. Other descriptions of the instrument (`choices`) compete with the names where the model is
-badly off, or no name is found. 4. It joins the model, and everything is fitted again. 5. Repeat. 6. Drop names that are
-not needed beside the others. 7. What no name explains is added as a free-form term, labelled, and the verdict is
-`unexplained`; names that only stood in for it are dropped as well. 8. List for each name what the data cannot tell from
-it, and give the verdict. Names are given at any size; `Step.negligible` says when it does not matter for q and u.
+1. Fit the model. 2. Score every effect of the catalogue, every sentence (`grammar`) and every pattern of the free-form
+basis; global p by Monte Carlo. 3. Below `Policy.alarm`: add names one after the other (`search`), each fitted together
+with everything before it is added. 4. Drop names that are not needed beside the others. 5. Names that leave a poor fit
+nearly as poor are told as parts of what is missing, and taken out again. 6. What no name explains is described, and the
+verdict is `unexplained`; a free-form term for it stays in the model where it predicts settings and parts of the field
+that it has not seen, and names that only stood in for it are dropped. 7. List for each name what the data cannot tell
+from it, and give the verdict. Names are given at any size; `Step.negligible` says when it does not matter for q and u.
+
+Nothing further is tried after `Policy.minutes`: the best found so far comes back, and says so.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import grammar, history, location, naming
+from walop_jax.diagnosis import grammar, location, naming
 from walop_jax.diagnosis.change_of_stokes import instrument_matrices, largest_change
 from walop_jax.diagnosis.choices import Choices
-from walop_jax.diagnosis.design import Design, held_out
+from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.effect_columns import Probe, applicable
 from walop_jax.diagnosis.effect_columns import probes as all_probes
-from walop_jax.diagnosis.examination import Examination, most_points
-from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexplained
+from walop_jax.diagnosis.examination import (
+    Examination,
+    examine,
+    most_points,
+    shortest,
+)
+from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexplained, told
 from walop_jax.diagnosis.mixups import SURE, mixups_of, refusal
-from walop_jax.diagnosis.score import Score
-from walop_jax.diagnosis.step_summary import before_and_after, refitted_in_order
-from walop_jax.diagnosis.telling import told, too_many_sentences, unexplained
+from walop_jax.diagnosis.naming import Trial, before_and_after, predicts_unseen, refitted_in_order
+from walop_jax.diagnosis.policy import POLICY, Policy
+from walop_jax.diagnosis.search import Found, search
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.fit.stand_in import in_field_points
@@ -44,11 +49,7 @@ from walop_jax.model.effects import EFFECTS, Context, Described, Effect, FreeFor
 from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import Model, effect_context
 
-MOST_STEPS = 6
-MOST_SENTENCES = 2  # that are refitted at a time; more than can be one thing that a sentence holds
-LEAST_EVIDENCE = 1.0  # ln B that an effect must be worth to the final model to stay in it
-MINUTES = 20.0  # after which no further name is sought
-POOR_FIT = 1.5  # χ²/dof above which effects that cannot be differentiated are tried
+MINUTES = POLICY.minutes
 _SMALL = 200  # field points up to which programs of earlier models may stay: half a gigabyte
 
 
@@ -58,20 +59,23 @@ def diagnose(
     *,
     catalogue: Sequence[type[Effect]] = EFFECTS,
     seed: int = 0,
-    minutes: float = MINUTES,
+    minutes: float | None = None,
     as_written: bool = False,
+    policy: Policy = POLICY,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Find what `model` (default: the base model) lacks to explain a calibration set.
 
-    `catalogue` are the effects that may be named. Of a set with more than `limits.DIAGNOSED_ROWS` (exposure, point)
-    pairs, or whose columns would be more than `limits.DIAGNOSED_NUMBERS`, points spread over the field are looked at.
-    The search for a further name, or for a free-form term, does not begin after `minutes`; what is left then has no
-    name. Other readings of the data are not tried where the caller has done that already (`as_written`). Raises what
-    `fit` raises, and `DataError` for data that another reading explains (`mixups`).
+    `catalogue` are the effects that may be named, `policy` the thresholds. Of a set with more than
+    `limits.DIAGNOSED_ROWS` (exposure, point) pairs, or whose columns would be more than `limits.DIAGNOSED_NUMBERS`,
+    points spread over the field are looked at. Nothing further is tried after `minutes` (default: those of the policy);
+    what is left then has no name, and `Diagnosis.caution` says so. Other readings of the data are not tried where the
+    caller has done that already (`as_written`). Raises what `fit` raises, and `DataError` for data that another reading
+    explains (`mixups`).
     """
     began = time.perf_counter()
     tell = progress or (lambda text: None)
+    policy = policy if minutes is None else dataclasses.replace(policy, minutes=minutes)
     model = model or base_model(calset)
     calset = in_field_points(calset, model, tell)
     context = effect_context(model.template, calset.exposures)
@@ -80,9 +84,41 @@ def diagnose(
     some = thinned(calset, most_points(calset, model.template, amplitudes), neighbours=1)
     if len(some.points) < len(calset.points):
         tell(f"looking at {len(some.points)} of {len(calset.points)} field points")
-    until = began + 60.0 * minutes
-    found = _Diagnosing(some, model, catalogue, every, seed, tell, until, as_written=as_written).run(began)
-    return dataclasses.replace(found, points=len(calset.points))
+    judge = Refit.of(some, model, catalogue, every, np.random.default_rng(seed), tell, policy, began)
+    readings = () if as_written else mixups_of(judge.fit)
+    if readings and readings[0].explained < SURE:
+        raise refusal(judge.fit, readings)
+    before = judge.fit
+    tell("scoring every effect and pattern")
+    last = first = judge.examined()
+    for _, _, left in search(first, judge, policy):
+        last = left
+    last, nameless = judge.conclusion(first, last)
+    # Another reading that comes near competes with names and with other descriptions of the instrument.
+    if nameless and readings and readings[0].explained * judge.fit.dof < judge.fit.chi2:
+        raise refusal(before, readings)
+    steps = tuple(judge.finished(step, last) for step in judge.steps)
+    verdict: Outcome = "unexplained" if nameless else "effect_found" if steps else "consistent"
+    return Diagnosis(
+        verdict=verdict,
+        steps=steps,
+        candidates=first.summary(),
+        limits=tuple(last.limits()),
+        untestable=first.untestable(judge.catalogue),
+        unexplained=nameless,
+        p_value=first.table.p_global,
+        remaining_p=last.table.p_global,
+        noise_scale=judge.fit.noise_scale * last.table.noise_scale,
+        noise_p=last.noise_p,
+        before=before,
+        after=judge.fit,
+        seconds=time.perf_counter() - began,
+        points=len(calset.points),
+        choices=tuple(sorted(judge.choices.values(), key=_promise)),
+        classes=tuple(first.classes()),
+        policy=policy,
+        ended=judge.ended,
+    )
 
 
 def _promise(choice: Choice) -> tuple[float, float]:
@@ -90,180 +126,164 @@ def _promise(choice: Choice) -> tuple[float, float]:
     return (-choice.better_by if np.isfinite(choice.better_by) else np.inf), choice.left
 
 
-class _Diagnosing:
-    """The state of one diagnosis: the current fit and the steps so far."""
+@dataclasses.dataclass
+class Refit:
+    """The judge that fits: the current fit of a diagnosis, and the steps so far.
 
-    def __init__(
-        self,
+    `wanted` are the probes of `catalogue`, `sentences` and `parts` what else can be said (`grammar`). `choices` are
+    other descriptions that were tried. `ended` says that there was no time for something.
+    """
+
+    calset: CalibrationSet
+    context: Context
+    catalogue: tuple[type[Effect], ...]
+    wanted: Sequence[Probe]
+    sentences: Sequence[Probe]
+    parts: Sequence[tuple[Probe, frozenset[type[Effect]]]]
+    rng: np.random.Generator
+    tell: Callable[[str], None]
+    policy: Policy
+    until: float
+    fit: FitResult
+    steps: list[Step] = dataclasses.field(default_factory=list)
+    choices: dict[str, Choice] = dataclasses.field(default_factory=dict)
+    ended: bool = False
+    _compared: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
         calset: CalibrationSet,
         model: Model,
         catalogue: Sequence[type[Effect]],
         sentences: Sequence[Probe],
-        seed: int,
+        rng: np.random.Generator,
         tell: Callable[[str], None],
-        until: float,
-        *,
-        as_written: bool = False,
-    ) -> None:
-        self.calset, self.tell, self.until = calset, tell, until
-        self.rng = np.random.default_rng(seed)
-        self.context: Context = effect_context(model.template, calset.exposures)
-        self.catalogue = applicable(catalogue, self.context, model.template)
-        self.wanted: list[Probe] = list(all_probes(self.catalogue, self.context))
-        every = sentences, self.catalogue, self.context, model.template
-        self.sentences = history.uncovered(*every)
-        self.parts = history.parts(*every)
-        self.steps: list[Step] = []
-        self.added = self.said = 0
-        self.choices: dict[str, Choice] = {}
+        policy: Policy,
+        began: float,
+    ) -> Refit:
+        """Fit a model to a set and lay out what may be said beyond it."""
+        context = effect_context(model.template, calset.exposures)
+        fitting = applicable(catalogue, context, model.template)
+        every = sentences, fitting, context, model.template
         tell("fitting the model")
-        self.fit: FitResult = fit(Likelihood.of(calset, model))
-        self.readings = () if as_written else mixups_of(self.fit)
-        if self.readings and self.readings[0].explained < SURE:
-            raise refusal(self.fit, self.readings)
-
-    def run(self, began: float) -> Diagnosis:
-        before = self.fit
-        self.tell("scoring every effect and pattern")
-        first = self._examine()
-        examination, nameless = self._conclude(first, self._add_names(first))
-        nameless = nameless or self._too_many_sentences(examination)
-        # Another reading that comes near competes with names and with other descriptions of the instrument.
-        if nameless and self.readings and self.readings[0].explained * self.fit.dof < self.fit.chi2:
-            raise refusal(before, self.readings)
-        steps = tuple(self._finished(step, examination) for step in self.steps)
-        verdict: Outcome = "unexplained" if nameless else "effect_found" if steps else "consistent"
-        return Diagnosis(
-            verdict=verdict,
-            steps=steps,
-            candidates=first.summary(),
-            limits=tuple(examination.limits()),
-            untestable=first.untestable(self.catalogue),
-            unexplained=nameless,
-            p_value=first.table.p_global,
-            remaining_p=examination.table.p_global,
-            noise_scale=self.fit.noise_scale * examination.table.noise_scale,
-            noise_p=examination.noise_p,
-            before=before,
-            after=self.fit,
-            seconds=time.perf_counter() - began,
-            points=len(self.calset.points),
-            choices=tuple(sorted(self.choices.values(), key=_promise)),
-            classes=tuple(first.classes()),
+        return cls(
+            calset=calset,
+            context=context,
+            catalogue=fitting,
+            wanted=list(all_probes(fitting, context)),
+            sentences=grammar.uncovered(*every),
+            parts=grammar.parts(*every),
+            rng=rng,
+            tell=tell,
+            policy=policy,
+            until=began + 60.0 * policy.minutes,
+            fit=fit(Likelihood.of(calset, model)),
         )
 
-    def _examine(self, earlier: Examination | None = None) -> Examination:
+    def examined(self, earlier: Examination | None = None) -> Examination:
+        """The current fit, scored."""
         forgetting = earlier is not None and len(self.calset.points) > _SMALL
         if forgetting:
             forget_programs()  # of models with fewer effects: they are not asked for again
-        found = Examination(self.fit, self.wanted, self.rng, earlier, self.sentences, self.parts)
+        found = examine(self.fit, self.wanted, self.rng, earlier, self.sentences, self.parts, self.policy)
         if forgetting:
             forget_programs()  # of columns
+        if found.alarm:
+            self.tell(f"p = {found.table.p_global:.2g}: something is missing")
         return found
 
-    # ------------------------------------------------------------------------------------------------ a name
+    # ------------------------------------------------------------------------------------------ as a judge
 
-    def _add_names(self, examination: Examination) -> Examination:
-        """Add names until nothing is missing or none is found; the examination of what they leave."""
-        while examination.alarm and self.added < MOST_STEPS and self._time_left():
-            self.tell(f"p = {examination.table.p_global:.2g}: something is missing; trying names")
-            poor = self.fit.chi2 > POOR_FIT * self.fit.dof
-            redescribed = any(step.effect == OtherDescription.name for step in self.steps)
-            every = poor and (redescribed or not self.steps)
-            added = self._add_best(examination, self._trials(examination), others=every)
-            if added is None and not every:
-                added = self._add_best(examination, iter(()), others=True)
-            if added is None:
-                break
-            self.added += 1
-            self.said += added == Described.name
-            self.tell(f"added {added}; scoring what is left")
-            examination = self._examine(examination)
-        return examination
+    def time_left(self) -> bool:
+        """Whether another trial may begin."""
+        self.ended |= time.perf_counter() >= self.until
+        return not self.ended
 
-    def _time_left(self) -> bool:
-        return time.perf_counter() < self.until
+    def fitted(self, state: Examination, trial: Trial) -> Trial | None:
+        """A linear trial fitted exactly; None where the fit does not converge."""
+        item = trial.item
+        assert item is not None
+        self.tell(f"trying {item.probe.name if item.effect is Described else item.effect.name}")
+        if item.effect is Described:
+            said = shortest(item, self.policy.most_together)
+            found = naming.try_sentences(self.fit, said, self.context, len(state.sentences))
+        else:
+            shapes = sum(probe.effect is item.effect for probe in state.probes)
+            found = naming.try_shapes(self.fit, item, self.context, shapes, self.policy)
+        if found.fit is None or not found.fit.converged:
+            return None
+        return dataclasses.replace(found, item=item, linear=trial.linear)
 
-    def _trials(self, examination: Examination) -> Iterator[naming.Trial]:
-        for item in naming.leaders(examination.significant) if examination.significant else ():
-            if not self._time_left():
-                return
-            self.tell(f"trying {item.effect.name}")
-            shapes = sum(probe.effect is item.effect for probe in examination.probes)
-            yield naming.try_shapes(self.fit, item, self.context, shapes)
-        yield from self._sentences(examination)
-        if self.fit.chi2 > POOR_FIT * self.fit.dof:
-            for effect in self.catalogue:
-                if effect.is_structural() and effect.name not in self.fit.model.effect_names:
-                    self.tell(f"trying {effect.name}")
-                    yield naming.try_effect(self.fit, effect.neutral(self.context), self.context)
-
-    def _sentences(self, examination: Examination) -> Iterator[naming.Trial]:
-        """Sentences that are more probable than every name, by linear steps."""
-        for item in examination.sentences_before_names()[:MOST_SENTENCES]:
-            if self._time_left():
-                self.tell(f"trying {item.probe.name}")
-                said, count = naming.shortest(item), len(examination.sentences)
-                yield naming.try_sentences(self.fit, said, self.context, count)
-
-    def _other_descriptions(self) -> Iterator[naming.Trial]:
-        """The instrument described otherwise; what was tried is kept."""
-        choices = Choices(self.fit, self.context, self._time_left, self.tell)
+    def others(self, state: Examination) -> Iterator[Trial]:
+        """Structural effects where the model is far off, and the instrument described otherwise."""
+        for effect in self.catalogue if state.poor else ():
+            if effect.is_structural() and effect.name not in self.fit.model.effect_names and self.time_left():
+                self.tell(f"trying {effect.name}")
+                yield naming.try_effect(self.fit, effect.neutral(self.context), self.context)
+        choices = Choices(self.fit, self.context, self.policy, self.time_left, self.tell)
         yield from choices.trials()
         self.choices |= choices.tried
 
-    def _add_best(
-        self, examination: Examination, names: Iterator[naming.Trial], *, others: bool
-    ) -> str | None:
-        """Add the name with the highest evidence that held-out data confirm; None when there is none.
-
-        `others`: descriptions compete with the names.
-        """
-        trials = [
-            t
-            for t in itertools.chain(names, self._other_descriptions() if others else ())
-            if t.fit.converged and examination.is_worth_telling(t)
-        ]
-        trials = self._decided(sorted(trials, key=naming.names_first))
-        for trial in trials:
-            step = self._step(examination, *naming.with_rivals(trial, trials))
-            if step.confirmed:
-                # A further change of the description joins those before.
-                earlier = next((s for s in self.steps if s.effect == step.effect), None)
-                self.steps = [*(s for s in self.steps if s is not earlier), step]
-                self._adopt(trial.fit)
-                if self.fit is not trial.fit:
-                    compared = before_and_after(step.effect, examination.design, Design.of(self.fit))
-                    self.steps[-1] = dataclasses.replace(step, **compared)
-                if earlier is not None:
-                    self.steps[-1] = dataclasses.replace(
-                        self.steps[-1],
-                        chi2_before=earlier.chi2_before,
-                        heldout_before=earlier.heldout_before,
-                        residual_before=earlier.residual_before,
-                    )
-                return step.effect
-        return None
-
-    def _decided(self, trials: list[naming.Trial]) -> list[naming.Trial]:
+    def decided(self, trials: list[Trial]) -> list[Trial]:
         """Trials in order of evidence; what scaled errors leave even at the top is decided with errors as stated."""
-        even = [t for t in trials if trials[0].log_bayes - t.log_bayes < naming.EVEN_ODDS]
+        even = [t for t in trials if trials[0].evidence - t.evidence < self.policy.even_odds]
         if self.fit.noise_scale == 1.0 or len(even) < 2:
             return trials
-        refitted = [
+        exact = [
             dataclasses.replace(t, fit=fit(t.fit.likelihood, start=t.fit.values, noise_scale=1.0))
             for t in even
+            if t.fit is not None
         ]
-        refitted.sort(key=lambda t: t.fit.posterior.objective)
-        best = refitted[0].fit.posterior.objective
+        exact.sort(key=lambda t: t.fit.posterior.objective)
+        best = exact[0].fit.posterior.objective
         clearly = [
-            dataclasses.replace(t, log_bayes=t.log_bayes - 0.5 * (t.fit.posterior.objective - best))
-            for t in refitted
+            dataclasses.replace(t, evidence=t.evidence - 0.5 * (t.fit.posterior.objective - best))
+            for t in exact
         ]
         return [*clearly, *trials[len(even) :]]
 
-    def _adopt(self, result: FitResult) -> None:
-        """Go on with a fit: errors as given where they need not be scaled any more, refuted priors widened."""
+    def confirmed(self, state: Examination, trial: Trial) -> bool:
+        """Whether data that took no part in the fit agree better with the effect than without."""
+        assert trial.fit is not None
+        self._compared = before_and_after(trial.effect.name, state.design, Design.of(trial.fit))
+        return self._compared["heldout_after"].mean < self._compared["heldout_before"].mean
+
+    def adopted(self, state: Examination, found: Found) -> Examination:
+        """Go on with the model of a trial, everything fitted again where priors or errors were in its way."""
+        trial, name = found.trial, found.trial.effect.name
+        assert trial.fit is not None
+        item = trial.item or next((r for r in state.ranked if r.effect is trial.effect), None)
+        step = Step(
+            effect=name,
+            parameters={},
+            score=item.score.statistic if item else state.chi2 - trial.left,
+            p_value=state.table.corrected(item.score) if item else state.table.p_global,
+            log_bayes=trial.evidence,
+            nameless=found.nameless,
+            equivalent=tuple(dict.fromkeys((*found.rivals, *found.parts))),
+            alternatives=trial.alternatives,
+            **self._compared,
+        )
+        # A further change of the description joins those before.
+        earlier = next((s for s in self.steps if s.effect == name), None)
+        self.steps = [*(s for s in self.steps if s is not earlier), step]
+        self._go_on_with(trial.fit)
+        if self.fit is not trial.fit:
+            step = dataclasses.replace(step, **before_and_after(name, state.design, Design.of(self.fit)))
+        if earlier is not None:
+            step = dataclasses.replace(
+                step,
+                chi2_before=earlier.chi2_before,
+                heldout_before=earlier.heldout_before,
+                residual_before=earlier.residual_before,
+            )
+        self.steps[-1] = step
+        self.tell(f"added {name}; scoring what is left")
+        return self.examined(state)
+
+    def _go_on_with(self, result: FitResult) -> None:
+        """Take a fit: errors as given where they need not be scaled any more, refuted priors widened."""
         if result.noise_scale > 1.0:
             result = fit(result.likelihood, start=result.values)
         model = result.model
@@ -273,87 +293,38 @@ class _Diagnosing:
             result = fit(Likelihood.of(self.calset, model), start=result.values)
         self.fit = result
 
-    def _step(self, examination: Examination, trial: naming.Trial, close: tuple[str, ...]) -> Step:
-        name = trial.effect.name
-        score: Score | None = next((r.score for r in examination.ranked if r.effect is trial.effect), None)
-        return Step(
-            effect=name,
-            parameters={},
-            score=score.statistic if score else examination.result.chi2 - trial.fit.chi2,
-            p_value=examination.table.corrected(score) if score else examination.table.p_global,
-            log_bayes=trial.log_bayes,
-            nameless=examination.nameless(trial),
-            equivalent=tuple(dict.fromkeys((*close, *examination.held_in_part(trial)))),
-            alternatives=trial.alternatives,
-            **before_and_after(name, examination.design, Design.of(trial.fit)),
-        )
-
-    # --------------------------------------------------------------------------------------- what has no name
-
-    def _unexplained(self, examination: Examination) -> Unexplained:
-        patterns = tuple(examination.patterns_needed())
-        found = unexplained(examination, patterns)
-        blocks = tuple(
-            dict.fromkeys(b for name, _ in patterns if (b := examination.blocks[name]) is not None)
-        )
-        there = FreeForm.name in self.fit.model.effect_names
-        if len(self.calset.exposures) > limits.FREE_EXPOSURES:
-            blocks = tuple(block for block in blocks if block != "exposures")
-        ready = bool(blocks) and not there and self._time_left()
-        return self._with_free_form(examination, found, blocks) if ready else found
-
-    def _too_many_sentences(self, examination: Examination) -> Unexplained | None:
-        """Something that no sentence holds looks like several that are there."""
-        if self.said <= MOST_SENTENCES:
-            return None
-        return too_many_sentences(examination, self.said)
-
-    def _with_free_form(
-        self, examination: Examination, found: Unexplained, blocks: tuple[str, ...]
-    ) -> Unexplained:
-        """Add a free-form term for patterns without a name, so that the calibration improves all the same.
-
-        It need not be probable, only useful: it stays when it predicts parts of the field that it has not seen.
-        """
-        term = FreeForm.of(self.context, blocks=blocks)
-        trial = naming.try_effect(self.fit, term, self.context)
-        if not trial.fit.converged:
-            return found
-        without, with_term = (
-            held_out(design, "field blocks").mean for design in (examination.design, Design.of(trial.fit))
-        )
-        if with_term >= without:
-            return found
-        before = self.fit
-        self._adopt(trial.fit)
-        change = largest_change(instrument_matrices(before), instrument_matrices(self.fit))
-        return dataclasses.replace(
-            found, term=blocks, chi2_before=before.chi2, chi2_after=self.fit.chi2, change_of_qu=change
-        )
-
     # ---------------------------------------------------------------------------------------------- the end
 
-    def _conclude(
-        self, first: Examination, examination: Examination
-    ) -> tuple[Examination, Unexplained | None]:
+    def conclusion(self, first: Examination, last: Examination) -> tuple[Examination, Unexplained | None]:
         """Drop what is not needed, then ask what has no name: the examination of the final model, and that."""
-        dropped = self._drop_what_is_not_needed()
+        said = sum(step.effect == Described.name for step in self.steps)
+        state, nameless = self._concluded(first, last)
+        if nameless is None and said > self.policy.most_sentences:
+            # Something that no sentence holds looks like several that are there.
+            nameless = too_many_sentences(state, said)
+        return state, nameless
+
+    def _concluded(self, first: Examination, state: Examination) -> tuple[Examination, Unexplained | None]:
+        dropped, parts = self._drop_what_is_not_needed(), ()
         while True:
             if dropped:
-                examination = self._examine(first)
-                self.steps = refitted_in_order(self.steps, first.design, examination.design)
+                state = self.examined(first)
+                self.steps = refitted_in_order(self.steps, first.design, state.design)
             # Errors that are a few per cent too small are no effect: nothing but their size is wrong.
-            if not examination.alarm and (self.fit.explains_data or self.fit.nearly_explains_data):
-                return examination, None
+            if not state.alarm and (self.fit.explains_data or self.fit.nearly_explains_data):
+                return state, None
             self.tell("something without a name is left")
-            nameless = self._unexplained(examination)
+            if not parts and (parts := self._parts(first)):
+                dropped = True
+                continue
+            nameless = dataclasses.replace(self._unexplained(state), parts=parts)
             if not nameless.term:
-                return examination, nameless
+                return state, nameless
             dropped = self._drop_what_is_not_needed()
             if not dropped:
-                return self._examine(examination), nameless
+                return self.examined(state), nameless
             # Those names only stood in for what has none: what is it without them?
-            self._adopt(naming.refit_without(self.fit, FreeForm.name))
+            self._go_on_with(naming.refit_without(self.fit, FreeForm.name))
 
     def _drop_what_is_not_needed(self) -> bool:
         """Take out, one by one, names that the final model does not need; whether there were any."""
@@ -363,19 +334,70 @@ class _Diagnosing:
                 s.effect: naming.evidence_of_presence(self.fit, s.effect, self.context) for s in self.steps
             }
             least = min(worth, key=lambda name: worth[name])
-            if worth[least] >= LEAST_EVIDENCE:
+            if worth[least] >= self.policy.least_evidence:
                 break
             self.tell(f"{least} is no longer needed")
-            self.steps = [s for s in self.steps if s.effect != least]
-            self._adopt(naming.refit_without(self.fit, least))
+            self._without(least)
             dropped = True
         return dropped
 
-    def _finished(self, step: Step, examination: Examination) -> Step:
+    def _without(self, name: str) -> None:
+        self.steps = [s for s in self.steps if s.effect != name]
+        self._go_on_with(naming.refit_without(self.fit, name))
+
+    def _parts(self, first: Examination) -> tuple[str, ...]:
+        """Take out names that leave a poor fit nearly as poor: in words what each of them would explain.
+
+        Such a name explains no more than it can borrow from what is missing, and the matrix between the points is worse
+        with it. Other descriptions of the instrument stay: they have no amplitude that could bend.
+        """
+        names = [step for step in self.steps if step.effect != OtherDescription.name]
+        left, missing = (f.chi2 / max(f.dof, 1) - 1.0 for f in (self.fit, first.result))
+        if not names or left < self.policy.poor_fit - 1.0 or left * self.policy.part < missing:
+            return ()
+        found = []
+        for step in names:
+            before, after = (chi2 / max(first.dof, 1) for chi2 in (step.chi2_before, step.chi2_after))
+            found.append(f"{step.effect} (χ²/dof {before:.3g} → {after:.3g})")
+            self.tell(f"{step.effect} explains a part only: not added")
+        for step in names:
+            self._without(step.effect)
+        return tuple(found)
+
+    def _unexplained(self, state: Examination) -> Unexplained:
+        patterns = tuple(state.patterns_needed())
+        found = unexplained(state, patterns)
+        blocks: dict[str, list[str]] = {}
+        for name, _ in patterns:
+            if (block := state.blocks[name]) is not None:
+                blocks.setdefault(block, []).append(name)
+        if len(self.calset.exposures) > limits.FREE_EXPOSURES:
+            blocks.pop("exposures", None)
+        if FreeForm.name in self.fit.model.effect_names or not blocks or not self.time_left():
+            return found
+        useful = tuple(b for b, names in blocks.items() if predicts_unseen(state.design, names, self.policy))
+        return (
+            self._with_free_form(state, found, useful) if useful else dataclasses.replace(found, useless=True)
+        )
+
+    def _with_free_form(self, state: Examination, found: Unexplained, blocks: tuple[str, ...]) -> Unexplained:
+        """Add a free-form term for patterns without a name, so that the calibration improves all the same."""
+        term = FreeForm.of(self.context, blocks=blocks)
+        trial = naming.try_effect(self.fit, term, self.context)
+        if trial.fit is None or not trial.fit.converged:
+            return found
+        before = self.fit
+        self._go_on_with(trial.fit)
+        change = largest_change(instrument_matrices(before), instrument_matrices(self.fit))
+        return dataclasses.replace(
+            found, term=blocks, chi2_before=before.chi2, chi2_after=self.fit.chi2, change_of_qu=change
+        )
+
+    def finished(self, step: Step, state: Examination) -> Step:
         """The step with final parameters, what cannot be told from it, and where it sits."""
         change = naming.signature(self.fit, step.effect, self.context)
-        separation = examination.separation(step.effect, change)
-        close = {name for name, s in separation.items() if s < naming.SEPARATION} | set(step.equivalent)
+        separation = state.separation(step.effect, change)
+        close = {name for name, s in separation.items() if s < self.policy.separation} | set(step.equivalent)
         close -= {other.effect for other in self.steps}
         effect = self.fit.model.instrument(self.fit.values).effect(step.effect)
         standard = np.asarray(values_of(effect.standard_form())) if not type(effect).is_structural() else ()
@@ -390,9 +412,32 @@ class _Diagnosing:
             told=told(self.fit) if step.effect == Described.name else (),
             far=naming.beyond_prior(self.fit, step.effect),
             choices=naming.spoken_choices(effect),
-            robust_ratio=examination.design.robust_ratio(step.effect),
+            robust_ratio=state.design.robust_ratio(step.effect),
             equivalent=tuple(sorted(close, key=lambda name: (separation.get(name, np.inf), name))),
             separation=separation,
             separated_by=effect.separated_by if close or step.nameless else "",
-            where=location.describe(examination.design, change),
+            where=location.describe(state.design, change),
         )
+
+
+# -------------------------------------------------------------------------------------------- without a name
+
+
+def unexplained(state: Examination, patterns: tuple[tuple[str, float], ...]) -> Unexplained:
+    """What an examination leaves without a name: its patterns, and where the residuals sit."""
+    if not state.alarm:
+        ratio = state.chi2 / state.dof
+        text = f"residuals scatter more than N_ERR says (χ²/dof = {ratio:.3g}) without any pattern that was looked for"
+    elif patterns:
+        text = f"patterns without a name: {'; '.join(f'{name} (p = {p:.1g})' for name, p in patterns)}"
+    else:
+        text = "something is missing, no single pattern is significant by itself"
+    where = location.describe(state.design, state.design.residual)
+    text += f". Residuals sit in: cameras {where['camera']}; kinds {where['kind']}; field {where['field']}"
+    return Unexplained(state.table.p_global, text, patterns)
+
+
+def too_many_sentences(state: Examination, said: int) -> Unexplained:
+    """What is said where so many sentences were needed that none of them is the thing itself."""
+    text = f"{said} sentences were needed: they say where it sits, no single one of them what it is"
+    return Unexplained(state.table.p_global, text, ())

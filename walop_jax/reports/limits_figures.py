@@ -7,10 +7,10 @@ from matplotlib.colors import BoundaryNorm, LogNorm
 from matplotlib.figure import Figure
 
 from walop_jax.diagnosis.limits_found import DetectionLimits
-from walop_jax.diagnosis.naming import SEPARATION
+from walop_jax.diagnosis.policy import POLICY
 from walop_jax.reports.style import FONT, QUIET, SMALL, empty_figure, field_axes, plain_numbers
 
-_STEPS = (0.0, 1.0, 2.0, SEPARATION, 4.0, 5.0, 6.0)
+_STEPS = (0.0, 1.0, 2.0, POLICY.separation, 4.0, 5.0, 6.0)
 
 
 def protection_figure(found: DetectionLimits) -> Figure:
@@ -53,6 +53,8 @@ def separation_figure(found: DetectionLimits) -> Figure:
     axis.set_ylabel("just detected", fontsize=FONT)
     axis.set_xlabel("does its best to look alike", fontsize=FONT)
     bar = figure.colorbar(shown, ax=axis, shrink=0.7)
-    bar.set_label(f"separation (σ); below {SEPARATION:g} one may be taken for the other", fontsize=SMALL + 1)
+    bar.set_label(
+        f"separation (σ); below {POLICY.separation:g} one may be taken for the other", fontsize=SMALL + 1
+    )
     bar.ax.tick_params(labelsize=SMALL)
     return figure

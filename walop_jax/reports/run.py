@@ -12,9 +12,9 @@ import numpy as np
 from walop_jax.calibration.product import CalibrationProduct, read_product
 from walop_jax.calibration.summary import FAILED, PRODUCT, SUMMARY
 from walop_jax.data.user_tables import read_input_table
-from walop_jax.diagnosis.document import DIAGNOSIS
 from walop_jax.diagnosis.figure_data import UNNAMED
 from walop_jax.diagnosis.figure_file import FIGURE_DATA, DiagnosisFigureData, read_figure_data
+from walop_jax.diagnosis.findings import DIAGNOSIS
 from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.text import read_json

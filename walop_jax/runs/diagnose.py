@@ -11,10 +11,9 @@ from typing import Any
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import write_product
 from walop_jax.calibration.summary import PRODUCT, SUMMARY, summary
-from walop_jax.diagnosis.document import DIAGNOSIS, document
 from walop_jax.diagnosis.figure_data import figure_data
 from walop_jax.diagnosis.figure_file import FIGURE_DATA, write_figure_data
-from walop_jax.diagnosis.findings import Diagnosis
+from walop_jax.diagnosis.findings import DIAGNOSIS, Diagnosis, document
 from walop_jax.diagnosis.trust import examined
 from walop_jax.diagnosis.workflow import MINUTES, diagnose
 from walop_jax.fit.misfit import describe

@@ -13,8 +13,8 @@ from walop_jax.calibration.from_file import product_path
 from walop_jax.calibration.product import read_product, write_product
 from walop_jax.calibration.summary import PRODUCT
 from walop_jax.data import read_calibration_set
-from walop_jax.diagnosis.document import document as diagnosis_document
 from walop_jax.diagnosis.findings import Diagnosis
+from walop_jax.diagnosis.findings import document as diagnosis_document
 from walop_jax.diagnosis.trust import examined
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.refit import FitResult

@@ -13,7 +13,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.from_file import read_calibration
 from walop_jax.calibration.summary import FAILED, PRODUCT, SUMMARY
 from walop_jax.data import CalibrationSet, read_calibration_set
-from walop_jax.diagnosis.document import DIAGNOSIS
+from walop_jax.diagnosis.findings import DIAGNOSIS
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import fail
 from walop_jax.io.fits_reading import primary_keywords
