@@ -28,9 +28,10 @@ from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.effect_columns import Probe, probes
 from walop_jax.diagnosis.examination import Evidence, Ranked, examine
 from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, Measured
+from walop_jax.diagnosis.naming import Trial
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.score import Scorer, separations, whitening
-from walop_jax.diagnosis.search import Found, Linear, joined, search
+from walop_jax.diagnosis.search import Linear, joined, search
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
@@ -305,14 +306,14 @@ class Blind:
         classes: list[frozenset[str]] = []
         last = self._evidence(scene)
         first: Ranked | None = None
-        for found, before, left in search(last, Cached(self._scorers, scene.removed), POLICY):
-            last, item = left, found.trial.item
+        for trial, before, left in search(last, Cached(self._scorers, scene.removed), POLICY):
+            last, item = left, trial.item
             assert item is not None
             first, name = first or item, item.effect.name
             named.append(name)
             if item.effect is Described:
                 said.append(item.probe.name)
-            told = {*found.rivals, *found.parts, *found.nameless, *before.close(item)}
+            told = {*trial.rivals, *trial.nameless, *before.close(item)}
             classes.append(frozenset(told - {name, item.probe.name}))
         missing = last.alarm or len(said) > POLICY.most_sentences
         kind = "unexplained" if missing else "effect_found" if named else "consistent"
@@ -331,9 +332,9 @@ class Cached(Linear):
     def __init__(self, scorers: dict[tuple[str, ...], Scorer], removed: tuple[str, ...]) -> None:
         self.scorers, self.added = scorers, removed
 
-    def adopted(self, state: Evidence, found: Found) -> Evidence:
+    def adopted(self, state: Evidence, trial: Trial) -> Evidence:
         """As `Linear`, with the scorer of another scene where it went the same way."""
-        item = found.trial.item
+        item = trial.item
         assert item is not None
         self.added = (*self.added, item.probe.name)
         after = joined(state, item, self.scorers.get(self.added))

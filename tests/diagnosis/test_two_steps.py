@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from walop_jax.diagnosis.effect_columns import Probe
-from walop_jax.diagnosis.examination import Behind, Ranked, name_first
+from walop_jax.diagnosis.examination import Ranked, name_first
 from walop_jax.diagnosis.score import Score
 from walop_jax.model.effects import Described, effect_by_name
 
@@ -40,11 +40,11 @@ class Geometry:
             found.append(Ranked(KINDS[name], Probe(name, KINDS[name], ()), score, 0.5 * square - PRICE))
         return sorted(found, key=lambda item: -item.log_bayes)
 
-    def behind(self, item: Ranked) -> Behind:
+    def behind(self, item: Ranked) -> tuple[list[Ranked], list[Ranked], float]:
         d = self.directions[item.probe.name]
         left = self.residual - d * (d @ self.residual)
         p = 0.5 if left @ left < LEAST else 1e-6
-        return Behind(self.ranked(("a", "b"), d), self.ranked(("sentence",), d), p)
+        return self.ranked(("a", "b"), d), self.ranked(("sentence",), d), p
 
     def name_first(self) -> bool:
         names, sentence = self.ranked(("a", "b")), self.ranked(("sentence",))[0]

@@ -18,7 +18,6 @@ import itertools
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -129,12 +128,8 @@ def shortest(item: Ranked, most: int = POLICY.most_together) -> Described:
     return Described.combine([item.probe.group[i] for i in best], amplitudes)
 
 
-class Behind(NamedTuple):
-    """Names and sentences in order of evidence, and the global p of what is left, once one of them is in the model."""
-
-    names: Sequence[Ranked]
-    sentences: Sequence[Ranked]
-    p_global: float
+Behind = tuple[Sequence[Ranked], Sequence[Ranked], float]
+"""Names and sentences in order of evidence, and the global p of what is left, once one of them is in the model."""
 
 
 def name_first(
@@ -155,13 +150,13 @@ def name_first(
 
     if not names:
         return False
-    said = behind(sentence)
-    least = worth(sentence, [*said.names[:1], *said.sentences[:1]], len(said.names))
+    left_names, left_sentences, p_sentence = behind(sentence)
+    least = worth(sentence, [*left_names[:1], *left_sentences[:1]], len(left_names))
     for name in leaders(names, policy):
-        left = behind(name)
-        if name is names[0] and said.p_global < policy.alarm <= left.p_global:
+        left_names, _, p_name = behind(name)
+        if name is names[0] and p_sentence < policy.alarm <= p_name:
             return True
-        if worth(name, left.names[:1], len(left.names)) > least:
+        if worth(name, left_names[:1], len(left_names)) > least:
             return True
     return False
 
@@ -309,7 +304,7 @@ class Evidence:
         table = scorer.after(self.table, reduce(self.scores, self.square)[0])
         probes = [probe for probe in self.probes if probe.effect is not item.effect]
         said = [probe for probe in self.sentences if probe is not item.probe]
-        return Behind(rank(table, probes, self.policy), rank_sentences(table, said), table.p_global)
+        return rank(table, probes, self.policy), rank_sentences(table, said), table.p_global
 
     def sentences_before_names(self) -> list[Ranked]:
         """Sentences that are more probable than every name; none where names suffice and they do not."""

@@ -133,7 +133,7 @@ class Unexplained:
             )
         if self.useless:
             said.append(
-                "a term without a name does not predict settings and parts of the field that it has not seen: it was "
+                "such a term does not predict settings and parts of the field that it has not seen: it was "
                 "left out of the model"
             )
         return ". ".join(said)

@@ -7,7 +7,7 @@ Evidence       Laplace: ln B = ½ (O_base − O_g) − ½ (ln det H_g − ln det
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,9 @@ from walop_jax.diagnosis.change_of_stokes import instrument_matrices, largest_ch
 from walop_jax.diagnosis.design import Design, held_out
 from walop_jax.diagnosis.examination import Ranked
 from walop_jax.diagnosis.findings import Step
-from walop_jax.diagnosis.freeform import strata
 from walop_jax.diagnosis.grammar import said_by
 from walop_jax.diagnosis.policy import Policy
+from walop_jax.diagnosis.score import Candidate
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
 from walop_jax.fit.robust import field_cells, states
 from walop_jax.likelihood.likelihood import Likelihood
@@ -33,7 +33,8 @@ class Trial:
     """An addition to a model that was tried: its evidence (ln B), and what it leaves, χ² and whether that is noise.
 
     `item` is its linear step, `linear` the evidence of that (NaN where there was none). `fit` is None until it has been
-    fitted. `alternatives` are other shapes of the effect that do as well, in words.
+    fitted. `alternatives` are other shapes of the effect that do as well, in words. `rivals` are effects of nearly its
+    evidence, or of which a part would do, `nameless` sentences that are not improbable beside it.
     """
 
     effect: type[Effect]
@@ -44,6 +45,8 @@ class Trial:
     linear: float = float("nan")
     fit: FitResult | None = None
     alternatives: tuple[str, ...] = ()
+    rivals: tuple[str, ...] = ()
+    nameless: tuple[str, ...] = ()
 
     @classmethod
     def of_fit(cls, effect: type[Effect], fit: FitResult, evidence: float) -> Trial:
@@ -284,10 +287,10 @@ def refitted_in_order(steps: Sequence[Step], start: Design, end: Design) -> list
     return compared
 
 
-def predicts_unseen(design: Design, patterns: Collection[str], policy: Policy) -> bool:
-    """Whether patterns without a name predict states and parts of the field that it has not seen.
+def predicts_unseen(design: Design, terms: Sequence[Candidate], policy: Policy) -> bool:
+    """Whether terms without a name predict states and parts of the field that it has not seen.
 
-    One Gauss–Newton step of everything, with and without the patterns, from all data but those of a unit gives the
+    One Gauss–Newton step of everything, with and without the terms, from all data but those of a unit gives the
     density of that unit, ln p = −½ (dᵀΣ⁻¹d + ln det Σ), Σ = s² (1 + A H⁻¹ Aᵀ): it is broad where the step leaves it
     open, and s² is the χ²/dof that a model leaves, 1 or more. Units are states (exposures that differ in nothing but
     the filter), and the cells of the field. The mean gain must exceed `Policy.useful` times its standard error over the
@@ -296,7 +299,6 @@ def predicts_unseen(design: Design, patterns: Collection[str], policy: Policy) -
 
     Symbols     d prediction error of the unit, A its rows of the Jacobian, H normal matrix of all others and priors
     """
-    terms = [design.measured.candidate(one) for one in strata(design.measured) if one.name in patterns]
     widths = np.concatenate([one.widths for one in terms])
     own = design.stacked([one.columns for one in terms])
     prior = np.zeros((len(widths), design.jacobian.shape[1]))

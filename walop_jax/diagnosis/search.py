@@ -9,14 +9,14 @@ model is computed, and the blind study (`tests/diagnosis/blind.py`) runs thousan
    linear step by more than `Policy.linear_good`, rivals that lie within twice the difference are fitted as well.
 3. Where the model is far off and no name explains that, or none is found, what cannot be differentiated competes with
    the names: structural effects and other descriptions of the instrument (`choices`).
-4. What data that took no part in the fit confirm joins the model (`Judge.adopted`), and what is left is scored again.
+4. What data that took no part in the fit confirm joins the model (`adopted`), and what is left is scored again.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -29,50 +29,36 @@ from walop_jax.model.effects import Described
 State = TypeVar("State", bound=Evidence)
 
 
-@runtime_checkable
-class Judge(Protocol[State]):
-    """What tells the search how much a trial is worth, and goes on with it."""
+class Linear:
+    """What a trial is worth by its linear step; nothing is held out and no time runs. `workflow.Refit` fits instead."""
 
     def time_left(self) -> bool:
         """Whether another trial may begin."""
-        ...
+        return True
 
-    def fitted(self, state: State, trial: Trial) -> Trial | None:
+    def fitted(self, state: Any, trial: Trial) -> Trial | None:
         """A linear trial as the judge finds it; None where nothing comes of it."""
-        ...
+        return trial
 
-    def others(self, state: State) -> Iterator[Trial]:
+    def others(self, state: Any) -> Iterator[Trial]:
         """Trials of what has no linear step."""
-        ...
+        return iter(())
 
     def decided(self, trials: list[Trial]) -> list[Trial]:
         """Trials, best first, with those of even odds in their order."""
-        ...
+        return trials
 
-    def confirmed(self, state: State, trial: Trial) -> bool:
-        """Whether data that took no part in a trial agree better with it than without."""
-        ...
+    def confirmed(self, state: Any, trial: Trial) -> bool:
+        """Whether data that took no part in a trial agree better with it than without; a score space has no rows."""
+        return True
 
-    def adopted(self, state: State, found: Found) -> State:
+    def adopted(self, state: Any, trial: Trial) -> Any:
         """The evidence of what is left once a trial has joined the model."""
-        ...
+        assert trial.item is not None
+        return joined(state, trial.item)
 
 
-@dataclasses.dataclass(frozen=True)
-class Found:
-    """An addition, with what may be taken for it.
-
-    `rivals` are effects of nearly its evidence, `parts` effects of which a part would do, `nameless` sentences that are
-    not improbable beside it.
-    """
-
-    trial: Trial
-    rivals: tuple[str, ...] = ()
-    parts: tuple[str, ...] = ()
-    nameless: tuple[str, ...] = ()
-
-
-def search(state: State, judge: Judge[State], policy: Policy) -> Iterator[tuple[Found, State, State]]:
+def search(state: State, judge: Linear, policy: Policy) -> Iterator[tuple[Trial, State, State]]:
     """Additions until nothing is missing or none is found, each with the evidence before and after."""
     for _ in range(policy.most_steps):
         if not (state.alarm and judge.time_left()):
@@ -123,7 +109,7 @@ def _promising(state: Evidence, trial: Trial, policy: Policy) -> bool:
     return _worth(state, dataclasses.replace(trial, evidence=more * trial.evidence, left=left))
 
 
-def _next(state: State, judge: Judge[State], policy: Policy) -> Found | None:
+def _next(state: State, judge: Linear, policy: Policy) -> Trial | None:
     """The addition with the highest evidence that is worth telling and confirmed; None where there is none."""
     waiting = [trial for trial in linear_trials(state, policy) if _promising(state, trial, policy)]
     tried, ready = list(waiting), []
@@ -155,7 +141,7 @@ def _next(state: State, judge: Judge[State], policy: Policy) -> Found | None:
             return None
 
 
-def _with_rivals(state: Evidence, trial: Trial, tried: Sequence[Trial], policy: Policy) -> Found:
+def _with_rivals(state: Evidence, trial: Trial, tried: Sequence[Trial], policy: Policy) -> Trial:
     """A trial with what is not improbable beside it, and other shapes of its effect that are as probable."""
     rivals, shapes = [], list(trial.alternatives)
     for other in tried:
@@ -167,41 +153,12 @@ def _with_rivals(state: Evidence, trial: Trial, tried: Sequence[Trial], policy: 
             rivals.append(other.effect.name)
         elif other.effect is trial.effect and other.fit is not None and apart < policy.even_odds:
             shapes.append(in_words(other.instance))
-    trial = dataclasses.replace(trial, alternatives=tuple(shapes))
     item = trial.item or next((r for r in state.ranked if r.effect is trial.effect), None)
-    if item is None:
-        return Found(trial, tuple(rivals))
-    return Found(trial, tuple(rivals), state.held_in_part(item), state.nameless(item, trial.sentences))
-
-
-class Linear:
-    """The judge that takes every candidate at its linear step; nothing is held out and no time runs."""
-
-    def time_left(self) -> bool:
-        """Always."""
-        return True
-
-    def fitted(self, state: Evidence, trial: Trial) -> Trial:
-        """As it is."""
-        return trial
-
-    def others(self, state: Evidence) -> Iterator[Trial]:
-        """None: what cannot be differentiated has no linear step."""
-        return iter(())
-
-    def decided(self, trials: list[Trial]) -> list[Trial]:
-        """As they are."""
-        return trials
-
-    def confirmed(self, state: Evidence, trial: Trial) -> bool:
-        """Taken for granted: a score space has no rows to hold out."""
-        return True
-
-    def adopted(self, state: Evidence, found: Found) -> Evidence:
-        """What is left when the linear step of a candidate has been taken."""
-        item = found.trial.item
-        assert item is not None
-        return joined(state, item)
+    nameless = () if item is None else state.nameless(item, trial.sentences)
+    rivals += () if item is None else state.held_in_part(item)
+    return dataclasses.replace(
+        trial, alternatives=tuple(shapes), rivals=tuple(dict.fromkeys(rivals)), nameless=nameless
+    )
 
 
 def joined(state: Evidence, item: Ranked, scorer: Scorer | None = None) -> Evidence:

@@ -34,10 +34,11 @@ from walop_jax.diagnosis.examination import (
     shortest,
 )
 from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexplained, told
+from walop_jax.diagnosis.freeform import strata
 from walop_jax.diagnosis.mixups import SURE, mixups_of, refusal
 from walop_jax.diagnosis.naming import Trial, before_and_after, predicts_unseen, refitted_in_order
 from walop_jax.diagnosis.policy import POLICY, Policy
-from walop_jax.diagnosis.search import Found, search
+from walop_jax.diagnosis.search import Linear, search
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.fit.stand_in import in_field_points
@@ -127,11 +128,12 @@ def _promise(choice: Choice) -> tuple[float, float]:
 
 
 @dataclasses.dataclass
-class Refit:
+class Refit(Linear):
     """The judge that fits: the current fit of a diagnosis, and the steps so far.
 
     `wanted` are the probes of `catalogue`, `sentences` and `parts` what else can be said (`grammar`). `choices` are
-    other descriptions that were tried. `ended` says that there was no time for something.
+    other descriptions that were tried, `said` the groups of sentences that were added. `ended` says that there was no
+    time for something.
     """
 
     calset: CalibrationSet
@@ -147,6 +149,7 @@ class Refit:
     fit: FitResult
     steps: list[Step] = dataclasses.field(default_factory=list)
     choices: dict[str, Choice] = dataclasses.field(default_factory=dict)
+    said: list[str] = dataclasses.field(default_factory=list)
     ended: bool = False
     _compared: dict[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -249,9 +252,9 @@ class Refit:
         self._compared = before_and_after(trial.effect.name, state.design, Design.of(trial.fit))
         return self._compared["heldout_after"].mean < self._compared["heldout_before"].mean
 
-    def adopted(self, state: Examination, found: Found) -> Examination:
+    def adopted(self, state: Examination, trial: Trial) -> Examination:
         """Go on with the model of a trial, everything fitted again where priors or errors were in its way."""
-        trial, name = found.trial, found.trial.effect.name
+        name = trial.effect.name
         assert trial.fit is not None
         item = trial.item or next((r for r in state.ranked if r.effect is trial.effect), None)
         step = Step(
@@ -260,11 +263,13 @@ class Refit:
             score=item.score.statistic if item else state.chi2 - trial.left,
             p_value=state.table.corrected(item.score) if item else state.table.p_global,
             log_bayes=trial.evidence,
-            nameless=found.nameless,
-            equivalent=tuple(dict.fromkeys((*found.rivals, *found.parts))),
+            nameless=trial.nameless,
+            equivalent=trial.rivals,
             alternatives=trial.alternatives,
             **self._compared,
         )
+        if trial.effect is Described and item is not None:
+            self.said.append(item.probe.name)
         # A further change of the description joins those before.
         earlier = next((s for s in self.steps if s.effect == name), None)
         self.steps = [*(s for s in self.steps if s is not earlier), step]
@@ -297,12 +302,17 @@ class Refit:
 
     def conclusion(self, first: Examination, last: Examination) -> tuple[Examination, Unexplained | None]:
         """Drop what is not needed, then ask what has no name: the examination of the final model, and that."""
-        said = sum(step.effect == Described.name for step in self.steps)
         state, nameless = self._concluded(first, last)
-        if nameless is None and said > self.policy.most_sentences:
-            # Something that no sentence holds looks like several that are there.
-            nameless = too_many_sentences(state, said)
-        return state, nameless
+        if nameless is not None or len(self.said) <= self.policy.most_sentences:
+            return state, nameless
+        # Something that no sentence holds looks like several that are there.
+        nameless = too_many_sentences(state, self.said)
+        if predicts_unseen(first.design, [first.said[name] for name in self.said], self.policy):
+            return state, nameless
+        self._without(Described.name)
+        state = self.examined(first)
+        self.steps = refitted_in_order(self.steps, first.design, state.design)
+        return state, dataclasses.replace(nameless, p_value=state.table.p_global, useless=True)
 
     def _concluded(self, first: Examination, state: Examination) -> tuple[Examination, Unexplained | None]:
         dropped, parts = self._drop_what_is_not_needed(), ()
@@ -375,7 +385,14 @@ class Refit:
             blocks.pop("exposures", None)
         if FreeForm.name in self.fit.model.effect_names or not blocks or not self.time_left():
             return found
-        useful = tuple(b for b, names in blocks.items() if predicts_unseen(state.design, names, self.policy))
+        measured, every = state.design.measured, list(strata(state.design.measured))
+        useful = tuple(
+            block
+            for block, names in blocks.items()
+            if predicts_unseen(
+                state.design, [measured.candidate(one) for one in every if one.name in names], self.policy
+            )
+        )
         return (
             self._with_free_form(state, found, useful) if useful else dataclasses.replace(found, useless=True)
         )
@@ -437,7 +454,7 @@ def unexplained(state: Examination, patterns: tuple[tuple[str, float], ...]) -> 
     return Unexplained(state.table.p_global, text, patterns)
 
 
-def too_many_sentences(state: Examination, said: int) -> Unexplained:
+def too_many_sentences(state: Examination, said: Sequence[str]) -> Unexplained:
     """What is said where so many sentences were needed that none of them is the thing itself."""
-    text = f"{said} sentences were needed: they say where it sits, no single one of them what it is"
-    return Unexplained(state.table.p_global, text, ())
+    text = f"{len(said)} sentences were needed: they say where it sits, no single one of them what it is"
+    return Unexplained(state.table.p_global, f"{text} ({' | '.join(said)})", ())
