@@ -29,7 +29,7 @@ def test_a_sample_of_a_large_set_is_looked_at(monkeypatch):
         assert set(some.points.point) < set(calset.points.point)
         raise SeenError
 
-    monkeypatch.setattr(workflow, "_Diagnosing", looked_at)
+    monkeypatch.setattr(workflow.Refit, "of", looked_at)
     with pytest.raises(SeenError):
         diagnose(calset)
 

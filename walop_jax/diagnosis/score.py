@@ -10,8 +10,10 @@ Noise scale  T is divided by the mean square of the residuals in the complement 
              errors that are stated a few per cent too small or too large raise no alarm (an F statistic; the
              complement has thousands of degrees of freedom, so χ² serves).
 Global p     Under the base model the scores of all candidates together are N(0, G): the smallest p of a draw is
-             compared with the smallest p found, 10⁴ times, without a model call. Beyond the reach of the draws the
-             tail is continued with the effective number of trials that the draws themselves give.
+             compared with the smallest p found, a thousand times, without a model call. Below the smallest fifth of
+             the draws p follows from the effective number of trials n that these give: with 1 − (1 − p)ⁿ the chance of
+             a smallest p below p, n = k / (Σ_{i≤k} tᵢ + (D − k) tₖ) for the k smallest t = −ln(1 − p) of D draws (to
+             1/√k; measured between 0.3 % and 40 % of the draws it is the same to a tenth).
 Sources      Rao 1948; Bera & Bilias 2001, J. Stat. Plan. Inference 97, 9 (score tests); Gross & Vitells 2010,
              Eur. Phys. J. C 70, 525 (trial factors).
 """
@@ -37,7 +39,7 @@ ABSORBED = 1e-6  # surviving share of a column's square below which the base has
 FAINTEST = 0.05  # standard deviations that a plausible amplitude must reach to be testable
 RANK_TOLERANCE = 1e-8
 LEAST_REST = 0.1  # share of the degrees of freedom that must be left behind all candidates to tell the noise
-LEAST_COUNT = 20  # draws below the smallest p found that make counting them precise enough
+TAIL = 0.2  # share of the draws, those with the smallest p, that give the number of trials
 
 
 @dataclasses.dataclass(frozen=True)
@@ -259,7 +261,16 @@ class Scorer:
 
     def threshold(self, p: float) -> float:
         """ln of the local p that the smallest of all candidates undercuts with probability `p` under the base."""
-        return float(np.quantile(self._smallest, p)) if len(self._smallest) else float(np.log(p))
+        return float(np.log(local_p(p, self.trials)))
+
+    @functools.cached_property
+    def trials(self) -> float:
+        """Effective number of independent candidates: 1 without draws."""
+        count = int(TAIL * len(self._smallest))
+        if not count:
+            return 1.0
+        t = -np.log1p(-np.exp(np.minimum(np.sort(self._smallest), -1e-12)))
+        return max(1.0, count / float(t[:count].sum() + (len(t) - count) * t[count - 1]))
 
     def __call__(self, scores: Vector, square: float) -> ScoreTable:
         """The table from s = C̃ᵀr and r·r, both behind the projection."""
@@ -294,13 +305,10 @@ class Scorer:
         found = min((score.log_p for score in scores if score.testable), default=0.0)
         if not len(self._smallest):
             return 1.0, 1.0
-        # Effective number of trials where the draws still count well (their 1 % quantile).
-        reference = float(np.quantile(self._smallest, 0.01))
-        trials = max(1.0, float(np.log1p(-0.01) / np.log1p(-np.exp(reference))))
         below = int(np.sum(self._smallest <= found))
-        if below >= LEAST_COUNT:
-            return (1 + below) / (1 + len(self._smallest)), trials
-        return corrected_p(found, trials), trials
+        if below >= TAIL * len(self._smallest):
+            return (1 + below) / (1 + len(self._smallest)), self.trials
+        return corrected_p(found, self.trials), self.trials
 
     def _smallest_p(self, rng: np.random.Generator, draws: int) -> Vector:
         """ln of the smallest p among all candidates, drawn under the base."""

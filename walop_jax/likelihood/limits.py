@@ -120,8 +120,8 @@ COLUMNS_TOGETHER = 256
 """Columns that are multiplied together: large enough for the full speed of a core, small enough to share them out."""
 AMPLITUDES_AT_ONCE = 32
 """Amplitudes that are differentiated together: hundreds of them at all exposures of several points take gigabytes."""
-NULL_DRAWS = 10_000
-"""Draws of all scores under the base model: probabilities down to 0.002 are counted, not extrapolated."""
+NULL_DRAWS = 1_000
+"""Draws of all scores under the base model: a fifth of them give the number of trials to 7 %."""
 MANY_SHAPES = 8
 """Shapes of an effect above which they are swept in one compiled loop instead of differentiated together."""
 
