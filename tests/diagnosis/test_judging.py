@@ -199,14 +199,14 @@ def test_patterns_that_hold_at_no_other_setting_do_not_predict_it():
     _, calset = slipped()
     slips = Design.of(fit(Likelihood.of(calset, base_model(calset))))
     assert slips.fit.chi2 > 1.5 * slips.fit.dof
-    assert not naming.predicts_unseen(slips, vectors(slips), POLICY)
+    assert not naming.predicts_unseen(slips, vectors(slips), POLICY.useful)
 
 
 def test_patterns_of_the_optics_predict_settings_that_they_have_not_seen():
     hidden = Described.saying(["retardance u behind half1.plate * xy"], [0.02])
     calset = simulate(PLAN, seed=1, effects=[hidden]).calset
     optics = Design.of(fit(Likelihood.of(calset, base_model(calset))))
-    assert naming.predicts_unseen(optics, vectors(optics), POLICY)
+    assert naming.predicts_unseen(optics, vectors(optics), POLICY.useful)
 
 
 @pytest.mark.long

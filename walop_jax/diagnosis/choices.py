@@ -60,6 +60,8 @@ class Choices:
         policy: Policy,
         going_on: Callable[[], bool],
         tell: Callable[[str], None],
+        *,
+        all_of_them: bool = True,
     ) -> None:
         self.result, self.context, self.policy = result, context, policy
         self.going_on, self.tell = going_on, tell
@@ -67,7 +69,9 @@ class Choices:
         if OtherDescription.name in result.model.effect_names:
             described = result.model.template.effect(OtherDescription.name)
             template = described.patch(template)
-        self.sentences, self.curves = tuple(alternatives(template)), other_curves(template)
+        self.curves = other_curves(template)
+        # What is turned, exchanged or left out changes the light by per cents: nothing of that kind is a small misfit.
+        self.sentences = tuple(alternatives(template)) if all_of_them else self.curves
         self.tried: dict[str, Choice] = {}
 
     def trials(self) -> Iterator[naming.Trial]:

@@ -287,15 +287,17 @@ def refitted_in_order(steps: Sequence[Step], start: Design, end: Design) -> list
     return compared
 
 
-def predicts_unseen(design: Design, terms: Sequence[Candidate], policy: Policy) -> bool:
+def predicts_unseen(
+    design: Design, terms: Sequence[Candidate], least: float, *, of_states: bool = True
+) -> bool:
     """Whether terms without a name predict states and parts of the field that it has not seen.
 
     One Gauss–Newton step of everything, with and without the terms, from all data but those of a unit gives the
     density of that unit, ln p = −½ (dᵀΣ⁻¹d + ln det Σ), Σ = s² (1 + A H⁻¹ Aᵀ): it is broad where the step leaves it
     open, and s² is the χ²/dof that a model leaves, 1 or more. Units are states (exposures that differ in nothing but
-    the filter), and the cells of the field. The mean gain must exceed `Policy.useful` times its standard error over the
-    units, for both: a term that only follows what each setting of an element does by itself predicts the field, and no
-    other setting.
+    the filter; not where the terms are about single ones), and the cells of the field. The mean gain must exceed
+    `least` times its standard error over the units, for both: a term that only follows what each setting of an element
+    does by itself predicts the field, and no other setting.
 
     Symbols     d prediction error of the unit, A its rows of the Jacobian, H normal matrix of all others and priors
     """
@@ -305,11 +307,14 @@ def predicts_unseen(design: Design, terms: Sequence[Candidate], policy: Policy) 
     rows = np.vstack([np.hstack([design.jacobian, own]), np.hstack([prior, np.diag(1.0 / widths)])])
     residual = np.append(design.residual, np.zeros(len(widths)))
     calset = design.fit.calset
-    for unit in (states(calset)[design.exposure], field_cells(calset)[design.point]):
+    units = [field_cells(calset)[design.point]]
+    if of_states:
+        units.append(states(calset)[design.exposure])
+    for unit in units:
         before = _predictive_density(design.jacobian, design.residual, unit, design.projector.free)
         after = _predictive_density(rows, residual, unit, design.projector.free)
         gain = after - before
-        if len(gain) < 2 or gain.mean() < policy.useful * gain.std(ddof=1) / np.sqrt(len(gain)):
+        if len(gain) < 2 or gain.mean() < least * gain.std(ddof=1) / np.sqrt(len(gain)):
             return False
     return True
 

@@ -58,6 +58,8 @@ class Policy:
     """Evidence that an effect must be worth to the final model to stay in it."""
     part: float = 10.0
     """Factor by which names must bring down χ²/dof − 1 of a poor fit; else they are told as parts, and not added."""
+    hopeful: float = 1.0
+    """Standard errors by which a sentence must predict unseen settings better, by its linear step, to be fitted."""
     useful: float = 2.0
     """Standard errors by which a term without a name must predict unseen settings better to stay in the model."""
     most_patterns: int = 8

@@ -29,6 +29,7 @@ from walop_jax.diagnosis.effect_columns import Probe, applicable
 from walop_jax.diagnosis.effect_columns import probes as all_probes
 from walop_jax.diagnosis.examination import (
     Examination,
+    Ranked,
     examine,
     most_points,
     shortest,
@@ -209,6 +210,8 @@ class Refit(Linear):
         assert item is not None
         self.tell(f"trying {item.probe.name if item.effect is Described else item.effect.name}")
         if item.effect is Described:
+            if not self._hopeful(state, item):
+                return None
             said = shortest(item, self.policy.most_together)
             found = naming.try_sentences(self.fit, said, self.context, len(state.sentences))
         else:
@@ -218,13 +221,21 @@ class Refit(Linear):
             return None
         return dataclasses.replace(found, item=item, linear=trial.linear)
 
+    def _hopeful(self, state: Examination, item: Ranked) -> bool:
+        """Whether a sentence predicts what it has not seen, by its linear step: nobody has a name for it to believe."""
+        single = any("exposure" in text for text in grammar.said_by(item.probe))
+        columns = [state.said[item.probe.name]]
+        return predicts_unseen(state.design, columns, self.policy.hopeful, of_states=not single)
+
     def others(self, state: Examination) -> Iterator[Trial]:
-        """Structural effects where the model is far off, and the instrument described otherwise."""
+        """The instrument described otherwise; where the model is far off in all ways, and structural effects."""
         for effect in self.catalogue if state.poor else ():
             if effect.is_structural() and effect.name not in self.fit.model.effect_names and self.time_left():
                 self.tell(f"trying {effect.name}")
                 yield naming.try_effect(self.fit, effect.neutral(self.context), self.context)
-        choices = Choices(self.fit, self.context, self.policy, self.time_left, self.tell)
+        choices = Choices(
+            self.fit, self.context, self.policy, self.time_left, self.tell, all_of_them=state.poor
+        )
         yield from choices.trials()
         self.choices |= choices.tried
 
@@ -307,7 +318,7 @@ class Refit(Linear):
             return state, nameless
         # Something that no sentence holds looks like several that are there.
         nameless = too_many_sentences(state, self.said)
-        if predicts_unseen(first.design, [first.said[name] for name in self.said], self.policy):
+        if predicts_unseen(first.design, [first.said[name] for name in self.said], self.policy.useful):
             return state, nameless
         self._without(Described.name)
         state = self.examined(first)
@@ -390,7 +401,9 @@ class Refit(Linear):
             block
             for block, names in blocks.items()
             if predicts_unseen(
-                state.design, [measured.candidate(one) for one in every if one.name in names], self.policy
+                state.design,
+                [measured.candidate(one) for one in every if one.name in names],
+                self.policy.useful,
             )
         )
         return (
