@@ -389,7 +389,7 @@ class Evidence:
 
 def explains(chi2: float, dof: float) -> bool:
     """Whether χ² is what noise alone would give, as `FitResult.explains_data` has it."""
-    return dof > 0 and chi2 - dof < SUSPECT_SIGMA * np.sqrt(2.0 * dof)
+    return bool(dof > 0 and chi2 - dof < SUSPECT_SIGMA * np.sqrt(2.0 * dof))
 
 
 def upper_limit(value: float, sigma: float, *, one_sided: bool, probability: float = POLICY.limit) -> float:
