@@ -7,18 +7,16 @@ import numpy as np
 import pytest
 import scenes
 from own_instrument import OWN
-from quick import quick
 
 from walop_jax.data.records import Position
 from walop_jax.diagnosis import grammar
-from walop_jax.diagnosis.effect_columns import applicable, effect_candidates, probes
-from walop_jax.diagnosis.sentence_columns import all_candidates, sentence_candidates
+from walop_jax.diagnosis.effect_columns import all_candidates, applicable, effect_candidates, probes
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.instruments.description import parsed
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.build import build
-from walop_jax.model.effects import EFFECTS, Described, effect_by_name
+from walop_jax.model.effects import EFFECTS
 from walop_jax.model.specification import effect_context
 from walop_jax.simulation.simulate import simulate
 
@@ -57,7 +55,7 @@ def said(laid, request):
     if not request.config.getoption("--long"):
         found = [probe for probe in found if probe.name in QUICK]
         assert len(found) == len(QUICK)
-    made = sentence_candidates(laid.likelihood, laid.model, laid.values, found)
+    made = all_candidates(laid.likelihood, laid.values, (), found)[1]
     return {name: candidate.columns for name, candidate in made.items()}
 
 
@@ -86,32 +84,6 @@ def test_names_are_sentences(laid, said):
         held = 1.0 - np.sum(left**2) / np.sum(rest**2)
         print(probe.name, held)
         assert held > HELD, probe.name
-
-
-def test_columns_are_those_of_the_effect_itself(laid, said):
-    """What is multiplied by a factor afterwards is what the effect with that factor does."""
-    listed = [name for name in LISTED if name in said]
-    each = {name: Described.saying(name.split("; "), [0.0] * len(name.split("; "))) for name in listed}
-    whole = Likelihood.of(laid.calset, laid.model, tuple(each.values()))
-    columns = whole.effect_columns(laid.values, tuple(each.values()))
-    ends = np.cumsum([said[name].shape[1] for name in listed])
-    for name, own in zip(listed, np.split(columns, ends[:-1], axis=1), strict=True):
-        assert said[name] == pytest.approx(own, rel=1e-7, abs=1e-7 * np.abs(own).max())
-
-
-@pytest.mark.parametrize("name", quick(["etalon", "flexure", "hwp_temperature"], ["hwp_temperature"]))
-def test_columns_of_effects_that_are_plain_sums_are_those_of_the_effects(laid, name):
-    """Added up from sentences, and differentiated with the effect itself in the light path."""
-    template = laid.model.template
-    context = effect_context(template, laid.calset.exposures)
-    effect = effect_by_name(name)
-    assert effect.neutral(context).sums(template)
-    wanted = [next(probes([effect], context))]
-    summed, _ = all_candidates(laid.likelihood, laid.model, laid.values, wanted, ())
-    direct = effect_candidates(laid.calset, laid.model, laid.values, wanted)
-    for probe in wanted:
-        own = direct[probe.name].columns
-        assert summed[probe.name].columns == pytest.approx(own, rel=1e-7, abs=1e-7 * np.abs(own).max())
 
 
 def test_sentences_that_have_a_name_are_left_to_it(laid):

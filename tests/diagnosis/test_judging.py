@@ -19,6 +19,7 @@ from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
+from walop_jax.likelihood.columns import own_columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described, FreeForm, effect_by_name
 from walop_jax.model.effects.free_form import BLOCKS
@@ -49,9 +50,9 @@ def test_signature_is_what_taking_the_effect_away_does(leaking):
     """To first order, the effect's column times its amplitude."""
     calset, context, base, extended = leaking
     probe = effect_by_name("camera_leakage").probes(context)[0]
-    bare = Likelihood.of(calset, base.model, probes=probe)
+    bare = Likelihood.of(calset, base.model)
     kept = [extended.model.index(name) for name in base.model.names]
-    column = bare.effect_columns(extended.values[kept], probe)[:, 0]
+    column = own_columns(bare, extended.values[kept], probe)[:, 0]
     share, _ = extended.value("camera_leakage.share")
     found = naming.signature(extended, "camera_leakage", context)
     np.testing.assert_allclose(found, -column * share, atol=2e-2 * np.abs(found).max())

@@ -1,32 +1,30 @@
-"""What each named effect would do to the residuals: the columns of the score test, from the catalogue itself.
+"""What each effect, and each sentence of the grammar, would do to the residuals: the columns of the score test.
 
-Effects that need the same kind of computation are differentiated together; those with many shapes (the gap of an
-etalon, the place of a blemish) are swept over their shapes in one compiled loop. Structural effects have no
-amplitude: they cannot be differentiated, only tried (`naming.py`).
+All come from the responses of the light path (`likelihood.columns`), but those of effects of a user's own, which are
+differentiated themselves. Structural effects have no amplitude: they can only be tried (`naming.py`).
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.data.records import CalibrationSet
+from walop_jax.diagnosis.effect_sums import sums
 from walop_jax.diagnosis.score import Candidate
-from walop_jax.likelihood import limits
+from walop_jax.likelihood.columns import Change, Columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model import light
 from walop_jax.model.dependence import changed_elements, conditions_asked_by
 from walop_jax.model.effects import Context, Effect
+from walop_jax.model.effects.sentence import Sentence
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations
 from walop_jax.model.ray import CONDITIONS
 from walop_jax.model.specification import Model
 
-LEAST_SURVIVING = 1e-3  # a contrast of 1 % that the band reduces by this factor is 0.001 %: of no consequence
 DEFAULT_WIDTH = 1.0
 FEWEST_POINTS = 9  # in which a pattern over the field is looked for, or what refers to their median
 
@@ -83,19 +81,6 @@ def probes(catalogue: Sequence[type[Effect]], context: Context) -> Iterator[Prob
                 yield probe
 
 
-def _kind_of_computation(instrument: Instrument, effect: Effect) -> tuple[object, ...]:
-    """What makes a computation costly: derivatives of the optics, optics for every exposure, many nodes, ghosts.
-
-    It only sorts effects into batches, so it asks the elements that the effect changes, not the whole path.
-    """
-    bare = dataclasses.replace(instrument, effects=())
-    patched, changed = effect.patch(bare), changed_elements(bare, effect)
-    asked = frozenset(name for element in changed for name in conditions_asked_by(element))
-    longest = max((element.path_difference for element in changed), default=0.0)
-    optics = bool(changed) or patched.filter_shift is not bare.filter_shift
-    return optics, asked, longest, bool(patched.cameras.ghosts)
-
-
 def _can_show(calset: CalibrationSet, instrument: Instrument, effect: Effect) -> bool:
     """Whether a set has what an effect acts on: several field points, or the conditions that its elements ask for."""
     if effect.over_field and len(calset.points) < FEWEST_POINTS:
@@ -120,51 +105,48 @@ def effect_candidates(
     calset: CalibrationSet, model: Model, values: Vector, wanted: Sequence[Probe]
 ) -> dict[str, Candidate]:
     """Columns of all probes at the fit `values` of `model`, by probe name; without those that the bands blur away."""
-    wanted = showable(calset, model.template, wanted)
-    number = Counter(p.effect for p in wanted)
-    several = {effect for effect, count in number.items() if count > limits.MANY_SHAPES}
-    result: dict[str, Candidate] = {}
-    kinds: dict[type[Effect], tuple[object, ...]] = {}
-    together: dict[tuple[object, ...], list[Probe]] = {}
-    for probe in wanted:
-        if probe.effect not in several:
-            if probe.effect not in kinds:
-                kinds[probe.effect] = _kind_of_computation(model.template, probe.group[0])
-            together.setdefault(kinds[probe.effect], []).append(probe)
-    for batch in together.values():
-        members = tuple(member for probe in batch for member in probe.group)
-        columns = Likelihood.of(calset, model, members).effect_columns(values, members)
-        start = 0
-        for probe in batch:
-            stop = start + len(probe.widths)
-            result[probe.name] = Candidate(probe.name, columns[:, start:stop], probe.widths)
-            start = stop
-    for effect in several:
-        mine = [probe for probe in wanted if probe.effect is effect]
-        result |= swept(calset, model, values, mine)
-    return {probe.name: result[probe.name] for probe in wanted if probe.name in result}
+    return all_candidates(Likelihood.of(calset, model), values, wanted, ())[0]
 
 
-def swept(
-    calset: CalibrationSet, model: Model, values: Vector, mine: Sequence[Probe]
-) -> dict[str, Candidate]:
-    """Columns of one effect at many shapes: one compiled sweep for each of its discrete choices."""
-    likelihood = Likelihood.of(calset, model, (mine[0].group[0],))
-    instrument = model.instrument(values)
-    nodes = np.asarray(light.node_wavelengths(instrument, likelihood.plan))
-    weight = np.asarray(light.band_weights(instrument, likelihood.plan))
-    mine = [probe for probe in mine if probe.group[0].survives(nodes, weight) > LEAST_SURVIVING]
-    members = [(i, j) for i, probe in enumerate(mine) for j in range(len(probe.group))]
-    by_choice: dict[tuple[tuple[str, object], ...], list[tuple[int, int]]] = {}
-    for i, j in members:
-        by_choice.setdefault(tuple(sorted(mine[i].group[j].choices().items())), []).append((i, j))
-    found: dict[tuple[int, int], np.ndarray] = {}
-    for group in by_choice.values():
-        columns = likelihood.effect_columns_over_shapes(values, [mine[i].group[j] for i, j in group])
-        found |= dict(zip(group, columns, strict=True))
-    return {
-        probe.name: Candidate(
-            probe.name, np.column_stack([found[i, j] for j in range(len(probe.group))]), probe.widths
-        )
-        for i, probe in enumerate(mine)
+def all_candidates(
+    likelihood: Likelihood, values: Vector, effects: Sequence[Probe], sentences: Sequence[Probe]
+) -> tuple[dict[str, Candidate], dict[str, Candidate]]:
+    """Columns of effects and of sentences at the fit `values` of a model, by name.
+
+    Without effects that the set cannot show, and without fringes that the bands blur away.
+    """
+    calset, template = likelihood.calset, likelihood.model.template
+    shown = showable(calset, template, effects)
+    columns = Columns(likelihood, values)
+    changes: dict[int, list[Change]] = {}
+    for number, probe in enumerate([*shown, *sentences]):
+        each = [sums(member, template) for member in probe.group]
+        if all(one is not None and all(columns.has(change) for change in one) for one in each):
+            changes[number] = [change for one in each for change in one or ()]
+    gaps = [sentence.gap for some in changes.values() for change in some for sentence in _fringes(change)]
+    survives = columns.survives(gaps)
+    blurred = {
+        number
+        for number, some in changes.items()
+        if not all(survives[sentence.gap] for change in some for sentence in _fringes(change))
     }
+    kept = {number: some for number, some in changes.items() if number not in blurred}
+    found = columns.of([change for some in kept.values() for change in some])
+    named: dict[str, Candidate] = {}
+    said: dict[str, Candidate] = {}
+    first = 0
+    for number, probe in enumerate([*shown, *sentences]):
+        if number in kept:
+            own = found[:, first : first + len(probe.widths)]
+            first += len(probe.widths)
+        elif number in blurred:
+            continue
+        else:
+            own = own_columns(likelihood, values, probe.group)
+        into = named if number < len(shown) else said
+        into[probe.name] = Candidate(probe.name, own, probe.widths)
+    return named, said
+
+
+def _fringes(change: Change) -> Iterator[Sentence]:
+    return (sentence for _, sentence in change if sentence.kind == "fringes")

@@ -26,7 +26,7 @@ from scipy import stats
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.effect_columns import Probe
+from walop_jax.diagnosis.effect_columns import Probe, all_candidates
 from walop_jax.diagnosis.findings import Alike, Limit
 from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, number_of_columns, strata
 from walop_jax.diagnosis.policy import POLICY, Policy
@@ -41,7 +41,6 @@ from walop_jax.diagnosis.score import (
     log_bayes,
     separations,
 )
-from walop_jax.diagnosis.sentence_columns import all_candidates
 from walop_jax.fit.refit import SUSPECT_SIGMA, FitResult
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import Described, Effect
@@ -479,7 +478,7 @@ def examine(
     named, said = (
         (earlier.named, earlier.said)
         if earlier is not None and earlier.is_like(design)
-        else all_candidates(result.likelihood, result.model, result.values, inactive, every)
+        else all_candidates(result.likelihood, result.values, inactive, every)
     )
     probes = [probe for probe in inactive if probe.name in named]
     sentences = tuple(probe for probe in sentences if probe.name in said)

@@ -21,10 +21,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Iterator, Sequence
-from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from walop_jax.data.records import Exposures
@@ -40,9 +37,9 @@ from walop_jax.model.effects.sentence import (
     SKY,
     Sentence,
 )
-from walop_jax.model.elements import Element, Polariser, PupilMapping, WavePlate
+from walop_jax.model.elements import Polariser, PupilMapping, WavePlate
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.ray import CONDITIONS, Conditions, Ray
+from walop_jax.model.responses import acts
 
 LINEAR = ("diattenuation", "retardance")
 ALONE = ("diattenuation v", "retardance v", "depolarisation")
@@ -258,26 +255,15 @@ def places(instrument: Instrument, exposures: Exposures) -> Iterator[tuple[str, 
     if polariser is None and behind:
         yield "ahead of", behind[0].name, True
     for element in behind:
-        if _acts(element) and (element.moves is None or exposures.position(element.moves).inside.any()):
+        if acts(element) and (element.moves is None or exposures.position(element.moves).inside.any()):
             yield "behind", element.name, True
     for arm in instrument.arms:
         own = list(arm.train())
         if len(instrument.arms) > 1:
             yield "ahead of", f"{arm.name}.{own[0].name if own else arm.analyser.name}", True
         for element in own:
-            if _acts(element):
+            if acts(element):
                 yield "behind", f"{arm.name}.{element.name}", True
-
-
-def _acts(element: Element) -> bool:
-    """Whether an element does anything to polarisation."""
-    one, zero = jnp.ones(1), jnp.zeros(())
-
-    def run(element: Element) -> Any:
-        conditions = Conditions(band_width=0.1 * one, planned=dict.fromkeys(CONDITIONS, one))
-        return element.mueller(Ray.entering(zero, zero, (0.62 * one, conditions)))
-
-    return jax.eval_shape(run, element) is not None
 
 
 def _of_plates(instrument: Instrument, exposures: Exposures, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
@@ -343,7 +329,7 @@ def _together(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence,
     arms, names = instrument.arms, instrument.cameras.names
     if len(arms) > 1 and len({arm.path for arm in arms}) == 1:
         for element in arms[0].train():
-            if _acts(element):
+            if acts(element):
                 each = [list(_families("behind", f"{arm.name}.{element.name}")) for arm in arms]
                 yield from (tuple(itertools.chain(*same)) for same in zip(*each, strict=True))
     plates = [place for place in instrument.places(WavePlate) if "." in place]

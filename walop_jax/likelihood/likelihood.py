@@ -7,13 +7,11 @@ import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.likelihood import effect_columns, engine, limits
+from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.expansion import Census, DataTerms, OpticsUsed, Posterior
 from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.layout import Layout
@@ -282,45 +280,10 @@ class Likelihood:
         """
         instrument, select = self.model.instrument(values), self.model.selection()
         parts = [
-            _rows(engine.linearised_residuals(instrument, self.plan, c)[1], c) @ select for c in self.points
-        ]
-        return np.concatenate(parts)
-
-    def effect_columns(self, values: Vector, probes: tuple[Effect, ...]) -> Float[np.ndarray, "d a"]:
-        """Derivatives of the used residuals with respect to the amplitudes of neutral effects added to the model."""
-        instrument, once = self.model.instrument(values), self.is_small
-        parts = [
-            _rows(effect_columns.effect_columns(instrument, self.plan, probes, c, once=once), c)
+            used_rows(engine.linearised_residuals(instrument, self.plan, c)[1], c) @ select
             for c in self.points
         ]
         return np.concatenate(parts)
-
-    def effect_changes(
-        self, values: Vector, probes: tuple[Effect, ...]
-    ) -> tuple[Float[np.ndarray, "p a e k"], Float[np.ndarray, "p e k"]]:
-        """Derivatives of weighted counts, the flux held, to amplitudes of neutral effects and to the flux."""
-        instrument, once = self.model.instrument(values), self.is_small
-        parts = [
-            effect_columns.effect_changes(instrument, self.plan, probes, c, once=once) for c in self.points
-        ]
-        change, along = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
-        return change[: self.layout.points], along[: self.layout.points]
-
-    def effect_columns_over_shapes(
-        self, values: Vector, probes: Sequence[Effect]
-    ) -> Float[np.ndarray, "g d a"]:
-        """As `effect_columns` for one effect at many shapes, all with the same discrete choices."""
-        instrument = self.model.instrument(values)
-        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *probes)
-        parts = []
-        for chunk in self.points:
-            cube = np.asarray(
-                effect_columns.effect_columns_over_shapes(
-                    instrument, self.plan, stacked, chunk, once=self.is_small
-                )
-            )
-            parts.append(np.stack([_rows(one, chunk) for one in cube]))
-        return np.concatenate(parts, axis=1)
 
     @property
     def is_small(self) -> bool:
@@ -339,7 +302,7 @@ class Likelihood:
         return np.concatenate(parts)[: self.layout.points]
 
 
-def _rows(columns: Array | np.ndarray, chunk: engine.PointData) -> Float[np.ndarray, "d n"]:
+def used_rows(columns: Array | np.ndarray, chunk: engine.PointData) -> Float[np.ndarray, "d n"]:
     """The rows of a chunk that are used."""
     used = np.asarray(chunk.weight[..., 0] > 0)
     cube = np.asarray(columns).reshape(*used.shape, chunk.weight.shape[-1], -1)

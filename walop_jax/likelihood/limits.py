@@ -32,6 +32,10 @@ COLUMNS = 256
 """Columns of an image row that are worked on together: the sums of four cameras and 25 exposures take a megabyte."""
 PROBES_AT_ONCE = 6
 """Shapes of one effect that are worked on together: bounds the memory, and more are no faster."""
+RESPONSES_TOGETHER = 32
+"""Field points whose responses are computed together: one program serves sets of any size."""
+RESPONSE_NUMBERS = 4_000_000
+"""Numbers of responses that meet the exposures of some points together: 32 MB."""
 
 # ------------------------------------------------------------------------------- optics on nodes of the field
 

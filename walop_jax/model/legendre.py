@@ -20,7 +20,7 @@ def terms(degree: int) -> tuple[tuple[int, int], ...]:
 
 
 def _one_dimension(t: Float[Array, ...], degree: int) -> list[Float[Array, ...]]:
-    values = [jnp.ones_like(t), t]
+    values = [0.0 * t + 1.0, t]
     for k in range(1, degree):
         values.append(((2 * k + 1) * t * values[k] - k * values[k - 1]) / (k + 1))
     return values

@@ -121,9 +121,13 @@ def band_weights(instrument: Instrument, plan: Plan) -> Float[Array, "b n"]:
     Photon spectrum λ⁻⁴ / (exp(14387.77/λT) − 1) (Planck; λ in µm, T in K), flat where T = 0 stands for
     "none".
     """
-    wavelength = node_wavelengths(instrument, plan)
-    hot = plan.teff > 0
-    exponent = 14387.77 / (wavelength * jnp.where(hot, plan.teff, 5000.0)[:, None])
+    return weights_at(plan, node_wavelengths(instrument, plan), plan.teff)
+
+
+def weights_at(plan: Plan, wavelength: Float[Array, " n"], teff: Float[Array, " b"]) -> Float[Array, "b n"]:
+    """As `band_weights`, for other wavelengths of the nodes and colour temperatures of the bands."""
+    hot = teff > 0
+    exponent = 14387.77 / (wavelength * jnp.where(hot, teff, 5000.0)[:, None])
     spectrum = jnp.where(hot[:, None], wavelength**-4 / jnp.expm1(exponent), 1.0)
     weight = plan.node_weight * spectrum
     return weight / weight.sum(axis=1, keepdims=True)
@@ -146,7 +150,7 @@ def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float
     def at(wavelength: Float[Array, " n"]) -> Float[Array, "c n r 4"]:
         return _node_rows(instrument, plan, Ray.entering(x, y, (wavelength, plan.conditions)))
 
-    if _dispersed(instrument):
+    if is_dispersed(instrument):
         rows = jnp.concatenate(jax.jvp(at, (wavelength,), (wavelength,)), axis=2)
     else:
         rows = at(wavelength)
@@ -162,7 +166,14 @@ def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float
                 for i, (_, first, last) in enumerate(plan.settings)
             ]
         )
-    analysers, mean = [arm.analyser for arm in instrument.arms], weights @ wavelength
+    return in_bands(instrument, bands, weights @ wavelength)
+
+
+def in_bands(
+    instrument: Instrument, bands: Float[Array, "b r 4"], mean: Float[Array, " b"]
+) -> Float[Array, "b r 4"]:
+    """Band-integrated rows with what the analysers do from band to band, at mean wavelengths (µm)."""
+    analysers = [arm.analyser for arm in instrument.arms]
     if all(analyser.balance is None and analyser.loss is None for analyser in analysers):
         return bands
     parts = jnp.split(bands, bands.shape[1] // Analyser.rows, axis=1)
@@ -171,7 +182,8 @@ def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float
     )
 
 
-def _dispersed(instrument: Instrument) -> bool:
+def is_dispersed(instrument: Instrument) -> bool:
+    """Whether the beams of an analyser differ in wavelength."""
     return any(arm.analyser.dispersion is not None for arm in instrument.arms)
 
 
@@ -198,11 +210,23 @@ def camera_vectors(
 ) -> Float[Array, "b k 4"]:
     """Analysis vectors (band, camera, Stokes): counts = vector · Stokes for light of unit flux."""
     instrument = instrument.patched()
+    seen = beams(instrument, rows) @ upstream(instrument, x, y)
+    return behind_throughput(instrument, seen, throughput, x, y)
+
+
+def beams(instrument: Instrument, rows: Float[Array, "b r 4"]) -> Float[Array, "b k 4"]:
+    """What the beam of each camera takes of the rows of its analyser."""
+    index, shares = _beams(instrument)
+    return sum(shares[:, j, None] * rows[:, index[:, j]] for j in range(index.shape[1]))
+
+
+def behind_throughput(
+    instrument: Instrument, beams: Float[Array, "b k 4"], throughput: Float[Array, " k"], x: Scalar, y: Scalar
+) -> Float[Array, "b k 4"]:
+    """Analysis vectors from the beams of an instrument without effects (`patched`): throughput, and what mixes them."""
     for part in instrument.cameras.transmission:
         throughput = throughput * part.factors(x, y)
-    index, shares = _beams(instrument)
-    analysed = sum(shares[:, j, None] * rows[:, index[:, j]] for j in range(index.shape[1]))
-    vectors = throughput[:, None] * (analysed @ upstream(instrument, x, y))
+    vectors = throughput[:, None] * beams
     for part in instrument.cameras.mixing:
         vectors = part.vectors(vectors, x, y)
     return vectors
@@ -220,7 +244,7 @@ def _beams(instrument: Instrument) -> tuple[Int[np.ndarray, "k j"], Float[Array,
         index[cameras, : analyser.rows] = first + np.arange(analyser.rows)
         shares = shares.at[cameras, : analyser.rows].set(analyser.shares())
         first += analyser.rows
-    if _dispersed(instrument):
+    if is_dispersed(instrument):
         slopes = jnp.zeros_like(shares)
         for arm in instrument.arms:
             cameras = np.array([instrument.cameras.names.index(name) for name in arm.analyser.cameras])

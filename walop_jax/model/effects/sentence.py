@@ -21,6 +21,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Self
 
 import jax.numpy as jnp
+import numpy as np
 
 from walop_jax.model import legendre
 from walop_jax.model.conventions import FIELD_SCALE
@@ -187,12 +188,13 @@ def factor(name: str, at: Any) -> Any:
         square = (at.x**2 + at.y**2) / FIELD_SCALE**2
         return legendre.polynomial(int(ring[1]), 2.0 * square / LARGEST_SQUARE - 1.0)
     if harmonic := _HARMONIC.fullmatch(name):
-        wave = {"cos": jnp.cos, "sin": jnp.sin}[harmonic[1]]
-        return wave(int(harmonic[2]) * at.angle(harmonic[3]))
+        angle = at.angle(harmonic[3])
+        wave = getattr(np if isinstance(angle, np.ndarray) else jnp, harmonic[1])
+        return wave(int(harmonic[2]) * angle)
     if span := _SPAN.fullmatch(name):
-        return jnp.where((at.hours >= float(span[1])) & (at.hours < float(span[2])), 1.0, 0.0)
+        return ((at.hours >= float(span[1])) & (at.hours < float(span[2]))) * 1.0
     if one := _EXPOSURE.fullmatch(name):
-        return jnp.where(at.number == int(one[1]), 1.0, 0.0)
+        return (at.number == int(one[1])) * 1.0
     if _GAP.fullmatch(name):
         return 1.0  # the fringes themselves know it
     raise unknown_name("factor", name, _FACTORS)
