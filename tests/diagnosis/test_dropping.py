@@ -85,7 +85,7 @@ class Rehearsal(workflow.Refit):
 
     def __init__(self):
         self.fit = Mock(spec=FitResult, explains_data=True, chi2=1.0, dof=1, noise_scale=1.0)
-        self.steps, self.policy = [SimpleNamespace(effect="name")], POLICY
+        self.steps, self.said, self.policy = [SimpleNamespace(effect="name")], [], POLICY
         self.tell = lambda text: None
 
     def examined(self, earlier=None):
