@@ -26,6 +26,7 @@ import numpy as np
 
 from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, CalibrationSet, Exposures, Points
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.diagnosis.policy import POLICY
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.search import FAR_OFF
@@ -35,14 +36,9 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.thinning import thinned
 from walop_jax.model.specification import Model
 
-GAIN = 10.0
-"""Factor by which an alternative must bring down χ²/dof − 1 to be told."""
-SURE = 1.2  # χ²/dof up to which another reading explains the data to the noise
-_COARSE = 0.01  # share of the light that a fit of mixed-up data misses at least
 _POINTS, _FEW = 16, 64  # field points that are looked at; sets of so few are looked at whole
 _STEPS = (1, 6)  # Gauss–Newton steps at the first look, and of the best
 _BEST = 3  # alternatives that are looked at again
-_ALIKE = 1.5  # factor in χ² within which two alternatives are both told
 _ALL_ORDERS = 4  # cameras up to which all orders are tried, beyond pairs alone
 _FIELD = 1.5  # of the designed field: what a field in other units must fit into
 
@@ -96,7 +92,10 @@ def mixups(calset: CalibrationSet, model: Model, left: float) -> tuple[Alternati
     few = calset if len(calset.points) <= _FEW else thinned(calset, _POINTS, neighbours=1)
     block = few.intensities.block(0, len(few.points))
     seen = block.used[..., None] & (block.counts > 0)
-    if not seen.any() or np.median(block.sigma[seen] / block.counts[seen]) * np.sqrt(left) < _COARSE:
+    if (
+        not seen.any()
+        or np.median(block.sigma[seen] / block.counts[seen]) * np.sqrt(left) < POLICY.reading_coarse
+    ):
         return ()
     few = dataclasses.replace(few, intensities=TableIntensities.dense(few.points, block))
     as_it_stands = Alternative("", "", lambda calset: calset)
@@ -106,10 +105,10 @@ def mixups(calset: CalibrationSet, model: Model, left: float) -> tuple[Alternati
     for readings in (_readings(few, model), _instruments(few)):
         tried = [_judged(one, few, model, left, _STEPS[0]) for one in readings]
         best = [_judged(one, few, model, one.explained, _STEPS[1]) for one in _sorted(tried)[:_BEST]]
-        enough = min(1.0 + (left - 1.0) / GAIN, FAR_OFF)
+        enough = min(1.0 + (left - 1.0) / POLICY.reading_gain, FAR_OFF)
         good = [one for one in _sorted(best) if one.explained < enough]
         if good:
-            return tuple(one for one in good if one.explained < _ALIKE * good[0].explained)
+            return tuple(one for one in good if one.explained < POLICY.reading_alike * good[0].explained)
     return ()
 
 

@@ -78,6 +78,16 @@ class Policy:
     least_gain: float = 12.0
     """Gain in χ² behind one linear step above which a description is worth a fit."""
 
+    # Other readings of the data
+    reading_coarse: float = 0.01
+    """Share of the light that a fit of mixed-up data misses at least."""
+    reading_gain: float = 10.0
+    """Factor by which a reading must bring down χ²/dof − 1 to be told."""
+    reading_alike: float = 1.5
+    """Factor in χ² within which two readings are both told."""
+    reading_sure: float = 1.2
+    """χ²/dof up to which another reading explains the data to the noise, before anything is looked for."""
+
     # How long?
     most_steps: int = 6
     minutes: float = 20.0

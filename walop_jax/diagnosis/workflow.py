@@ -36,7 +36,7 @@ from walop_jax.diagnosis.examination import (
 )
 from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexplained, told
 from walop_jax.diagnosis.freeform import strata
-from walop_jax.diagnosis.mixups import SURE, mixups_of, refusal
+from walop_jax.diagnosis.mixups import mixups_of, refusal
 from walop_jax.diagnosis.naming import Trial, before_and_after, predicts_unseen, refitted_in_order
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.search import Linear, search
@@ -88,7 +88,7 @@ def diagnose(
         tell(f"looking at {len(some.points)} of {len(calset.points)} field points")
     judge = Refit.of(some, model, catalogue, every, np.random.default_rng(seed), tell, policy, began)
     readings = () if as_written else mixups_of(judge.fit)
-    if readings and readings[0].explained < SURE:
+    if readings and readings[0].explained < policy.reading_sure:
         raise refusal(judge.fit, readings)
     before = judge.fit
     tell("scoring every effect and pattern")
