@@ -18,8 +18,10 @@ from science.truth import TrueInstrument
 from walop_jax.data import DataError, Site, read_calibration_set
 from walop_jax.sky.moon import (
     earth_rotation,
+    local_sidereal_time,
     moon_direction,
     moon_sky,
+    offset_direction,
     rayleigh_sky,
     sky_to_instrument,
     standard_rotation,
@@ -204,3 +206,20 @@ def test_moon_exposures_of_an_outside_simulator(either_south_set):
 
     assert abs(chi2(calset.site) - 1) < 5 * np.sqrt(2 / (2 * len(rows) * len(moon)))
     assert chi2(dataclasses.replace(calset.site, longitude=110.0)) > 3  # the parallax is seen
+
+
+def test_offsets_are_those_of_astropy_and_sidereal_time_is_within_arc_seconds():
+    from astropy import units
+    from astropy.coordinates import SkyCoord
+    from astropy.time import Time
+
+    random = np.random.default_rng(4)
+    ra, dec, angle, far = random.uniform((0, -80, 0, 1), (360, 80, 360, 40), (50, 4)).T
+    there = SkyCoord(ra, dec, unit="deg").directional_offset_by(angle * units.deg, far * units.deg)
+    found = offset_direction(ra, dec, angle, far)
+    np.testing.assert_allclose(found[0], there.ra.deg, atol=1e-10)
+    np.testing.assert_allclose(found[1], there.dec.deg, atol=1e-10)
+    mjd = 58849.0 + 3650.0 * random.random(20)
+    theirs = Time(mjd, format="mjd", scale="ut1").sidereal_time("mean", 20.8 * units.deg).deg
+    away = np.mod(local_sidereal_time(mjd, 20.8) - theirs + 180.0, 360.0) - 180.0
+    assert np.abs(away).max() < 5.0 / 3600.0

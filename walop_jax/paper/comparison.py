@@ -64,7 +64,7 @@ LINES = 81  # wavelengths across the filter
 
 @dataclasses.dataclass(frozen=True)
 class Offsets:
-    """Where Δq, Δu come from, point by point.
+    """Origin of Δq, Δu, point by point.
 
     `found` as in the paper; `along` what the coefficients' departure along the weakest direction of the design
     matrix makes of unpolarised light, `along_three` along its three weakest; `noiseless` Δ of a fit to noise-free

@@ -1,4 +1,4 @@
-"""What a calibration run observes: points, exposures, standards and filters, without any light yet."""
+"""The plan of a calibration run: points, exposures, standards and filters, without any light yet."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from walop_jax.model.build import as_designed, nominal_instrument
 from walop_jax.model.effects.base import Context
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import unknown_name
-from walop_jax.sky.moon import moon_direction
+from walop_jax.sky.moon import local_sidereal_time, moon_direction, offset_direction
 
 NAN = float("nan")
 _SOME_NIGHT = 61041.9  # MJD
@@ -110,7 +110,7 @@ class ObservingPlan:
 
     @property
     def _raster(self) -> tuple[str, float]:
-        """How the field points lie, and how far out (deg); found without making the instrument."""
+        """Layout of the field points and its half-width (deg); found without making the instrument."""
         if isinstance(self.instrument, Instrument):
             return self.instrument.raster
         described_as = described(self.instrument or default_name())
@@ -131,7 +131,7 @@ class ObservingPlan:
 
     @property
     def site(self) -> Site:
-        """Where the instrument stands."""
+        """Place of the telescope."""
         return Site(*self.design.site[:4])
 
     @property
@@ -183,13 +183,14 @@ class ObservingPlan:
         mjd = self.start + _SPACING * (np.arange(n) - n_in)
         moon, star = slice(n_in, n_in + n_moon), slice(n_in + n_moon, n)
         ra, dec, rotator = np.full((3, n), NAN)
-        ra[moon], dec[moon] = self._patches(mjd[moon])
+        if n_moon:
+            ra[moon], dec[moon] = self._patches(mjd[moon])
         rotator[moon] = [_MOON_ROTATOR[i % 4] for i in range(n_moon)]
         rotator[star] = [_STAR_ROTATOR[i % 4] for i in range(n_star)]
         # Pointings that the plan does not fix are spread over ±3 h, out of step with the polariser.
         ha = 6.0 * np.mod(np.arange(n) * _GOLDEN, 1.0) - 3.0
         if n_moon or n_star:
-            sidereal = _local_sidereal(mjd, self.site.longitude)
+            sidereal = local_sidereal_time(mjd, self.site.longitude)
             ra[star] = np.mod(sidereal[star] - 15.0 * ha[star], 360.0)
             dec[star] = np.clip(self.site.latitude + 5.0, -85.0, 85.0)
             ha[moon] = (np.mod(sidereal[moon] - ra[moon] + 180.0, 360.0) - 180.0) / 15.0
@@ -222,6 +223,14 @@ class ObservingPlan:
             found[prefix] = Position(np.isfinite(angle), angle)
         return found
 
+    def _patches(
+        self, mjd: Float[np.ndarray, " m"]
+    ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """Field centres (deg) around the Moon: separations and position angles spread evenly."""
+        order, (near, far) = np.arange(len(mjd)), self.separations
+        separation = near + (far - near) * np.mod(0.5 + order * _GOLDEN, 1.0)
+        return offset_direction(*moon_direction(mjd, self.site), 360.0 * _GOLDEN * order, separation)
+
     def layout(self) -> tuple[Bool[np.ndarray, "p e"], np.ndarray]:
         """Which (point, exposure) pairs are measured, and the row of the star in each (−1: none)."""
         exposures, points = self.exposures(), self.points()
@@ -231,7 +240,7 @@ class ObservingPlan:
         return used, np.where(used, star, -1)
 
     def context(self) -> Context:
-        """What effects that grow with the data need to know."""
+        """The facts that effects which grow with the data need."""
         exposures = self.exposures()
         moon = np.flatnonzero(exposures.kind == "moon")
         return Context(
@@ -242,23 +251,6 @@ class ObservingPlan:
             cameras=len(self.design.cameras),
         )
 
-    def _patches(
-        self, mjd: Float[np.ndarray, " m"]
-    ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-        """Field centres around the Moon: separations and position angles spread evenly."""
-        if not len(mjd):
-            return mjd, mjd
-        moon_ra, moon_dec = (np.deg2rad(a) for a in moon_direction(mjd, self.site))
-        order = np.arange(len(mjd))
-        near, far = np.deg2rad(self.separations)
-        distance = near + (far - near) * np.mod(0.5 + order * _GOLDEN, 1.0)
-        angle = 2.0 * np.pi * _GOLDEN * order
-        sin_dec = np.sin(moon_dec) * np.cos(distance) + np.cos(moon_dec) * np.sin(distance) * np.cos(angle)
-        east = np.sin(distance) * np.sin(angle)
-        north = np.cos(distance) * np.cos(moon_dec) - np.sin(distance) * np.sin(moon_dec) * np.cos(angle)
-        ra = np.mod(np.rad2deg(moon_ra + np.arctan2(east, north)), 360.0)
-        return ra, np.rad2deg(np.arcsin(sin_dec))
-
 
 def filter_curve(name: str) -> FilterCurve:
     """A built-in filter, or one of the narrow bands of `NARROW_BANDS` (flat-topped, 15 nm wide)."""
@@ -266,9 +258,3 @@ def filter_curve(name: str) -> FilterCurve:
         return builtin_filter(name)
     offset = np.linspace(-0.015, 0.015, 61)
     return FilterCurve(name, NARROW_BANDS[name] + offset, np.exp(-np.log(2.0) * (offset / 0.0075) ** 6))
-
-
-def _local_sidereal(mjd: Float[np.ndarray, " e"], longitude: float) -> Float[np.ndarray, " e"]:
-    """Local mean sidereal time (deg) to a few arcsec (Meeus 1998, Astronomical Algorithms, 12.4)."""
-    days = mjd - 51544.5
-    return np.mod(280.46061837 + 360.98564736629 * days + longitude, 360.0)

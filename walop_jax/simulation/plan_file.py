@@ -29,7 +29,7 @@ _KNOWN = (*(field.name for field in dataclasses.fields(ObservingPlan)), FULL_TUR
 
 
 def is_plan(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is a plan by its name."""
+    """True for a file that is a plan by its name."""
     return Path(path).suffix.lower() == ".toml"
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ from walop_jax.model.compiled import compiled
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects import in_order
 from walop_jax.model.effects.base import Effect
+from walop_jax.model.elements import Analyser
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.plan import Plan, with_median
@@ -60,21 +61,26 @@ def truth_values(truth: Instrument) -> dict[str, float]:
 def draw_instrument(model: Model, rng: np.random.Generator) -> Instrument:
     """An instrument as it might have been built.
 
-    Every parameter with a prior is drawn from it (efficiencies stop at 1), tied ones follow; throughputs are
-    drawn as smooth maps: levels 0.5 ± 0.03, structure over the field of 2 % rms. The scale that all cameras
+    Every parameter with a prior is drawn from it (efficiencies of analysers stop at 1), tied ones follow; throughputs
+    are drawn as smooth maps: levels 0.5 ± 0.03, structure over the field of 2 % rms. The scale that all cameras
     share is a gauge, so the constant of camera N0 is 0.5. What else has no prior stays at its start value.
     """
     values = model.start
     for i, p in enumerate(model.parameters):
         if p.prior is not None:
             values[i] = rng.normal(*p.prior)
-            if p.name.endswith(".efficiency"):
-                values[i] = min(values[i], 1.0)
     for i, p in enumerate(model.parameters):
         if p.tie is not None:
             values[i] = values[model.index(p.tie)]
     values[list(series_indices(model.template))] = _throughput(model.template, rng).ravel()
-    return model.instrument(values)
+    return jax.tree.map(_possible, model.instrument(values), is_leaf=lambda node: isinstance(node, Analyser))
+
+
+def _possible(node: Any) -> Any:
+    """An analyser with no more than all of the light in its beams; whatever else as it is."""
+    if not isinstance(node, Analyser):
+        return node
+    return dataclasses.replace(node, efficiency=jnp.minimum(node.efficiency, 1.0))
 
 
 def _throughput(template: Instrument, rng: np.random.Generator) -> Float[np.ndarray, "k t"]:
@@ -145,7 +151,7 @@ def simulate(
 
 
 def as_planned(plan: ObservingPlan) -> CalibrationSet:
-    """What a plan is worth: the set that the instrument as designed would give, without noise."""
+    """The set that the instrument as designed would give, without noise: for judging a plan."""
     return simulate(plan, instrument=plan.design, noiseless=True).calset
 
 

@@ -91,6 +91,28 @@ def moon_direction(
         return np.asarray(moon.ra.deg, dtype=np.float64), np.asarray(moon.dec.deg, dtype=np.float64)
 
 
+def offset_direction(
+    ra: Float[np.ndarray, " e"],
+    dec: Float[np.ndarray, " e"],
+    position_angle: Float[np.ndarray, " e"],
+    separation: Float[np.ndarray, " e"],
+) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
+    """Return right ascension and declination of the points that far from others, north through east; all in degrees."""
+    from astropy.coordinates import offset_by
+
+    there = offset_by(*(np.deg2rad(angle) for angle in (ra, dec, position_angle, separation)))
+    return np.mod(there[0].deg, 360.0), np.asarray(there[1].deg)
+
+
+def local_sidereal_time(mjd: Float[np.ndarray, " e"], longitude: float) -> Float[np.ndarray, " e"]:
+    """Return the local mean sidereal time (deg) at UTC days and a longitude (deg, east positive), to a few arcsec.
+
+    Source: Meeus 1998, Astronomical Algorithms, equation 12.4, without its terms in T². UTC stands for UT1, so that the
+    same plan gives the same exposures whatever tables of Earth rotation are installed.
+    """
+    return np.mod(280.46061837 + 360.98564736629 * (mjd - 51544.5) + longitude, 360.0)
+
+
 @contextlib.contextmanager
 def _offline() -> Iterator[None]:
     """Keep astropy from the network, and from warning that its Earth-rotation tables end."""
