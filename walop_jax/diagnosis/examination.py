@@ -170,7 +170,7 @@ class Evidence:
     `scorer` holds the space of all candidates behind the nuisance that single exposures may have, `scores` are C̃ᵀr and
     `square` r·r there. `probes` are effects, `sentences` what else can be said, `parts` sentences that are told as the
     effects that hold them (`grammar.parts`), `patterns` the names of patterns without a name. `chi2` and `dof` are
-    those of the fit.
+    those of the fit, `scale` the factor on the errors with which it was made.
     """
 
     scorer: Scorer
@@ -183,6 +183,7 @@ class Evidence:
     patterns: Sequence[str]
     chi2: float
     dof: int
+    scale: float = 1.0
     policy: Policy = POLICY
 
     @property
@@ -520,6 +521,7 @@ def examine(
         patterns=[pattern.name for pattern in patterns],
         chi2=result.chi2,
         dof=result.dof,
+        scale=result.noise_scale,
         policy=policy,
         result=result,
         design=design,

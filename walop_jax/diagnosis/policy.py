@@ -43,7 +43,9 @@ class Policy:
     same_counts: float = 0.01
     """Relative change of the counts up to which columns of an earlier model serve again."""
     poor_fit: float = 1.5
-    """χ²/dof above which what cannot be differentiated is tried: structural effects, other descriptions."""
+    """χ²/dof above which what cannot be differentiated is tried: structural effects, other descriptions; but not"""
+    good_share: float = 0.5
+    """where a name explains this share of what is missing."""
 
     # What is worth telling?
     even_odds: float = 3.0

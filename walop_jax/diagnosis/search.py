@@ -7,8 +7,8 @@ model is computed, and the blind study (`tests/diagnosis/blind.py`) runs thousan
 1. Candidates are ordered by their linear evidence. What linear algebra finds not worth telling is not tried.
 2. The best is fitted. If it leaves nothing but noise, no rival can be better. If its evidence differs from that of its
    linear step by more than `Policy.linear_good`, rivals that lie within twice the difference are fitted as well.
-3. Where the model is far off and no name explains that, or none is found, what cannot be differentiated competes with
-   the names: structural effects and other descriptions of the instrument (`choices`).
+3. Where the model is far off and no name explains half of that, or none is found, what cannot be differentiated
+   competes with the names: structural effects and other descriptions of the instrument (`choices`).
 4. What data that took no part in the fit confirm joins the model (`adopted`), and what is left is scored again.
 """
 
@@ -79,15 +79,16 @@ def linear_trials(state: Evidence, policy: Policy) -> list[Trial]:
 
 
 def linear_trial(state: Evidence, item: Ranked) -> Trial:
-    """What one candidate explains by its linear step."""
-    left = state.chi2 - item.score.statistic * state.table.noise_scale**2
+    """What one candidate explains by its linear step; `linear` is what a fit should find, with its errors."""
+    noise, statistic = state.table.noise_scale, item.score.statistic
+    left = state.chi2 - statistic * (noise * state.scale) ** 2
     return Trial(
         item.effect,
         item.log_bayes,
         left,
         explains(left, state.dof - item.score.rank),
         item=item,
-        linear=item.log_bayes,
+        linear=item.log_bayes + 0.5 * statistic * (noise**2 - 1.0),
     )
 
 
@@ -127,7 +128,8 @@ def _next(state: State, judge: Linear, policy: Policy) -> Trial | None:
             reach = 2.0 * error if error > policy.linear_good else 0.0
             if trial.noise or not waiting or trial.linear - waiting[0].linear >= reach:
                 break
-        explained = any(trial.noise for trial in new)
+        missing = state.chi2 - state.dof
+        explained = any(t.noise or state.chi2 - t.left > policy.good_share * missing for t in new)
         if not others_asked and not explained and (state.poor or not new):
             others_asked = True
             others = [trial for trial in judge.others(state) if _worth(state, trial)]
@@ -180,6 +182,6 @@ def joined(state: Evidence, item: Ranked, scorer: Scorer | None = None) -> Evide
             (probe, {effect for effect in effects if effect is not item.effect})
             for probe, effects in state.parts
         ],
-        chi2=state.chi2 - item.score.statistic * state.table.noise_scale**2,
+        chi2=state.chi2 - item.score.statistic * (state.table.noise_scale * state.scale) ** 2,
         dof=state.dof - item.score.rank,
     )
