@@ -102,7 +102,7 @@ class Sentence:
     kind: str
     where: str
     place: str
-    factors: tuple[str, ...] = ()
+    factors: tuple[Any, ...] = ()  # texts; a column may be taken with a function of the exposures instead
     origin: str = ""
 
     @classmethod
