@@ -183,3 +183,18 @@ def test_fluxes_that_were_solved_for_leave_less_room_for_noise():
     scoring = Scoring(Projector(np.zeros((4 * rows, 0)), eliminated=rows), [candidate], rng)
     scales = [scoring(projected(rng.standard_normal(4 * rows))).noise_scale for _ in range(50)]
     assert np.mean(scales) == pytest.approx(1.0, abs=4 / np.sqrt(2 * 3 * rows * 50))
+
+
+def test_noise_is_measured_behind_all_candidates_however_alike_they_are():
+    """Columns that repeat and add up to others count once: their span is that of a QR decomposition with pivots."""
+    rng = np.random.default_rng(3)
+    columns = rng.standard_normal((ROWS, 12)) * np.logspace(-2, 3, 12)
+    columns = np.hstack([columns, columns[:, :4], columns[:, 2:6] @ rng.standard_normal((4, 3))])
+    base = rng.standard_normal((ROWS, FREE))
+    names = [f"c{i}" for i in range(columns.shape[1])]
+    residual = 1.3 * rng.standard_normal(ROWS)
+    whole = np.hstack([base, columns[:, :12] / np.linalg.norm(columns[:, :12], axis=0)])
+    left = residual - whole @ np.linalg.lstsq(whole, residual, rcond=None)[0]
+    candidates = [Candidate(n, c[:, None], 1e3 * np.ones(1)) for n, c in zip(names, columns.T, strict=True)]
+    table = Scoring(Projector(base), candidates, rng)(residual)
+    assert table.noise_scale == pytest.approx(np.sqrt(left @ left / (ROWS - FREE - 12)), rel=1e-9)

@@ -23,6 +23,17 @@ def test_pieces_make_the_whole(order, count, monkeypatch):
     np.testing.assert_array_equal(changed, 2.0 * columns)
 
 
+@pytest.mark.parametrize("exact", [0, 5, 12, 30])
+def test_columns_that_are_not_exact_take_part_in_single_precision(exact, monkeypatch):
+    monkeypatch.setattr(limits, "COLUMNS_TOGETHER", 7)
+    columns = np.random.default_rng(4).standard_normal((50, 30)) * 10.0 ** np.linspace(-3, 5, 30)
+    found, whole, length = tall.gram(columns, exact), columns.T @ columns, np.linalg.norm(columns, axis=0)
+    off = np.abs(found - whole) / np.outer(length, length)
+    assert np.max(off[:exact, :exact], initial=0.0) < 1e-14
+    assert np.max(off) < 1e-6
+    assert (np.max(off) > 1e-9) == (exact < 30)
+
+
 def test_an_error_in_a_piece_is_an_error():
     def refuse(some):
         raise ValueError("not these")

@@ -502,7 +502,8 @@ def examine(
     for name in active:
         rest, basis = design.without(name)
         absorbed[name] = _Absorbed(rest, basis, basis.T @ columns)
-    bare = ScoreSpace.projected(design.projector, names, widths, columns)
+    exact = sum(len(probe.widths) for probe in probes)  # rivals may be the same to the last digit
+    bare = ScoreSpace.projected(design.projector, names, widths, columns, exact)
     r = design.projector(design.residual)
     space, scores, square, common_mode = bare, columns.T @ r, float(r @ r), np.zeros(0)
     if SINGLE_EXPOSURES in names:

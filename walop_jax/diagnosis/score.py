@@ -26,7 +26,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy import optimize, stats
+from scipy import linalg, optimize, stats
 
 from walop_jax.diagnosis.tall import change_in_place, gram
 from walop_jax.likelihood import limits
@@ -38,6 +38,7 @@ Reduction = Callable[[Vector, float], tuple[Vector, float]]
 ABSORBED = 1e-6  # surviving share of a column's square below which the base has swallowed it
 FAINTEST = 0.05  # standard deviations that a plausible amplitude must reach to be testable
 RANK_TOLERANCE = 1e-8
+ROOT_TOLERANCE = 1e-6  # ten times what products in single precision leave
 LEAST_REST = 0.1  # share of the degrees of freedom that must be left behind all candidates to tell the noise
 TAIL = 0.2  # share of the draws, those with the smallest p, that give the number of trials
 
@@ -166,17 +167,31 @@ class ScoreSpace:
 
     @classmethod
     def projected(
-        cls, projector: Projector, names: Sequence[str], widths: Sequence[Vector], columns: Matrix
+        cls,
+        projector: Projector,
+        names: Sequence[str],
+        widths: Sequence[Vector],
+        columns: Matrix,
+        exact: int | None = None,
     ) -> ScoreSpace:
-        """The space of candidates whose columns stand side by side; these are projected in place."""
+        """The space of candidates whose columns stand side by side; these are projected in place.
+
+        Products of different candidates beyond the first `exact` columns are taken in single precision: 10⁻⁷ of the
+        lengths of two columns, where a part of 10⁻³ counts.
+        """
         before = np.einsum("dk,dk->k", columns, columns)
         change_in_place(projector, columns)
+        products, first = gram(columns, exact), 0
+        for size in (len(w) for w in widths):
+            own = columns[:, first : first + size]
+            products[first : first + size, first : first + size] = own.T @ own
+            first += size
         return cls(
             names=tuple(names),
             sizes=tuple(len(w) for w in widths),
             widths=np.concatenate(widths),
             before=before,
-            gram=gram(columns),
+            gram=products,
             free=projector.free,
         )
 
@@ -232,6 +247,35 @@ class ScoreSpace:
         return dataclasses.replace(self, gram=self.gram - along @ along.T, free=free), reduce
 
 
+class _Root:
+    """L of a Gram matrix G = L Lᵀ (`whole`) of some `rank`: Cholesky's method, the column with most left coming next.
+
+    Columns of which less than `ROOT_TOLERANCE` of their square is left behind those before them add nothing.
+    Source: Higham 1990, in Reliable Numerical Computation (Oxford), 161; LAPACK dpstrf.
+    """
+
+    def __init__(self, gram: Matrix) -> None:
+        norm = np.sqrt(np.clip(np.diag(gram), 0.0, None))
+        seen = np.flatnonzero(norm)
+        self.whole, self.rank = np.zeros((len(norm), 0)), 0
+        if not len(seen):
+            return
+        scaled = gram[np.ix_(seen, seen)] / np.outer(norm[seen], norm[seen])
+        factor, pivots, self.rank, _ = linalg.lapack.dpstrf(scaled, tol=ROOT_TOLERANCE, overwrite_a=True)
+        order = seen[pivots - 1]
+        upper = np.triu(factor)[: self.rank]
+        self.whole = np.zeros((len(norm), self.rank))
+        self.whole[order] = upper.T * norm[order, None]
+        self._chosen = order[: self.rank]
+
+    def explained(self, scores: Vector) -> float:
+        """sᵀ G⁺ s of the scores s = Cᵀr: the square of what of r lies in the span of the columns C."""
+        if not self.rank:
+            return 0.0
+        part = linalg.solve_triangular(self.whole[self._chosen], scores[self._chosen], lower=True)
+        return float(part @ part)
+
+
 class Scorer:
     """Candidates made ready for one design, with the distribution of the smallest p under the base.
 
@@ -245,12 +289,8 @@ class Scorer:
         self._smallest = self._smallest_p(rng, draws) if draws else np.zeros(0)
 
     @functools.cached_property
-    def _gram(self) -> Matrix:
-        return np.where(np.outer(self._alive, self._alive), self.space.gram, 0.0)
-
-    @functools.cached_property
-    def _all(self) -> Matrix:
-        return whitening(self._gram)
+    def _root(self) -> _Root:
+        return _Root(np.where(np.outer(self._alive, self._alive), self.space.gram, 0.0))
 
     def after(self, earlier: ScoreTable, scores: Vector) -> ScoreTable:
         """The table of a space that is part of an earlier one, with the noise and the number of trials found there."""
@@ -274,9 +314,8 @@ class Scorer:
 
     def __call__(self, scores: Vector, square: float) -> ScoreTable:
         """The table from s = C̃ᵀr and r·r, both behind the projection."""
-        explained = self._all.T @ np.where(self._alive, scores, 0.0)
-        rest = max(square - float(explained @ explained), 0.0)
-        left = self.space.free - self._all.shape[1]
+        rest = max(square - self._root.explained(scores), 0.0)
+        left = self.space.free - self._root.rank
         if (
             left < LEAST_REST * self.space.free
         ):  # candidates that could explain anything say nothing of the noise
@@ -312,10 +351,10 @@ class Scorer:
 
     def _smallest_p(self, rng: np.random.Generator, draws: int) -> Vector:
         """ln of the smallest p among all candidates, drawn under the base."""
-        if not self._all.shape[1]:
+        if not self._root.rank:
             return np.zeros(0)
-        # Scores s = G W n have covariance G for unit normals n. Seven digits are plenty for what is only counted.
-        root = self._gram @ self._all
+        # Scores s = L n have covariance G for unit normals n. Seven digits are plenty for what is only counted.
+        root = self._root.whole
         places = self.space.places()
         maps = [root[places[name]].T @ w for name, w in self._whitening.items() if w.shape[1]]
         normal = rng.standard_normal((draws, root.shape[1]), dtype=np.float32)

@@ -6,6 +6,7 @@ number of cores, and so neither do the results.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -18,17 +19,18 @@ from walop_jax.likelihood.runner import cores
 Matrix = Float[np.ndarray, "_ _"]
 
 
-def gram(columns: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "n n"]:
-    """CᵀC."""
+def gram(columns: Float[np.ndarray, "d n"], exact: int | None = None) -> Float[np.ndarray, "n n"]:
+    """CᵀC; in single precision where a column beyond the first `exact` takes part, if that is said."""
     count = columns.shape[1]
+    single = columns if exact is None or exact >= count else columns.astype(np.float32)
     found = np.empty((count, count))
-    pieces = [
-        slice(first, first + limits.COLUMNS_TOGETHER) for first in range(0, count, limits.COLUMNS_TOGETHER)
-    ]
+    starts = {*range(0, count, limits.COLUMNS_TOGETHER), count, min(exact or 0, count)}
+    pieces = [slice(first, stop) for first, stop in itertools.pairwise(sorted(starts))]
 
     def product(pair: tuple[slice, slice]) -> None:
         one, other = pair
-        found[one, other] = columns[:, one].T @ columns[:, other]
+        source = columns if exact is None or other.stop <= exact else single
+        found[one, other] = source[:, one].T @ source[:, other]
         found[other, one] = found[one, other].T
 
     _on_all_cores(product, [(one, other) for i, one in enumerate(pieces) for other in pieces[i:]])
