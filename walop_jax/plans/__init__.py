@@ -1,0 +1,1 @@
+"""Plans of calibration exposures with a proof of how good they are."""

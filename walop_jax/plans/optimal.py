@@ -1,0 +1,576 @@
+"""Optimal experiments from information matrices, with a proof of how far a plan is from the best there is.
+
+Nothing here knows what is measured. A candidate i has the Fisher information M_i (n × n) and the cost c_i; a plan gives
+it the weight w_i ≥ 0, how often it is done. With what is known already, M₀, a plan leaves
+
+    M(w) = M₀ + Σ_i w_i M_i,      Σ_i c_i w_i ≤ B,
+
+and the variance of target k, some linear functions A_k (n × q) of the parameters, is φ_k(w) = tr A_kᵀ M(w)⁻¹ A_k. The
+criterion is the largest of them, averaged over draws r of what the instrument may be,
+
+    f(w) = mean_r max_k φ_rk(w),
+
+which holds A-, I- and c-optimality (one target), G-optimality (one target for each place), and naming (one target for
+each pair of hypotheses) as cases. f is convex.
+
+Proof        For multipliers π_rk ≥ 0, Σ_k π_rk = 1, let L_r = Σ_k π_rk A_rk A_rkᵀ and G_r = M_r(w)⁻¹ L_r M_r(w)⁻¹. Every
+             other plan v has, by Cauchy and Schwarz,
+                 f(v) ≥ mean_r tr L_r M_r(v)⁻¹ ≥ (mean_r tr L_r M_r(w)⁻¹)² / mean_r tr G_r M_r(v),
+             and the denominator is at most mean_r tr G_r M₀r + B max_i d_i / c_i, d_i = mean_r tr G_r M_ir. The maximum
+             over all candidates, a continuum of them included, therefore bounds f from below: the equivalence theorem of
+             Kiefer & Wolfowitz (1960, Canad. J. Math. 12, 363) as an inequality that holds at any w.
+Candidates   come in families whose information is linear in a few fixed matrices, M_i = Σ_j F_ij B_j, so that a million
+             candidates cost a million short dot products. Of a `Torus` F are products of sines and cosines of continuous
+             angles; its maximum over the continuum is bounded by that over a grid, see there.
+Solution     Column generation: a log-barrier Newton method solves the problem for a few candidates (min mean t_r with
+             φ_rk ≤ t_r; Boyd & Vandenberghe 2004, Convex Optimization, 11.3), those with the largest d_i / c_i join, those
+             without weight leave, until the proven gap is small.
+Rounding     Efficient apportionment (Pukelsheim & Rieder 1992, Biometrika 79, 763), then exchanges of single candidates
+             while they lower f; the loss is proven by the same lower bound.
+
+Units        Those of the caller: information per unit of weight, cost in those of the budget.
+Limits       Local design: the information is that at assumed parameters, or its average over draws of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy import linalg
+
+Matrices = Float[np.ndarray, "r j n n"]
+
+GAP = 0.01  # proven distance from the optimum at which the search ends
+_ROUNDS = 60  # of column generation
+_NEWTON = 80  # steps for one set of candidates
+_SHARPER = 8.0  # by what the barrier falls between two Newton solutions
+_LEAST_WEIGHT = 1e-5  # share of the budget below which a candidate leaves
+_UNSEEN = 1e-13  # eigenvalue, of the scaled information of everything, below which a direction is not seen
+_GRID = (256, 64, 32)  # points per period of the highest harmonic, for 1, 2, 3 axes: 0.01, 0.24, 1.5 % of slack
+_EXCHANGES = 200
+_TRIED = 60  # exchanges, most promising first, of which the first that lowers the criterion is made
+_SHARPNESS = 20  # power of the variances by which targets share the slope of an exchange
+_PATIENCE = 4  # rounds without a better bound or value after which the search ends
+
+
+class NotEstimableError(ValueError):
+    """What is wanted depends on parameters that neither the candidates nor what is known inform about."""
+
+
+class Family(Protocol):
+    """Candidates whose information is linear in a few fixed matrices."""
+
+    @property
+    def basis(self) -> Matrices:
+        """Matrices B_rj (draw, member, parameter, parameter)."""
+        ...
+
+    @property
+    def cost(self) -> float | Float[np.ndarray, " m"]:
+        """Cost of a candidate, one for all or one for each."""
+        ...
+
+    def coefficients(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, "s j"]:
+        """Coefficients F of the candidates at `places`, points of the family's own coordinates."""
+        ...
+
+    def cost_at(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, " s"]:
+        """Cost of the candidates at `places`."""
+        ...
+
+    def best(self, gains: Float[np.ndarray, " j"], most: int) -> tuple[Float[np.ndarray, "s d"], float]:
+        """Places of at most `most` local maxima of F·gains / cost, and an upper bound of it over all candidates."""
+        ...
+
+    def spread(self) -> Float[np.ndarray, "s d"]:
+        """A few candidates that stand for all of the family: a plan begins with them."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Listed:
+    """Candidates one by one: candidate i has the information Σ_j F_ij B_j; its place is its number i.
+
+    With `basis` left out there is one matrix for each candidate.
+    """
+
+    basis: Matrices
+    rows: Float[np.ndarray, "m j"]
+    cost: float | Float[np.ndarray, " m"] = 1.0
+
+    @classmethod
+    def of(cls, information: Matrices, cost: float | Float[np.ndarray, " m"] = 1.0) -> Listed:
+        """Candidates given by their own matrices (draw, candidate, n, n)."""
+        return cls(information, np.eye(information.shape[1]), cost)
+
+    def coefficients(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, "s j"]:
+        """Coefficients of the candidates with these numbers."""
+        return self.rows[self._numbers(places)]
+
+    def cost_at(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, " s"]:
+        """Cost of the candidates with these numbers."""
+        return np.broadcast_to(self.cost, len(self.rows))[self._numbers(places)].astype(float)
+
+    def best(self, gains: Float[np.ndarray, " j"], most: int) -> tuple[Float[np.ndarray, "s d"], float]:
+        """The candidates with the largest gain for their cost."""
+        ratio = self.rows @ gains / self.cost
+        top = np.argpartition(-ratio, min(most, len(ratio)) - 1)[:most]
+        return top[:, None].astype(float), float(ratio.max())
+
+    def spread(self) -> Float[np.ndarray, "s d"]:
+        """Up to sixteen candidates, evenly through the list."""
+        return np.unique(np.linspace(0, len(self.rows) - 1, 16).round())[:, None]
+
+    @staticmethod
+    def _numbers(places: Float[np.ndarray, "s d"]) -> Int[np.ndarray, " s"]:
+        return np.rint(places[:, 0]).astype(int)
+
+
+@dataclasses.dataclass(frozen=True)
+class Torus:
+    """A continuum of candidates at angles in [0, 2π) on each of `orders` axes; information is a Fourier series in them.
+
+    The basis goes with products of (1, cos a, sin a, …, cos Ha, sin Ha), one factor for each axis, the last axis
+    varying fastest.
+
+    Limit: a trigonometric polynomial p of degree H with max |p| = ‖p‖ is at least ‖p‖ cos(πH/N) somewhere on a grid of
+    N > 2H points (Ehlich & Zeller 1964, Math. Z. 86, 41), so a grid bounds the maximum over the continuum.
+    """
+
+    basis: Matrices
+    orders: tuple[int, ...]
+    cost: float = 1.0
+
+    @classmethod
+    def sampled(cls, information: Float[np.ndarray, "r s n n"], orders: tuple[int, ...], cost: float = 1.0) -> Torus:
+        """The family with these matrices at equidistant angles, at least 2H + 1 on each axis, the last one fastest.
+
+        `information` has the shape (draw, sample, n, n) with Π N_a samples, N_a = 2 H_a + 1.
+        """
+        counts = [2 * order + 1 for order in orders]
+        grids = np.meshgrid(*[2 * np.pi * np.arange(n) / n for n in counts], indexing="ij")
+        places = np.stack([g.ravel() for g in grids], axis=1)
+        transform = np.linalg.inv(_products(places, orders))
+        return cls(np.einsum("js,rsab->rjab", transform, information), orders, cost)
+
+    def coefficients(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, "s j"]:
+        """Products of sines and cosines at these angles (rad)."""
+        return _products(places, self.orders)
+
+    def cost_at(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, " s"]:
+        """The cost, which is the same everywhere."""
+        return np.full(len(places), float(self.cost))
+
+    def best(self, gains: Float[np.ndarray, " j"], most: int) -> tuple[Float[np.ndarray, "s d"], float]:
+        """Local maxima on a fine grid, each refined, and the bound over the continuum."""
+        counts = [max(self._fineness * order, 1) for order in self.orders]
+        axes = [2 * np.pi * np.arange(n) / n for n in counts]
+        shape = [2 * order + 1 for order in self.orders]
+        values = gains.reshape(shape)
+        for axis, order in enumerate(self.orders):
+            values = np.moveaxis(np.tensordot(_harmonics(axes[axis], order), values, (1, axis)), 0, axis)
+        peak = np.ones(values.shape, bool)
+        for axis in range(values.ndim):
+            peak &= (values >= np.roll(values, 1, axis)) & (values > np.roll(values, -1, axis))
+        at = np.argwhere(peak) if peak.any() else np.array([np.unravel_index(np.argmax(values), values.shape)])
+        at = at[np.argsort(-values[tuple(at.T)])][:most]
+        places = np.stack([axes[a][at[:, a]] for a in range(values.ndim)], axis=1)
+        slack = np.prod([np.cos(np.pi * o / n) if o else 1.0 for o, n in zip(self.orders, counts, strict=True)])
+        return self._refined(places, gains), float(values.max() / slack) / self.cost
+
+    @property
+    def _fineness(self) -> int:
+        return _GRID[min(len(self.orders), len(_GRID)) - 1]
+
+    def spread(self) -> Float[np.ndarray, "s d"]:
+        """Equidistant angles, enough for all harmonics."""
+        axes = [2 * np.pi * np.arange(2 * o + 1) / (2 * o + 1) for o in self.orders]
+        return np.array(list(itertools.product(*axes))).reshape(-1, len(self.orders))
+
+    def _refined(self, places: Float[np.ndarray, "s d"], gains: Float[np.ndarray, " j"]) -> Float[np.ndarray, "s d"]:
+        """Places moved to the top of the parabola through their neighbours, axis by axis."""
+        for axis, order in enumerate(self.orders):
+            step = np.zeros(len(self.orders))
+            step[axis] = 2 * np.pi / max(self._fineness * order, 1)
+            low, mid, high = (self.coefficients(places + k * step) @ gains for k in (-1, 0, 1))
+            bend = low - 2 * mid + high
+            shift = np.where(bend < 0, 0.5 * (low - high) / np.where(bend < 0, bend, -1.0), 0.0)
+            places = places + np.clip(shift, -1, 1)[:, None] * step
+        return np.mod(places, 2 * np.pi)
+
+
+def _harmonics(angle: Float[np.ndarray, " s"], order: int) -> Float[np.ndarray, "s h"]:
+    """1, cos a, sin a, …, cos Ha, sin Ha at each angle."""
+    turns = angle[:, None] * np.arange(1, order + 1)
+    pairs = np.stack([np.cos(turns), np.sin(turns)], axis=2).reshape(len(angle), -1)
+    return np.hstack([np.ones((len(angle), 1)), pairs])
+
+
+def _products(places: Float[np.ndarray, "s d"], orders: tuple[int, ...]) -> Float[np.ndarray, "s j"]:
+    found = np.ones((len(places), 1))
+    for axis, order in enumerate(orders):
+        found = (found[:, :, None] * _harmonics(places[:, axis], order)[:, None, :]).reshape(len(places), -1)
+    return found
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """What is wanted, what is known and what can be done.
+
+    `known` is M₀ (draw, n, n), `targets` A (draw, target, n, q), `families` the candidates, `budget` the cost that a
+    plan may have. Raises NotEstimableError, when solved, if a target depends on a direction nothing informs about.
+    """
+
+    known: Float[np.ndarray, "r n n"]
+    targets: Float[np.ndarray, "r k n q"]
+    families: tuple[Family, ...]
+    budget: float
+
+    def reduced(self) -> Experiment:
+        """The same in coordinates in which the information of everything together is the identity.
+
+        Directions that nothing informs about (gauges) are left out. Raises NotEstimableError if a target needs one.
+        """
+        shares = [self.budget / len(self.families) / family.cost_at(family.spread()) for family in self.families]
+        whole = self.known.mean(axis=0) + sum(
+            np.einsum("s,sj,jab->ab", w / len(w), f.coefficients(f.spread()), f.basis.mean(axis=0))
+            for w, f in zip(shares, self.families, strict=True)
+        )
+        size = np.sqrt(np.clip(np.diag(whole), 0.0, None))
+        size = np.where(size > 0, size, 1.0)
+        value, vector = linalg.eigh(whole / np.outer(size, size))
+        seen = value > _UNSEEN * value[-1]
+        to_seen = vector[:, seen] / size[:, None] / np.sqrt(value[seen])  # θ = to_seen · z
+        lost = np.einsum("na,rknq->rkaq", vector[:, ~seen] / size[:, None], self.targets)
+        kept = np.einsum("na,rknq->rkaq", to_seen, self.targets)
+        # A target is estimable if it has no part along what is not seen, beside its part along what is.
+        part = np.linalg.norm(lost, axis=(2, 3)) if lost.shape[2] else np.zeros(lost.shape[:2])
+        if np.any(part > 1e-6 * np.linalg.norm(kept, axis=(2, 3))):
+            bad = np.unique(np.argwhere(part > 1e-6 * np.linalg.norm(kept, axis=(2, 3)))[:, 1])
+            raise NotEstimableError(
+                f"targets {', '.join(map(str, bad[:5].tolist()))} depend on parameters that no candidate informs about"
+            )
+
+        def turned(matrices: Float[np.ndarray, "*s n n"]) -> Float[np.ndarray, "*s a a"]:
+            return np.einsum("na,...nm,mb->...ab", to_seen, matrices, to_seen, optimize=True)
+
+        families = tuple(dataclasses.replace(f, basis=turned(f.basis)) for f in self.families)  # type: ignore[type-var]
+        return Experiment(turned(self.known), kept, families, self.budget)
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """A plan: weights of candidates, its criterion, and the least that any plan of this budget can have.
+
+    `family` (number of the family), `place` (its coordinates there) and `weight` are one for each candidate in it.
+    `bound` ≤ the criterion of every plan; `gap` = value / bound − 1 is proven. `gain` is d_i B / Σ w d for every
+    candidate of the plan: 1 where a plan is optimal.
+    """
+
+    family: Int[np.ndarray, " s"]
+    place: list[Float[np.ndarray, " d"]]
+    weight: Float[np.ndarray, " s"]
+    value: float
+    bound: float
+    rounds: int
+
+    @property
+    def gap(self) -> float:
+        """Proven relative distance of the criterion from that of the best plan."""
+        return self.value / self.bound - 1.0
+
+
+class _Some:
+    """The problem for a few candidates: their matrices laid out, and the barrier method on them."""
+
+    def __init__(self, experiment: Experiment, chosen: Sequence[tuple[int, Float[np.ndarray, " d"]]]) -> None:
+        self.experiment, self.chosen = experiment, list(chosen)
+        matrices, costs = [], []
+        for number, place in self.chosen:
+            family, at = experiment.families[number], np.atleast_2d(place)
+            matrices.append(np.einsum("j,rjab->rab", family.coefficients(at)[0], family.basis, optimize=True))
+            costs.append(float(family.cost_at(at)[0]))
+        self.matrices = np.stack(matrices, axis=1)  # (r, s, n, n)
+        self.costs = np.array(costs)
+        r, k, n, q = experiment.targets.shape
+        self.wide = np.moveaxis(experiment.targets, 2, 1).reshape(r, n, k * q)  # A of all targets side by side
+        self.per_target = (k, q)
+
+    def covariance(self, weight: Float[np.ndarray, " s"]) -> Float[np.ndarray, "r n n"]:
+        """M(w)⁻¹ of every draw."""
+        there = self.experiment.known + np.tensordot(weight, self.matrices, (0, 1))
+        return np.linalg.inv(0.5 * (there + np.swapaxes(there, 1, 2)))
+
+    def variances(self, covariance: Float[np.ndarray, "r n n"]) -> Float[np.ndarray, "r k"]:
+        """φ of every target."""
+        return self._by_target(self.wide * (covariance @ self.wide))
+
+    def _by_target(self, products: Float[np.ndarray, "*l n kq"]) -> Float[np.ndarray, "*l k"]:
+        """Sums over the parameters and the columns of each target."""
+        summed = products.sum(axis=-2)
+        return summed.reshape(*summed.shape[:-1], *self.per_target).sum(axis=-1)
+
+    def value(self, weight: Float[np.ndarray, " s"]) -> float:
+        """The criterion f(w)."""
+        return float(self.variances(self.covariance(weight)).max(axis=1).mean())
+
+    def solve(self, weight: Float[np.ndarray, " s"], gap: float) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "r k"]]:
+        """Weights within `gap` of the best, and the multipliers π of the targets.
+
+        Barrier: mean_r t_r − μ [Σ log(t_r − φ_rk) + Σ log w_s], Newton in (w, t) on the budget's plane.
+        """
+        draws, targets = self.experiment.targets.shape[:2]
+        weight = np.maximum(weight, 1e-3 * self.experiment.budget / self.costs.sum())
+        weight *= self.experiment.budget / (self.costs @ weight)
+        phi = self.variances(self.covariance(weight))
+        level = phi.max(axis=1) * 1.05
+        constraints = draws * targets + len(weight)
+        mu = level.mean() / constraints
+        least = 0.2 * gap * level.mean() / constraints
+        while True:
+            weight, level = self._centred(weight, level, mu)
+            least = min(least, 0.2 * gap * level.mean() / constraints)
+            if mu <= least:
+                break
+            mu = max(mu / _SHARPER, least)
+        phi = self.variances(self.covariance(weight))
+        shares = 1.0 / np.maximum(level[:, None] - phi, 1e-300)
+        return weight, shares / shares.sum(axis=1, keepdims=True)
+
+    def _barrier(self, weight: Float[np.ndarray, " s"], level: Float[np.ndarray, " r"], mu: float) -> float:
+        if np.any(weight <= 0):
+            return np.inf
+        try:
+            slack = level[:, None] - self.variances(self.covariance(weight))
+        except np.linalg.LinAlgError:
+            return np.inf
+        if np.any(slack <= 0):
+            return np.inf
+        return float(level.mean() - mu * (np.log(slack).sum() + np.log(weight).sum()))
+
+    def _centred(
+        self, weight: Float[np.ndarray, " s"], level: Float[np.ndarray, " r"], mu: float
+    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " r"]]:
+        """Newton's method for one μ."""
+        s, r = len(weight), len(level)
+        for _ in range(_NEWTON):
+            covariance = self.covariance(weight)
+            y = covariance @ self.wide
+            slope = -np.stack([self._by_target(one * (m @ one)) for one, m in zip(y, self.matrices, strict=True)])
+            slack = level[:, None] - self._by_target(self.wide * y)
+            push = mu / slack
+            # Curvature of the φ: Σ_k push_k 2 tr(M_s P M_t Q), P = M⁻¹, Q = Σ_k push_k y_k y_kᵀ.
+            pushed = y * np.repeat(push, self.per_target[1], axis=1)[:, None]
+            left, right = _root(covariance), _root(pushed @ np.swapaxes(y, 1, 2))
+            flat = np.moveaxis(left[:, None] @ self.matrices @ right[:, None], 1, 0).reshape(s, -1)
+            hessian = np.zeros((s + r, s + r))
+            gradient = np.zeros(s + r)
+            gradient[:s] = np.einsum("rk,rsk->s", push, slope) - mu / weight
+            gradient[s:] = 1.0 / r - push.sum(axis=1)
+            hessian[:s, :s] = 2.0 * flat @ flat.T + np.diag(mu / weight**2)
+            stiff = mu / slack**2
+            hessian[:s, :s] += np.einsum("rsk,rtk->st", slope * stiff[:, None], slope, optimize=True)
+            hessian[:s, s:] = -np.einsum("rk,rsk->sr", stiff, slope)
+            hessian[s:, :s] = hessian[:s, s:].T
+            hessian[s:, s:] += np.diag(stiff.sum(axis=1))
+            step = _on_the_budget(hessian, gradient, np.append(self.costs, np.zeros(r)))
+            decrement = float(-gradient @ step)
+            if decrement < 1e-9 * max(mu, 1e-300) * (s + r):
+                break
+            here, length = self._barrier(weight, level, mu), 1.0
+            while length > 1e-10:
+                new = weight + length * step[:s], level + length * step[s:]
+                there = self._barrier(*new, mu)
+                if there <= here - 0.1 * length * decrement:
+                    break
+                length *= 0.5
+            else:
+                break
+            weight, level = new
+            if decrement < 1e-3 * mu * (s + r):
+                break
+        return weight, level
+
+
+def _root(matrices: Float[np.ndarray, "r n n"]) -> Float[np.ndarray, "r n n"]:
+    """Symmetric square roots."""
+    value, vector = np.linalg.eigh(matrices)
+    return np.einsum("rab,rb,rcb->rac", vector, np.sqrt(np.clip(value, 0.0, None)), vector, optimize=True)
+
+
+def _on_the_budget(
+    hessian: Float[np.ndarray, "v v"], gradient: Float[np.ndarray, " v"], cost: Float[np.ndarray, " v"]
+) -> Float[np.ndarray, " v"]:
+    """The Newton step that leaves cost · step = 0."""
+    size = np.sqrt(np.diag(hessian))
+    factor = linalg.cho_factor(hessian / np.outer(size, size) + 1e-14 * np.eye(len(size)))
+    free = linalg.cho_solve(factor, gradient / size) / size
+    along = linalg.cho_solve(factor, cost / size) / size
+    return -(free - along * (cost @ free) / (cost @ along))
+
+
+def optimise(
+    experiment: Experiment,
+    *,
+    gap: float = GAP,
+    most: int = 8,
+    progress: Callable[[str], None] | None = None,
+) -> Plan:
+    """The plan with the least criterion, to a proven relative `gap`, and the proof.
+
+    At most `most` candidates of each family join in a round; `progress` is told value, bound and gap of every round.
+    Raises NotEstimableError for a target that nothing informs about, ValueError for a budget that is not positive. The
+    gap that was reached is `Plan.gap`: larger than asked for only if rounding errors end the search.
+    """
+    if not experiment.budget > 0:
+        raise ValueError(f"the budget is {experiment.budget:g}: nothing can be done with it")
+    problem = experiment.reduced()
+    chosen = [(number, place) for number, f in enumerate(problem.families) for place in f.spread()]
+    some = _Some(problem, chosen)
+    weight = np.full(len(chosen), problem.budget / some.costs.sum())
+    best_bound, plan, idle = 0.0, None, 0
+    for turn in range(1, _ROUNDS + 1):
+        weight, shares = some.solve(weight, 0.5 * gap if turn > 1 else max(gap, 0.2))
+        value = some.value(weight)
+        bound, tops = lower_bound(problem, some.covariance(weight), shares, most)
+        better = plan is None or bound > best_bound * (1 + 1e-2 * gap) or value < plan.value * (1 - 1e-2 * gap)
+        idle = 0 if better else idle + 1
+        best_bound = max(best_bound, bound)
+        plan = _plan(some, weight, value, best_bound, turn)
+        if progress is not None:
+            progress(f"round {turn}: criterion {value:.6g}, bound {best_bound:.6g}, gap {100 * plan.gap:.2g} %")
+        if plan.gap <= gap or idle == _PATIENCE:
+            break
+        used = weight * some.costs > _LEAST_WEIGHT * problem.budget
+        kept = [c for c, keep in zip(some.chosen, used, strict=True) if keep]
+        new = [top for top in tops if not any(_same(top, there) for there in kept)]
+        if not new and turn > 3:
+            break
+        share = 0.05 * problem.budget / max(len(new), 1)
+        some = _Some(problem, [*kept, *new])
+        weight = np.concatenate([0.95 * weight[used], share / some.costs[len(kept) :]])
+    assert plan is not None
+    return plan
+
+
+def _same(one: tuple[int, Float[np.ndarray, " d"]], other: tuple[int, Float[np.ndarray, " d"]]) -> bool:
+    return one[0] == other[0] and bool(np.allclose(one[1], other[1], atol=1e-9, rtol=0.0))
+
+
+def _plan(some: _Some, weight: Float[np.ndarray, " s"], value: float, bound: float, rounds: int) -> Plan:
+    used = np.flatnonzero(weight * some.costs > _LEAST_WEIGHT * some.experiment.budget)
+    return Plan(
+        np.array([some.chosen[i][0] for i in used]),
+        [some.chosen[i][1] for i in used],
+        weight[used],
+        value,
+        bound,
+        rounds,
+    )
+
+
+def lower_bound(
+    experiment: Experiment,
+    covariance: Float[np.ndarray, "r n n"],
+    shares: Float[np.ndarray, "r k"],
+    most: int = 8,
+) -> tuple[float, list[tuple[int, Float[np.ndarray, " d"]]]]:
+    """The least criterion that any plan can have, by the inequality of the module, and the candidates that promise most.
+
+    `covariance` is M(w)⁻¹ of a plan, `shares` multipliers π of the targets with sum 1 in each draw. Any of both gives a
+    valid bound; those of the optimum give the largest.
+    """
+    y = np.einsum("rnm,rkmq->rknq", covariance, experiment.targets, optimize=True)
+    g = np.einsum("rk,rknq,rkmq->rnm", shares, y, y, optimize=True)
+    here = float(np.einsum("rk,rknq,rknq->r", shares, experiment.targets, y, optimize=True).mean())
+    known = float(np.einsum("rnm,rnm->r", g, experiment.known).mean())
+    tops, ratio = [], 0.0
+    for number, family in enumerate(experiment.families):
+        gains = np.einsum("rnm,rjnm->rj", g, family.basis, optimize=True).mean(axis=0)
+        places, largest = family.best(gains, most)
+        ratio = max(ratio, largest)
+        tops += [(number, place) for place in places]
+    return here**2 / (known + experiment.budget * ratio), tops
+
+
+def rounded(experiment: Experiment, plan: Plan, *, most: int = 8) -> Plan:
+    """A plan of whole numbers within the budget, and its proven distance from the best plan of any weights.
+
+    Weights are rounded down, what is left of the budget goes where it lowers the criterion most for its cost, then
+    single candidates are exchanged while that lowers it further. Raises ValueError for a budget that pays for nothing,
+    and NotEstimableError for one that does not pay for all that the targets need.
+    """
+    problem = experiment.reduced()
+    some = _Some(problem, list(zip(plan.family.tolist(), plan.place, strict=True)))
+    if some.costs.min() > problem.budget:
+        raise ValueError(f"the budget, {problem.budget:g}, is less than the cheapest candidate costs: {some.costs.min():g}")
+    count = np.floor(plan.weight + 1e-9)
+    some, count = _filled(some, count, plan.weight)
+    for _ in range(_EXCHANGES):
+        some, count, better = _exchanged(some, count, most)
+        if not better:
+            break
+    used = np.flatnonzero(count)
+    return Plan(
+        np.array([some.chosen[i][0] for i in used]),
+        [some.chosen[i][1] for i in used],
+        count[used],
+        some.value(count),
+        plan.bound,
+        plan.rounds,
+    )
+
+
+def _filled(
+    some: _Some, count: Float[np.ndarray, " s"], weight: Float[np.ndarray, " s"]
+) -> tuple[_Some, Float[np.ndarray, " s"]]:
+    """Spend what is left of the budget, one candidate at a time."""
+    while True:
+        left = some.experiment.budget - some.costs @ count
+        can = np.flatnonzero(some.costs <= left * (1 + 1e-9))
+        if not len(can):
+            return some, count
+        # A plan that is not whole yet may not determine everything: a thousandth of the weights stands in for the rest.
+        base = count + 1e-3 * weight
+        here = some.value(base)
+        gain = [(here - some.value(base + (np.arange(len(count)) == i))) / some.costs[i] for i in can]
+        count = count + (np.arange(len(count)) == can[int(np.argmax(gain))])
+
+
+def _exchanged(
+    some: _Some, count: Float[np.ndarray, " s"], most: int
+) -> tuple[_Some, Float[np.ndarray, " s"], bool]:
+    """One exchange that lowers the criterion, if there is one: the most promising by their slopes are tried."""
+    problem, here = some.experiment, some.value(count)
+    covariance = some.covariance(count)
+    phi = some.variances(covariance)
+    # The worst targets, smoothly: the slope of the maximum alone would forget the next one.
+    shares = (phi / phi.max(axis=1, keepdims=True)) ** _SHARPNESS
+    _, tops = lower_bound(problem, covariance, shares / shares.sum(axis=1, keepdims=True), most)
+    new = [top for top in tops if not any(_same(top, there) for there in some.chosen)]
+    kept = np.flatnonzero(count)
+    some = _Some(problem, [*(some.chosen[i] for i in kept), *new])
+    count = np.concatenate([count[kept], np.zeros(len(new))])
+    y = covariance @ some.wide
+    weights = np.repeat(shares / shares.sum(axis=1, keepdims=True), some.per_target[1], axis=1)[:, None]
+    slope = np.array([np.mean([np.sum(a * (m @ (a * w))) for a, m, w in zip(y, one, weights, strict=True)])
+                      for one in np.swapaxes(some.matrices, 0, 1)])
+    left = problem.budget - some.costs @ count
+    out, into = np.meshgrid(np.arange(len(kept)), np.arange(len(count)), indexing="ij")
+    fits = (some.costs[into] - some.costs[out] <= left * (1 + 1e-9)) & (out != into)
+    promise = np.where(fits, slope[into] - slope[out], -np.inf)
+    for flat in np.argsort(-promise, axis=None)[:_TRIED]:
+        i, j = np.unravel_index(flat, promise.shape)
+        if not np.isfinite(promise[i, j]):
+            break
+        changed = count.copy()
+        changed[i] -= 1
+        changed[j] += 1
+        if some.value(changed) < here * (1 - 1e-9):
+            return some, changed, True
+    return some, count, False
