@@ -13,20 +13,21 @@ criterion is the largest of them, averaged over draws r of what the instrument m
 which holds A-, I- and c-optimality (one target), G-optimality (one target for each place), and naming (one target for
 each pair of hypotheses) as cases. f is convex.
 
-Proof        For multipliers π_rk ≥ 0, Σ_k π_rk = 1, let L_r = Σ_k π_rk A_rk A_rkᵀ and G_r = M_r(w)⁻¹ L_r M_r(w)⁻¹. Every
+Proof        For multipliers π_rk ≥ 0, Σ_k π_rk = 1, let L_r = Σ_k π_rk A_rk A_rkᵀ, G_r = M_r(w)⁻¹ L_r M_r(w)⁻¹. Every
              other plan v has, by Cauchy and Schwarz,
                  f(v) ≥ mean_r tr L_r M_r(v)⁻¹ ≥ (mean_r tr L_r M_r(w)⁻¹)² / mean_r tr G_r M_r(v),
-             and the denominator is at most mean_r tr G_r M₀r + B max_i d_i / c_i, d_i = mean_r tr G_r M_ir. The maximum
-             over all candidates, a continuum of them included, therefore bounds f from below: the equivalence theorem of
-             Kiefer & Wolfowitz (1960, Canad. J. Math. 12, 363) as an inequality that holds at any w.
+             and the denominator is at most mean_r tr G_r M₀r + B max_i d_i / c_i, d_i = mean_r tr G_r M_ir. The
+             maximum over all candidates, a continuum of them included, therefore bounds f from below: the equivalence
+             theorem of Kiefer & Wolfowitz (1960, Canad. J. Math. 12, 363) as an inequality that holds at any w.
 Candidates   come in families whose information is linear in a few fixed matrices, M_i = Σ_j F_ij B_j, so that a million
-             candidates cost a million short dot products. Of a `Torus` F are products of sines and cosines of continuous
-             angles; its maximum over the continuum is bounded by that over a grid, see there.
+             candidates cost a million short dot products. Of a `Circle` F is a Fourier series in a continuous
+             angle; its maximum over the continuum is bounded by that over a grid, see there.
 Solution     Column generation: a log-barrier Newton method solves the problem for a few candidates (min mean t_r with
-             φ_rk ≤ t_r; Boyd & Vandenberghe 2004, Convex Optimization, 11.3), those with the largest d_i / c_i join, those
-             without weight leave, until the proven gap is small.
-Rounding     Efficient apportionment (Pukelsheim & Rieder 1992, Biometrika 79, 763), then exchanges of single candidates
-             while they lower f; the loss is proven by the same lower bound.
+             φ_rk ≤ t_r; Boyd & Vandenberghe 2004, Convex Optimization, 11.3), those with the largest d_i / c_i join,
+             those without weight leave, until the proven gap is small.
+Rounding     Weights rounded down, the rest of the budget spent where it lowers f most for its cost, then exchanges of
+             single candidates while they lower f (Fedorov 1972, Theory of Optimal Experiments); the loss is proven by
+             the same lower bound.
 
 Units        Those of the caller: information per unit of weight, cost in those of the budget.
 Limits       Local design: the information is that at assumed parameters, or its average over draws of them.
@@ -34,13 +35,13 @@ Limits       Local design: the information is that at assumed parameters, or its
 
 from __future__ import annotations
 
+import abc
+import copy
 import dataclasses
-import itertools
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import linalg
 
 Matrices = Float[np.ndarray, "r j n n"]
@@ -51,7 +52,10 @@ _NEWTON = 80  # steps for one set of candidates
 _SHARPER = 8.0  # by what the barrier falls between two Newton solutions
 _LEAST_WEIGHT = 1e-5  # share of the budget below which a candidate leaves
 _UNSEEN = 1e-13  # eigenvalue, of the scaled information of everything, below which a direction is not seen
-_GRID = (256, 64, 32)  # points per period of the highest harmonic, for 1, 2, 3 axes: 0.01, 0.24, 1.5 % of slack
+_GRID = 64  # points per period of the highest harmonic: the maximum is known to 1 / cos(π / 64), 0.12 %
+_SPREAD = 16  # candidates of a family that a plan begins with
+_NEAR = 0.5  # of the largest variance: targets below it wait until they are among the largest
+COMPRESSED = 1e-6
 _EXCHANGES = 200
 _TRIED = 60  # exchanges, most promising first, of which the first that lowers the criterion is made
 _SHARPNESS = 20  # power of the variances by which targets share the slope of an exchange
@@ -62,38 +66,30 @@ class NotEstimableError(ValueError):
     """What is wanted depends on parameters that neither the candidates nor what is known inform about."""
 
 
-class Family(Protocol):
-    """Candidates whose information is linear in a few fixed matrices."""
+class Family(abc.ABC):
+    """Candidates whose information is linear in a few fixed matrices, `basis` (draw, member, parameter, parameter)."""
 
-    @property
-    def basis(self) -> Matrices:
-        """Matrices B_rj (draw, member, parameter, parameter)."""
-        ...
+    basis: Matrices
 
-    @property
-    def cost(self) -> float | Float[np.ndarray, " m"]:
-        """Cost of a candidate, one for all or one for each."""
-        ...
-
+    @abc.abstractmethod
     def coefficients(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, "s j"]:
         """Coefficients F of the candidates at `places`, points of the family's own coordinates."""
-        ...
 
+    @abc.abstractmethod
     def cost_at(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, " s"]:
         """Cost of the candidates at `places`."""
-        ...
 
+    @abc.abstractmethod
     def best(self, gains: Float[np.ndarray, " j"], most: int) -> tuple[Float[np.ndarray, "s d"], float]:
         """Places of at most `most` local maxima of F·gains / cost, and an upper bound of it over all candidates."""
-        ...
 
+    @abc.abstractmethod
     def spread(self) -> Float[np.ndarray, "s d"]:
         """A few candidates that stand for all of the family: a plan begins with them."""
-        ...
 
 
 @dataclasses.dataclass(frozen=True)
-class Listed:
+class Listed(Family):
     """Candidates one by one: candidate i has the information Σ_j F_ij B_j; its place is its number i.
 
     With `basis` left out there is one matrix for each candidate.
@@ -123,8 +119,8 @@ class Listed:
         return top[:, None].astype(float), float(ratio.max())
 
     def spread(self) -> Float[np.ndarray, "s d"]:
-        """Up to sixteen candidates, evenly through the list."""
-        return np.unique(np.linspace(0, len(self.rows) - 1, 16).round())[:, None]
+        """A few candidates, evenly through the list."""
+        return np.unique(np.linspace(0, len(self.rows) - 1, _SPREAD).round())[:, None]
 
     @staticmethod
     def _numbers(places: Float[np.ndarray, "s d"]) -> Int[np.ndarray, " s"]:
@@ -132,35 +128,46 @@ class Listed:
 
 
 @dataclasses.dataclass(frozen=True)
-class Torus:
-    """A continuum of candidates at angles in [0, 2π) on each of `orders` axes; information is a Fourier series in them.
+class Circle(Family):
+    """A continuum of candidates at an angle in [0, 2π), whose information is a Fourier series of degree H in it.
 
-    The basis goes with products of (1, cos a, sin a, …, cos Ha, sin Ha), one factor for each axis, the last axis
-    varying fastest.
+    F = (1, cos a, sin a, …, cos Ha, sin Ha) · `mixing`: most series hold far fewer matrices than harmonics.
 
-    Limit: a trigonometric polynomial p of degree H with max |p| = ‖p‖ is at least ‖p‖ cos(πH/N) somewhere on a grid of
-    N > 2H points (Ehlich & Zeller 1964, Math. Z. 86, 41), so a grid bounds the maximum over the continuum.
+    Limit: a trigonometric polynomial p of degree H is at least max |p| cos(πH/N) somewhere on a grid of N > 2H points
+    (Ehlich & Zeller 1964, Math. Z. 86, 41), so a grid bounds the maximum over the continuum.
     """
 
     basis: Matrices
-    orders: tuple[int, ...]
+    mixing: Float[np.ndarray, "h j"]
     cost: float = 1.0
 
     @classmethod
-    def sampled(cls, information: Float[np.ndarray, "r s n n"], orders: tuple[int, ...], cost: float = 1.0) -> Torus:
-        """The family with these matrices at equidistant angles, at least 2H + 1 on each axis, the last one fastest.
+    def sampled(
+        cls, information: Float[np.ndarray, "r s n n"], cost: float = 1.0, tolerance: float = COMPRESSED
+    ) -> Circle:
+        """The series through matrices (draw, angle, n, n) at an odd number of equidistant angles, beginning at 0.
 
-        `information` has the shape (draw, sample, n, n) with Π N_a samples, N_a = 2 H_a + 1.
+        Singular vectors that hold less than `tolerance` of any element, in units of its mean diagonal, are left out.
         """
-        counts = [2 * order + 1 for order in orders]
-        grids = np.meshgrid(*[2 * np.pi * np.arange(n) / n for n in counts], indexing="ij")
-        places = np.stack([g.ravel() for g in grids], axis=1)
-        transform = np.linalg.inv(_products(places, orders))
-        return cls(np.einsum("js,rsab->rjab", transform, information), orders, cost)
+        draws, samples, n, _ = information.shape
+        size = np.sqrt(np.einsum("rsaa->ra", information) / samples)
+        size = np.where(size > 0, size, 1.0)
+        scaled = np.moveaxis(information / (size[:, None, :, None] * size[:, None, None, :]), 1, 0)
+        flat = scaled.reshape(samples, -1)
+        value, vector = np.linalg.eigh(flat @ flat.T)
+        left = vector[:, value > (tolerance * samples) ** 2]
+        basis = (left.T @ flat).reshape(-1, draws, n, n) * size[:, :, None] * size[:, None, :]
+        angle = 2 * np.pi * np.arange(samples) / samples
+        return cls(np.moveaxis(basis, 0, 1), np.linalg.solve(_harmonics(angle, samples // 2), left), cost)
+
+    @property
+    def order(self) -> int:
+        """Degree H of the series."""
+        return len(self.mixing) // 2
 
     def coefficients(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, "s j"]:
-        """Products of sines and cosines at these angles (rad)."""
-        return _products(places, self.orders)
+        """Coefficients at these angles (rad)."""
+        return _harmonics(places[:, 0], self.order) @ self.mixing
 
     def cost_at(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, " s"]:
         """The cost, which is the same everywhere."""
@@ -168,40 +175,24 @@ class Torus:
 
     def best(self, gains: Float[np.ndarray, " j"], most: int) -> tuple[Float[np.ndarray, "s d"], float]:
         """Local maxima on a fine grid, each refined, and the bound over the continuum."""
-        counts = [max(self._fineness * order, 1) for order in self.orders]
-        axes = [2 * np.pi * np.arange(n) / n for n in counts]
-        shape = [2 * order + 1 for order in self.orders]
-        values = gains.reshape(shape)
-        for axis, order in enumerate(self.orders):
-            values = np.moveaxis(np.tensordot(_harmonics(axes[axis], order), values, (1, axis)), 0, axis)
-        peak = np.ones(values.shape, bool)
-        for axis in range(values.ndim):
-            peak &= (values >= np.roll(values, 1, axis)) & (values > np.roll(values, -1, axis))
-        at = np.argwhere(peak) if peak.any() else np.array([np.unravel_index(np.argmax(values), values.shape)])
-        at = at[np.argsort(-values[tuple(at.T)])][:most]
-        places = np.stack([axes[a][at[:, a]] for a in range(values.ndim)], axis=1)
-        slack = np.prod([np.cos(np.pi * o / n) if o else 1.0 for o, n in zip(self.orders, counts, strict=True)])
-        return self._refined(places, gains), float(values.max() / slack) / self.cost
-
-    @property
-    def _fineness(self) -> int:
-        return _GRID[min(len(self.orders), len(_GRID)) - 1]
+        series, count = self.mixing @ gains, max(_GRID * self.order, 1)
+        spectrum = np.zeros(count // 2 + 1, complex)
+        spectrum[0] = series[0]
+        spectrum[1 : self.order + 1] = 0.5 * (series[1::2] - 1j * series[2::2])
+        values = np.fft.irfft(spectrum, count) * count
+        peak = np.flatnonzero((values >= np.roll(values, 1)) & (values > np.roll(values, -1)))
+        peak = peak if len(peak) else np.array([int(np.argmax(values))])
+        peak = peak[np.argsort(-values[peak])][:most]
+        low, mid, high = (values[(peak + k) % count] for k in (-1, 0, 1))
+        bend = np.minimum(low - 2 * mid + high, -1e-300)
+        shift = np.clip(0.5 * (low - high) / bend, -1, 1)
+        top = float(values.max()) / (np.cos(np.pi * self.order / count) if self.order else 1.0)
+        return (2 * np.pi / count * (peak + shift) % (2 * np.pi))[:, None], top / self.cost
 
     def spread(self) -> Float[np.ndarray, "s d"]:
-        """Equidistant angles, enough for all harmonics."""
-        axes = [2 * np.pi * np.arange(2 * o + 1) / (2 * o + 1) for o in self.orders]
-        return np.array(list(itertools.product(*axes))).reshape(-1, len(self.orders))
-
-    def _refined(self, places: Float[np.ndarray, "s d"], gains: Float[np.ndarray, " j"]) -> Float[np.ndarray, "s d"]:
-        """Places moved to the top of the parabola through their neighbours, axis by axis."""
-        for axis, order in enumerate(self.orders):
-            step = np.zeros(len(self.orders))
-            step[axis] = 2 * np.pi / max(self._fineness * order, 1)
-            low, mid, high = (self.coefficients(places + k * step) @ gains for k in (-1, 0, 1))
-            bend = low - 2 * mid + high
-            shift = np.where(bend < 0, 0.5 * (low - high) / np.where(bend < 0, bend, -1.0), 0.0)
-            places = places + np.clip(shift, -1, 1)[:, None] * step
-        return np.mod(places, 2 * np.pi)
+        """Equidistant angles."""
+        count = min(2 * self.order + 1, _SPREAD)
+        return 2 * np.pi * np.arange(count)[:, None] / count
 
 
 def _harmonics(angle: Float[np.ndarray, " s"], order: int) -> Float[np.ndarray, "s h"]:
@@ -209,13 +200,6 @@ def _harmonics(angle: Float[np.ndarray, " s"], order: int) -> Float[np.ndarray, 
     turns = angle[:, None] * np.arange(1, order + 1)
     pairs = np.stack([np.cos(turns), np.sin(turns)], axis=2).reshape(len(angle), -1)
     return np.hstack([np.ones((len(angle), 1)), pairs])
-
-
-def _products(places: Float[np.ndarray, "s d"], orders: tuple[int, ...]) -> Float[np.ndarray, "s j"]:
-    found = np.ones((len(places), 1))
-    for axis, order in enumerate(orders):
-        found = (found[:, :, None] * _harmonics(places[:, axis], order)[:, None, :]).reshape(len(places), -1)
-    return found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -236,7 +220,9 @@ class Experiment:
 
         Directions that nothing informs about (gauges) are left out. Raises NotEstimableError if a target needs one.
         """
-        shares = [self.budget / len(self.families) / family.cost_at(family.spread()) for family in self.families]
+        shares = [
+            self.budget / len(self.families) / family.cost_at(family.spread()) for family in self.families
+        ]
         whole = self.known.mean(axis=0) + sum(
             np.einsum("s,sj,jab->ab", w / len(w), f.coefficients(f.spread()), f.basis.mean(axis=0))
             for w, f in zip(shares, self.families, strict=True)
@@ -298,7 +284,9 @@ class _Some:
         self.matrices = np.stack(matrices, axis=1)  # (r, s, n, n)
         self.costs = np.array(costs)
         r, k, n, q = experiment.targets.shape
-        self.wide = np.moveaxis(experiment.targets, 2, 1).reshape(r, n, k * q)  # A of all targets side by side
+        self.wide = np.moveaxis(experiment.targets, 2, 1).reshape(
+            r, n, k * q
+        )  # A of all targets side by side
         self.per_target = (k, q)
 
     def covariance(self, weight: Float[np.ndarray, " s"]) -> Float[np.ndarray, "r n n"]:
@@ -317,19 +305,48 @@ class _Some:
 
     def value(self, weight: Float[np.ndarray, " s"]) -> float:
         """The criterion f(w)."""
-        return float(self.variances(self.covariance(weight)).max(axis=1).mean())
+        try:
+            covariance = self.covariance(weight)
+        except np.linalg.LinAlgError:
+            return np.inf
+        if np.any(np.einsum("raa->ra", covariance) <= 0):  # singular, to rounding
+            return np.inf
+        return float(self.variances(covariance).max(axis=1).mean())
 
-    def solve(self, weight: Float[np.ndarray, " s"], gap: float) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "r k"]]:
+    def solve(
+        self, weight: Float[np.ndarray, " s"], gap: float
+    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "r k"]]:
         """Weights within `gap` of the best, and the multipliers π of the targets.
 
         Barrier: mean_r t_r − μ [Σ log(t_r − φ_rk) + Σ log w_s], Newton in (w, t) on the budget's plane.
         """
-        draws, targets = self.experiment.targets.shape[:2]
         weight = np.maximum(weight, 1e-3 * self.experiment.budget / self.costs.sum())
         weight *= self.experiment.budget / (self.costs @ weight)
         phi = self.variances(self.covariance(weight))
+        near = np.zeros(phi.shape[1], bool)
+        while True:
+            near |= (phi >= _NEAR * phi.max(axis=1, keepdims=True)).any(axis=0)
+            weight, shares = self._of_targets(near)._solved(weight, gap)
+            phi = self.variances(self.covariance(weight))
+            if np.all(phi[:, ~near] <= (1.0 + 0.1 * gap) * phi[:, near].max(axis=1, keepdims=True)):
+                whole = np.zeros(phi.shape)
+                whole[:, near] = shares
+                return weight, whole
+
+    def _of_targets(self, near: Bool[np.ndarray, " k"]) -> _Some:
+        """The same for some of the targets."""
+        other = copy.copy(self)
+        r, _, n, q = self.experiment.targets.shape
+        other.wide = self.wide.reshape(r, n, -1, q)[:, :, near].reshape(r, n, -1)
+        other.per_target = (int(near.sum()), q)
+        return other
+
+    def _solved(
+        self, weight: Float[np.ndarray, " s"], gap: float
+    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "r k"]]:
+        phi = self.variances(self.covariance(weight))
         level = phi.max(axis=1) * 1.05
-        constraints = draws * targets + len(weight)
+        constraints = phi.size + len(weight)
         mu = level.mean() / constraints
         least = 0.2 * gap * level.mean() / constraints
         while True:
@@ -338,8 +355,7 @@ class _Some:
             if mu <= least:
                 break
             mu = max(mu / _SHARPER, least)
-        phi = self.variances(self.covariance(weight))
-        shares = 1.0 / np.maximum(level[:, None] - phi, 1e-300)
+        shares = 1.0 / np.maximum(level[:, None] - self.variances(self.covariance(weight)), 1e-300)
         return weight, shares / shares.sum(axis=1, keepdims=True)
 
     def _barrier(self, weight: Float[np.ndarray, " s"], level: Float[np.ndarray, " r"], mu: float) -> float:
@@ -361,7 +377,9 @@ class _Some:
         for _ in range(_NEWTON):
             covariance = self.covariance(weight)
             y = covariance @ self.wide
-            slope = -np.stack([self._by_target(one * (m @ one)) for one, m in zip(y, self.matrices, strict=True)])
+            slope = -np.stack(
+                [self._by_target(one * (m @ one)) for one, m in zip(y, self.matrices, strict=True)]
+            )
             slack = level[:, None] - self._by_target(self.wide * y)
             push = mu / slack
             # Curvature of the φ: Σ_k push_k 2 tr(M_s P M_t Q), P = M⁻¹, Q = Σ_k push_k y_k y_kᵀ.
@@ -438,12 +456,16 @@ def optimise(
         weight, shares = some.solve(weight, 0.5 * gap if turn > 1 else max(gap, 0.2))
         value = some.value(weight)
         bound, tops = lower_bound(problem, some.covariance(weight), shares, most)
-        better = plan is None or bound > best_bound * (1 + 1e-2 * gap) or value < plan.value * (1 - 1e-2 * gap)
+        better = (
+            plan is None or bound > best_bound * (1 + 1e-2 * gap) or value < plan.value * (1 - 1e-2 * gap)
+        )
         idle = 0 if better else idle + 1
         best_bound = max(best_bound, bound)
         plan = _plan(some, weight, value, best_bound, turn)
         if progress is not None:
-            progress(f"round {turn}: criterion {value:.6g}, bound {best_bound:.6g}, gap {100 * plan.gap:.2g} %")
+            progress(
+                f"round {turn}: criterion {value:.6g}, bound {best_bound:.6g}, gap {100 * plan.gap:.2g} %"
+            )
         if plan.gap <= gap or idle == _PATIENCE:
             break
         used = weight * some.costs > _LEAST_WEIGHT * problem.budget
@@ -480,7 +502,7 @@ def lower_bound(
     shares: Float[np.ndarray, "r k"],
     most: int = 8,
 ) -> tuple[float, list[tuple[int, Float[np.ndarray, " d"]]]]:
-    """The least criterion that any plan can have, by the inequality of the module, and the candidates that promise most.
+    """The least criterion that any plan can have (see the module), and the candidates that promise most.
 
     `covariance` is M(w)⁻¹ of a plan, `shares` multipliers π of the targets with sum 1 in each draw. Any of both gives a
     valid bound; those of the optimum give the largest.
@@ -508,9 +530,16 @@ def rounded(experiment: Experiment, plan: Plan, *, most: int = 8) -> Plan:
     problem = experiment.reduced()
     some = _Some(problem, list(zip(plan.family.tolist(), plan.place, strict=True)))
     if some.costs.min() > problem.budget:
-        raise ValueError(f"the budget, {problem.budget:g}, is less than the cheapest candidate costs: {some.costs.min():g}")
+        raise ValueError(
+            f"the budget, {problem.budget:g}, is less than the cheapest candidate costs: {some.costs.min():g}"
+        )
     count = np.floor(plan.weight + 1e-9)
-    some, count = _filled(some, count, plan.weight)
+    count = _filled(some, count, plan.weight)
+    if not np.isfinite(some.value(count)):
+        raise NotEstimableError(
+            f"the budget, {problem.budget:g}, pays for {count.sum():.0f} of the candidates, which do not determine all "
+            "targets: raise it"
+        )
     for _ in range(_EXCHANGES):
         some, count, better = _exchanged(some, count, most)
         if not better:
@@ -528,13 +557,13 @@ def rounded(experiment: Experiment, plan: Plan, *, most: int = 8) -> Plan:
 
 def _filled(
     some: _Some, count: Float[np.ndarray, " s"], weight: Float[np.ndarray, " s"]
-) -> tuple[_Some, Float[np.ndarray, " s"]]:
+) -> Float[np.ndarray, " s"]:
     """Spend what is left of the budget, one candidate at a time."""
     while True:
         left = some.experiment.budget - some.costs @ count
         can = np.flatnonzero(some.costs <= left * (1 + 1e-9))
         if not len(can):
-            return some, count
+            return count
         # A plan that is not whole yet may not determine everything: a thousandth of the weights stands in for the rest.
         base = count + 1e-3 * weight
         here = some.value(base)
@@ -544,7 +573,7 @@ def _filled(
 
 def _exchanged(
     some: _Some, count: Float[np.ndarray, " s"], most: int
-) -> tuple[_Some, Float[np.ndarray, " s"], bool]:
+) -> tuple[_Some, Float[np.ndarray, " _"], bool]:
     """One exchange that lowers the criterion, if there is one: the most promising by their slopes are tried."""
     problem, here = some.experiment, some.value(count)
     covariance = some.covariance(count)
@@ -558,8 +587,12 @@ def _exchanged(
     count = np.concatenate([count[kept], np.zeros(len(new))])
     y = covariance @ some.wide
     weights = np.repeat(shares / shares.sum(axis=1, keepdims=True), some.per_target[1], axis=1)[:, None]
-    slope = np.array([np.mean([np.sum(a * (m @ (a * w))) for a, m, w in zip(y, one, weights, strict=True)])
-                      for one in np.swapaxes(some.matrices, 0, 1)])
+    slope = np.array(
+        [
+            np.mean([np.sum(a * (m @ (a * w))) for a, m, w in zip(y, one, weights, strict=True)])
+            for one in np.swapaxes(some.matrices, 0, 1)
+        ]
+    )
     left = problem.budget - some.costs @ count
     out, into = np.meshgrid(np.arange(len(kept)), np.arange(len(count)), indexing="ij")
     fits = (some.costs[into] - some.costs[out] <= left * (1 + 1e-9)) & (out != into)

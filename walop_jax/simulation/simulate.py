@@ -123,12 +123,14 @@ def simulate(
     instrument: Instrument | None = None,
     effects: Sequence[Effect] = (),
     noiseless: bool = False,
+    steady: bool = False,
 ) -> Simulated:
     """Simulate a calibration run: the same plan, seed and effects give the same set, bit for bit.
 
     `instrument` is the true one (default: drawn from the priors of the base model); its standards are
     replaced by those of the simulated catalogue, `effects` are added to it. `noiseless` leaves the expected
-    counts as they are and states the errors that they would have. Effects that depend on the run are made
+    counts as they are and states the errors that they would have; `steady` gives every exposure the mean transparency
+    and every star the mean brightness. Effects that depend on the run are made
     with `plan.context()`.
     """
     build, stars, sky, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
@@ -139,7 +141,7 @@ def simulate(
     active = in_order((*instrument.effects, *effects))
     truth = make_template(dataclasses.replace(instrument.with_source(standards), effects=active))
     blank = _without_light(plan, sources, seed, len(truth.cameras))
-    expected = _expected(blank, truth, _fluxes(plan, sky))
+    expected = _expected(blank, truth, _fluxes(plan, None if steady else sky))
     detector = PhotonNoise(plan.read_noise)
     if noiseless:
         counts, sigma = expected, detector.sigma(expected)
@@ -152,7 +154,7 @@ def simulate(
 
 def as_planned(plan: ObservingPlan) -> CalibrationSet:
     """The set that the instrument as designed would give, without noise: for judging a plan."""
-    return simulate(plan, instrument=plan.design, noiseless=True).calset
+    return simulate(plan, instrument=plan.design, noiseless=True, steady=True).calset
 
 
 def _without_light(plan: ObservingPlan, sources: Sources, seed: int, cameras: int) -> CalibrationSet:
@@ -180,12 +182,15 @@ def _with_counts(plan: ObservingPlan, blank: CalibrationSet, counts: Cube, sigma
     return dataclasses.replace(blank, intensities=TableIntensities.dense(points, block))
 
 
-def _fluxes(plan: ObservingPlan, rng: np.random.Generator) -> Float[np.ndarray, "p e"]:
+def _fluxes(plan: ObservingPlan, rng: np.random.Generator | None) -> Float[np.ndarray, "p e"]:
     """Flux of every (point, exposure): transparency, illumination of the field, brightness of the stars.
 
-    A camera of throughput 0.5 sees a quarter of unpolarised light.
+    A camera of throughput 0.5 sees a quarter of unpolarised light. Without `rng` all are at their means.
     """
     used, source = plan.layout()
+    if rng is None:
+        brightness = np.append(np.full(plan.standards, np.mean(TRANSPARENCY)), 1.0)
+        return 4.0 * plan.electrons * np.mean(TRANSPARENCY) * np.broadcast_to(brightness[source], used.shape)
     transparency = rng.uniform(*TRANSPARENCY, used.shape[1])
     illumination = rng.uniform(0.9, 1.1, used.shape[0])
     brightness = np.append(rng.uniform(*TRANSPARENCY, plan.standards), 1.0)  # the last entry: no star

@@ -1,0 +1,212 @@
+"""Optimal experiments: textbook designs, semidefinite programs, and the proof held against every other plan."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from walop_jax.plans.optimal import (
+    Circle,
+    Experiment,
+    Listed,
+    NotEstimableError,
+    lower_bound,
+    optimise,
+    rounded,
+)
+
+
+def regression(rows: np.ndarray) -> Listed:
+    """Candidates that each measure one row of a linear regression with unit error."""
+    return Listed.of(np.einsum("ia,ib->iab", rows, rows)[None])
+
+
+def experiment(family, targets, *, known=0.0, budget=1.0) -> Experiment:
+    n = targets.shape[-2]
+    return Experiment(known * np.eye(n)[None], targets, (family,), budget)
+
+
+GRID = np.linspace(-1.0, 1.0, 201)
+QUADRATIC = np.stack([np.ones_like(GRID), GRID, GRID**2], axis=1)
+
+
+def weights_at(plan, values: np.ndarray, near: float) -> float:
+    """Weight of a plan within 0.05 of a place."""
+    where = np.array([values[int(p[0])] for p in plan.place])
+    return float(plan.weight[np.abs(where - near) < 0.05].sum())
+
+
+def test_a_optimal_quadratic_regression():
+    """On [−1, 1]: weights 1/4, 1/2, 1/4 at −1, 0, 1, trace of the inverse 8 (Pukelsheim 2006, Optimal Design, 9.5)."""
+    plan = optimise(experiment(regression(QUADRATIC), np.eye(3)[None, None]), gap=1e-5)
+    assert plan.value == pytest.approx(8.0, rel=1e-5)
+    assert plan.bound <= 8.0 <= plan.value
+    assert [weights_at(plan, GRID, x) for x in (-1, 0, 1)] == pytest.approx([0.25, 0.5, 0.25], abs=2e-3)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 4])
+def test_the_worst_variance_of_a_polynomial_is_its_number_of_coefficients(degree):
+    """Kiefer & Wolfowitz 1960: the least possible largest variance of a fitted curve is n, with weights 1/n.
+
+    The places are the zeros of (1 − x²) P'_degree (Guest 1958, Ann. Math. Stat. 29, 294).
+    """
+    rows = np.polynomial.legendre.legvander(GRID, degree)
+    plan = optimise(experiment(regression(rows), rows[None, :, :, None]), gap=1e-3)
+    # Their places lie between those of the grid, by up to 0.005.
+    assert plan.value == pytest.approx(degree + 1, rel=2e-3)
+    inner = np.polynomial.legendre.Legendre.basis(degree).deriv().roots()
+    for x in (-1.0, *inner, 1.0):
+        assert weights_at(plan, GRID, x) == pytest.approx(1 / (degree + 1), abs=0.02)
+
+
+def test_c_optimal_extrapolation():
+    """The line 1 + x seen on [−1, 1] and wanted at x = 2: weights 3/4 at 1, 1/4 at −1, variance 4 (Elfving 1952)."""
+    rows = QUADRATIC[:, :2]
+    wanted = np.array([1.0, 2.0])[None, None, :, None]
+    plan = optimise(experiment(regression(rows), wanted), gap=1e-4)
+    assert plan.value == pytest.approx(4.0, rel=1e-4)
+    assert weights_at(plan, GRID, 1.0) == pytest.approx(0.75, abs=5e-3)
+
+
+def harmonics(angle: np.ndarray, degree: int) -> np.ndarray:
+    turns = angle[:, None] * np.arange(1, degree + 1)
+    return np.hstack([np.ones((len(angle), 1)), np.cos(turns), np.sin(turns)])
+
+
+def fourier(degree: int) -> Circle:
+    """Regression on a circle: information is a series of twice the degree."""
+    rows = harmonics(2 * np.pi * np.arange(4 * degree + 1) / (4 * degree + 1), degree)
+    return Circle.sampled(np.einsum("ia,ib->iab", rows, rows)[None])
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_a_fourier_regression_is_best_on_even_angles(degree):
+    """Any 2H + 1 or more even angles are optimal on the continuum, largest variance 2H + 1 (Pukelsheim 2006, 9.16)."""
+    wanted = harmonics(np.linspace(0, 2 * np.pi, 60), degree)[None, :, :, None]
+    plan = optimise(experiment(fourier(degree), wanted))
+    assert plan.value == pytest.approx(2 * degree + 1, rel=0.01)
+    assert plan.bound <= (2 * degree + 1) * (1 + 1e-9)
+    assert plan.gap <= 0.01
+
+
+def test_a_circle_is_what_it_was_sampled_from():
+    family, angle = fourier(2), np.array([0.1, 1.3, 5.9])
+    made = np.einsum("sj,jab->sab", family.coefficients(angle[:, None]), family.basis[0])
+    rows = harmonics(angle, 2)
+    np.testing.assert_allclose(made, np.einsum("sa,sb->sab", rows, rows), atol=1e-6)
+
+
+def test_the_largest_gain_of_a_circle_is_bounded_and_found():
+    family, rng = fourier(3), np.random.default_rng(5)
+    dense = np.linspace(0, 2 * np.pi, 200_001)[:, None]
+    for _ in range(20):
+        gains = rng.standard_normal(family.basis.shape[1])
+        values = family.coefficients(dense) @ gains
+        places, bound = family.best(gains, 3)
+        assert bound >= values.max() > 0 or values.max() <= 0
+        assert bound <= values.max() + 0.0013 * abs(values.max())
+        assert (family.coefficients(places) @ gains).max() == pytest.approx(values.max(), rel=1e-5)
+
+
+def random_experiment(seed: int, *, draws: int = 1, count: int = 60, budget: float = 7.0) -> Experiment:
+    """A few parameters seen by candidates of several rows each, some known before, wanted in several combinations."""
+    rng = np.random.default_rng(seed)
+    n = 5
+    rows = rng.standard_normal((draws, count, 2, n)) * np.geomspace(1.0, 30.0, n)
+    information = np.einsum("rsqa,rsqb->rsab", rows, rows)
+    targets = rng.standard_normal((draws, 6, n, 2)) / np.geomspace(1.0, 30.0, n)[:, None]
+    known = np.broadcast_to(np.diag([0.0, 0.0, 1.0, 4.0, 9.0]), (draws, n, n)).copy()
+    half = count // 2
+    families = (
+        Listed.of(information[:, :half], rng.uniform(0.5, 2.0, half)),
+        Listed.of(information[:, half:], rng.uniform(0.5, 2.0, count - half)),
+    )
+    return Experiment(known, targets, families, budget)
+
+
+@pytest.mark.parametrize(("seed", "draws", "count"), [(1, 1, 60), (2, 3, 40), (3, 1, 300)])
+def test_against_a_semidefinite_program(seed, draws, count):
+    """The same by cvxpy and Clarabel: least mean of t with the Schur complement [[M, A], [Aᵀ, X]] ⪰ 0, tr X ≤ t."""
+    cvxpy = pytest.importorskip("cvxpy")
+    problem = random_experiment(seed, draws=draws, count=count)
+    weight = cvxpy.Variable(count, nonneg=True)
+    cost = np.concatenate([f.cost for f in problem.families])
+    constraints, levels = [cost @ weight <= problem.budget], cvxpy.Variable(draws)
+    for r in range(draws):
+        matrices = np.concatenate([f.basis[r] for f in problem.families])
+        total = problem.known[r] + cvxpy.sum([weight[i] * matrices[i] for i in range(count)])
+        for a in problem.targets[r]:
+            corner = cvxpy.Variable((2, 2), symmetric=True)
+            constraints += [cvxpy.bmat([[total, a], [a.T, corner]]) >> 0, cvxpy.trace(corner) <= levels[r]]
+    program = cvxpy.Problem(cvxpy.Minimize(cvxpy.sum(levels) / draws), constraints)
+    program.solve(solver="CLARABEL")
+    plan = optimise(problem, gap=3e-5)
+    assert plan.value == pytest.approx(program.value, rel=1e-4)
+    assert plan.bound <= program.value * (1 + 1e-6)
+
+
+def test_no_plan_is_better_than_the_bound():
+    """A thousand plans of the same budget, those of few candidates among them; the bound holds for any multipliers."""
+    problem, rng = random_experiment(4).reduced(), np.random.default_rng(6)
+    plan = optimise(problem)
+    cost = np.concatenate([f.cost for f in problem.families])
+    matrices = np.concatenate([f.basis[0] for f in problem.families])
+
+    def variances(weight):
+        covariance = np.linalg.inv(problem.known[0] + np.tensordot(weight, matrices, 1))
+        return covariance, np.einsum("knq,nm,kmq->k", problem.targets[0], covariance, problem.targets[0])
+
+    for _ in range(1000):
+        weight = rng.dirichlet(np.full(len(cost), rng.choice([0.02, 0.1, 1.0]))) * problem.budget / cost
+        covariance, phi = variances(weight)
+        assert phi.max() >= plan.bound
+        shares = rng.dirichlet(np.ones(len(phi)))
+        assert lower_bound(problem, covariance[None], shares[None])[0] <= plan.value
+
+
+def test_whole_numbers_are_within_three_per_cent_of_any_weights():
+    for seed in range(5):
+        problem = random_experiment(seed, budget=30.0)
+        plan = optimise(problem, gap=1e-3)
+        whole = rounded(problem, plan)
+        cost = sum(
+            w * float(problem.families[f].cost_at(p[None])[0])
+            for f, p, w in zip(whole.family, whole.place, whole.weight, strict=True)
+        )
+        assert cost <= problem.budget * (1 + 1e-9)
+        assert np.all(whole.weight == np.round(whole.weight))
+        assert whole.weight.sum() >= 15
+        assert 0.0 <= whole.gap <= 0.03
+
+
+def test_what_nobody_sees_is_not_estimable():
+    rows = QUADRATIC * np.array([1.0, 1.0, 0.0])
+    with pytest.raises(NotEstimableError, match="targets 0"):
+        optimise(experiment(regression(rows), np.eye(3)[None, None]))
+    # A gauge that no target asks for is left out.
+    wanted = np.eye(3)[None, None, :, :2]
+    assert optimise(experiment(regression(rows), wanted), gap=1e-4).value == pytest.approx(2.0, rel=1e-3)
+
+
+def test_scales_of_parameters_do_not_matter():
+    problem = random_experiment(7)
+    turn = np.diag(10.0 ** np.arange(-6, 9, 3.0))
+    other = Experiment(
+        turn @ problem.known @ turn,
+        np.einsum("an,rknq->rkaq", turn, problem.targets),
+        tuple(Listed.of(turn @ f.basis @ turn, f.cost) for f in problem.families),
+        problem.budget,
+    )
+    assert optimise(other, gap=1e-4).value == pytest.approx(optimise(problem, gap=1e-4).value, rel=1e-4)
+
+
+@pytest.mark.parametrize("budget", [0.0, -3.0, float("nan")])
+def test_a_budget_must_be_positive(budget):
+    with pytest.raises(ValueError, match="nothing can be done with it"):
+        optimise(random_experiment(1, budget=budget))
+
+
+def test_a_budget_below_every_cost_pays_for_nothing():
+    problem = random_experiment(1, budget=0.1)
+    with pytest.raises(ValueError, match="cheapest"):
+        rounded(problem, optimise(problem))
