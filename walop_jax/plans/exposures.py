@@ -30,6 +30,7 @@ from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import base_model
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.priors import prior_rows
 from walop_jax.model.specification import Model
 from walop_jax.plans.optimal import Circle, Experiment, Family, Listed
 from walop_jax.science.star_errors import sample_stars
@@ -119,32 +120,33 @@ def candidates(
     `overhead` (s) by KIND is added to EXPTIME; `angles`, an odd number, are those of the polariser.
     """
     tell = progress or (lambda text: None)
+    sky = dataclasses.replace(plan, polariser_angles=(0.0,), plate=plan.plate[:1])
+    # The model of all exposures: no family by itself would free all parameters.
+    model = base_model(simulate(sky, noiseless=True, steady=True).calset, plan.design)
     families: list[Family] = []
-    labels, truncation = [], 0.0
+    labels, truncation = [], float("nan")
     for label, there in _through_the_polariser(plan, angles):
         tell(f"information of {label}")
         rows = np.flatnonzero(there.exposures().kind == "clp")
-        information = np.stack([_information(there, seed + draw, rows) for draw in range(draws)])
+        information = np.stack([_information(there, model, seed + draw, rows) for draw in range(draws)])
         families.append(Circle.sampled(information, _cost(there, rows, overhead)[0]))
         labels.append(label)
-        # Held against what it stands for, at angles between those of the series, in the first draw.
-        between = dataclasses.replace(
-            there, polariser_angles=tuple(np.array(there.polariser_angles) + 90.0 / angles)
-        )
-        truncation = max(truncation, _between(families[-1], between, _information(between, seed, rows)))
-    sky = dataclasses.replace(plan, polariser_angles=(0.0,), plate=plan.plate[:1], filters=plan.filters)
+        if len(families) == 1:
+            # Held against what it stands for, at angles between those of the series.
+            turned = tuple(np.array(there.polariser_angles) + 90.0 / angles)
+            between = dataclasses.replace(there, polariser_angles=turned)
+            truncation = _between(families[0], between, _information(between, model, seed, rows))
     exposures = sky.exposures()
     for kind in dict.fromkeys(k for k in exposures.kind.tolist() if k != "clp"):
         tell(f"information of {kind} exposures")
         rows = np.flatnonzero(exposures.kind == kind)
-        information = np.stack([_information(sky, seed + draw, rows) for draw in range(draws)])
+        information = np.stack([_information(sky, model, seed + draw, rows) for draw in range(draws)])
         families.append(Listed.of(information, _cost(sky, rows, overhead)))
         labels.append(kind)
     tell("what is wanted")
-    wanted = [_wanted(sky, *_drawn(sky, seed + draw)[1:], colours) for draw in range(draws)]
+    wanted = [_wanted(sky, model, _drawn(sky, model, seed + draw)[1], colours) for draw in range(draws)]
     slopes, forms = (np.stack(part) for part in zip(*wanted, strict=True))
-    calset, model, _ = _drawn(sky, seed)
-    known = Likelihood.of(calset, model).priors.jacobian(model.selection())
+    known = prior_rows(model).jacobian(model.selection())
     x, y = _target_points(plan)
     repeated = len(colours) * len(plan.filters)
     return Candidates(
@@ -193,17 +195,18 @@ def _cost(
     return exposures.exptime[rows] + np.array([overhead.get(str(k), 0.0) for k in exposures.kind[rows]])
 
 
-def _drawn(plan: ObservingPlan, seed: int) -> tuple[CalibrationSet, Model, Float[np.ndarray, " n"]]:
-    """The set that a plan gives without noise, the base model, and the true values of its parameters."""
+def _drawn(plan: ObservingPlan, model: Model, seed: int) -> tuple[CalibrationSet, Float[np.ndarray, " n"]]:
+    """The set that a plan gives without noise, and the true values of the model's parameters."""
     calset, truth = simulate(plan, seed=seed, noiseless=True, steady=True)
-    model = base_model(calset, plan.design)
     there = truth_values(truth)
-    return calset, model, np.array([there[name] for name in model.names])
+    return calset, np.array([there[name] for name in model.names])
 
 
-def _information(plan: ObservingPlan, seed: int, chosen: Int[np.ndarray, " e"]) -> Float[np.ndarray, "e f f"]:
+def _information(
+    plan: ObservingPlan, model: Model, seed: int, chosen: Int[np.ndarray, " e"]
+) -> Float[np.ndarray, "e f f"]:
     """J_eᵀ J_e of chosen exposures, in the instrument that a seed draws."""
-    calset, model, values = _drawn(plan, seed)
+    calset, values = _drawn(plan, model, seed)
     likelihood = Likelihood.of(calset, model)
     jacobian = likelihood.jacobian(values)
     exposure = np.repeat(np.nonzero(likelihood.used)[1], likelihood.cameras)

@@ -56,6 +56,8 @@ _GRID = 64  # points per period of the highest harmonic: the maximum is known to
 _SPREAD = 16  # candidates of a family that a plan begins with
 _NEAR = 0.5  # of the largest variance: targets below it wait until they are among the largest
 COMPRESSED = 1e-6
+_NOTHING = 1e-9  # of the information of everything
+_HOPELESS = 1e3  # times the criterion of the best weights: some target is not determined
 _EXCHANGES = 200
 _TRIED = 60  # exchanges, most promising first, of which the first that lowers the criterion is made
 _SHARPNESS = 20  # power of the variances by which targets share the slope of an exchange
@@ -246,7 +248,9 @@ class Experiment:
             return np.einsum("na,...nm,mb->...ab", to_seen, matrices, to_seen, optimize=True)
 
         families = tuple(dataclasses.replace(f, basis=turned(f.basis)) for f in self.families)  # type: ignore[type-var]
-        return Experiment(turned(self.known), kept, families, self.budget)
+        # What a few candidates leave open is known to next to nothing instead: no target needs it, or it is found bad.
+        known = turned(self.known) + _NOTHING * np.eye(int(seen.sum()))
+        return Experiment(known, kept, families, self.budget)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -305,13 +309,7 @@ class _Some:
 
     def value(self, weight: Float[np.ndarray, " s"]) -> float:
         """The criterion f(w)."""
-        try:
-            covariance = self.covariance(weight)
-        except np.linalg.LinAlgError:
-            return np.inf
-        if np.any(np.einsum("raa->ra", covariance) <= 0):  # singular, to rounding
-            return np.inf
-        return float(self.variances(covariance).max(axis=1).mean())
+        return float(self.variances(self.covariance(weight)).max(axis=1).mean())
 
     def solve(
         self, weight: Float[np.ndarray, " s"], gap: float
@@ -535,7 +533,7 @@ def rounded(experiment: Experiment, plan: Plan, *, most: int = 8) -> Plan:
         )
     count = np.floor(plan.weight + 1e-9)
     count = _filled(some, count, plan.weight)
-    if not np.isfinite(some.value(count)):
+    if some.value(count) > _HOPELESS * plan.value:
         raise NotEstimableError(
             f"the budget, {problem.budget:g}, pays for {count.sum():.0f} of the candidates, which do not determine all "
             "targets: raise it"
