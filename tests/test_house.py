@@ -25,6 +25,7 @@ ROOMS = (
     "posterior",
     "science",
     "diagnosis",
+    "plans",
     "paper",
     "reports",
     "runs",
@@ -41,7 +42,7 @@ OWNERS = {
     "jinja2": {"reports"},
     "typer": {"cli", "commands"},
     "rich": {"cli", "commands"},
-    "tomlkit": {"cli", "model", "fit"},
+    "tomlkit": {"simulation", "cli", "model", "fit"},
 }
 # Imported by nobody: tools of the tests, and what there is no need of.
 STRANGERS = {"pandas", "elli", "beartype", "hypothesis", "pytest", "oracle", "tests"}

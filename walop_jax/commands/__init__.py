@@ -16,6 +16,7 @@ COMMANDS = (
     "clip",
     "diagnose",
     "limits",
+    "plan",
     "sample",
     "report",
     "plot",

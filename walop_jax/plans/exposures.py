@@ -55,16 +55,18 @@ class Candidates:
     """Everything that could be observed, with the information that each exposure would bring.
 
     `families` go by `labels`: a continuum of polariser angles (as 2θ, rad) for each setting, then the exposures of each
-    other KIND in the order of `plan`. `slopes` (draw, point, element, parameter) are the
-    derivatives of the matrix at the target points, `forms` (draw, point, 6, 6) the quadratic form that makes the mean
-    square error of p of them, 0 where one exposure holds no u. `truncation` is the largest relative error of the
-    information between the angles that were computed.
+    other KIND in the order of `plan`; `settings` are filter and positions of moving elements of the former. `slopes`
+    (draw, point, element, parameter) are the derivatives of the matrix at the target points, `forms`
+    (draw, point, 6, 6) the quadratic form that makes the mean square error of p of them, 0 where one exposure holds no
+    u. `truncation` is the largest error of the information between the angles that were computed, in units of the mean
+    diagonal of each parameter.
     """
 
     plan: ObservingPlan
     model: Model
     families: tuple[Family, ...]
     labels: tuple[str, ...]
+    settings: tuple[tuple[str, Mapping[str, float | None]], ...]
     x: Float[np.ndarray, " p"]
     y: Float[np.ndarray, " p"]
     slopes: Float[np.ndarray, "r p 6 f"]
@@ -122,10 +124,16 @@ def candidates(
     tell = progress or (lambda text: None)
     sky = dataclasses.replace(plan, polariser_angles=(0.0,), plate=plan.plate[:1])
     # The model of all exposures: no family by itself would free all parameters.
-    model = base_model(simulate(sky, noiseless=True, steady=True).calset, plan.design)
+    blank = simulate(sky, noiseless=True, steady=True).calset
+    model = base_model(blank, plan.design, throughput_degree=plan.throughput_degree)
     families: list[Family] = []
     labels, truncation = [], float("nan")
-    for label, there in _through_the_polariser(plan, angles):
+    settings = []
+    for setting, there in _through_the_polariser(plan, angles):
+        label = ", ".join(
+            ["clp", setting[0], *(f"{p} {'out' if a is None else f'{a:g}°'}" for p, a in setting[1].items())]
+        )
+        settings.append(setting)
         tell(f"information of {label}")
         rows = np.flatnonzero(there.exposures().kind == "clp")
         information = np.stack([_information(there, model, seed + draw, rows) for draw in range(draws)])
@@ -154,6 +162,7 @@ def candidates(
         model=model,
         families=tuple(families),
         labels=tuple(labels),
+        settings=tuple(settings),
         x=np.tile(x, repeated),
         y=np.tile(y, repeated),
         slopes=slopes,
@@ -163,18 +172,16 @@ def candidates(
     )
 
 
-def _through_the_polariser(plan: ObservingPlan, angles: int) -> Iterator[tuple[str, ObservingPlan]]:
+def _through_the_polariser(
+    plan: ObservingPlan, angles: int
+) -> Iterator[tuple[tuple[str, dict[str, float | None]], ObservingPlan]]:
     """One plan for every filter and position of the moving elements, the polariser going through half a turn."""
     turn = tuple((180.0 / angles * np.arange(angles)).tolist())
     positions = {CALIBRATION_PLATE: plan.plate, **plan.moving}
     for name in plan.filters:
         for stops in itertools.product(*positions.values()):
-            there = [
-                f"{prefix} {'out' if a is None else f'{a:g}°'}"
-                for prefix, a in zip(positions, stops, strict=True)
-            ]
             yield (
-                ", ".join(["clp", name, *there]),
+                (name, dict(zip(positions, stops, strict=True))),
                 dataclasses.replace(
                     plan,
                     polariser_angles=turn,

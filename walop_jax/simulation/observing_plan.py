@@ -35,6 +35,20 @@ def polariser_turn(count: int = 15, *, full_turn: bool = False) -> tuple[float, 
 
 
 @dataclasses.dataclass(frozen=True)
+class Stop:
+    """Exposures through the polariser at one angle (deg), `times` of them.
+
+    `plate` is the angle of the calibration plate, `moving` those of further moving elements (deg, None: out).
+    """
+
+    polariser_angle: float
+    filter: str = DEFAULT_FILTER
+    plate: float | None = None
+    moving: Mapping[str, float | None] = dataclasses.field(default_factory=dict)
+    times: int = 1
+
+
+@dataclasses.dataclass(frozen=True)
 class ObservingPlan:
     """A calibration run: where, when, through what.
 
@@ -50,6 +64,9 @@ class ObservingPlan:
     holds the positions (deg, None: out) of further moving elements by the prefix of their columns: the polariser goes
     through its angles for every combination of them, and `lamps` exposures of KIND `lamp` without it follow each
     time.
+
+    A plan may also say each exposure: `stops` are those through the polariser, in place of all combinations; `patches`
+    and `stars` the numbers, from 0, of the Moon patches and standards that are taken, in order (None: each once).
     """
 
     instrument: str | Instrument | None = None
@@ -72,6 +89,9 @@ class ObservingPlan:
     throughput_degree: int | None = None
     moving: Mapping[str, tuple[float | None, ...]] = dataclasses.field(default_factory=dict)
     lamps: int = 0
+    stops: tuple[Stop, ...] = ()
+    patches: tuple[int, ...] | None = None
+    stars: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.instrument, str):
@@ -94,6 +114,18 @@ class ObservingPlan:
             )
         for name in self.filters:
             filter_curve(name)
+        for stop in self.stops:
+            if stop.filter not in self.filters:
+                raise unknown_name("filter of a stop", stop.filter, self.filters)
+            for prefix in stop.moving:
+                if prefix not in self.moving:
+                    raise unknown_name("moving element of a stop", prefix, tuple(self.moving))
+            if stop.times < 1:
+                raise ValueError(f"a stop is taken {stop.times} times; leave it out, or take it once")
+        for name, total in (("patches", self.moon_patches), ("stars", self.standards)):
+            for number in getattr(self, name) or ():
+                if not 0 <= number < total:
+                    raise ValueError(f"{name}: there is no number {number}; they go from 0 to {total - 1}")
 
     @classmethod
     def bench(cls, tilts: int = 11) -> ObservingPlan:
@@ -127,7 +159,9 @@ class ObservingPlan:
         degree = self.design.throughput.degree if self.throughput_degree is None else self.throughput_degree
         fields |= {"instrument": self.name, "throughput_degree": degree, "moving": dict(self.moving)}
         # Named only where there are any: plans of other instruments read as they always did.
-        return {key: value for key, value in fields.items() if value or key not in ("moving", "lamps")}
+        fields["stops"] = [dataclasses.asdict(stop) for stop in self.stops]
+        later = {"moving": {}, "lamps": 0, "stops": [], "patches": None, "stars": None}
+        return {key: value for key, value in fields.items() if key not in later or value != later[key]}
 
     @property
     def site(self) -> Site:
@@ -168,6 +202,12 @@ class ObservingPlan:
 
     def _indoors(self) -> list[tuple[str, float | None, tuple[float | None, ...], float]]:
         """Filter, calibration plate, further positions, polariser angle (NaN: out) of exposures indoors."""
+        if self.stops:
+            return [
+                (s.filter, s.plate, tuple(s.moving.get(prefix) for prefix in self.moving), s.polariser_angle)
+                for s in self.stops
+                for _ in range(s.times)
+            ]
         further = list(itertools.product(*self.moving.values()))
         angles = (*self.polariser_angles, *(NAN for _ in range(self.lamps)))
         return [(f, p, m, a) for f in self.filters for p in self.plate for m in further for a in angles]
@@ -175,18 +215,21 @@ class ObservingPlan:
     def exposures(self) -> Exposures:
         """All exposures in the order in which they are taken."""
         indoors = self._indoors()
-        n_in, n_moon, n_star = len(indoors), self.moon_patches, self.standards
+        patches, stars = self._patch_numbers, self._star_numbers
+        n_in, n_moon, n_star = len(indoors), len(patches), len(stars)
         n = n_in + n_moon + n_star
-        sky_plate = [self.plate[i % len(self.plate)] for i in range(max(n_moon, n_star))]
+        # Where every exposure is said, those of the sky are taken with the plate at its first setting.
+        settings = 1 if self.stops else len(self.plate)
+        sky_plate = [self.plate[i % settings] for i in range(max(n_moon, n_star))]
         plate = [p for _, p, _, _ in indoors] + sky_plate[:n_moon] + sky_plate[:n_star]
         angle = np.array([a for _, _, _, a in indoors] + [NAN] * (n_moon + n_star), float)
         mjd = self.start + _SPACING * (np.arange(n) - n_in)
         moon, star = slice(n_in, n_in + n_moon), slice(n_in + n_moon, n)
         ra, dec, rotator = np.full((3, n), NAN)
         if n_moon:
-            ra[moon], dec[moon] = self._patches(mjd[moon])
-        rotator[moon] = [_MOON_ROTATOR[i % 4] for i in range(n_moon)]
-        rotator[star] = [_STAR_ROTATOR[i % 4] for i in range(n_star)]
+            ra[moon], dec[moon] = self._patches(mjd[moon], patches)
+        rotator[moon] = [_MOON_ROTATOR[i % 4] for i in patches]
+        rotator[star] = [_STAR_ROTATOR[i % 4] for i in stars]
         # Pointings that the plan does not fix are spread over ±3 h, out of step with the polariser.
         ha = 6.0 * np.mod(np.arange(n) * _GOLDEN, 1.0) - 3.0
         if n_moon or n_star:
@@ -223,11 +266,19 @@ class ObservingPlan:
             found[prefix] = Position(np.isfinite(angle), angle)
         return found
 
+    @property
+    def _patch_numbers(self) -> tuple[int, ...]:
+        return tuple(range(self.moon_patches)) if self.patches is None else self.patches
+
+    @property
+    def _star_numbers(self) -> tuple[int, ...]:
+        return tuple(range(self.standards)) if self.stars is None else self.stars
+
     def _patches(
-        self, mjd: Float[np.ndarray, " m"]
+        self, mjd: Float[np.ndarray, " m"], numbers: tuple[int, ...]
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Field centres (deg) around the Moon: separations and position angles spread evenly."""
-        order, (near, far) = np.arange(len(mjd)), self.separations
+        order, (near, far) = np.array(numbers), self.separations
         separation = near + (far - near) * np.mod(0.5 + order * _GOLDEN, 1.0)
         return offset_direction(*moon_direction(mjd, self.site), 360.0 * _GOLDEN * order, separation)
 
@@ -236,7 +287,8 @@ class ObservingPlan:
         exposures, points = self.exposures(), self.points()
         on_star = np.arange(len(points)) >= len(points) - (self.standard_grid**2 if self.standards else 0)
         used = on_star[:, None] == (exposures.kind == "standard")
-        star = np.where(exposures.kind == "standard", np.cumsum(exposures.kind == "standard") - 1, -1)
+        star = np.full(len(exposures), -1)
+        star[exposures.kind == "standard"] = self._star_numbers
         return used, np.where(used, star, -1)
 
     def context(self) -> Context:

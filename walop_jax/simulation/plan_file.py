@@ -7,24 +7,33 @@ full_turn = true                  # those over a full one
 plate = ["out", 0, 45]
 filters = ["SDSS-r", "NB-660"]
 electrons = 5e5
+
+[[stops]]                         # each exposure through the polariser, in place of all combinations
+polariser_angle = 33.75
+plate = "out"
+times = 4
 """
 
 from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import tomlkit
 
 from walop_jax.io.errors import errors_naming, fail
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import unknown_name
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.observing_plan import ObservingPlan, Stop, polariser_turn
 
 OUT = "out"
 _ANGLES = len(polariser_turn())
 FULL_TURN = "full_turn"
+_STOP = tuple(field.name for field in dataclasses.fields(Stop))
 _KNOWN = (*(field.name for field in dataclasses.fields(ObservingPlan)), FULL_TURN)
 
 
@@ -56,8 +65,14 @@ def read_plan(
             raise ValueError(
                 f"{FULL_TURN} is of no use beside a list of angles; give their number, or leave it out"
             )
+        stops = content.pop("stops", [])
         values = {name: _value(value) for name, value in content.items()}
+        for stop in stops:
+            for name in stop:
+                if name not in _STOP:
+                    raise unknown_name("entry of a stop", name, _STOP)
         try:
+            values["stops"] = tuple(Stop(**_value(stop)) for stop in stops)
             return ObservingPlan(None if instrument is None else Instrument.read(instrument), **values)
         except TypeError as error:  # text where a number belongs
             raise fail(str(error), advice="see `walop-jax docs files` for a plan") from None
@@ -70,3 +85,22 @@ def _value(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _value(one) for name, one in value.items()}
     return None if value == OUT else value
+
+
+def plan_text(plan: ObservingPlan) -> str:
+    """A plan as the text of a file that `read_plan` reads.
+
+    An instrument of one's own goes by its name: set `instrument` to its description file.
+    """
+    return tomlkit.dumps(
+        {name: _written(value) for name, value in plan.document().items() if value is not None}
+    )
+
+
+def _written(value: Any) -> Any:
+    """Lists and tables as TOML has them, OUT for what is out."""
+    if isinstance(value, Mapping):
+        return {name: _written(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_written(one) for one in value]
+    return OUT if value is None else value
