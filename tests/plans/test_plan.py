@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import refit
@@ -18,7 +19,9 @@ from walop_jax.simulation.plan_file import plan_text, read_plan
 from walop_jax.simulation.simulate import simulate
 
 ANGLES = 181
-SMALL = ObservingPlan(grid=4, standard_grid=2, moon_patches=3, standards=2, unpolarised=1, throughput_degree=2)
+SMALL = ObservingPlan(
+    grid=4, standard_grid=2, moon_patches=3, standards=2, unpolarised=1, throughput_degree=2
+)
 
 
 @pytest.fixture(scope="module")
