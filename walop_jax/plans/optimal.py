@@ -254,12 +254,11 @@ class Experiment:
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
-    """A plan: weights of candidates, its criterion, and the least that any plan of this budget can have.
+class Allocation:
+    """How often each candidate is done: weights of candidates, its criterion, and the least that any plan of this budget can have.
 
     `family` (number of the family), `place` (its coordinates there) and `weight` are one for each candidate in it.
-    `bound` ≤ the criterion of every plan; `gap` = value / bound − 1 is proven. `gain` is d_i B / Σ w d for every
-    candidate of the plan: 1 where a plan is optimal.
+    `bound` ≤ the criterion of every plan.
     """
 
     family: Int[np.ndarray, " s"]
@@ -396,8 +395,6 @@ class _Some:
             hessian[s:, s:] += np.diag(stiff.sum(axis=1))
             step = _on_the_budget(hessian, gradient, np.append(self.costs, np.zeros(r)))
             decrement = float(-gradient @ step)
-            if decrement < 1e-9 * max(mu, 1e-300) * (s + r):
-                break
             here, length = self._barrier(weight, level, mu), 1.0
             while length > 1e-10:
                 new = weight + length * step[:s], level + length * step[s:]
@@ -436,12 +433,12 @@ def optimise(
     gap: float = GAP,
     most: int = 8,
     progress: Callable[[str], None] | None = None,
-) -> Plan:
+) -> Allocation:
     """The plan with the least criterion, to a proven relative `gap`, and the proof.
 
     At most `most` candidates of each family join in a round; `progress` is told value, bound and gap of every round.
     Raises NotEstimableError for a target that nothing informs about, ValueError for a budget that is not positive. The
-    gap that was reached is `Plan.gap`: larger than asked for only if rounding errors end the search.
+    gap that was reached is `Allocation.gap`: larger than asked for only if rounding errors end the search.
     """
     if not experiment.budget > 0:
         raise ValueError(f"the budget is {experiment.budget:g}: nothing can be done with it")
@@ -482,9 +479,11 @@ def _same(one: tuple[int, Float[np.ndarray, " d"]], other: tuple[int, Float[np.n
     return one[0] == other[0] and bool(np.allclose(one[1], other[1], atol=1e-9, rtol=0.0))
 
 
-def _plan(some: _Some, weight: Float[np.ndarray, " s"], value: float, bound: float, rounds: int) -> Plan:
+def _plan(
+    some: _Some, weight: Float[np.ndarray, " s"], value: float, bound: float, rounds: int
+) -> Allocation:
     used = np.flatnonzero(weight * some.costs > _LEAST_WEIGHT * some.experiment.budget)
-    return Plan(
+    return Allocation(
         np.array([some.chosen[i][0] for i in used]),
         [some.chosen[i][1] for i in used],
         weight[used],
@@ -518,7 +517,7 @@ def lower_bound(
     return here**2 / (known + experiment.budget * ratio), tops
 
 
-def rounded(experiment: Experiment, plan: Plan, *, most: int = 8) -> Plan:
+def rounded(experiment: Experiment, plan: Allocation, *, most: int = 8) -> Allocation:
     """A plan of whole numbers within the budget, and its proven distance from the best plan of any weights.
 
     Weights are rounded down, what is left of the budget goes where it lowers the criterion most for its cost, then
@@ -543,7 +542,7 @@ def rounded(experiment: Experiment, plan: Plan, *, most: int = 8) -> Plan:
         if not better:
             break
     used = np.flatnonzero(count)
-    return Plan(
+    return Allocation(
         np.array([some.chosen[i][0] for i in used]),
         [some.chosen[i][1] for i in used],
         count[used],

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.io.display import Display, Displayed
 from walop_jax.plans.exposures import Candidates, candidates
-from walop_jax.plans.optimal import GAP, Experiment, Listed, Plan, optimise, rounded
+from walop_jax.plans.optimal import GAP, Experiment, Listed, Allocation, optimise, rounded
 from walop_jax.science.star_errors import GOAL
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, polariser_turn
 
@@ -206,7 +206,7 @@ def _information_of(known: Calibration, found: Candidates) -> Float[np.ndarray, 
     return whole
 
 
-def _total(experiment: Experiment, plan: Plan) -> Float[np.ndarray, "r n n"]:
+def _total(experiment: Experiment, plan: Allocation) -> Float[np.ndarray, "r n n"]:
     """M of a plan in every draw."""
     total = experiment.known.copy()
     for number, place, weight in zip(plan.family, plan.place, plan.weight, strict=True):
@@ -232,7 +232,12 @@ def _criterion(experiment: Experiment, total: Float[np.ndarray, "r n n"]) -> flo
 
 
 def _finished(
-    could: ObservingPlan, found: Candidates, experiment: Experiment, weights: Plan, best: Plan, minutes: float
+    could: ObservingPlan,
+    found: Candidates,
+    experiment: Experiment,
+    weights: Allocation,
+    best: Allocation,
+    minutes: float,
 ) -> ExposurePlan:
     total = _total(experiment, best)
     lines = tuple(_lines(could, found, experiment, best, total))
@@ -272,7 +277,7 @@ def _lines(
     could: ObservingPlan,
     found: Candidates,
     experiment: Experiment,
-    best: Plan,
+    best: Allocation,
     total: Float[np.ndarray, "r n n"],
 ) -> Iterator[PlannedExposure]:
     """The exposures in order: setting by setting, the polariser turning one way, then the sky."""
@@ -301,7 +306,7 @@ def _beside(found: Candidates, experiment: Experiment) -> Iterator[tuple[str, fl
     def error(weight: Mapping[tuple[int, float], float]) -> float:
         costs = {key: float(experiment.families[key[0]].cost_at(np.array([[key[1]]]))[0]) for key in weight}
         share = experiment.budget / sum(w * costs[key] for key, w in weight.items())
-        plan = Plan(
+        plan = Allocation(
             np.array([key[0] for key in weight]),
             [np.array([key[1]]) for key in weight],
             np.array([share * w for w in weight.values()]),
