@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from walop_jax.plans.families import Circle, Listed
 from walop_jax.plans.optimal import (
-    Circle,
     Experiment,
-    Listed,
     NotEstimableError,
     lower_bound,
     optimise,

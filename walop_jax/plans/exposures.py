@@ -32,7 +32,8 @@ from walop_jax.fit.model_builder import base_model
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.priors import prior_rows
 from walop_jax.model.specification import Model
-from walop_jax.plans.optimal import Circle, Experiment, Family, Listed
+from walop_jax.plans.families import Circle, Family, Listed
+from walop_jax.plans.optimal import Experiment
 from walop_jax.science.star_errors import sample_stars
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate, truth_values

@@ -17,7 +17,8 @@ from jaxtyping import Float
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.io.display import Display, Displayed
 from walop_jax.plans.exposures import Candidates, candidates
-from walop_jax.plans.optimal import GAP, Experiment, Listed, Allocation, optimise, rounded
+from walop_jax.plans.families import Listed
+from walop_jax.plans.optimal import GAP, Allocation, Experiment, optimise, rounded
 from walop_jax.science.star_errors import GOAL
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, polariser_turn
 
