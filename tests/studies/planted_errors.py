@@ -167,6 +167,9 @@ ERRORS = (
             "(s * (1 - t), 1, 0), ((1 - s) * t, 0, 1)", "paper/test_polynomial.py"),
     # runs and command line
     planted("commands/refit.py", "            if result.converged:", "            if True:", "cli/test_commands.py"),
+    # plans
+    planted("plans/optimal.py", "return here**2 / (known", "return here**2 / (0.0 * known", "plans/test_optimal.py"),
+    planted("plans/families.py", "- 1j * series[2::2]", "+ 1j * series[2::2]", "plans/test_optimal.py"),
 )  # fmt: skip
 
 
