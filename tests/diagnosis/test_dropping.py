@@ -108,6 +108,13 @@ def test_what_has_no_name_is_asked_of_the_model_without_needless_names():
     assert (nameless, judge.steps, state.table.p_global) == (None, [], 1.0)
 
 
+def test_when_time_is_over_nothing_further_is_tried():
+    judge = Rehearsal()
+    judge.until, judge.ended = 0.0, False
+    assert not judge.time_left()
+    assert judge.ended
+
+
 @pytest.mark.long
 def test_after_a_drop_several_steps_follow_one_another():
     effects = [dataclasses.replace(WOBBLE(), amplitude=3.0), dataclasses.replace(LEAKAGE(), share=1e-3)]

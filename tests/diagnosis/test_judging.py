@@ -148,13 +148,14 @@ def test_every_block_of_the_free_form_term_answers_to_a_stratum(leaking):
 
 
 def test_many_names_and_weak_errors_call_for_caution():
-    def caution(*steps, far=None):
+    def caution(*steps, far=None, ended=False):
         named = [SimpleNamespace(effect=name, robust_ratio=ratio, far=far or {}) for name, ratio in steps]
         after = SimpleNamespace(calset=SimpleNamespace(points=range(9)))
-        known = SimpleNamespace(steps=named, after=after, points=9, policy=POLICY, ended=False)
+        known = SimpleNamespace(steps=named, after=after, points=9, policy=POLICY, ended=ended)
         return Diagnosis.caution.fget(known)
 
     assert caution() == caution(("a", 1.1), ("b", float("nan"))) == ""
+    assert "ended after 20 minutes" in caution(ended=True)
     assert "3 names" in caution(*((name, 1.0) for name in "abc"))
     assert "errors of a" in caution(("a", 2.0))
     assert "a.angle (6 widths)" in caution(("a", 1.0), far={"angle": 6.1})

@@ -1,0 +1,94 @@
+"""The search itself, on candidates that are plain columns: what is fitted, what is added, and when it stops."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from walop_jax.diagnosis.effect_columns import Probe
+from walop_jax.diagnosis.examination import Evidence
+from walop_jax.diagnosis.policy import POLICY
+from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace
+from walop_jax.diagnosis.search import Linear, search
+from walop_jax.model.effects import Context, effect_by_name
+
+ROWS, PATTERN = 400, "a pattern without a name"
+NAMES = ("clp_zero", "rotator_zero", "lens_birefringence")
+SHARED = 0.97  # cosine between the first two names
+
+
+def evidence(amplitudes, seed=1):
+    """Two names that are much alike, a third one and a pattern beside a base of two parameters."""
+    rng = np.random.default_rng(seed)
+    base, columns = rng.standard_normal((ROWS, 2)), rng.standard_normal((ROWS, 4))
+    columns /= np.linalg.norm(columns, axis=0)
+    columns[:, 1] = SHARED * columns[:, 0] + np.sqrt(1.0 - SHARED**2) * columns[:, 1]
+    residual = rng.standard_normal(ROWS) - columns[:, : len(amplitudes)] @ amplitudes
+    projector = Projector(base)
+    residual = projector(residual)
+    columns = np.asfortranarray(columns)
+    space = ScoreSpace.projected(projector, [*NAMES, PATTERN], [np.full(1, 10.0)] * 4, columns)
+    scorer = Scorer(space, np.random.default_rng(0))
+    scores, square = columns.T @ residual, float(residual @ residual)
+    kinds = [effect_by_name(name) for name in NAMES]
+    return Evidence(
+        scorer=scorer,
+        scores=scores,
+        square=square,
+        table=scorer(scores, square),
+        probes=[Probe(k.name, k, (dataclasses.replace(k.neutral(Context())),)) for k in kinds],
+        sentences=(),
+        parts=(),
+        patterns=[PATTERN],
+        chi2=square,
+        dof=space.free,
+    )
+
+
+class Counting(Linear):
+    """A judge that counts its fits; `surprise` is by how much the fit of a name is better than its linear step."""
+
+    def __init__(self, surprise=None):
+        self.fits, self.surprise = [], surprise or {}
+
+    def fitted(self, state, trial):
+        self.fits.append(trial.effect.name)
+        more = self.surprise.get(trial.effect.name, 0.0)
+        noise = trial.noise if not self.surprise else False
+        return dataclasses.replace(trial, evidence=trial.linear + more, noise=noise)
+
+
+def names(state, judge):
+    return [trial.effect.name for trial, _, _ in search(state, judge, POLICY)]
+
+
+def test_nothing_is_tried_where_nothing_is_missing():
+    judge = Counting()
+    assert names(evidence([0.0]), judge) == judge.fits == []
+
+
+def test_a_name_that_leaves_noise_is_the_only_one_that_is_fitted():
+    judge = Counting()
+    assert names(evidence([14.0]), judge) == ["clp_zero"]
+    assert judge.fits == ["clp_zero"]
+
+
+@pytest.mark.parametrize(("surprise", "expected"), [(0.5, "clp_zero"), (10.0, "rotator_zero")])
+def test_a_fit_that_disagrees_with_its_linear_step_lets_the_next_rival_be_fitted(surprise, expected):
+    """The leader turns out worse than thought by as much as the rival turns out better."""
+    judge = Counting({"clp_zero": -surprise, "rotator_zero": surprise})
+    assert names(evidence([14.0]), judge)[0] == expected
+    assert ("rotator_zero" in judge.fits) == (surprise > POLICY.linear_good)
+
+
+def test_two_effects_are_found_one_after_the_other():
+    assert sorted(names(evidence([14.0, 0.0, 12.0]), Linear())) == ["clp_zero", "lens_birefringence"]
+
+
+def test_what_a_pattern_explains_better_is_not_given_a_name():
+    assert names(evidence([0.0, 0.0, 4.0, 30.0]), Linear()) in ([], ["lens_birefringence"])
+
+
+def test_the_search_ends_with_its_policy():
+    short = dataclasses.replace(POLICY, most_steps=1)
+    assert len(list(search(evidence([14.0, 0.0, 12.0]), Linear(), short))) == 1
