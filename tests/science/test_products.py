@@ -8,7 +8,6 @@ import json
 import numpy as np
 import pytest
 from astropy.io import fits
-from scipy import stats
 from small_run import SMALL
 from typer.testing import CliRunner
 from walop_jax.cli.app import app
@@ -21,7 +20,6 @@ from walop_jax.data import write_calibration_set
 from walop_jax.fit.model_builder import model_for
 from walop_jax.fit.refit import refit
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.science.chance import chi2_tail
 from walop_jax.science.epoch import chi2_of_change, epoch, fit_like
 from walop_jax.simulation.simulate import simulate
 
@@ -115,11 +113,6 @@ def test_certify_from_the_command_line(product, tmp_path):
 
 
 # ------------------------------------------------------------------------------------------------- epochs
-
-
-def test_tail_of_chi2_by_scipy():
-    for value, dof in ((1.0, 1), (30.0, 20), (120.0, 70), (0.0, 3)):
-        assert chi2_tail(value, dof) == pytest.approx(stats.chi2.sf(value, dof), rel=1e-10)
 
 
 def test_departure_by_hand():

@@ -53,6 +53,8 @@ class Quality(enum.IntFlag):
     DOUBTED = 32768
     ERRORS_TOO_LARGE = 65536
     DISAGREES = 131072
+    UNKNOWN_COLOUR = 262144
+    CATALOGUE = 524288
 
     @property
     def meanings(self) -> tuple[str, ...]:
@@ -78,6 +80,8 @@ _MEANINGS = {
     Quality.DOUBTED: "the residuals hold more than noise, or differ between parts of the data",
     Quality.ERRORS_TOO_LARGE: "the stated errors are far larger than the scatter of the data",
     Quality.DISAGREES: "the intensities disagree with the calibration by more than noise",
+    Quality.UNKNOWN_COLOUR: "no TEFF, and the colour is most of the error",
+    Quality.CATALOGUE: "the stars of the catalogue together say that calibration or errors do not hold",
     Quality.NO_STOKES: "no Stokes parameters: too few cameras, too little light, or no u in the rows there are",
 }
 

@@ -7,13 +7,13 @@ is in the catalogue.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import special
 
 from walop_jax.calibration.analysis_vectors import COLOURS, AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
@@ -21,18 +21,16 @@ from walop_jax.calibration.colour import COOLEST, colour_weights
 from walop_jax.calibration.records import Quality
 from walop_jax.data.catalogue import Catalogue
 from walop_jax.data.settings import Settings
-from walop_jax.io.errors import DataError
+from walop_jax.io.errors import DataError, rows_text
 from walop_jax.likelihood import limits
 from walop_jax.model import carried, light
 from walop_jax.model.parameters import with_values
-from walop_jax.science.chance import chi2_tail
 from walop_jax.science.estimate import calibration_shift, estimate_with
-from walop_jax.science.validity import check_validity
 
 MOST_SETTINGS = 200
 ILL_POSED = 10.0  # ratio of the errors of the two principal directions from which FLAG 16 is set
 COOL, HOT = 3500.0, 10000.0
-"""Colour temperatures (K) between which stars without TEFF are taken to lie."""
+"""Colour temperatures (K) between which 95 % of the stars without TEFF are taken to lie, normal in 1/T."""
 _ROUNDS = 16
 IMPROBABLE = 1e-6
 """Probability of a CHI2 as large below which FLAG 131072 is set, …"""
@@ -44,15 +42,17 @@ ROUGH = 0.005
 class Stars:
     """Stokes parameters of the stars of a catalogue, in the order of `Catalogue.star`.
 
-    On the sky (equatorial frame) where the catalogue has a ROTATOR, in the instrument frame elsewhere;
-    `covariance` is `photon` plus `calibration`. `colour` is the error of (q, u) if the colour of the star were
-    ignored; where TEFF is not known, half the difference between stars of 3500 K and 10 000 K, which is not
-    in the covariance. `flag` holds bits of `Quality`; `rows` counts the rows of a star.
+    On the sky (equatorial frame) where the catalogue has a ROTATOR, in the instrument frame elsewhere. `covariance`
+    is the sum of `photon`, `calibration` (parameters of the optics and of the detectors) and `spectrum`: a star
+    without TEFF has the colour of a population (`COOL`, `HOT`). `colour` is the error of (q, u) if TEFF were ignored;
+    without TEFF, half the difference between stars of 3500 K and 10 000 K. `flag` holds bits of `Quality`; `rows`
+    counts the rows of a star.
     """
 
     qu: Float[np.ndarray, "s 2"]
     photon: Float[np.ndarray, "s 2 2"]
     calibration: Float[np.ndarray, "s 2 2"]
+    spectrum: Float[np.ndarray, "s 2 2"]
     colour: Float[np.ndarray, "s 2"]
     chi2: Float[np.ndarray, " s"]
     dof: Int[np.ndarray, " s"]
@@ -61,8 +61,8 @@ class Stars:
 
     @property
     def covariance(self) -> Float[np.ndarray, "s 2 2"]:
-        """Covariance of (q, u), photons and calibration together."""
-        return self.photon + self.calibration
+        """Covariance of (q, u), all causes together."""
+        return self.photon + self.calibration + self.spectrum
 
 
 def apply(
@@ -140,31 +140,48 @@ def _stars_of_rows(
         local = vectors.derivatives(settings[k], x[here], y[here], teff[here])
         plain, throughput = (found.gain[here] @ np.einsum("rs,rksf->rkf", s[here], part) for part in local)
         derivative[here] = vectors.to_parameters(plain, throughput, x[here], y[here])
+    for p, change in _detector_slopes(vectors, counts):
+        lit = np.where(found.flux > 0, found.flux, np.inf)
+        derivative[..., p] -= np.einsum("rik,rk->ri", found.gain, np.nan_to_num(change) / lit[:, None])
     if slope.any():
         dq, du = 2.0 * s[:, 2], -2.0 * s[:, 1]  # (q + iu) exp(−2i R) grows by −2i (q + iu) dR
         turned = np.where(sky[:, None], there[..., 1] * dq[:, None] + there[..., 2] * du[:, None], 0.0)
         derivative += (found.gain @ turned[..., None]) * slope
     root = np.add.reduceat(-derivative, first) @ vectors.root
-    colour = np.einsum("rc,rcks,rs->rk", _ignored_colour(teff), spectra, s, optimize=True)
-    shift = calibration_shift(found.gain, colour[..., None], star)[..., 0]
+
+    def shift(weights: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "s 2"]:
+        change = np.einsum("rc,rcks,rs->rk", weights, spectra, s, optimize=True)
+        return calibration_shift(found.gain, change[..., None], star)[..., 0]
+
+    calibration = root @ root.swapaxes(1, 2)
+    spectrum, dominant = np.zeros_like(calibration), np.zeros(len(first), bool)
+    if np.isnan(teff).any():
+        mean, width = (shift(weights) for weights in _unknown_colour(teff))
+        spectrum = mean[:, :, None] * mean[:, None] + width[:, :, None] * width[:, None]
+        dominant = np.trace(spectrum, axis1=1, axis2=2) > np.trace(
+            found.photon + calibration, axis1=1, axis2=2
+        )
+    flag = _flags(
+        vectors,
+        catalogue,
+        rows,
+        used,
+        first,
+        found.qu,
+        found.condition,
+        _disagree(found.chi2, found.dof, np.maximum.reduceat(_brightness(used, sigma), first)),
+    )
+    flag[dominant] |= Quality.UNKNOWN_COLOUR
     return Stars(
         qu=found.qu,
         photon=found.photon,
-        calibration=root @ root.swapaxes(1, 2),
-        colour=shift,
+        calibration=calibration,
+        spectrum=spectrum,
+        colour=shift(_ignored_colour(teff)),
         chi2=found.chi2,
         dof=found.dof,
         rows=np.diff(first, append=len(rows)),
-        flag=_flags(
-            vectors,
-            catalogue,
-            rows,
-            used,
-            first,
-            found.qu,
-            found.condition,
-            _disagree(found.chi2, found.dof, np.maximum.reduceat(_brightness(used, sigma), first)),
-        ),
+        flag=flag,
     )
 
 
@@ -210,7 +227,46 @@ def _ignored_colour(teff: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r c"]:
     return np.where(np.isnan(teff)[:, None], half, flat - colour_weights(teff, COLOURS))
 
 
+def _unknown_colour(
+    teff: Float[np.ndarray, " r"],
+) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "r c"]]:
+    """Mixtures of spectra: mean of the stars without TEFF less the flat one, and their standard deviation.
+
+    The effect of the colour is close to linear in 1/T, in which `COOL` and `HOT` lie two deviations from the mean. Rows
+    with TEFF have weight 0.
+    """
+    unknown = np.isnan(teff)[:, None]
+    hot, cool = colour_weights(np.array([HOT, COOL]), COLOURS)
+    flat = colour_weights(np.array([np.nan]), COLOURS)[0]
+    return np.where(unknown, 0.5 * (hot + cool) - flat, 0.0), np.where(unknown, 0.25 * (cool - hot), 0.0)
+
+
 # ------------------------------------------------------------------------------------- settings and flags
+
+
+def check_validity(calibration: Calibration, settings: Settings) -> None:
+    """Raise `DataError`, with column and rows, for settings that the exposures of a calibration do not cover.
+
+    Settings are filter and temperature. Dates are no bound: every science exposure lies outside those of the
+    calibration; later exposures say whether it still holds (`epoch`, `watch`).
+    """
+    beyond = calibration.beyond_settings(settings)
+    if not beyond.any():
+        return
+    seen = np.unique(calibration.exposures.filter)
+    other = ~np.isin(settings.filter, seen)
+    if other.any():
+        column, rows = "FILTER", other
+        names = ", ".join(np.unique(settings.filter[other]))
+        what = f"{names}; the calibration was made in {', '.join(seen)}"
+    else:
+        column, rows = "TEMP", beyond
+        low, high = np.nanmin(calibration.exposures.temp), np.nanmax(calibration.exposures.temp)
+        what = f"the calibration was made between {low:.1f} and {high:.1f} Celsius"
+    raise DataError(
+        f"{column}: {rows_text(np.flatnonzero(rows))}: {what}; apply a calibration that covers them, or --force "
+        "(force=True): FLAG 2048 marks these stars then"
+    )
 
 
 def _settings(vectors: AnalysisVectors, catalogue: Catalogue) -> tuple[list[Settings], Int[np.ndarray, " n"]]:
@@ -229,16 +285,6 @@ def _settings(vectors: AnalysisVectors, catalogue: Catalogue) -> tuple[list[Sett
     return [setting for setting, _ in found], of
 
 
-@functools.cache
-def improbable_chi2(dof: int) -> float:
-    """The χ² that noise alone exceeds with the probability `IMPROBABLE`."""
-    low, high = float(dof), dof + 60.0 + 20.0 * np.sqrt(dof)
-    while high - low > 1e-6 * high:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if chi2_tail(middle, dof) > IMPROBABLE else (low, middle)
-    return high
-
-
 def _brightness(counts: Float[np.ndarray, "r k"], sigma: Float[np.ndarray, "r k"]) -> Float[np.ndarray, " r"]:
     """Largest signal-to-noise ratio of a camera in every row; 0 where there is none."""
     good = np.isfinite(counts) & np.isfinite(sigma) & (sigma > 0)
@@ -252,7 +298,7 @@ def _disagree(
     found = np.zeros(len(chi2), bool)
     chi2 = chi2 / (1.0 + (ROUGH * brightness) ** 2)
     for k in np.unique(dof[dof > 0]).tolist():
-        found |= (dof == k) & (chi2 > improbable_chi2(k))
+        found |= (dof == k) & (chi2 > special.chdtri(k, IMPROBABLE))
     return found
 
 
@@ -294,6 +340,32 @@ def linearised(calibration: Calibration, counts: Float[np.ndarray, "n k"]) -> Fl
     for _ in range(_ROUNDS):
         true = true + (counts - np.asarray(carried.reported(instrument, jnp.asarray(true))))
     return true
+
+
+def _detector_slopes(
+    vectors: AnalysisVectors, counts: Float[np.ndarray, "r k"]
+) -> Iterator[tuple[int, Float[np.ndarray, "r k"]]]:
+    """Positions in `vectors.parameters` of those of the detectors, and d(linearised counts)/d(parameter).
+
+    `counts` are linearised. From reported(N, θ) = what was measured: dN/dθ = −(∂reported/∂θ) / (∂reported/∂N).
+    """
+    calibration = vectors.calibration
+    template, values = calibration.model.template, jnp.asarray(calibration.values)
+    if light.is_linear(vectors.instrument):
+        return
+    to_instrument = with_values(template)
+
+    def reported(values: jax.Array, counts: jax.Array) -> jax.Array:
+        return carried.reported(to_instrument(values), counts)
+
+    probe = jnp.full((1, counts.shape[1]), 1e6)
+    known = np.abs(np.asarray(jax.jacfwd(reported)(values, probe))).max(axis=(0, 1)) > 0
+    true = jnp.asarray(np.nan_to_num(counts))
+    _, slope = jax.jvp(lambda c: reported(values, c), (true,), (jnp.ones_like(true),))
+    for place in np.flatnonzero(known[vectors.parameters]):
+        along = jnp.zeros_like(values).at[vectors.parameters[place]].set(1.0)
+        _, change = jax.jvp(lambda v: reported(v, true), (values,), (along,))
+        yield int(place), -np.asarray(change / slope)
 
 
 def _rotator_zero(vectors: AnalysisVectors) -> tuple[float, Float[np.ndarray, " n"]]:

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy import special
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
@@ -30,7 +31,6 @@ from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.rounding import probability, two_digits, value_and_error, with_minus_sign
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import Model
-from walop_jax.science.chance import chi2_tail
 from walop_jax.science.star_errors import determinant, joint_errors, sample_stars, statistics
 
 CHANCE = 0.01
@@ -147,7 +147,7 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
         for n, i, j, d, s in zip(names, a, b, change, error, strict=True)
         if s > 0
     ]
-    p_value = chi2_tail(test, directions)
+    p_value = float(special.chdtrc(directions, test))
     return Epoch(
         fits=p_value > CHANCE,
         p_value=p_value,
