@@ -248,12 +248,12 @@ def test_errors_hold_the_colour_that_is_not_known(vectors, calibration, tmp_path
     """Stars of which 95 % lie between 3500 and 10 000 K, without TEFF: pulls of unit width."""
     rng = np.random.default_rng(12)
     low, high = 1 / HOT, 1 / COOL
-    teff = 1.0 / np.clip(rng.normal(0.5 * (low + high), 0.25 * (high - low), 400), 3e-5, 1 / 2500.0)
-    table, qu = stars(vectors, 400, flux=1e10)  # colour is all that matters
+    teff = 1.0 / np.clip(rng.normal(0.5 * (low + high), 0.25 * (high - low), 2000), 3e-5, 1 / 2500.0)
+    table, qu = stars(vectors, 2000, flux=1e10)  # colour is all that matters
     x, y = np.array(table["X"]), np.array(table["Y"])
     spectra = vectors.at(setting(), x, y)
     a = np.einsum("pc,pcks->pks", colour_weights(teff, COLOURS), spectra)
-    table["N"] = 1e10 * np.einsum("pks,ps->pk", a, np.column_stack([np.ones(400), qu]))
+    table["N"] = 1e10 * np.einsum("pks,ps->pk", a, np.column_stack([np.ones(2000), qu]))
     table["N_ERR"] = np.sqrt(table["N"])
     table["TEFF"] = teff
     known = apply(calibration, read(table, tmp_path))
@@ -495,3 +495,101 @@ def test_intensities_that_no_star_makes_are_flagged(vectors, calibration, tmp_pa
     table["N"][1, 2] *= 1.1
     found = apply(calibration, read(table, tmp_path))
     assert (found.flag & Quality.DISAGREES > 0).tolist() == [False, True, False, False]
+
+
+# ------------------------------------------------------------------------------------- the catalogue as a whole
+
+
+def noisy(vectors, tmp_path, seed=5, count=600, **options):
+    return stars(vectors, count, np.random.default_rng(seed), teff=5500.0, **options)
+
+
+def pulls(found, qu):
+    """Root mean square of q and u off, in stated errors."""
+    return np.sqrt(np.mean((found.qu - qu) ** 2 / np.einsum("sii->si", found.covariance), axis=0))
+
+
+@pytest.mark.parametrize(("factor", "words"), [(0.1, "times too small"), (5.0, "times too large")])
+def test_errors_that_are_not_those_of_the_counts_are_said_and_mended(
+    vectors, calibration, tmp_path, factor, words
+):
+    table, qu = noisy(vectors, tmp_path)
+    table["N_ERR"] *= factor
+    found = apply(calibration, read(table, tmp_path))
+    assert any(
+        f"N_ERR is {1 / factor if factor < 1 else factor:.2g}"[:8] in w and words in w
+        for w in found.check.warnings()
+    )
+    np.testing.assert_allclose(pulls(found, qu), 1.0, atol=0.12)
+    assert np.all(found.flag & Quality.CATALOGUE)
+
+
+def test_quiet_catalogues_say_nothing(vectors, calibration, tmp_path):
+    """Noise alone, bright stars with the error of the calibration, stars without TEFF, and thirty variable ones."""
+    table, _ = noisy(vectors, tmp_path)
+    quiet = apply(calibration, read(table, tmp_path))
+    assert quiet.check.holds
+    assert not np.any(quiet.flag & Quality.CATALOGUE)
+    assert 2e-4 < quiet.check.smallest < 2e-3
+    table["N"][:30, 0] *= 1.0 + 0.2 * np.random.default_rng(1).standard_normal(30)
+    assert apply(calibration, read(table, tmp_path)).check.holds
+    del table["TEFF"]
+    assert apply(calibration, read(table, tmp_path)).check.holds
+    values = calibration.values + np.linalg.cholesky(
+        calibration.covariance + 1e-24 * np.eye(len(calibration.values))
+    ) @ np.random.default_rng(3).standard_normal(len(calibration.values))
+    truth = AnalysisVectors(dataclasses.replace(calibration, values=values))
+    bright, _ = stars(truth, 400, np.random.default_rng(2), flux=4e8, plate=(None, 22.5))
+    assert apply(calibration, read(bright, tmp_path)).check.holds
+
+
+@pytest.mark.parametrize("camera", range(4))
+@pytest.mark.parametrize("gain", [0.01, 0.003])
+def test_a_camera_that_has_become_brighter_is_said(vectors, calibration, tmp_path, camera, gain):
+    """With its size, among the cameras that such rows cannot tell apart; errors hold what it does to q and u."""
+    table, qu = noisy(vectors, tmp_path, seed=camera)
+    table["N"][:, camera] *= 1.0 + gain
+    found = apply(calibration, read(table, tmp_path))
+    (change,) = found.check.changes
+    named = {entry.question.camera: entry for entry in change.alike if entry.question.kind == "gain"}
+    assert named[camera].size == pytest.approx(gain, abs=4 * named[camera].error)
+    assert np.all(pulls(found, qu) < 1.3)
+    # Before, every q or u was off by nine (three) stated errors.
+    assert np.any(pulls(dataclasses.replace(found, changed=0.0 * found.changed), qu) > 2.0)
+
+
+def test_two_settings_of_the_plate_name_the_camera(vectors, calibration, tmp_path):
+    table, _ = noisy(vectors, tmp_path, plate=(None, 22.5))
+    table["N"][:, 1] *= 1.01
+    (change,) = apply(calibration, read(table, tmp_path)).check.changes
+    assert change.cameras == ("E1",)
+    assert "E1 brighter by 1.0" in change.words()
+
+
+def test_rows_that_are_there_four_times_are_said(vectors, calibration, tmp_path):
+    table, qu = noisy(vectors, tmp_path)
+    fourfold = Table({name: np.concatenate([table[name]] * 4) for name in table.colnames})
+    found = apply(calibration, read(fourfold, tmp_path))
+    (sentence,) = found.check.warnings()
+    assert "the rows of a star agree more than independent rows do" in sentence
+    np.testing.assert_allclose(pulls(found, qu), 1.0, atol=0.15)
+
+
+def test_what_grows_with_time_along_the_field_or_with_light(vectors, calibration, tmp_path):
+    table, _ = noisy(vectors, tmp_path, count=2000)
+    time = np.random.default_rng(0).uniform(60000.0, 60010.0, len(table))
+    clean = table["N"].copy()
+    table["MJD"] = time
+    for kind, factor in (
+        ("time", 0.004 * (time - 60005.0) / 5.0),
+        ("x", 0.004 * table["X"] / 0.28),
+        ("flux", 0.006 * clean[:, 2] / 1e6),
+    ):
+        table["N"] = clean
+        table["N"][:, 2] *= 1.0 + np.asarray(factor)
+        (change,) = apply(calibration, read(table, tmp_path)).check.changes
+        assert kind in {entry.question.kind for entry in change.alike}
+    table["N"] = clean
+    table["N"][:, 2] += 5000.0
+    (change,) = apply(calibration, read(table, tmp_path)).check.changes
+    assert "light" in {entry.question.kind for entry in change.alike}

@@ -101,6 +101,11 @@ class AnalysisVectors:
         value, vector = np.linalg.eigh(calibration.covariance[np.ix_(self.parameters, self.parameters)])
         self.root: Float[np.ndarray, "n n"] = vector * np.sqrt(np.clip(value, 0.0, None))
 
+    @property
+    def plain(self) -> int:
+        """Number of `parameters` that are not coefficients of the throughput series; they come first."""
+        return len(self._uncertain)
+
     # ------------------------------------------------------------------------------------ asking
 
     def reduced(self, settings: Settings) -> Settings:
@@ -139,7 +144,7 @@ class AnalysisVectors:
     ) -> Local:
         """Derivatives of the vectors to the plain parameters that are not certain, and to the local throughputs."""
         weights = colour_weights(teff, DERIVATIVE_COLOURS)
-        plain = len(self._uncertain)
+        plain = self.plain
         size = plain + self.cameras
         values = self._of(setting).derivatives(x, y).reshape(len(x), DERIVATIVE_COLOURS + 1, -1)
         mixed = np.einsum("pc,pcf->pf", weights, values).reshape(len(x), self.cameras, 3, size)
@@ -153,9 +158,12 @@ class AnalysisVectors:
         y: Float[np.ndarray, " p"],
     ) -> Float[np.ndarray, "p 2 n"]:
         """Derivatives to `parameters`: those to the local throughputs are spread over the series."""
-        basis = np.asarray(self.instrument.throughput.basis(jnp.asarray(x), jnp.asarray(y)))
-        spread = linear.through_series(throughput[:, :, None], basis[:, None, None])
+        spread = linear.through_series(throughput[:, :, None], self.basis(x, y)[:, None, None])
         return np.concatenate([plain, spread], axis=-1)
+
+    def basis(self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p t"]:
+        """Terms of the throughput series at field positions (deg)."""
+        return np.asarray(self.instrument.throughput.basis(jnp.asarray(x), jnp.asarray(y)))
 
     # ------------------------------------------------------------------------------------ making the tables
 

@@ -10,6 +10,7 @@
 | ROTATOR | deg | position angle of +X; where it is given the results are on the sky |
 | N_FLAG | | bits of the cameras as FLAG of a calibration set, one number or one per camera; any bit: not used |
 | FILTER, TEMP, HA | Celsius, h | as for field points |
+| MJD | d | mid-exposure: what changes with time is looked for |
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from walop_jax.data.schema import Column, Place
 from walop_jax.data.user_tables import InputTable, numeric_column, vector_column
 from walop_jax.io.errors import rows_text
 
-_ROTATOR = Column("float", "deg", float("nan"))
+_ROTATOR, _TIME = Column("float", "deg", float("nan")), Column("float", "d", float("nan"))
 _NEGATIVE = 5.0  # sigma: what noise about a subtracted background may do, and no more
 
 
@@ -35,7 +36,7 @@ class Catalogue:
 
     `points` are positions and settings; `counts` and `sigma` [electron] are NaN where a camera is not used;
     `spoilt` marks rows in which a camera was flagged. `star` numbers the stars from 0; `rotator` [deg] is NaN
-    for results in the instrument frame.
+    for results in the instrument frame, `time` [MJD, d] where it is not known.
     """
 
     points: FieldPoints
@@ -44,6 +45,7 @@ class Catalogue:
     spoilt: Bool[np.ndarray, " n"]
     star: Int[np.ndarray, " n"]
     rotator: Float[np.ndarray, " n"]
+    time: Float[np.ndarray, " n"]
 
     def __len__(self) -> int:
         return len(self.star)
@@ -90,6 +92,7 @@ def read_catalogue(
         spoilt=np.any(bad, axis=1),
         star=star,
         rotator=rotator,
+        time=numeric_column(source, "MJD", _TIME),
     )
 
 

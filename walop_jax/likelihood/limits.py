@@ -133,3 +133,8 @@ MANY_SHAPES = 8
 
 STAR_ROWS = 16384
 """Rows of a star catalogue that are worked on together: their matrices take some MB."""
+STAR_SAMPLE = 16384
+"""Rows of a catalogue, spread over it, by which the whole of it is judged: they see a camera that has changed by a
+fiftieth of what single stars of 10⁶ electrons would show."""
+CHECKED_ROWS = 2048
+"""Rows whose columns for the check of a catalogue are worked on together: a hundred columns of them take 7 MB."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -185,7 +186,10 @@ def apply(
     rows = read_catalogue(table, there.model.template.patched(), saturation, always_in=there.always_in)
     with errors_naming(table.path):
         stars = apply_to_rows(chosen, rows, force=force)
-    cards = header(there.to_product().content_hash(), estimator, float(np.mean(np.isfinite(rows.rotator))))
+    content, on_sky = there.to_product().content_hash(), float(np.mean(np.isfinite(rows.rotator)))
+    cards = header(content, estimator, on_sky, stars.check)
+    for sentence in stars.check.warnings():
+        warnings.warn(f"{table.path}: {sentence}", stacklevel=2)
     return extended(table, stokes_columns(stars, rows.star, estimator), cards)
 
 

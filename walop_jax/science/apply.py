@@ -1,13 +1,15 @@
 """A calibration applied to a science catalogue: q, u of every star with errors of photons and calibration.
 
-Rows are taken star by star in blocks that fit into memory. Nothing that is computed for a star depends on what else
-is in the catalogue.
+Rows are taken star by star in blocks that fit into memory. What is computed for a star does not depend on what else is
+in the catalogue, until all of it is looked at together (`catalogue_check`): then errors grow for all stars by what
+that has found.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,9 +25,12 @@ from walop_jax.data.catalogue import Catalogue
 from walop_jax.data.settings import Settings
 from walop_jax.io.errors import DataError, rows_text
 from walop_jax.likelihood import limits
+from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
 from walop_jax.model import carried, light
 from walop_jax.model.parameters import with_values
-from walop_jax.science.estimate import calibration_shift, estimate_with
+from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, check_catalogue
+from walop_jax.science.estimate import Estimate, calibration_shift, estimate_with
+from walop_jax.science.star_residuals import StarResiduals
 
 MOST_SETTINGS = 200
 ILL_POSED = 10.0  # ratio of the errors of the two principal directions from which FLAG 16 is set
@@ -43,26 +48,29 @@ class Stars:
     """Stokes parameters of the stars of a catalogue, in the order of `Catalogue.star`.
 
     On the sky (equatorial frame) where the catalogue has a ROTATOR, in the instrument frame elsewhere. `covariance`
-    is the sum of `photon`, `calibration` (parameters of the optics and of the detectors) and `spectrum`: a star
-    without TEFF has the colour of a population (`COOL`, `HOT`). `colour` is the error of (q, u) if TEFF were ignored;
+    is the sum of `photon`, `calibration` (parameters of the optics and of the detectors), `spectrum`: a star without
+    TEFF has the colour of a population (`COOL`, `HOT`), and `changed`: what the whole catalogue says has changed since
+    the calibration. `colour` is the error of (q, u) if TEFF were ignored;
     without TEFF, half the difference between stars of 3500 K and 10 000 K. `flag` holds bits of `Quality`; `rows`
-    counts the rows of a star.
+    counts the rows of a star. `check` is what all stars say together.
     """
 
     qu: Float[np.ndarray, "s 2"]
     photon: Float[np.ndarray, "s 2 2"]
     calibration: Float[np.ndarray, "s 2 2"]
     spectrum: Float[np.ndarray, "s 2 2"]
+    changed: Float[np.ndarray, "s 2 2"]
     colour: Float[np.ndarray, "s 2"]
     chi2: Float[np.ndarray, " s"]
     dof: Int[np.ndarray, " s"]
     rows: Int[np.ndarray, " s"]
     flag: Int[np.ndarray, " s"]
+    check: CatalogueCheck = NOTHING_TO_SPARE
 
     @property
     def covariance(self) -> Float[np.ndarray, "s 2 2"]:
         """Covariance of (q, u), all causes together."""
-        return self.photon + self.calibration + self.spectrum
+        return self.photon + self.calibration + self.spectrum + self.changed
 
 
 def apply(
@@ -78,22 +86,234 @@ def apply(
     catalogue with more optical settings than can be tabulated, and, unless `force` is given, for what the calibration
     does not cover (`check_validity`).
     """
-    vectors = AnalysisVectors(calibration)
-    settings, setting_of = _settings(vectors, catalogue)
-    if not force:
-        check_validity(calibration, catalogue.points.settings)
-    counts = linearised(calibration, catalogue.counts)
-    offset, slope = _rotator_zero(vectors)
-    order = np.argsort(catalogue.star, kind="stable")
-    parts = []
-    for done, rows in _slices_of_stars(catalogue.star[order]):
-        rows = order[rows]
-        parts.append(
-            _stars_of_rows(vectors, catalogue, rows, counts[rows], settings, setting_of[rows], offset, slope)
-        )
+    work = _Application(calibration, catalogue, force=force)
+    chosen = work.sample(limits.STAR_SAMPLE)
+    parts, watched = [], []
+    for done, rows in work.blocks():
+        block = work.block(rows)
+        parts.append(block.stars)
+        watched += work.residuals(block, chosen)
         if progress is not None:
-            progress(done, len(order))
-    return Stars(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Stars)))
+            progress(done, len(catalogue))
+    columns = [f.name for f in dataclasses.fields(Stars) if f.name != "check"]
+    stars = Stars(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
+    return work.together(stars, work.checked(watched))
+
+
+def residuals_of(
+    calibration: Calibration, catalogue: Catalogue, rows: int = limits.STAR_SAMPLE, *, force: bool = False
+) -> tuple[StarResiduals | None, Float[np.ndarray, "n n"]]:
+    """Residuals of a catalogue, of some `rows` of it at most, and the root of the covariance of their parameters.
+
+    None where no row has a camera to spare. Raises `DataError` as `apply` does.
+    """
+    work = _Application(calibration, catalogue, force=force)
+    chosen = work.sample(rows)
+    watched = [part for _, here in work.blocks() for part in work.residuals(work.block(here), chosen)]
+    return (StarResiduals.joined(watched) if watched else None), work.vectors.root
+
+
+class _Block(NamedTuple):
+    """Rows of whole stars and all that was computed for them; `rows` are those of the catalogue."""
+
+    rows: Int[np.ndarray, " r"]
+    star: Int[np.ndarray, " r"]
+    stars: Stars
+    found: Estimate
+    vectors: Float[np.ndarray, "r k 3"]
+    sigma: Float[np.ndarray, "r k"]
+    plain: Float[np.ndarray, "r k o"]
+    throughput: Float[np.ndarray, "r k k"]
+    colour: Float[np.ndarray, "r k 2"]
+    derivative: Float[np.ndarray, "s 2 n"]
+
+
+class _Application:
+    """A calibration at work on a catalogue."""
+
+    def __init__(self, calibration: Calibration, catalogue: Catalogue, *, force: bool) -> None:
+        self.catalogue = catalogue
+        self.vectors = AnalysisVectors(calibration)
+        self.settings, self.setting_of = _settings(self.vectors, catalogue)
+        if not force:
+            check_validity(calibration, catalogue.points.settings)
+        self.counts = linearised(calibration, catalogue.counts)
+        self.offset, self.slope = _rotator_zero(self.vectors)
+        self.order = np.argsort(catalogue.star, kind="stable")
+
+    def blocks(self) -> Iterator[tuple[int, Int[np.ndarray, " r"]]]:
+        """Rows of whole stars, each with the number of rows done after it."""
+        for done, rows in _slices_of_stars(self.catalogue.star[self.order]):
+            yield done, self.order[rows]
+
+    def block(self, rows: Int[np.ndarray, " r"]) -> _Block:
+        """Stokes parameters of some stars."""
+        catalogue, vectors, setting_of = self.catalogue, self.vectors, self.setting_of[rows]
+        points, sigma, counts = catalogue.points, catalogue.sigma[rows], self.counts[rows]
+        _, star = np.unique(catalogue.star[rows], return_inverse=True)
+        first = np.flatnonzero(np.diff(star, prepend=-1))
+        outside = _outside(vectors, catalogue, rows)
+        x, y = (np.where(outside, 0.0, values[rows]) for values in (points.x, points.y))
+        teff, sky = points.settings.teff[rows], np.isfinite(catalogue.rotator[rows])
+        turn = 2.0 * np.where(sky, np.deg2rad(catalogue.rotator[rows]) + self.offset, 0.0)
+
+        spectra = np.empty((len(rows), COLOURS + 1, vectors.cameras, 3))
+        for k, here in _rows_by_setting(setting_of):
+            spectra[here] = vectors.at(self.settings[k], x[here], y[here])
+        there = np.einsum("rc,rcks->rks", colour_weights(teff, COLOURS), spectra)
+        used = np.where(outside[:, None], np.nan, counts)
+        on_sky = _vectors_on_sky(there, turn)
+        found = estimate_with(vectors.instrument.cameras, on_sky, used, sigma, star)
+
+        s = _instrument_stokes(found.qu[star], turn)
+        # Of the model per unit flux, to the plain parameters and to the throughputs.
+        plain = np.empty((len(rows), vectors.cameras, vectors.plain))
+        throughput = np.empty((len(rows), vectors.cameras, vectors.cameras))
+        derivative = np.empty((len(rows), 2, len(vectors.parameters)))
+        for k, here in _rows_by_setting(setting_of):
+            local = vectors.derivatives(self.settings[k], x[here], y[here], teff[here])
+            plain[here], throughput[here] = (np.einsum("rs,rksf->rkf", s[here], part) for part in local)
+            gain = found.gain[here]
+            derivative[here] = vectors.to_parameters(
+                gain @ plain[here], gain @ throughput[here], x[here], y[here]
+            )
+        lit = np.where(found.flux > 0, found.flux, np.inf)
+        for p, change in _detector_slopes(vectors, counts):
+            change = np.nan_to_num(change) / lit[:, None]
+            plain[..., p] -= change
+            derivative[..., p] -= np.einsum("rik,rk->ri", found.gain, change)
+        if self.slope.any():
+            dq, du = 2.0 * s[:, 2], -2.0 * s[:, 1]  # (q + iu) exp(−2i R) grows by −2i (q + iu) dR
+            turned = np.where(sky[:, None], there[..., 1] * dq[:, None] + there[..., 2] * du[:, None], 0.0)
+            derivative += (found.gain @ turned[..., None]) * self.slope
+        derivative = np.add.reduceat(-derivative, first)
+        root = derivative @ vectors.root
+        calibration = root @ root.swapaxes(1, 2)
+
+        def change_of(weights: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r k"]:
+            return np.einsum("rc,rcks,rs->rk", weights, spectra, s, optimize=True)
+
+        def shift(change: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "s 2"]:
+            return calibration_shift(found.gain, change[..., None], star)[..., 0]
+
+        nothing = np.zeros_like(calibration)
+        spectrum, colour = nothing, np.zeros((len(rows), vectors.cameras, 2))
+        if np.isnan(teff).any():
+            colour = np.stack([change_of(weights) for weights in _unknown_colour(teff)], axis=-1)
+            mean, width = (shift(colour[..., n]) for n in range(2))
+            spectrum = mean[:, :, None] * mean[:, None] + width[:, :, None] * width[:, None]
+        disagree = _disagree(found.chi2, found.dof, np.maximum.reduceat(_brightness(used, sigma), first))
+        flag = _flags(vectors, catalogue, rows, used, first, found.qu, found.condition, disagree)
+        others = np.trace(found.photon + calibration, axis1=1, axis2=2)
+        flag[np.trace(spectrum, axis1=1, axis2=2) > others] |= Quality.UNKNOWN_COLOUR
+        stars = Stars(
+            qu=found.qu,
+            photon=found.photon,
+            calibration=calibration,
+            spectrum=spectrum,
+            changed=nothing,
+            colour=shift(change_of(_ignored_colour(teff))),
+            chi2=found.chi2,
+            dof=found.dof,
+            rows=np.diff(first, append=len(rows)),
+            flag=flag,
+        )
+        return _Block(rows, star, stars, found, on_sky, sigma, plain, throughput, colour, derivative)
+
+    # ------------------------------------------------------------------------------ the catalogue as a whole
+
+    def sample(self, most: int) -> Bool[np.ndarray, " s"]:
+        """Stars that stand for the catalogue, about `most` rows of them, spread by multiples of the golden section."""
+        stars = np.arange(self.catalogue.star.max() + 1)
+        return np.mod(stars * 0.6180339887498949, 1.0) < most / len(self.catalogue)
+
+    def residuals(self, block: _Block, chosen: Bool[np.ndarray, " s"]) -> list[StarResiduals]:
+        """What the chosen stars of a block leave: none, or one list of those that have a result within the field."""
+        catalogue, vectors, stars = self.catalogue, self.vectors, block.stars
+        number = catalogue.star[block.rows]
+        first = np.flatnonzero(np.diff(block.star, prepend=-1))
+        beyond = Quality.BEYOND_FIELD | Quality.BEYOND_SETTINGS | Quality.NO_STOKES
+        good = chosen[number[first]] & (stars.flag & beyond == 0) & (stars.dof > 0)
+        r = np.flatnonzero(good[block.star])
+        if not r.size:
+            return []
+        rows, shared = block.rows[r], Sharing(vectors.instrument.cameras.together)
+        sigma, counts = block.sigma[r], self.counts[rows]
+        used = np.isfinite(counts) & np.isfinite(sigma) & (sigma > 0)
+        root = np.where(used, 1.0 / np.where(used, sigma, 1.0), 0.0)
+        a, qu = block.vectors[r], stars.qu[block.star[r]]
+        unit = root * np.einsum("rks,rs->rk", a, np.concatenate([np.ones((len(qu), 1)), qu], axis=1))
+        flux, residual = eliminate_flux(
+            root * np.where(used, counts, 0.0), unit, np.zeros(len(r), bool), shared
+        )
+        model, scale = flux * unit, (flux * root)[..., None]
+        tangent = project_flux(np.moveaxis(scale * a[..., 1:], -1, 0), model, False, shared)
+        x, y = catalogue.points.x[rows], catalogue.points.y[rows]
+        left = StarResiduals(
+            star=np.unique(block.star[r], return_inverse=True)[1],
+            residual=residual,
+            model=model,
+            tangent=np.moveaxis(tangent, 0, 1),
+            photon=stars.photon[good],
+            root=root,
+            x=x,
+            y=y,
+            time=catalogue.time[rows],
+            plain=scale * block.plain[r],
+            throughput=scale * block.throughput[r],
+            basis=vectors.basis(x, y),
+            colour=scale * block.colour[r],
+            together=vectors.instrument.cameras.together,
+        )
+        return [left]
+
+    def checked(self, watched: list[StarResiduals]) -> CatalogueCheck:
+        """What the stars say together."""
+        if not watched:
+            return NOTHING_TO_SPARE
+        calibration, parameters = self.vectors.calibration, self.vectors.parameters
+        known = [calibration.model.parameters[int(p)] for p in parameters]
+        names = [(p.name, p.unit) for p in known]
+        cameras = self.vectors.instrument.cameras.names
+        return check_catalogue(StarResiduals.joined(watched), cameras, names, self.vectors.root)
+
+    def together(self, stars: Stars, check: CatalogueCheck) -> Stars:
+        """The stars with errors, and a bit of FLAG, that hold what all of them say together."""
+        if check.holds:
+            return dataclasses.replace(stars, check=check)
+        changed = stars.changed
+        if check.changes:
+            found = [self._changed(self.block(rows), check) for _, rows in self.blocks()]
+            changed = np.concatenate(found)
+        factor = np.where(stars.rows > 1, check.scale[1], check.scale[0])[:, None, None]
+        flag = stars.flag | Quality.CATALOGUE
+        photon = stars.photon * factor
+        return dataclasses.replace(stars, photon=photon, changed=changed, flag=flag, check=check)
+
+    def _changed(self, block: _Block, check: CatalogueCheck) -> Float[np.ndarray, "s 2 2"]:
+        """Effect of the changes on stars: the largest, in q and in u, of those that cannot be told apart."""
+        points, found = self.catalogue.points, block.found
+        counts = np.nan_to_num(self.counts[block.rows])
+        lit = np.where(found.flux > 0, found.flux, np.inf)
+        place = (points.x[block.rows], points.y[block.rows], self.catalogue.time[block.rows])
+        total = np.zeros_like(block.stars.changed)
+        for change in check.changes:
+            largest = np.zeros_like(block.stars.qu)
+            for entry in change.alike:
+                question = entry.question
+                if question.of_camera:
+                    grown = (
+                        check.growth(question, *place, counts)[:, None]
+                        * np.eye(counts.shape[1])[question.camera]
+                    )
+                    shift = calibration_shift(found.gain, (grown / lit[:, None])[..., None], block.star)[
+                        ..., 0
+                    ]
+                else:
+                    shift = block.derivative[:, :, question.parameter]
+                largest = np.maximum(largest, np.abs(entry.size * np.nan_to_num(shift)))
+            total += largest[:, :, None] ** 2 * np.eye(2)
+        return total
 
 
 def _slices_of_stars(star: Int[np.ndarray, " n"]) -> Iterator[tuple[int, slice]]:
@@ -107,82 +327,6 @@ def _slices_of_stars(star: Int[np.ndarray, " n"]) -> Iterator[tuple[int, slice]]
             end = int(first[at + 1]) if at + 1 < len(first) else len(star)
         yield end, slice(start, end)
         start = end
-
-
-def _stars_of_rows(
-    vectors: AnalysisVectors,
-    catalogue: Catalogue,
-    rows: Int[np.ndarray, " r"],
-    counts: Float[np.ndarray, "r k"],
-    settings: list[Settings],
-    setting_of: Int[np.ndarray, " r"],
-    offset: float,
-    slope: Float[np.ndarray, " n"],
-) -> Stars:
-    points, sigma = catalogue.points, catalogue.sigma[rows]
-    _, star = np.unique(catalogue.star[rows], return_inverse=True)
-    first = np.flatnonzero(np.diff(star, prepend=-1))
-    outside = _outside(vectors, catalogue, rows)
-    x, y = (np.where(outside, 0.0, values[rows]) for values in (points.x, points.y))
-    teff, sky = points.settings.teff[rows], np.isfinite(catalogue.rotator[rows])
-    turn = 2.0 * np.where(sky, np.deg2rad(catalogue.rotator[rows]) + offset, 0.0)
-
-    spectra = np.empty((len(rows), COLOURS + 1, vectors.cameras, 3))
-    for k, here in _rows_by_setting(setting_of):
-        spectra[here] = vectors.at(settings[k], x[here], y[here])
-    there = np.einsum("rc,rcks->rks", colour_weights(teff, COLOURS), spectra)
-    used = np.where(outside[:, None], np.nan, counts)
-    found = estimate_with(vectors.instrument.cameras, _vectors_on_sky(there, turn), used, sigma, star)
-
-    s = _instrument_stokes(found.qu[star], turn)
-    derivative = np.empty((len(rows), 2, len(vectors.parameters)))
-    for k, here in _rows_by_setting(setting_of):
-        local = vectors.derivatives(settings[k], x[here], y[here], teff[here])
-        plain, throughput = (found.gain[here] @ np.einsum("rs,rksf->rkf", s[here], part) for part in local)
-        derivative[here] = vectors.to_parameters(plain, throughput, x[here], y[here])
-    for p, change in _detector_slopes(vectors, counts):
-        lit = np.where(found.flux > 0, found.flux, np.inf)
-        derivative[..., p] -= np.einsum("rik,rk->ri", found.gain, np.nan_to_num(change) / lit[:, None])
-    if slope.any():
-        dq, du = 2.0 * s[:, 2], -2.0 * s[:, 1]  # (q + iu) exp(−2i R) grows by −2i (q + iu) dR
-        turned = np.where(sky[:, None], there[..., 1] * dq[:, None] + there[..., 2] * du[:, None], 0.0)
-        derivative += (found.gain @ turned[..., None]) * slope
-    root = np.add.reduceat(-derivative, first) @ vectors.root
-
-    def shift(weights: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "s 2"]:
-        change = np.einsum("rc,rcks,rs->rk", weights, spectra, s, optimize=True)
-        return calibration_shift(found.gain, change[..., None], star)[..., 0]
-
-    calibration = root @ root.swapaxes(1, 2)
-    spectrum, dominant = np.zeros_like(calibration), np.zeros(len(first), bool)
-    if np.isnan(teff).any():
-        mean, width = (shift(weights) for weights in _unknown_colour(teff))
-        spectrum = mean[:, :, None] * mean[:, None] + width[:, :, None] * width[:, None]
-        dominant = np.trace(spectrum, axis1=1, axis2=2) > np.trace(
-            found.photon + calibration, axis1=1, axis2=2
-        )
-    flag = _flags(
-        vectors,
-        catalogue,
-        rows,
-        used,
-        first,
-        found.qu,
-        found.condition,
-        _disagree(found.chi2, found.dof, np.maximum.reduceat(_brightness(used, sigma), first)),
-    )
-    flag[dominant] |= Quality.UNKNOWN_COLOUR
-    return Stars(
-        qu=found.qu,
-        photon=found.photon,
-        calibration=calibration,
-        spectrum=spectrum,
-        colour=shift(_ignored_colour(teff)),
-        chi2=found.chi2,
-        dof=found.dof,
-        rows=np.diff(first, append=len(rows)),
-        flag=flag,
-    )
 
 
 def _outside(

@@ -1,0 +1,510 @@
+"""Do the stars of a catalogue, all together, still agree with the calibration and with their stated errors?
+
+Asked are, of the residuals of `star_residuals`:
+
+noise       Σ χ² against Σ ν, from both sides: N_ERR too small or too large
+rows        what the rows of one star have in common: rows that are there twice, noise that is correlated
+changes     the mean residual of every camera and how it grows with X, Y, time and flux, light that is added to every
+            row, and all parameters of the optics; the strongest is fitted with the errors of the calibration and
+            asked for again, until nothing is left
+
+One correction for all of them: the chance is `ALARM` that noise raises any. Where analysers split the light in two,
+stars of a single exposure can hardly tell the cameras of an arm, or one arm brighter from the other fainter: what
+describes the data as well (Δχ² < `RIVAL`) is told together.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy import special
+
+from walop_jax.io.display import Display, Displayed
+from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.rounding import with_error, with_minus_sign
+from walop_jax.science.star_residuals import (
+    Scale,
+    StarResiduals,
+    chance_of_scale,
+    eliminated,
+    noise_scale,
+    normal_matrix,
+    shared_by_rows,
+)
+
+ALARM = 1e-4
+RIVAL = 11.0
+NOISE_MATTERS = 1.1
+"""Factor on χ² below which, and above the inverse of which, errors are left as they are (5 % of N_ERR)."""
+_MOST_CHANGES = 6
+_ROUNDS = 8
+_SETTLED = 0.05  # standard errors
+_REFERENCE = 1e6  # electron
+_SEEN = 2.33  # one-sided 99 %
+
+CAMERA_KINDS = ("gain", "x", "y", "time", "flux", "light")
+
+
+class Question(NamedTuple):
+    """One thing that may have changed: a camera, in one of `CAMERA_KINDS`, or a parameter of the optics."""
+
+    kind: str
+    name: str
+    unit: str
+    camera: int = -1
+    parameter: int = -1
+
+    @property
+    def of_camera(self) -> bool:
+        """Whether a camera has changed, not the optics."""
+        return self.camera >= 0
+
+    def words(self, size: float, error: float) -> str:
+        """A size of it in words."""
+        more, amount = ("brighter", "fainter")[size < 0], abs(size)
+        if not self.of_camera:
+            larger = ("larger", "smaller")[size < 0]
+            return f"{self.name} {larger} by {with_error(amount, error)} {self.unit}".rstrip()
+        if self.kind == "light":
+            return f"{with_error(amount, error)} electrons too {('many', 'few')[size < 0]} in every row of {self.name}"
+        where = {
+            "x": " at the edge of the field along +X",
+            "y": " at the edge of the field along +Y",
+            "time": " at the end of the catalogue than in its middle",
+            "flux": " for every 10⁶ electrons",
+        }.get(self.kind, "")
+        return f"{self.name} {more} by {with_error(100 * amount, 100 * error)} %{where}"
+
+
+class Found(NamedTuple):
+    """A change that was found: what, by how much, standard error, and its significance (standard errors)."""
+
+    question: Question
+    size: float
+    error: float
+    sigma: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """A change of the instrument since it was calibrated: the best description, and those as good (best included)."""
+
+    best: Found
+    alike: tuple[Found, ...]
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras it may be; empty if it may be the optics."""
+        if not all(entry.question.of_camera for entry in self.alike):
+            return ()
+        return tuple(dict.fromkeys(entry.question.name for entry in self.alike))
+
+    def words(self) -> str:
+        """The change in a sentence."""
+        text = f"changed since the calibration, {abs(self.best.sigma):.0f} σ: {self._words(self.best)}"
+        others = [self._words(entry) for entry in self.alike if entry.question != self.best.question]
+        if not others:
+            return text
+        more = f", and {len(others) - 4} more" if len(others) > 4 else ""
+        return f"{text}. These rows cannot tell it from {', '.join(others[:4])}{more}"
+
+    def _words(self, found: Found) -> str:
+        return found.question.words(found.size, found.error)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class CatalogueCheck(Displayed):
+    """What the stars of a catalogue say together.
+
+    `noise` is χ² per degree of freedom behind the changes (1 expected; without outliers) and `noise_p` its chance;
+    `rows` the factor by which the variance of what the rows of a star share exceeds N_ERR, None where every star has
+    one row, and `rows_p` its chance beside `noise`. `scale` are the factors on the photon covariance of stars of one
+    row and of several: 1 unless errors are off. `tests` are the `asked` questions in their first answer; `smallest` is
+    the gain change of the camera seen best that would be found in 99 % of cases (nan: none). `stars` and `rows_used`
+    count what was looked at; `edge` (deg) and `times` (middle and half of the time covered, d) are the units of X, Y
+    and time.
+    """
+
+    stars: int
+    rows_used: int
+    asked: int
+    noise: float
+    noise_p: float
+    rows: float | None
+    rows_p: float
+    scale: tuple[float, float]
+    tests: tuple[Found, ...]
+    changes: tuple[Change, ...]
+    smallest: float
+    edge: float = 1.0
+    times: tuple[float, float] = (0.0, 0.0)
+
+    def growth(
+        self,
+        question: Question,
+        x: Float[np.ndarray, " r"],
+        y: Float[np.ndarray, " r"],
+        time: Float[np.ndarray, " r"],
+        counts: Float[np.ndarray, "r k"],
+    ) -> Float[np.ndarray, " r"]:
+        """Electrons that a change of unit size adds to the counts of its camera in every row."""
+        return _growth(question.kind, x, y, time, counts[:, question.camera], self.edge, self.times)
+
+    @property
+    def alarm(self) -> float:
+        """The chance below which a single answer counts."""
+        return ALARM / max(self.asked, 1)
+
+    @property
+    def noise_is_off(self) -> bool:
+        """Whether N_ERR is not what the counts scatter by."""
+        off = not 1.0 / NOISE_MATTERS < self.noise < NOISE_MATTERS
+        return self.noise_p < self.alarm and off and not self.rows_agree
+
+    @property
+    def rows_agree(self) -> bool:
+        """Whether rows of a star have more in common than light."""
+        return self.rows is not None and self.rows_p < self.alarm and self.rows > NOISE_MATTERS * self.noise
+
+    @property
+    def holds(self) -> bool:
+        """Whether calibration and errors stand."""
+        return not (self.changes or self.noise_is_off or self.rows_agree)
+
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for each thing that does not hold."""
+        said = [change.words() for change in self.changes]
+        if self.rows_agree:
+            assert self.rows is not None
+            said.append(
+                f"the rows of a star agree more than independent rows do: together their variance is {self.rows:.3g} "
+                "times what N_ERR says. Are rows there twice, or is their noise correlated? Photon errors of stars of "
+                f"several rows were multiplied by {np.sqrt(self.scale[1]):.3g}"
+            )
+        if self.noise_is_off:
+            factor = np.sqrt(self.noise)
+            word = f"{factor:.3g} times too small" if factor > 1 else f"{1 / factor:.3g} times too large"
+            said.append(
+                f"N_ERR is {word}: χ²/dof of the stars together is {self.noise:.3g}. Photon errors were multiplied by "
+                f"{factor:.3g}"
+            )
+        return tuple(said)
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+
+        def entry(found: Found) -> dict[str, Any]:
+            q = found.question
+            return {"kind": q.kind, "name": q.name, "unit": q.unit} | {
+                k: float(getattr(found, k)) for k in ("size", "error", "sigma")
+            }
+
+        return {
+            "holds": self.holds,
+            "stars": self.stars,
+            "rows": self.rows_used,
+            "asked": self.asked,
+            "chi2_per_dof": self.noise,
+            "chi2_p_value": self.noise_p,
+            "shared_by_rows": self.rows,
+            "shared_p_value": self.rows_p,
+            "photon_error_factors": [float(np.sqrt(s)) for s in self.scale],
+            "changes": [{"best": entry(c.best), "alike": [entry(e) for e in c.alike]} for c in self.changes],
+            "tests": [entry(test) for test in self.tests],
+            "smallest_gain_seen": self.smallest if np.isfinite(self.smallest) else None,
+            "warnings": list(self.warnings()),
+        }
+
+    def to_table(self) -> Any:
+        """All questions with their first answers, as an astropy table."""
+        columns = {
+            "KIND": (
+                np.array([t.question.kind for t in self.tests]),
+                "",
+                "gain, x, y, time, flux, light, or optics",
+            ),
+            "NAME": (np.array([t.question.name for t in self.tests]), "", "camera or parameter"),
+            "SIZE": (np.array([t.size for t in self.tests]), "", "change, this one alone"),
+            "ERROR": (np.array([t.error for t in self.tests]), "", "standard error, calibration included"),
+            "SIGMA": (np.array([t.sigma for t in self.tests]), "", "SIZE / ERROR"),
+            "UNIT": (np.array([t.question.unit for t in self.tests]), "", "unit of SIZE"),
+        }
+        return astropy_table(columns)
+
+    def display(self) -> Display:
+        """The verdict, the noise, and the answers for every camera."""
+        rows = tuple(
+            (
+                t.question.name,
+                t.question.kind,
+                with_error(t.size, t.error),
+                with_minus_sign(f"{t.sigma:+.1f}"),
+            )
+            for t in self.tests
+            if t.question.of_camera
+        )
+        seen = (
+            f"{100 * self.smallest:.2g} %"
+            if np.isfinite(self.smallest)
+            else "none: no row has a camera to spare"
+        )
+        facts = (
+            ("stars, rows", f"{self.stars}, {self.rows_used}"),
+            ("χ²/dof", f"{self.noise:.3f}"),
+            ("smallest change seen", f"{seen} of one camera"),
+        )
+        title = "The catalogue agrees with the calibration" if self.holds else "The catalogue DISAGREES"
+        return Display(title, facts, ("camera", "grows with", "change", ">σ"), rows, self.warnings())
+
+
+def check_catalogue(
+    stars: StarResiduals,
+    cameras: Sequence[str],
+    parameters: Sequence[tuple[str, str]],
+    root: Float[np.ndarray, "n n"],
+) -> CatalogueCheck:
+    """Ask the stars of a catalogue all questions.
+
+    `cameras` are names; `parameters` names and units of those of `stars.parameters()`, of which the first, as many as
+    `stars.plain` has, are asked as well; `root` is a square root of their covariance, C = root rootᵀ.
+    """
+    return _Search(stars, cameras, parameters, root).answer()
+
+
+NOTHING_TO_SPARE = CatalogueCheck(0, 0, 0, 1.0, 1.0, None, 1.0, (1.0, 1.0), (), (), np.nan)
+"""Of a catalogue in which no row has a camera to spare."""
+
+
+def _growth(
+    kind: str,
+    x: Float[np.ndarray, " r"],
+    y: Float[np.ndarray, " r"],
+    time: Float[np.ndarray, " r"],
+    counts: Float[np.ndarray, " r"],
+    edge: float,
+    times: tuple[float, float],
+) -> Float[np.ndarray, " r"]:
+    """Electrons that a change of one of `CAMERA_KINDS`, of unit size, adds to `counts` of its camera."""
+    if kind == "light":
+        return np.ones_like(counts)
+    if kind == "flux":
+        return counts**2 / _REFERENCE
+    middle, half = times
+    with_place = {"x": x / edge, "y": y / edge, "time": np.nan_to_num(time - middle) / (half or 1.0)}
+    return counts * with_place.get(kind, 1.0)
+
+
+class _Search:
+    """The columns of all questions, then of the errors of the calibration; what has been found so far."""
+
+    def __init__(
+        self,
+        stars: StarResiduals,
+        cameras: Sequence[str],
+        parameters: Sequence[tuple[str, str]],
+        root: Float[np.ndarray, "n n"],
+    ) -> None:
+        self.stars = stars
+        self.root = root[:, np.abs(root).max(axis=0, initial=0.0) > 0]
+        self.edge = max(float(np.abs(np.concatenate([stars.x, stars.y])).max()), 1e-9)
+        times = stars.time[np.isfinite(stars.time)]
+        self.times = (0.0, 0.0)
+        if times.size and np.ptp(times) > 0:
+            self.times = 0.5 * float(times.min() + times.max()), 0.5 * float(np.ptp(times))
+        kinds = [kind for kind in CAMERA_KINDS if kind != "time" or self.times[1] > 0]
+        self.kinds = kinds
+        units = {"flux": "per 1e6 electron", "light": "electron"}
+        self.questions = [
+            Question(kind, name, units.get(kind, ""), camera=k)
+            for kind in kinds
+            for k, name in enumerate(cameras)
+        ]
+        plain = stars.plain.shape[-1]
+        self.questions += [
+            Question("optics", name, unit, parameter=p) for p, (name, unit) in enumerate(parameters[:plain])
+        ]
+        # Columns: those of the cameras, all parameters, two of the colours; from them questions and nuisances are made.
+        count, shown = len(kinds) * len(cameras), len(root)
+        asked, known = count + plain, self.root.shape[1]
+        self.asked = asked
+        self.mixing = np.zeros((count + shown + 2, asked + known + 2))
+        self.mixing[:asked, :asked] = np.eye(asked)
+        self.mixing[count : count + shown, asked : asked + known] = self.root
+        self.mixing[-2:, -2:] = np.eye(2)
+        self.prior = np.concatenate([np.zeros(asked), np.ones(known + 2)])
+
+    def _columns(self, part: StarResiduals) -> Float[np.ndarray, "r k c"]:
+        cameras = part.model.shape[1]
+        values = np.zeros((*part.model.shape, len(self.mixing)))
+        place = (part.x, part.y, part.time)
+        seen = np.where(part.root > 0, part.model / np.where(part.root > 0, part.root, 1.0), 0.0)
+        for n, kind in enumerate(self.kinds):
+            for k in range(cameras):
+                grown = _growth(kind, *place, seen[:, k], self.edge, self.times)
+                values[:, k, n * cameras + k] = grown * part.root[:, k]
+        values[..., len(self.kinds) * cameras : -2] = part.parameters()
+        values[..., -2:] = part.colour
+        return values
+
+    def _left(self, sizes: Float[np.ndarray, " c"]) -> Float[np.ndarray, "r k"]:
+        """Residuals behind changes of all columns."""
+        if not sizes.any():
+            return self.stars.residual
+        amounts, out = self.mixing @ sizes, []
+        first = self.stars.first
+        for here, part in self.stars.blocks():
+            rows = slice(first[here.start], first[here.start] + len(part))
+            out.append(self.stars.residual[rows] - part.left(self._columns(part) @ amounts))
+        return np.concatenate(out)
+
+    def _looked(self, sizes: Float[np.ndarray, " c"]) -> _Look:
+        """Scales, Q and g (priors included) with these changes taken away."""
+        stars = self.stars
+        residual = self._left(sizes)
+        chi2 = np.add.reduceat(np.sum(residual**2, axis=1), stars.first)
+        noise = noise_scale(chi2 / self.variance, stars.dof.astype(float))
+        rows = shared_by_rows(stars, residual, self.variance)
+        known = self.asked + 2
+        alarm = ALARM / known
+        single = noise.value if noise.value > 1 or chance_of_scale(noise) < alarm else 1.0
+        several = single
+        if rows is not None and _chance_beside(rows, noise) < alarm:
+            several = max(single, rows.value)
+        each = self.variance * np.where(stars.rows > 1, several, single)
+        matrix, score = normal_matrix(stars, residual, self._columns, noise.kept / each, noise.share)
+        matrix = self.mixing.T @ matrix @ self.mixing + np.diag(self.prior)
+        return _Look(noise, rows, matrix, self.mixing.T @ score - self.prior * sizes)
+
+    @property
+    def variance(self) -> Float[np.ndarray, " s"]:
+        """Variance of residuals that colours, unknown star by star, add to that of the noise: 1 where none do."""
+        if not hasattr(self, "_variance"):
+            stars, spread = self.stars, np.zeros(len(self.stars.photon))
+            if stars.colour.any():
+                for n in range(2):
+                    left = stars.left(stars.colour[..., n])
+                    spread += np.add.reduceat(np.sum(left**2, axis=1), stars.first)
+            self._variance = 1.0 + spread / np.maximum(stars.dof, 1)
+        return self._variance
+
+    def answer(self) -> CatalogueCheck:
+        """All questions, then again behind what was found."""
+        sizes = np.zeros(len(self.prior))
+        chosen: list[int] = []
+        look, sizes = self._settled(sizes, chosen)
+        tests = self._beside(look.matrix, look.score, chosen)
+        smallest = self._smallest(tests)
+        answers = tests
+        while len(chosen) < _MOST_CHANGES:
+            strongest = max(range(self.asked), key=lambda n: abs(answers[n].sigma), default=-1)
+            if strongest < 0 or strongest in chosen or _chance(answers[strongest].sigma) >= self._alarm:
+                break
+            chosen.append(strongest)
+            look, sizes = self._settled(sizes, chosen)
+            answers = self._beside(look.matrix, look.score, chosen)
+        changes = tuple(self._change(look, sizes, chosen, n) for n in chosen)
+        noise, rows = look.noise, look.rows
+        rows_p = 1.0 if rows is None else _chance_beside(rows, noise)
+        found = CatalogueCheck(
+            stars=len(self.stars.photon),
+            rows_used=len(self.stars),
+            asked=self.asked + 2,
+            noise=noise.value,
+            noise_p=chance_of_scale(noise),
+            rows=None if rows is None else rows.value,
+            rows_p=rows_p,
+            scale=(1.0, 1.0),
+            tests=tuple(tests),
+            changes=changes,
+            smallest=smallest,
+            edge=self.edge,
+            times=self.times,
+        )
+        # χ² of rows that repeat each other says nothing of N_ERR: what they share does.
+        single = noise.value if found.noise_is_off else 1.0
+        several = float(rows.value) if rows is not None and found.rows_agree else single
+        return dataclasses.replace(found, scale=(single, several))
+
+    @property
+    def _alarm(self) -> float:
+        return ALARM / (self.asked + 2)
+
+    def _settled(
+        self, sizes: Float[np.ndarray, " c"], chosen: list[int]
+    ) -> tuple[_Look, Float[np.ndarray, " c"]]:
+        """Changes `chosen` and errors of the calibration fitted together, with the stars that this keeps."""
+        look = self._looked(sizes)
+        fitted = np.array([*chosen, *range(self.asked, len(sizes))])
+        for _ in range(_ROUNDS):
+            matrix = look.matrix[np.ix_(fitted, fitted)]
+            step = _solved(matrix, look.score[fitted])
+            if step @ matrix @ step < _SETTLED**2:
+                break
+            sizes = sizes.copy()
+            sizes[fitted] += step
+            look = self._looked(sizes)
+        return look, sizes
+
+    def _beside(
+        self, matrix: Float[np.ndarray, "c c"], score: Float[np.ndarray, " c"], chosen: list[int]
+    ) -> list[Found]:
+        """Every question, alone beside `chosen`, which have no answer here."""
+        free = [n for n in range(self.asked) if n not in chosen]
+        order = [*free, *chosen, *range(self.asked, len(score))]
+        left, along = eliminated(matrix[np.ix_(order, order)], score[order], len(free))
+        found = [Found(question, 0.0, np.inf, 0.0) for question in self.questions]
+        for n, information, slope in zip(free, np.diag(left), along, strict=True):
+            if information > 1e-9 * matrix[n, n]:
+                error = float(information**-0.5)
+                found[n] = Found(self.questions[n], float(slope * error**2), error, float(slope * error))
+        return found
+
+    def _change(self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int], asked: int) -> Change:
+        """What was found, and what describes the same residuals as well."""
+        away = np.zeros_like(sizes)
+        away[asked] = sizes[asked]
+        score = look.score + look.matrix @ away
+        each = self._beside(look.matrix, score, [k for k in chosen if k != asked])
+        best = max(each, key=lambda found: found.sigma**2)
+        alike = [found for found in each if found.sigma**2 > best.sigma**2 - RIVAL]
+        return Change(best, tuple(sorted(alike, key=lambda found: -abs(found.sigma))))
+
+    def _smallest(self, tests: list[Found]) -> float:
+        """The gain change of one camera that raises the alarm in 99 % of cases."""
+        errors = [t.error for t in tests if t.question.kind == "gain" and np.isfinite(t.error)]
+        return (threshold(self._alarm) + _SEEN) * min(errors) if errors else np.nan
+
+
+class _Look(NamedTuple):
+    noise: Scale
+    rows: Scale | None
+    matrix: Float[np.ndarray, "c c"]
+    score: Float[np.ndarray, " c"]
+
+
+def threshold(chance: float) -> float:
+    """Standard deviations that a normal number exceeds, to either side, with this probability."""
+    return float(-special.ndtri(0.5 * chance))
+
+
+def _chance(sigma: float) -> float:
+    return float(2.0 * special.ndtr(-abs(sigma)))
+
+
+def _chance_beside(rows: Scale, noise: Scale) -> float:
+    """Probability that noise alone makes what rows share as large beside the scatter of all."""
+    if rows.worth <= 0 or noise.worth <= 0:
+        return 1.0
+    return float(special.fdtrc(rows.worth, noise.worth, rows.value / noise.value))
+
+
+def _solved(matrix: Float[np.ndarray, "c c"], score: Float[np.ndarray, " c"]) -> Float[np.ndarray, " c"]:
+    scale = np.sqrt(np.clip(np.diag(matrix), 1e-300, None))
+    value, vector = np.linalg.eigh(matrix / np.outer(scale, scale))
+    good = value > 1e-10 * value[-1]
+    along = vector[:, good]
+    return along @ ((along.T @ (score / scale)) / value[good]) / scale

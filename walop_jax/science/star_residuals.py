@@ -1,0 +1,265 @@
+"""What stars leave once their flux and (q, u) are fitted: the residuals that watch a calibration.
+
+A row of four cameras has three unknowns, so one number of it is left, whose expectation is 0. For the rows of a star,
+
+    r = y − m,    y = N/σ,    m = F a·s/σ,    P = 1 − (flux of every row) − T H Tᵀ
+
+with T the derivative of m to (q, u) behind the flux and H the covariance of (q, u): r = P r has covariance P. A change
+of counts of shape c (over σ) and size β leaves P c β.
+
+Normal matrix   Q = Σ w κ cᵀ P c,  score  g = Σ w cᵀ r over the stars that are kept; both of any list of columns. A
+                camera's gain has the column m in that camera. The sum over all cameras is flux: P c = 0.
+Calibration     Its errors θ, of covariance C, are columns like others, with the prior θᵀ C⁻¹ θ: what the calibration
+                does not know is no alarm (`eliminated`).
+Trimmed         Stars of χ² > q, with P(χ²_ν > q) = `TRIMMED`, are not used. For a normal distribution cut at a radius
+                covariance and response are both smaller by κ = P(χ²_{ν+2} < q) (about 0.99), so that estimates are
+                unbiased and errors known; what lies far off, however far, has no influence.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import special
+
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.flux import Sharing, project_flux
+from walop_jax.likelihood.linear import through_series
+
+TRIMMED = 1e-3
+_ROUNDS = 50
+Matrix = Float[np.ndarray, "c c"]
+
+
+@dataclasses.dataclass(frozen=True)
+class StarResiduals:
+    """Rows of stars, ready to be asked what has changed; rows of a star follow each other, numbered from 0.
+
+    `residual`, `model` and `tangent` (derivatives of the model to q, u, flux projected) are over σ, and 0 where a
+    camera is not used; `root` is 1/σ. `photon` is the covariance H of a star's (q, u). `x`, `y`
+    in degrees, `time` in days (NaN: not known). `plain` and `throughput` are derivatives of the model over σ to
+    parameters and to the throughputs of the cameras, `basis` the terms of their series at the row; `colour` the changes
+    of the model for stars without TEFF: mean and standard deviation of their colours. `together` is 1 where two
+    cameras share a flux (None: all do).
+    """
+
+    star: Int[np.ndarray, " r"]
+    residual: Float[np.ndarray, "r k"]
+    model: Float[np.ndarray, "r k"]
+    tangent: Float[np.ndarray, "r 2 k"]
+    photon: Float[np.ndarray, "s 2 2"]
+    root: Float[np.ndarray, "r k"]
+    x: Float[np.ndarray, " r"]
+    y: Float[np.ndarray, " r"]
+    time: Float[np.ndarray, " r"]
+    plain: Float[np.ndarray, "r k o"]
+    throughput: Float[np.ndarray, "r k k"]
+    basis: Float[np.ndarray, "r t"]
+    colour: Float[np.ndarray, "r k 2"]
+    together: Float[np.ndarray, "k k"] | None = None
+
+    @classmethod
+    def joined(cls, parts: list[StarResiduals]) -> StarResiduals:
+        """Several lists of stars as one."""
+        values = {
+            f.name: np.concatenate([getattr(p, f.name) for p in parts])
+            for f in dataclasses.fields(cls)
+            if f.name not in ("star", "together")
+        }
+        first = np.cumsum([0, *(len(p.photon) for p in parts[:-1])])
+        star = np.concatenate([p.star + start for p, start in zip(parts, first, strict=True)])
+        return cls(star=star, together=parts[0].together, **values)
+
+    def __len__(self) -> int:
+        return len(self.star)
+
+    @property
+    def first(self) -> Int[np.ndarray, " s"]:
+        """The first row of every star."""
+        return np.flatnonzero(np.diff(self.star, prepend=-1))
+
+    @property
+    def rows(self) -> Int[np.ndarray, " s"]:
+        """Rows of every star in which a camera is used."""
+        return np.add.reduceat((self.root > 0).any(axis=1).astype(int), self.first)
+
+    @property
+    def dof(self) -> Int[np.ndarray, " s"]:
+        """Degrees of freedom of every star: cameras used, less the fluxes and q, u."""
+        used = self.root > 0
+        arms = np.ones((1, used.shape[1])) if self.together is None else np.unique(self.together, axis=0)
+        fluxes = ((used @ (arms > 0).T) > 0).sum(axis=1)
+        return np.add.reduceat(used.sum(axis=1) - fluxes, self.first) - 2
+
+    def part(self, stars: slice) -> StarResiduals:
+        """Some of the stars, a slice of them."""
+        first = np.append(self.first, len(self))
+        start, stop, _ = stars.indices(len(first) - 1)
+        rows = slice(first[start], first[stop])
+        cut = {
+            f.name: getattr(self, f.name)[rows]
+            for f in dataclasses.fields(self)
+            if f.name not in ("star", "photon", "together")
+        }
+        return StarResiduals(
+            star=self.star[rows] - start, photon=self.photon[stars], together=self.together, **cut
+        )
+
+    def blocks(self) -> Iterator[tuple[slice, StarResiduals]]:
+        """Slices of stars of some `limits.CHECKED_ROWS` rows, each with its rows."""
+        first = self.first
+        cuts = np.searchsorted(first, np.arange(0, len(self), limits.CHECKED_ROWS))
+        for start, stop in zip(cuts, [*cuts[1:], len(first)], strict=True):
+            if stop > start:
+                stars = slice(int(start), int(stop))
+                yield stars, self.part(stars)
+
+    def parameters(self) -> Float[np.ndarray, "r k n"]:
+        """Derivatives of the model over σ to all parameters: plain ones, then the throughput series."""
+        series = through_series(self.throughput[:, :, None], self.basis[:, None, None])
+        return np.concatenate([self.plain, series], axis=-1)
+
+    def projected(
+        self, columns: Float[np.ndarray, "r k c"]
+    ) -> tuple[Float[np.ndarray, "c r k"], Float[np.ndarray, "s 2 c"]]:
+        """Columns without flux, and their products Tᵀ c with what q and u of a star do."""
+        free = project_flux(np.moveaxis(columns, -1, 0), self.model, False, Sharing(self.together))
+        along = np.einsum("rik,crk->ric", self.tangent, free, optimize=True)
+        return free, np.add.reduceat(along, self.first)
+
+    def left(self, change: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "r k"]:
+        """P c of one change of the counts over σ."""
+        free, along = self.projected(change[..., None])
+        moved = np.einsum("sij,sjc->sic", self.photon, along)[self.star, :, 0]
+        return np.where(self.root > 0, free[0] - np.einsum("rik,ri->rk", self.tangent, moved), 0.0)
+
+
+Columns = Callable[[StarResiduals], Float[np.ndarray, "r k c"]]
+
+
+def normal_matrix(
+    stars: StarResiduals,
+    residual: Float[np.ndarray, "r k"],
+    columns: Columns,
+    weight: Float[np.ndarray, " s"],
+    share: Float[np.ndarray, " s"],
+) -> tuple[Matrix, Float[np.ndarray, " c"]]:
+    """Q and g (head of this file) of columns; `weight` is 1/variance of a star's residuals, 0 for those left out.
+
+    `residual` is that of `stars` or what is left of it behind changes; `share` is κ.
+    """
+    first = stars.first
+    matrix, score = np.zeros((0, 0)), np.zeros(0)
+    for here, part in stars.blocks():
+        values = columns(part)
+        free, along = part.projected(values)
+        count = len(free)
+        if not score.size:
+            matrix, score = np.zeros((count, count)), np.zeros(count)
+        rows = slice(first[here.start], first[here.start] + len(part))
+        w, k = weight[here], share[here]
+        scaled = np.sqrt(w * k)
+        flat = (free * scaled[part.star, None]).reshape(count, -1)
+        half = np.linalg.cholesky(part.photon).swapaxes(1, 2) @ along * scaled[:, None, None]
+        taken = half.reshape(-1, count)
+        matrix += flat @ flat.T - taken.T @ taken
+        score += values.reshape(-1, count).T @ (residual[rows] * w[part.star, None]).ravel()
+    return matrix, score
+
+
+def eliminated(matrix: Matrix, score: Float[np.ndarray, " c"], kept: int) -> tuple[Matrix, np.ndarray]:
+    """Q and g of the first `kept` columns with all others fitted (these have their priors in Q and g)."""
+    other = matrix[kept:, kept:]
+    if not len(other):
+        return matrix, score
+    scale = np.sqrt(np.clip(np.diag(other), 1e-300, None))
+    weight, vector = np.linalg.eigh(other / np.outer(scale, scale))
+    root = vector / scale[:, None] * np.where(weight > 1e-10 * weight[-1], weight, np.inf) ** -0.5
+    cross = matrix[:kept, kept:] @ root
+    return matrix[:kept, :kept] - cross @ cross.T, score[:kept] - cross @ (root.T @ score[kept:])
+
+
+# -------------------------------------------------------------------------------------------- noise, robustly
+
+
+class Scale(NamedTuple):
+    """s² = χ²/ν of the stars that are kept, with the degrees of freedom that its accuracy is worth (2/variance)."""
+
+    value: float
+    worth: float
+    kept: Bool[np.ndarray, " s"]
+    share: Float[np.ndarray, " s"]
+
+
+def noise_scale(chi2: Float[np.ndarray, " s"], dof: Float[np.ndarray, " s"]) -> Scale:
+    """The factor by which χ² of stars exceeds its degrees of freedom, whatever a few of them do.
+
+    From the median, then from all stars within the cut, until these stay the same. Stars without degrees of freedom
+    are not kept.
+    """
+    known, of = np.unique(dof, return_inverse=True)
+    known, asked = np.maximum(known, 1e-12), np.isfinite(chi2) & (dof > 0)
+    cut = special.chdtri(known, TRIMMED)
+    inside = special.chdtr(known + 2.0, cut)
+    mean = known * inside / (1.0 - TRIMMED)
+    if not asked.any():
+        return Scale(1.0, 0.0, asked, inside[of])
+    scale = float(np.median(chi2[asked] / special.chdtri(known, 0.5)[of][asked]))
+    kept = asked
+    for _ in range(_ROUNDS):
+        kept = asked & (chi2 <= cut[of] * scale)
+        before, scale = scale, float(chi2[kept].sum() / max(mean[of][kept].sum(), 1e-300))
+        if scale <= 0 or abs(scale - before) < 1e-9 * before:
+            break
+    density = np.exp(
+        special.xlogy(known / 2, cut) - cut / 2 - special.xlogy(known / 2, 2) - special.gammaln(known / 2)
+    )
+    slope = known * inside - density * (cut - mean)  # cut · probability density = `density`
+    fourth = known * (known + 2.0) * special.chdtr(known + 4.0, cut)
+    variance = fourth - 2.0 * mean * known * inside + mean**2 * (1.0 - TRIMMED)
+    number = np.bincount(of[kept], minlength=len(known))
+    worth = 2.0 * float(number @ slope) ** 2 / max(float(number @ variance), 1e-300)
+    return Scale(scale, worth, kept, inside[of])
+
+
+def chance_of_scale(scale: Scale) -> float:
+    """Probability, both sides, of a scale as far from 1 by noise alone."""
+    if scale.worth <= 0:
+        return 1.0
+    value = scale.value * scale.worth
+    return float(min(1.0, 2.0 * min(special.chdtr(scale.worth, value), special.chdtrc(scale.worth, value))))
+
+
+def shared_by_rows(
+    stars: StarResiduals, residual: Float[np.ndarray, "r k"], variance: Float[np.ndarray, " s"]
+) -> Scale | None:
+    """The factor by which what the rows of a star have in common exceeds its expectation; None where all have one.
+
+    T = Σ_k (Σ_j r_jk)² over cameras k and rows j has expectation tr I and variance 2 tr I², I the covariance of the
+    sums: T · ν / tr I is near χ² with ν = (tr I)² / tr I² degrees of freedom (Satterthwaite 1946).
+    """
+    several = stars.rows > 1
+    if not several.any():
+        return None
+    value, dof = np.full(len(several), np.nan), np.zeros(len(several))
+    first = stars.first
+    for here, part in stars.blocks():
+        cameras = part.model.shape[1]
+        same = np.eye(cameras) * (part.root > 0)[:, :, None]
+        free, along = part.projected(same)
+        each = np.einsum("arc,brc->rab", free, free, optimize=True)
+        left = np.add.reduceat(each, part.first) - np.einsum(
+            "sia,sij,sjb->sab", along, part.photon, along, optimize=True
+        )
+        rows = slice(first[here.start], first[here.start] + len(part))
+        total = np.add.reduceat(residual[rows], part.first)
+        trace, square = np.trace(left, axis1=1, axis2=2), np.sum(left**2, axis=(1, 2))
+        good = several[here] & (trace > 1e-9 * part.rows)
+        safe = np.where(good, square, 1.0)
+        dof[here] = np.where(good, trace**2 / safe, 0.0)
+        value[here] = np.where(good, np.sum(total**2, axis=1) * trace / safe / variance[here], np.nan)
+    return noise_scale(value, np.round(dof, 2))
