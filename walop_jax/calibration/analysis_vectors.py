@@ -163,7 +163,7 @@ class AnalysisVectors:
 
     def basis(self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p t"]:
         """Terms of the throughput series at field positions (deg)."""
-        return np.asarray(self.instrument.throughput.basis(jnp.asarray(x), jnp.asarray(y)))
+        return self.instrument.throughput.basis(x, y)
 
     # ------------------------------------------------------------------------------------ making the tables
 

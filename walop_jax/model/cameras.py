@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -47,8 +48,8 @@ class Throughput(Component):
         terms = legendre.terms(self.degree)
         return tuple(f"n{k}.p{i}{j}" for k in range(self.coefficients.shape[0]) for i, j in terms)
 
-    def basis(self, x: Float[Array, ...], y: Float[Array, ...]) -> Float[Array, "... t"]:
-        """Values of the terms of the series at field positions in degrees."""
+    def basis(self, x: Float[Any, ...], y: Float[Any, ...]) -> Float[Any, "... t"]:
+        """Values of the terms of the series at field positions in degrees; arrays of numpy stay so."""
         return legendre.basis(x, y, self.degree, self.scale)
 
     def at(self, x: Scalar, y: Scalar) -> Float[Array, " k"]:

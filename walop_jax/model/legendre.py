@@ -6,7 +6,11 @@ Recursion   (k+1) P_{k+1} = (2k+1) t P_k − k P_{k−1}.
 
 from __future__ import annotations
 
+from typing import Any
+
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.model.conventions import FIELD_SCALE
@@ -19,8 +23,8 @@ def terms(degree: int) -> tuple[tuple[int, int], ...]:
     return tuple((n - j, j) for n in range(degree + 1) for j in range(n + 1))
 
 
-def _one_dimension(t: Float[Array, ...], degree: int) -> list[Float[Array, ...]]:
-    values = [0.0 * t + 1.0, t]
+def _one_dimension(t: Float[Any, ...], degree: int) -> list[Float[Any, ...]]:
+    values = [t * 0.0 + 1.0, t]
     for k in range(1, degree):
         values.append(((2 * k + 1) * t * values[k] - k * values[k - 1]) / (k + 1))
     return values
@@ -32,8 +36,8 @@ def polynomial(degree: int, t: Float[Array, ...]) -> Float[Array, ...]:
 
 
 def basis(
-    x: Float[Array, ...], y: Float[Array, ...], degree: int, scale: float = FIELD_SCALE
-) -> Float[Array, "... t"]:
-    """Values of all terms at field positions in degrees."""
+    x: Float[Any, ...], y: Float[Any, ...], degree: int, scale: float = FIELD_SCALE
+) -> Float[Any, "... t"]:
+    """Values of all terms at field positions in degrees; arrays of numpy stay so."""
     px, py = _one_dimension(x / scale, degree), _one_dimension(y / scale, degree)
-    return jnp.stack([px[i] * py[j] for i, j in terms(degree)], axis=-1)
+    return (jnp if isinstance(x, jax.Array) else np).stack([px[i] * py[j] for i, j in terms(degree)], axis=-1)

@@ -395,8 +395,11 @@ class _Search:
         """All questions, then again behind what was found."""
         sizes = np.zeros(len(self.prior))
         chosen: list[int] = []
-        look, sizes = self._settled(sizes, chosen)
+        look = self._looked(sizes)
         tests = self._beside(look.matrix, look.score, chosen)
+        if self._suspicious(look, tests):  # else one linear step is all there is to do
+            look, sizes = self._settled(look, sizes, chosen)
+            tests = self._beside(look.matrix, look.score, chosen)
         smallest = self._smallest(tests)
         answers = tests
         while len(chosen) < _MOST_CHANGES:
@@ -404,7 +407,7 @@ class _Search:
             if strongest < 0 or strongest in chosen or _chance(answers[strongest].sigma) >= self._alarm:
                 break
             chosen.append(strongest)
-            look, sizes = self._settled(sizes, chosen)
+            look, sizes = self._settled(look, sizes, chosen)
             answers = self._beside(look.matrix, look.score, chosen)
         changes = tuple(self._change(look, sizes, chosen, n) for n in chosen)
         noise, rows = look.noise, look.rows
@@ -433,11 +436,17 @@ class _Search:
     def _alarm(self) -> float:
         return ALARM / (self.asked + 2)
 
+    def _suspicious(self, look: _Look, tests: list[Found]) -> bool:
+        """Whether anything comes near an alarm."""
+        near = 100.0 * self._alarm
+        rows = 1.0 if look.rows is None else _chance_beside(look.rows, look.noise)
+        strongest = max((abs(test.sigma) for test in tests), default=0.0)
+        return min(rows, chance_of_scale(look.noise), _chance(strongest)) < near
+
     def _settled(
-        self, sizes: Float[np.ndarray, " c"], chosen: list[int]
+        self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int]
     ) -> tuple[_Look, Float[np.ndarray, " c"]]:
         """Changes `chosen` and errors of the calibration fitted together, with the stars that this keeps."""
-        look = self._looked(sizes)
         fitted = np.array([*chosen, *range(self.asked, len(sizes))])
         for _ in range(_ROUNDS):
             matrix = look.matrix[np.ix_(fitted, fitted)]
