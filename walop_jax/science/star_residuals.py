@@ -171,7 +171,9 @@ def normal_matrix(
     return matrix, score
 
 
-def eliminated(matrix: Matrix, score: Float[np.ndarray, " c"], kept: int) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, " k"]]:
+def eliminated(
+    matrix: Matrix, score: Float[np.ndarray, " c"], kept: int
+) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, " k"]]:
     """Q and g of the first `kept` columns with all others fitted (these have their priors in Q and g)."""
     other = matrix[kept:, kept:]
     if not len(other):
