@@ -106,6 +106,12 @@ class AnalysisVectors:
         """Number of `parameters` that are not coefficients of the throughput series; they come first."""
         return len(self._uncertain)
 
+    @property
+    def named(self) -> list[tuple[str, str]]:
+        """Names and units of `parameters`."""
+        known = self.calibration.model.parameters
+        return [(known[int(p)].name, known[int(p)].unit) for p in self.parameters]
+
     # ------------------------------------------------------------------------------------ asking
 
     def reduced(self, settings: Settings) -> Settings:

@@ -86,7 +86,7 @@ def apply(
     catalogue with more optical settings than can be tabulated, and, unless `force` is given, for what the calibration
     does not cover (`check_validity`).
     """
-    work = _Application(calibration, catalogue, force=force)
+    work = _Application(AnalysisVectors(calibration), catalogue, force=force)
     chosen = work.sample(limits.STAR_SAMPLE)
     parts, watched = [], []
     for done, rows in work.blocks():
@@ -101,16 +101,15 @@ def apply(
 
 
 def residuals_of(
-    calibration: Calibration, catalogue: Catalogue, rows: int = limits.STAR_SAMPLE, *, force: bool = False
-) -> tuple[StarResiduals | None, Float[np.ndarray, "n n"]]:
-    """Residuals of a catalogue, of some `rows` of it at most, and the root of the covariance of their parameters.
+    vectors: AnalysisVectors, catalogue: Catalogue, rows: int = limits.STAR_SAMPLE, *, force: bool = False
+) -> list[StarResiduals]:
+    """Residuals of the stars of a catalogue, of about `rows` of its rows at most; none where no camera is to spare.
 
-    None where no row has a camera to spare. Raises `DataError` as `apply` does.
+    Raises `DataError` as `apply` does.
     """
-    work = _Application(calibration, catalogue, force=force)
+    work = _Application(vectors, catalogue, force=force)
     chosen = work.sample(rows)
-    watched = [part for _, here in work.blocks() for part in work.residuals(work.block(here), chosen)]
-    return (StarResiduals.joined(watched) if watched else None), work.vectors.root
+    return [part for _, here in work.blocks() for part in work.residuals(work.block(here), chosen)]
 
 
 class _Block(NamedTuple):
@@ -131,9 +130,9 @@ class _Block(NamedTuple):
 class _Application:
     """A calibration at work on a catalogue."""
 
-    def __init__(self, calibration: Calibration, catalogue: Catalogue, *, force: bool) -> None:
-        self.catalogue = catalogue
-        self.vectors = AnalysisVectors(calibration)
+    def __init__(self, vectors: AnalysisVectors, catalogue: Catalogue, *, force: bool) -> None:
+        self.catalogue, self.vectors = catalogue, vectors
+        calibration = vectors.calibration
         self.settings, self.setting_of = _settings(self.vectors, catalogue)
         if not force:
             check_validity(calibration, catalogue.points.settings)
@@ -271,11 +270,9 @@ class _Application:
         """What the stars say together."""
         if not watched:
             return NOTHING_TO_SPARE
-        calibration, parameters = self.vectors.calibration, self.vectors.parameters
-        known = [calibration.model.parameters[int(p)] for p in parameters]
-        names = [(p.name, p.unit) for p in known]
-        cameras = self.vectors.instrument.cameras.names
-        return check_catalogue(StarResiduals.joined(watched), cameras, names, self.vectors.root)
+        vectors = self.vectors
+        cameras = vectors.instrument.cameras.names
+        return check_catalogue(StarResiduals.joined(watched), cameras, vectors.named, vectors.root)
 
     def together(self, stars: Stars, check: CatalogueCheck) -> Stars:
         """The stars with errors, and a bit of FLAG, that hold what all of them say together."""

@@ -1,0 +1,564 @@
+"""When did a calibration cease to hold? Asked of the stars of many nights, without any calibration exposure.
+
+    r_j = P (β c_j h(t_j)) + noise + errors of the calibration
+
+A camera k that becomes brighter by β leaves P c β, c the counts of the model in that camera (`star_residuals`); flux
+and (q, u) of the stars are eliminated. Of every exposure group (rows of one time) and camera the score g and their
+matrix Q are kept, errors of the calibration eliminated. Then any history h over the groups is algebra:
+
+step        h = 1 from one group on
+drift       h grows evenly from one group to the last
+once        h = 1 in a single group
+
+    z = hᵀg / √(hᵀQh),   β = hᵀg / hᵀQh,   σ_β = (hᵀQh)^(−1/2), the Cramér–Rao bound (matched filter)
+
+All cameras together are flux: no history of theirs leaves a trace. One correction for all histories asked: noise
+raises an alarm in one of 1/`ALARM` catalogues, at z₀; what is seen in 99 % is (z₀ + 2.33) σ_β. What was found competes
+with the same history of the numbers of the optics (thicknesses, axes of plates, …) and of the other cameras: those that
+describe the stars as well are told together, and a camera is named only if no other is among them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from walop_jax.io.display import Display, Displayed
+from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.rounding import two_digits, with_error, with_minus_sign
+from walop_jax.science.catalogue_check import ALARM, NOISE_MATTERS, RIVAL, threshold
+from walop_jax.science.star_residuals import (
+    Scale,
+    StarResiduals,
+    chance_of_scale,
+    eliminated,
+    noise_scale,
+    normal_matrix,
+)
+
+SEEN = 2.33
+"""Standard deviations above the alarm from which 99 % are found."""
+MOST_GROUPS = 400
+"""Exposure groups that are told apart; neighbours of more are joined."""
+_DATE = 1e3  # times above are dates, not numbers of groups
+_FEW = 20  # stars: fewer have no scale of their own
+_MOST_CHANGES = 4
+_ROUNDS = 6
+_SETTLED = 0.1  # standard errors
+
+
+class History(NamedTuple):
+    """How a change went: `kind` is step, drift or once; `start` the group it began in."""
+
+    kind: str
+    start: int
+
+    def over(self, time: Float[np.ndarray, " g"]) -> Float[np.ndarray, " g"]:
+        """Its size in every group, 1 at most."""
+        number = np.arange(len(time))
+        if self.kind == "once":
+            return (number == self.start).astype(float)
+        if self.kind == "step":
+            return (number >= self.start).astype(float)
+        return np.clip((time - time[self.start]) / max(time[-1] - time[self.start], 1e-300), 0.0, 1.0)
+
+
+class Suspect(NamedTuple):
+    """What may have changed: a camera or a number of the optics, by how much, and its significance."""
+
+    name: str
+    camera: bool
+    history: History
+    size: float
+    error: float
+    unit: str
+
+    @property
+    def sigma(self) -> float:
+        """Size in standard errors."""
+        return self.size / self.error
+
+
+@dataclasses.dataclass(frozen=True)
+class WatchedChange:
+    """A change: the best description, those that describe the stars as well, and when (MJD, or the group's number)."""
+
+    best: Suspect
+    alike: tuple[Suspect, ...]
+    time: float
+
+    @property
+    def camera(self) -> str | None:
+        """The camera, if it is one and no other, and not the optics."""
+        names = {entry.name for entry in self.alike}
+        return self.best.name if len(names) == 1 and self.best.camera else None
+
+    def words(self) -> str:
+        """The change in a sentence."""
+        date = f"MJD {self.time:.4f}" if self.time > _DATE else f"group {self.time:g}"
+        how = {
+            "step": "from {} on",
+            "drift": "at the end, drifting since {}",
+            "once": "in the exposures of {} only",
+        }
+        when = how[self.best.history.kind].format(date)
+        text = f"{_words(self.best)} {when} ({abs(self.best.sigma):.0f} σ)"
+        others = {entry.name: entry for entry in self.alike if entry.name != self.best.name}
+        if not others:
+            return text
+        told = [_words(entry) for entry in list(others.values())[:4]]
+        more = f", and {len(others) - 4} more" if len(others) > 4 else ""
+        return f"{text}. These stars cannot tell it from {', '.join(told)}{more}"
+
+
+def _words(entry: Suspect) -> str:
+    if entry.camera:
+        more = ("brighter", "fainter")[entry.size < 0]
+        return f"{entry.name} {more} by {with_error(100 * abs(entry.size), 100 * entry.error)} %"
+    larger = ("larger", "smaller")[entry.size < 0]
+    return f"{entry.name} {larger} by {with_error(abs(entry.size), entry.error)} {entry.unit}".rstrip()
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Watch(Displayed):
+    """The history of a calibration as its stars tell it.
+
+    By exposure group: `time` (MJD, or its number), `stars`, `chi2` per degree of freedom, `gain` of every camera
+    (change since the calibration, that camera alone) with `error`, and `smallest`: the step of each camera from that
+    group on that would be found in 99 % of cases. `tests` histories were asked; the alarm is at `alarm` standard
+    errors.
+    """
+
+    cameras: tuple[str, ...]
+    time: Float[np.ndarray, " g"]
+    stars: Int[np.ndarray, " g"]
+    chi2: Float[np.ndarray, " g"]
+    gain: Float[np.ndarray, "g k"]
+    error: Float[np.ndarray, "g k"]
+    smallest: Float[np.ndarray, "g k"]
+    changes: tuple[WatchedChange, ...]
+    noise: float
+    tests: int
+    alarm: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether the calibration still holds."""
+        return not self.changes
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for every change, and one if N_ERR is not what the counts scatter by."""
+        said = tuple(change.words() for change in self.changes)
+        if 1.0 / NOISE_MATTERS < self.noise < NOISE_MATTERS:
+            return said
+        return (
+            *said,
+            f"χ²/dof of the stars is {self.noise:.3g}: N_ERR was multiplied by {np.sqrt(self.noise):.3g}",
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+
+        def plain(entry: Suspect) -> dict[str, Any]:
+            return {
+                "name": entry.name,
+                "camera": entry.camera,
+                "history": entry.history.kind,
+                "start": float(self.time[entry.history.start]),
+                "size": entry.size,
+                "error": entry.error,
+                "sigma": entry.sigma,
+                "unit": entry.unit,
+            }
+
+        found = [
+            {"camera": c.camera, "time": c.time, "best": plain(c.best), "alike": [plain(e) for e in c.alike]}
+            for c in self.changes
+        ]
+        groups = [
+            {
+                "time": float(self.time[g]),
+                "stars": int(self.stars[g]),
+                "chi2_per_dof": float(self.chi2[g]),
+                "gain": dict(zip(self.cameras, self.gain[g].tolist(), strict=True)),
+                "error": dict(zip(self.cameras, self.error[g].tolist(), strict=True)),
+                "smallest_step_seen": dict(zip(self.cameras, self.smallest[g].tolist(), strict=True)),
+            }
+            for g in range(len(self.time))
+        ]
+        return {
+            "holds": self.holds,
+            "changes": found,
+            "smallest_step_seen": float(np.min(self.smallest)),
+            "chi2_per_dof": self.noise,
+            "tests": self.tests,
+            "alarm_sigma": self.alarm,
+            "groups": groups,
+            "warnings": list(self.warnings),
+        }
+
+    def to_table(self) -> Any:
+        """A row for each exposure group, as an astropy table."""
+        columns = {
+            "TIME": (self.time, "", "MJD, or number of the group"),
+            "STARS": (self.stars, "", "stars seen in it"),
+            "CHI2DOF": (self.chi2, "", "chi squared per degree of freedom of its stars"),
+        }
+        for k, name in enumerate(self.cameras):
+            columns |= {
+                f"GAIN_{name}": (self.gain[:, k], "", "change since the calibration, this camera alone"),
+                f"ERROR_{name}": (self.error[:, k], "", "its standard error"),
+                f"SEEN_{name}": (self.smallest[:, k], "", "smallest step from here on that is found in 99 %"),
+            }
+        return astropy_table(columns)
+
+    def display(self) -> Display:
+        """The verdict, what has changed, what would have been seen, and the groups."""
+        percent = 100.0
+        rows = tuple(
+            (
+                f"{self.time[g]:.4f}" if self.time[g] > _DATE else f"{self.time[g]:g}",
+                f"{self.stars[g]}",
+                f"{self.chi2[g]:.2f}",
+                *(
+                    with_minus_sign(f"{percent * self.gain[g, k]:+.3f}")
+                    + f" ± {percent * self.error[g, k]:.3f}"
+                    for k in range(len(self.cameras))
+                ),
+                f"{percent * self.smallest[g].min():.2g}",
+            )
+            for g in range(len(self.time))
+        )
+        seen = two_digits(percent * float(np.min(self.smallest)))
+        return Display(
+            title="The calibration holds" if self.holds else "The calibration HAS CEASED TO HOLD",
+            facts=(
+                ("exposure groups", f"{len(self.time)}"),
+                ("smallest step seen", f"{seen} % of one camera, in 99 % of cases"),
+            ),
+            head=("time", ">stars", ">χ²/dof", *(f">{name} %" for name in self.cameras), ">seen %"),
+            rows=rows,
+            notes=self.warnings,
+        )
+
+
+def watch_stars(
+    stars: StarResiduals,
+    cameras: Sequence[str],
+    parameters: Sequence[tuple[str, str]],
+    root: Float[np.ndarray, "n n"],
+) -> Watch:
+    """Look for the histories at the head of this file in the residuals of stars.
+
+    `stars.time` is an MJD, or the number of the exposure group; rows of equal time are one group. `cameras` are names,
+    `parameters` names and units of `stars.parameters()`, `root` a square root of their covariance.
+    """
+    return _Watching(stars, cameras, parameters, root).watch()
+
+
+def grouped(
+    time: Float[np.ndarray, " r"], most: int = MOST_GROUPS
+) -> tuple[Float[np.ndarray, " g"], Int[np.ndarray, " r"]]:
+    """Times of exposure groups and the group of every row; a time that is not known is as the earliest.
+
+    Neighbours of more than `most` groups are joined.
+    """
+    known = np.where(np.isfinite(time), time, np.nanmin(time) if np.isfinite(time).any() else 0.0)
+    times, group = np.unique(known, return_inverse=True)
+    if len(times) > most:
+        step = -(-len(times) // most)
+        group = group // step
+        times = times[::step]
+    return times, group.reshape(-1)
+
+
+class _Watching:
+    def __init__(
+        self,
+        stars: StarResiduals,
+        cameras: Sequence[str],
+        parameters: Sequence[tuple[str, str]],
+        root: Float[np.ndarray, "n n"],
+    ) -> None:
+        self.stars, self.cameras, self.optics = (
+            stars,
+            tuple(cameras),
+            list(parameters[: stars.plain.shape[-1]]),
+        )
+        self.root = root[:, np.abs(root).max(axis=0, initial=0.0) > 0]
+        self.time, self.group = grouped(stars.time)
+        groups = len(self.time)
+        self.histories = [History("step", g) for g in range(groups)]
+        self.histories += [History("drift", g) for g in range(groups - 2)]
+        self.histories += [History("once", g) for g in range(1, groups - 1)]
+        self.shapes = np.stack([h.over(self.time) for h in self.histories], axis=1)
+        self.tests = len(self.histories) * len(cameras)
+        self.alarm = threshold(ALARM / self.tests)
+        # Stars of a single group have a scale with the others of it; those of several groups together.
+        low, high = (op.reduceat(self.group, stars.first) for op in (np.minimum, np.maximum))
+        self.pool = np.where(low == high, low, groups)
+
+    # --------------------------------------------------------------------------------------------- noise
+
+    def weights(
+        self, residual: Float[np.ndarray, "r k"]
+    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Scale]:
+        """1/variance of every star (0: left out), κ, and the scale of all of them."""
+        chi2, dof = (
+            np.add.reduceat(np.sum(residual**2, axis=1), self.stars.first),
+            self.stars.dof.astype(float),
+        )
+        alarm = ALARM / (len(self.time) + 1)
+        whole = noise_scale(chi2, dof)
+        common = whole.value if chance_of_scale(whole) < alarm else 1.0
+        weight, share = np.where(whole.kept, 1.0 / common, 0.0), whole.share.copy()
+        for pool in np.unique(self.pool):
+            here = np.flatnonzero(self.pool == pool)
+            own = noise_scale(chi2[here], dof[here])
+            if len(here) >= _FEW and own.worth > 0 and chance_of_scale(own) < alarm:
+                weight[here], share[here] = np.where(own.kept, 1.0 / own.value, 0.0), own.share
+            elif len(here) >= _FEW:
+                weight[here], share[here] = np.where(own.kept, 1.0 / common, 0.0), own.share
+        return weight, share, whole
+
+    # -------------------------------------------------------------------------------------------- columns
+
+    def scan(
+        self,
+        residual: Float[np.ndarray, "r k"],
+        weight: Float[np.ndarray, " s"],
+        share: Float[np.ndarray, " s"],
+    ) -> tuple[Float[np.ndarray, "c c"], Float[np.ndarray, " c"]]:
+        """Q and g of the gains of all cameras in all groups (group, camera), errors of the calibration eliminated."""
+        stars, count, groups = self.stars, len(self.cameras), len(self.time)
+        known = self.root.shape[1] + 2
+        gains = np.zeros((groups * count, groups * count))
+        cross, nuisance = np.zeros((groups * count, known)), np.eye(known)
+        score, pull = np.zeros(groups * count), np.zeros(known)
+        first = stars.first
+        for here, part in stars.blocks():
+            rows = slice(first[here.start], first[here.start] + len(part))
+            group, w, k = self.group[rows], weight[here], share[here]
+            values = np.concatenate([part.model[..., None] * np.eye(count), self._errors(part)], axis=-1)
+            free, along = part.projected(values)
+            heavy = np.sqrt(w * k)[part.star]
+            free = free * heavy[:, None]
+            own, other = free[:count], free[count:].reshape(known, -1)
+            each = np.einsum("arc,brc->rab", own, own, optimize=True)
+            blocks = gains.reshape(groups, count, groups, count)
+            np.add.at(blocks, (group, slice(None), group), each)
+            mixed = np.einsum("arc,nrc->ran", own, free[count:], optimize=True)
+            np.add.at(cross.reshape(groups, count, known), group, mixed)
+            nuisance += other @ other.T
+            # What the stars take by their q and u: sums over the rows of a star in each group.
+            half = np.linalg.cholesky(part.photon).swapaxes(1, 2)
+            row = half[part.star] @ np.einsum("rik,ark->ria", part.tangent, own, optimize=True)
+            pair, where = np.unique(part.star * groups + group, return_inverse=True)
+            sums = np.zeros((len(pair), *row.shape[1:]))
+            np.add.at(sums, where.reshape(-1), row)
+            of_star, of_group = pair // groups, pair % groups
+            errors = (half @ along[..., count:]) * np.sqrt(w * k)[:, None, None]
+            flat = errors.reshape(-1, known)
+            nuisance -= flat.T @ flat
+            taken = np.einsum("pia,pin->pan", sums, errors[of_star], optimize=True)
+            np.subtract.at(cross.reshape(groups, count, known), of_group, taken)
+            self._subtract(blocks, sums, of_star, of_group)
+            normal = residual[rows] * w[part.star, None]
+            np.add.at(score.reshape(groups, count), group, part.model * normal)
+            pull += self._errors(part).reshape(-1, known).T @ normal.ravel()
+        full = np.block([[gains, cross], [cross.T, nuisance]])
+        return eliminated(full, np.concatenate([score, pull]), groups * count)
+
+    @staticmethod
+    def _subtract(
+        blocks: Float[np.ndarray, "g k g k"],
+        sums: Float[np.ndarray, "p 2 k"],
+        of_star: Int[np.ndarray, " p"],
+        of_group: Int[np.ndarray, " p"],
+    ) -> None:
+        """Take what the stars take from the matrix: between all groups that a star is in."""
+        pairs = np.bincount(of_star)
+        alone = pairs[of_star] == 1
+        own = np.einsum("pia,pib->pab", sums[alone], sums[alone])
+        np.subtract.at(blocks, (of_group[alone], slice(None), of_group[alone]), own)
+        groups, count = blocks.shape[:2]
+        several = np.flatnonzero(~alone)
+        numbers, place = np.unique(of_star[several], return_inverse=True)
+        step = max(1, 2_000_000 // (2 * groups * count))
+        for start in range(0, len(numbers), step):
+            chosen = (place >= start) & (place < start + step)
+            dense = np.zeros((min(step, len(numbers) - start), 2, groups, count))
+            dense[place[chosen] - start, :, of_group[several[chosen]]] = sums[several[chosen]]
+            flat = dense.reshape(-1, groups * count)
+            blocks -= (flat.T @ flat).reshape(blocks.shape)
+
+    def _errors(self, part: StarResiduals) -> Float[np.ndarray, "r k n"]:
+        return np.concatenate([part.parameters() @ self.root, part.colour], axis=-1)
+
+    def suspects(self, residual: Any, weight: Any, share: Any, histories: list[History]) -> list[Suspect]:
+        """Every camera and every number of the optics with each of a few histories, alone, most significant first."""
+        count, plain = len(self.cameras), len(self.optics)
+        shapes = np.stack([h.over(self.time) for h in histories], axis=1)
+        stars = dataclasses.replace(self.stars, time=self.group.astype(float))
+
+        def columns(part: StarResiduals) -> Float[np.ndarray, "r k c"]:
+            grown = shapes[part.time.astype(int)]
+            gains = part.model[..., None] * np.eye(count)
+            each = np.concatenate([gains, part.plain], axis=-1)
+            asked = np.einsum("rkc,rh->rkhc", each, grown).reshape(*part.model.shape, -1)
+            return np.concatenate([asked, self._errors(part)], axis=-1)
+
+        matrix, score = normal_matrix(stars, residual, columns, weight, share)
+        asked = len(histories) * (count + plain)
+        known = len(score) - asked
+        matrix[asked:, asked:] += np.eye(known)
+        left, along = eliminated(matrix, score, asked)
+        found = []
+        for n, (information, slope) in enumerate(zip(np.diag(left), along, strict=True)):
+            history, which = histories[n // (count + plain)], n % (count + plain)
+            if not information > 1e-9 * matrix[n, n]:
+                continue
+            camera = which < count
+            name, unit = (self.cameras[which], "") if camera else self.optics[which - count]
+            found.append(
+                Suspect(name, camera, history, float(slope / information), float(information**-0.5), unit)
+            )
+        return sorted(found, key=lambda entry: -abs(entry.sigma))
+
+    def without(
+        self, residual: Float[np.ndarray, "r k"], change: Suspect, size: float
+    ) -> Float[np.ndarray, "r k"]:
+        """Residuals behind a change."""
+        grown, first = change.history.over(self.time)[self.group] * size, self.stars.first
+        out = []
+        for here, part in self.stars.blocks():
+            rows = slice(first[here.start], first[here.start] + len(part))
+            if change.camera:
+                column = part.model * np.eye(len(self.cameras))[self.cameras.index(change.name)]
+            else:
+                column = part.plain[..., [name for name, _ in self.optics].index(change.name)]
+            out.append(residual[rows] - part.left(column * grown[rows, None]))
+        return np.concatenate(out)
+
+    # --------------------------------------------------------------------------------------------- asking
+
+    def watch(self) -> Watch:
+        """Histories of cameras, the strongest first, until nothing is left."""
+        residual, changes = self.stars.residual, []
+        weight, share, whole = self.weights(residual)
+        matrix, score = first_look = self.scan(residual, weight, share)
+        while len(changes) < _MOST_CHANGES:
+            z = self.significance(matrix, score)
+            history, camera = np.unravel_index(np.argmax(np.abs(z)), z.shape)
+            if not abs(z[history, camera]) > self.alarm:
+                break
+            found, residual = self.settled(residual, z)
+            changes.append(found)
+            weight, share, whole = self.weights(residual)
+            matrix, score = self.scan(residual, weight, share)
+        return self.told(changes, first_look, matrix, whole)
+
+    def significance(self, matrix: Any, score: Any) -> Float[np.ndarray, "h k"]:
+        """z of every history of every camera."""
+        groups, count = len(self.time), len(self.cameras)
+        z = np.zeros((len(self.histories), count))
+        blocks, slopes = matrix.reshape(groups, count, groups, count), score.reshape(groups, count)
+        for k in range(count):
+            own = blocks[:, k, :, k]
+            information = np.einsum("gh,gf,fh->h", self.shapes, own, self.shapes, optimize=True)
+            floor = 1e-9 * np.trace(own)
+            z[:, k] = np.where(
+                information > floor,
+                self.shapes.T @ slopes[:, k] / np.sqrt(np.maximum(information, 1e-300)),
+                0.0,
+            )
+        return z
+
+    def settled(
+        self, residual: Float[np.ndarray, "r k"], z: Float[np.ndarray, "h k"]
+    ) -> tuple[WatchedChange, Float[np.ndarray, "r k"]]:
+        """A change with its rivals, and what is left behind it.
+
+        Histories compared are the best of each kind and camera and their neighbours. The fit is repeated with the
+        stars that it keeps.
+        """
+        best: Suspect | None = None
+        total, left, alike = 0.0, residual, []
+        for _ in range(_ROUNDS):
+            weight, share, _ = self.weights(left)
+            if best is not None:
+                z = self.significance(*self.scan(self.without(left, best, -total), weight, share))
+            near = self.near(z)
+            full = residual if best is None else self.without(left, best, -total)
+            ranked = self.suspects(full, weight, share, near)
+            before, best = best, ranked[0]
+            alike = [entry for entry in ranked if entry.sigma**2 > best.sigma**2 - RIVAL]
+            moved = abs(best.size - total) / best.error
+            total = best.size
+            left = self.without(residual, best, total)
+            if before is not None and before[:3] == best[:3] and moved < _SETTLED:
+                break
+        assert best is not None
+        return WatchedChange(best, tuple(alike), float(self.time[best.history.start])), left
+
+    def near(self, z: Float[np.ndarray, "h k"]) -> list[History]:
+        """The best history of each kind, for all cameras together, and its neighbours in time."""
+        strength = np.max(np.abs(z), axis=1)
+        chosen: list[History] = []
+        for kind in ("step", "drift", "once"):
+            mine = [n for n, h in enumerate(self.histories) if h.kind == kind]
+            if not mine:
+                continue
+            top = max(mine, key=lambda n: strength[n])
+            starts = [self.histories[n].start for n in mine]
+            chosen += [
+                History(kind, start)
+                for start in (self.histories[top].start + d for d in (-1, 0, 1))
+                if start in starts
+            ]
+        return chosen
+
+    def told(
+        self,
+        changes: list[WatchedChange],
+        first_look: tuple[Any, Any],
+        matrix: Float[np.ndarray, "c c"],
+        whole: Scale,
+    ) -> Watch:
+        """The record: gains as they were first seen, accuracies with all that was found taken away."""
+        groups, count = len(self.time), len(self.cameras)
+        blocks = matrix.reshape(groups, count, groups, count)
+        slopes = first_look[1].reshape(groups, count)
+        seen_first = first_look[0].reshape(groups, count, groups, count)
+        gain, error, smallest = (np.full((groups, count), np.nan) for _ in range(3))
+        steps = np.tril(np.ones((groups, groups)))  # group, start
+        for k in range(count):
+            own, then = np.diag(blocks[:, k, :, k]), np.diag(seen_first[:, k, :, k])
+            gain[:, k] = slopes[:, k] / np.where(then > 0, then, np.inf)
+            error[:, k] = np.where(own > 0, own, np.nan) ** -0.5
+            information = np.einsum("gh,gf,fh->h", steps, blocks[:, k, :, k], steps, optimize=True)
+            smallest[:, k] = (self.alarm + SEEN) * np.where(information > 0, information, np.nan) ** -0.5
+        chi2 = np.add.reduceat(np.sum(self.stars.residual**2, axis=1), self.stars.first)
+        dof = self.stars.dof
+        pairs = np.unique(self.stars.star * groups + self.group)
+        ratio = np.full(groups, np.nan)
+        for g in np.unique(self.pool[self.pool < groups]):
+            ratio[g] = noise_scale(chi2[self.pool == g], dof[self.pool == g].astype(float)).value
+        return Watch(
+            cameras=self.cameras,
+            time=self.time,
+            stars=np.bincount(pairs % groups, minlength=groups),
+            chi2=ratio,
+            gain=gain,
+            error=error,
+            smallest=smallest,
+            changes=tuple(changes),
+            noise=whole.value if chance_of_scale(whole) < ALARM else 1.0,
+            tests=self.tests,
+            alarm=self.alarm,
+        )
