@@ -23,7 +23,6 @@ from walop_jax.posterior import with_moments
 from walop_jax.runs.left_out import left_out_cards, left_out_sentences
 from walop_jax.runs.written_table import WrittenTable
 from walop_jax.science.apply import apply
-from walop_jax.science.catalogue_check import CatalogueCheck
 from walop_jax.science.polarisation import ESTIMATORS
 from walop_jax.science.stokes_columns import header, stokes_columns
 
@@ -36,27 +35,21 @@ BITS = (
     Quality.VALIDITY_FORCED,
     Quality.NO_STOKES,
     Quality.DISAGREES,
-    Quality.UNKNOWN_COLOUR,
 )
 """Bits of FLAG that a star can have by itself."""
 
 
 @dataclasses.dataclass(frozen=True)
 class StokesTable(WrittenTable):
-    """A catalogue that was written: its stars, the estimator of p, and the time it took.
-
-    `check` is what the stars say together of the calibration and of their errors.
-    """
+    """A catalogue that was written: its stars, the estimator of p, and the time it took."""
 
     stars: int
     seconds: float
     estimator: str
-    check: CatalogueCheck
 
     def document(self) -> dict[str, Any]:
         """Everything but the warnings as plain data."""
         own = {"stars": self.stars, "seconds": self.seconds, "estimator": self.estimator}
-        own["catalogue"] = self.check.document()
         return super().document() | own
 
 
@@ -105,8 +98,7 @@ def apply_to_catalogue(
     columns = stokes_columns(stars, rows.star, estimator)
     content = held.product.content_hash()
     lost = calibration.left_behind
-    cards = header(content, estimator, float(np.mean(np.isfinite(rows.rotator))), stars.check)
-    cards |= left_out_cards(lost)
+    cards = header(content, estimator, float(np.mean(np.isfinite(rows.rotator)))) | left_out_cards(lost)
     write_output_table(output, table, columns, overwrite=overwrite, header=cards)
 
     counts = {bit: int((stars.flag & bit > 0).sum()) for bit in BITS}
@@ -120,15 +112,13 @@ def apply_to_catalogue(
             "the background subtracted, are the cameras in order?",
         ),
     )
-    flagged = [f"{catalogue}: {text} (FLAG {Quality.CATALOGUE:d})" for text in stars.check.warnings()]
-    flagged += [f"{catalogue}: {counts[bit]} {text}" for bit, text in said if counts[bit]]
+    flagged = [f"{catalogue}: {counts[bit]} {text}" for bit, text in said if counts[bit]]
     return StokesTable(
         path=Path(output),
         rows=table.rows,
         stars=len(stars.qu),
         seconds=time.perf_counter() - began,
         estimator=estimator,
-        check=stars.check,
         trusted=held.product.verdict.trusted,
         flags=counts,
         product=content,

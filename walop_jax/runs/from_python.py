@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -186,10 +185,7 @@ def apply(
     rows = read_catalogue(table, there.model.template.patched(), saturation, always_in=there.always_in)
     with errors_naming(table.path):
         stars = apply_to_rows(chosen, rows, force=force)
-    content, on_sky = there.to_product().content_hash(), float(np.mean(np.isfinite(rows.rotator)))
-    cards = header(content, estimator, on_sky, stars.check)
-    for sentence in stars.check.warnings():
-        warnings.warn(f"{table.path}: {sentence}", stacklevel=2)
+    cards = header(there.to_product().content_hash(), estimator, float(np.mean(np.isfinite(rows.rotator))))
     return extended(table, stokes_columns(stars, rows.star, estimator), cards)
 
 
