@@ -136,5 +136,7 @@ STAR_ROWS = 16384
 STAR_SAMPLE = 16384
 """Rows of a catalogue, spread over it, by which the whole of it is judged: they see a camera that has changed by a
 fiftieth of what single stars of 10⁶ electrons would show."""
+WATCHED_ROWS = 200_000
+"""Rows of catalogues by which a calibration is watched: a kilobyte each, and a camera is seen to 10⁻⁵."""
 CHECKED_ROWS = 2048
 """Rows whose columns for the check of a catalogue are worked on together: a hundred columns of them take 7 MB."""

@@ -27,9 +27,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.data.catalogue import Catalogue
 from walop_jax.io.display import Display, Displayed
+from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.rounding import two_digits, with_error, with_minus_sign
+from walop_jax.likelihood import limits
+from walop_jax.model.effects import effect_by_name
+from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.science.apply import residuals_of
 from walop_jax.science.catalogue_check import ALARM, NOISE_MATTERS, RIVAL, threshold
 from walop_jax.science.star_residuals import (
     Scale,
@@ -44,6 +52,19 @@ SEEN = 2.33
 """Standard deviations above the alarm from which 99 % are found."""
 MOST_GROUPS = 400
 """Exposure groups that are told apart; neighbours of more are joined."""
+RIVALS = (
+    "hwp1_axis",
+    "hwp2_axis",
+    "hwp1_crossing",
+    "hwp2_crossing",
+    "chwp_axis",
+    "wollaston_axis",
+    "upstream_retarder",
+    "telescope_polarisation",
+    "filter_shift",
+)
+"""Effects of the optics that may be what has changed, beside the parameters of the model."""
+_CERTAIN = 1e-9  # in their units: nothing is left to them as an error of the calibration
 _DATE = 1e3  # times above are dates, not numbers of groups
 _FEW = 20  # stars: fewer have no scale of their own
 _MOST_CHANGES = 4
@@ -245,6 +266,54 @@ class Watch(Displayed):
             rows=rows,
             notes=self.warnings,
         )
+
+
+def watch(
+    calibration: Calibration,
+    catalogues: Sequence[Catalogue],
+    *,
+    rows: int = limits.WATCHED_ROWS,
+    force: bool = False,
+) -> Watch:
+    """Look for changes of the instrument since it was calibrated in the stars of catalogues.
+
+    Rows of one MJD are an exposure group; catalogues without it are a group each, in their order. Of more than `rows`
+    rows as many are looked at, spread over the stars. Raises `DataError` as `science.apply.apply` does, and where no
+    row has a camera to spare.
+    """
+    dated = [np.isfinite(catalogue.time).any() for catalogue in catalogues]
+    vectors = AnalysisVectors(with_rivals(calibration))
+    total, parts = sum(map(len, catalogues)), []
+    for number, catalogue in enumerate(catalogues):
+        if not all(dated):
+            catalogue = dataclasses.replace(catalogue, time=np.full(len(catalogue), float(number)))
+        share = -(-rows * len(catalogue) // total)
+        parts += residuals_of(vectors, catalogue, share, force=force)
+    if not parts:
+        raise DataError("N: no star has a camera to spare beside flux, q and u; add rows at other settings")
+    stars = StarResiduals.joined(parts)
+    return watch_stars(stars, vectors.instrument.cameras.names, vectors.named, vectors.root)
+
+
+def with_rivals(calibration: Calibration) -> Calibration:
+    """The calibration with those of `RIVALS` that its instrument may have, at neutral and as good as certain.
+
+    They are columns that a change of the optics may have, beside the parameters that were fitted.
+    """
+    context = effect_context(calibration.model.template, calibration.exposures)
+    model = calibration.model
+    for name in RIVALS:
+        try:
+            model = with_effects(model, [effect_by_name(name).neutral(context)], context)
+        except ValueError:
+            continue  # there already, or of an element that the instrument lacks
+    old = np.array([model.index(name) for name in calibration.model.names])
+    new = np.setdiff1d(np.arange(len(model.names)), old)
+    values, covariance = model.start, np.zeros((len(model.names), len(model.names)))
+    values[old] = calibration.values
+    covariance[np.ix_(old, old)] = calibration.covariance
+    covariance[new, new] = _CERTAIN**2
+    return dataclasses.replace(calibration, model=model, values=values, covariance=covariance)
 
 
 def watch_stars(
