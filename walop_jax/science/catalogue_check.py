@@ -27,10 +27,13 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.rounding import with_error, with_minus_sign
 from walop_jax.science.star_residuals import (
+    NO_NOISE,
     Scale,
     StarResiduals,
     chance_of_scale,
+    colour_variance,
     eliminated,
+    is_off,
     noise_scale,
     normal_matrix,
     shared_by_rows,
@@ -163,12 +166,14 @@ class CatalogueCheck(Displayed):
     def noise_is_off(self) -> bool:
         """Whether N_ERR is not what the counts scatter by."""
         off = not 1.0 / NOISE_MATTERS < self.noise < NOISE_MATTERS
-        return self.noise_p < self.alarm and off and not self.rows_agree
+        return self.noise > NO_NOISE and self.noise_p < self.alarm and off and not self.rows_agree
 
     @property
     def rows_agree(self) -> bool:
         """Whether rows of a star have more in common than light."""
-        return self.rows is not None and self.rows_p < self.alarm and self.rows > NOISE_MATTERS * self.noise
+        if self.rows is None or self.rows < NO_NOISE:
+            return False
+        return self.rows_p < self.alarm and self.rows > NOISE_MATTERS * self.noise
 
     @property
     def holds(self) -> bool:
@@ -309,6 +314,7 @@ class _Search:
         root: Float[np.ndarray, "n n"],
     ) -> None:
         self.stars = stars
+        self.variance = colour_variance(stars)
         self.root = root[:, np.abs(root).max(axis=0, initial=0.0) > 0]
         self.edge = max(float(np.abs(np.concatenate([stars.x, stars.y])).max()), 1e-9)
         times = stars.time[np.isfinite(stars.time)]
@@ -370,7 +376,7 @@ class _Search:
         rows = shared_by_rows(stars, residual, self.variance)
         known = self.asked + 2
         alarm = ALARM / known
-        single = noise.value if noise.value > 1 or chance_of_scale(noise) < alarm else 1.0
+        single = noise.value if noise.value > 1 or is_off(noise, alarm) else 1.0
         several = single
         if rows is not None and _chance_beside(rows, noise) < alarm:
             several = max(single, rows.value)
@@ -378,18 +384,6 @@ class _Search:
         matrix, score = normal_matrix(stars, residual, self._columns, noise.kept / each, noise.share)
         matrix = self.mixing.T @ matrix @ self.mixing + np.diag(self.prior)
         return _Look(noise, rows, matrix, self.mixing.T @ score - self.prior * sizes)
-
-    @property
-    def variance(self) -> Float[np.ndarray, " s"]:
-        """Variance of residuals that colours, unknown star by star, add to that of the noise: 1 where none do."""
-        if not hasattr(self, "_variance"):
-            stars, spread = self.stars, np.zeros(len(self.stars.photon))
-            if stars.colour.any():
-                for n in range(2):
-                    left = stars.left(stars.colour[..., n])
-                    spread += np.add.reduceat(np.sum(left**2, axis=1), stars.first)
-            self._variance = 1.0 + spread / np.maximum(stars.dof, 1)
-        return self._variance
 
     def answer(self) -> CatalogueCheck:
         """All questions, then again behind what was found."""

@@ -31,7 +31,10 @@ from walop_jax.likelihood.flux import Sharing, project_flux
 from walop_jax.likelihood.linear import through_series
 
 TRIMMED = 1e-3
+NO_NOISE = 1e-4
+"""χ² per degree of freedom below which counts hold no noise at all: they were computed, not measured."""
 _ROUNDS = 50
+_FEW = 8.0  # degrees of freedom: of fewer a single star may be the scale
 Matrix = Float[np.ndarray, "c c"]
 
 
@@ -138,6 +141,15 @@ class StarResiduals:
         return np.where(self.root > 0, free[0] - np.einsum("rik,ri->rk", self.tangent, moved), 0.0)
 
 
+def colour_variance(stars: StarResiduals) -> Float[np.ndarray, " s"]:
+    """Variance of residuals over that of the noise, where colours that are unknown star by star add to it; else 1."""
+    spread = np.zeros(len(stars.photon))
+    if stars.colour.any():
+        for n in range(stars.colour.shape[-1]):
+            spread += np.add.reduceat(np.sum(stars.left(stars.colour[..., n]) ** 2, axis=1), stars.first)
+    return 1.0 + spread / np.maximum(stars.dof, 1)
+
+
 Columns = Callable[[StarResiduals], Float[np.ndarray, "r k c"]]
 
 
@@ -230,10 +242,15 @@ def noise_scale(chi2: Float[np.ndarray, " s"], dof: Float[np.ndarray, " s"]) -> 
 
 def chance_of_scale(scale: Scale) -> float:
     """Probability, both sides, of a scale as far from 1 by noise alone."""
-    if scale.worth <= 0:
+    if scale.worth < _FEW:
         return 1.0
     value = scale.value * scale.worth
     return float(min(1.0, 2.0 * min(special.chdtr(scale.worth, value), special.chdtrc(scale.worth, value))))
+
+
+def is_off(scale: Scale, alarm: float) -> bool:
+    """Whether a scale is not that of noise; counts without any noise are expected ones, whose errors stand."""
+    return scale.value > NO_NOISE and chance_of_scale(scale) < alarm
 
 
 def shared_by_rows(

@@ -42,8 +42,9 @@ from walop_jax.science.catalogue_check import ALARM, NOISE_MATTERS, RIVAL, thres
 from walop_jax.science.star_residuals import (
     Scale,
     StarResiduals,
-    chance_of_scale,
+    colour_variance,
     eliminated,
+    is_off,
     noise_scale,
     normal_matrix,
 )
@@ -360,6 +361,7 @@ class _Watching:
             list(parameters[: stars.plain.shape[-1]]),
         )
         self.root = root[:, np.abs(root).max(axis=0, initial=0.0) > 0]
+        self.variance = colour_variance(stars)
         self.time, self.group = grouped(stars.time)
         groups = len(self.time)
         self.histories = [History("step", g) for g in range(groups)]
@@ -378,22 +380,20 @@ class _Watching:
         self, residual: Float[np.ndarray, "r k"]
     ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Scale]:
         """1/variance of every star (0: left out), κ, and the scale of all of them."""
-        chi2, dof = (
-            np.add.reduceat(np.sum(residual**2, axis=1), self.stars.first),
-            self.stars.dof.astype(float),
-        )
+        chi2 = np.add.reduceat(np.sum(residual**2, axis=1), self.stars.first) / self.variance
+        dof = self.stars.dof.astype(float)
         alarm = ALARM / (len(self.time) + 1)
         whole = noise_scale(chi2, dof)
-        common = whole.value if chance_of_scale(whole) < alarm else 1.0
+        common = whole.value if is_off(whole, alarm) else 1.0
         weight, share = np.where(whole.kept, 1.0 / common, 0.0), whole.share.copy()
         for pool in np.unique(self.pool):
             here = np.flatnonzero(self.pool == pool)
             own = noise_scale(chi2[here], dof[here])
-            if len(here) >= _FEW and own.worth > 0 and chance_of_scale(own) < alarm:
+            if len(here) >= _FEW and is_off(own, alarm):
                 weight[here], share[here] = np.where(own.kept, 1.0 / own.value, 0.0), own.share
             elif len(here) >= _FEW:
                 weight[here], share[here] = np.where(own.kept, 1.0 / common, 0.0), own.share
-        return weight, share, whole
+        return weight / self.variance, share, whole
 
     # -------------------------------------------------------------------------------------------- columns
 
@@ -627,7 +627,7 @@ class _Watching:
             error=error,
             smallest=smallest,
             changes=tuple(changes),
-            noise=whole.value if chance_of_scale(whole) < ALARM else 1.0,
+            noise=whole.value if is_off(whole, ALARM) else 1.0,
             tests=self.tests,
             alarm=self.alarm,
         )
