@@ -94,7 +94,7 @@ class Found(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """A change of the instrument since it was calibrated: the best description, and those as good (best included)."""
+    """A change of the instrument since it was calibrated: the simplest description, and all as good (it included)."""
 
     best: Found
     alike: tuple[Found, ...]
@@ -474,7 +474,9 @@ class _Search:
         each = self._beside(look.matrix, score, [k for k in chosen if k != asked])
         best = max(each, key=lambda found: found.sigma**2)
         alike = [found for found in each if found.sigma**2 > best.sigma**2 - RIVAL]
-        return Change(best, tuple(sorted(alike, key=lambda found: -abs(found.sigma))))
+        # A gain is the simplest of what describes the stars alike.
+        ranked = sorted(alike, key=lambda found: (found.question.kind != "gain", -abs(found.sigma)))
+        return Change(ranked[0], tuple(ranked))
 
     def _smallest(self, tests: list[Found]) -> float:
         """The gain change of one camera that raises the alarm in 99 % of cases."""

@@ -34,7 +34,7 @@ TRIMMED = 1e-3
 NO_NOISE = 1e-4
 """χ² per degree of freedom below which counts hold no noise at all: they were computed, not measured."""
 _ROUNDS = 50
-_FEW = 8.0  # degrees of freedom: of fewer a single star may be the scale
+_FEW = 4.0  # degrees of freedom: of fewer a single star may be the scale
 Matrix = Float[np.ndarray, "c c"]
 
 

@@ -67,7 +67,7 @@ RIVALS = (
 """Effects of the optics that may be what has changed, beside the parameters of the model."""
 _CERTAIN = 1e-9  # in their units: nothing is left to them as an error of the calibration
 _DATE = 1e3  # times above are dates, not numbers of groups
-_FEW = 20  # stars: fewer have no scale of their own
+_FEW = 4  # stars: fewer have no scale of their own
 _MOST_CHANGES = 4
 _ROUNDS = 6
 _SETTLED = 0.1  # standard errors
