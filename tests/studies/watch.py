@@ -33,7 +33,8 @@ from walop_jax.data.settings import Settings  # noqa: E402
 from walop_jax.data.user_tables import in_memory  # noqa: E402
 from walop_jax.science.apply import residuals_of  # noqa: E402
 from walop_jax.science.star_residuals import StarResiduals  # noqa: E402
-from walop_jax.science.watch import Watch, watch_stars, with_rivals  # noqa: E402
+from walop_jax.science.watch import watch_stars, with_rivals  # noqa: E402
+from walop_jax.science.watch_found import Watch  # noqa: E402
 
 NIGHTS, START = 10, 6
 PLATES = (None, 22.5)

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from walop_jax.reports.style import AFTER, BEFORE, FONT, QUIET, SMALL, empty_figure
-from walop_jax.science.watch import Watch
+from walop_jax.science.watch_found import Watch
 
 
 def watch_figure(found: Watch) -> Figure:

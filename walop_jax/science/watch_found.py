@@ -1,0 +1,212 @@
+"""What watching a calibration has found: histories of cameras and of the optics, night by night (`watch`)."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from walop_jax.io.display import Display, Displayed
+from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.rounding import two_digits, with_error, with_minus_sign
+from walop_jax.science.catalogue_check import NOISE_MATTERS
+
+_DATE = 1e3  # times above are dates, not numbers of groups
+
+
+class History(NamedTuple):
+    """How a change went: `kind` is step, drift or once; `start` the group it began in."""
+
+    kind: str
+    start: int
+
+    def over(self, time: Float[np.ndarray, " g"]) -> Float[np.ndarray, " g"]:
+        """Its size in every group, 1 at most."""
+        number = np.arange(len(time))
+        if self.kind == "once":
+            return (number == self.start).astype(float)
+        if self.kind == "step":
+            return (number >= self.start).astype(float)
+        return np.clip((time - time[self.start]) / max(time[-1] - time[self.start], 1e-300), 0.0, 1.0)
+
+
+class Suspect(NamedTuple):
+    """What may have changed: a camera or a number of the optics, by how much, and its significance."""
+
+    name: str
+    camera: bool
+    history: History
+    size: float
+    error: float
+    unit: str
+
+    @property
+    def sigma(self) -> float:
+        """Size in standard errors."""
+        return self.size / self.error
+
+
+@dataclasses.dataclass(frozen=True)
+class WatchedChange:
+    """A change: the best description, those that describe the stars as well, and when (MJD, or the group's number)."""
+
+    best: Suspect
+    alike: tuple[Suspect, ...]
+    time: float
+
+    @property
+    def camera(self) -> str | None:
+        """The camera, if it is one and no other, and not the optics."""
+        names = {entry.name for entry in self.alike}
+        return self.best.name if len(names) == 1 and self.best.camera else None
+
+    def words(self) -> str:
+        """The change in a sentence."""
+        date = f"MJD {self.time:.4f}" if self.time > _DATE else f"group {self.time:g}"
+        how = {
+            "step": "from {} on",
+            "drift": "at the end, drifting since {}",
+            "once": "in the exposures of {} only",
+        }
+        when = how[self.best.history.kind].format(date)
+        text = f"{_words(self.best)} {when} ({abs(self.best.sigma):.0f} σ)"
+        others = {entry.name: entry for entry in self.alike if entry.name != self.best.name}
+        if not others:
+            return text
+        told = [_words(entry) for entry in list(others.values())[:4]]
+        more = f", and {len(others) - 4} more" if len(others) > 4 else ""
+        return f"{text}. These stars cannot tell it from {', '.join(told)}{more}"
+
+
+def _words(entry: Suspect) -> str:
+    if entry.camera:
+        more = ("brighter", "fainter")[entry.size < 0]
+        return f"{entry.name} {more} by {with_error(100 * abs(entry.size), 100 * entry.error)} %"
+    larger = ("larger", "smaller")[entry.size < 0]
+    return f"{entry.name} {larger} by {with_error(abs(entry.size), entry.error)} {entry.unit}".rstrip()
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Watch(Displayed):
+    """The history of a calibration as its stars tell it.
+
+    By exposure group: `time` (MJD, or its number), `stars`, `chi2` per degree of freedom, `gain` of every camera
+    (change since the calibration, that camera alone) with `error`, and `smallest`: the step of each camera from that
+    group on that would be found in 99 % of cases. `tests` histories were asked; the alarm is at `alarm` standard
+    errors.
+    """
+
+    cameras: tuple[str, ...]
+    time: Float[np.ndarray, " g"]
+    stars: Int[np.ndarray, " g"]
+    chi2: Float[np.ndarray, " g"]
+    gain: Float[np.ndarray, "g k"]
+    error: Float[np.ndarray, "g k"]
+    smallest: Float[np.ndarray, "g k"]
+    changes: tuple[WatchedChange, ...]
+    noise: float
+    tests: int
+    alarm: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether the calibration still holds."""
+        return not self.changes
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for every change, and one if N_ERR is not what the counts scatter by."""
+        said = tuple(change.words() for change in self.changes)
+        if 1.0 / NOISE_MATTERS < self.noise < NOISE_MATTERS:
+            return said
+        return (
+            *said,
+            f"χ²/dof of the stars is {self.noise:.3g}: N_ERR was multiplied by {np.sqrt(self.noise):.3g}",
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+
+        def plain(entry: Suspect) -> dict[str, Any]:
+            return {
+                "name": entry.name,
+                "camera": entry.camera,
+                "history": entry.history.kind,
+                "start": float(self.time[entry.history.start]),
+                "size": entry.size,
+                "error": entry.error,
+                "sigma": entry.sigma,
+                "unit": entry.unit,
+            }
+
+        found = [
+            {"camera": c.camera, "time": c.time, "best": plain(c.best), "alike": [plain(e) for e in c.alike]}
+            for c in self.changes
+        ]
+        groups = [
+            {
+                "time": float(self.time[g]),
+                "stars": int(self.stars[g]),
+                "chi2_per_dof": float(self.chi2[g]),
+                "gain": dict(zip(self.cameras, self.gain[g].tolist(), strict=True)),
+                "error": dict(zip(self.cameras, self.error[g].tolist(), strict=True)),
+                "smallest_step_seen": dict(zip(self.cameras, self.smallest[g].tolist(), strict=True)),
+            }
+            for g in range(len(self.time))
+        ]
+        return {
+            "holds": self.holds,
+            "changes": found,
+            "smallest_step_seen": float(np.min(self.smallest)),
+            "chi2_per_dof": self.noise,
+            "tests": self.tests,
+            "alarm_sigma": self.alarm,
+            "groups": groups,
+            "warnings": list(self.warnings),
+        }
+
+    def to_table(self) -> Any:
+        """A row for each exposure group, as an astropy table."""
+        columns = {
+            "TIME": (self.time, "", "MJD, or number of the group"),
+            "STARS": (self.stars, "", "stars seen in it"),
+            "CHI2DOF": (self.chi2, "", "chi squared per degree of freedom of its stars"),
+        }
+        for k, name in enumerate(self.cameras):
+            columns |= {
+                f"GAIN_{name}": (self.gain[:, k], "", "change since the calibration, this camera alone"),
+                f"ERROR_{name}": (self.error[:, k], "", "its standard error"),
+                f"SEEN_{name}": (self.smallest[:, k], "", "smallest step from here on that is found in 99 %"),
+            }
+        return astropy_table(columns)
+
+    def display(self) -> Display:
+        """The verdict, what has changed, what would have been seen, and the groups."""
+        percent = 100.0
+        rows = tuple(
+            (
+                f"{self.time[g]:.4f}" if self.time[g] > _DATE else f"{self.time[g]:g}",
+                f"{self.stars[g]}",
+                f"{self.chi2[g]:.2f}",
+                *(
+                    with_minus_sign(f"{percent * self.gain[g, k]:+.3f}")
+                    + f" ± {percent * self.error[g, k]:.3f}"
+                    for k in range(len(self.cameras))
+                ),
+                f"{percent * self.smallest[g].min():.2g}",
+            )
+            for g in range(len(self.time))
+        )
+        seen = two_digits(percent * float(np.min(self.smallest)))
+        return Display(
+            title="The calibration holds" if self.holds else "The calibration HAS CEASED TO HOLD",
+            facts=(
+                ("exposure groups", f"{len(self.time)}"),
+                ("smallest step seen", f"{seen} % of one camera, in 99 % of cases"),
+            ),
+            head=("time", ">stars", ">χ²/dof", *(f">{name} %" for name in self.cameras), ">seen %"),
+            rows=rows,
+            notes=self.warnings,
+        )
