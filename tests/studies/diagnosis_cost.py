@@ -115,7 +115,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", nargs="*", default=["quiet", "encoder", "nameless"])
     parser.add_argument("--package", type=Path, default=ROOT)
-    parser.add_argument("--sets", type=Path, help="folder of sets that are there already, CASE.fits")
+    parser.add_argument("--sets", type=Path, help="folder of sets made before, CASE.fits")
     options = parser.parse_args()
     output = next((Path(case) for case in options.cases if case.endswith(".json")), None)
     cases = [case for case in options.cases if not case.endswith(".json")]

@@ -109,8 +109,8 @@ class Unexplained:
     """What is left and has no name; `term` are the blocks of the free-form term that was added for it.
 
     `chi2_before` and `chi2_after` are without and with that term, `change_of_qu` is what it changes in calibrated q
-    and u of a star with p ≤ 5 %. `useless` says that such a term was not added because it does not predict what it has
-    not seen, `parts` are names that were taken out again because they explain a part only, with what they leave.
+    and u of a star with p ≤ 5 %. `parts` are names that were taken out again because they explain a part only, with
+    what they leave.
     """
 
     p_value: float
@@ -120,23 +120,7 @@ class Unexplained:
     chi2_before: float = float("nan")
     chi2_after: float = float("nan")
     change_of_qu: float = float("nan")
-    useless: bool = False
     parts: tuple[str, ...] = ()
-
-    @property
-    def words(self) -> str:
-        """The description, and what was left out of the model."""
-        said = [self.description]
-        if self.parts:
-            said.append(
-                f"explains a part and may stand in for something else, not added: {'; '.join(self.parts)}"
-            )
-        if self.useless:
-            said.append(
-                "such a term does not predict settings and parts of the field that it has not seen: it was "
-                "left out of the model"
-            )
-        return ". ".join(said)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -258,7 +242,7 @@ class Diagnosis(Displayed):
             if s.equivalent or s.nameless
         ]
         notes += [f"{told.words}: {told.tested_by}" for s in self.steps for told in s.told]
-        notes += [self.unexplained.words] if self.unexplained is not None else []
+        notes += [self.unexplained.description] if self.unexplained is not None else []
         notes += [self.caution] if self.caution else []
         return Display(
             title=f"Diagnosis: {self.verdict}",
@@ -411,7 +395,7 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         if unexplained is None
         else {
             "p_value": unexplained.p_value,
-            "description": unexplained.words,
+            "description": unexplained.description,
             "patterns": [{"pattern": name, "p_value": p} for name, p in unexplained.patterns],
             "free_form": list(unexplained.term),
             "chi2_before": _number(unexplained.chi2_before),

@@ -323,7 +323,7 @@ class Refit(Linear):
         self._without(Described.name)
         state = self.examined(first)
         self.steps = refitted_in_order(self.steps, first.design, state.design)
-        return state, dataclasses.replace(nameless, p_value=state.table.p_global, useless=True)
+        return state, _and(dataclasses.replace(nameless, p_value=state.table.p_global), _LEFT_OUT)
 
     def _concluded(self, first: Examination, state: Examination) -> tuple[Examination, Unexplained | None]:
         dropped, parts = self._drop_what_is_not_needed(), ()
@@ -338,7 +338,10 @@ class Refit(Linear):
             if not parts and (parts := self._parts(first)):
                 dropped = True
                 continue
-            nameless = dataclasses.replace(self._unexplained(state), parts=parts)
+            nameless = self._unexplained(state)
+            if parts:
+                text = "explains a part and may stand in for something else, not added"
+                nameless = dataclasses.replace(_and(nameless, f"{text}: {'; '.join(parts)}"), parts=parts)
             if not nameless.term:
                 return state, nameless
             dropped = self._drop_what_is_not_needed()
@@ -406,9 +409,7 @@ class Refit(Linear):
                 self.policy.useful,
             )
         )
-        return (
-            self._with_free_form(state, found, useful) if useful else dataclasses.replace(found, useless=True)
-        )
+        return self._with_free_form(state, found, useful) if useful else _and(found, _LEFT_OUT)
 
     def _with_free_form(self, state: Examination, found: Unexplained, blocks: tuple[str, ...]) -> Unexplained:
         """Add a free-form term for patterns without a name, so that the calibration improves all the same."""
@@ -465,6 +466,15 @@ def unexplained(state: Examination, patterns: tuple[tuple[str, float], ...]) -> 
     where = location.describe(state.design, state.design.residual)
     text += f". Residuals sit in: cameras {where['camera']}; kinds {where['kind']}; field {where['field']}"
     return Unexplained(state.table.p_global, text, patterns)
+
+
+_LEFT_OUT = (
+    "a term without a name would not predict settings and field points that it has not seen: it was left out"
+)
+
+
+def _and(found: Unexplained, text: str) -> Unexplained:
+    return dataclasses.replace(found, description=f"{found.description}. {text}")
 
 
 def too_many_sentences(state: Examination, said: Sequence[str]) -> Unexplained:
