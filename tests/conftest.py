@@ -139,7 +139,7 @@ def either_south_set(request: pytest.FixtureRequest) -> Callable[[str], SouthSet
 @pytest.fixture(scope="session")
 def south_fit() -> Callable[[SouthSet], FitResult]:
     """Fits of the base model to sets with known truth, each made once."""
-    return functools.cache(lambda south: refit(read_calibration_set(south.path)))
+    return functools.cache(lambda south: refit(read_calibration_set(south.path)).judged())
 
 
 @pytest.fixture

@@ -81,7 +81,7 @@ def product() -> CalibrationProduct:
         site=Site("SAAO", -32.38, 20.81, 1798.0),
         origin="a hand",
         date="2026-11-21T10:00:00",
-        verdict=Verdict(1234.5, 1200, 1608, 1.0, True, True, 0),
+        verdict=Verdict(1234.5, 1200, 1608, 1.0, True),
         parameters=ParameterTable(
             name=np.array(names),
             value=np.array([entry["value"] for entry in SUMMARY["parameters"].values()]),

@@ -177,7 +177,7 @@ def test_kinds_and_flags():
 
 
 def test_quality_bits():
-    from walop_jax.calibration.records import Quality
+    from walop_jax.fit.verdict import Quality
 
     told = {int(row[0]): row[1] for row in rows(section("files", "Quality bits"))}
     assert told == {bit.value: bit.meanings[0] for bit in Quality}

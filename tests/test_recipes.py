@@ -46,7 +46,9 @@ def folder(tmp_path_factory) -> Path:
     write_calibration_set(path / "run.fits", calset)
     write_calibration_set(path / "night2.fits", simulate(SMALL, seed=SEED + 1).calset)
     (path / "RUN").mkdir()
-    write_product(path / "RUN" / "calibration.fits", Calibration.from_fit(refit(calset)).to_product())
+    write_product(
+        path / "RUN" / "calibration.fits", Calibration.from_fit(refit(calset).judged()).to_product()
+    )
     x, y = np.random.default_rng(0).uniform(-0.25, 0.25, (2, 30))
     Table({"X": x, "Y": y}).write(path / "stars.csv")
     clp = np.flatnonzero(calset.exposures.kind == "clp")

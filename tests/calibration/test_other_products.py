@@ -17,7 +17,7 @@ from walop_jax.calibration.product import (
     read_product,
     write_product,
 )
-from walop_jax.calibration.records import Quality, ResidualMap, matrix_names, residual_names
+from walop_jax.calibration.records import ResidualMap, matrix_names, residual_names
 from walop_jax.data import DataError, read_calibration_set
 from walop_jax.data.frames import Grid
 
@@ -48,7 +48,7 @@ def product_of(calset, arms: int, positions: dict[str, float]) -> CalibrationPro
         site=calset.site,
         origin=calset.origin,
         date="2026-11-21T10:00:00",
-        verdict=Verdict(100.0, 90, 120, 1.0, True, True, 0),
+        verdict=Verdict(100.0, 90, 120, 1.0, True),
         parameters=ParameterTable(
             name=np.array(["hwp.retardance", "throughput.n1.p00"]),
             value=np.array([0.5, 0.25]),

@@ -84,7 +84,7 @@ def product(handmade) -> CalibrationProduct:
         site=calset.site,
         origin=calset.origin,
         date="2026-11-21T10:00:00",
-        verdict=Verdict(
+        verdict=Verdict.recorded(
             1.0 / 3.0 * 1e5, 33000, 44000, 1.0, True, False, 8192, ("chi2/dof = 1.5", "look at it")
         ),
         parameters=ParameterTable(
@@ -199,7 +199,7 @@ def test_the_hash_is_of_the_content(product):
     values[1] = np.nextafter(values[1], 1.0)
     moved = dataclasses.replace(product, parameters=dataclasses.replace(product.parameters, value=values))
     assert moved.content_hash() != product.content_hash()
-    warned = dataclasses.replace(product, verdict=dataclasses.replace(product.verdict, trusted=True))
+    warned = dataclasses.replace(product, verdict=dataclasses.replace(product.verdict, against=()))
     assert warned.content_hash() != product.content_hash()
     for name in ("temp", "ha", "teff", "clp_angle", "rotator"):
         other = dataclasses.replace(product.exposures, **{name: getattr(product.exposures, name) + 1.5})

@@ -18,7 +18,6 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import _physics
 from walop_jax.calibration.matrix import analysis_vectors, matrices
 from walop_jax.calibration.matrix_table import matrix_columns
-from walop_jax.calibration.records import Quality, Verdict
 from walop_jax.data import DataError
 from walop_jax.data.calset import empty_sources
 from walop_jax.data.catalogue import read_catalogue
@@ -26,6 +25,7 @@ from walop_jax.data.field_points import field_points
 from walop_jax.data.records import Exposures, FilterCurve, Position, Site
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
+from walop_jax.fit.verdict import Verdict
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import values_of
 from walop_jax.model.planning import plan_for, plan_for_settings
@@ -114,7 +114,7 @@ def calibration(model) -> Calibration:
         chwp_in=np.zeros(8, bool), chwp_angle=nan, temp=np.full(8, 10.0), ha=nan, ra=nan, dec=nan, rotator=nan,
         teff=nan, moving={"HWP": Position(np.ones(8, bool), angles), "RET": Position(odd, np.where(odd, 20.0, np.nan))},
     )  # fmt: skip
-    verdict = Verdict(1.0, 1, 16, 1.0, converged=True, trusted=True, quality=Quality(0))
+    verdict = Verdict(1.0, 1, 16, 1.0, converged=True)
     return Calibration(
         model=model,
         values=np.asarray(values_of(model.template)),

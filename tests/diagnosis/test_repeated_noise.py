@@ -84,4 +84,4 @@ def test_a_copy_in_a_small_set_is_not_trusted():
         )
     )
     assert not found.trusted
-    assert "the same noise" in "; ".join(found.doubts)
+    assert "the same noise" in "; ".join(found.verdict.doubts)

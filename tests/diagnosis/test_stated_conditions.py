@@ -62,7 +62,7 @@ def cooler(calset: CalibrationSet) -> CalibrationSet:
 def test_a_number_that_is_wrong_is_told_with_its_size(change, what, size):
     result = examined(refit(change(simulate(SMALL, seed=SEED).calset)))
     assert not result.trusted
-    (told,) = [text for text in result.doubts if text.startswith(f"the residuals ask for {what}")]
+    (told,) = [text for text in result.verdict.doubts if text.startswith(f"the residuals ask for {what}")]
     value, error = re.search(r"([−\d.]+) ± ([\d.]+)", told).groups()  # type: ignore[union-attr]
     # A step of a quarter is not a linear one.
     assert float(value.replace("−", "-")) == pytest.approx(size, abs=4 * float(error) + 0.25 * abs(size))

@@ -7,17 +7,21 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy import stats
 from small_run import SMALL
 
+import walop_jax as walop
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.records import Quality
 from walop_jax.data.records import Block, CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.trust import examined, group_scores
 from walop_jax.fit import refit as fitting
 from walop_jax.fit.refit import FitResult
+from walop_jax.fit.verdict import Doubt, Quality, Verdict
+from walop_jax.posterior import sample
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate
 
@@ -87,7 +91,8 @@ def clean(calset) -> FitResult:
 
 
 def test_a_fit_of_what_the_model_describes_is_trusted(clean):
-    assert (clean.examined, clean.doubts, clean.trusted, clean.warnings) == (True, (), True, ())
+    assert clean.trusted
+    assert clean.verdict == dataclasses.replace(clean.verdict, against=())
 
 
 def test_a_lamp_of_another_temperature(calset):
@@ -98,7 +103,7 @@ def test_a_lamp_of_another_temperature(calset):
     found = refit(dataclasses.replace(warm, exposures=dataclasses.replace(warm.exposures, teff=said)))
     assert found.explains_data
     assert not found.trusted
-    assert "TEFF of exposures of kind clp" in found.doubts[0]
+    assert "TEFF of exposures of kind clp" in found.verdict.doubts[0]
 
 
 @pytest.mark.parametrize(
@@ -124,21 +129,56 @@ def test_a_mistake_in_the_data_is_not_trusted(
 def test_chi2_a_few_per_cent_too_large_is_trusted_only_without_doubts(clean):
     """10⁴ degrees of freedom: χ²/dof = 1.1 is 7 standard deviations, 1.2 more than errors are put down to."""
 
-    def found(ratio: float, **changed) -> FitResult:
+    def found(ratio: float, *doubts: str) -> FitResult:
         data = 1e4 * ratio - (clean.chi2 - clean.posterior.data)
         posterior = dataclasses.replace(clean.posterior, data=data, dof=10_000)
-        return dataclasses.replace(clean, posterior=posterior, **changed)
+        return dataclasses.replace(clean, posterior=posterior).judged(doubts)
 
     assert found(1.1).chi2 == pytest.approx(11_000)
     cases = [
-        (found(1.0), (True, False, True)),
-        (found(1.1), (False, True, True)),
-        (found(1.1, doubts=("a camera",)), (False, False, False)),
-        (found(1.1, examined=False), (False, False, False)),
-        (found(1.2), (False, False, False)),
+        (found(1.0), (True, True)),
+        (found(1.1), (False, True)),
+        (found(1.1, "a camera"), (False, False)),
+        (found(1.2), (False, False)),
     ]
     for one, expected in cases:
-        assert (one.explains_data, one.noise_only, one.trusted) == expected
+        assert (one.explains_data, one.trusted) == expected
+
+
+def test_a_fit_that_nobody_examined_has_no_verdict(clean):
+    """It can neither be asked for trust nor written; a fit with other errors is to be examined anew."""
+    unexamined = dataclasses.replace(clean, verdict=None)
+    assert "not examined" in repr(unexamined)
+    for ask in (
+        lambda: unexamined.trusted,
+        lambda: Calibration.from_fit(unexamined),
+        lambda: sample(unexamined),
+    ):
+        with pytest.raises(RuntimeError, match=r"call walop_jax\.diagnosis\.trust\.examined"):
+            ask()
+
+
+def test_every_fit_of_a_diagnosis_is_examined():
+    """Its `after` was trusted unasked: here a camera that was never read is left in, and nothing may be named."""
+    calset = dark(simulate(dataclasses.replace(SMALL, grid=3), seed=7).calset)
+    found = walop.diagnose(calset, catalogue=())
+    for result in (found.before, found.after):
+        assert result.verdict is not None
+    assert not found.after.trusted
+
+
+@given(st.lists(st.builds(Doubt, st.sampled_from(Quality), st.text(max_size=5), st.booleans())), st.data())
+def test_adding_a_doubt_never_makes_trusted(doubts, data):
+    """Bits and sentences only grow, a verdict that is not trusted stays so, and a file gives the same."""
+    verdict = Verdict(1.0, 1, 16, 1.0, converged=True, against=tuple(doubts))
+    more = data.draw(st.builds(Doubt, st.sampled_from(Quality), st.text(max_size=5), st.booleans()))
+    worse = dataclasses.replace(verdict, against=(*doubts, more))
+    assert worse.trusted <= verdict.trusted
+    assert worse.trusted == (verdict.trusted and not more.blocking)
+    assert worse.quality == verdict.quality | more.bit
+    assert set(verdict.warnings) <= set(worse.warnings)
+    again = Verdict.recorded(1.0, 1, 16, 1.0, True, worse.trusted, int(worse.quality), worse.warnings)
+    assert (again.trusted, again.quality, again.warnings) == (worse.trusted, worse.quality, worse.warnings)
 
 
 @pytest.mark.long
@@ -148,9 +188,8 @@ def test_errors_a_few_per_cent_off_are_no_matter_of_the_model():
     clean = refit(calset)
     found = refit(with_data(calset, sigma=0.93 * block(calset).sigma))
     assert not found.explains_data
-    assert found.noise_only
     assert found.trusted
-    assert found.doubts == ()
+    assert found.verdict.doubts == ()
     assert "% too small" in found.warnings[0]
     ratio = np.median(found.sigma[found.sigma > 0] / clean.sigma[clean.sigma > 0])
     assert 1.0 < ratio < 1.5
@@ -183,12 +222,12 @@ def test_the_product_says_what_the_fit_does(calset):
 
 
 def test_an_examination_changes_no_value(calset, clean):
-    again = examined(dataclasses.replace(clean, examined=False))
+    again = examined(clean)
     np.testing.assert_array_equal(again.values, clean.values)
     np.testing.assert_array_equal(again.covariance, clean.covariance)
 
 
 def test_a_plan_without_noise_is_not_held_against_its_errors(clean):
     found = refit(simulate(SMALL, seed=7, noiseless=True).calset)
-    assert (found.noiseless, found.trusted, found.warnings) == (True, True, ())
+    assert (found.trusted, found.warnings) == (True, ())
     np.testing.assert_allclose(found.sigma[found.sigma > 0], clean.sigma[clean.sigma > 0], rtol=0.1)

@@ -72,8 +72,9 @@ def test_cameras_that_are_exchanged_are_no_outliers(clean):
     swapped = TableIntensities.dense(clean.points, clean.intensities.block(0, len(clean.points)))
     swapped.counts[:], swapped.sigma[:] = table.counts[:, order], table.sigma[:, order]
     found = clipped(dataclasses.replace(clean, intensities=swapped))
-    assert not found.result.trusted
-    assert any("far off" in text for text in found.result.warnings)
+    verdict = found.result.judged().verdict
+    assert not verdict.trusted
+    assert any("far off" in text for text in verdict.warnings)
 
 
 def test_a_fit_tells_that_there_are_some(clean):

@@ -98,7 +98,7 @@ def _fold(off: dict[str, np.ndarray], number: int) -> list[np.ndarray]:
 
 
 def test_the_same_instrument_still_fits_and_a_turned_derotator_does_not(fitted, table):
-    old = Calibration.from_fit(fitted)
+    old = Calibration.from_fit(fitted.judged())
     noisy = table.copy()
     noisy["N"] = (
         table["N"]

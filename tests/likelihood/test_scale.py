@@ -205,7 +205,7 @@ def test_whole_frames(tmp_path, side):
 def matrix_error(calset, truth, result) -> tuple[float, float]:
     """Rms error of the elements of the matrix at places between the points, and what the covariance expects."""
     x, y = (part.ravel() for part in np.meshgrid(*[np.linspace(-0.23, 0.23, 11)] * 2))
-    calibration = Calibration.from_fit(result)
+    calibration = Calibration.from_fit(result.judged())
     found, covariance = calibration.matrix(x, y)
     plan = plan_for_settings(truth, Settings.default(1), calset.filters)
     exact = instrument_matrix(jnp.asarray(analysis_vectors(truth, plan, x, y)[:, 0]))

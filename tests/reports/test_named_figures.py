@@ -28,7 +28,7 @@ WITHOUT = ("corner", "trace", "residual-map", "protection", "separation")  # wha
 def source(tmp_path_factory) -> Source:
     folder = tmp_path_factory.mktemp("run")
     write_calibration_set(folder / "set.fits", simulate(SMALL, seed=SEED).calset)
-    calibration = Calibration.from_fit(refit(read_calibration_set(folder / "set.fits")))
+    calibration = Calibration.from_fit(refit(read_calibration_set(folder / "set.fits")).judged())
     write_product(folder / "calibration.fits", calibration.to_product())
     return Source(folder)
 

@@ -43,7 +43,7 @@ def fitted(tmp_path_factory) -> FittedSet:
     path, run = folder / "small.fits", folder / "RUN"
     write_calibration_set(path, simulate(SMALL, seed=SEED).calset)
     calset = read_calibration_set(path)
-    result = refit(calset)
+    result = refit(calset).judged()
     calibration = Calibration.from_fit(result)
     run.mkdir()
     write_product(run / "calibration.fits", calibration.to_product())

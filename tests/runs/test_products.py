@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 from pathlib import Path
 
@@ -65,8 +64,7 @@ def test_what_a_new_fit_lacks_is_looked_for_without_trying_other_readings_again(
     fitted: FittedSet, monkeypatch
 ):
     asked: dict[str, object] = {}
-    doubtful = functools.partial(dataclasses.replace, examined=True, doubts=("odd",))
-    monkeypatch.setattr(walop_jax.runs.epoch, "examined", doubtful)
+    monkeypatch.setattr(walop_jax.runs.epoch, "examined", lambda result: result.judged(["odd"]))
     monkeypatch.setattr(walop_jax.runs.epoch, "diagnose", lambda *_, **how: asked.update(how))
     assert not compare_epochs(fitted.run, [fitted.calset]).found.holds
     assert asked["as_written"] is True

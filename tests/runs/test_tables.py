@@ -11,7 +11,7 @@ import pytest
 from astropy.table import Table
 
 from walop_jax.calibration.product import write_product
-from walop_jax.calibration.records import Quality
+from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import DataError
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.model.trace import Sightline

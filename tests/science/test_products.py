@@ -19,13 +19,14 @@ from walop_jax.calibration.product import write_product
 from walop_jax.data import write_calibration_set
 from walop_jax.fit.model_builder import model_for
 from walop_jax.fit.refit import refit
+from walop_jax.fit.verdict import Doubt, Quality
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.science.epoch import chi2_of_change, epoch, fit_like
 from walop_jax.simulation.simulate import simulate
 
 
 def calibrate(calset):
-    return Calibration.from_fit(refit(calset))
+    return Calibration.from_fit(refit(calset).judged())
 
 
 @pytest.fixture(scope="module")
@@ -69,8 +70,8 @@ def test_what_is_wrong_is_named(product):
         return changed(verdict=dataclasses.replace(product.verdict, **more))
 
     assert failed(verdict(converged=False)) == ["converged"]
-    assert failed(verdict(trusted=False)) == ["explains the data"]
-    assert failed(verdict(quality=2)) == ["conditioned"]
+    assert failed(verdict(against=(Doubt(Quality.UNEXPLAINED, ""),))) == ["explains the data"]
+    assert failed(verdict(against=(Doubt(Quality.ILL_CONDITIONED, "", blocking=False),))) == ["conditioned"]
     broken = product.covariance.copy()
     broken[0, 1] += 3 * np.sqrt(broken[0, 0] * broken[1, 1]) + 1e-6
     assert "covariance" in failed(changed(covariance=broken))
@@ -104,7 +105,9 @@ def test_certify_from_the_command_line(product, tmp_path):
     assert told["valid"] is True
     assert told["content"] == product.content_hash()
     assert told["parents"] == [product.inputs[0].sha256]
-    bad = dataclasses.replace(product, verdict=dataclasses.replace(product.verdict, trusted=False))
+    bad = dataclasses.replace(
+        product, verdict=dataclasses.replace(product.verdict, against=(Doubt(Quality.DOUBTED, ""),))
+    )
     write_product(tmp_path / "bad.fits", bad)
     result = CliRunner().invoke(app, ["certify", str(tmp_path / "bad.fits"), "--quiet"])
     assert result.exit_code == 1

@@ -132,7 +132,7 @@ def _product(folder: Path) -> bytes:
     nan = float("nan")
     product = CalibrationProduct(
         instrument=calset.instrument, site=calset.site, origin="by hand", date="2026-11-21T10:00:00",
-        verdict=Verdict(3e4, 33000, 44000, 1.0, True, True, 0, ()),
+        verdict=Verdict(3e4, 33000, 44000, 1.0, True),
         parameters=ParameterTable(
             name=np.array(["pupil.magnification", "collimator.q", "throughput.n0.p00"]),
             value=np.array([15.63, 1.0 / 3.0, 0.5]), sigma=np.sqrt(np.diag(root @ root.T)),

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import functools
-import operator
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -16,8 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from walop_jax.calibration.matrix import matrices, matrix_draws
-from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, ParameterTable, Verdict, in_ascii
-from walop_jax.calibration.records import Quality, ResidualMap
+from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, ParameterTable, in_ascii
+from walop_jax.calibration.records import ResidualMap
 from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter, single_wavelength
 from walop_jax.data.frames import Grid
 from walop_jax.data.quantities import in_unit
@@ -27,6 +25,7 @@ from walop_jax.fit.model_builder import model_without_data, standard_names
 from walop_jax.fit.model_file import render
 from walop_jax.fit.parameter_table import HEAD, parameter_notes, parameter_rows, parameter_table
 from walop_jax.fit.refit import FitResult
+from walop_jax.fit.verdict import Quality, Verdict
 from walop_jax.instruments.description import parsed
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, nearest
@@ -42,10 +41,6 @@ Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
 
 MAP_SIZE = 31  # pixels along each axis of the maps of a product: 0.02° over ±0.3°
-ILL_CONDITIONED = (
-    1e6  # for each intensity: eigenvalues of data grow with their number, those of priors do not
-)
-EXCESS_NOISE = 0.5  # sigma
 HIGH_CROSSTALK = 10.0  # condition number of the local 2 × 2 inverse
 TEMPERATURE_MARGIN = 2.0  # K beyond the temperatures of the exposures
 
@@ -74,27 +69,17 @@ class Calibration(Displayed):
 
     @classmethod
     def from_fit(cls, result: FitResult, residuals: ResidualMap | None = None) -> Calibration:
-        """The calibration that a fit gives, with the verdict on it (see `quality`).
+        """The calibration that a fit gives, with the verdict on it.
 
         `residuals` is what the model leaves over the field (`residual_map`), worth its pass for large sets.
+        Raises RuntimeError for a fit that nobody has examined.
         """
         calset = result.calset
-        verdict = Verdict(
-            chi2=result.chi2,
-            dof=result.dof,
-            n_data=result.n_data,
-            noise_scale=result.noise_scale,
-            converged=result.converged,
-            trusted=result.trusted,
-            quality=quality(result),
-            warnings=result.warnings,
-            errors_from=result.errors_from,
-        )
         return cls(
             model=result.model,
             values=result.values,
             covariance=0.5 * (result.covariance + result.covariance.T),
-            verdict=verdict,
+            verdict=result.checked_verdict(),
             filters=calset.filters,
             exposures=calset.exposures,
             sources=calset.sources,
@@ -125,7 +110,7 @@ class Calibration(Displayed):
             "errors from": f"covariance of the {v.covariance_from}, {v.errors_from}",
         }
         return Display(
-            title=f"Calibration of {self.model.name}: {'trusted' if v.trusted else 'not trusted'}",
+            title=f"Calibration of {self.model.name}: {v.words}",
             facts=tuple(facts.items()),
             head=HEAD,
             rows=parameter_rows(self.model, self.values, self.sigma),
@@ -262,13 +247,15 @@ class Calibration(Displayed):
         parameters = self.model.parameters
         priors = np.array([p.prior or (np.nan, np.nan) for p in parameters]).reshape(-1, 2)
         maps = self.maps()
-        texts = tuple(in_ascii(text) for text in self.verdict.warnings)
+        against = tuple(
+            dataclasses.replace(doubt, sentence=in_ascii(doubt.sentence)) for doubt in self.verdict.against
+        )
         return CalibrationProduct(
             instrument=self.model.name,
             site=self.site,
             origin=in_ascii(self.origin),
             date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds").replace("+00:00", ""),
-            verdict=dataclasses.replace(self.verdict, warnings=texts),
+            verdict=dataclasses.replace(self.verdict, against=against),
             parameters=ParameterTable(
                 name=np.array([p.name for p in parameters]),
                 value=self.values,
@@ -352,18 +339,3 @@ def model_of_product(product: CalibrationProduct, catalogue: Sequence[type[Effec
     context = effect_context(adapted(design, standards=standards), product.exposures)
     text = "\n".join(product.model)
     return model_without_data(design, text, standards=standards, context=context, catalogue=catalogue)
-
-
-def quality(result: FitResult) -> Quality:
-    """What is to be said against a fit as a whole."""
-    ratio = result.chi2 / max(result.dof, 1)
-    held_against = {
-        Quality.NOT_CONVERGED: not result.converged,
-        Quality.ILL_CONDITIONED: result.minimum.condition > ILL_CONDITIONED * result.n_data,
-        Quality.AT_PRIOR_EDGE: len(result.at_prior_edge) > 0,
-        Quality.EXCESS_NOISE: max(ratio, result.noise_scale**2) > 1.0 + EXCESS_NOISE**2,
-        Quality.UNEXPLAINED: not (result.explains_data or result.noise_only),
-        Quality.DOUBTED: len(result.doubts) > 0,
-        Quality.ERRORS_TOO_LARGE: result.errors_too_large,
-    }
-    return functools.reduce(operator.or_, (bit for bit, holds in held_against.items() if holds), Quality(0))

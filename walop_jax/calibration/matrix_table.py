@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.records import Quality, matrix_names
+from walop_jax.calibration.records import matrix_names
 from walop_jax.data.settings import Settings
+from walop_jax.fit.verdict import Quality
 
 
 def provenance(content: str, calibration: Calibration, *, drawn: bool = False) -> dict[str, str]:

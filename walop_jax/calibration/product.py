@@ -203,7 +203,7 @@ def _from_hdus(opened: OpenFile) -> CalibrationProduct:
         site=site,
         origin=header.text("ORIGIN"),
         date=header.text("DATE"),
-        verdict=Verdict(
+        verdict=Verdict.recorded(
             chi2=header.number("CHI2"),
             dof=int(header.number("DOF")),
             n_data=int(header.number("NDATA")),

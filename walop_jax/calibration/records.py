@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import enum
 import hashlib
 from collections.abc import Iterable, Mapping
 
@@ -12,6 +11,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import Exposures, FilterCurve, InputFile, Site, Sources
+from walop_jax.fit.verdict import Verdict
 from walop_jax.likelihood.expansion import STATED
 
 SMALLEST_DETERMINANT = 0.1
@@ -31,59 +31,6 @@ def residual_names(arms: int) -> tuple[str, ...]:
     ratios = ("RATIO",) if arms == 2 else tuple(f"RATIO{arm}" for arm in range(2, arms + 1))
     return (*matrix_names(arms), *ratios)
 
-
-class Quality(enum.IntFlag):
-    """Bits of QUALITY (of a product) and FLAG (of a row, star or pixel)."""
-
-    NOT_CONVERGED = 1
-    ILL_CONDITIONED = 2
-    AT_PRIOR_EDGE = 4
-    EXCESS_NOISE = 8
-    HIGH_CROSSTALK = 16
-    BEYOND_FIELD = 32
-    BEYOND_SETTINGS = 64
-    CAMERA_MISSING = 128
-    SATURATED = 256
-    FREE_FORM = 512
-    CLASS_ONLY = 1024
-    VALIDITY_FORCED = 2048
-    NON_PHYSICAL = 4096
-    UNEXPLAINED = 8192
-    NO_STOKES = 16384
-    DOUBTED = 32768
-    ERRORS_TOO_LARGE = 65536
-    DISAGREES = 131072
-    UNKNOWN_COLOUR = 262144
-    CATALOGUE = 524288
-
-    @property
-    def meanings(self) -> tuple[str, ...]:
-        """What the bits that are set say, in words."""
-        return tuple(text for bit, text in _MEANINGS.items() if bit & self)
-
-
-_MEANINGS = {
-    Quality.NOT_CONVERGED: "not converged",
-    Quality.ILL_CONDITIONED: "ill-conditioned",
-    Quality.AT_PRIOR_EDGE: "a parameter lies at the edge of its prior",
-    Quality.EXCESS_NOISE: "excess noise above 0.5 sigma",
-    Quality.HIGH_CROSSTALK: "zone of high cross-talk (a local inverse has a condition number above 10)",
-    Quality.BEYOND_FIELD: "extrapolated in the field",
-    Quality.BEYOND_SETTINGS: "extrapolated in wavelength or temperature",
-    Quality.CAMERA_MISSING: "a camera is missing",
-    Quality.SATURATED: "saturated or non-linear data used",
-    Quality.FREE_FORM: "unknown free-form term active",
-    Quality.CLASS_ONLY: "only a class of causes was named",
-    Quality.VALIDITY_FORCED: "validity forced",
-    Quality.NON_PHYSICAL: "non-physical Mueller matrix within tolerance",
-    Quality.UNEXPLAINED: "the model does not explain the data",
-    Quality.DOUBTED: "the residuals hold more than noise, or differ between parts of the data",
-    Quality.ERRORS_TOO_LARGE: "the stated errors are far larger than the scatter of the data",
-    Quality.DISAGREES: "the intensities disagree with the calibration by more than noise",
-    Quality.UNKNOWN_COLOUR: "no TEFF, and the colour is most of the error",
-    Quality.CATALOGUE: "the stars of the catalogue together say that calibration or errors do not hold",
-    Quality.NO_STOKES: "no Stokes parameters: too few cameras, too little light, or no u in the rows there are",
-}
 
 _SPELT = {
     "χ²": "chi2", "²": "^2", "⁻": "^-", "×": "x", "·": "*", "°": " deg", "±": "+-", "−": "-", "–": "-",
@@ -192,27 +139,6 @@ class ResidualMap:
         """How many standard deviations the scatter of all corrections lies above what their errors make it."""
         squares = (self.values / self.errors)[np.isfinite(self.values)] ** 2
         return float((squares.sum() - squares.size) / np.sqrt(2.0 * max(squares.size, 1)))
-
-
-@dataclasses.dataclass(frozen=True)
-class Verdict:
-    """How far a product can be trusted; `quality` are bits of `Quality`.
-
-    `noise_scale` multiplied the errors of the data in the fit (1: as given); `covariance_from` says what the
-    covariance is of ("fit" or "posterior"), `errors_from` what that was made from: the stated errors of the data, or
-    what what a fit left (`fit.robust`).
-    """
-
-    chi2: float
-    dof: int
-    n_data: int
-    noise_scale: float
-    converged: bool
-    trusted: bool
-    quality: int
-    warnings: tuple[str, ...] = ()
-    covariance_from: str = "fit"
-    errors_from: str = STATED
 
 
 @dataclasses.dataclass(frozen=True)

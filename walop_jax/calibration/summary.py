@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from walop_jax.calibration.calibration import quality
 from walop_jax.calibration.records import ResidualMap
 from walop_jax.fit.misfit import Misfit
 from walop_jax.fit.refit import FitResult
@@ -27,8 +26,9 @@ def summary(
 ) -> dict[str, Any]:
     """What a fit found and how far it can be trusted, key by key as in docs: files.
 
-    Frozen parameters have sigma 0.
+    Frozen parameters have sigma 0. Raises RuntimeError for a fit that nobody has examined.
     """
+    verdict = result.checked_verdict()
     parameters = {
         p.name: {"value": float(value), "sigma": float(sigma), "unit": p.unit}
         for p, value, sigma in zip(result.model.parameters, result.values, result.sigma, strict=True)
@@ -43,10 +43,10 @@ def summary(
         "seconds": seconds,
         "versions": software_versions(),
         "inputs": [{"path": str(entry.path), "sha256": entry.sha256} for entry in result.calset.inputs],
-        "trusted": result.trusted,
-        "quality": int(quality(result)),
-        "doubts": list(result.doubts) if result.examined else None,
-        "warnings": list(result.warnings),
+        "trusted": verdict.trusted,
+        "quality": int(verdict.quality),
+        "doubts": list(verdict.doubts),
+        "warnings": list(verdict.warnings),
         "instrument": result.model.name,
         "effects": list(result.model.effect_names),
         "free_parameters": len(result.model.free),

@@ -46,7 +46,7 @@ def matrix(
     of the instrument (0.35 degrees for the WALOPs) there is no value: NaN and FLAG 32.
     """
     switch_on_jax()
-    from walop_jax.calibration.records import Quality
+    from walop_jax.fit.verdict import Quality
     from walop_jax.model.effects.own import catalogue_with
     from walop_jax.runs.matrix import tabulate_matrix
 

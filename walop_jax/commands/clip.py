@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Job, Option, Outcome, command
@@ -41,6 +42,7 @@ def clip(
     """
     from walop_jax.data.table_intensities import TableIntensities
     from walop_jax.data.write import write_calibration_set
+    from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.outliers import clipped
 
     job.tell("reading", "reading")
@@ -54,6 +56,9 @@ def clip(
     with job.repeated() as say:
         say(Stage("fitting", "fitting"))
         found = clipped(calset, chosen, sigma)
+        # Of too many rows the model lacks something: no need to ask what.
+        result = found.result.judged() if found.too_many else examined(found.result, as_written=True)
+        found = dataclasses.replace(found, result=result)
     job.tell("writing", "writing")
     if output is not None:
         write_calibration_set(output, found.calset, overwrite=job.overwrite)

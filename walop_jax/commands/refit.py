@@ -96,7 +96,7 @@ def refit(
                 lambda: summary(result, seconds=seconds, misfit=misfit, residuals=residuals) | {"seed": job.seed},
                 lambda: "\n".join((
                     dataclasses.replace(result.display(), notes=result.notes).text(),
-                    f"{'trusted' if result.trusted else 'NOT trusted'}: {output}   ({seconds:.1f} s)",
+                    f"{result.checked_verdict().words}: {output}   ({seconds:.1f} s)",
                 )),
                 files,
                 saved_as=SUMMARY,

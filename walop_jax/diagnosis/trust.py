@@ -54,26 +54,27 @@ _SHOWN = 3
 Cube = Float[np.ndarray, "p e k"]
 
 
-def examined(result: FitResult, seed: int = 0) -> FitResult:
-    """The fit with what its residuals say against it (`doubts`).
+def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> FitResult:
+    """The fit with the verdict on it: what its residuals say against it, beside χ², priors and convergence.
 
-    A fit that explains nothing is held against other readings of its data first (`mixups`), and against stated errors
-    that are too small. `seed` is that of the Monte Carlo p. Of a set with more than `limits.TRUST_ROWS` (exposure,
-    point) pairs, points spread over the field are looked at. A χ² that is a few per cent too large while nothing else
-    is wrong is put down to the stated errors (`FitResult.noise_only`), and the standard errors are made from the
-    residuals. Raises `DataError` with the remedy for data that another reading explains.
+    A fit that explains nothing is held against other readings of its data first (`mixups`), unless these were tried
+    already (`as_written`), and against stated errors that are too small. `seed` is that of the Monte Carlo p. Of a set
+    with more than `limits.TRUST_ROWS` (exposure, point) pairs, points spread over the field are looked at. A χ² that is
+    a few per cent too large while nothing else is wrong is put down to the stated errors, and the standard errors are
+    made from the residuals. Raises `DataError` with the remedy for data that another reading explains.
     """
     if not result.converged:
-        return dataclasses.replace(result, examined=True)
+        return result.judged()
     if not (result.explains_data or result.nearly_explains_data):
-        refuse_mixups(result)
+        if not as_written:
+            refuse_mixups(result)
         doubts = tuple(_errors_too_small(result, seed)) or tuple(
             stated_conditions(Design.of(_looked_at(result)))
         )
-        return dataclasses.replace(result, examined=True, doubts=doubts)
+        return result.judged(doubts)
     design = Design.of(_looked_at(result))
     if result.errors_too_large and _hold_no_noise(design):
-        return dataclasses.replace(result, examined=True, noiseless=True)
+        return result.judged(noiseless=True)
     table = pattern_scores(design, seed)
     doubts = (
         *stated_conditions(design),
@@ -82,7 +83,7 @@ def examined(result: FitResult, seed: int = 0) -> FitResult:
         *repeated_noise(design),
         *_far_from_pixels(result),
     )
-    return with_honest_errors(dataclasses.replace(result, examined=True, doubts=doubts))
+    return with_honest_errors(result).judged(doubts)
 
 
 def _looked_at(result: FitResult) -> FitResult:

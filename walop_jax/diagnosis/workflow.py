@@ -40,8 +40,9 @@ from walop_jax.diagnosis.mixups import mixups_of, refusal
 from walop_jax.diagnosis.naming import Trial, before_and_after, predicts_unseen, refitted_in_order
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.search import Linear, search
+from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.model_builder import base_model
-from walop_jax.fit.refit import FitResult, fit
+from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.stand_in import in_field_points
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
@@ -71,7 +72,7 @@ def diagnose(
     `catalogue` are the effects that may be named, `policy` the thresholds. Of a set with more than
     `limits.DIAGNOSED_ROWS` (exposure, point) pairs, or whose columns would be more than `limits.DIAGNOSED_NUMBERS`,
     points spread over the field are looked at. Nothing further is tried after `minutes` (default: those of the policy);
-    what is left then has no name, and `Diagnosis.caution` says so. Other readings of the data are not tried where the
+    what is left then has no name, and `Diagnosis.caution` says so. Both fits are examined. Other readings of the data are not tried where the
     caller has done that already (`as_written`). Raises what `fit` raises, and `DataError` for data that another reading
     explains (`mixups`).
     """
@@ -101,7 +102,8 @@ def diagnose(
         raise refusal(before, readings)
     steps = tuple(judge.finished(step, last) for step in judge.steps)
     verdict: Outcome = "unexplained" if nameless else "effect_found" if steps else "consistent"
-    return Diagnosis(
+    tell("examining what is left")
+    found = Diagnosis(
         verdict=verdict,
         steps=steps,
         candidates=first.summary(),
@@ -121,6 +123,15 @@ def diagnose(
         policy=policy,
         ended=judge.ended,
     )
+    after = examined(with_honest_errors(found.after), as_written=True)
+    before = after if found.before is found.after else _examined_first(found.before)
+    return dataclasses.replace(found, before=before, after=after)
+
+
+def _examined_first(result: FitResult) -> FitResult:
+    """The verdict on the fit of the model given: where χ² speaks against it, the steps say what is missing."""
+    explained = result.explains_data or result.nearly_explains_data
+    return examined(result, as_written=True) if explained else result.judged()
 
 
 def _promise(choice: Choice) -> tuple[float, float]:

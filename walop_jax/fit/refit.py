@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from walop_jax.fit.model_file import render
 from walop_jax.fit.parameter_table import HEAD, parameter_notes, parameter_rows, parameter_table
 from walop_jax.fit.robust import robust_errors
 from walop_jax.fit.search import find_minimum, free_scales
+from walop_jax.fit.verdict import Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.heartbeat import Stage
 from walop_jax.io.software import software_versions
@@ -37,15 +38,18 @@ SUSPECT_SIGMA = 5.0  # excess of χ² over its expectation, in its own standard 
 NEARLY = 1.15  # χ²/dof that errors stated seven per cent too small give
 TOO_LOW = 0.8  # χ²/dof below which the stated errors are those of something else
 PRIOR_EDGE = 4.0  # standard deviations
+EXCESS_NOISE = 0.5  # sigma
+ILL_CONDITIONED = (
+    1e6  # for each intensity: eigenvalues of data grow with their number, those of priors do not
+)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class FitResult(Displayed):
-    """A fit, the likelihood that it maximises, and how far it can be trusted.
+    """A fit, the likelihood that it maximises, and the verdict on it.
 
-    `values` and `covariance` are of all parameters in tree order, frozen ones with zero variance. `trusted` needs a
-    converged fit that explains the data within its priors, and no doubts: `doubts` is what the residuals say against
-    it, once they were `examined` (`diagnosis.trust`); `noiseless` data are expected counts, those of a plan.
+    `values` and `covariance` are of all parameters in tree order, frozen ones with zero variance. `verdict` is None
+    until the residuals were examined (`diagnosis.trust.examined`); to ask for `trusted` before is an error.
     `errors_from` is what the covariance was made from, the stated errors of the data (`STATED`) or residuals.
     """
 
@@ -57,9 +61,7 @@ class FitResult(Displayed):
     starts: int
     seconds: float
     errors_from: str = STATED
-    examined: bool = False
-    doubts: tuple[str, ...] = ()
-    noiseless: bool = False
+    verdict: Verdict | None = None
 
     @property
     def model(self) -> Model:
@@ -122,14 +124,9 @@ class FitResult(Displayed):
         return self.dof > 0 and not self.explains_data and bool(self.chi2 < NEARLY * self.dof)
 
     @property
-    def noise_only(self) -> bool:
-        """Whether χ² is a few per cent too large while the residuals, once examined, show nothing but noise."""
-        return self.examined and not self.doubts and self.nearly_explains_data
-
-    @property
     def errors_too_large(self) -> bool:
         """Whether χ² is far smaller than noise of the stated size would make it."""
-        return not self.noiseless and bool(self.excess < -SUSPECT_SIGMA and self.chi2 < TOO_LOW * self.dof)
+        return bool(self.excess < -SUSPECT_SIGMA and self.chi2 < TOO_LOW * self.dof)
 
     @property
     def at_prior_edge(self) -> tuple[str, ...]:
@@ -140,16 +137,47 @@ class FitResult(Displayed):
             if p.free and p.prior is not None and abs(value - p.prior[0]) > PRIOR_EDGE * p.prior[1]
         )
 
+    def judged(self, doubts: Sequence[str] = (), *, noiseless: bool = False) -> FitResult:
+        """The fit with the verdict on it, given the sentences that its residuals hold against it.
+
+        `noiseless` data are expected counts, those of a plan: they may scatter less than their errors.
+        """
+        verdict = Verdict(
+            chi2=self.chi2,
+            dof=self.dof,
+            n_data=self.n_data,
+            noise_scale=self.noise_scale,
+            converged=self.converged,
+            against=tuple(_against(self, doubts, examined=True, noiseless=noiseless)),
+            errors_from=self.errors_from,
+        )
+        return dataclasses.replace(self, verdict=verdict)
+
+    def checked_verdict(self) -> Verdict:
+        """The verdict; raises RuntimeError for a fit that nobody has examined."""
+        if self.verdict is None:
+            raise RuntimeError(
+                "nobody has examined the residuals of this fit: call walop_jax.diagnosis.trust.examined(fit), as "
+                "walop_jax.refit and walop_jax.diagnose do"
+            )
+        return self.verdict
+
     @property
     def trusted(self) -> bool:
-        """Whether the result may be used without a second thought."""
-        explained = (self.explains_data or self.noise_only) and not self.errors_too_large
-        return self.converged and explained and not self.doubts and not self.at_prior_edge
+        """True if nothing that speaks against the fit forbids its use (`Verdict.trusted`).
+
+        Raises RuntimeError for a fit that nobody has examined.
+        """
+        return self.checked_verdict().trusted
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What does not hold, in sentences."""
-        return tuple(_warnings(self))
+        """The sentences of the verdict; of a fit that was not examined, those on χ², priors and convergence."""
+        if self.verdict is not None:
+            return self.verdict.warnings
+        return tuple(
+            doubt.sentence for doubt in _against(self, (), examined=False, noiseless=False) if doubt.sentence
+        )
 
     def value(self, name: str) -> tuple[float, float]:
         """Value and standard error of a parameter."""
@@ -167,7 +195,7 @@ class FitResult(Displayed):
 
     def display(self) -> Display:
         """The verdict and the parameters."""
-        verdict = "trusted" if self.trusted else "not trusted"
+        verdict = "not examined" if self.verdict is None else self.verdict.words
         facts = {
             "χ²/dof": f"{self.chi2:.1f} / {self.dof} = {self.chi2 / max(self.dof, 1):.4g}",
             "intensities": str(self.n_data),
@@ -253,7 +281,8 @@ def _start(likelihood: Likelihood) -> Vector:
 def with_honest_errors(result: FitResult) -> FitResult:
     """The fit with errors from its residuals where it does not explain the data (`robust`); as it is where it does.
 
-    Nothing but the covariance changes. For what leaves the program: evidence is weighed with errors as stated.
+    Nothing but the covariance changes, and the verdict is to be made anew. For what leaves the program: evidence is
+    weighed with errors as stated.
     """
     if result.explains_data or result.errors_from != STATED or result.dof <= 0 or not result.converged:
         return result
@@ -263,40 +292,67 @@ def with_honest_errors(result: FitResult) -> FitResult:
         result,
         covariance=select @ found.covariance @ select.T,
         errors_from=found.made_from,
+        verdict=None,
     )
 
 
-def _warnings(result: FitResult) -> Iterator[str]:
+def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noiseless: bool) -> Iterator[Doubt]:
+    """Everything that speaks against a fit, with remarks. The only place where bits and trust are decided.
+
+    A χ² that is a few per cent too large while the residuals, once examined, show nothing but noise is put down to the
+    stated errors.
+    """
     ratio = result.chi2 / max(result.dof, 1)
+    excess = Quality.EXCESS_NOISE if ratio > 1.0 + EXCESS_NOISE**2 else Quality(0)
     if not result.converged:
-        yield result.minimum.message
+        yield Doubt(Quality.NOT_CONVERGED, result.minimum.message)
+    if result.minimum.condition > ILL_CONDITIONED * result.n_data:
+        yield Doubt(Quality.ILL_CONDITIONED, "", blocking=False)
     if result.dof <= 0:
-        yield f"{result.n_data} intensities for {len(result.model.free)} free parameters: nothing is left to test"
-    elif result.noise_only:
-        yield (
+        yield Doubt(
+            Quality.UNEXPLAINED | excess,
+            f"{result.n_data} intensities for {len(result.model.free)} free parameters: nothing is left to test",
+        )
+    elif examined and not doubts and result.nearly_explains_data:
+        yield Doubt(
+            excess,
             f"χ²/dof = {ratio:.4g} with nothing but noise in the residuals: the stated errors N_ERR are "
-            f"{100 * (np.sqrt(ratio) - 1):.2g} % too small"
+            f"{100 * (np.sqrt(ratio) - 1):.2g} % too small",
+            blocking=False,
         )
     elif not result.explains_data:
-        yield (
+        yield Doubt(
+            Quality.UNEXPLAINED | excess,
             f"χ²/dof = {ratio:.4g} lies {result.excess:.3g} standard deviations above 1: the model does not explain "
-            "the data; do not trust the calibration (walop-jax diagnose looks for what is missing)"
+            "the data; do not trust the calibration (walop-jax diagnose looks for what is missing)",
         )
-    elif result.errors_too_large:
-        yield (
+    elif result.errors_too_large and not noiseless:
+        yield Doubt(
+            Quality.ERRORS_TOO_LARGE,
             f"χ²/dof = {ratio:.4g}: N_ERR is not the standard error of N; check the gain, and whether N_ERR holds "
-            "variances or other units"
+            "variances or other units",
         )
+    elif excess:
+        yield Doubt(excess, "", blocking=False)  # so few degrees of freedom that noise alone may do it
     if result.noise_scale > 1.0:
-        yield f"the errors of the data were multiplied by {result.noise_scale:.3g} to fit at all: the model is far off"
+        large = result.noise_scale**2 > 1.0 + EXCESS_NOISE**2
+        yield Doubt(
+            Quality.EXCESS_NOISE if large else Quality(0),
+            f"the errors of the data were multiplied by {result.noise_scale:.3g} to fit at all: the model is far off",
+            blocking=False,
+        )
     for name in result.at_prior_edge:
         p, value = result.model[name], result.value(name)[0]
         assert p.prior is not None
         pull = (value - p.prior[0]) / p.prior[1]
-        yield f"{name} = {value:.6g} {p.unit} lies {pull:+.1f} prior widths from {p.prior[0]:g}"
-    yield from result.doubts
+        yield Doubt(
+            Quality.AT_PRIOR_EDGE,
+            f"{name} = {value:.6g} {p.unit} lies {pull:+.1f} prior widths from {p.prior[0]:g}",
+        )
+    yield from (Doubt(Quality.DOUBTED, sentence) for sentence in doubts)
     if result.errors_from != STATED:
-        yield f"standard errors are made from the {result.errors_from}"
+        made = f"standard errors are made from the {result.errors_from}"
+        yield Doubt(Quality(0), made, blocking=False)
 
 
 def refit(

@@ -26,6 +26,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import Block, CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model.specification import Model
@@ -153,7 +154,7 @@ def reweighted_calibration(
     """
     current, weight = calset, np.ones(0)
     while True:
-        calibration = Calibration.from_fit(refit(current, model))
+        calibration = Calibration.from_fit(examined(refit(current, model)))
         patches = judge_patches(calset, calibration)
         rounds -= 1
         if rounds < 1 or (weight.size and np.allclose(patches.weight, weight, rtol=0.05)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -40,7 +41,7 @@ def fit_of_run(
 
     Raises `DataError` when the data are missing, not those of the fit or too many to be sampled, and when the fit does
     not come out as the product says (another model, or another version of the physics). Errors are made as those of
-    the product were.
+    the product were, and the verdict is its verdict.
     """
     if not product.inputs:
         raise fail("does not say what it was fitted to", file=run, advice="make it with walop-jax refit")
@@ -70,4 +71,6 @@ def fit_of_run(
             f"fitted again, {name} moves by {np.max(away):.2g} standard errors", file=run,
             advice="run walop-jax refit with this model and version first",
         )  # fmt: skip
-    return result if product.verdict.errors_from == STATED else with_honest_errors(result)
+    if product.verdict.errors_from != STATED:
+        result = with_honest_errors(result)
+    return dataclasses.replace(result, verdict=product.verdict)

@@ -190,12 +190,13 @@ def sample(
 
     With `folder`, checkpoints are kept there; `resume` goes on from them, bit for bit as if there had been no
     interruption. Raises `DataError` for a folder that holds a run already while `resume` is False, or one of
-    other data, model, priors, sampler, settings or versions; ValueError where there is nothing to sample.
+    other data, model, priors, sampler, settings or versions; ValueError where there is nothing to sample;
+    RuntimeError for a fit that nobody has examined.
 
     Around a fit whose errors come from its residuals (`errors_from`), chains are those of the stated errors, and draws
     and covariance are `sandwich_adjusted`.
     """
-    options = options or Options()
+    options, trusted = options or Options(), result.trusted
     report = report or (lambda progress: None)
     if result.errors_from != STATED:
         stated = dataclasses.replace(
@@ -224,7 +225,7 @@ def sample(
     report(Progress("comparing with the exact posterior", 1.0, *numbers_of(verdict)))
     finished = _finish(target, posterior, ensembles, verdict, seconds)
     fit = digest_of_fit(result.calset.inputs, result.model.names, result.values)
-    return dataclasses.replace(finished, of_trusted_fit=result.trusted, fit=fit)
+    return dataclasses.replace(finished, of_trusted_fit=trusted, fit=fit)
 
 
 def _surrogate(

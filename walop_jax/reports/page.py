@@ -15,7 +15,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from walop_jax.calibration.records import Quality
+from walop_jax.fit.verdict import Quality
 from walop_jax.io.rounding import probability, rounded, value_and_error, with_error, with_minus_sign
 from walop_jax.reports import diagnosis_figures, product_figures
 from walop_jax.reports.about_data import data_in_words, model_entries, symbols_in_words

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from walop_jax.calibration.from_file import read_calibration
-from walop_jax.calibration.records import Quality
 from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.user_tables import read_input_table, table_format, write_output_table
+from walop_jax.fit.verdict import Quality
 from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import errors_naming
 from walop_jax.model.effects import EFFECTS, Effect

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Callable, Sequence
 
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.write import write_calibration_set
+from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.outliers import BEYOND, Clipped, clipped
 from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import fail
@@ -47,6 +49,9 @@ def clip_sets(
     with repeated(tell) as say:
         say("fitting")
         found = clipped(calset, chosen, beyond)
+        # Of too many rows the model lacks something: no need to ask what.
+        result = found.result.judged() if found.too_many else examined(found.result, as_written=True)
+        found = dataclasses.replace(found, result=result)
     tell("writing")
     write_calibration_set(output, found.calset, overwrite=overwrite)
     return found

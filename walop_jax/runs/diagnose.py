@@ -14,11 +14,9 @@ from walop_jax.calibration.summary import PRODUCT, SUMMARY, summary
 from walop_jax.diagnosis.figure_data import figure_data
 from walop_jax.diagnosis.figure_file import FIGURE_DATA, write_figure_data
 from walop_jax.diagnosis.findings import DIAGNOSIS, Diagnosis, document
-from walop_jax.diagnosis.trust import examined
 from walop_jax.diagnosis.workflow import MINUTES, diagnose
 from walop_jax.fit.misfit import describe
 from walop_jax.fit.model_file import render
-from walop_jax.fit.refit import with_honest_errors
 from walop_jax.io.folder import output_folder
 from walop_jax.io.heartbeat import repeated
 from walop_jax.io.text import json_text, read_text
@@ -72,7 +70,7 @@ def diagnose_sets(
                 calset, chosen, catalogue=catalogue, seed=seed or 0, minutes=minutes, progress=say
             )
         tell("mapping the field")
-        after = examined(with_honest_errors(found.after))
+        after = found.after
         product = Calibration.from_fit(after).to_product()
         misfit = None if after.explains_data else describe(after)
         content = document(found)

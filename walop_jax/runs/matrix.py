@@ -8,9 +8,9 @@ from pathlib import Path
 
 from walop_jax.calibration.from_file import read_calibration
 from walop_jax.calibration.matrix_table import matrix_columns, provenance
-from walop_jax.calibration.records import Quality
 from walop_jax.data.field_points import field_points
 from walop_jax.data.user_tables import read_input_table, table_format, write_output_table
+from walop_jax.fit.verdict import Quality
 from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import errors_naming
 from walop_jax.model.effects import EFFECTS, Effect

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from walop_jax.calibration.records import Quality
+from walop_jax.fit.verdict import Quality
 from walop_jax.runs.left_out import KEY
 
 

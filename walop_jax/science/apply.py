@@ -20,9 +20,9 @@ from scipy import special
 from walop_jax.calibration.analysis_vectors import COLOURS, AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.colour import COOLEST, colour_weights
-from walop_jax.calibration.records import Quality
 from walop_jax.data.catalogue import Catalogue
 from walop_jax.data.settings import Settings
+from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import DataError, rows_text
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux

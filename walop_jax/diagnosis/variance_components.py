@@ -1,0 +1,242 @@
+"""Do residuals agree where no smooth pattern looks? One variance component for each way of grouping the data.
+
+A gain of every field point, a response of every exposure, a light of its own in every night: numbers by the hundred,
+each below its noise, alike only in size. Let r = P(A a + ε) with noise ε of unit variance and a of variance τ² in the
+columns A of a grouping. Against τ = 0 the score test is
+
+    T = |Aᵀr|² − c |r|²,   c = tr G / f,   G = AᵀPA,   f = tr P,
+
+with mean 0, whatever the size of the noise, and, in units of its variance,
+
+    κ₂ = 2 (tr G² − c tr G),   κ₃ = 8 (tr G³ − 3c tr G² + 2c² tr G),   τ² = T / (tr G² − c tr G);
+
+its p is that of the shifted χ² with these moments. P = 1 − Σwwᵀ − QQᵀ couples places through the parameters alone, so
+that with B = QᵀA and D what the fluxes leave of AᵀA, block by block,
+
+    tr G = tr D − tr M,   tr G² = |D|² − 2 tr BDBᵀ + |M|²,   tr G³ = tr D³ − 3 tr BD²Bᵀ + 3 tr BDBᵀM − tr M³,  M = BBᵀ.
+
+Groupings   the gain of each camera, and what it makes of each Stokes parameter, at each field point (structure finer
+            than any polynomial: flat fields, dust, pixels); its gain and gradients over the field in each exposure;
+            what it makes of each Stokes parameter in each state of the moving elements; its gain and gradients for
+            each night and kind of exposure; its gain and what it makes of each Stokes parameter for each standard
+Symbols     r whitened residuals; w expected counts / errors of what has a flux in common, of unit length; Q orthonormal
+            basis of the derivatives with respect to the free parameters; τ a share of the counts
+Sources     score test of a variance component: Rao 1948; Lin 1997, Biometrika 84, 309. Three moments: Imhof 1961,
+            Biometrika 48, 419 (after Pearson 1959). Many questions: Šidák 1967
+Limits      Which place is off is not told, only how much places differ. The mean square of the noise is taken from
+            the residuals themselves, so that structure in all of them counts a little less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy import stats
+
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.score import local_p
+
+ALARM = 1e-3
+"""Probability that noise alone raises a doubt, all groupings together."""
+MOST_PLACES = 1000  # field points that are asked, spread over the set
+_SHOWN = 2
+
+
+class Grouping(NamedTuple):
+    """A way of grouping the data, and what may differ from place to place.
+
+    `place` is the number of the place of every (point, exposure), −1 for none; the gain of a camera there is multiplied
+    with each of the `features`. `words` say what agrees; `of_field` is true where a place is one field point.
+    """
+
+    name: str
+    words: str
+    place: Int[np.ndarray, "p e"]
+    features: Float[np.ndarray, "p e j"]
+    of_field: bool = False
+
+
+class Component(NamedTuple):
+    """What one grouping holds: T in standard deviations of noise, its p, and the size τ with its standard error."""
+
+    grouping: Grouping
+    deviate: float
+    p_value: float
+    size: float
+    error: float
+
+
+def variance_components(design: Design) -> list[Component]:
+    """Every grouping that the data have, asked by itself."""
+    residual = design.projector(design.residual)
+    square = float(residual @ residual)
+    ready = (asked(design, grouping, residual[:, None]) for grouping in groupings(design))
+    return [one[0].answered(one[1][:, 0], square) for one in ready if one is not None and square > 0]
+
+
+def found_components(components: list[Component]) -> list[Component]:
+    """Those that noise does not make, the clearest first, after one correction for all that were asked."""
+    limit = local_p(ALARM, len(components))
+    return sorted((c for c in components if c.p_value < limit), key=lambda c: c.p_value)
+
+
+def in_words(found: list[Component]) -> Iterator[str]:
+    """One sentence on what was found; a grouping that is asked as well often answers to the same structure."""
+    if not found:
+        return
+    first = found[0]
+    more = ", ".join(f"{c.grouping.name} {c.deviate:.2g} σ" for c in found[1 : 1 + _SHOWN])
+    yield (
+        f"residuals {first.grouping.words}, {first.deviate:.2g} σ: structure of {first.size:.2g} that the model does "
+        f"not have" + (f" (also {more})" if more else "")
+    )
+
+
+def groupings(design: Design) -> Iterator[Grouping]:
+    """The groupings that the data have; of two that cut them alike, the first."""
+    measured, calset = design.measured, design.fit.calset
+    e, points, used = calset.exposures, calset.points, measured.used
+    one = np.ones((*used.shape, 1))
+    stokes = measured.likelihood.stokes(measured.values)[..., 1:3]
+    reach = max(float(np.hypot(points.x, points.y).max(initial=0.0)), 1e-12)
+    plane = np.stack([np.ones(len(points)), points.x / reach, points.y / reach], axis=-1)
+    plane = np.broadcast_to(plane[:, None], (*used.shape, 3))
+    agree = "of the same field point agree between exposures"
+    every = -(-used.shape[0] // MOST_PLACES)
+    number = np.arange(used.shape[0])
+    at_points = np.where(number % every == 0, number // every, -1)[:, None]
+    at_points = np.broadcast_to(at_points, used.shape)
+    if used.shape[0] > 1:
+        yield Grouping("field points", agree, at_points, one, of_field=True)
+        said = f"{agree} in what they make of q and u"
+        yield Grouping("field points in q and u", said, at_points, stokes, of_field=True)
+    positions = [
+        np.where(at.inside, at.angle, np.nan) for at in map(e.position, design.fit.likelihood.plan.moving)
+    ]
+    night = np.floor(e.mjd + calset.site.longitude / 360.0 - 0.5)
+    source = calset.intensities.block(0, len(points)).source
+    seen = [np.zeros(used.shape, int)]
+    for name, words, place, features in (
+        ("exposures", "of the same exposure agree between field points", _numbered(e.exposure), plane),
+        ("states", "of the same filter and moving elements agree", _numbered(e.filter, *positions), stokes),
+        ("sources", "of the same standard agree", source, np.concatenate([one, stokes], axis=-1)),
+        ("nights", "of the same night agree", _numbered(night), plane),
+        ("kinds", "of the same kind of exposure agree", _numbered(e.kind), plane),
+    ):
+        place = np.broadcast_to(place, used.shape)
+        if len(np.unique(place[used])) > 1 and not any(np.array_equal(place, other) for other in seen):
+            seen.append(place)
+            yield Grouping(name, words, place, features)
+
+
+def _numbered(*labels: np.ndarray) -> Int[np.ndarray, " e"]:
+    """Numbers of the different rows, in the order in which they come."""
+    rows = ["/".join(map(str, row)) for row in zip(*labels, strict=True)]
+    first: dict[str, int] = {}
+    return np.array([first.setdefault(row, len(first)) for row in rows])
+
+
+class Question(NamedTuple):
+    """One grouping made ready: c, the standard error of τ² for noise of unit variance, and the skewness of T."""
+
+    grouping: Grouping
+    free: int
+    share: float
+    error: float
+    skew: float
+
+    def answered(self, pull: Float[np.ndarray, " a"], square: float) -> Component:
+        """The component, from Aᵀr and r·r."""
+        noise = square / self.free
+        deviate = 0.5 * self.error * (float(np.sum(pull**2)) / noise - self.share * self.free)
+        error = noise * self.error  # of τ²
+        size = float(np.sqrt(max(deviate * error, 0.0)))
+        p_value = _tail(deviate, self.skew)
+        return Component(self.grouping, deviate, p_value, size, 0.5 * error / max(size, np.sqrt(error)))
+
+
+def asked(
+    design: Design, grouping: Grouping, residuals: Float[np.ndarray, "d n"]
+) -> tuple[Question, Float[np.ndarray, "a n"]] | None:
+    """One grouping made ready, and Aᵀr of residuals behind the projection; None where the fit takes up all of it."""
+    blocks = _blocks(design, grouping, residuals)
+    if blocks is None:
+        return None
+    d, b, pull = blocks
+    free = design.projector.free
+    db, dd = d @ b, d @ d
+    flat, along = b.reshape(-1, b.shape[-1]), db.reshape(-1, b.shape[-1])
+    m, m2, m3 = flat.T @ flat, flat.T @ along, along.T @ along
+    whole = float(np.einsum("laa->", d))
+    first = whole - np.trace(m)
+    second = np.sum(d**2) - 2.0 * np.trace(m2) + np.sum(m**2)
+    third = np.sum(dd * d) - 3.0 * np.trace(m3) + 3.0 * np.sum(m2 * m) - np.sum(m @ m * m)
+    share = first / max(free, 1)
+    known = second - share * first
+    if not (free > 0 and first > 1e-6 * whole and known > 1e-6 * second):
+        return None
+    skew = 8.0 * (third - 3.0 * share * second + 2.0 * share**2 * first) / (2.0 * known) ** 1.5
+    question = Question(grouping, free, float(share), float(np.sqrt(2.0 / known)), float(skew))
+    return question, pull.reshape(-1, pull.shape[-1])
+
+
+def _tail(deviate: float, skew: float) -> float:
+    """The p of a standardised sum of squares with that skewness: a shifted χ²."""
+    if skew < 1e-6:
+        return float(stats.norm.sf(deviate))
+    degrees = 8.0 / skew**2
+    return float(stats.chi2.sf(degrees + deviate * np.sqrt(2.0 * degrees), degrees))
+
+
+def _blocks(
+    design: Design, grouping: Grouping, residuals: Float[np.ndarray, "d n"]
+) -> tuple[Float[np.ndarray, "l a a"], Float[np.ndarray, "l a q"], Float[np.ndarray, "l a n"]] | None:
+    """D, QᵀA and Aᵀr, place by place; columns are camera × feature. None where a flux belongs to several places."""
+    measured = design.measured
+    used, shared, cameras = measured.used, measured.shared, measured.cameras
+    place, features = grouping.place[used], grouping.features[used]
+    gain = (measured.flux[..., None] * measured.model)[used] / design.fit.noise_scale
+    change = gain[..., None] * features[:, None, :]
+    power = shared.summed(measured.model**2)
+    unit = np.where(measured.known[:, None], 0.0, measured.model / np.sqrt(np.where(power > 0, power, 1.0)))[
+        used
+    ]
+    along = (change * unit[..., None]).reshape(len(change), -1)
+    group = None
+    if shared.exposures is not None:
+        of_exposure = np.asarray(shared.exposures).argmax(axis=1)
+        points, exposures = np.nonzero(used)
+        group = points * (of_exposure.max() + 1) + of_exposure[exposures]
+        pairs = np.unique(np.stack([group, place]), axis=1)
+        if len(np.unique(pairs[0])) < pairs.shape[1]:
+            return None
+    width = change.shape[-1]
+    together = np.kron(measured.together, np.ones((width, width)))
+    basis = design.projector.basis
+    rows = np.column_stack([basis, residuals])[: design.rows].reshape(len(change), cameras, -1)
+    order = np.argsort(place, kind="stable")
+    labels, starts = np.unique(place[order], return_index=True)
+    found_d, found_b = [], []
+    for label, start, stop in zip(labels, starts, [*starts[1:], len(order)], strict=True):
+        if label < 0:
+            continue
+        here = order[start:stop]
+        if here[-1] - here[0] == len(here) - 1:
+            here = slice(here[0], here[-1] + 1)  # rows of a field point lie together: no copy
+        c, a = change[here].transpose(1, 2, 0), along[here]
+        if group is not None:
+            a = np.equal.outer(np.unique(group[here]), group[here]).astype(float) @ a
+        block = -(a.T @ a) * together
+        own = c @ c.transpose(0, 2, 1)
+        for k in range(cameras):
+            at = slice(k * width, (k + 1) * width)
+            block[at, at] += own[k]
+        found_d.append(block)
+        found_b.append((c @ rows[here].transpose(1, 0, 2)).reshape(cameras * width, -1))
+    if len(found_d) < 2:
+        return None
+    both = np.stack(found_b)
+    return np.stack(found_d), both[..., : basis.shape[1]], both[..., basis.shape[1] :]

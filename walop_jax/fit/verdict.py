@@ -1,0 +1,141 @@
+"""The verdict on a fit: what speaks against it, computed once; bits, words, exit codes and trust are read off it."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import functools
+import operator
+from collections.abc import Sequence
+
+from walop_jax.likelihood.expansion import STATED
+
+
+class Quality(enum.IntFlag):
+    """Bits of QUALITY (of a product) and FLAG (of a row, star or pixel)."""
+
+    NOT_CONVERGED = 1
+    ILL_CONDITIONED = 2
+    AT_PRIOR_EDGE = 4
+    EXCESS_NOISE = 8
+    HIGH_CROSSTALK = 16
+    BEYOND_FIELD = 32
+    BEYOND_SETTINGS = 64
+    CAMERA_MISSING = 128
+    SATURATED = 256
+    FREE_FORM = 512
+    CLASS_ONLY = 1024
+    VALIDITY_FORCED = 2048
+    NON_PHYSICAL = 4096
+    UNEXPLAINED = 8192
+    NO_STOKES = 16384
+    DOUBTED = 32768
+    ERRORS_TOO_LARGE = 65536
+    DISAGREES = 131072
+    UNKNOWN_COLOUR = 262144
+    CATALOGUE = 524288
+
+    @property
+    def meanings(self) -> tuple[str, ...]:
+        """What the bits that are set say, in words."""
+        return tuple(text for bit, text in _MEANINGS.items() if bit & self)
+
+
+_MEANINGS = {
+    Quality.NOT_CONVERGED: "not converged",
+    Quality.ILL_CONDITIONED: "ill-conditioned",
+    Quality.AT_PRIOR_EDGE: "a parameter lies at the edge of its prior",
+    Quality.EXCESS_NOISE: "excess noise above 0.5 sigma",
+    Quality.HIGH_CROSSTALK: "zone of high cross-talk (a local inverse has a condition number above 10)",
+    Quality.BEYOND_FIELD: "extrapolated in the field",
+    Quality.BEYOND_SETTINGS: "extrapolated in wavelength or temperature",
+    Quality.CAMERA_MISSING: "a camera is missing",
+    Quality.SATURATED: "saturated or non-linear data used",
+    Quality.FREE_FORM: "unknown free-form term active",
+    Quality.CLASS_ONLY: "only a class of causes was named",
+    Quality.VALIDITY_FORCED: "validity forced",
+    Quality.NON_PHYSICAL: "non-physical Mueller matrix within tolerance",
+    Quality.UNEXPLAINED: "the model does not explain the data",
+    Quality.DOUBTED: "the residuals hold more than noise, or differ between parts of the data",
+    Quality.ERRORS_TOO_LARGE: "the stated errors are far larger than the scatter of the data",
+    Quality.DISAGREES: "the intensities disagree with the calibration by more than noise",
+    Quality.UNKNOWN_COLOUR: "no TEFF, and the colour is most of the error",
+    Quality.CATALOGUE: "the stars of the catalogue together say that calibration or errors do not hold",
+    Quality.NO_STOKES: "no Stokes parameters: too few cameras, too little light, or no u in the rows there are",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Doubt:
+    """One thing that speaks against a fit: a bit of `Quality`, a sentence for the user, and whether it forbids trust.
+
+    A remark has no bit and forbids nothing.
+    """
+
+    bit: Quality
+    sentence: str
+    blocking: bool = True
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """Statistics of a fit and everything that speaks against it.
+
+    The one rule of trust: a result is trusted if none of the doubts `against` it is blocking. `noise_scale` multiplied
+    the errors of the data in the fit (1: as given); `covariance_from` names the origin of the covariance ("fit" or
+    "posterior"), `errors_from` what that was made from: the stated errors of the data, or the residuals (`fit.robust`).
+    """
+
+    chi2: float
+    dof: int
+    n_data: int
+    noise_scale: float
+    converged: bool
+    against: tuple[Doubt, ...] = ()
+    covariance_from: str = "fit"
+    errors_from: str = STATED
+
+    @classmethod
+    def recorded(
+        cls,
+        chi2: float,
+        dof: int,
+        n_data: int,
+        noise_scale: float,
+        converged: bool,
+        trusted: bool,
+        quality: int,
+        warnings: Sequence[str] = (),
+        **origin: str,
+    ) -> Verdict:
+        """The verdict that a file states; it does not say which sentence belongs to which bit."""
+        remarks = tuple(Doubt(Quality(0), text, blocking=False) for text in warnings)
+        bits = (Doubt(Quality(quality), "", blocking=not trusted),) if quality or not trusted else ()
+        return cls(chi2, dof, n_data, noise_scale, converged, (*bits, *remarks), **origin)
+
+    @property
+    def trusted(self) -> bool:
+        """True if nothing that speaks against the fit forbids its use."""
+        return not any(doubt.blocking for doubt in self.against)
+
+    @property
+    def quality(self) -> Quality:
+        """The bits of all doubts."""
+        return functools.reduce(operator.or_, (doubt.bit for doubt in self.against), Quality(0))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Doubts and remarks in sentences."""
+        return tuple(doubt.sentence for doubt in self.against if doubt.sentence)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """The sentences about the residuals alone (`Quality.DOUBTED`)."""
+        return tuple(
+            doubt.sentence for doubt in self.against if doubt.bit & Quality.DOUBTED and doubt.sentence
+        )
+
+    @property
+    def words(self) -> str:
+        """The verdict as it is printed everywhere."""
+        return "trusted" if self.trusted else "not trusted"
