@@ -20,6 +20,7 @@ from walop_jax.calibration.product import (
 from walop_jax.calibration.records import ResidualMap, matrix_names, residual_names
 from walop_jax.data import DataError, read_calibration_set
 from walop_jax.data.frames import Grid
+from walop_jax.fit.verdict import Quality
 
 NAN = float("nan")
 GRID = Grid(4, 3, (2.5, 2.0), (0.0, 0.0), ((10.0, 0.0), (0.0, 20.0)))

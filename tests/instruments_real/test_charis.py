@@ -104,11 +104,11 @@ def test_the_same_instrument_still_fits_and_a_turned_derotator_does_not(fitted, 
         table["N"]
         + np.random.default_rng(0).normal(0.0, 1e-3, table["N"].shape) * table["N"].mean(axis=1)[:, None]
     )
-    same = epoch(old, fit_like(old, charis_set(noisy)))
+    same = epoch(old, fit_like(old, charis_set(noisy)).judged())
     assert same.fits
     turned = table.copy()
     turned["ROTATOR_ANGLE"] = table["ROTATOR_ANGLE"] + 0.5
-    new = fit_like(old, charis_set(turned))
+    new = fit_like(old, charis_set(turned)).judged()
     other = epoch(old, new)
     assert not other.fits
     assert new.values[new.model.index("derotator.axis")] - fitted.value("derotator.axis")[0] == pytest.approx(

@@ -128,7 +128,8 @@ def test_an_instrument_that_has_not_changed_still_fits(first):
     """Over six later runs of the same instrument T follows its χ², and no run is called a change."""
     truth, old = first
     found = [
-        epoch(old, fit_like(old, simulate(SMALL, seed=100 + k, instrument=truth).calset)) for k in range(6)
+        epoch(old, fit_like(old, simulate(SMALL, seed=100 + k, instrument=truth).calset).judged())
+        for k in range(6)
     ]
     assert all(entry.fits for entry in found)
     k = found[0].directions
@@ -144,7 +145,7 @@ def test_a_change_is_found_and_named(first):
     """A wedge that has yielded by half a milliradian."""
     truth, old = first
     bent = truth.changed("half2.wedge", angle=lambda angle: angle + 5e-4)
-    found = epoch(old, fit_like(old, simulate(SMALL, seed=200, instrument=bent).calset))
+    found = epoch(old, fit_like(old, simulate(SMALL, seed=200, instrument=bent).calset).judged())
     assert not found.fits
     assert found.moved[0].name == "half2.wedge"
     assert found.moved[0].new - found.moved[0].old == pytest.approx(5e-4, abs=4 * found.moved[0].error)

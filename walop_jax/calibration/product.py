@@ -56,6 +56,7 @@ from walop_jax.data.frames import read_grid
 from walop_jax.data.records import InputFile, Site
 from walop_jax.data.schema import Column, Place, column_names, read_table, table_rules
 from walop_jax.data.write import exposures_hdu, filter_columns, grid_cards, sign_and_write, table_hdu
+from walop_jax.fit.verdict import Structure
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.fits_reading import UNREADABLE, OpenFile, one_line, open_fits
@@ -214,6 +215,7 @@ def _from_hdus(opened: OpenFile) -> CalibrationProduct:
             warnings=() if warnings is None else tuple(warnings["TEXT"].tolist()),
             covariance_from=header.text("COVFROM") or "fit",
             errors_from=header.text("ERRFROM") or STATED,
+            structure=Structure(header.number("STRUCTG", 0.0), header.number("STRUCTR", 0.0)),
         ),
         parameters=parameters,
         covariance=covariance,

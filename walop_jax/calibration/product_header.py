@@ -74,6 +74,14 @@ def primary_hdu(product: CalibrationProduct, version: int) -> fits.PrimaryHDU:
         "QUALITY": (int(verdict.quality), "bit mask, 0 is good"),
         "COVFROM": (verdict.covariance_from, "what COVARIANCE is of"),
         "ERRFROM": (verdict.errors_from, ""),
+        **(
+            {
+                "STRUCTG": (verdict.structure.gain, "rms gain of a camera at a field point"),
+                "STRUCTR": (verdict.structure.response, "rms response of a camera to q, u there"),
+            }
+            if verdict.structure
+            else {}
+        ),
         "MAPFILT": (product.maps.filter, f"filter of the maps M21...{product.maps.names[-1]}"),
         **{
             f"FIELD{side}": (value, "[deg] extent of the field points used")

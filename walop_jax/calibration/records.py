@@ -190,6 +190,7 @@ class CalibrationProduct:
             *(str(int(verdict.quality)), *(f"{value:.11e}" for value in numbers)),
             *(entry.sha256 for entry in self.inputs),
             *((verdict.errors_from,) if verdict.errors_from != STATED else ()),
+            *(f"{v:.11e}" for v in (verdict.structure.gain, verdict.structure.response) if verdict.structure),
             *_texts(self.maps.positions),
             *(_texts(self.residuals.positions) if self.residuals is not None else ()),
         ]

@@ -1,7 +1,7 @@
 """The extension COMPRESSION: of a calibration set that stands for the pixels of whole frames, what they were.
 
 A table NAME, VALUE of the model's parameters at which the pixels were summed; in its header NPIXELS, CHI2 and DOF of
-the pixels there, and the frames, FILE1, SHA1, … (docs: files).
+the pixels there, and the frames, FILE1, SHA1, …; STRUCTG and STRUCTR, by how much single pixels differ (docs: files).
 """
 
 from __future__ import annotations
@@ -31,6 +31,9 @@ def compression_hdu(found: Compression) -> fits.BinTableHDU:
     hdu.header["NPIXELS"] = (found.pixels, "pixels that the field points stand for")
     hdu.header["CHI2"] = (found.chi2, "chi-square of the pixels at these values")
     hdu.header["DOF"] = (found.dof, "its degrees of freedom")
+    if found.gain is not None and found.response is not None:
+        hdu.header["STRUCTG"] = (found.gain, "rms gain of a camera at a pixel")
+        hdu.header["STRUCTR"] = (found.response, "rms response of a camera to q, u there")
     for number, entry in enumerate(found.frames, start=1):
         hdu.header[f"FILE{number}"] = str(entry.path.name)
         hdu.header[f"SHA{number}"] = entry.sha256
@@ -61,7 +64,15 @@ def read_compression(hdu: Any, path: Path) -> Compression:
             str(name).strip(): float(value) for name, value in zip(hdu.data["NAME"], values, strict=True)
         },
         frames=tuple(frames),
+        gain=_asked(header, "STRUCTG"),
+        response=_asked(header, "STRUCTR"),
     )
+
+
+def _asked(header: Any, name: str) -> float | None:
+    """A number of the header; None where it is missing."""
+    value = header.get(name)
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
 def remark(calset: CalibrationSet) -> str:

@@ -235,6 +235,7 @@ class Compression:
     """What a calibration set stands for that was made of whole frames: so many `pixels` of the files `frames`.
 
     The pixels were summed at `values` of the model's parameters, where their χ² and its degrees of freedom were these.
+    `gain` and `response` are by how much single pixels differ there (`fit.verdict.Structure`); None: nobody asked.
     """
 
     pixels: int
@@ -242,6 +243,8 @@ class Compression:
     dof: int
     values: Mapping[str, float]
     frames: tuple[InputFile, ...] = ()
+    gain: float | None = None
+    response: float | None = None
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

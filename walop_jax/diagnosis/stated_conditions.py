@@ -1,4 +1,4 @@
-"""Were the data taken under the conditions that their set states? Its coordinates, filter curves and colours.
+"""Were the data taken under the conditions that their set states? Its coordinates, filter curves, colours and sky.
 
 A field that is displaced, turned or scaled, a filter curve that is displaced, a lamp of another temperature: each is a
 single number, and a fit takes most of it up in its own parameters, which are then wrong by many standard errors while
@@ -9,6 +9,12 @@ So each number has its own efficient score (`score`), with the derivative
 
 of the whitened residuals r with respect to the number c that the set states, fluxes solved for anew. A row knows of the
 field only its own place, so that scale and angle are sums of X and Y, row by row.
+
+The coordinates and times of sky exposures, the site and ROTATOR are asked in the same way. A number of the instrument
+that is thought to be known, and is not, looks much like these: the prior of each parameter, and those of each element
+together, are rivals with the column (mean − value)/width. So are terms of one camera with one amplitude: a
+non-linearity (its counts squared), a pedestal, scattered light (the median counts of an exposure), light of another
+camera. What cannot be told apart is told together.
 
 Limits      What the free parameters take up whole is told by no residual: with a single filter its displacement, the
             thicknesses of the plates look the same. One number at a time, by a linear step: the size is a hint.
@@ -27,12 +33,20 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM
 from walop_jax.diagnosis.mixups import with_exposures, with_places
-from walop_jax.diagnosis.score import Score, Scorer, ScoreSpace, corrected_p
+from walop_jax.diagnosis.score import Candidate, Score, Scorer, ScoreSpace, ScoreTable, corrected_p
 from walop_jax.fit.refit import NEARLY
 from walop_jax.io.rounding import value_and_error
+from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 
+_SHOWN = 4  # alternatives that are told in words
 _ALIKE = 25.0  # in χ², within which conditions are told together
+_PRIOR_WIDTHS = 30.0  # by which a prior may be wrong at most
+MOST_OF_ELEMENT = 4  # numbers of an element whose priors may be wrong together
+_PRECESSION = (
+    46.124 / 3600.0,
+    20.043 / 3600.0,
+)  # deg a year: m and n, Capitaine et al. 2003, A&A 412, 567, J2000
 STEP = 1e-4  # of the width: what is left out of the derivative is its square
 
 
@@ -65,58 +79,150 @@ class Scored(NamedTuple):
     column: Float[np.ndarray, " _"]
     square: float
 
-    @property
-    def gain(self) -> float:
-        """By how much the change lowers χ², by a linear step."""
-        return float(self.score.amplitudes[0] ** 2 * self.square)
+
+class Single(NamedTuple):
+    """One number, or a few of one thing, that may be otherwise: its columns, and its size in words."""
+
+    candidate: Candidate
+    said: Callable[[Score], str]
 
 
 def stated_conditions(design: Design) -> Iterator[str]:
-    """A sentence on the conditions that the residuals of a fit speak against, the clearest first.
+    """A sentence on the single numbers that the residuals of a fit speak against, the clearest first.
 
-    Of a fit that does not explain its data only where one condition alone would.
+    Conditions that the set states, priors, and terms of a camera that have one amplitude. Of a fit that does not
+    explain its data only where one of them alone would.
     """
-    scored = [item for item in condition_scores(design) if item.score.testable]
-    found = [item for item in scored if corrected_p(item.score.log_p, len(scored)) < ALARM]
+    rivals = [*_conditions(design), *_priors(design), *_of_cameras(design)]
+    if not rivals:
+        return
+    names = [one.candidate.name for one in rivals]
+    widths = [one.candidate.widths for one in rivals]
+    columns = np.concatenate([one.candidate.columns for one in rivals], axis=1)
+    table = _table(design, names, widths, columns)[0]
+    scores = [score for score in table.scores if score.testable]
+    found = [score for score in scores if corrected_p(score.log_p, len(scores)) < ALARM]
     if not found:
         return
-    found.sort(key=lambda item: item.score.log_p)
-    best, result = found[0].score.statistic, design.fit
-    left = float(np.sum(design.projector(design.residual) ** 2)) - found[0].gain
+    found.sort(key=lambda score: score.log_p)
+    best, result = found[0], design.fit
+    square = float(np.sum(design.projector(design.residual) ** 2))
+    left = square - best.statistic * table.noise_scale**2
     if not result.explains_data and left > NEARLY * design.projector.free:
         return
-    likely = [item for item in found if item.score.statistic > best - _ALIKE]
-    said = "; or for ".join(_in_words(item.stated, item.score) for item in likely)
-    yield f"the residuals ask for {said} (p = {corrected_p(found[0].score.log_p, len(scored)):.2g})"
+    likely = [score for score in found if score.statistic > best.statistic - _ALIKE]
+    # Of an element and one of its numbers alone, the shorter statement if it explains as much.
+    likely = [one for one in likely if not any(_holds(one, other) for other in likely)]
+    said = {one.candidate.name: one.said for one in rivals}
+    told = "; or for ".join(said[score.name](score) for score in likely[:_SHOWN])
+    more = f"; or for {len(likely) - _SHOWN} others" if len(likely) > _SHOWN else ""
+    yield f"the residuals ask for {told}{more} (p = {corrected_p(best.log_p, len(scores)):.2g})"
 
 
-def _in_words(stated: Stated, score: Score) -> str:
-    size, sigma = float(score.amplitudes[0]), float(np.sqrt(score.covariance[0, 0]))
-    if stated.value is None:
-        value, error = value_and_error(size, sigma)
-        return f"{stated.what} changed by {value} ± {error} {stated.unit}".rstrip() + f" ({stated.remedy})"
-    value, error = value_and_error(stated.value + size, sigma)
-    return f"{stated.what} {value} ± {error} {stated.unit}, not {stated.value:g} ({stated.remedy})"
+def _holds(one: Score, other: Score) -> bool:
+    """True if another statement, shorter or longer about the same element, is the better one."""
+    if other.name.startswith(f"{one.name}."):
+        return other.log_p <= one.log_p
+    return one.name.startswith(f"{other.name}.") and other.log_p < one.log_p
+
+
+def _conditions(design: Design) -> Iterator[Single]:
+    asked, columns = _asked(design)
+    for one, column in zip(asked, columns.T, strict=True):
+        candidate = Candidate(one.what, column[:, None], np.array([one.width]))
+        yield Single(candidate, lambda score, one=one: _in_words(one, score))
+
+
+def _priors(design: Design) -> Iterator[Single]:
+    """The prior of every free parameter, and those of all numbers of an element, as what may be wrong."""
+    rows, parameters = design.fit.likelihood.priors, design.fit.model.parameters
+    known = np.flatnonzero(rows.known).tolist()
+    names = {parameters[rows.index[i]].name: [i] for i in known}
+    together: dict[str, list[int]] = {}
+    for i in known:
+        together.setdefault(parameters[rows.index[i]].name.rpartition(".")[0], []).append(i)
+    elements = {k: v for k, v in together.items() if k and 1 < len(v) <= MOST_OF_ELEMENT} | names
+
+    def said(score: Score) -> str:
+        texts = []
+        for number, i in enumerate(elements[score.name]):
+            p, mean, width = parameters[rows.index[i]], float(rows.mean[i]), float(rows.width[i])
+            sigma = float(np.sqrt(score.covariance[number, number])) * width
+            value, error = value_and_error(mean + float(score.amplitudes[number]) * width, sigma)
+            texts.append(f"{p.name} {value} ± {error} {p.unit}".rstrip() + f", not {mean:g} ± {width:g}")
+        return " with ".join(texts) + " (check what the model file knows of it)"
+
+    for name, members in elements.items():
+        columns = np.zeros((len(design.residual), len(members)))
+        columns[design.rows + np.array(members), np.arange(len(members))] = 1.0
+        yield Single(Candidate(name, columns, np.full(len(members), _PRIOR_WIDTHS)), said)
+
+
+def _of_cameras(design: Design) -> Iterator[Single]:
+    """What a single camera may do to its counts with one amplitude: closed forms of the counts themselves."""
+    measured, names = design.measured, design.fit.model.template.cameras.names
+    counts = measured.flux[..., None] * measured.model / np.where(measured.weight > 0, measured.weight, 1.0)
+    counts = np.where(measured.used[..., None], counts, np.nan)
+    median = np.nan_to_num(np.nanmedian(counts, axis=0))
+    counts, typical = np.nan_to_num(counts), float(np.nanmedian(counts))
+
+    def single(k: int, change: np.ndarray, width: float, words: str, unit: str) -> Single:
+        cube = np.zeros_like(counts)
+        cube[..., k] = change
+        column = project_flux(cube * measured.weight, measured.model, measured.known, measured.shared)
+        rows = design.stacked([-column[measured.used].reshape(-1, 1)])
+
+        def said(score: Score) -> str:
+            size, sigma = float(score.amplitudes[0]), float(np.sqrt(score.covariance[0, 0]))
+            value, error = value_and_error(size, sigma)
+            return f"{words.format(names[k])} of {value} ± {error} {unit}".rstrip()
+
+        return Single(Candidate(words.format(names[k]), rows, np.array([width])), said)
+
+    if not measured.used.any():
+        return
+    for k in range(measured.cameras):
+        yield single(k, counts[..., k] ** 2 / 1e6, 0.02, "a non-linearity of {}", "at 10⁶ electrons")
+        level = np.broadcast_to(median[:, k], counts.shape[:2])
+        yield single(k, level, 0.03, "scattered light in {}", "of the median counts")
+        yield single(k, np.ones_like(counts[..., k]), 0.03 * typical, "a pedestal in {}", "electrons")
+        for other in range(measured.cameras):
+            if other != k:
+                yield single(k, counts[..., other], 0.02, f"light of {names[other]} in {{}}", "of its counts")
 
 
 def condition_scores(design: Design) -> list[Scored]:
     """The numbers that a set states, each with the score of changing it."""
-    asked = list(_stated(design.fit.calset))
+    asked, columns = _asked(design)
     if not asked:
         return []
-    columns = design.stacked([column[:, None] for column in _columns(design, asked)])
-    there = np.flatnonzero(np.any(columns != 0.0, axis=0))  # a number may be stated and not used
-    asked, columns = [asked[i] for i in there], columns[:, there]
-    given = columns.copy()
     names = [str(number) for number in range(len(asked))]
     widths = [np.array([one.width]) for one in asked]
+    table, square = _table(design, names, widths, columns.copy())
+    return [
+        Scored(one, table[name], column, float(length))
+        for one, name, column, length in zip(asked, names, columns.T, square, strict=True)
+    ]
+
+
+def _asked(design: Design) -> tuple[list[Stated], Float[np.ndarray, "d c"]]:
+    """The numbers that a set states and that are used, and the derivatives of the rows."""
+    asked = list(_stated(design.fit.calset))
+    if not asked:
+        return [], np.zeros((len(design.residual), 0))
+    columns = design.stacked([column[:, None] for column in _columns(design, asked)])
+    there = np.flatnonzero(np.any(columns != 0.0, axis=0))  # a number may be stated and not used
+    return [asked[i] for i in there], columns[:, there]
+
+
+def _table(
+    design: Design, names: Sequence[str], widths: Sequence[np.ndarray], columns: Float[np.ndarray, "d c"]
+) -> tuple[ScoreTable, Float[np.ndarray, " c"]]:
+    """Scores of columns, which are projected in place, and what is left of their squares."""
     space = ScoreSpace.projected(design.projector, names, widths, columns)
     residual = design.projector(design.residual)
     table = Scorer(space, np.random.default_rng(), draws=0)(columns.T @ residual, float(residual @ residual))
-    return [
-        Scored(one, table[name], column, float(square))
-        for one, name, column, square in zip(asked, names, given.T, np.diag(space.gram), strict=True)
-    ]
+    return table, np.diag(space.gram)
 
 
 def _columns(design: Design, asked: Sequence[Stated]) -> Iterator[Float[np.ndarray, " _"]]:
@@ -136,6 +242,8 @@ def _column(design: Design, one: Stated) -> np.ndarray:
         return likelihood.residuals(design.fit.values)[1][design.measured.used].reshape(-1)
 
     step = STEP * one.width
+    if one.along is None:  # smooth: what a one-sided difference leaves out is as small as the step
+        return (residual(step) - design.measured.residual[design.measured.used].reshape(-1)) / step
     return (residual(step) - residual(-step)) / (2.0 * step)
 
 
@@ -166,6 +274,71 @@ def _stated(calset: CalibrationSet) -> Iterator[Stated]:
                 lambda e: dataclasses.replace(e, teff=e.teff * np.where(chosen, 1.0 + step / typical, 1.0))
             )(calset),
             typical if np.ptp(e.teff[chosen]) == 0.0 else None,
+        )
+    yield from _of_sky(calset)
+
+
+def _of_sky(calset: CalibrationSet) -> Iterator[Stated]:
+    """Where and when the sky was, as the exposures and the site state it."""
+    e, site = calset.exposures, calset.site
+    moon = (e.kind == "moon") & np.isfinite(e.ra) & np.isfinite(e.dec)
+
+    def changed(**columns: np.ndarray) -> CalibrationSet:
+        return with_exposures(lambda e: dataclasses.replace(e, **columns))(calset)
+
+    if moon.any():
+        at = "check RA and DEC: ICRS, of the centre of the field (docs: conventions)"
+        by_year, across = _PRECESSION
+        along_ra = by_year + across * np.sin(np.deg2rad(e.ra)) * np.tan(
+            np.deg2rad(np.clip(e.dec, -80.0, 80.0))
+        )
+        along_dec = across * np.cos(np.deg2rad(e.ra))
+        yield Stated(
+            "the equinox of RA and DEC",
+            "",
+            "they are to be ICRS, not coordinates of date",
+            100.0,
+            lambda h: changed(
+                ra=np.where(moon, e.ra - h * along_ra, e.ra), dec=np.where(moon, e.dec - h * along_dec, e.dec)
+            ),
+            2000.0,
+        )
+        yield Stated(
+            "RA of sky exposures",
+            "deg",
+            at,
+            5.0,
+            lambda h: changed(ra=np.where(moon, e.ra + h, e.ra)),
+        )
+        yield Stated(
+            "DEC of sky exposures", "deg", at, 5.0, lambda h: changed(dec=np.where(moon, e.dec + h, e.dec))
+        )
+        yield Stated(
+            "MJD of sky exposures",
+            "d",
+            "check the clock and the time zone: UTC at mid-exposure",
+            1.0,
+            lambda h: changed(mjd=np.where(moon, e.mjd + h, e.mjd)),
+        )
+        for name, width in (("longitude", 180.0), ("latitude", 90.0)):
+            yield Stated(
+                f"the {name} of the site",
+                "deg",
+                "check the site in the header",
+                width,
+                lambda h, name=name: dataclasses.replace(
+                    calset, site=dataclasses.replace(site, **{name: getattr(site, name) + h})
+                ),
+                float(getattr(site, name)),
+            )
+    for kind in np.unique(e.kind[np.isfinite(e.rotator)]):
+        chosen = e.kind == kind
+        yield Stated(
+            f"ROTATOR of exposures of kind {kind}",
+            "deg",
+            "check its zero and its sense (docs: conventions)",
+            45.0,
+            lambda h, chosen=chosen: changed(rotator=np.where(chosen, e.rotator + h, e.rotator)),
         )
 
 

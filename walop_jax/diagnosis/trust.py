@@ -10,8 +10,10 @@ Groups      the squared residuals of each camera, kind, filter and exposure. Beh
                 E Σ r² = tr P_gg,   cov(Σ_g r², Σ_h r²) = 2 ‖P_gh‖²
             for groups g, h. The mean square of a group over that of the rest of the data has mean 1 and the variance
             that follows from these; its p is that of a scaled χ² with these two moments.
-Conditions  the efficient score of every number that the set states of itself: field, filters, colours
-            (`stated_conditions`).
+Components  the variance of what field points, exposures, states, standards, nights and kinds have in common beyond the
+            model, finer than any pattern (`variance_components`).
+Conditions  the efficient score of every number that the set states of itself: field, filters, colours, sky; and of
+            every prior (`stated_conditions`).
 Repeats     the correlation of what is left of two exposures (`repeated_noise`).
 Errors      χ²/dof far below 1 says that N_ERR is not the error of N; a few per cent off is no matter of the model.
 
@@ -39,10 +41,20 @@ from walop_jax.diagnosis.pattern_scores import pattern_scores
 from walop_jax.diagnosis.repeated_noise import repeated_noise
 from walop_jax.diagnosis.score import Projector, ScoreTable, local_p
 from walop_jax.diagnosis.stated_conditions import stated_conditions
+from walop_jax.diagnosis.variance_components import (
+    Component,
+    found_components,
+    in_words,
+    structure_of,
+    variance_components,
+    with_structure,
+)
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
-from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points
+from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points, with_pixels
+from walop_jax.fit.verdict import Structure
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.likelihood.pixels import PixelPosterior
 from walop_jax.likelihood.thinning import thinned
 
 UNEVEN = 1.25
@@ -63,6 +75,7 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
     a few per cent too large while nothing else is wrong is put down to the stated errors, and the standard errors are
     made from the residuals. Raises `DataError` with the remedy for data that another reading explains.
     """
+    result = with_pixels(result)
     if not result.converged:
         return result.judged()
     if not (result.explains_data or result.nearly_explains_data):
@@ -72,22 +85,76 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
             stated_conditions(Design.of(_looked_at(result)))
         )
         return result.judged(doubts)
-    design = Design.of(_looked_at(result))
+    whole = on_field_points(result)
+    design = Design.of(sampled(whole, _most(whole)))
     if result.errors_too_large and _hold_no_noise(design):
         return result.judged(noiseless=True)
     table = pattern_scores(design, seed)
+    pixels = _of_pixels(result)
+    components = found_components([*variance_components(design), *pixels])
     doubts = (
         *stated_conditions(design),
         *_patterns(table),
+        *in_words(components),
         *_groups(design),
         *repeated_noise(design),
+        *_summed_pixels(result),
         *_far_from_pixels(result),
     )
-    return with_honest_errors(result).judged(doubts)
+    structure = structure_of(components)
+    if structure:
+        of_points = [one for one in components if one not in pixels]
+        result = with_structure(result, design, of_points, len(whole.calset.points))
+    structure = _with_summed_pixels(result, structure)
+    return with_honest_errors(result).judged(doubts, structure=structure)
+
+
+def _of_pixels(result: FitResult) -> list[Component]:
+    """What single pixels of whole frames have in common between exposures, of a sample of them."""
+    if not isinstance(result.posterior, PixelPosterior):
+        return []
+    return variance_components(Design.of(sampled(result, _most(result))), pixels=True)
+
+
+def _summed_pixels(result: FitResult) -> Iterator[str]:
+    """What was found in the pixels that a set stands for, when they were summed."""
+    found = result.calset.compression
+    if found is None:
+        return
+    if found.gain is None and not result.explains_data:
+        yield (
+            f"χ² of the {found.pixels} pixels that were summed lies {result.excess:.3g} standard deviations above its "
+            "expectation, and nobody looked for the cause: compress the frames again"
+        )
+    elif found.gain or found.response:
+        yield (
+            "residuals of the same pixel agreed between exposures when the pixels were summed: structure of "
+            f"{max(found.gain or 0.0, found.response or 0.0):.2g} that the model does not have"
+        )
+
+
+def _with_summed_pixels(result: FitResult, structure: Structure) -> Structure:
+    """The structure of field points with that of the pixels that they stand for."""
+    found = result.calset.compression
+    if found is None:
+        return structure
+    gain = np.hypot(structure.gain, found.gain or 0.0)
+    return Structure(float(gain), float(np.hypot(structure.response, found.response or 0.0)))
+
+
+def pixel_structure(result: FitResult) -> Structure:
+    """By how much single pixels of whole frames differ beyond the model of a fit."""
+    return structure_of(found_components(_of_pixels(result)))
 
 
 def _looked_at(result: FitResult) -> FitResult:
-    return sampled(on_field_points(result), max(1, limits.TRUST_ROWS // max(len(result.calset.exposures), 1)))
+    whole = on_field_points(result)
+    return sampled(whole, _most(whole))
+
+
+def _most(result: FitResult) -> int:
+    """Field points that are looked at."""
+    return max(1, limits.TRUST_ROWS // max(len(result.calset.exposures), 1))
 
 
 def _errors_too_small(result: FitResult, seed: int) -> Iterator[str]:

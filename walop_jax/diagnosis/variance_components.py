@@ -29,6 +29,7 @@ Limits      Which place is off is not told, only how much places differ. The mea
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -38,25 +39,30 @@ from scipy import stats
 
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.score import local_p
+from walop_jax.fit.refit import FitResult
+from walop_jax.fit.verdict import Structure
+from walop_jax.likelihood.expansion import STATED
 
 ALARM = 1e-3
 """Probability that noise alone raises a doubt, all groupings together."""
 MOST_PLACES = 1000  # field points that are asked, spread over the set
 _SHOWN = 2
+WITH_STRUCTURE = "N_ERR with structure of field points"
 
 
 class Grouping(NamedTuple):
     """A way of grouping the data, and what may differ from place to place.
 
     `place` is the number of the place of every (point, exposure), −1 for none; the gain of a camera there is multiplied
-    with each of the `features`. `words` say what agrees; `of_field` is true where a place is one field point.
+    with each of the `features`. `words` say what agrees; `structure` names the field of `Structure` that its size is,
+    where a place is one field point.
     """
 
     name: str
     words: str
     place: Int[np.ndarray, "p e"]
     features: Float[np.ndarray, "p e j"]
-    of_field: bool = False
+    structure: str = ""
 
 
 class Component(NamedTuple):
@@ -69,11 +75,11 @@ class Component(NamedTuple):
     error: float
 
 
-def variance_components(design: Design) -> list[Component]:
-    """Every grouping that the data have, asked by itself."""
+def variance_components(design: Design, *, pixels: bool = False) -> list[Component]:
+    """Every grouping that the data have, asked by itself; of single `pixels` those of field points alone."""
     residual = design.projector(design.residual)
     square = float(residual @ residual)
-    ready = (asked(design, grouping, residual[:, None]) for grouping in groupings(design))
+    ready = (asked(design, grouping, residual[:, None]) for grouping in groupings(design, pixels=pixels))
     return [one[0].answered(one[1][:, 0], square) for one in ready if one is not None and square > 0]
 
 
@@ -95,7 +101,44 @@ def in_words(found: list[Component]) -> Iterator[str]:
     )
 
 
-def groupings(design: Design) -> Iterator[Grouping]:
+def structure_of(found: list[Component]) -> Structure:
+    """What field points differ by, of the components that were found."""
+
+    def size(name: str) -> float:
+        return float(np.sqrt(sum(c.size**2 for c in found if c.grouping.structure == name)))
+
+    return Structure(size("gain"), size("response"))
+
+
+def with_structure(result: FitResult, design: Design, found: list[Component], points: int) -> FitResult:
+    """The fit with what the structure of field points does to its parameters added to their covariance.
+
+    With J = QR the parameters take up R⁻¹QᵀA of the amplitudes, so that τ² R⁻¹BBᵀR⁻ᵀ is added. `design` may be of a
+    sample of so many `points`: structure then counts by their share, as noise does.
+    """
+    jacobian = design.jacobian
+    length = np.linalg.norm(jacobian, axis=0)
+    length = np.where(length > 0, length, 1.0)
+    triangle = design.projector.basis.T @ (jacobian / length)
+    added, places = np.zeros((len(length), len(length))), 1
+    for component in found:
+        blocks = _blocks(design, component.grouping, np.zeros((len(jacobian), 0)))
+        if not component.grouping.structure or blocks is None:
+            continue
+        places, b = len(blocks[0]), blocks[1].reshape(-1, len(triangle))
+        taken = np.linalg.lstsq(triangle, b.T, rcond=None)[0] / length[:, None]
+        added += component.size**2 * taken @ taken.T
+    share = len(design.fit.calset.points) ** 2 / (places * points)
+    select = result.model.selection()
+    return dataclasses.replace(
+        result,
+        covariance=result.covariance + share * select @ added @ select.T,
+        errors_from=result.errors_from if result.errors_from != STATED else WITH_STRUCTURE,
+        verdict=None,
+    )
+
+
+def groupings(design: Design, *, pixels: bool = False) -> Iterator[Grouping]:
     """The groupings that the data have; of two that cut them alike, the first."""
     measured, calset = design.measured, design.fit.calset
     e, points, used = calset.exposures, calset.points, measured.used
@@ -104,15 +147,18 @@ def groupings(design: Design) -> Iterator[Grouping]:
     reach = max(float(np.hypot(points.x, points.y).max(initial=0.0)), 1e-12)
     plane = np.stack([np.ones(len(points)), points.x / reach, points.y / reach], axis=-1)
     plane = np.broadcast_to(plane[:, None], (*used.shape, 3))
-    agree = "of the same field point agree between exposures"
+    point = "pixel" if pixels else "field point"
+    agree = f"of the same {point} agree between exposures"
     every = -(-used.shape[0] // MOST_PLACES)
     number = np.arange(used.shape[0])
     at_points = np.where(number % every == 0, number // every, -1)[:, None]
     at_points = np.broadcast_to(at_points, used.shape)
     if used.shape[0] > 1:
-        yield Grouping("field points", agree, at_points, one, of_field=True)
+        yield Grouping(f"{point}s", agree, at_points, one, "gain")
         said = f"{agree} in what they make of q and u"
-        yield Grouping("field points in q and u", said, at_points, stokes, of_field=True)
+        yield Grouping(f"{point}s in q and u", said, at_points, stokes, "response")
+    if pixels:
+        return
     positions = [
         np.where(at.inside, at.angle, np.nan) for at in map(e.position, design.fit.likelihood.plan.moving)
     ]

@@ -20,7 +20,7 @@ from walop_jax.fit.model_file import render
 from walop_jax.fit.parameter_table import HEAD, parameter_notes, parameter_rows, parameter_table
 from walop_jax.fit.robust import robust_errors
 from walop_jax.fit.search import find_minimum, free_scales
-from walop_jax.fit.verdict import Doubt, Quality, Verdict
+from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality, Structure, Verdict
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.heartbeat import Stage
 from walop_jax.io.software import software_versions
@@ -137,10 +137,13 @@ class FitResult(Displayed):
             if p.free and p.prior is not None and abs(value - p.prior[0]) > PRIOR_EDGE * p.prior[1]
         )
 
-    def judged(self, doubts: Sequence[str] = (), *, noiseless: bool = False) -> FitResult:
+    def judged(
+        self, doubts: Sequence[str] = (), *, noiseless: bool = False, structure: Structure = NO_STRUCTURE
+    ) -> FitResult:
         """The fit with the verdict on it, given the sentences that its residuals hold against it.
 
-        `noiseless` data are expected counts, those of a plan: they may scatter less than their errors.
+        `noiseless` data are expected counts, those of a plan: they may scatter less than their errors. `structure` is
+        what its field points differ by.
         """
         verdict = Verdict(
             chi2=self.chi2,
@@ -150,6 +153,7 @@ class FitResult(Displayed):
             converged=self.converged,
             against=tuple(_against(self, doubts, examined=True, noiseless=noiseless)),
             errors_from=self.errors_from,
+            structure=structure,
         )
         return dataclasses.replace(self, verdict=verdict)
 

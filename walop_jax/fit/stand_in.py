@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from jaxtyping import Float
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.refit import FitResult, fit
@@ -41,6 +42,29 @@ def in_field_points(calset: CalibrationSet, model: Model, tell: Progress) -> Cal
     return found
 
 
+def with_pixels(result: FitResult) -> FitResult:
+    """The fit of a set that stands for pixels with the χ² and the degrees of freedom of these; any other as it is.
+
+    From where they were summed χ² of the pixels changes as that of the field points does.
+    """
+    compression = result.calset.compression
+    if compression is None:
+        return result
+    there = values_then(result)
+    before = float(np.sum(result.likelihood.residuals(there)[1] ** 2))
+    data = compression.chi2 + result.posterior.data - before
+    posterior = dataclasses.replace(result.posterior, data=data, dof=compression.dof)
+    return dataclasses.replace(result, posterior=posterior)
+
+
+def values_then(result: FitResult) -> Float[np.ndarray, " n"]:
+    """Where the pixels of a set were summed; parameters that were not there then have their start values."""
+    compression = result.calset.compression
+    assert compression is not None
+    names, start = [p.name for p in result.model.parameters], result.model.start
+    return np.array([compression.values.get(name, value) for name, value in zip(names, start, strict=True)])
+
+
 def moved(result: FitResult) -> float:
     """How far (standard errors, all parameters together) a fit lies from where the pixels of its set were summed.
 
@@ -49,7 +73,5 @@ def moved(result: FitResult) -> float:
     compression = result.calset.compression
     if compression is None:
         return 0.0
-    names, start = [p.name for p in result.model.parameters], result.model.start
-    before = np.array([compression.values.get(name, value) for name, value in zip(names, start, strict=True)])
-    step = (result.values - before)[result.model.free]
+    step = (result.values - values_then(result))[result.model.free]
     return float(np.sqrt(max(step @ result.posterior.matrix @ step, 0.0)))

@@ -7,6 +7,7 @@ import enum
 import functools
 import operator
 from collections.abc import Sequence
+from typing import Any
 
 from walop_jax.likelihood.expansion import STATED
 
@@ -78,12 +79,32 @@ class Doubt:
 
 
 @dataclasses.dataclass(frozen=True)
+class Structure:
+    """Differences between field points that are finer than the model, rms over points and cameras.
+
+    `gain` is that of the gain of a camera (a share of its counts), `response` that of what it makes of fully polarised
+    light (a share of the counts as well); 0 where residuals show none. Standard errors of everything that is seen at
+    one place of the field hold them: no average over exposures makes them smaller.
+    """
+
+    gain: float = 0.0
+    response: float = 0.0
+
+    def __bool__(self) -> bool:
+        return self.gain > 0.0 or self.response > 0.0
+
+
+NO_STRUCTURE = Structure()
+
+
+@dataclasses.dataclass(frozen=True)
 class Verdict:
     """Statistics of a fit and everything that speaks against it.
 
     The one rule of trust: a result is trusted if none of the doubts `against` it is blocking. `noise_scale` multiplied
-    the errors of the data in the fit (1: as given); `covariance_from` names the origin of the covariance ("fit" or
-    "posterior"), `errors_from` what that was made from: the stated errors of the data, or the residuals (`fit.robust`).
+    the errors of the data in the fit (1: as given); `structure` is what field points differ by; `covariance_from` names
+    the origin of the covariance ("fit" or "posterior"), `errors_from` what that was made from: the stated errors of the
+    data, or the residuals (`fit.robust`).
     """
 
     chi2: float
@@ -94,6 +115,7 @@ class Verdict:
     against: tuple[Doubt, ...] = ()
     covariance_from: str = "fit"
     errors_from: str = STATED
+    structure: Structure = NO_STRUCTURE
 
     @classmethod
     def recorded(
@@ -106,12 +128,12 @@ class Verdict:
         trusted: bool,
         quality: int,
         warnings: Sequence[str] = (),
-        **origin: str,
+        **others: Any,
     ) -> Verdict:
         """The verdict that a file states; it does not say which sentence belongs to which bit."""
         remarks = tuple(Doubt(Quality(0), text, blocking=False) for text in warnings)
         bits = (Doubt(Quality(quality), "", blocking=not trusted),) if quality or not trusted else ()
-        return cls(chi2, dof, n_data, noise_scale, converged, (*bits, *remarks), **origin)
+        return cls(chi2, dof, n_data, noise_scale, converged, (*bits, *remarks), **others)
 
     @property
     def trusted(self) -> bool:

@@ -73,4 +73,8 @@ def fit_of_run(
         )  # fmt: skip
     if product.verdict.errors_from != STATED:
         result = with_honest_errors(result)
+    if result.errors_from != product.verdict.errors_from and product.verdict.covariance_from == "fit":
+        result = dataclasses.replace(
+            result, covariance=product.covariance, errors_from=product.verdict.errors_from
+        )
     return dataclasses.replace(result, verdict=product.verdict)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.write import write_calibration_set
+from walop_jax.diagnosis.trust import pixel_structure
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import fail
@@ -61,6 +62,9 @@ def compress_frames(
     if not result.converged:
         raise ValueError(f"the fit of the frames did not converge ({result.minimum.message})")
     tell("compressing")
-    found = compressed(result.posterior)
+    found, structure = compressed(result.posterior), pixel_structure(result)
+    assert found.compression is not None
+    asked = dataclasses.replace(found.compression, gain=structure.gain, response=structure.response)
+    found = dataclasses.replace(found, compression=asked)
     write_calibration_set(output, found, overwrite=overwrite)
     return CompressedRun(result, found)
