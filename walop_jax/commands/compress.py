@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,6 +36,7 @@ def compress(
     converge.
     """
     from walop_jax.data.write import write_calibration_set
+    from walop_jax.diagnosis.trust import pixel_structure
     from walop_jax.fit.refit import refit
     from walop_jax.likelihood.compression import compressed
     from walop_jax.likelihood.pixels import PixelPosterior
@@ -53,7 +55,10 @@ def compress(
     if not result.converged:
         raise ValueError(f"the fit of the frames did not converge ({result.minimum.message})")
     job.tell("compressing", "compressing")
-    found = compressed(result.posterior)
+    found, structure = compressed(result.posterior), pixel_structure(result)
+    assert found.compression is not None
+    asked = dataclasses.replace(found.compression, gain=structure.gain, response=structure.response)
+    found = dataclasses.replace(found, compression=asked)
     if output is not None:
         write_calibration_set(output, found, overwrite=job.overwrite)
     record, points = found.compression, len(found.points)
