@@ -10,10 +10,10 @@ import pytest
 from scipy import stats
 from small_run import SEED, SMALL, small_fit
 
-from walop_jax.calibration.matrix_slopes import matrix_slopes
+from walop_jax.calibration.matrix_slopes import change_of_qu, matrix_slopes
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import stated_conditions as conditions
-from walop_jax.diagnosis.change_of_stokes import change_of_qu, first_setting
+from walop_jax.diagnosis.change_of_stokes import first_setting
 from walop_jax.diagnosis.condition_limits import condition_limits
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.limits_found import PROBABILITY

@@ -54,7 +54,7 @@ def test_a_good_product_is_valid(product):
     checks = certify(product)
     assert [check.name for check in checks] == [
         "converged", "explains the data", "conditioned", "covariance", "validity", "parents", "model", "maps",
-        "physics",
+        "physics", "protection",
     ]  # fmt: skip
     assert failed(product) == []
     known = validity(product)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from walop_jax.calibration.matrix import matrices, matrix_draws
+from walop_jax.calibration.matrix_slopes import change_of_qu, matrix_slopes
 from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, ParameterTable, in_ascii
 from walop_jax.calibration.records import ResidualMap
 from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter, single_wavelength
@@ -25,7 +26,7 @@ from walop_jax.fit.model_builder import model_without_data, standard_names
 from walop_jax.fit.model_file import render
 from walop_jax.fit.parameter_table import HEAD, parameter_notes, parameter_rows, parameter_table
 from walop_jax.fit.refit import FitResult
-from walop_jax.fit.verdict import Quality, Verdict
+from walop_jax.fit.verdict import Hidden, Quality, Verdict
 from walop_jax.instruments.description import parsed
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, nearest
@@ -66,6 +67,7 @@ class Calibration(Displayed):
     inputs: tuple[InputFile, ...] = ()
     residuals: ResidualMap | None = None
     draws: Float[np.ndarray, "d n"] | None = None
+    hidden: Hidden | None = None
 
     @classmethod
     def from_fit(cls, result: FitResult, residuals: ResidualMap | None = None) -> Calibration:
@@ -88,6 +90,7 @@ class Calibration(Displayed):
             field=result.posterior.census.field,
             inputs=calset.inputs,
             residuals=residuals,
+            hidden=result.hidden,
         )
 
     @property
@@ -155,6 +158,23 @@ class Calibration(Displayed):
         instrument = self.model.instrument(self.values)
         values, covariance = matrices(instrument, settings, filters, x, y, self.covariance)
         return values, covariance + self._of_structure(values)
+
+    def protection(
+        self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings | None = None
+    ) -> tuple[Float[np.ndarray, " p"], str]:
+        """Largest error of q and u, at field positions (deg), of a mistake that would not have been found, and which.
+
+        For stars polarised by up to 5 %, in one setting (default: the usual one); NaN where u is hardly measured, and
+        where nobody asked.
+        """
+        if self.hidden is None or not len(self.hidden):
+            return np.full(len(x), np.nan if self.hidden is None else 0.0), ""
+        settings = self.usual_settings() if settings is None else settings
+        filters = {str(settings.filter[0]): self.filter_curve(str(settings.filter[0]))}
+        matrix, slopes = matrix_slopes(self.model.instrument(self.values), settings, filters, x, y)
+        errors = np.array([change_of_qu(matrix, matrix + slopes @ change) for change in self.hidden.changes])
+        worst = int(np.argmax(np.nan_to_num(errors).max(axis=1)))
+        return np.nanmax(errors, axis=0), self.hidden.names[worst]
 
     def _of_structure(self, values: Float[np.ndarray, "p m"]) -> Float[np.ndarray, "p m m"]:
         """What the structure of field points adds to the covariance of the matrix at a place.
@@ -293,6 +313,7 @@ class Calibration(Displayed):
             versions=software_versions(),
             residuals=self.residuals,
             description=tuple(_lines(self.model.template.description)),
+            hidden=self.hidden,
         )
 
     @classmethod
@@ -328,6 +349,9 @@ class Calibration(Displayed):
             field=product.field,
             inputs=product.inputs,
             residuals=product.residuals,
+            hidden=None
+            if product.hidden is None
+            else dataclasses.replace(product.hidden, changes=product.hidden.changes[:, order]),
         )
 
 

@@ -60,7 +60,7 @@ def certify(product: CalibrationProduct, catalogue: Sequence[type[Effect]] = EFF
     except ValueError as error:
         return [*checks, Check("model", False, f"cannot be rebuilt: {error}")]
     checks.append(Check("model", True, f"{len(calibration.model.names)} parameters rebuilt by name"))
-    return [*checks, _maps(product, calibration), _physics(calibration)]
+    return [*checks, _maps(product, calibration), _physics(calibration), _protection(calibration)]
 
 
 def _verdict(product: CalibrationProduct) -> list[Check]:
@@ -139,4 +139,24 @@ def _physics(calibration: Calibration) -> Check:
     good = bool(np.all(vectors[..., 0] > 0)) and bool(np.all(least > -DARKEST))
     return Check(
         "physics", good, f"least transmission for any polarisation, over that of unpolarised light: {found}"
+    )
+
+
+def _protection(calibration: Calibration) -> Check:
+    """What could hide is stated, never failed: it is as large as the data leave it."""
+    if calibration.hidden is None:
+        return Check("protection", True, "nobody asked what could hide")
+    limit = min(calibration.model.template.field_limit, float(np.abs(calibration.field).max()))
+    x, y = np.random.default_rng(0).uniform(-limit, limit, (2, _POINTS))
+    setting = calibration.usual_settings(filter_name=str(np.unique(calibration.exposures.filter)[0]))
+    errors, name = calibration.protection(x, y, setting)
+    if not np.isfinite(errors).any() or not name:
+        return Check("protection", True, "no single mistake would move q and u by more than their errors")
+    number = calibration.hidden.names.index(name)
+    size, unit = calibration.hidden.sizes[number], calibration.hidden.units[number]
+    found = f"{name}, off by {size:.2g} {unit}".rstrip()
+    return Check(
+        "protection",
+        True,
+        f"up to {100 * np.nanmax(errors):.2g} % in q and u by what would not be found ({found})",
     )

@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from walop_jax.calibration.matrix import in_chunks, point_matrix, point_sky_vectors
+from walop_jax.calibration.records import SMALLEST_DETERMINANT
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.likelihood import limits
@@ -24,6 +25,23 @@ from walop_jax.model.planning import plan_for_settings
 
 Scalar = Float[Array, ""]
 Vector = Float[np.ndarray, " p"]
+
+LARGEST_P = 0.05
+
+
+def change_of_qu(
+    assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
+) -> Float[np.ndarray, " p"]:
+    """Largest error of q and u at each field point for stars polarised by up to `p`; NaN where not measured."""
+    found = np.full(len(assumed), np.nan)
+    if assumed.shape[1] != 2:  # one exposure of one arm, or of three, does not give q and u and nothing else
+        return found
+    good = np.abs(np.linalg.det(assumed[:, :, 1:])) > SMALLEST_DETERMINANT
+    inverse = np.linalg.inv(assumed[good, :, 1:])
+    change = (true - assumed)[good]
+    offset = np.linalg.norm(inverse @ change[:, :, :1], axis=(1, 2))
+    found[good] = offset + p * np.linalg.norm(inverse @ change[:, :, 1:], ord=2, axis=(1, 2))
+    return found
 
 
 def matrix_slopes(

@@ -56,7 +56,7 @@ from walop_jax.data.frames import read_grid
 from walop_jax.data.records import InputFile, Site
 from walop_jax.data.schema import Column, Place, column_names, read_table, table_rules
 from walop_jax.data.write import exposures_hdu, filter_columns, grid_cards, sign_and_write, table_hdu
-from walop_jax.fit.verdict import Structure
+from walop_jax.fit.verdict import Hidden, Structure
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.fits_reading import UNREADABLE, OpenFile, one_line, open_fits
@@ -133,6 +133,8 @@ def _hdus(product: CalibrationProduct, path: object) -> list[Any]:
     instrument_name(product.instrument, version, Place(path, "PRIMARY"))
     exposures = exposures_hdu(product.exposures, version, path)
     images = [fits.ImageHDU(product.covariance, name="COVARIANCE")]
+    if product.hidden is not None:
+        images.append(_hidden_hdu(product.hidden))
     for suffix, maps in (("", product.maps.values), ("_ERR", product.maps.errors)):
         for name, image in zip(product.maps.names, maps, strict=True):
             images.append(fits.ImageHDU(image, name=name + suffix))
@@ -142,6 +144,39 @@ def _hdus(product: CalibrationProduct, path: object) -> list[Any]:
     parameters_hdu, filters = made.pop("PARAMETERS"), made.pop("FILTERS")
     primary = primary_hdu(product, version)
     return [primary, parameters_hdu, *images, filters, exposures, *made.values()]
+
+
+def _hidden_hdu(hidden: Hidden) -> Any:
+    """An image (mistake, parameter) of what each mistake does to the parameters; no data where there is none."""
+    hdu = fits.ImageHDU(hidden.changes if len(hidden) else None, name="HIDDEN")
+    for number, (name, size, unit) in enumerate(
+        zip(hidden.names, hidden.sizes, hidden.units, strict=True), start=1
+    ):
+        hdu.header[f"HIDE{number}"] = in_ascii(name)
+        hdu.header[f"SIZE{number}"] = size
+        hdu.header[f"UNIT{number}"] = in_ascii(unit)
+    return hdu
+
+
+def _read_hidden(units: Mapping[str, Any], parameters: int, path: Path) -> Hidden | None:
+    """The mistakes of the extension HIDDEN; None in products that nobody asked for them."""
+    if "HIDDEN" not in units:
+        return None
+    header, place = units["HIDDEN"].header, Place(path, "HIDDEN")
+    names, sizes, kept = [], [], []
+    while (number := len(names) + 1) and f"HIDE{number}" in header:
+        size = header.get(f"SIZE{number}")
+        if isinstance(size, bool) or not isinstance(size, int | float):
+            raise place.fail(f"is {size!r}, not a number", f"SIZE{number}", "make the product again")
+        names.append(str(header[f"HIDE{number}"]))
+        sizes.append(float(size))
+        kept.append(str(header.get(f"UNIT{number}", "")))
+    changes = _image(units, "HIDDEN", path) if names else np.zeros((0, parameters))
+    if changes.shape != (len(names), parameters):
+        raise place.fail(
+            f"has shape {changes.shape}, not {(len(names), parameters)}", advice="make the product again"
+        )
+    return Hidden(tuple(names), tuple(sizes), tuple(kept), changes)
 
 
 def _strings(values: Iterable[str]) -> np.ndarray:
@@ -236,6 +271,7 @@ def _from_hdus(opened: OpenFile) -> CalibrationProduct:
         versions=header.versions(),
         residuals=read_residual_map(units, maps.arms, path),
         description=() if description is None else tuple(description["LINE"].tolist()),
+        hidden=_read_hidden(units, len(parameters), path),
     )  # fmt: skip
     if header.text("CONTHASH") not in (product.content_hash(), product.content_hash(every_column=False)):
         raise fail(

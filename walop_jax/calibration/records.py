@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import Exposures, FilterCurve, InputFile, Site, Sources
-from walop_jax.fit.verdict import Verdict
+from walop_jax.fit.verdict import Hidden, Verdict
 from walop_jax.likelihood.expansion import STATED
 
 SMALLEST_DETERMINANT = 0.1
@@ -147,7 +147,8 @@ class CalibrationProduct:
 
     `field` is (smallest x, largest x, smallest y, largest y) of the field points that were used, in degrees; `model`
     are the lines of the model's TOML text, `description` those of the instrument's description file where it does not
-    come with the package; `versions` name the software; `date` is UTC, ISO 8601.
+    come with the package; `hidden` are mistakes that would not have been found; `versions` name the software; `date` is
+    UTC, ISO 8601.
     """
 
     instrument: str
@@ -167,6 +168,7 @@ class CalibrationProduct:
     versions: Mapping[str, str] = dataclasses.field(default_factory=dict)
     residuals: ResidualMap | None = None
     description: tuple[str, ...] = ()
+    hidden: Hidden | None = None
 
     def __post_init__(self) -> None:
         n = len(self.parameters)
@@ -214,6 +216,8 @@ class CalibrationProduct:
             for prefix, position in self.exposures.moving.items():
                 yield from (np.array([prefix]), position.inside, position.angle)
         yield from (self.covariance, self.maps.values, self.maps.errors)
+        if self.hidden is not None and len(self.hidden):
+            yield from (np.array(self.hidden.names), self.hidden.changes)
         if self.residuals is not None:
             yield from (self.residuals.values, self.residuals.errors, self.residuals.chi2)
         for name, curve in self.filters.items():

@@ -47,6 +47,15 @@ def summary(
         "quality": int(verdict.quality),
         "doubts": list(verdict.doubts),
         "warnings": list(verdict.warnings),
+        "structure": dataclasses.asdict(verdict.structure),
+        "hidden": None
+        if result.hidden is None
+        else [
+            {"name": name, "size": size, "unit": unit}
+            for name, size, unit in zip(
+                result.hidden.names, result.hidden.sizes, result.hidden.units, strict=True
+            )
+        ],
         "instrument": result.model.name,
         "effects": list(result.model.effect_names),
         "free_parameters": len(result.model.free),

@@ -11,15 +11,13 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.matrix import sky_vectors
-from walop_jax.calibration.records import SMALLEST_DETERMINANT
+from walop_jax.calibration.matrix_slopes import LARGEST_P, change_of_qu
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
 from walop_jax.model import light
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.planning import plan_for_settings
-
-LARGEST_P = 0.05
 
 
 def first_setting(calset: CalibrationSet, instrument: Instrument) -> Settings:
@@ -34,21 +32,6 @@ def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p a 3"]:
     plan = plan_for_settings(instrument, first_setting(calset, instrument), calset.filters)
     vectors = sky_vectors(instrument, plan, calset.points.x, calset.points.y)[:, 0]
     return np.asarray(light.instrument_matrix(jnp.asarray(vectors), instrument.cameras.pairs))
-
-
-def change_of_qu(
-    assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
-) -> Float[np.ndarray, " p"]:
-    """Largest error of q and u at each field point for stars polarised by up to `p`; NaN where not measured."""
-    found = np.full(len(assumed), np.nan)
-    if assumed.shape[1] != 2:  # one exposure of one arm, or of three, does not give q and u and nothing else
-        return found
-    good = np.abs(np.linalg.det(assumed[:, :, 1:])) > SMALLEST_DETERMINANT
-    inverse = np.linalg.inv(assumed[good, :, 1:])
-    change = (true - assumed)[good]
-    offset = np.linalg.norm(inverse @ change[:, :, :1], axis=(1, 2))
-    found[good] = offset + p * np.linalg.norm(inverse @ change[:, :, 1:], ord=2, axis=(1, 2))
-    return found
 
 
 def largest_change(

@@ -32,13 +32,25 @@ from jaxtyping import Float
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM
+from walop_jax.diagnosis.limits_found import PROBABILITY
 from walop_jax.diagnosis.mixups import with_exposures, with_places
-from walop_jax.diagnosis.score import Candidate, Score, Scorer, ScoreSpace, ScoreTable, corrected_p
+from walop_jax.diagnosis.score import (
+    Candidate,
+    Score,
+    Scorer,
+    ScoreSpace,
+    ScoreTable,
+    corrected_p,
+    local_p,
+    noncentrality,
+)
 from walop_jax.fit.refit import NEARLY
+from walop_jax.fit.verdict import Hidden
 from walop_jax.io.rounding import value_and_error
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 
+MOST_HIDDEN = 12  # mistakes that a product keeps: what a star needs for each is a product of two vectors
 _SHOWN = 4  # alternatives that are told in words
 _ALIKE = 25.0  # in χ², within which conditions are told together
 _PRIOR_WIDTHS = 30.0  # by which a prior may be wrong at most
@@ -81,26 +93,91 @@ class Scored(NamedTuple):
 
 
 class Single(NamedTuple):
-    """One number, or a few of one thing, that may be otherwise: its columns, and its size in words."""
+    """One number, or a few of one thing, that may be otherwise: its columns, and its size in words.
+
+    `plausible` is the largest mistake to reckon with where the data would not show it; 0 where errors hold it already.
+    """
 
     candidate: Candidate
     said: Callable[[Score], str]
+    plausible: float = 0.0
+    unit: str = ""
 
 
-def stated_conditions(design: Design) -> Iterator[str]:
+@dataclasses.dataclass(frozen=True, eq=False)
+class Singles:
+    """All single numbers of a fit with their scores.
+
+    `along` (q, columns) is what the parameters take up of their columns, Qᵀ C; `left` the square of what they leave.
+    """
+
+    rivals: tuple[Single, ...]
+    table: ScoreTable
+    along: Float[np.ndarray, "q c"]
+    left: Float[np.ndarray, " c"]
+
+    @classmethod
+    def of(cls, design: Design) -> Singles:
+        """Conditions that the set states, priors, and terms of a camera that have one amplitude."""
+        rivals = (*_conditions(design), *_priors(design), *_of_cameras(design))
+        names = [one.candidate.name for one in rivals]
+        widths = [one.candidate.widths for one in rivals]
+        columns = np.concatenate(
+            [np.zeros((len(design.residual), 0)), *(one.candidate.columns for one in rivals)], axis=1
+        )
+        along = design.projector.basis.T @ columns
+        if not rivals:
+            return cls((), ScoreTable((), 1.0, 1.0, 1.0), along, np.zeros(0))
+        table, left = _table(design, names, widths, columns)
+        return cls(rivals, table, along, left)
+
+    @property
+    def testable(self) -> list[Score]:
+        """The scores of those of which the parameters leave something."""
+        return [score for score in self.table.scores if score.testable]
+
+
+def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
+    """What single mistakes do to the parameters that the data would just have shown with a probability of 99 %.
+
+    A number that is wrong by h moves the parameters by R⁻¹QᵀC h (J = QR) and is found where h² |PC|² reaches the
+    noncentrality of its test; h is at most the plausible size. Kept are those that move them by more than their
+    standard errors, the worst first.
+    """
+    jacobian = design.jacobian
+    length = np.linalg.norm(jacobian, axis=0)
+    length = np.where(length > 0, length, 1.0)
+    least = noncentrality(local_p(ALARM, len(singles.testable)), 1, PROBABILITY)
+    found: list[tuple[float, Single, float, int]] = []
+    first = 0
+    for one in singles.rivals:
+        if one.plausible > 0.0:
+            size = one.plausible
+            if singles.table[one.candidate.name].testable:
+                size = min(size, float(np.sqrt(least / singles.left[first])))
+            moved = size * float(np.linalg.norm(singles.along[:, first]))
+            if moved > 1.0:
+                found.append((moved, one, size, first))
+        first += len(one.candidate.widths)
+    found = sorted(found, key=lambda entry: -entry[0])[:MOST_HIDDEN]
+    triangle = design.projector.basis.T @ (jacobian / length)
+    columns = np.array([size * singles.along[:, at] for _, _, size, at in found]).reshape(len(found), -1).T
+    taken = np.linalg.lstsq(triangle, columns, rcond=None)[0] / length[:, None]
+    return Hidden(
+        names=tuple(one.candidate.name for _, one, _, _ in found),
+        sizes=tuple(size for _, _, size, _ in found),
+        units=tuple(one.unit for _, one, _, _ in found),
+        changes=(design.fit.model.selection() @ taken).T,
+    )
+
+
+def stated_conditions(design: Design, singles: Singles | None = None) -> Iterator[str]:
     """A sentence on the single numbers that the residuals of a fit speak against, the clearest first.
 
-    Conditions that the set states, priors, and terms of a camera that have one amplitude. Of a fit that does not
-    explain its data only where one of them alone would.
+    Of a fit that does not explain its data only where one of them alone would.
     """
-    rivals = [*_conditions(design), *_priors(design), *_of_cameras(design)]
-    if not rivals:
-        return
-    names = [one.candidate.name for one in rivals]
-    widths = [one.candidate.widths for one in rivals]
-    columns = np.concatenate([one.candidate.columns for one in rivals], axis=1)
-    table = _table(design, names, widths, columns)[0]
-    scores = [score for score in table.scores if score.testable]
+    singles = singles or Singles.of(design)
+    rivals, table, scores = singles.rivals, singles.table, singles.testable
     found = [score for score in scores if corrected_p(score.log_p, len(scores)) < ALARM]
     if not found:
         return
@@ -130,7 +207,7 @@ def _conditions(design: Design) -> Iterator[Single]:
     asked, columns = _asked(design)
     for one, column in zip(asked, columns.T, strict=True):
         candidate = Candidate(one.what, column[:, None], np.array([one.width]))
-        yield Single(candidate, lambda score, one=one: _in_words(one, score))
+        yield Single(candidate, lambda score, one=one: _in_words(one, score), one.width, one.unit)
 
 
 def _priors(design: Design) -> Iterator[Single]:
@@ -177,15 +254,15 @@ def _of_cameras(design: Design) -> Iterator[Single]:
             value, error = value_and_error(size, sigma)
             return f"{words.format(names[k])} of {value} ± {error} {unit}".rstrip()
 
-        return Single(Candidate(words.format(names[k]), rows, np.array([width])), said)
+        return Single(Candidate(words.format(names[k]), rows, np.array([width])), said, width, unit)
 
     if not measured.used.any():
         return
     for k in range(measured.cameras):
         yield single(k, counts[..., k] ** 2 / 1e6, 0.02, "a non-linearity of {}", "at 10⁶ electrons")
         level = np.broadcast_to(median[:, k], counts.shape[:2])
-        yield single(k, level, 0.03, "scattered light in {}", "of the median counts")
-        yield single(k, np.ones_like(counts[..., k]), 0.03 * typical, "a pedestal in {}", "electrons")
+        yield single(k, level, 0.003, "scattered light in {}", "of the median counts")
+        yield single(k, np.ones_like(counts[..., k]), 0.003 * typical, "a pedestal in {}", "electrons")
         for other in range(measured.cameras):
             if other != k:
                 yield single(k, counts[..., other], 0.02, f"light of {names[other]} in {{}}", "of its counts")

@@ -40,7 +40,7 @@ from walop_jax.diagnosis.mixups import refuse_mixups
 from walop_jax.diagnosis.pattern_scores import pattern_scores
 from walop_jax.diagnosis.repeated_noise import repeated_noise
 from walop_jax.diagnosis.score import Projector, ScoreTable, local_p
-from walop_jax.diagnosis.stated_conditions import stated_conditions
+from walop_jax.diagnosis.stated_conditions import Singles, hidden_mistakes, stated_conditions
 from walop_jax.diagnosis.variance_components import (
     Component,
     found_components,
@@ -89,11 +89,11 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
     design = Design.of(sampled(whole, _most(whole)))
     if result.errors_too_large and _hold_no_noise(design):
         return result.judged(noiseless=True)
-    table = pattern_scores(design, seed)
+    table, singles = pattern_scores(design, seed), Singles.of(design)
     pixels = _of_pixels(result)
     components = found_components([*variance_components(design), *pixels])
     doubts = (
-        *stated_conditions(design),
+        *stated_conditions(design, singles),
         *_patterns(table),
         *in_words(components),
         *_groups(design),
@@ -106,7 +106,8 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
         of_points = [one for one in components if one not in pixels]
         result = with_structure(result, design, of_points, len(whole.calset.points))
     structure = _with_summed_pixels(result, structure)
-    return with_honest_errors(result).judged(doubts, structure=structure)
+    found = with_honest_errors(result).judged(doubts, structure=structure)
+    return dataclasses.replace(found, hidden=hidden_mistakes(design, singles))
 
 
 def _of_pixels(result: FitResult) -> list[Component]:

@@ -20,7 +20,7 @@ from walop_jax.fit.model_file import render
 from walop_jax.fit.parameter_table import HEAD, parameter_notes, parameter_rows, parameter_table
 from walop_jax.fit.robust import robust_errors
 from walop_jax.fit.search import find_minimum, free_scales
-from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality, Structure, Verdict
+from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Hidden, Quality, Structure, Verdict
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.heartbeat import Stage
 from walop_jax.io.software import software_versions
@@ -50,7 +50,8 @@ class FitResult(Displayed):
 
     `values` and `covariance` are of all parameters in tree order, frozen ones with zero variance. `verdict` is None
     until the residuals were examined (`diagnosis.trust.examined`); to ask for `trusted` before is an error.
-    `errors_from` is what the covariance was made from, the stated errors of the data (`STATED`) or residuals.
+    `errors_from` is what the covariance was made from, the stated errors of the data (`STATED`) or residuals; `hidden`
+    are mistakes that the residuals would not show, None until these were examined.
     """
 
     likelihood: Likelihood
@@ -62,6 +63,7 @@ class FitResult(Displayed):
     seconds: float
     errors_from: str = STATED
     verdict: Verdict | None = None
+    hidden: Hidden | None = None
 
     @property
     def model(self) -> Model:

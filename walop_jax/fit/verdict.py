@@ -9,6 +9,9 @@ import operator
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from walop_jax.likelihood.expansion import STATED
 
 
@@ -95,6 +98,24 @@ class Structure:
 
 
 NO_STRUCTURE = Structure()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Hidden:
+    """Single mistakes that the data would not show, by name.
+
+    `sizes` in `units` are those that would just have been found, or the largest plausible ones; `changes` what each
+    does to the parameters of the model, all of them in tree order. The largest effect of any of them on a star is the
+    protection level of its Stokes parameters (RAIM: National Academies 4920, 2023).
+    """
+
+    names: tuple[str, ...]
+    sizes: tuple[float, ...]
+    units: tuple[str, ...]
+    changes: Float[np.ndarray, "s n"]
+
+    def __len__(self) -> int:
+        return len(self.names)
 
 
 @dataclasses.dataclass(frozen=True)
