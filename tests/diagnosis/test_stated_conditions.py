@@ -12,6 +12,7 @@ from small_run import SEED, SMALL, small_fit
 
 from walop_jax.calibration.matrix_slopes import change_of_qu, matrix_slopes
 from walop_jax.data.records import CalibrationSet
+from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import stated_conditions as conditions
 from walop_jax.diagnosis.change_of_stokes import first_setting
 from walop_jax.diagnosis.condition_limits import condition_limits
@@ -48,6 +49,44 @@ def cooler(calset: CalibrationSet) -> CalibrationSet:
     e = calset.exposures
     teff = np.where(e.kind == "clp", 2800.0, e.teff)
     return dataclasses.replace(calset, exposures=dataclasses.replace(e, teff=teff))
+
+
+def of_date(calset: CalibrationSet) -> CalibrationSet:
+    """RA and DEC of the sky as a telescope displays them in 2080: apparent, not ICRS (precession by Meeus, ch. 21)."""
+    e, years = calset.exposures, 80.0
+    ra, dec, moon = np.deg2rad(e.ra), np.deg2rad(e.dec), e.kind == "moon"
+    m, n = 46.124 * years / 3600.0, 20.043 * years / 3600.0
+    later = {
+        "ra": np.where(moon, e.ra + m + n * np.sin(ra) * np.tan(dec), e.ra),
+        "dec": np.where(moon, e.dec + n * np.cos(ra), e.dec),
+    }
+    return dataclasses.replace(calset, exposures=dataclasses.replace(e, **later))
+
+
+def not_linear(calset: CalibrationSet) -> CalibrationSet:
+    """The second camera answers with 0.1 % less at 10⁶ electrons."""
+    block = calset.intensities.block(0, len(calset.points))
+    counts = block.counts.copy()
+    counts[..., 1] *= 1.0 - 1e-3 * counts[..., 1] / 1e6
+    table = TableIntensities.dense(calset.points, dataclasses.replace(block, counts=counts))
+    return dataclasses.replace(calset, intensities=table)
+
+
+@pytest.mark.parametrize(
+    ("change", "what", "size"),
+    [
+        (of_date, "the equinox of RA and DEC", 2080.0),
+        (not_linear, "a non-linearity of E1 of", -1e-3),
+    ],
+)
+def test_one_number_is_among_those_that_are_told(change, what, size):
+    """Others that do nearly the same are told beside it."""
+    result = examined(refit(change(simulate(SMALL, seed=SEED).calset)), as_written=True)
+    assert not result.trusted
+    (told,) = [text for text in result.verdict.doubts if text.startswith("the residuals ask for ")]
+    value, error = re.search(re.escape(what) + r" ([−\d.]+) ± ([\d.]+)", told).groups()  # type: ignore[union-attr]
+    off = float(value.replace("−", "-")) - size
+    assert abs(off) < 4 * float(error) + (2.0 if size > 0 else 0.0)  # terms beyond the first, in years
 
 
 @pytest.mark.parametrize(

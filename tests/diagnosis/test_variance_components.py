@@ -1,4 +1,4 @@
-"""Structure that no smooth pattern holds: the moments are those of dense algebra, noise passes, what is there is told."""
+"""Structure that no smooth pattern holds: moments are those of dense algebra, noise passes, what is there is told."""
 
 from __future__ import annotations
 
@@ -118,10 +118,7 @@ def test_errors_of_one_place_hold_its_structure(rough, tmp_path):
     assert added == pytest.approx(gain / np.sqrt(2.0) * (1.0 - values[0, 0] ** 2), rel=1e-6)
     write_product(tmp_path / "rough.fits", calibration.to_product())
     again = read_product(tmp_path / "rough.fits")
-    assert (
-        again.verdict.structure == pytest.approx(rough.verdict.structure)
-        or again.verdict.structure.gain == gain
-    )
+    assert again.verdict.structure.gain == pytest.approx(gain, rel=1e-12)
 
 
 def test_parameters_know_of_the_structure_in_their_data(rough):
