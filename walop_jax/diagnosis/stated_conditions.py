@@ -28,6 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy import stats
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.design import Design
@@ -194,6 +195,26 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     told = "; or for ".join(said[score.name](score) for score in likely[:_SHOWN])
     more = f"; or for {len(likely) - _SHOWN} others" if len(likely) > _SHOWN else ""
     yield f"the residuals ask for {told}{more} (p = {corrected_p(best.log_p, len(scores)):.2g})"
+
+
+def rival_conditions(design: Design, chi2: float) -> Iterator[str]:
+    """A sentence on conditions that a set states, one of which, if wrong, explains the data as a model with `chi2` does.
+
+    `design` is of the fit before anything was added to its model.
+    """
+    scored = [item for item in condition_scores(design) if item.score.testable]
+    square = float(np.sum(design.projector(design.residual) ** 2))
+    least = stats.chi2.isf(local_p(ALARM, len(scored)), 1) if scored else np.inf
+    gains = [float(item.score.amplitudes[0]) ** 2 * item.square for item in scored]
+    alike = [
+        (gain, item)
+        for gain, item in zip(gains, scored, strict=True)
+        if square - gain < chi2 + _ALIKE and gain > least
+    ]
+    if alike:
+        alike.sort(key=lambda pair: -pair[0])
+        said = "; or ".join(_in_words(item.stated, item.score) for _, item in alike[:_SHOWN])
+        yield f"what was found explains no more than one number that the set states would, if it were {said}"
 
 
 def _holds(one: Score, other: Score) -> bool:

@@ -40,6 +40,7 @@ from walop_jax.diagnosis.mixups import mixups_of, refusal
 from walop_jax.diagnosis.naming import Trial, before_and_after, predicts_unseen, refitted_in_order
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.search import Linear, search
+from walop_jax.diagnosis.stated_conditions import rival_conditions
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
@@ -72,9 +73,9 @@ def diagnose(
     `catalogue` are the effects that may be named, `policy` the thresholds. Of a set with more than
     `limits.DIAGNOSED_ROWS` (exposure, point) pairs, or whose columns would be more than `limits.DIAGNOSED_NUMBERS`,
     points spread over the field are looked at. Nothing further is tried after `minutes` (default: those of the policy);
-    what is left then has no name, and `Diagnosis.caution` says so. Both fits are examined. Other readings of the data are not tried where the
-    caller has done that already (`as_written`). Raises what `fit` raises, and `DataError` for data that another reading
-    explains (`mixups`).
+    what is left then has no name, and `Diagnosis.caution` says so. Both fits are examined. Other readings of the data
+    are not tried where the caller has done that already (`as_written`). Raises what `fit` raises, and `DataError` for
+    data that another reading explains (`mixups`).
     """
     began = time.perf_counter()
     tell = progress or (lambda text: None)
@@ -123,15 +124,20 @@ def diagnose(
         policy=policy,
         ended=judge.ended,
     )
+    return _examined(found)
+
+
+def _examined(found: Diagnosis) -> Diagnosis:
+    """A diagnosis with the verdicts on its fits; what a wrong statement of the set explains as well is remarked."""
     after = examined(with_honest_errors(found.after), as_written=True)
-    before = after if found.before is found.after else _examined_first(found.before)
+    if found.before is found.after:
+        return dataclasses.replace(found, before=after, after=after)
+    for sentence in rival_conditions(Design.of(found.before), found.after.chi2):
+        after = after.remarked(sentence)
+    # Where χ² speaks against the model given, the steps say what is missing.
+    explained = found.before.explains_data or found.before.nearly_explains_data
+    before = examined(found.before, as_written=True) if explained else found.before.judged()
     return dataclasses.replace(found, before=before, after=after)
-
-
-def _examined_first(result: FitResult) -> FitResult:
-    """The verdict on the fit of the model given: where χ² speaks against it, the steps say what is missing."""
-    explained = result.explains_data or result.nearly_explains_data
-    return examined(result, as_written=True) if explained else result.judged()
 
 
 def _promise(choice: Choice) -> tuple[float, float]:

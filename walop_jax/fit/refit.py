@@ -159,6 +159,12 @@ class FitResult(Displayed):
         )
         return dataclasses.replace(self, verdict=verdict)
 
+    def remarked(self, sentence: str) -> FitResult:
+        """The fit with a remark in its verdict, which forbids nothing."""
+        verdict = self.checked_verdict()
+        against = (*verdict.against, Doubt(Quality(0), sentence, blocking=False))
+        return dataclasses.replace(self, verdict=dataclasses.replace(verdict, against=against))
+
     def checked_verdict(self) -> Verdict:
         """The verdict; raises RuntimeError for a fit that nobody has examined."""
         if self.verdict is None:
