@@ -198,7 +198,7 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
 
 
 def rival_conditions(design: Design, chi2: float) -> Iterator[str]:
-    """A sentence on conditions that a set states, one of which, if wrong, explains the data as a model with `chi2` does.
+    """A sentence on stated conditions, each of which, if wrong, explains the data as well as a model with `chi2` does.
 
     `design` is of the fit before anything was added to its model.
     """
