@@ -50,7 +50,7 @@ def measure(path: Path, nuts_draws: int, plain_steps: int) -> dict[str, Any]:
 
     calset = read_calibration_set(path)
     likelihood = Likelihood.of(calset, base_model(calset))
-    result = fit(likelihood)
+    result = fit(likelihood).judged()
     target = Target(result)
     found: dict[str, Any] = {"core": CORE, "coefficients": len(target.free)}
 
