@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,6 +37,7 @@ def compress(
     from walop_jax.data.write import write_calibration_set
     from walop_jax.diagnosis.trust import pixel_structure
     from walop_jax.fit.refit import refit
+    from walop_jax.fit.stand_in import with_pixel_structure
     from walop_jax.likelihood.compression import compressed
     from walop_jax.likelihood.pixels import PixelPosterior
 
@@ -55,10 +55,7 @@ def compress(
     if not result.converged:
         raise ValueError(f"the fit of the frames did not converge ({result.minimum.message})")
     job.tell("compressing", "compressing")
-    found, structure = compressed(result.posterior), pixel_structure(result)
-    assert found.compression is not None
-    asked = dataclasses.replace(found.compression, gain=structure.gain, response=structure.response)
-    found = dataclasses.replace(found, compression=asked)
+    found = with_pixel_structure(compressed(result.posterior), pixel_structure(result))
     if output is not None:
         write_calibration_set(output, found, overwrite=job.overwrite)
     record, points = found.compression, len(found.points)

@@ -41,7 +41,7 @@ from walop_jax.diagnosis.naming import Trial, before_and_after, predicts_unseen,
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.search import Linear, search
 from walop_jax.diagnosis.stated_conditions import rival_conditions
-from walop_jax.diagnosis.trust import examined
+from walop_jax.diagnosis.trust import examined, pixel_structure
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.stand_in import in_field_points
@@ -81,7 +81,7 @@ def diagnose(
     tell = progress or (lambda text: None)
     policy = policy if minutes is None else dataclasses.replace(policy, minutes=minutes)
     model = model or base_model(calset)
-    calset = in_field_points(calset, model, tell)
+    calset = in_field_points(calset, model, tell, pixel_structure)
     context = effect_context(model.template, calset.exposures)
     every = grammar.sentences(model.template, calset.exposures, len(calset.points))
     amplitudes = sum(len(probe.widths) for probe in (*all_probes(tuple(catalogue), context), *every))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.refit import FitResult, fit
+from walop_jax.fit.verdict import Structure
 from walop_jax.likelihood.compression import compressed
 from walop_jax.likelihood.frames import stands_for_pixels
 from walop_jax.likelihood.likelihood import Likelihood
@@ -30,16 +32,30 @@ def on_field_points(result: FitResult) -> FitResult:
     return dataclasses.replace(result, likelihood=likelihood, posterior=posterior)
 
 
-def in_field_points(calset: CalibrationSet, model: Model, tell: Progress) -> CalibrationSet:
-    """Whole frames of many pixels as the set that stands for them at their minimum; any other set as it is."""
+def in_field_points(
+    calset: CalibrationSet, model: Model, tell: Progress, look: Callable[[FitResult], Structure]
+) -> CalibrationSet:
+    """Whole frames of many pixels as the set that stands for them at their minimum; any other set as it is.
+
+    `look` says by how much single pixels differ beyond the model of a fit.
+    """
     likelihood = Likelihood.of(calset, model, runner=Runner(progress=tell))
     if not (likelihood.layout.large and stands_for_pixels(likelihood, model.start)):
         return calset
     tell("fitting all pixels")
-    found = on_field_points(fit(likelihood)).calset
+    result = fit(likelihood)
+    found = on_field_points(result).calset
     if found.compression is not None:
+        found = with_pixel_structure(found, look(result))
         tell(f"looking at {len(found.points)} field points that stand for all pixels")
     return found
+
+
+def with_pixel_structure(calset: CalibrationSet, structure: Structure) -> CalibrationSet:
+    """A set that stands for pixels with the record of how much these differ beyond the model."""
+    assert calset.compression is not None
+    record = dataclasses.replace(calset.compression, gain=structure.gain, response=structure.response)
+    return dataclasses.replace(calset, compression=record)
 
 
 def with_pixels(result: FitResult) -> FitResult:

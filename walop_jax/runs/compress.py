@@ -10,6 +10,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.data.write import write_calibration_set
 from walop_jax.diagnosis.trust import pixel_structure
 from walop_jax.fit.refit import FitResult, refit
+from walop_jax.fit.stand_in import with_pixel_structure
 from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import fail
 from walop_jax.io.heartbeat import repeated
@@ -62,9 +63,6 @@ def compress_frames(
     if not result.converged:
         raise ValueError(f"the fit of the frames did not converge ({result.minimum.message})")
     tell("compressing")
-    found, structure = compressed(result.posterior), pixel_structure(result)
-    assert found.compression is not None
-    asked = dataclasses.replace(found.compression, gain=structure.gain, response=structure.response)
-    found = dataclasses.replace(found, compression=asked)
+    found = with_pixel_structure(compressed(result.posterior), pixel_structure(result))
     write_calibration_set(output, found, overwrite=overwrite)
     return CompressedRun(result, found)
