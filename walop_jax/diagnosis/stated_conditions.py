@@ -228,7 +228,9 @@ def _conditions(design: Design) -> Iterator[Single]:
     asked, columns = _asked(design)
     for one, column in zip(asked, columns.T, strict=True):
         candidate = Candidate(one.what, column[:, None], np.array([one.width]))
-        yield Single(candidate, lambda score, one=one: _in_words(one, score), one.width, one.unit)
+        # What stars see as well is no mistake of the matrix alone.
+        plausible = 0.0 if one.seen_by_stars else one.width
+        yield Single(candidate, lambda score, one=one: _in_words(one, score), plausible, one.unit)
 
 
 def _priors(design: Design) -> Iterator[Single]:
@@ -260,9 +262,10 @@ def _of_cameras(design: Design) -> Iterator[Single]:
     """What a single camera may do to its counts with one amplitude: closed forms of the counts themselves."""
     measured, names = design.measured, design.fit.model.template.cameras.names
     counts = measured.flux[..., None] * measured.model / np.where(measured.weight > 0, measured.weight, 1.0)
-    counts = np.where(measured.used[..., None], counts, np.nan)
-    median = np.nan_to_num(np.nanmedian(counts, axis=0))
-    counts, typical = np.nan_to_num(counts), float(np.nanmedian(counts))
+    counts = np.where(measured.used[..., None], counts, 0.0)
+    median, seen = np.zeros(counts.shape[1:]), measured.used.any(axis=0)
+    median[seen] = np.nanmedian(np.where(measured.used[..., None], counts, np.nan)[:, seen], axis=0)
+    typical = float(np.median(counts[measured.used])) if measured.used.any() else 0.0
 
     def single(k: int, change: np.ndarray, width: float, words: str, unit: str) -> Single:
         cube = np.zeros_like(counts)

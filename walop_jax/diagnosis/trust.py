@@ -103,7 +103,7 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
     )
     structure = structure_of(components)
     if structure:
-        of_points = [one for one in components if one not in pixels]
+        of_points = [one for one in components if not any(one is other for other in pixels)]
         result = with_structure(result, design, of_points, len(whole.calset.points))
     structure = _with_summed_pixels(result, structure)
     found = with_honest_errors(result).judged(doubts, structure=structure)
