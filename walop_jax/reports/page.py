@@ -27,6 +27,7 @@ from walop_jax.reports.run import RunContents
 from walop_jax.reports.wording import (
     UNNAMED,
     effect_in_words,
+    hidden_in_words,
     unit_in_words,
     verdict_of_diagnosis,
     verdict_of_fit,
@@ -82,6 +83,7 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         "fit_sentence": ": ".join(verdict_of_fit(summary)),
         "good": good and bool(summary.get("trusted", summary["converged"])),
         "quality": quality.meanings,
+        "hidden": hidden_in_words(summary),
         "steps": [] if diagnosis is None else _steps(run),
         "unnamed": None if diagnosis is None else _drawn(run, len(diagnosis["steps"]) + 1),
         "unnamed_term": UNNAMED,

@@ -55,6 +55,15 @@ def verdict_of_fit(summary: Mapping[str, Any]) -> tuple[str, str]:
     return "Trusted", f"The fit converged, and the data are consistent with the model: {numbers}."
 
 
+def hidden_in_words(summary: Mapping[str, Any]) -> str:
+    """The mistakes that these data would not have shown, the worst first; empty where nobody asked or none counts."""
+    entries = (summary.get("hidden") or [])[:4]
+    sizes = [f"{entry['name']} ({entry['size']:.2g} {entry['unit']})".replace(" )", ")") for entry in entries]
+    return (
+        f"Not found if smaller than in brackets, and more than the errors: {listed(sizes)}." if sizes else ""
+    )
+
+
 def verdict_of_diagnosis(diagnosis: Mapping[str, Any]) -> tuple[str, str]:
     """What a diagnosis found, as a label and the sentences that a scientist would say."""
     steps, p = diagnosis["steps"], probability(diagnosis.get("p_value"))
