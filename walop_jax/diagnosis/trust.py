@@ -102,11 +102,11 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
         *_far_from_pixels(result),
     )
     structure = structure_of(components)
+    found = with_honest_errors(result)
     if structure:
         of_points = [one for one in components if not any(one is other for other in pixels)]
-        result = with_structure(result, design, of_points, len(whole.calset.points))
-    structure = _with_summed_pixels(result, structure)
-    found = with_honest_errors(result).judged(doubts, structure=structure)
+        found = with_structure(found, design, of_points, len(whole.calset.points))
+    found = found.judged(doubts, structure=_with_summed_pixels(result, structure))
     return dataclasses.replace(found, hidden=hidden_mistakes(design, singles))
 
 
