@@ -160,6 +160,9 @@ ERRORS = (
     planted("diagnosis/score.py", "- 0.5 * log_det)", "+ 0.5 * log_det)", "diagnosis/test_score.py"),
     planted("diagnosis/trust.py", "2.0 * min(above, 1.0 - above)", "min(above, 1.0)", "diagnosis/test_trust.py"),
     planted("diagnosis/trust.py", "variance = 2.0 * (own[0]", "variance = 4.0 * (own[0]", "diagnosis/test_trust.py"),
+    planted("diagnosis/variance_components.py", "first = whole - np.trace(m)", "first = whole",
+            "diagnosis/test_variance_components.py"),
+    planted("fit/verdict.py", "return not any(doubt.blocking", "return any(doubt.blocking", "diagnosis/test_trust.py"),
     planted("diagnosis/mixups.py", "sign * a + offset", "sign * a - offset", "diagnosis/test_mixups.py"),
     # paper
     planted("paper/polynomial.py", "- self.delta[:, None]", "+ self.delta[:, None]", "paper/test_polynomial.py"),
