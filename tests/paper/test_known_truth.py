@@ -216,7 +216,8 @@ def test_errors_of_bright_stars_on_set_b(whole_south_set, south_fit, tmp_path):
 @pytest.mark.long
 def test_compare_writes_what_it_found(either_south_set, tmp_path):
     from typer.testing import CliRunner
-    from walop_jax.cli.app import app
+
+    from walop_jax.commands.program import app
 
     south = either_south_set("a")
     arguments = [

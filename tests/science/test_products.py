@@ -10,12 +10,12 @@ import pytest
 from astropy.io import fits
 from small_run import SMALL
 from typer.testing import CliRunner
-from walop_jax.cli.app import app
 
 import walop_jax.science.epoch
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify, validity
 from walop_jax.calibration.product import write_product
+from walop_jax.commands.program import app
 from walop_jax.data import write_calibration_set
 from walop_jax.fit.model_builder import model_for
 from walop_jax.fit.refit import refit
