@@ -292,6 +292,16 @@ def _of_cameras(design: Design) -> Iterator[Single]:
                 yield single(k, counts[..., other], 0.02, f"light of {names[other]} in {{}}", "of its counts")
 
 
+def _in_words(stated: Stated, score: Score) -> str:
+    size, sigma = float(score.amplitudes[0]), float(np.sqrt(score.covariance[0, 0]))
+    if stated.value is None:
+        value, error = value_and_error(size, sigma)
+        return f"{stated.what} changed by {value} ± {error} {stated.unit}".rstrip() + f" ({stated.remedy})"
+    value, error = value_and_error(stated.value + size, sigma)
+    found = f"{stated.what} {value} ± {error} {stated.unit}".rstrip()
+    return f"{found}, not {stated.value:g} ({stated.remedy})"
+
+
 def condition_scores(design: Design) -> list[Scored]:
     """The numbers that a set states, each with the score of changing it."""
     asked, columns = _asked(design)

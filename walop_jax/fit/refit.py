@@ -202,8 +202,9 @@ class FitResult(Displayed):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What its table of parameters leaves out, and which of them the data do not constrain."""
-        return parameter_notes(self.model, self.sigma)
+        """What its table leaves out, what the data do not constrain, and which mistakes they would not show."""
+        notes = parameter_notes(self.model, self.sigma)
+        return notes if self.hidden is None or not len(self.hidden) else (*notes, self.hidden.in_words())
 
     def display(self) -> Display:
         """The verdict and the parameters."""

@@ -117,6 +117,16 @@ class Hidden:
     def __len__(self) -> int:
         return len(self.names)
 
+    def in_words(self, most: int = 3) -> str:
+        """The worst of them in a sentence."""
+        sizes = [
+            f"{name} of {size:.2g} {unit}".rstrip()
+            for name, size, unit in zip(self.names, self.sizes, self.units, strict=True)
+        ]
+        more = f" and {len(sizes) - most} more" if len(sizes) > most else ""
+        listed = ", ".join(sizes[:most]) + more
+        return f"would not be seen in these data, and move the result by more than its errors: {listed}"
+
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
