@@ -43,11 +43,14 @@ def dense(design: Design, grouping: Grouping) -> np.ndarray:
 
 
 def noise(design: Design, draws: int, seed: int) -> np.ndarray:
-    """Draws of P ε."""
+    """Draws of the residuals that noise leaves."""
     rng, unit = np.random.default_rng(seed), design.measured.unit_model
     rows = rng.standard_normal((draws, *unit.shape))
     rows -= np.sum(rows * unit, axis=-1, keepdims=True) * unit
-    priors = rng.standard_normal((draws, len(design.residual) - design.rows))
+    # A weak pull is no datum: it has no noise.
+    priors = (
+        rng.standard_normal((draws, len(design.residual) - design.rows)) * design.fit.likelihood.priors.known
+    )
     return design.projector(np.concatenate([rows.reshape(draws, -1), priors], axis=1).T)
 
 
