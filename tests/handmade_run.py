@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from builders import NAN, exposures, monochromatic
+from builders import exposures, monochromatic
 
-from walop_jax.calibration.product import (
-    CalibrationProduct,
-    MatrixMaps,
-    ParameterTable,
-    Verdict,
-    write_product,
-)
+from walop_jax.calibration import Calibration, ListedModel, MatrixMaps, write_calibration
 from walop_jax.data import empty_sources
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import InputFile, Points, Site
@@ -28,7 +23,9 @@ from walop_jax.diagnosis.figure_file import (
     write_figure_data,
 )
 from walop_jax.diagnosis.limits_found import DetectionLimit, DetectionLimits
+from walop_jax.fit.verdict import Verdict
 from walop_jax.io.text import json_text
+from walop_jax.model.specification import Parameter
 
 INPUT = "night <b>one</b> & two.fits"
 X, Y = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.2, 0.2, 3), np.linspace(-0.2, 0.2, 3)))
@@ -71,33 +68,43 @@ DIAGNOSIS: dict[str, Any] = {
 }  # fmt: skip
 
 
-def product() -> CalibrationProduct:
-    names = list(SUMMARY["parameters"])
-    sigma = np.array([entry["sigma"] for entry in SUMMARY["parameters"].values()])
+def listed(calibration: Calibration, **changes: Any) -> Calibration:
+    """A calibration with its model as a file holds it, with changes of that."""
+    c = calibration
+    model = ListedModel(c.fitted.name, c.fitted.parameters, c.maps, c.model_lines, c.description)
+    return dataclasses.replace(c, fitted=model._replace(**changes))
+
+
+def parameters(*rows: tuple[str, str, float, tuple[float, float] | None, bool]) -> tuple[Parameter, ...]:
+    """Parameters typed by hand: name, unit, start, prior, free."""
+    return tuple(
+        Parameter(name, unit, "", "", start, prior, free, 1.0) for name, unit, start, prior, free in rows
+    )
+
+
+def product() -> Calibration:
+    entries = SUMMARY["parameters"]
+    sigma = np.array([entry["sigma"] for entry in entries.values()])
+    priors = ((15.63, 0.05), (-0.23, 0.001), None, (0.0, 0.1), None)
     grid = Grid(5, 5, (3.0, 3.0), (0.0, 0.0), ((0.1, 0.0), (0.0, 0.1)))
     ramp = np.linspace(-0.03, 0.02, 25).reshape(5, 5)
-    return CalibrationProduct(
-        instrument="WALOP-SOUTH",
+    maps = MatrixMaps(grid, "band", np.stack([ramp + k for k in range(6)]), np.full((6, 5, 5), 2e-4))
+    rows = [
+        (name, entry["unit"], entry["value"], prior, entry["sigma"] > 0)
+        for (name, entry), prior in zip(entries.items(), priors, strict=True)
+    ]
+    return Calibration(
+        fitted=ListedModel("WALOP-SOUTH", parameters(*rows), maps, ("[model]",)),
+        values=np.array([entry["value"] for entry in entries.values()]),
         site=Site("SAAO", -32.38, 20.81, 1798.0),
         origin="a hand",
         date="2026-11-21T10:00:00",
         verdict=Verdict(1234.5, 1200, 1608, 1.0, True),
-        parameters=ParameterTable(
-            name=np.array(names),
-            value=np.array([entry["value"] for entry in SUMMARY["parameters"].values()]),
-            sigma=sigma,
-            unit=np.array([entry["unit"] for entry in SUMMARY["parameters"].values()]),
-            prior_mean=np.array([15.63, -0.23, NAN, 0.0, NAN]),
-            prior_width=np.array([0.05, 0.001, NAN, 0.1, NAN]),
-            free=np.array([True, True, True, True, False]),
-        ),
         covariance=np.diag(sigma**2),
-        maps=MatrixMaps(grid, "band", np.stack([ramp + k for k in range(6)]), np.full((6, 5, 5), 2e-4)),
         field=(-0.2, 0.2, -0.2, 0.2),
         exposures=exposures({"clp_angle": 0.0}, {"clp_angle": 45.0}),
         filters={"band": monochromatic(0.62)},
         sources=empty_sources(),
-        model=("[model]",),
         inputs=(InputFile(Path("night.fits"), "ab" * 32),),
         versions={"python": "3.11.7"},
     )
@@ -152,7 +159,7 @@ def make_refit(folder: Path, **changes: Any) -> Path:
     """A run as `refit` leaves it; `changes` replace entries of its summary."""
     folder.mkdir(exist_ok=True)
     (folder / "summary.json").write_text(json.dumps(SUMMARY | changes))
-    write_product(folder / "calibration.fits", product(), overwrite=True)
+    write_calibration(folder / "calibration.fits", product(), overwrite=True)
     return folder
 
 

@@ -187,8 +187,8 @@ def test_calibration():
     from walop_jax.calibration import product
 
     text = section("files", "Calibration")
-    names = {*product._RULES, "COVARIANCE", *product._RULES["PARAMETERS"]}
-    names |= keys_written("walop_jax.calibration.product_header", "primary_hdu")
+    names = {*product.TABLES, "EXPOSURES", "COVARIANCE", *product.TABLES["PARAMETERS"]}
+    names |= keys_written("walop_jax.calibration.product", "_primary")
     assert unexplained(names, text) == []
 
 

@@ -38,17 +38,14 @@ SAID = {
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     """What the scripts find beside them."""
-    from walop_jax.calibration.calibration import Calibration
-    from walop_jax.calibration.product import write_product
+    from walop_jax.calibration import Calibration, write_calibration
 
     path = tmp_path_factory.mktemp("recipes")
     calset = simulate(SMALL, seed=SEED).calset
     write_calibration_set(path / "run.fits", calset)
     write_calibration_set(path / "night2.fits", simulate(SMALL, seed=SEED + 1).calset)
     (path / "RUN").mkdir()
-    write_product(
-        path / "RUN" / "calibration.fits", Calibration.from_fit(refit(calset).judged()).to_product()
-    )
+    write_calibration(path / "RUN" / "calibration.fits", Calibration.from_fit(refit(calset).judged()))
     x, y = np.random.default_rng(0).uniform(-0.25, 0.25, (2, 30))
     Table({"X": x, "Y": y}).write(path / "stars.csv")
     clp = np.flatnonzero(calset.exposures.kind == "clp")

@@ -17,7 +17,6 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import _physics
 from walop_jax.calibration.matrix import analysis_vectors, matrices
-from walop_jax.calibration.matrix_table import matrix_columns
 from walop_jax.data import DataError
 from walop_jax.data.calset import empty_sources
 from walop_jax.data.catalogue import read_catalogue
@@ -116,7 +115,7 @@ def calibration(model) -> Calibration:
     )  # fmt: skip
     verdict = Verdict(1.0, 1, 16, 1.0, converged=True)
     return Calibration(
-        model=model,
+        fitted=model,
         values=np.asarray(values_of(model.template)),
         covariance=np.diag(sigma**2),
         verdict=verdict,
@@ -228,7 +227,7 @@ def test_flags_and_columns(calibration):
     """One row has no inverse, so its cross-talk is no matter; a filter that was never used is."""
     settings = dataclasses.replace(settings_of(HWP, RET), filter=np.array(["line"] * 3 + ["SDSS-r"]))
     outside = np.array([False, True, False, False])
-    columns = matrix_columns(calibration, X, Y, settings, outside)
+    columns = calibration.matrix_columns(X, Y, settings, outside)
     assert list(columns) == ["M21", "M22", "M23", "M21_ERR", "M22_ERR", "M23_ERR", "FLAG"]
     assert columns["FLAG"][0].tolist() == [0, 32, 0, 64]
     assert np.isnan(columns["M22"][0]).tolist() == outside.tolist()

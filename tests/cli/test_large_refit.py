@@ -16,11 +16,11 @@ import pytest
 from astropy.io import fits
 
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.maps import residual_names
 from walop_jax.calibration.product import read_product, write_product
-from walop_jax.calibration.records import residual_names
 from walop_jax.data import Grid, write_frames
 from walop_jax.likelihood import limits
-from walop_jax.reports import product_figures
+from walop_jax.reports import figures
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -107,7 +107,7 @@ def test_the_map_stays_with_the_calibration(finished, tmp_path):
     copy = read_product(tmp_path / "copy.fits")
     assert copy.content_hash() == again.content_hash()
     np.testing.assert_array_equal(copy.residuals.values, product.residuals.values)
-    figure = product_figures.residual_map_figure(product.residuals)
+    figure = figures.residual_map_figure(product.residuals)
     assert len(figure.axes) == 16
 
 

@@ -17,7 +17,7 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np  # noqa: E402
 
 import walop_jax as walop  # noqa: E402
-from walop_jax.calibration.matrix_slopes import effect_slopes  # noqa: E402
+from walop_jax.calibration.matrix import effect_slopes  # noqa: E402
 from walop_jax.diagnosis.change_of_stokes import first_setting  # noqa: E402
 from walop_jax.diagnosis.detection_limits import detection_limits  # noqa: E402
 from walop_jax.diagnosis.effect_columns import probes  # noqa: E402

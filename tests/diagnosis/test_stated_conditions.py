@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 from small_run import SEED, SMALL, small_fit
 
-from walop_jax.calibration.matrix_slopes import change_of_qu, matrix_slopes
+from walop_jax.calibration.matrix import change_of_qu, matrix_slopes
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import stated_conditions as conditions

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.from_file import read_calibration
+from walop_jax.calibration.product import read_calibration
 from walop_jax.data import read_calibration_set
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_builder import base_model

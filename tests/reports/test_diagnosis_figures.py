@@ -10,7 +10,7 @@ import pytest
 from matplotlib.collections import PatchCollection
 
 from walop_jax.reports import diagnosis_figures as figures
-from walop_jax.reports import product_figures
+from walop_jax.reports import figures as of_calibrations
 
 
 def tiles(figure) -> list[PatchCollection]:
@@ -91,12 +91,12 @@ def test_ladder_shows_chi2_per_degree_of_freedom():
 
 def test_maps_of_a_product_are_those_of_the_file():
     maps = handmade_run.product().maps
-    figure = product_figures.matrix_maps_figure(maps)
+    figure = of_calibrations.matrix_maps_figure(maps)
     first = figure.axes[0].images[0]
     np.testing.assert_allclose(first.get_array(), 100.0 * maps.values[0])
     assert first.get_clim() == pytest.approx((-3.0, 3.0))  # −3 to 2 per cent, symmetric
     assert first.get_extent() == pytest.approx((-0.25, 0.25, -0.25, 0.25))
     one_arm = dataclasses.replace(maps, values=maps.values[:3], errors=maps.errors[:3])
-    assert len([a for a in product_figures.matrix_maps_figure(one_arm).axes if a.get_title()]) == 3
-    errors = product_figures.matrix_errors_figure(maps)
+    assert len([a for a in of_calibrations.matrix_maps_figure(one_arm).axes if a.get_title()]) == 3
+    errors = of_calibrations.matrix_errors_figure(maps)
     np.testing.assert_allclose(errors.axes[5].images[0].get_array(), 0.02)

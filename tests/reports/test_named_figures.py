@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from small_run import SEED, SMALL
 
+from walop_jax.calibration import write_calibration
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.product import write_product
-from walop_jax.calibration.retardance import plate_retardances, retardance
 from walop_jax.data import read_calibration_set, write_calibration_set
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model import mueller
-from walop_jax.reports.matrix_panels import element_kind
+from walop_jax.paper.retardance import plate_retardances, retardance
 from walop_jax.reports.named import FIGURES, Source, draw
 from walop_jax.reports.posterior_figures import informed
+from walop_jax.reports.style import element_kind
 from walop_jax.runs.plot import plot_figure
 from walop_jax.simulation.simulate import simulate
 
@@ -29,7 +29,7 @@ def source(tmp_path_factory) -> Source:
     folder = tmp_path_factory.mktemp("run")
     write_calibration_set(folder / "set.fits", simulate(SMALL, seed=SEED).calset)
     calibration = Calibration.from_fit(refit(read_calibration_set(folder / "set.fits")).judged())
-    write_product(folder / "calibration.fits", calibration.to_product())
+    write_calibration(folder / "calibration.fits", calibration)
     return Source(folder)
 
 
@@ -59,7 +59,7 @@ def test_names_and_files(source, tmp_path):
 
 
 def test_maps_say_their_scale(source):
-    maps = source.product.maps
+    maps = source.maps
     axis = draw("efficiency", source).axes[0]
     low, high = (float(part.replace("−", "-")) for part in axis.get_title().splitlines()[1].split(" … "))
     np.testing.assert_allclose(

@@ -381,7 +381,7 @@ def _with(calibration, model, known=0.0):
     where = np.array([model.names.index(name) for name in old])
     values[where] = calibration.values
     covariance[np.ix_(where, where)] = calibration.covariance
-    return dataclasses.replace(calibration, model=model, values=values, covariance=covariance)
+    return dataclasses.replace(calibration, fitted=model, values=values, covariance=covariance)
 
 
 # ------------------------------------------------------------------------------------------------ catalogues

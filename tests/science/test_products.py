@@ -8,13 +8,14 @@ import json
 import numpy as np
 import pytest
 from astropy.io import fits
+from handmade_run import listed
 from small_run import SMALL
 from typer.testing import CliRunner
 
 import walop_jax.science.epoch
+from walop_jax.calibration import write_calibration
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify, validity
-from walop_jax.calibration.product import write_product
 from walop_jax.commands.program import app
 from walop_jax.data import write_calibration_set
 from walop_jax.fit.model_builder import model_for
@@ -43,7 +44,7 @@ def product(first, tmp_path_factory):
 
     path = tmp_path_factory.mktemp("sets") / "first.fits"
     write_calibration_set(path, simulate(SMALL, seed=5).calset)
-    return calibrate(read_calibration_set(path)).to_product()
+    return listed(calibrate(read_calibration_set(path)))
 
 
 def failed(product):
@@ -79,17 +80,15 @@ def test_what_is_wrong_is_named(product):
     assert "validity" in failed(changed(exposures=exposures))
     assert failed(changed(inputs=())) == ["parents"]
     maps = dataclasses.replace(product.maps, values=product.maps.values + 1e-5)
-    assert failed(changed(maps=maps)) == ["maps"]
-    assert failed(changed(model=("[model]", 'effects = ["no_such"]'))) == ["model"]
-    values = product.parameters.value.copy()
-    values[product.parameters.name.tolist().index("half1.efficiency")] = (
-        1.2  # analyses more light than there is
-    )
-    assert "physics" in failed(changed(parameters=dataclasses.replace(product.parameters, value=values)))
+    assert failed(listed(product, maps=maps)) == ["maps"]
+    assert failed(listed(product, lines=("[model]", 'effects = ["no_such"]'))) == ["model"]
+    values = product.values.copy()
+    values[product.fitted.names.index("half1.efficiency")] = 1.2  # analyses more light than there is
+    assert "physics" in failed(changed(values=values))
 
 
 def test_validity_stands_in_the_header(product, tmp_path):
-    write_product(tmp_path / "p.fits", product)
+    write_calibration(tmp_path / "p.fits", product)
     header = fits.getheader(tmp_path / "p.fits")
     known = validity(product)
     assert (header["MJD-BEG"], header["MJD-END"]) == pytest.approx(known.mjd)
@@ -98,7 +97,7 @@ def test_validity_stands_in_the_header(product, tmp_path):
 
 
 def test_certify_from_the_command_line(product, tmp_path):
-    write_product(tmp_path / "good.fits", product)
+    write_calibration(tmp_path / "good.fits", product)
     result = CliRunner().invoke(app, ["certify", str(tmp_path / "good.fits"), "--json"])
     assert result.exit_code == 0, result.output
     told = json.loads(result.stdout)
@@ -108,7 +107,7 @@ def test_certify_from_the_command_line(product, tmp_path):
     bad = dataclasses.replace(
         product, verdict=dataclasses.replace(product.verdict, against=(Doubt(Quality.DOUBTED, ""),))
     )
-    write_product(tmp_path / "bad.fits", bad)
+    write_calibration(tmp_path / "bad.fits", bad)
     result = CliRunner().invoke(app, ["certify", str(tmp_path / "bad.fits"), "--quiet"])
     assert result.exit_code == 1
     assert "explains the data" in result.stderr
@@ -191,7 +190,7 @@ def test_the_new_set_is_fitted_with_the_old_model(first, monkeypatch):
 
 
 def test_epoch_from_the_command_line(product, first, tmp_path):
-    write_product(tmp_path / "old.fits", product)
+    write_calibration(tmp_path / "old.fits", product)
     write_calibration_set(tmp_path / "new.fits", simulate(SMALL, seed=300, instrument=first[0]).calset)
     result = CliRunner().invoke(
         app, ["epoch", str(tmp_path / "old.fits"), str(tmp_path / "new.fits"), "--json"]

@@ -37,15 +37,15 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from astropy.table import Table  # noqa: E402
+from handmade_run import parameters  # noqa: E402
 from handmade_set import Handmade  # noqa: E402
 
-from walop_jax.calibration.product import (  # noqa: E402
-    CalibrationProduct,
+from walop_jax.calibration import (  # noqa: E402
+    Calibration,
+    ListedModel,
     MatrixMaps,
-    ParameterTable,
-    Verdict,
-    read_product,
-    write_product,
+    read_calibration,
+    write_calibration,
 )  # fmt: skip
 from walop_jax.data import DataError, read_calibration_set  # noqa: E402
 from walop_jax.data.catalogue import read_catalogue  # noqa: E402
@@ -53,6 +53,7 @@ from walop_jax.data.frames import Grid  # noqa: E402
 from walop_jax.data.user_tables import read_input_table  # noqa: E402
 from walop_jax.fit.model_builder import base_model, model_for  # noqa: E402
 from walop_jax.fit.model_file import render  # noqa: E402
+from walop_jax.fit.verdict import Verdict  # noqa: E402
 from walop_jax.model.build import nominal_instrument  # noqa: E402
 
 SLOWEST = 10  # seconds
@@ -116,8 +117,8 @@ def _read_set(path: Path) -> Answer:
 
 
 def _read_product(path: Path) -> Answer:
-    product = read_product(path)
-    return Answer(digest(dataclasses.replace(product, inputs=())))
+    product = read_calibration(path, rebuild=False)
+    return Answer(digest(dataclasses.replace(product, inputs=(), path=None)))
 
 
 def _read_catalogue(path: Path) -> Answer:
@@ -129,22 +130,22 @@ def _product(folder: Path) -> bytes:
     rng = np.random.default_rng(5)
     root = 1e-3 * rng.standard_normal((3, 3))
     grid = Grid(4, 3, (2.5, 2.0), (0.0, 0.0), ((0.1, 0.0), (0.0, 0.2)))
-    nan = float("nan")
-    product = CalibrationProduct(
-        instrument=calset.instrument, site=calset.site, origin="by hand", date="2026-11-21T10:00:00",
+    three = parameters(
+        ("pupil.magnification", "", 15.63, (15.63, 0.05), True),
+        ("collimator.q", "", 0.0, (0.0, 0.0015), True),
+        ("throughput.n0.p00", "", 0.5, None, False),
+    )
+    maps = MatrixMaps(grid, "SDSS-r", rng.random((6, 3, 4)), rng.random((6, 3, 4)))
+    product = Calibration(
+        fitted=ListedModel(calset.instrument, three, maps, ("[model]", 'instrument = "WALOP-SOUTH"')),
+        values=np.array([15.63, 1.0 / 3.0, 0.5]), site=calset.site, origin="by hand", date="2026-11-21T10:00:00",
         verdict=Verdict(3e4, 33000, 44000, 1.0, True),
-        parameters=ParameterTable(
-            name=np.array(["pupil.magnification", "collimator.q", "throughput.n0.p00"]),
-            value=np.array([15.63, 1.0 / 3.0, 0.5]), sigma=np.sqrt(np.diag(root @ root.T)),
-            unit=np.array(["", "", ""]), prior_mean=np.array([15.63, 0.0, nan]),
-            prior_width=np.array([0.05, 0.0015, nan]), free=np.array([True, True, False]),
-        ),
-        covariance=root @ root.T, maps=MatrixMaps(grid, "SDSS-r", rng.random((6, 3, 4)), rng.random((6, 3, 4))),
+        covariance=root @ root.T,
         field=(-0.29, 0.29, -0.3, 0.25), exposures=calset.exposures, filters=calset.filters,
-        sources=calset.sources, model=("[model]", 'instrument = "WALOP-SOUTH"'), inputs=calset.inputs,
+        sources=calset.sources, inputs=calset.inputs,
         versions={"python": "3.11"},
     )  # fmt: skip
-    write_product(folder / "product.fits", product)
+    write_calibration(folder / "product.fits", product)
     return (folder / "product.fits").read_bytes()
 
 

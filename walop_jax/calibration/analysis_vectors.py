@@ -22,12 +22,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.colour import colour_nodes, colour_weights
 from walop_jax.calibration.matrix import in_chunks, sky_vectors
 from walop_jax.data.settings import Settings
 from walop_jax.likelihood import limits, linear
 from walop_jax.likelihood.field_table import FieldTable, accurate_table, held_out
-from walop_jax.model import light
+from walop_jax.model import chebyshev, light
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import compiled
 from walop_jax.model.dependence import needs
@@ -43,7 +42,24 @@ DERIVATIVE_NODES = (14, 20, 28, 40)
 TOLERANCE = 1e-7  # of a vector's largest element
 DERIVATIVE_TOLERANCE = 1e-3  # of a derivative's largest value: errors of errors
 BETWEEN = (2300.0, 3500.0, 5772.0, 12000.0, np.nan)  # colour temperatures (K) at which a table is checked
+COOLEST = 2000.0  # K; no Planck curve describes the spectrum of a cooler star in a red filter
 REACH = 1.25  # of the calibrated field: beyond, no polynomial of the throughput means anything
+
+
+def colour_nodes(count: int) -> Float[np.ndarray, " c"]:
+    """Colour temperatures (K) at which a Chebyshev series in 1/T over [0, 1/`COOLEST`] is made."""
+    return COOLEST / (0.5 * (1.0 + chebyshev.nodes(count)))
+
+
+def colour_weights(teff: Float[np.ndarray, " p"], count: int) -> Float[np.ndarray, "p c"]:
+    """Weights of the functions (flat spectrum, then `colour_nodes`) for sources of temperature `teff` (K).
+
+    NaN is a flat photon spectrum; what is cooler than `COOLEST` is taken as that.
+    """
+    flat = np.isnan(teff)
+    t = 2.0 * np.minimum(COOLEST / np.where(flat, COOLEST, teff), 1.0) - 1.0
+    lagrange = chebyshev.polynomials(t, count) @ chebyshev.to_coefficients(count)
+    return np.concatenate([flat[:, None].astype(float), np.where(flat[:, None], 0.0, lagrange)], axis=1)
 
 
 class Local(NamedTuple):

@@ -1,22 +1,23 @@
-"""A calibration: what a fit has learnt of an instrument, ready to be asked for the matrix in the field.
+"""A calibration: all that a fit has learnt of an instrument, and all that `calibration.fits` holds (`product`).
 
-It is made from a fit, goes into a calibration product and comes back from one with the same answers.
+It is made from a fit or read from a file, and is asked for the matrix anywhere in the field.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import datetime
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+import functools
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.calibration.matrix import matrices, matrix_draws
-from walop_jax.calibration.matrix_slopes import change_of_qu, matrix_slopes
-from walop_jax.calibration.product import CalibrationProduct, MatrixMaps, ParameterTable, in_ascii
-from walop_jax.calibration.records import ResidualMap
+from walop_jax.calibration.maps import MatrixMaps, ResidualMap, matrix_names
+from walop_jax.calibration.matrix import change_of_qu, matrices, matrix_draws, matrix_slopes
 from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter, single_wavelength
 from walop_jax.data.frames import Grid
 from walop_jax.data.quantities import in_unit
@@ -31,30 +32,63 @@ from walop_jax.instruments.description import parsed
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.software import software_versions
+from walop_jax.io.text import in_ascii
+from walop_jax.likelihood.expansion import STATED
 from walop_jax.model import carried
 from walop_jax.model.build import adapted, build, nominal_instrument
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.specification import Model, effect_context
+from walop_jax.model.specification import Model, Parameter, effect_context
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
+Columns = dict[str, tuple[np.ndarray, str]]  # values, description
 
-MAP_SIZE = 31  # pixels along each axis of the maps of a product: 0.02° over ±0.3°
+MAP_SIZE = 31  # pixels along each axis of the maps: 0.02° over ±0.3°
 HIGH_CROSSTALK = 10.0  # condition number of the local 2 × 2 inverse
 TEMPERATURE_MARGIN = 2.0  # K beyond the temperatures of the exposures
+
+
+def now() -> str:
+    """Date and time, UTC, ISO 8601 to the second."""
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds").replace("+00:00", "")
+
+
+class ListedModel(NamedTuple):
+    """The model of a calibration as its file holds it, not rebuilt: parameters, and what follows from the model.
+
+    `name` is that of the instrument; `maps` are of the matrix; `lines` those of the model file of the fit,
+    `description` those of the description of an instrument that does not come with the package.
+    """
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    maps: MatrixMaps
+    lines: tuple[str, ...]
+    description: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(p.name for p in self.parameters)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Calibration(Displayed):
     """An instrument as fitted: model, values and covariance of all parameters, and where they come from.
 
-    `field` is (smallest x, largest x, smallest y, largest y) in degrees of the points that were used. With `draws` of a
-    posterior, matrices and their covariance are means over these instead of the linear propagation of `covariance`.
+    `field` is (smallest x, largest x, smallest y, largest y) in degrees of the points that were used. `residuals` is
+    what the model leaves over the field, `hidden` are mistakes that would not have been found; `date` is UTC,
+    `versions` name the software. With `draws` of a posterior, matrices and their covariance are means over these
+    instead of the linear propagation of `covariance`.
+
+    `fitted` is the model, a `ListedModel` where it was not rebuilt from its file (`rebuilt`). `listed` is how the file
+    held a model that was rebuilt; `dataclasses.replace` forgets it, and maps and texts are made anew. Raises ValueError
+    for shapes that do not belong together.
     """
 
-    model: Model
+    fitted: Model | ListedModel
     values: Vector
     covariance: Matrix
     verdict: Verdict
@@ -66,8 +100,23 @@ class Calibration(Displayed):
     field: tuple[float, float, float, float]
     inputs: tuple[InputFile, ...] = ()
     residuals: ResidualMap | None = None
-    draws: Float[np.ndarray, "d n"] | None = None
     hidden: Hidden | None = None
+    date: str = dataclasses.field(default_factory=now)
+    versions: Mapping[str, str] = dataclasses.field(default_factory=software_versions)
+    draws: Float[np.ndarray, "d n"] | None = None
+    path: Path | None = None
+    listed: dataclasses.InitVar[ListedModel | None] = None
+
+    def __post_init__(self, listed: ListedModel | None) -> None:
+        n = len(self.fitted.parameters)
+        if self.covariance.shape != (n, n):
+            raise ValueError(f"covariance has shape {self.covariance.shape}, there are {n} parameters")
+        held = self.fitted if isinstance(self.fitted, ListedModel) else listed
+        if held is None:
+            return
+        vars(self).update(maps=held.maps, model_lines=held.lines, description=held.description)
+        if self.residuals is not None and self.residuals.arms != held.maps.arms:
+            raise ValueError(f"a residual map of {self.residuals.arms} arms, the matrix has {held.maps.arms}")
 
     @classmethod
     def from_fit(cls, result: FitResult, residuals: ResidualMap | None = None) -> Calibration:
@@ -78,7 +127,7 @@ class Calibration(Displayed):
         """
         calset = result.calset
         return cls(
-            model=result.model,
+            fitted=result.model,
             values=result.values,
             covariance=0.5 * (result.covariance + result.covariance.T),
             verdict=result.checked_verdict(),
@@ -93,10 +142,123 @@ class Calibration(Displayed):
             hidden=result.hidden,
         )
 
+    def rebuilt(self, catalogue: Sequence[type[Effect]] = EFFECTS) -> Calibration:
+        """The calibration with its model rebuilt from the lines of its file; parameters go by name.
+
+        `catalogue` are the effects that the model may have. Raises ValueError if it cannot be rebuilt, or has other
+        parameters than the file lists.
+        """
+        if isinstance(self.fitted, Model):
+            return self
+        sources, names = self.sources, self.fitted.names
+        standards = list(zip(standard_names(sources), sources.q.tolist(), sources.u.tolist(), strict=True))
+        context = effect_context(adapted(self.design, standards=standards), self.exposures)
+        text = "\n".join(self.model_lines)
+        model = model_without_data(
+            self.design, text, standards=standards, context=context, catalogue=catalogue
+        )
+        if sorted(model.names) != sorted(names):
+            odd = sorted(set(model.names) ^ set(names)) or ["one of them twice"]
+            raise DataError(
+                f"the model of the product has other parameters than it lists ({', '.join(odd[:3])}): it was "
+                "made by a version with other physics; fit again"
+            )
+        order, hidden = np.array([names.index(name) for name in model.names]), self.hidden
+        return dataclasses.replace(
+            self,
+            fitted=model,
+            values=self.values[order],
+            covariance=self.covariance[np.ix_(order, order)],
+            hidden=hidden
+            if hidden is None
+            else dataclasses.replace(hidden, changes=hidden.changes[:, order]),
+            listed=self.fitted,
+        )
+
+    def with_covariance(self, covariance: Matrix, errors_from: str) -> Calibration:
+        """The calibration with the covariance of a posterior, made of errors from `errors_from`, as made now."""
+        verdict = dataclasses.replace(self.verdict, covariance_from="posterior", errors_from=errors_from)
+        return dataclasses.replace(
+            self, covariance=covariance, verdict=verdict, date=now(), versions=software_versions()
+        )
+
+    @property
+    def instrument(self) -> str:
+        """Name of the instrument."""
+        return self.fitted.name
+
+    @property
+    def model(self) -> Model:
+        """The model; RuntimeError where it was not rebuilt."""
+        if not isinstance(self.fitted, Model):
+            raise RuntimeError(
+                "the model of this calibration was not rebuilt: ask the one that `rebuilt` returns"
+            )
+        return self.fitted
+
+    @property
+    def design(self) -> Instrument:
+        """The instrument as designed: from the description in the file, or the one that comes with the package.
+
+        Raises `DataError` for elements that only the fit has known: such a product is rebuilt where they are known.
+        """
+        if isinstance(self.fitted, Model):
+            return self.fitted.template
+        if not self.description:
+            return nominal_instrument(self.fitted.name)
+        name = f"the description of {self.fitted.name} in the product"
+        return build(parsed("\n".join(self.description), name))
+
+    @functools.cached_property
+    def model_lines(self) -> tuple[str, ...]:
+        """The model file of the fit, line by line in ASCII."""
+        return _lines(render(self.model))
+
+    @functools.cached_property
+    def description(self) -> tuple[str, ...]:
+        """The description file of an instrument that does not come with the package, line by line in ASCII."""
+        return _lines(self.model.template.description)
+
+    # names of before
+    def to_product(self) -> Calibration:
+        """Return it."""
+        return self
+
+    @classmethod
+    def from_product(cls, product: Calibration, catalogue: Sequence[type[Effect]] = EFFECTS) -> Calibration:
+        """Return it rebuilt."""
+        return product.rebuilt(catalogue)
+
+    product = property(to_product)
+    calibration = property(to_product)
+
+    @property
+    def parameters(self) -> Any:
+        """Return the columns."""
+        import types
+
+        return types.SimpleNamespace(**{n.lower(): v for n, v in self.parameter_columns().items()})
+
+    # end of names of before
+
     @property
     def sigma(self) -> Vector:
         """Standard errors of all parameters."""
         return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
+
+    @property
+    def prior_width(self) -> dict[str, float]:
+        """Standard deviations of the priors by parameter, NaN where there is none."""
+        return {p.name: np.nan if p.prior is None else p.prior[1] for p in self.fitted.parameters}
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence if the calibration is not to be trusted."""
+        if self.verdict.trusted:
+            return ()
+        where = "" if self.path is None else f"{self.path}: "
+        why = "; ".join(self.verdict.warnings) or "see WARNINGS"
+        return (f"{where}this calibration is not trusted: {why}",)
 
     def to_table(self) -> Any:
         """All parameters as an astropy table: value, error, unit, start, prior, and whether it was free."""
@@ -257,8 +419,8 @@ class Calibration(Displayed):
             beyond |= settings.temperature > high + TEMPERATURE_MARGIN
         return beyond
 
-    def maps(self, size: int = MAP_SIZE) -> MatrixMaps:
-        """The matrix over the field on a regular grid, for a look at it.
+    def new_maps(self, size: int = MAP_SIZE) -> MatrixMaps:
+        """The matrix over the field on a regular grid, computed anew, for a look at it.
 
         In `usual_settings`, through SDSS-r or the first filter of the exposures where they do not use that.
         """
@@ -277,106 +439,121 @@ class Calibration(Displayed):
             grid, name, values.T.reshape(planes), errors.T.reshape(planes), settings[:1].further()
         )
 
-    # ------------------------------------------------------------------------------- into a file and back
+    @functools.cached_property
+    def maps(self) -> MatrixMaps:
+        """The maps of the file that it was read from, or made anew."""
+        return self.new_maps()
 
-    def to_product(self) -> CalibrationProduct:
-        """The record that `write_product` writes; its texts are in plain ASCII."""
-        parameters = self.model.parameters
-        priors = np.array([p.prior or (np.nan, np.nan) for p in parameters]).reshape(-1, 2)
-        maps = self.maps()
-        against = tuple(
-            dataclasses.replace(doubt, sentence=in_ascii(doubt.sentence)) for doubt in self.verdict.against
+    # ------------------------------------------------------------------------------- tables and contents
+
+    def provenance(self, content: str = "") -> dict[str, str]:
+        """Cards of a table of matrices: the calibration (hash of its content), and what the errors are made from."""
+        verdict = self.verdict
+        drawn = (
+            "draws of the posterior"
+            if self.draws is not None
+            else f"covariance of the {verdict.covariance_from}"
         )
-        return CalibrationProduct(
-            instrument=self.model.name,
-            site=self.site,
-            origin=in_ascii(self.origin),
-            date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds").replace("+00:00", ""),
-            verdict=dataclasses.replace(self.verdict, against=against),
-            parameters=ParameterTable(
-                name=np.array([p.name for p in parameters]),
-                value=self.values,
-                sigma=self.sigma,
-                unit=np.array([p.unit for p in parameters]),
-                prior_mean=priors[:, 0],
-                prior_width=priors[:, 1],
-                free=np.array([p.free and p.tie is None for p in parameters]),
-            ),
-            covariance=self.covariance,
-            maps=maps,
-            field=self.field,
-            exposures=self.exposures,
-            filters=self.filters,
-            sources=self.sources,
-            model=tuple(_lines(render(self.model))),
-            inputs=self.inputs,
-            versions=software_versions(),
-            residuals=self.residuals,
-            description=tuple(_lines(self.model.template.description)),
-            hidden=self.hidden,
-        )
+        return {
+            "CALHASH": content or self.content_hash(),
+            "ERRFROM": f"{drawn}, {verdict.errors_from}",
+            "TRUSTED": str(verdict.trusted)[0],
+        }
 
-    @classmethod
-    def from_product(
-        cls, product: CalibrationProduct, catalogue: Sequence[type[Effect]] = EFFECTS
-    ) -> Calibration:
-        """The calibration that a product holds; parameters go by name, whatever their order there.
+    def matrix_columns(
+        self,
+        x: Float[np.ndarray, " p"],
+        y: Float[np.ndarray, " p"],
+        settings: Settings,
+        outside: Bool[np.ndarray, " p"],
+    ) -> Columns:
+        """The matrix elements, their standard errors and FLAG, each with its description; NaN and 32 where `outside`.
 
-        `catalogue` are the effects that its model may have.
-        Raises ValueError if the model of the product cannot be rebuilt, or has other parameters than it
-        lists.
+        Raises `DataError` for a filter that neither the calibration nor the package knows.
         """
-        model = model_of_product(product, catalogue)
-        names = [str(name) for name in product.parameters.name]
-        if sorted(model.names) != sorted(names):
-            odd = sorted(set(model.names) ^ set(names)) or ["one of them twice"]
-            raise DataError(
-                f"the model of the product has other parameters than it lists ({', '.join(odd[:3])}): it was "
-                "made by a version with other physics; fit again"
-            )
-        place = {name: n for n, name in enumerate(names)}
-        order = np.array([place[name] for name in model.names])
-        return cls(
-            model=model,
-            values=product.parameters.value[order],
-            covariance=product.covariance[np.ix_(order, order)],
-            verdict=product.verdict,
-            filters=product.filters,
-            exposures=product.exposures,
-            sources=product.sources,
-            site=product.site,
-            origin=product.origin,
-            field=product.field,
-            inputs=product.inputs,
-            residuals=product.residuals,
-            hidden=None
-            if product.hidden is None
-            else dataclasses.replace(product.hidden, changes=product.hidden.changes[:, order]),
-        )
+        inside = np.flatnonzero(~outside)
+        there, covariance = self.matrix(x[inside], y[inside], settings[inside])
+        values, errors = np.full((2, len(x), there.shape[1]), np.nan)
+        values[inside] = there
+        errors[inside] = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
+        flag = np.full(len(x), Quality.BEYOND_FIELD, np.int32)
+        flag[inside] = self.flags(x[inside], y[inside], settings[inside], values[inside])
+        names = matrix_names(values.shape[1] // 3)
+        columns: Columns = {
+            name: (column, f"element {name.lower()} of the instrument matrix")
+            for name, column in zip(names, values.T, strict=True)
+        }
+        for name, column in zip(names, errors.T, strict=True):
+            columns[f"{name}_ERR"] = column, f"standard error of {name}"
+        columns["FLAG"] = flag, "16 high cross-talk, 32 beyond the calibrated field, 64 filter or temperature"
+        return columns
+
+    def parameter_columns(self) -> dict[str, np.ndarray]:
+        """The columns of PARAMETERS, priors NaN where there are none."""
+        parameters = self.fitted.parameters
+        priors = np.array([p.prior or (np.nan, np.nan) for p in parameters]).reshape(-1, 2)
+        return {
+            "NAME": np.array([p.name for p in parameters]),
+            "VALUE": np.asarray(self.values),
+            "SIGMA": self.sigma,
+            "UNIT": np.array([p.unit for p in parameters]),
+            "PRIOR_MEAN": priors[:, 0],
+            "PRIOR_WIDTH": priors[:, 1],
+            "FREE": np.array([p.free and p.tie is None for p in parameters]),
+        }
+
+    def content_hash(self, *, every_column: bool = True) -> str:
+        """SHA-256 of all that a calibration says of the instrument: not of dates, paths and versions.
+
+        Nor of structure and hidden mistakes, which versions that do not know them leave aside (the checksums of the
+        file hold them).
+
+        Without `every_column` only those columns of the exposures that the hashes of first products covered.
+        """
+        digest = hashlib.sha256()
+        verdict, maps = self.verdict, [self.maps, *((self.residuals,) if self.residuals is not None else ())]
+        # Twelve digits: a number in a FITS header may lose its last bit.
+        numbers = (verdict.chi2, verdict.noise_scale, *self.field)
+        texts = [
+            *(self.instrument, *self.model_lines, *self.description),
+            *(in_ascii(text) for text in verdict.warnings),
+            verdict.covariance_from,
+            *(str(value) for value in (verdict.dof, verdict.n_data, verdict.converged, verdict.trusted)),
+            *(str(int(verdict.quality)), *(f"{value:.11e}" for value in numbers)),
+            *(entry.sha256 for entry in self.inputs),
+            *((verdict.errors_from,) if verdict.errors_from != STATED else ()),
+            *(f"{prefix} {angle:.11e}" for one in maps for prefix, angle in one.positions.items()),
+        ]
+        for text in texts:
+            digest.update(text.encode() + b"\n")
+        for values in self._arrays(every_column):
+            if values.dtype.kind in "US":
+                digest.update("\n".join(values.astype(str).ravel().tolist()).encode() + b"\n")
+            else:
+                digest.update(np.asarray(values, "<f8").tobytes())
+        return digest.hexdigest()
+
+    def _arrays(self, every_column: bool) -> Iterable[np.ndarray]:
+        yield from self.parameter_columns().values()
+        yield from (getattr(self.sources, entry.name) for entry in dataclasses.fields(self.sources))
+        if every_column:
+            for name, values in self.exposures.columns().items():
+                yield from (np.array([name]), values)
+        else:
+            yield from (getattr(self.exposures, name) for name in ("exposure", "kind", "mjd", "filter"))
+            for prefix, position in self.exposures.moving.items():
+                yield from (np.array([prefix]), position.inside, position.angle)
+        yield from (self.covariance, self.maps.values, self.maps.errors)
+        if self.residuals is not None:
+            yield from (self.residuals.values, self.residuals.errors, self.residuals.chi2)
+        for name, curve in self.filters.items():
+            yield from (np.array([name]), curve.wavelength, curve.throughput)
 
 
-def _lines(text: str) -> Iterator[str]:
-    return (in_ascii(line) for line in text.splitlines() if line.strip())
+def _lines(text: str) -> tuple[str, ...]:
+    return tuple(in_ascii(line) for line in text.splitlines() if line.strip())
 
 
-def instrument_as_designed(product: CalibrationProduct) -> Instrument:
-    """The instrument of a product as designed, from the description that it holds or that comes with the package.
-
-    Raises `DataError` for elements that only the fit has known: such a product is rebuilt where they are known.
-    """
-    if not product.description:
-        return nominal_instrument(product.instrument)
-    return build(
-        parsed("\n".join(product.description), f"the description of {product.instrument} in the product")
-    )
-
-
-def model_of_product(product: CalibrationProduct, catalogue: Sequence[type[Effect]] = EFFECTS) -> Model:
-    """The model of a product from its lines of TOML, its standards and its exposures."""
-    sources = product.sources
-    names = standard_names(sources)
-    standards = list(zip(names, sources.q.tolist(), sources.u.tolist(), strict=True))
-    design = instrument_as_designed(product)
-    context = effect_context(adapted(design, standards=standards), product.exposures)
-    text = "\n".join(product.model)
-    return model_without_data(design, text, standards=standards, context=context, catalogue=catalogue)
+def model_of_product(product: Calibration, catalogue: Sequence[type[Effect]] = EFFECTS) -> Model:
+    """Name of before."""
+    return product.rebuilt(catalogue).model

@@ -1,7 +1,7 @@
 """Is a calibration product fit for use? Checks that fail closed: one that does not hold makes the product invalid.
 
-A product is read with its checksums, version and content hash before it comes here (`data/product.py`); what is left
-to find out is whether it says what its own parameters say, and whether that is physics.
+A product is read with its checksums, version and content hash before it comes here (`read_calibration`, without its
+model); what is left to find out is whether it says what its own parameters say, and whether that is physics.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.product import CalibrationProduct
 from walop_jax.data.filters import BUILTIN_FILTERS
 from walop_jax.fit.verdict import Quality
 from walop_jax.model.effects import EFFECTS, Effect
@@ -34,15 +33,15 @@ class Check(NamedTuple):
 
 
 class Validity(NamedTuple):
-    """What a product may be applied to: MJD of its exposures, their filters, their temperatures (Celsius)."""
+    """Range of application of a calibration: MJD of its exposures, their filters, their temperatures (Celsius)."""
 
     mjd: tuple[float, float]
     filters: tuple[str, ...]
     temperature: tuple[float, float]
 
 
-def validity(product: CalibrationProduct) -> Validity:
-    """Dates, filters and temperatures of the exposures that a product was made from; NaN where none are known."""
+def validity(product: Calibration) -> Validity:
+    """Dates, filters and temperatures of the exposures that a calibration was made from; NaN where none are known."""
     e = product.exposures
     return Validity(_range(e.mjd), tuple(np.unique(e.filter).tolist()), _range(e.temp))
 
@@ -52,18 +51,18 @@ def _range(values: Float[np.ndarray, " e"]) -> tuple[float, float]:
     return (float(known.min()), float(known.max())) if known.size else (float("nan"), float("nan"))
 
 
-def certify(product: CalibrationProduct, catalogue: Sequence[type[Effect]] = EFFECTS) -> list[Check]:
+def certify(product: Calibration, catalogue: Sequence[type[Effect]] = EFFECTS) -> list[Check]:
     """All checks of a product that could be read, in a fixed order; those behind a failed one may be missing."""
     checks = [*_verdict(product), _covariance(product), _validity(product), _parents(product)]
     try:
-        calibration = Calibration.from_product(product, catalogue)
+        calibration = product.rebuilt(catalogue)
     except ValueError as error:
         return [*checks, Check("model", False, f"cannot be rebuilt: {error}")]
     checks.append(Check("model", True, f"{len(calibration.model.names)} parameters rebuilt by name"))
     return [*checks, _maps(product, calibration), _physics(calibration), _protection(calibration)]
 
 
-def _verdict(product: CalibrationProduct) -> list[Check]:
+def _verdict(product: Calibration) -> list[Check]:
     v = product.verdict
     return [
         Check(
@@ -84,20 +83,18 @@ def _verdict(product: CalibrationProduct) -> list[Check]:
     ]
 
 
-def _covariance(product: CalibrationProduct) -> Check:
+def _covariance(product: Calibration) -> Check:
     c = product.covariance
-    sigma = np.sqrt(np.clip(np.diag(c), 0.0, None))
-    scale = np.where(sigma > 0, sigma, 1.0)
+    scale = np.where(product.sigma > 0, product.sigma, 1.0)
     correlation = c / np.outer(scale, scale)
     lowest = float(np.linalg.eigvalsh(0.5 * (correlation + correlation.T))[0])
     lopsided = float(np.abs(correlation - correlation.T).max())
-    differing = float(np.abs(product.parameters.sigma - sigma).max(initial=0.0) / scale.max())
-    good = lowest > -1e-8 and lopsided < 1e-10 and differing < 1e-10
+    good = lowest > -1e-8 and lopsided < 1e-10
     found = f"smallest eigenvalue of the correlation {lowest:.1e}; made from {product.verdict.errors_from}"
     return Check("covariance", good, found)
 
 
-def _validity(product: CalibrationProduct) -> Check:
+def _validity(product: Calibration) -> Check:
     known = validity(product)
     unknown = [name for name in known.filters if name not in product.filters and name not in BUILTIN_FILTERS]
     good = bool(np.isfinite(known.mjd[0])) and not unknown
@@ -107,7 +104,7 @@ def _validity(product: CalibrationProduct) -> Check:
     return Check("validity", good, found + (f"; no curve of {', '.join(unknown)}" if unknown else ""))
 
 
-def _parents(product: CalibrationProduct) -> Check:
+def _parents(product: Calibration) -> Check:
     bad = [entry for entry in product.inputs if not re.fullmatch(r"[0-9a-f]{64}", entry.sha256)]
     good = bool(product.inputs) and not bad
     return Check(
@@ -115,8 +112,8 @@ def _parents(product: CalibrationProduct) -> Check:
     )
 
 
-def _maps(product: CalibrationProduct, calibration: Calibration) -> Check:
-    again = calibration.maps(product.maps.values.shape[1])
+def _maps(product: Calibration, calibration: Calibration) -> Check:
+    again = calibration.new_maps(product.maps.values.shape[1])
     if again.grid != product.maps.grid or again.positions != product.maps.positions:
         return Check("maps", False, "are not of the grid and setting that this program makes")
     off = float(np.abs(again.values - product.maps.values).max())

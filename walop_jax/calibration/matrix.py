@@ -1,25 +1,30 @@
-"""The instrument matrix anywhere in the field, with its covariance from the fit.
+"""The instrument matrix anywhere in the field, with its covariance from the fit, and its derivatives.
 
 Elements     three for each arm, m21, m22, m23, m31, … of `light.instrument_matrix`: band integrated, with throughput.
 Covariance   C_m = J C_θ Jᵀ with the exact J; the throughput series enters through its local values.
+Derivatives  to all parameters, and to the amplitudes of effects that are not there yet.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from walop_jax.calibration.maps import SMALLEST_DETERMINANT
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.likelihood import limits, linear
 from walop_jax.likelihood.runner import usual_threads
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
+from walop_jax.model.effects.base import Effect, with_amplitudes
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import with_values
 from walop_jax.model.plan import Plan, with_numbers
@@ -27,6 +32,9 @@ from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import Model
 
 Scalar = Float[Array, ""]
+Vector = Float[np.ndarray, " p"]
+
+LARGEST_P = 0.05
 
 
 def _point_vectors(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
@@ -80,8 +88,8 @@ _sky_vectors = compiled(jax.vmap(point_sky_vectors, in_axes=(None, None, 0, 0)),
 def analysis_vectors(
     instrument: Instrument,
     plan: Plan,
-    x: Float[np.ndarray, " p"],
-    y: Float[np.ndarray, " p"],
+    x: Vector,
+    y: Vector,
     size: int | None = None,
 ) -> Float[np.ndarray, "p b k 4"]:
     """Analysis vectors (point, band, camera, Stokes) for light behind the telescope, at field positions in degrees.
@@ -94,8 +102,8 @@ def analysis_vectors(
 def sky_vectors(
     instrument: Instrument,
     plan: Plan,
-    x: Float[np.ndarray, " p"],
-    y: Float[np.ndarray, " p"],
+    x: Vector,
+    y: Vector,
     size: int | None = None,
 ) -> Float[np.ndarray, "p b k 4"]:
     """As `analysis_vectors`, for light from the sky, which passes the telescope first."""
@@ -106,8 +114,8 @@ def matrices(
     instrument: Instrument,
     settings: Settings,
     filters: Mapping[str, FilterCurve],
-    x: Float[np.ndarray, " p"],
-    y: Float[np.ndarray, " p"],
+    x: Vector,
+    y: Vector,
     covariance: Float[np.ndarray, "n n"],
 ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
     """Elements of the instrument matrix (three for each arm) and their covariance at field positions (deg).
@@ -132,8 +140,8 @@ def matrix_draws(
     draws: Float[np.ndarray, "d n"],
     settings: Settings,
     filters: Mapping[str, FilterCurve],
-    x: Float[np.ndarray, " p"],
-    y: Float[np.ndarray, " p"],
+    x: Vector,
+    y: Vector,
 ) -> Float[np.ndarray, "d p m"]:
     """Elements of the instrument matrix at field positions (deg) for every draw of all parameters."""
     pairs = model.template.cameras.pairs
@@ -168,3 +176,73 @@ def in_chunks(
     with ThreadPoolExecutor(usual_threads()) as pool:
         parts += pool.map(solved, range(size, count, size))
     return tuple(np.concatenate(parts) for parts in zip(*parts, strict=True))
+
+
+# ------------------------------------------------------------------------------------------ derivatives
+
+
+def matrix_slopes(
+    instrument: Instrument, setting: Settings, filters: Mapping[str, FilterCurve], x: Vector, y: Vector
+) -> tuple[Float[np.ndarray, "p a 3"], Float[np.ndarray, "p a 3 n"]]:
+    """Instrument matrix (point, arm, element) at positions in degrees, and its derivatives to all parameters.
+
+    `setting` has one row. Raises KeyError for a filter that `filters` does not hold.
+    """
+    plan = plan_for_settings(instrument, setting, filters)
+    values, slopes = in_chunks(lambda a, b: _all_slopes(instrument, plan, a, b), x, y)
+    return values[:, 0], slopes[:, 0]
+
+
+def change_of_qu(
+    assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
+) -> Float[np.ndarray, " p"]:
+    """Largest error of q and u at each field point for stars polarised by up to `p`; NaN where not measured."""
+    found = np.full(len(assumed), np.nan)
+    if assumed.shape[1] != 2:  # one exposure of one arm, or of three, does not give q and u and nothing else
+        return found
+    good = np.abs(np.linalg.det(assumed[:, :, 1:])) > SMALLEST_DETERMINANT
+    inverse = np.linalg.inv(assumed[good, :, 1:])
+    change = (true - assumed)[good]
+    offset = np.linalg.norm(inverse @ change[:, :, :1], axis=(1, 2))
+    found[good] = offset + p * np.linalg.norm(inverse @ change[:, :, 1:], ord=2, axis=(1, 2))
+    return found
+
+
+def effect_slopes(
+    instrument: Instrument,
+    setting: Settings,
+    filters: Mapping[str, FilterCurve],
+    x: Vector,
+    y: Vector,
+    effects: tuple[Effect, ...],
+) -> Float[np.ndarray, "p a 3 e"]:
+    """Derivatives of the matrix with respect to the amplitudes of neutral effects, effect by effect in their order.
+
+    What of an effect does not go with the matrix (single exposures, ghosts, detectors) has none.
+    """
+    if not effects:
+        return np.zeros((len(x), len(instrument.arms), 3, 0))
+    there = dataclasses.replace(instrument, effects=(*instrument.effects, *effects))
+    plan = plan_for_settings(there, setting, filters)
+    few = limits.MATRIX_POINTS[0]  # many amplitudes at a time: few points
+    return in_chunks(lambda a, b: (_effect_slopes(instrument, plan, effects, a, b),), x, y, size=few)[0][:, 0]
+
+
+def _point_effect_slopes(
+    instrument: Instrument, plan: Plan, effects: tuple[Effect, ...], x: Scalar, y: Scalar
+) -> Float[Array, "b a 3 e"]:
+    neutral, put = with_amplitudes(instrument, effects)
+
+    def matrix(amplitudes: list[Float[Array, ...]]) -> Float[Array, "b a 3"]:
+        there = put(amplitudes)
+        return light.instrument_matrix(point_sky_vectors(there, plan, x, y), there.cameras.pairs)
+
+    _, push = jax.linearize(matrix, neutral)
+    flat, to_tree = ravel_pytree(neutral)
+    return jnp.moveaxis(jax.vmap(lambda one: push(to_tree(one)))(jnp.eye(flat.size)), 0, -1)
+
+
+_all_slopes = compiled(jax.vmap(point_matrix, in_axes=(None, None, 0, 0)), kept_as="slopes")
+_effect_slopes = compiled(
+    jax.vmap(_point_effect_slopes, in_axes=(None, None, None, 0, 0)), kept_as="effect_slopes"
+)

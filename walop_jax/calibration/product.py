@@ -1,4 +1,4 @@
-"""The calibration product, `calibration.fits`: what a fit has learnt, complete in one file.
+"""The file of a calibration, `calibration.fits`: what a fit has learnt, complete in one file.
 
     PRIMARY      instrument, verdict of the fit, validity (dates, temperatures, filters), versions of the software,
                  hash of the content
@@ -7,74 +7,58 @@
     M21 … M33    images of the instrument matrix over the field (filter of MAPFILT, flat photon spectrum,
                  calibration plate out), M21_ERR … M33_ERR their standard errors; linear WCS in degrees; three for
                  each arm of the instrument, further moving elements at ANGLE1, … of the elements ELEM1, …
-    RESIDUAL…    of a large set: what the smooth model leaves, in cells of the field (see residual_map.py)
+    RESIDUAL     (7, ny, nx), of a large set, in cells of the field: dm21 … dm33 to be added to the instrument matrix,
+                 and the relative change of the throughput of the second arm (cameras N2, N3); NaN where a cell has too
+                 few data. Of an instrument with A arms 4 A − 1 planes, PLANE1, … name them. RESIDUAL_ERR are their
+                 standard errors, RESIDUAL_CHI2 (ny, nx) is χ² per degree of freedom before that correction
     FILTERS      the filter curves that were used          } as in a calibration set
     EXPOSURES    the exposures that went in                }
-    SOURCES      the standards, if there were any          }
     MODEL        LINE: the model file of the fit, line by line
     INSTRUMENT   LINE: the description file of an instrument that does not come with the package
+    SOURCES      the standards, if there were any, as in a calibration set
     INPUTS       PATH, SHA256 of the calibration sets
     WARNINGS     TEXT: what does not hold
 
 PRODVERS is 2 for an instrument that is none of the first three or has not two arms, for further moving elements and
-for lamps, otherwise 1. FITS headers and tables hold ASCII only: Greek letters and signs are spelt out when a product
-is made.
+for lamps, otherwise 1. FITS headers and tables hold ASCII only: Greek letters and signs are spelt out.
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 from astropy.io import fits
 
-from walop_jax.calibration.product_header import (
-    PRODVERS,
-    ProductHeader,
-    position_cards,
-    primary_hdu,
-    product_version,
-    read_positions,
-)
-from walop_jax.calibration.records import (
-    CalibrationProduct,
-    MatrixMaps,
-    ParameterTable,
-    Verdict,
-    in_ascii,
-    matrix_names,
-)
-from walop_jax.calibration.residual_map_file import read_residual_map, residual_hdus
+from walop_jax.calibration.calibration import Calibration, ListedModel
+from walop_jax.calibration.maps import MatrixMaps, ResidualMap, matrix_names, residual_names
 from walop_jax.data import schema
 from walop_jax.data.calset import empty_sources
-from walop_jax.data.checks import instrument_name, make_exposures, make_filters, make_sources
-from walop_jax.data.frames import read_grid
-from walop_jax.data.records import InputFile, Site
+from walop_jax.data.checks import instrument_name, make_exposures, make_filters, make_sources, oldest_version
+from walop_jax.data.frames import Grid, read_grid
+from walop_jax.data.records import PREFIX, InputFile, Site
 from walop_jax.data.schema import Column, Place, column_names, read_table, table_rules
 from walop_jax.data.write import exposures_hdu, filter_columns, grid_cards, sign_and_write, table_hdu
-from walop_jax.fit.verdict import Hidden, Structure
+from walop_jax.fit.verdict import Hidden, Structure, Verdict
 from walop_jax.io.atomic import atomic_path
-from walop_jax.io.errors import DataError, fail
+from walop_jax.io.errors import DataError, errors_naming, fail
 from walop_jax.io.fits_reading import UNREADABLE, OpenFile, one_line, open_fits
+from walop_jax.io.text import in_ascii
 from walop_jax.likelihood.expansion import STATED
+from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.parameters import NAME
+from walop_jax.model.specification import Parameter
 
-__all__ = [
-    "PRODVERS",
-    "CalibrationProduct",
-    "MatrixMaps",
-    "ParameterTable",
-    "Verdict",
-    "in_ascii",
-    "read_product",
-    "write_product",
-]
+PRODUCT = "calibration.fits"
+PRODVERS = 2
+"""Newest version of the format; a product is written in the oldest version that can hold it."""
 
-_RULES: Mapping[str, Mapping[str, Column]] = {
+TABLES: Mapping[str, Mapping[str, Column]] = {
     "PARAMETERS": {
         "NAME": Column("str"),
         "VALUE": Column("float"),
@@ -84,264 +68,477 @@ _RULES: Mapping[str, Mapping[str, Column]] = {
         "PRIOR_WIDTH": Column("float", missing=float("nan")),
         "FREE": Column("bool"),
     },
+    "FILTERS": schema.FILTERS,
     "MODEL": {"LINE": Column("str")},
     "INSTRUMENT": {"LINE": Column("str")},
+    "SOURCES": schema.SOURCES,
     "INPUTS": {"PATH": Column("str"), "SHA256": Column("str")},
     "WARNINGS": {"TEXT": Column("str")},
-    "FILTERS": schema.FILTERS,
-    "SOURCES": schema.SOURCES,
 }
+"""Tables and their columns, EXPOSURES apart, whose columns depend on the instrument."""
+
+_RESIDUALS = {"RESIDUAL": "values", "RESIDUAL_ERR": "errors", "RESIDUAL_CHI2": "chi2"}
+_FIELD = ("FIELDXMI", "FIELDXMA", "FIELDYMI", "FIELDYMA")
 _MATRIX_IMAGE = re.compile(r"M([1-9][0-9]{0,2})[123](_ERR)?")
+_LONGEST_SOFTWARE_LIST = 30
+_AGAIN = "make the product again"
+
+Cards = dict[str, tuple[Any, str]]
 
 
 # ------------------------------------------------------------------------------------------------- writing
 
 
-def write_product(
-    path: str | os.PathLike[str], product: CalibrationProduct, *, overwrite: bool = False
+def write_calibration(
+    path: str | os.PathLike[str], calibration: Calibration, *, overwrite: bool = False
 ) -> None:
-    """Write a calibration product with checksums; the file appears whole or not at all.
+    """Write a calibration with checksums; the file appears whole or not at all.
 
     Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only, and for a
     parameter whose name could not be read again.
     """
-    with atomic_path(path, overwrite=overwrite) as temporary:
-        sign_and_write(_hdus(product, path), temporary)
-
-
-def _hdus(product: CalibrationProduct, path: object) -> list[Any]:
-    parameters = product.parameters
-    for name in parameters.name.tolist():
+    for name in calibration.fitted.names:
         if not NAME.fullmatch(name):
-            raise fail(f"{name!r} is not a parameter name", file=path, extension="PARAMETERS", column="NAME")
+            raise Place(path, "PARAMETERS").fail(f"{name!r} is not a parameter name", "NAME")
+    with atomic_path(path, overwrite=overwrite) as temporary:
+        sign_and_write(_hdus(calibration, path), temporary)
+
+
+write_product, CalibrationProduct = write_calibration, Calibration
+
+
+def _hdus(c: Calibration, path: object) -> list[Any]:
     tables = {
-        "PARAMETERS": {name: getattr(parameters, name.lower()) for name in _RULES["PARAMETERS"]},
-        "FILTERS": filter_columns(product.filters),
-        "MODEL": {"LINE": _strings(product.model)},
+        "PARAMETERS": c.parameter_columns(),
+        "FILTERS": filter_columns(c.filters),
+        "MODEL": {"LINE": _strings(c.model_lines)},
+        "INSTRUMENT": {"LINE": _strings(c.description)},
+        "SOURCES": {name: getattr(c.sources, name.lower()) for name in schema.SOURCES},
+        "INPUTS": {
+            "PATH": _strings(in_ascii(str(entry.path)) for entry in c.inputs),
+            "SHA256": _strings(entry.sha256 for entry in c.inputs),
+        },
+        "WARNINGS": {"TEXT": _strings(in_ascii(text) for text in c.verdict.warnings)},
     }
-    if product.description:
-        tables["INSTRUMENT"] = {"LINE": _strings(product.description)}
-    if len(product.sources):
-        tables["SOURCES"] = {name: getattr(product.sources, name.lower()) for name in schema.SOURCES}
-    if product.inputs:
-        paths = _strings(in_ascii(str(entry.path)) for entry in product.inputs)
-        tables["INPUTS"] = {"PATH": paths, "SHA256": _strings(entry.sha256 for entry in product.inputs)}
-    if product.verdict.warnings:
-        tables["WARNINGS"] = {"TEXT": _strings(product.verdict.warnings)}
-    made = {name: table_hdu(name, columns, path, _RULES[name]) for name, columns in tables.items()}
-    version = product_version(product)
-    instrument_name(product.instrument, version, Place(path, "PRIMARY"))
-    exposures = exposures_hdu(product.exposures, version, path)
-    images = [fits.ImageHDU(product.covariance, name="COVARIANCE")]
-    if product.hidden is not None:
-        images.append(_hidden_hdu(product.hidden))
-    for suffix, maps in (("", product.maps.values), ("_ERR", product.maps.errors)):
-        for name, image in zip(product.maps.names, maps, strict=True):
-            images.append(fits.ImageHDU(image, name=name + suffix))
-            images[-1].header.update(grid_cards(product.maps.grid) | position_cards(product.maps.positions))
-    if product.residuals is not None:
-        images += residual_hdus(product.residuals)
-    parameters_hdu, filters = made.pop("PARAMETERS"), made.pop("FILTERS")
-    primary = primary_hdu(product, version)
-    return [primary, parameters_hdu, *images, filters, exposures, *made.values()]
-
-
-def _hidden_hdu(hidden: Hidden) -> Any:
-    """An image (mistake, parameter) of what each mistake does to the parameters; no data where there is none."""
-    hdu = fits.ImageHDU(hidden.changes if len(hidden) else None, name="HIDDEN")
-    for number, (name, size, unit) in enumerate(
-        zip(hidden.names, hidden.sizes, hidden.units, strict=True), start=1
-    ):
-        hdu.header[f"HIDE{number}"] = in_ascii(name)
-        hdu.header[f"SIZE{number}"] = size
-        hdu.header[f"UNIT{number}"] = in_ascii(unit)
-    return hdu
-
-
-def _read_hidden(units: Mapping[str, Any], parameters: int, path: Path) -> Hidden | None:
-    """The mistakes of the extension HIDDEN; None in products that nobody asked for them."""
-    if "HIDDEN" not in units:
-        return None
-    header, place = units["HIDDEN"].header, Place(path, "HIDDEN")
-    names, sizes, kept = [], [], []
-    while (number := len(names) + 1) and f"HIDE{number}" in header:
-        size = header.get(f"SIZE{number}")
-        if isinstance(size, bool) or not isinstance(size, int | float):
-            raise place.fail(f"is {size!r}, not a number", f"SIZE{number}", "make the product again")
-        names.append(str(header[f"HIDE{number}"]))
-        sizes.append(float(size))
-        kept.append(str(header.get(f"UNIT{number}", "")))
-    changes = _image(units, "HIDDEN", path) if names else np.zeros((0, parameters))
-    if changes.shape != (len(names), parameters):
-        raise place.fail(
-            f"has shape {changes.shape}, not {(len(names), parameters)}", advice="make the product again"
-        )
-    return Hidden(tuple(names), tuple(sizes), tuple(kept), changes)
+    made = {
+        name: table_hdu(name, columns, path, TABLES[name])
+        for name, columns in tables.items()
+        if len(next(iter(columns.values())))
+    }
+    version = _version(c)
+    instrument_name(c.instrument, version, Place(path, "PRIMARY"))
+    images = [fits.ImageHDU(c.covariance, name="COVARIANCE")]
+    for suffix, planes in (("", c.maps.values), ("_ERR", c.maps.errors)):
+        for name, image in zip(c.maps.names, planes, strict=True):
+            images.append(_map_hdu(name + suffix, image, c.maps))
+    if c.residuals is not None:
+        images += _residual_hdus(c.residuals)
+    if c.hidden is not None:
+        images.append(_hidden_hdu(c.hidden))
+    parameters, filters = made.pop("PARAMETERS"), made.pop("FILTERS")
+    exposures = exposures_hdu(c.exposures, version, path)
+    return [_primary(c, version), parameters, *images, filters, exposures, *made.values()]
 
 
 def _strings(values: Iterable[str]) -> np.ndarray:
     return np.array(list(values), dtype=np.str_)
 
 
+def _version(c: Calibration) -> int:
+    """The oldest version of the format that can hold a calibration."""
+    newer = c.maps.arms != 2 or c.maps.positions or (c.residuals is not None and c.residuals.positions)
+    return 2 if newer else oldest_version(c.instrument, c.exposures, 4)
+
+
+def _primary(c: Calibration, version: int) -> fits.PrimaryHDU:
+    """The primary header: verdict, validity, software, content hash."""
+    verdict, site = c.verdict, c.site
+    cards: Cards = {
+        "TELESCOP": (site.telescope, ""),
+        "INSTRUME": (c.instrument, ""),
+        "PRODVERS": (version, "version of the calibration product format"),
+        "ORIGIN": (c.origin, ""),
+        "CREATOR": ("walop-jax", ""),
+        "DATE": (c.date, "UTC, when the product was made"),
+        "SITELAT": (site.latitude, "[deg] latitude"),
+        "SITELONG": (site.longitude, "[deg] longitude, east positive"),
+        "SITEELEV": (site.elevation, "[m] elevation"),
+        "TRUSTED": (verdict.trusted, "converged and explains the data"),
+        "CONVERGD": (verdict.converged, "the minimum was reached"),
+        "CHI2": (verdict.chi2, "chi squared of data and priors"),
+        "DOF": (verdict.dof, "degrees of freedom"),
+        "NDATA": (verdict.n_data, "intensities used"),
+        "NOISESCL": (verdict.noise_scale, "factor on the errors of the data"),
+        "QUALITY": (int(verdict.quality), "bit mask, 0 is good"),
+        "COVFROM": (verdict.covariance_from, "what COVARIANCE is of"),
+        "ERRFROM": (verdict.errors_from, ""),
+        **(
+            {
+                "STRUCTG": (verdict.structure.gain, "rms gain of a camera at a field point"),
+                "STRUCTR": (verdict.structure.response, "rms response of a camera to q, u there"),
+            }
+            if verdict.structure
+            else {}
+        ),
+        "MAPFILT": (c.maps.filter, f"filter of the maps M21...{c.maps.names[-1]}"),
+        **{
+            name: (edge, "[deg] extent of the field points used")
+            for name, edge in zip(_FIELD, c.field, strict=True)
+        },
+        **_validity_cards(c),
+        "CONTHASH": (c.content_hash(), ""),
+    }
+    primary = fits.PrimaryHDU()
+    for name, (value, comment) in cards.items():
+        if isinstance(value, float) and not np.isfinite(value):
+            continue  # FITS headers know no NaN; a missing card is read as one
+        primary.header[name] = (in_ascii(value) if isinstance(value, str) else value, comment)
+    primary.header["INSTRUME"] = c.instrument  # blanks inside a name count
+    for number, (name, release) in enumerate(c.versions.items(), start=1):
+        primary.header[f"SOFT{number}"] = in_ascii(f"{name} {release}")
+    return primary
+
+
+def _validity_cards(c: Calibration) -> Cards:
+    """Dates, temperatures and filters that the product may be applied to, for a look: EXPOSURES says the same."""
+    cards: Cards = {}
+    for values, names, comment in (
+        (c.exposures.mjd, ("MJD-BEG", "MJD-END"), "[d] UTC of the exposures"),
+        (c.exposures.temp, ("TEMPMIN", "TEMPMAX"), "[Celsius] of the exposures"),
+    ):
+        known = values[np.isfinite(values)]
+        if known.size:
+            cards |= {names[0]: (float(known.min()), comment), names[1]: (float(known.max()), comment)}
+    for number, name in enumerate(np.unique(c.exposures.filter).tolist(), start=1):
+        cards[f"FILTER{number}"] = (name, "")
+    return cards
+
+
+def _map_hdu(name: str, image: np.ndarray, maps: MatrixMaps | ResidualMap) -> fits.ImageHDU:
+    """An image of the field, with cards for the moving elements that are in the beam."""
+    hdu = fits.ImageHDU(image, name=name)
+    hdu.header.update(grid_cards(maps.grid))
+    inside = [entry for entry in maps.positions.items() if np.isfinite(entry[1])]
+    for number, (prefix, angle) in enumerate(inside, start=1):
+        hdu.header[f"ELEM{number}"], hdu.header[f"ANGLE{number}"] = prefix, angle
+    return hdu
+
+
+def _residual_hdus(residuals: ResidualMap) -> list[fits.ImageHDU]:
+    hdus = [
+        _map_hdu(name, getattr(residuals, attribute), residuals) for name, attribute in _RESIDUALS.items()
+    ]
+    for hdu in hdus:
+        hdu.header["FILTER"] = residuals.filter
+        if np.isfinite(residuals.chwp_angle):
+            hdu.header["CHWPANG"] = (residuals.chwp_angle, "[deg] calibration plate; absent: out")
+        if hdu.header["NAXIS"] == 3:
+            for number, quantity in enumerate(residuals.names, start=1):
+                hdu.header[f"PLANE{number}"] = quantity
+    return hdus
+
+
+def _hidden_hdu(hidden: Hidden) -> fits.ImageHDU:
+    """An image (mistake, parameter) of what each mistake does to the parameters; no data where there is none."""
+    hdu = fits.ImageHDU(hidden.changes if len(hidden) else None, name="HIDDEN")
+    mistakes = zip(hidden.names, hidden.sizes, hidden.units, strict=True)
+    for number, (name, size, unit) in enumerate(mistakes, start=1):
+        hdu.header[f"HIDE{number}"] = in_ascii(name)
+        hdu.header[f"SIZE{number}"] = size
+        hdu.header[f"UNIT{number}"] = in_ascii(unit)
+    return hdu
+
+
 # ------------------------------------------------------------------------------------------------- reading
 
 
-def read_product(path: str | os.PathLike[str]) -> CalibrationProduct:
-    """Read and check a calibration product.
+def read_calibration(
+    run: str | os.PathLike[str], catalogue: Sequence[type[Effect]] = EFFECTS, *, rebuild: bool = True
+) -> Calibration:
+    """Read and check a calibration, given by its file or by the folder of a run.
 
+    `catalogue` are the effects that its model may have; without `rebuild` the model is left as the file lists it.
     Raises `DataError`, with advice, for a file that is damaged, of another kind, from a newer version of the
-    format, or changed since it was written.
+    format, or changed since it was written, and if the model cannot be rebuilt.
     """
+    path = product_path(run)
     with open_fits(path) as opened:
         try:
-            return _from_hdus(opened)
+            found = _Reader(opened).calibration()
         except DataError:
             raise
         except UNREADABLE as error:
-            raise fail(
-                f"cannot be read: {one_line(error)}", file=path, advice="make the product again"
-            ) from error
+            raise fail(f"cannot be read: {one_line(error)}", file=path, advice=_AGAIN) from error
+    with errors_naming(path):
+        return found.rebuilt(catalogue) if rebuild else found
 
 
-def _from_hdus(opened: OpenFile) -> CalibrationProduct:
-    path = opened.path
-    header = ProductHeader(opened.hdus[0].header, Place(path, "PRIMARY"))
-    version = header.version()
-    units: dict[str, Any] = {}
-    for hdu in opened.hdus[1:]:
-        name = hdu.name.strip().upper()
-        if name in units:
-            raise fail("is there twice", file=path, extension=name, advice="remove one")
-        units[name] = hdu
+def read_product(path: str | os.PathLike[str]) -> Calibration:
+    """Name of before."""
+    return read_calibration(path, rebuild=False)
 
-    def table(name: str, *, optional: bool = False) -> dict[str, Any] | None:
-        if name in units:
-            place = Place(path, name)
-            rules = _RULES.get(name) or table_rules(name, version, column_names(units[name], place), place)
-            return read_table(units[name], rules, place)[0]
-        if optional:
-            return None
-        _missing(path, name)
 
-    covariance = _image(units, "COVARIANCE", path)
-    maps = _maps(units, header.text("MAPFILT"), version, path)
-    parameters = _parameters(table("PARAMETERS"), Place(path, "PARAMETERS"))
-    _check_covariance(covariance, parameters, Place(path, "COVARIANCE"))
-    site = Site(
-        header.text("TELESCOP"), *(header.number(f"SITE{n}", np.nan) for n in ("LAT", "LONG", "ELEV"))
-    )
-    filters = make_filters(table("FILTERS") or {}, Place(path, "FILTERS"))
-    sources, inputs = table("SOURCES", optional=True), table("INPUTS", optional=True)
-    warnings, model = table("WARNINGS", optional=True), table("MODEL") or {}
-    description = table("INSTRUMENT", optional=True)
-    product = CalibrationProduct(
-        instrument=header.instrument(version),
-        site=site,
-        origin=header.text("ORIGIN"),
-        date=header.text("DATE"),
-        verdict=Verdict.recorded(
-            chi2=header.number("CHI2"),
-            dof=int(header.number("DOF")),
-            n_data=int(header.number("NDATA")),
-            noise_scale=header.number("NOISESCL"),
-            converged=header.flag("CONVERGD"),
-            trusted=header.flag("TRUSTED"),
-            quality=int(header.number("QUALITY")),
-            warnings=() if warnings is None else tuple(warnings["TEXT"].tolist()),
-            covariance_from=header.text("COVFROM") or "fit",
-            errors_from=header.text("ERRFROM") or STATED,
-            structure=Structure(header.number("STRUCTG", 0.0), header.number("STRUCTR", 0.0)),
-        ),
-        parameters=parameters,
-        covariance=covariance,
-        maps=maps,
-        field=(
-            header.number("FIELDXMI"), header.number("FIELDXMA"),
-            header.number("FIELDYMI"), header.number("FIELDYMA"),
-        ),
-        exposures=make_exposures(
-            table("EXPOSURES") or {}, filters, site, Place(path, "EXPOSURES"), version=version, kinds=None
-        ),
-        filters=filters,
-        sources=empty_sources() if sources is None else make_sources(sources, Place(path, "SOURCES")),
-        model=tuple(model["LINE"].tolist()),
-        inputs=()
-        if inputs is None
-        else tuple(InputFile(Path(p), s) for p, s in zip(inputs["PATH"], inputs["SHA256"], strict=True)),
-        versions=header.versions(),
-        residuals=read_residual_map(units, maps.arms, path),
-        description=() if description is None else tuple(description["LINE"].tolist()),
-        hidden=_read_hidden(units, len(parameters), path),
-    )  # fmt: skip
-    if header.text("CONTHASH") not in (product.content_hash(), product.content_hash(every_column=False)):
-        raise fail(
-            "the content is not what was written",
-            file=path,
-            extension="PRIMARY",
-            column="CONTHASH",
-            advice="a product is not edited by hand: fit again, with a model file for what should differ",
+def product_path(run: str | os.PathLike[str]) -> Path:
+    """The file that a folder of a run, or the file itself, stands for."""
+    path = Path(run)
+    return path / PRODUCT if path.is_dir() else path
+
+
+class _Reader:
+    """The parts of an open file by name; every method raises `DataError` for what is amiss."""
+
+    def __init__(self, opened: OpenFile) -> None:
+        self.path, self.header = opened.path, opened.hdus[0].header
+        self.primary = Place(self.path, "PRIMARY")
+        self.version = self._version()
+        self.hdus: dict[str, Any] = {}
+        for hdu in opened.hdus[1:]:
+            name = hdu.name.strip().upper()
+            if name in self.hdus:
+                raise fail("is there twice", file=self.path, extension=name, advice="remove one")
+            self.hdus[name] = hdu
+
+    def calibration(self) -> Calibration:
+        """The calibration as the file lists it, its content hash checked."""
+        covariance = self.image("COVARIANCE")
+        maps = self.maps()
+        table = self.table("PARAMETERS")
+        self.check_parameters(table, covariance)
+        model_lines = tuple(self.table("MODEL")["LINE"].tolist())
+        site = Site(
+            self.text("TELESCOP"), *(self.number(f"SITE{n}", np.nan) for n in ("LAT", "LONG", "ELEV"))
         )
-    return product
+        filters = make_filters(self.table("FILTERS"), Place(self.path, "FILTERS"))
+        sources, inputs = self.table("SOURCES", optional=True), self.table("INPUTS", optional=True)
+        warnings, description = self.table("WARNINGS", optional=True), self.table("INSTRUMENT", optional=True)
+        exposures, place = self.table("EXPOSURES"), Place(self.path, "EXPOSURES")
+        found = Calibration(
+            fitted=ListedModel(
+                name=instrument_name(self.header.get("INSTRUME", ""), self.version, self.primary),
+                parameters=_listed(table, model_lines),
+                maps=maps,
+                lines=model_lines,
+                description=tuple(description["LINE"].tolist()) if description else (),
+            ),
+            values=table["VALUE"],
+            covariance=covariance,
+            verdict=Verdict.recorded(
+                chi2=self.number("CHI2"),
+                dof=int(self.number("DOF")),
+                n_data=int(self.number("NDATA")),
+                noise_scale=self.number("NOISESCL"),
+                converged=self.flag("CONVERGD"),
+                trusted=self.flag("TRUSTED"),
+                quality=int(self.number("QUALITY")),
+                warnings=tuple(warnings["TEXT"].tolist()) if warnings else (),
+                covariance_from=self.text("COVFROM") or "fit",
+                errors_from=self.text("ERRFROM") or STATED,
+                structure=Structure(self.number("STRUCTG", 0.0), self.number("STRUCTR", 0.0)),
+            ),
+            filters=filters,
+            exposures=make_exposures(exposures, filters, site, place, version=self.version, kinds=None),
+            sources=make_sources(sources, Place(self.path, "SOURCES")) if sources else empty_sources(),
+            site=site,
+            origin=self.text("ORIGIN"),
+            field=(
+                self.number(_FIELD[0]),
+                self.number(_FIELD[1]),
+                self.number(_FIELD[2]),
+                self.number(_FIELD[3]),
+            ),
+            inputs=tuple(InputFile(Path(p), s) for p, s in zip(inputs["PATH"], inputs["SHA256"], strict=True))
+            if inputs
+            else (),
+            residuals=self.residuals(maps.arms),
+            hidden=self.hidden(len(table["NAME"])),
+            date=self.text("DATE"),
+            versions=self.versions(),
+            path=self.path,
+        )
+        if self.text("CONTHASH") not in (found.content_hash(), found.content_hash(every_column=False)):
+            advice = "a product is not edited by hand: fit again, with a model file for what should differ"
+            raise self.primary.fail("the content is not what was written", "CONTHASH", advice)
+        return found
+
+    # ------------------------------------------------------------------------------------ the header
+
+    def _version(self) -> int:
+        version = self.header.get("PRODVERS")
+        if version is None and "CALVERS" in self.header:
+            what, advice = "this is a calibration set, not a calibration product", "run walop-jax refit on it"
+        elif version is None:
+            what, advice = "is missing", "is this the calibration.fits of a fit?"
+        elif isinstance(version, bool) or not isinstance(version, int) or version < 1:
+            what, advice = f"is {version!r}, not a version", _AGAIN
+        elif version > PRODVERS:
+            what = f"is {version}, this program reads up to {PRODVERS}"
+            advice = "use a newer walop-jax, or make the product again with this one"
+        else:
+            return version
+        raise self.primary.fail(what, "PRODVERS", advice)
+
+    def number(self, name: str, missing: float | None = None) -> float:
+        """A number; `missing` where it is absent, if that may be."""
+        value = self.header.get(name, missing)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self.primary.fail(f"is {value!r}, not a number", name, _AGAIN)
+        return float(value)
+
+    def flag(self, name: str) -> bool:
+        """T or F."""
+        value = self.header.get(name)
+        if not isinstance(value, bool):
+            raise self.primary.fail(f"is {value!r}, not T or F", name, _AGAIN)
+        return value
+
+    def text(self, name: str) -> str:
+        """A text without blanks around it, empty where it is absent."""
+        return str(self.header.get(name, "")).strip()
+
+    def versions(self) -> dict[str, str]:
+        """Versions of the software by name."""
+        found: dict[str, str] = {}
+        for number in range(1, _LONGEST_SOFTWARE_LIST):
+            name, _, version = self.text(f"SOFT{number}").partition(" ")
+            if name:
+                found[name] = version
+        return found
+
+    # ---------------------------------------------------------------------------- tables and images
+
+    def table(self, name: str, *, optional: bool = False) -> dict[str, Any]:
+        """The columns of a table; empty for one that is `optional` and not there."""
+        if optional and name not in self.hdus:
+            return {}
+        hdu, place = self.hdu(name), Place(self.path, name)
+        rules = TABLES.get(name) or table_rules(name, self.version, column_names(hdu, place), place)
+        return read_table(hdu, rules, place)[0]
+
+    def hdu(self, name: str) -> Any:
+        """An extension that must be there."""
+        if name not in self.hdus:
+            self.fail(name, "the extension is missing")
+        return self.hdus[name]
+
+    def fail(self, name: str, what: str) -> NoReturn:
+        """Raise `DataError` about an extension."""
+        raise fail(what, file=self.path, extension=name, advice=_AGAIN)
+
+    def image(self, name: str) -> np.ndarray:
+        """An image with two axes, finite everywhere."""
+        data = getattr(self.hdu(name), "data", None)
+        if not isinstance(data, np.ndarray) or data.ndim != 2 or data.dtype.kind not in "fiu":
+            self.fail(name, "is not an image with two axes")
+        values = np.ascontiguousarray(data, dtype=np.float64)
+        if not np.all(np.isfinite(values)):
+            self.fail(name, "is not finite everywhere")
+        return values
+
+    def grid(self, name: str) -> Grid:
+        """The pixels of an image."""
+        return read_grid(self.hdus[name].header, Place(self.path, name))
+
+    def positions(self, name: str) -> dict[str, float]:
+        """Angles (deg) of the moving elements that were in the beam for an image, by column prefix."""
+        header, found = self.hdus[name].header, dict[str, float]()
+        while (card := f"ELEM{len(found) + 1}") in header:
+            prefix, angle = header[card], header.get(f"ANGLE{len(found) + 1}")
+            known = isinstance(prefix, str) and PREFIX.fullmatch(prefix) and prefix not in found
+            if not known or isinstance(angle, bool) or not isinstance(angle, int | float):
+                raise Place(self.path, name).fail(f"is {prefix!r} at {angle!r}", card, _AGAIN)
+            found[prefix] = float(angle)
+        return found
+
+    def maps(self) -> MatrixMaps:
+        """The maps of the matrix: of two arms in version 1, of as many as there are images later on."""
+        rows = [int(match[1]) for name in self.hdus if (match := _MATRIX_IMAGE.fullmatch(name))]
+        names = matrix_names(2 if self.version == 1 else max([1, *(row - 1 for row in rows)]))
+        errors = tuple(f"{name}_ERR" for name in names)
+        images = {name: self.image(name) for name in (*names, *errors)}
+        grid = self.grid(names[0])
+        for name, image in images.items():
+            if image.shape != (grid.height, grid.width) or self.grid(name) != grid:
+                self.fail(name, f"does not lie on the grid of {names[0]}")
+        return MatrixMaps(
+            grid=grid,
+            filter=self.text("MAPFILT"),
+            values=np.stack([images[name] for name in names]),
+            errors=np.stack([images[name] for name in errors]),
+            positions=self.positions(names[0]),
+        )
+
+    def residuals(self, arms: int) -> ResidualMap | None:
+        """The residual map of an instrument with so many arms, None without one."""
+        if not any(name in self.hdus for name in _RESIDUALS):
+            return None
+        images: dict[str, Any] = {}
+        for name, attribute in _RESIDUALS.items():
+            data = self.hdu(name).data
+            grid = self.grid("RESIDUAL")
+            shape = (grid.height, grid.width)
+            expected = shape if attribute == "chi2" else (len(residual_names(arms)), *shape)
+            if self.grid(name) != grid or not isinstance(data, np.ndarray) or data.shape != expected:
+                self.fail(name, "is not an image on the grid of RESIDUAL")
+            images[attribute] = np.ascontiguousarray(data, dtype=np.float64)
+        header = self.hdus["RESIDUAL"].header
+        return ResidualMap(
+            grid=self.grid("RESIDUAL"),
+            filter=str(header.get("FILTER", "")).strip(),
+            chwp_angle=float(header.get("CHWPANG", np.nan)),
+            positions=self.positions("RESIDUAL"),
+            **images,
+        )
+
+    def hidden(self, parameters: int) -> Hidden | None:
+        """The mistakes of the extension HIDDEN; None in products that nobody asked for them."""
+        if "HIDDEN" not in self.hdus:
+            return None
+        header, place = self.hdus["HIDDEN"].header, Place(self.path, "HIDDEN")
+        names, sizes, kept = [], [], []
+        while (number := len(names) + 1) and f"HIDE{number}" in header:
+            size = header.get(f"SIZE{number}")
+            if isinstance(size, bool) or not isinstance(size, int | float):
+                raise place.fail(f"is {size!r}, not a number", f"SIZE{number}", _AGAIN)
+            names.append(str(header[f"HIDE{number}"]))
+            sizes.append(float(size))
+            kept.append(str(header.get(f"UNIT{number}", "")))
+        changes = self.image("HIDDEN") if names else np.zeros((0, parameters))
+        if changes.shape != (len(names), parameters):
+            raise place.fail(f"has shape {changes.shape}, not {(len(names), parameters)}", advice=_AGAIN)
+        return Hidden(tuple(names), tuple(sizes), tuple(kept), changes)
+
+    def check_parameters(self, table: Mapping[str, Any], covariance: np.ndarray) -> None:
+        """Raise `DataError` for parameters that are none, and a covariance that is not theirs."""
+        place, names = Place(self.path, "PARAMETERS"), table["NAME"].tolist()
+        for name in names:
+            if names.count(name) > 1:
+                raise place.fail(f"{name!r} is there twice", "NAME", _AGAIN)
+            if not NAME.fullmatch(name):
+                raise place.fail(f"{name!r} is not a parameter name", "NAME", _AGAIN)
+        for column in ("VALUE", "SIGMA"):
+            if not np.all(np.isfinite(table[column])):
+                raise place.fail("is not finite everywhere", column, _AGAIN)
+        if covariance.shape != 2 * (len(names),):
+            self.fail("COVARIANCE", f"has shape {covariance.shape}, there are {len(names)} parameters")
+        variance = np.diag(covariance)
+        # Some elements are pure rounding: symmetry counts on the scale of the errors.
+        scale = np.sqrt(np.outer(np.abs(variance), np.abs(variance)))
+        if np.any(np.abs(covariance - covariance.T) > 1e-9 * scale) or np.any(variance < 0):
+            self.fail("COVARIANCE", "is not a covariance: not symmetric, or negative variances")
+        if not np.allclose(np.sqrt(variance), table["SIGMA"], rtol=1e-12, atol=0):
+            self.fail("COVARIANCE", "does not agree with SIGMA of PARAMETERS")
 
 
-def _missing(path: Path, name: str) -> NoReturn:
-    raise fail("the extension is missing", file=path, extension=name, advice="make the product again")
-
-
-def _maps(units: Mapping[str, Any], filter_name: str, version: int, path: Path) -> MatrixMaps:
-    """The maps of the matrix: of two arms in version 1, of as many as there are images later on."""
-    found = [int(match[1]) for name in units if (match := _MATRIX_IMAGE.fullmatch(name))]
-    names = matrix_names(2 if version == 1 else max([1, *(row - 1 for row in found)]))
-    errors = tuple(f"{name}_ERR" for name in names)
-    images = {name: _image(units, name, path) for name in (*names, *errors)}
-    grid = read_grid(units[names[0]].header, Place(path, names[0]))
-    for name, image in images.items():
-        same = image.shape == (grid.height, grid.width)
-        if not same or read_grid(units[name].header, Place(path, name)) != grid:
-            raise fail(f"does not lie on the grid of {names[0]}", file=path, extension=name)
-    return MatrixMaps(
-        grid=grid,
-        filter=filter_name,
-        values=np.stack([images[name] for name in names]),
-        errors=np.stack([images[name] for name in errors]),
-        positions=read_positions(units[names[0]].header, Place(path, names[0])),
-    )
-
-
-def _image(units: Mapping[str, Any], name: str, path: Path) -> np.ndarray:
-    if name not in units:
-        _missing(path, name)
-    data = getattr(units[name], "data", None)
-    if not isinstance(data, np.ndarray) or data.ndim != 2 or data.dtype.kind not in "fiu":
-        raise fail("is not an image with two axes", file=path, extension=name, advice="make it again")
-    values = np.ascontiguousarray(data, dtype=np.float64)
-    if not np.all(np.isfinite(values)):
-        raise fail("is not finite everywhere", file=path, extension=name, advice="make the product again")
-    return values
-
-
-def _parameters(table: dict[str, Any] | None, place: Place) -> ParameterTable:
-    assert table is not None
-    names = table["NAME"].tolist()
-    for name in names:
-        if names.count(name) > 1:
-            raise place.fail(f"{name!r} is there twice", "NAME", "make the product again")
-        if not NAME.fullmatch(name):
-            raise place.fail(f"{name!r} is not a parameter name", "NAME", "make the product again")
-    for column in ("VALUE", "SIGMA"):
-        if not np.all(np.isfinite(table[column])):
-            raise place.fail("is not finite everywhere", column, "make the product again")
-    return ParameterTable(**{name.lower(): table[name] for name in _RULES["PARAMETERS"]})
-
-
-def _check_covariance(covariance: np.ndarray, parameters: ParameterTable, place: Place) -> None:
-    n = len(parameters)
-    if covariance.shape != (n, n):
-        raise place.fail(f"has shape {covariance.shape}, there are {n} parameters", "", "make it again")
-    variance = np.diag(covariance)
-    # Some elements are pure rounding: symmetry counts on the scale of the errors.
-    scale = np.sqrt(np.outer(np.abs(variance), np.abs(variance)))
-    if np.any(np.abs(covariance - covariance.T) > 1e-9 * scale) or np.any(variance < 0):
-        raise place.fail("is not a covariance: not symmetric, or negative variances", "", "make it again")
-    if not np.allclose(np.sqrt(variance), parameters.sigma, rtol=1e-6, atol=0):
-        raise place.fail("does not agree with SIGMA of PARAMETERS", "", "make the product again")
+def _listed(table: Mapping[str, Any], model_lines: Sequence[str]) -> tuple[Parameter, ...]:
+    """The parameters of a file, with starts (NaN: unknown) and ties as far as the lines of its model say them."""
+    try:
+        written = tomllib.loads("\n".join(model_lines)).get("parameters", {})
+    except tomllib.TOMLDecodeError:
+        written = {}
+    found = []
+    for name, _, _, unit, mean, width, free in zip(*(table[n] for n in TABLES["PARAMETERS"]), strict=True):
+        entry, prior = written.get(name, {}), (float(mean), float(width)) if np.isfinite(width) else None
+        start = float(entry.get("start", np.nan if prior is None else mean))
+        tie = entry.get("tie")
+        found.append(Parameter(str(name), str(unit), "", "", start, prior, bool(free), 1.0, tie=tie))
+    return tuple(found)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from walop_jax.calibration.records import ResidualMap
+from walop_jax.calibration.maps import ResidualMap
+from walop_jax.calibration.product import PRODUCT as PRODUCT
 from walop_jax.fit.misfit import Misfit
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.software import software_versions
 
-PRODUCT = "calibration.fits"
-SUMMARY = "summary.json"
-FAILED = "summary.failed.json"
+SUMMARY, FAILED = "summary.json", "summary.failed.json"
 PARTIAL = "partial"
 """Folder of the finished parts of a fit that was interrupted."""
 
@@ -24,9 +23,9 @@ def summary(
     misfit: Misfit | None = None,
     residuals: ResidualMap | None = None,
 ) -> dict[str, Any]:
-    """What a fit found and how far it can be trusted, key by key as in docs: files.
+    """The content of `summary.json`, key by key as in docs: files. Frozen parameters have sigma 0.
 
-    Frozen parameters have sigma 0. Raises RuntimeError for a fit that nobody has examined.
+    Raises RuntimeError for a fit that nobody has examined.
     """
     verdict = result.checked_verdict()
     parameters = {

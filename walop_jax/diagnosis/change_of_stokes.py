@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.matrix import sky_vectors
-from walop_jax.calibration.matrix_slopes import LARGEST_P, change_of_qu
+from walop_jax.calibration.matrix import LARGEST_P, change_of_qu, sky_vectors
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from walop_jax.calibration.matrix_slopes import change_of_qu, matrix_slopes
+from walop_jax.calibration.matrix import change_of_qu, matrix_slopes
 from walop_jax.diagnosis.change_of_stokes import first_setting
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM

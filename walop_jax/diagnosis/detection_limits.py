@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-from walop_jax.calibration.matrix_slopes import change_of_qu, effect_slopes, matrix_slopes
+from walop_jax.calibration.matrix import change_of_qu, effect_slopes, matrix_slopes
 from walop_jax.diagnosis.change_of_stokes import first_setting
 from walop_jax.diagnosis.condition_limits import condition_limits
 from walop_jax.diagnosis.effect_columns import Probe, applicable

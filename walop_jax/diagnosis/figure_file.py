@@ -31,13 +31,13 @@ import numpy as np
 from astropy.io import fits
 from jaxtyping import Float, Int, Shaped
 
-from walop_jax.calibration.records import in_ascii
 from walop_jax.data.records import Points
 from walop_jax.data.schema import Column, Place, read_table
 from walop_jax.data.write import sign_and_write, table_hdu
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits
+from walop_jax.io.text import in_ascii
 
 FIGURE_DATA = "diagnosis.fits"
 DIAGVERS = 1

@@ -76,3 +76,18 @@ def plain(value: Any) -> Any:
 def printable(text: str) -> str:
     """The text with the bytes of a path that are not UTF-8, which no output takes, written as \\xff."""
     return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
+_SPELT = {
+    "χ²": "chi2", "²": "^2", "⁻": "^-", "×": "x", "·": "*", "°": " deg", "±": "+-", "−": "-", "–": "-",
+    "—": "-", "…": "...", "µ": "u", "σ": "sigma", "δ": "delta", "η": "eta", "κ": "kappa", "λ": "lambda",
+    "φ": "phi", "ε": "epsilon", "θ": "theta", "α": "alpha", "γ": "gamma", "π": "pi", "Δ": "Delta",
+    "√": "sqrt", "½": "1/2", "′": "'", "→": "->", "≥": ">=", "≤": "<=",
+}  # fmt: skip
+
+
+def in_ascii(text: str) -> str:
+    """The text on one line in ASCII: signs spelt out where that is usual, escaped (\\u00e9) otherwise."""
+    for sign, word in _SPELT.items():
+        text = text.replace(sign, word)
+    return " ".join(text.encode("ascii", "backslashreplace").decode("ascii").split())

@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.records import SMALLEST_DETERMINANT
+from walop_jax.calibration.maps import SMALLEST_DETERMINANT
 from walop_jax.data.filters import DEFAULT_FILTER
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings

@@ -17,7 +17,7 @@ from walop_jax.posterior.files import (
 )
 from walop_jax.posterior.nuts import Nuts
 from walop_jax.posterior.result import Options, PosteriorSample, Progress, Report
-from walop_jax.posterior.run import fit_of_run, locate
+from walop_jax.posterior.run import Run, fit_of_run
 from walop_jax.posterior.samplers import SAMPLERS, Density, Sampler, State, Stretch, make_sampler
 from walop_jax.posterior.sampling import Ensembles, sample, sandwich_adjusted
 from walop_jax.posterior.surrogate import Accuracy, Surrogate, build_surrogate, compare_with_exact
@@ -37,6 +37,7 @@ __all__ = [
     "PosteriorSample",
     "Progress",
     "Report",
+    "Run",
     "Sampler",
     "State",
     "Stretch",
@@ -50,7 +51,6 @@ __all__ = [
     "exact_density",
     "fit_of_run",
     "inference_data",
-    "locate",
     "make_sampler",
     "near_linear",
     "r_hat",

@@ -1,4 +1,4 @@
-"""One page about a run: a single HTML file, figures inside, nothing fetched from anywhere."""
+"""Pages about runs: single HTML files, figures inside, nothing fetched from anywhere."""
 
 from __future__ import annotations
 
@@ -15,19 +15,28 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.fit.verdict import Quality
-from walop_jax.io.rounding import probability, rounded, value_and_error, with_error, with_minus_sign
-from walop_jax.reports import diagnosis_figures, product_figures
-from walop_jax.reports.about_data import data_in_words, model_entries, symbols_in_words
-from walop_jax.reports.accuracy_figures import accuracy_figure
-from walop_jax.reports.limits_figures import protection_figure
-from walop_jax.reports.limits_in_words import limits_in_words
+from walop_jax.io.errors import fail
+from walop_jax.io.rounding import (
+    probability,
+    rounded,
+    two_digits,
+    value_and_error,
+    with_error,
+    with_minus_sign,
+)
+from walop_jax.io.text import read_json
+from walop_jax.reports import diagnosis_figures, figures
 from walop_jax.reports.posterior_figures import MOST_IN_CORNER, informed
-from walop_jax.reports.run import RunContents
+from walop_jax.reports.run import COMPARISON, EPOCH, LIMITS, SUMMARY, RunContents, read_limits
 from walop_jax.reports.wording import (
     UNNAMED,
+    data_in_words,
     effect_in_words,
     hidden_in_words,
+    model_entries,
+    symbols_in_words,
     unit_in_words,
     verdict_of_diagnosis,
     verdict_of_fit,
@@ -162,20 +171,20 @@ def _pulls(run: RunContents) -> list[dict[str, Any]]:
     """The coefficients farthest from their priors, in prior widths, farthest first."""
     if run.product is None:
         return []
-    table = run.product.parameters
-    known = np.flatnonzero(table.free & np.isfinite(table.prior_width) & (table.sigma > 0))
-    pull = (table.value[known] - table.prior_mean[known]) / table.prior_width[known]
-    order = np.argsort(-np.abs(pull), kind="stable")[:MOST_PULLS]
+    c, pulls = run.product, []
+    for p, value, sigma in zip(c.fitted.parameters, c.values.tolist(), c.sigma.tolist(), strict=True):
+        if p.free and p.tie is None and p.prior is not None and sigma > 0:
+            pulls.append((p, p.prior, value, sigma, (value - p.prior[0]) / p.prior[1]))
     return [
         {
-            "name": str(table.name[i]),
-            "value": with_error(float(table.value[i]), float(table.sigma[i])),
-            "unit": str(table.unit[i]),
-            "prior": with_error(float(table.prior_mean[i]), float(table.prior_width[i])),
-            "pull": with_minus_sign(f"{size:+.2f}"),
-            "strong": abs(float(size)) > STRONG_PULL,
+            "name": p.name,
+            "value": with_error(value, sigma),
+            "unit": p.unit,
+            "prior": with_error(*prior),
+            "pull": with_minus_sign(f"{pull:+.2f}"),
+            "strong": abs(pull) > STRONG_PULL,
         }
-        for i, size in zip(known[order], pull[order], strict=True)
+        for p, prior, value, sigma, pull in sorted(pulls, key=lambda row: -abs(row[-1]))[:MOST_PULLS]
     ]
 
 
@@ -191,8 +200,7 @@ def _interval(row: Mapping[str, Any]) -> dict[str, str]:
 def _in_corner(run: RunContents) -> tuple[str, ...]:
     """The coefficients of the corner plot, as `sample` chooses them."""
     spread = {str(r["NAME"]): 0.5 * float(r["HIGH68"] - r["LOW68"]) for r in run.intervals}
-    table = None if run.product is None else run.product.parameters
-    prior = {} if table is None else dict(zip(table.name.tolist(), table.prior_width.tolist(), strict=True))
+    prior = {} if run.product is None else run.product.prior_width
     return informed(tuple(spread), spread, prior)[:MOST_IN_CORNER]
 
 
@@ -200,14 +208,14 @@ def _figures(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, str]
     """The figures of the run as a whole, as data URIs."""
     made: dict[str, Figure] = {}
     if accuracy is not None:
-        made["accuracy"] = accuracy_figure(accuracy)
+        made["accuracy"] = figures.accuracy_figure(accuracy)
     if run.limits is not None and run.limits.worst is not None:
-        made["protection"] = protection_figure(run.limits)
+        made["protection"] = diagnosis_figures.protection_figure(run.limits)
     if run.product is not None:
-        made["matrix"] = product_figures.matrix_maps_figure(run.product.maps)
-        made["errors"] = product_figures.matrix_errors_figure(run.product.maps)
+        made["matrix"] = figures.matrix_maps_figure(run.product.maps)
+        made["errors"] = figures.matrix_errors_figure(run.product.maps)
         if run.product.residuals is not None:
-            made["residual_map"] = product_figures.residual_map_figure(run.product.residuals)
+            made["residual_map"] = figures.residual_map_figure(run.product.residuals)
     if run.figure_data is not None:
         data = run.figure_data
         whole = data.comparisons[0]
@@ -246,3 +254,87 @@ def in_greek(text: str) -> str:
     """A combination as FITS spells it, with the signs it stands for."""
     text = re.sub(r"(?<=\d) theta", "θ", text)
     return text.replace("theta", "θ").replace(" deg", "°").replace(" - ", " − ")
+
+
+def limits_in_words(found: DetectionLimits | None) -> dict[str, Any] | None:
+    """The protection level as a sentence (empty where no exposure gives q and u), and rows of the amplitudes."""
+    if found is None:
+        return None
+    level = found.protection_in_words()
+    names = ("amplitude", "detected", "named", "unit", "error", "taken_for")
+    return {
+        "level": f"{level[:1].upper()}{level[1:]}." if level else "",
+        "rows": [dict(zip(names, row, strict=True)) for row in found.display().rows],
+        "untestable": found.untestable,
+    }
+
+
+SHOWN = 24  # parameters that have moved
+KINDS = {"comparison": COMPARISON, "epoch": EPOCH, "limits": LIMITS}
+NEEDED = {
+    "comparison": ("on_grid", "between"),
+    "epoch": ("fits", "moved", "star_errors"),
+    "limits": ("probability",),
+}
+PICTURES = {
+    "comparison_histogram.png": "Errors of q, u and p over the field, on the grid points and between them.",
+    "comparison_map.png": "Maps of the errors of q and u of both methods.",
+    "comparison_offset.png": "Where the offsets Δq and Δu of Paper II come from.",
+    "comparison_spectral.png": "Efficiencies across the filter, and what the colour of a star changes.",
+}
+PROTECTION = (
+    "The largest error of q and u that a single effect can make at each field point without being detected."
+)
+SEPARATION = (
+    "Standard deviations between an effect that is just detected (row) and another that does its best to look like it "
+    "(column)."
+)
+
+Picture = tuple[str, str, str]
+
+
+def kind_of_run(folder: Path) -> str:
+    """One of `KINDS` for a folder that holds such a document and no fit to report; else `fit`."""
+    if (folder / SUMMARY).exists():
+        return "fit"
+    return next((kind for kind, file in KINDS.items() if (folder / file).exists()), "fit")
+
+
+def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
+    """The HTML text of the page about such a folder, and in words what the folder lacks for it.
+
+    Raises `DataError` for a document that cannot be read or lacks what the page shows.
+    """
+    path = folder / KINDS[kind]
+    document: dict[str, Any] = read_json(path)
+    for key in NEEDED[kind]:
+        if key not in document:
+            raise fail(f"has no {key!r}", file=path, advice="run the command that made it again")
+    words, pictures, missing = None, list[Picture](), ()
+    if kind == "comparison":
+        pictures, missing = _of_comparison(folder)
+    elif kind == "limits":
+        found = read_limits(path)
+        words = limits_in_words(found)
+        drawn = {PROTECTION: diagnosis_figures.protection_figure(found)} if found.worst is not None else {}
+        pictures = [
+            (embedded(figure), caption, caption)
+            for caption, figure in (drawn | {SEPARATION: diagnosis_figures.separation_figure(found)}).items()
+        ]
+    text = environment().get_template(f"{kind}.html").render(
+        document=document, name=folder.resolve().name, versions={}, pictures=pictures, missing=missing,
+        shown=SHOWN, percent=two_digits, words=words,
+    )  # fmt: skip
+    return text, missing
+
+
+def _of_comparison(folder: Path) -> tuple[list[Picture], tuple[str, ...]]:
+    """The figures that the command has drawn, and those that are not there."""
+    found, missing = [], []
+    for name, caption in PICTURES.items():
+        if not (folder / name).exists():
+            missing.append(f"{name} is not there.")
+            continue
+        data = base64.b64encode((folder / name).read_bytes()).decode("ascii")
+        found.append((f"data:image/png;base64,{data}", caption, caption))
+    return found, tuple(missing)

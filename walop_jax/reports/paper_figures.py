@@ -1,22 +1,26 @@
-"""The figures of Paper II that are not maps of the matrix, from a calibration and its data."""
+"""Figures of Paper II, from a calibration and its data, and of the comparison with it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.retardance import plate_names, plate_retardances
 from walop_jax.data.records import CalibrationSet
+from walop_jax.data.settings import Settings
 from walop_jax.io.errors import DataError
 from walop_jax.io.rounding import with_minus_sign
-from walop_jax.paper.polynomial import (
-    fit_paper,
-    fit_transmissions,
-    polariser_states,
-)
+from walop_jax.paper.comparison import Comparison
+from walop_jax.paper.polynomial import fit_paper, fit_transmissions, polariser_states
+from walop_jax.paper.retardance import plate_names, plate_retardances
 from walop_jax.reports.style import DIVERGING, FONT, SMALL, empty_figure, field_axes, outer_labels
+from walop_jax.science.star_errors import GOAL, QUANTITIES, MethodErrors, plate_errors
 
 _PIXELS, _LINES = 31, 41
 COEFFICIENTS = ("$1$", "$q_m$", "$u_m$", "$q_m^2$", "$u_m^2$")
@@ -147,4 +151,153 @@ def transmission_figure(
     above.legend(frameon=False, fontsize=SMALL, ncols=counts.shape[1])
     for axis in (above, below):
         axis.tick_params(labelsize=SMALL)
+    return figure
+
+
+_COLOURS = {"paper": "tab:orange", "joint": "tab:blue"}
+_NAMES = {"paper": "Paper II, point by point", "joint": "joint model"}
+_RANGE = (1e-3, 10.0)  # per cent
+_PLATE_PIXELS = 49
+
+
+def histogram_figure(comparison: Comparison) -> Figure:
+    """Distribution over the field of the errors of q, u and p: on the grid points above, between them below."""
+    figure = Figure(figsize=(9.6, 4.8), layout="constrained")
+    axes = figure.subplots(2, 3, sharex=True, sharey="row")
+    bins = np.geomspace(*_RANGE, 33)
+    for row, (place, title) in zip(
+        axes, ((comparison.grid, "on grid points"), (comparison.between, "between them")), strict=True
+    ):
+        for axis, k in zip(row, range(3), strict=True):
+            for method in ("paper", "joint"):
+                values = np.clip(100 * getattr(place, method)[:, k], *_RANGE)
+                axis.hist(values, bins, histtype="step", color=_COLOURS[method], label=_NAMES[method], lw=1.5)
+            axis.axvline(100 * GOAL, color="0.5", lw=0.8, ls=":")
+            axis.set_xscale("log")
+            axis.set_title(f"{QUANTITIES[k]}, {title}", fontsize=9)
+            axis.tick_params(labelsize=8)
+        row[0].set_ylabel("field points", fontsize=9)
+    for axis in axes[1]:
+        axis.set_xlabel("rms error (%)", fontsize=9)
+    axes[0, 0].legend(fontsize=7, loc="upper right")
+    return figure
+
+
+def map_figure(comparison: Comparison) -> Figure:
+    """Maps of the errors of q and u of both methods between the grid points and on them."""
+    figure = Figure(figsize=(10.4, 5.4), layout="constrained")
+    axes = figure.subplots(2, 4, sharex=True, sharey=True)
+    norm = LogNorm(2e-3, 2.0)
+    shown = None
+    for row, k in zip(axes, (0, 1), strict=True):
+        panels = [(comparison.grid, m) for m in ("paper", "joint")]
+        panels += [(comparison.between, m) for m in ("paper", "joint")]
+        for axis, (place, method) in zip(row, panels, strict=True):
+            shown = _contours(axis, place, method, k, norm)
+            where = "on grid" if place is comparison.grid else "between"
+            axis.set_title(f"{QUANTITIES[k]}, {method}, {where}", fontsize=9)
+            axis.set_aspect("equal")
+            axis.tick_params(labelsize=7)
+    for axis in axes[1]:
+        axis.set_xlabel("X (deg)", fontsize=8)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("Y (deg)", fontsize=8)
+    assert shown is not None
+    bar = figure.colorbar(shown, ax=axes, pad=0.01, shrink=0.8)
+    bar.set_ticks(
+        [0.002, 0.01, 0.03, 0.1, 0.3, 1.0, 2.0], labels=["0.002", "0.01", "0.03", "0.1", "0.3", "1", "2"]
+    )
+    bar.set_label("rms error (%)", fontsize=9)
+    return figure
+
+
+def _contours(axis: Axes, place: MethodErrors, method: str, k: int, norm: LogNorm):  # type: ignore[no-untyped-def]
+    values = 100 * getattr(place, method)[:, k]
+    levels = np.geomspace(norm.vmin or 1e-3, norm.vmax or 1.0, 13)
+    filled = axis.tricontourf(
+        place.x, place.y, values, levels=levels, norm=norm, cmap="viridis", extend="both"
+    )
+    axis.tricontour(place.x, place.y, values, levels=[100 * GOAL], colors="white", linewidths=0.8)
+    return filled
+
+
+def offset_figure(comparison: Comparison) -> Figure:
+    """Δq and Δu: against what the weakest direction of the design matrix predicts, and with one exposure more."""
+    found = comparison.offsets
+    figure = Figure(figsize=(9.6, 3.2), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    for axis, c, name in ((left, 0, "q"), (middle, 1, "u")):
+        for along, label, color in (
+            (found.along, "one", "tab:orange"),
+            (found.along_three, "three", "tab:blue"),
+        ):
+            axis.plot(
+                100 * along[:, c], 100 * found.found[:, c], ".", ms=4, color=color, label=label, alpha=0.7
+            )
+        axis.legend(fontsize=7, title="directions", title_fontsize=7)
+        edge = 105 * np.abs(found.found[:, c]).max()
+        axis.plot([-edge, edge], [-edge, edge], color="0.6", lw=0.8)
+        axis.set_xlabel(f"Δ{name} from the weakest directions (%)", fontsize=8)
+        axis.set_ylabel(f"Δ{name} of the paper's fit (%)", fontsize=8)
+    labels = ("as published", "noise-free states", "one unpolarised\nexposure added")
+    for c, name, shift in ((0, "q", -0.15), (1, "u", 0.15)):
+        sizes = [np.sqrt(np.mean(v[:, c] ** 2)) for v in (found.found, found.noiseless, found.anchored)]
+        right.bar(np.arange(3) + shift, 100 * np.array(sizes), 0.28, label=f"Δ{name}")
+    right.set_yscale("log")
+    right.set_xticks(range(3), labels, fontsize=7)
+    right.set_ylabel("rms over the grid (%)", fontsize=8)
+    right.legend(fontsize=8)
+    for axis in (left, middle, right):
+        axis.tick_params(labelsize=7)
+    return figure
+
+
+def spectral_figure(comparison: Comparison) -> Figure:
+    """Efficiencies and cross-talk across the filter at the extreme point; Δq_m, Δu_m of stars of four colours."""
+    figure = Figure(figsize=(9.6, 3.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    lines = comparison.lines
+    for column, label in ((2, "$m_{22}$: q to q"), (6, "$m_{33}$: u to u"), (5, "$m_{32}$: q to u")):
+        left.plot(1000 * lines[:, 0], lines[:, column], label=label, lw=1.2)
+    left.set_xlabel("wavelength (nm)", fontsize=9)
+    left.set_title("the extreme point of the field", fontsize=9)
+    left.legend(fontsize=8)
+    spread = np.clip(100 * comparison.colours, 1e-5, None)
+    bins = np.geomspace(spread.min() * 0.9, spread.max() * 1.1, 30)
+    for c, name in ((0, r"$\Delta q_m$"), (1, r"$\Delta u_m$")):
+        right.hist(spread[:, c], bins, histtype="step", lw=1.5, label=name)
+    right.axvline(0.05, color="0.5", ls=":", lw=0.8)
+    right.set_xscale("log")
+    right.set_xlabel("difference between four colours, p = 1 % (%)", fontsize=9)
+    right.set_ylabel("grid points", fontsize=9)
+    right.legend(fontsize=8)
+    for axis in (left, right):
+        axis.tick_params(labelsize=8)
+    return figure
+
+
+def plate_figure(calibration: Calibration, combinations: Sequence[Sequence[float | None]]) -> Figure:
+    """Maps of how much worse than an ideal instrument (q, u) are known with some settings of the calibration plate.
+
+    Each combination is a list of angles in degrees (None: out), one exposure each, and has a map of the photon error
+    in the worse direction.
+    """
+    analysis = AnalysisVectors(calibration)
+    low_x, high_x, low_y, high_y = calibration.field
+    x, y = np.meshgrid(np.linspace(low_x, high_x, _PLATE_PIXELS), np.linspace(low_y, high_y, _PLATE_PIXELS))
+    figure = Figure(figsize=(2.6 * len(combinations) + 0.9, 2.9), layout="constrained")
+    axes = figure.subplots(1, len(combinations), sharey=True, squeeze=False)[0]
+    norm, shown = LogNorm(1.0, 100.0), None
+    for axis, plates in zip(axes, combinations, strict=True):
+        settings = [Settings.default(1).at(CHWP=plate) for plate in plates]
+        worst = plate_errors(analysis, settings, x.ravel(), y.ravel()).reshape(x.shape)
+        shown = axis.pcolormesh(x, y, np.clip(worst, 1.0, 100.0), norm=norm, cmap="magma_r", rasterized=True)
+        names = ["out" if plate is None else f"{plate:g}°" for plate in plates]
+        axis.set_title("plate " + " and ".join(names), fontsize=9)
+        axis.set_aspect("equal")
+        axis.set_xlabel("X (deg)", fontsize=8)
+        axis.tick_params(labelsize=7)
+    axes[0].set_ylabel("Y (deg)", fontsize=8)
+    assert shown is not None
+    figure.colorbar(shown, ax=axes, pad=0.02).set_label("error / ideal instrument", fontsize=8)
     return figure

@@ -1,4 +1,4 @@
-"""What lies in the folder of a run: read, checked against each other, and what is missing said in words."""
+"""Contents of a page about a run: read, checked against each other, and what is missing said in words."""
 
 from __future__ import annotations
 
@@ -9,18 +9,27 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from walop_jax.calibration.product import CalibrationProduct, read_product
-from walop_jax.calibration.summary import FAILED, PRODUCT, SUMMARY
+from walop_jax.calibration import PRODUCT, SUMMARY, Calibration, read_calibration
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.figure_data import UNNAMED
 from walop_jax.diagnosis.figure_file import FIGURE_DATA, DiagnosisFigureData, read_figure_data
-from walop_jax.diagnosis.findings import DIAGNOSIS
 from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.text import read_json
+from walop_jax.posterior.run import (
+    COMPARISON,
+    CORNER,
+    DIAGNOSIS,
+    EPOCH,
+    INTERVALS,
+    LIMITS,
+    POSTERIOR,
+    SAMPLE,
+    Run,
+)
 
-POSTERIOR, INTERVALS, CORNER, SAMPLE = "posterior.nc", "posterior.ecsv", "posterior_corner.png", "sample.json"
-COMPARISON, EPOCH, LIMITS = "comparison.json", "epoch.json", "limits.json"
+__all__ = ["COMPARISON", "CORNER", "EPOCH", "INTERVALS", "LIMITS", "POSTERIOR", "SAMPLE", "SUMMARY"]
+
 SUMMARY_KEYS = ("chi2", "dof", "n_data", "parameters", "converged", "message", "versions", "inputs")
 DIAGNOSIS_KEYS = ("verdict", "steps", "candidates", "unexplained")
 DEFAULTS: dict[str, Any] = {"warnings": [], "remarks": [], "misfit": None}  # what a summary may lack
@@ -39,7 +48,7 @@ class RunContents:
 
     folder: Path
     summary: dict[str, Any]
-    product: CalibrationProduct | None
+    product: Calibration | None
     diagnosis: dict[str, Any] | None
     figure_data: DiagnosisFigureData | None
     sample: dict[str, Any] | None
@@ -55,35 +64,25 @@ def read_run(folder: Path) -> RunContents:
     Raises `DataError`, with advice, if it is no such folder or if its summary or diagnosis cannot be read; other
     files that are absent or damaged are left out and listed in `missing`.
     """
-    if not folder.is_dir():
-        raise fail(
-            "is not the folder of a run", file=folder, advice="give the RUN of walop-jax refit or diagnose"
-        )
-    if not (folder / SUMMARY).exists():
-        if (folder / FAILED).exists():
-            raise fail(
-                f"the fit of this run did not converge; {FAILED} says how it ended",
-                file=folder,
-                advice="look at the data with walop-jax inspect, then refit",
-            )
-        raise fail(f"holds no {SUMMARY}", file=folder, advice="give the RUN of walop-jax refit or diagnose")
+    run = Run(folder)
+    run.wanted(SUMMARY, "give the RUN of walop-jax refit or diagnose")
     missing: list[str] = []
 
     def optional(name: str, read: Callable[[Path], T], lost: str, wanted: bool = True) -> T | None:
-        path = folder / name
-        if not path.exists():
+        if name not in run:
             if wanted:
                 missing.append(f"{name} is not there: {lost}.")
             return None
         try:
-            return read(path)
+            return read(folder / name)
         except (DataError, OSError) as error:
             missing.append(f"{name} cannot be used ({error}): {lost}.")
             return None
 
     summary = DEFAULTS | _document(folder / SUMMARY, SUMMARY_KEYS)
-    product = optional(PRODUCT, read_product, "no maps of the matrix, no pulls from the priors")
-    diagnosis = _document(folder / DIAGNOSIS, DIAGNOSIS_KEYS) if (folder / DIAGNOSIS).exists() else None
+    lost = "no maps of the matrix, no pulls from the priors"
+    product = optional(PRODUCT, lambda path: read_calibration(path, rebuild=False), lost)
+    diagnosis = _document(folder / DIAGNOSIS, DIAGNOSIS_KEYS) if DIAGNOSIS in run else None
     figure_data = None
     if diagnosis is None:
         missing.append("This run is a refit: maps of the residuals come with walop-jax diagnose.")
@@ -102,7 +101,7 @@ def read_run(folder: Path) -> RunContents:
             missing.append(
                 f"{DIAGNOSIS} is of another fit than {SUMMARY}: this folder was written to again since."
             )
-    sampled = (folder / POSTERIOR).exists()
+    sampled = POSTERIOR in run
     return RunContents(
         folder=folder,
         summary=summary,

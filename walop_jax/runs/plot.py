@@ -43,6 +43,6 @@ def plot_figure(
         )
     if progress is not None:
         progress(f"drawing {name}")
-    figure = draw(name, Source(Path(run), tuple(parameters), place, tuple(catalogue)))
+    figure = draw(name, Source(Path(run), tuple(catalogue), tuple(parameters), place))
     save_figure(path, figure, overwrite=overwrite)
     return path

@@ -17,9 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import special
 
-from walop_jax.calibration.analysis_vectors import COLOURS, AnalysisVectors
+from walop_jax.calibration.analysis_vectors import COLOURS, COOLEST, AnalysisVectors, colour_weights
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.colour import COOLEST, colour_weights
 from walop_jax.data.catalogue import Catalogue
 from walop_jax.data.settings import Settings
 from walop_jax.fit.verdict import Quality

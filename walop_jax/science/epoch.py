@@ -21,7 +21,7 @@ from scipy import special
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.records import SMALLEST_DETERMINANT
+from walop_jax.calibration.maps import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import SKY_AND_STARS, model_like
