@@ -336,7 +336,9 @@ class Calibration(Displayed):
         matrix, slopes = matrix_slopes(self.model.instrument(self.values), settings, filters, x, y)
         errors = np.array([change_of_qu(matrix, matrix + slopes @ change) for change in self.hidden.changes])
         worst = int(np.argmax(np.nan_to_num(errors).max(axis=1)))
-        return np.nanmax(errors, axis=0), self.hidden.names[worst]
+        return np.where(
+            np.isnan(errors).all(axis=0), np.nan, np.nan_to_num(errors).max(axis=0)
+        ), self.hidden.names[worst]
 
     def _of_structure(self, values: Float[np.ndarray, "p m"]) -> Float[np.ndarray, "p m m"]:
         """What the structure of field points adds to the covariance of the matrix at a place.
