@@ -10,8 +10,7 @@ import pytest
 from astropy.table import Table
 from small_run import SEED, WITH_PLATE
 
-from walop_jax.calibration.analysis_vectors import COLOURS, AnalysisVectors
-from walop_jax.calibration.colour import colour_weights
+from walop_jax.calibration.analysis_vectors import COLOURS, AnalysisVectors, colour_weights
 from walop_jax.data import DataError
 from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.settings import Settings

@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from walop_jax.calibration.matrix_slopes import matrix_slopes
+from walop_jax.calibration.matrix import matrix_slopes
 from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import base_model
