@@ -250,6 +250,15 @@ def test_example_of_a_model_file():
 # -------------------------------------------------------------------------------------- model and effects
 
 
+def test_tables_of_effects_are_those_of_the_catalogue():
+    """Generated: what the page should say is what the assertion shows."""
+    from walop_jax.model.gallery import catalogue_tables
+
+    page = section("effects", "The catalogue of effects")
+    start, stop = page.index("### Sky and stars"), page.index("`free_form` is not an effect")
+    assert page[start:stop].strip() == catalogue_tables().strip()
+
+
 def test_effects_with_parameters_units_and_widths():
     from walop_jax.model.effects import EFFECTS
     from walop_jax.model.parameters import field_declarations

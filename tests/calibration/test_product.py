@@ -25,7 +25,7 @@ from walop_jax.fit.model_file import render
 from walop_jax.fit.verdict import Verdict
 from walop_jax.io.text import in_ascii
 from walop_jax.model.effects import Context, Described
-from walop_jax.model.effects.sentence import OPTICAL
+from walop_jax.model.effects.optics import OPTICAL
 from walop_jax.model.specification import with_effects
 
 NAN = float("nan")

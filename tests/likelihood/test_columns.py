@@ -9,7 +9,6 @@ from small_run import SMALL, WITH_PLATE
 
 from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.effect_columns import applicable, probes, showable
-from walop_jax.diagnosis.effect_sums import sums
 from walop_jax.fit.model_builder import base_model
 from walop_jax.likelihood.columns import Columns, columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
@@ -98,7 +97,7 @@ def test_every_effect_against_the_whole_light_path(laid):
     first = {probe.effect: probe for probe in reversed(wanted)}
     assert len(first) >= 30
     for effect, probe in first.items():
-        changes = [change for member in probe.group for change in sums(member, template) or ()]
+        changes = [change for member in probe.group for change in member.first_order(template)]
         ours = columns(likelihood, values, changes)
         _alike(ours, own_columns(likelihood, values, probe.group), [effect.name] * ours.shape[1])
 

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis.effect_sums import sums
 from walop_jax.diagnosis.score import Candidate
 from walop_jax.likelihood.columns import Change, Columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
@@ -120,9 +119,9 @@ def all_candidates(
     columns = Columns(likelihood, values)
     changes: dict[int, list[Change]] = {}
     for number, probe in enumerate([*shown, *sentences]):
-        each = [sums(member, template) for member in probe.group]
-        if all(one is not None and all(columns.has(change) for change in one) for one in each):
-            changes[number] = [change for one in each for change in one or ()]
+        each = [member.first_order(template) for member in probe.group]
+        if all(one and all(columns.has(change) for change in one) for one in each):
+            changes[number] = [change for one in each for change in one]
     gaps = [sentence.gap for some in changes.values() for change in some for sentence in _fringes(change)]
     survives = columns.survives(gaps)
     blurred = {

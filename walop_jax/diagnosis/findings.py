@@ -16,7 +16,6 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.rounding import value_and_error
 from walop_jax.model.effects import Described
-from walop_jax.model.effects.sentence import FIELD_FACTORS, OPPOSITE, Sentence
 from walop_jax.model.parameters import field_declarations
 
 Outcome = Literal["consistent", "effect_found", "unexplained"]
@@ -259,23 +258,6 @@ class Diagnosis(Displayed):
 
 # --------------------------------------------------------------------------------- sentences, told to people
 
-_OF_FACTOR = {
-    "hours": "the same exposures in another order, or once more hours later",
-    "hour angle": "the same exposures at other hour angles, in another order",
-    "kelvin": "the same exposures at another temperature",
-    "colour": "narrow bands, or another filter",
-    "counts": "the same exposures at another flux",
-}
-_OF_KIND = {
-    "afterglow": "a dark exposure after a bright one",
-    "light": "the same field points at another flux, and darks",
-    "gain": "a lamp that does not change, seen by all cameras in turn",
-    "fringes": "narrow bands a nanometre apart, or the same band at another temperature",
-    "shift": "narrow bands beside the broad one",
-    "displacement": "the same angles at several hour angles, and a star at known pixels in each",
-    "polarisation": "the same patch or star again at another ROTATOR angle",
-}
-
 
 def told(result: FitResult) -> tuple[Told, ...]:
     """The sentences of a fitted model, with their amplitudes."""
@@ -299,42 +281,10 @@ def told(result: FitResult) -> tuple[Told, ...]:
                 sigma=sigma,
                 unit=unit,
                 words=f"{kind}: {value} ± {error}{' ' if unit else ''}{unit}{''.join(f', {d}' for d in dependence)}",
-                tested_by=tested_by(sentence),
+                tested_by=sentence.tested_by,
             )
         )
     return tuple(found)
-
-
-def tested_by(sentence: Sentence) -> str:
-    """The observation that would show whether a sentence is true."""
-    advice = []
-    for factor in sentence.factors:
-        if factor in _OF_FACTOR:
-            advice.append(_OF_FACTOR[factor])
-        elif factor.startswith(("cos", "sin")):
-            advice.append(
-                "a full turn at more angles in random order, then with the element mounted turned by 90°"
-            )
-        elif factor.startswith(("hours", "exposure")):
-            advice.append("the same exposures once more")
-        elif factor in FIELD_FACTORS or factor.startswith("ring"):
-            advice.append(
-                "more field points along that direction; dither: what is of the optics stays where it is"
-            )
-    kind = sentence.kind.split()[0]
-    if sentence.origin == OPPOSITE:
-        advice.append("a star dithered over the field: its ghost moves the other way")
-    elif kind in _OF_KIND:
-        advice.append(_OF_KIND[kind])
-    elif sentence.where == "ahead of" and "." not in sentence.place:
-        advice.append("standards at several ROTATOR angles: light through the polariser does not have it")
-    elif sentence.where == "of":
-        advice.append("the same exposures without that element, or with it mounted turned over")
-    else:
-        advice.append(
-            "the calibration plate at 0° and 45°: it turns what is ahead of it, and not what is behind"
-        )
-    return "; ".join(dict.fromkeys(advice))
 
 
 # ------------------------------------------------------------------------------------------ as plain data

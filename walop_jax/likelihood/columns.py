@@ -32,8 +32,8 @@ from walop_jax.likelihood.thinning import median_counts
 from walop_jax.model import light, responses
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects.base import Effect, with_amplitudes
-from walop_jax.model.effects.described_parts import REFERENCE_COUNTS
-from walop_jax.model.effects.etalon import LARGEST_GAP
+from walop_jax.model.effects.cameras import REFERENCE_COUNTS
+from walop_jax.model.effects.optics import LARGEST_GAP
 from walop_jax.model.effects.sentence import Sentence
 from walop_jax.model.elements import WavePlate
 from walop_jax.model.elements.wave_plate import AirGap

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from walop_jax.model import responses
-from walop_jax.model.effects.described import cameras_of
+from walop_jax.model.effects.cameras import cameras_of
 from walop_jax.model.effects.sentence import BAND, NUMBERS, OPPOSITE, SKY, Sentence
 from walop_jax.model.elements import Element, WavePlate
 from walop_jax.model.instrument import Instrument

@@ -13,6 +13,7 @@ Oblique     The Stokes parameters of a ray of direction k refer to the ICS axes 
             the smallest rotation (`optics.carried_axes`).
 """
 
+REFERENCE_WAVELENGTH = 0.62  # µm: where dispersions, colours and fringes are counted from
 FIELD_SCALE = 0.3  # degrees: the unit of the field polynomials of WALOP
 
 

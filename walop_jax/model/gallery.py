@@ -3,14 +3,17 @@ pages."""
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import json
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from importlib.resources import files
 from typing import Any
 
 from walop_jax.model.effects import EFFECTS, Effect, effect_by_name
+from walop_jax.model.effects.catalogue import PARTS
 from walop_jax.model.elements import ELEMENTS
 from walop_jax.model.elements.base import Element
 from walop_jax.model.parameters import field_declarations, numbers_of, unknown_name
@@ -43,6 +46,33 @@ def listed() -> str:
     return "\n".join(lines) + "\n"
 
 
+def catalogue_tables() -> str:
+    """The tables of all effects in docs: effects, as Markdown, from the catalogue."""
+    lines: list[str] = []
+    for effect in EFFECTS:
+        if effect.name in PARTS:
+            lines += ["", f"### {PARTS[effect.name]}", ""]
+            lines += ["| effect | parameter | unit | width | what it is |", "| --- | --- | --- | --- | --- |"]
+        choices = [f.name for f in dataclasses.fields(effect) if f.metadata.get("static")]
+        choices = [name for name in choices if name not in ("positions", "ids")]
+        equation = effect.head().partition("Equation")[2].partition("\nSymbols")[0]
+        told = [_about(effect), *(f"choice: `{name}`" for name in choices), " ".join(equation.split())]
+        declared = field_declarations(effect)
+        for name, d in declared.items() or [("none", None)]:
+            width = "" if d is None or d.width is None else f"{d.width:g}"
+            what = "" if d is None else d.about + ("" if d.width else " (shape)")
+            cells = (
+                effect.name if told else "",
+                name,
+                d.unit if d else "",
+                width,
+                "; ".join((*told, what)).rstrip("; "),
+            )
+            lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |".replace("|  |", "| |"))
+            told = []
+    return re.sub(r"\|  (?=\|)", "| ", "\n".join(lines).strip()) + "\n"
+
+
 def numbers() -> dict[str, Any]:
     """The numbers of the pages: `plan` in words, and by effect what `diagnosis.detection_limits` finds for it, and
     the rms change of the matrix (per cent) at its usual size."""
@@ -58,7 +88,7 @@ def _effect(effect: type[Effect]) -> Iterator[str]:
     yield ""
     yield f"{_about(effect)}."
     yield ""
-    yield from _head(effect)
+    yield from _indented(effect.head())
     yield from _table(
         ("parameter", "unit", "usual size", "what it is"),
         [
@@ -66,7 +96,7 @@ def _effect(effect: type[Effect]) -> Iterator[str]:
             for n, d in field_declarations(effect).items()
         ],
     )
-    said = _head_text(effect)
+    said = f"\n{effect.head()}"
     if effect.revealed_by and "\nRevealed" not in said:
         yield f"**Revealed by** {effect.revealed_by}."
         yield ""
@@ -129,11 +159,11 @@ def _element(kind: type[Element]) -> Iterator[str]:
     yield ""
     yield f"{_about(kind)}."
     yield ""
-    yield from _head(kind)
+    yield from _indented(_head_text(kind).partition("\n")[2].strip("\n"))
     yield from _table(
         ("number", "unit", "what it is"), [(n, d.unit, d.about) for n, d in numbers_of(kind).items()]
     )
-    changed = [effect.name for effect in EFFECTS if kind.kind and kind.kind in _head_text(effect).lower()]
+    changed = [effect.name for effect in EFFECTS if kind.kind and kind.kind in effect.head().lower()]
     if changed:
         yield f"Effects that speak of it: {', '.join(f'`{name}`' for name in changed)}."
         yield ""
@@ -145,11 +175,10 @@ def _head_text(kind: type[Any]) -> str:
     return inspect.cleandoc(sys.modules[kind.__module__].__doc__ or "")
 
 
-def _head(kind: type[Any]) -> Iterator[str]:
-    """The head of the file that defines it, equation and symbols, as it stands there."""
-    lines = _head_text(kind).splitlines()[2:]
-    if lines:
-        yield from (f"    {line}".rstrip() for line in lines)
+def _indented(head: str) -> Iterator[str]:
+    """Equation and symbols, as they stand in the head of a file."""
+    if head:
+        yield from (f"    {line}".rstrip() for line in head.splitlines())
         yield ""
 
 

@@ -136,7 +136,7 @@ def _source() -> bytes:
     digest = hashlib.sha256(sys.version.encode())
     for package in _PACKAGES:
         digest.update(f"{package} {importlib.metadata.version(package)}".encode())
-    for path in sorted(root.rglob("*.py")):
+    for path in sorted((*root.rglob("*.py"), *root.rglob("effects/*.toml"))):
         if path.stat().st_mtime > _STARTED:
             raise _NotKept(str(path))
         digest.update(str(path.relative_to(root)).encode() + path.read_bytes())

@@ -130,24 +130,36 @@ def polarised(angle: Scalar, extinction: Scalar | float) -> Float[Array, "... 4"
     return jnp.stack([jnp.ones_like(two), c * jnp.cos(two), c * jnp.sin(two), jnp.zeros_like(two)], axis=-1)
 
 
-def one_retarder(axis: int, delta: Scalar) -> Float[Array, "... 4 4"]:
-    """Rotation of the Poincaré sphere about Stokes axis 1, 2 or 3: a retarder at 0° or 45°, or a circular one (rad)."""
-    j, k = {1: (2, 3), 2: (3, 1), 3: (1, 2)}[axis]
-    eye = jnp.broadcast_to(jnp.eye(4), (*jnp.shape(delta), 4, 4))
-    cos, sin = jnp.cos(delta), jnp.sin(delta)
-    return eye.at[..., j, j].set(cos).at[..., k, k].set(cos).at[..., j, k].set(sin).at[..., k, j].set(-sin)
+def general_retarder(q: Scalar, u: Scalar, v: Scalar) -> Float[Array, "... 4 4"]:
+    """Elliptical retarder of retardance vector (q, u, v) (rad): the Poincaré sphere turned about it by its length.
 
-
-def one_diattenuator(axis: int, d: Scalar) -> Float[Array, "... 4 4"]:
-    """A diattenuator of unit mean transmission along Stokes axis 1, 2 or 3 (Lu & Chipman 1996, eq. 18)."""
-    root = jnp.sqrt(1.0 - d**2)[..., None, None] * jnp.eye(4)
-    return (
-        root.at[..., 0, 0]
-        .set(1.0)
-        .at[..., axis, axis]
-        .set(1.0)
-        .at[..., 0, axis]
-        .set(d)
-        .at[..., axis, 0]
-        .set(d)
+    M = 1 + s A + c A², A the cross product with the vector r, s = sin Δ/Δ, c = (1 − cos Δ)/Δ², Δ = |r|; smooth at 0.
+    A linear one at an axis α has (Δ cos 2α, Δ sin 2α, 0).
+    """
+    square = q**2 + u**2 + v**2
+    small = square < 1e-6
+    length = jnp.sqrt(jnp.where(small, 1.0, square))
+    s = jnp.where(small, 1.0 - square / 6.0 + square**2 / 120.0, jnp.sin(length) / length)
+    half = jnp.sin(0.5 * length) / (0.5 * length)
+    c = jnp.where(small, 0.5 - square / 24.0 + square**2 / 720.0, 0.5 * half**2)
+    one, zero = jnp.ones_like(square), jnp.zeros_like(square)
+    rows = (
+        (one, zero, zero, zero),
+        (zero, one - c * (u**2 + v**2), c * q * u + s * v, c * q * v - s * u),
+        (zero, c * q * u - s * v, one - c * (q**2 + v**2), c * u * v + s * q),
+        (zero, c * q * v + s * u, c * u * v - s * q, one - c * (q**2 + u**2)),
     )
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def general_diattenuator(q: Scalar, u: Scalar, v: Scalar) -> Float[Array, "... 4 4"]:
+    """`diattenuator` with a circular part v."""
+    root = jnp.sqrt(1.0 - q**2 - u**2 - v**2)
+    k, one = 1.0 / (1.0 + root), jnp.ones_like(root)
+    rows = (
+        (one, q, u, v),
+        (q, root + k * q**2, k * q * u, k * q * v),
+        (u, k * q * u, root + k * u**2, k * u * v),
+        (v, k * q * v, k * u * v, root + k * v**2),
+    )
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)

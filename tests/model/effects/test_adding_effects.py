@@ -1,12 +1,18 @@
-"""Effects added to a model: names, order, starts, priors."""
+"""Effects added to a model: names, order, starts, priors; effects of one's own, by an entry or a class."""
 
 from __future__ import annotations
 
+import pickle
+from pathlib import Path
+
 import builders
 import effect_scenes as scenes
+import numpy as np
 import pytest
 
-from walop_jax.model.effects import effect_by_name
+from walop_jax.io.errors import DataError
+from walop_jax.model.effects import EFFECTS, effect_by_name
+from walop_jax.model.effects.own import catalogue_with
 from walop_jax.model.specification import effect_context, make_model, with_effects
 
 MODEL = make_model("WALOP-SOUTH", builders.south(standards=scenes.STARS)).change(
@@ -58,3 +64,69 @@ def test_wrong_names_and_effects_twice_are_errors():
 def test_context_of_a_data_set():
     context = effect_context(MODEL.template, scenes.EXPOSURES)
     assert context == scenes.CONTEXT
+
+
+# ---------------------------------------------------------------------------------- effects of one's own
+
+PAGE = Path(__file__).resolve().parents[3] / "walop_jax" / "docs" / "adding-an-effect.md"
+
+
+def example(title: str, first: str) -> str:
+    """The indented lines of a section of the page that begin with some text."""
+    section = PAGE.read_text(encoding="utf-8").partition(f"## {title}\n")[2].partition("\n## ")[0]
+    lines = section[section.index(f"    {first}") :].splitlines()
+    stop = next((i for i, line in enumerate(lines) if line and not line.startswith("    ")), len(lines))
+    return "\n".join(line.removeprefix("    ") for line in lines[:stop])
+
+
+def test_an_entry_of_a_file_is_an_effect(tmp_path):
+    """The example of the page is the retarder of the catalogue by another name."""
+    path = tmp_path / "window.toml"
+    path.write_text(example("An entry", "[stressed_window]"), encoding="utf-8")
+    *known, own = catalogue_with(path)
+    assert tuple(known) == EFFECTS
+    ours, theirs = (
+        effect_by_name(name, (*known, own)).of(scenes.CONTEXT, delta=0.05, axis=20.0)
+        for name in ("stressed_window", "upstream_retarder")
+    )
+    np.testing.assert_allclose(scenes.observe(ours), scenes.observe(theirs), rtol=1e-13)
+    names = with_effects(MODEL, [own], scenes.CONTEXT).names
+    assert [n for n in names if n.startswith("stressed")] == ["stressed_window.axis", "stressed_window.delta"]
+    assert "M = Ret(delta, axis)" in own.head()
+    assert pickle.loads(pickle.dumps(ours)) == ours
+
+
+def test_the_class_of_the_page_is_an_effect(tmp_path):
+    path = tmp_path / "spot.py"
+    path.write_text(example("A class", '"""A dark spot.'), encoding="utf-8")
+    own = catalogue_with(path)[-1].of(scenes.CONTEXT, x=0.21, size=0.1, depth=0.2)
+    left = 1.0 - 0.2 * np.exp(-((scenes.X - 0.21) ** 2 + scenes.Y**2) / 0.02)
+    np.testing.assert_allclose(
+        scenes.observe(own) / scenes.observe(), left[:, None, None] * np.ones((2, 9, 4))
+    )
+
+
+ENTRY = 'about = "a"\nsource = "b"\nrevealed_by = "c"\nseparated_by = "d"\n'
+GOOD = 'angle = { does = "turn of polariser", unit = "deg", width = 0.1, about = "e" }\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f"[a]\n{ENTRY}", r"\[a\] needs a parameter"),
+        (f"[a]\n{GOOD}", r"\[a\] needs about"),
+        (f"[a]\n{ENTRY}{GOOD.replace('turn of', 'tun of')}", "cannot read 'tun of polariser'"),
+        (f"[a]\n{ENTRY}{GOOD.replace('polariser', 'polariser * heat')}", "unknown factor 'heat'"),
+        (f"[a]\n{ENTRY}{GOOD.replace('width', 'widht')}", "unknown key of angle 'widht'; nearest: width"),
+        (f"[a]\n{ENTRY}{GOOD.replace(', width = 0.1', '')}", "angle: needs unit, about, and width"),
+        (f'[a]\n{ENTRY}{GOOD}on_sided = ["angle"]\n', "unknown key 'on_sided'; nearest: one_sided"),
+        (f"[clp_zero]\n{ENTRY}{GOOD}", "has the name of another effect"),
+        ("a = 3\n", "must be a table"),
+        ("", "defines no effect"),
+    ],
+)
+def test_an_entry_that_is_wrong_is_refused(tmp_path, text, message):
+    path = tmp_path / "own.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(DataError, match=message):
+        catalogue_with(path)

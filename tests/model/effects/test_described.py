@@ -1,19 +1,22 @@
-"""Sentences do what effects of the catalogue do that are known by another name, and what Mueller algebra says."""
+"""Changes do what effects of the catalogue do that are known by another name, and what Mueller algebra says."""
 
 import itertools
 import json
 
 import effect_scenes as scenes
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.linalg import expm, expm_frechet
 
 from walop_jax.fit.model_builder import model_without_data
 from walop_jax.fit.model_file import render
 from walop_jax.model import mueller
 from walop_jax.model.carried import left_behind
-from walop_jax.model.effects import Described, effect_by_name
-from walop_jax.model.effects.sentence import _PLAIN, KINDS, Sentence
+from walop_jax.model.effects import Change, Described, effect_by_name
+from walop_jax.model.effects.change import KINDS
+from walop_jax.model.effects.factors import PLAIN
 from walop_jax.model.parameters import NAME
 
 
@@ -174,16 +177,39 @@ def test_factors_grow_as_they_say():
     assert ring[..., 2:] == pytest.approx(1.0)
 
 
-def test_single_axis_matrices_are_the_general_ones():
+def test_general_matrices_are_those_of_one_axis():
     delta, d, none = (jnp.asarray(value) for value in (0.3, 0.2, 0.0))
-    for axis, general in ((1, 0.0), (2, np.pi / 4)):
-        ours, theirs = mueller.one_retarder(axis, delta), mueller.retarder(delta, jnp.asarray(general))
-        assert np.asarray(ours) == pytest.approx(np.asarray(theirs), abs=1e-15)
-    assert np.asarray(mueller.one_retarder(3, delta)) == pytest.approx(
-        np.asarray(mueller.rotation(delta / 2))
-    )
-    ours, theirs = mueller.one_diattenuator(2, d), mueller.diattenuator(none, d)
-    assert np.asarray(ours) == pytest.approx(np.asarray(theirs))
+    for axis, at in (
+        (0.0, (0.3, 0.0)),
+        (np.pi / 4, (0.0, 0.3)),
+        (0.2, (0.3 * np.cos(0.4), 0.3 * np.sin(0.4))),
+    ):
+        ours = mueller.general_retarder(*map(jnp.asarray, at), none)
+        assert np.asarray(ours) == pytest.approx(
+            np.asarray(mueller.retarder(delta, jnp.asarray(axis))), abs=1e-15
+        )
+    ours = mueller.general_retarder(none, none, delta)
+    assert np.asarray(ours) == pytest.approx(np.asarray(mueller.rotation(delta / 2)), abs=1e-15)
+    ours, theirs = mueller.general_diattenuator(delta, d, none), mueller.diattenuator(delta, d)
+    assert np.asarray(ours) == pytest.approx(np.asarray(theirs), abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    "vector", [(0.3, -0.2, 0.5), (3e-4, 5e-4, -6e-4), (1e-9, 0.0, 2e-9), (0.0, 0.0, 0.0)]
+)
+def test_an_elliptical_retarder_is_the_exponential_of_its_generator(vector):
+    """Against scipy's matrix exponential, with its derivatives, on either side of where the series is used."""
+    q, u, v = vector
+
+    def generator(q, u, v):
+        return np.array([[0, 0, 0, 0], [0, 0, v, -u], [0, -v, 0, q], [0, u, -q, 0]], float)
+
+    ours = mueller.general_retarder(*map(jnp.asarray, vector))
+    assert np.asarray(ours) == pytest.approx(expm(generator(q, u, v)), abs=1e-15)
+    slopes = jax.jacfwd(lambda r: mueller.general_retarder(*r))(jnp.asarray(vector))
+    for i, along in enumerate(np.eye(3)):
+        expected = expm_frechet(generator(q, u, v), generator(*along), compute_expm=False)
+        assert np.asarray(slopes[..., i]) == pytest.approx(expected, abs=1e-14)
 
 
 def test_what_cannot_be_carried_over_is_said():
@@ -198,12 +224,12 @@ def test_what_cannot_be_carried_over_is_said():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("retardence q behind collimator", "no sentence"),
+        ("retardence q behind collimator", "cannot read"),
         ("turn of polariser * z", "unknown factor 'z'"),
         ("gain of O3", "nearest: O2"),
         ("polarisation q of sky", "of which exposure"),
         ("polarisation q of green_star", "nearest: polarisation q of"),
-        ("polarisation of blue_star", "unknown sentence 'polarisation of blue_star'"),
+        ("polarisation of blue_star", "unknown description 'polarisation of blue_star'"),
         ("fringes of half1.plate", "of which gap"),
         ("shift of filter", "unknown place of a shift 'filter'"),
     ],
@@ -223,17 +249,17 @@ def test_sentences_are_read_as_they_are_written():
         "fringes of half1.plate * gap 10.0775",
         "polarisation q of sky * exposure 17",
     ):
-        assert Sentence.parsed(text).text == text
-    assert Sentence.parsed("turn of polariser * sin 2 CLP").in_words() == (
+        assert Change.parsed(text).text == text
+    assert Change.parsed("turn of polariser * sin 2 CLP").in_words() == (
         "turn of polariser, as the sine of 2 × the angle of CLP"
     )
 
 
 def test_every_kind_with_every_factor_is_a_parameter_name():
-    plain = (*_PLAIN, "ring 3", "cos 2 CLP", "sin 1 CHWP", "hours -0.5 to 20.5", "exposure 12", "gap 10.0775")
+    plain = (*PLAIN, "ring 3", "cos 2 CLP", "sin 1 CHWP", "hours -0.5 to 20.5", "exposure 12", "gap 10.0775")
     for kind, factor in itertools.product(KINDS, plain):
-        description = Sentence(kind, "behind", "half1.plate", (factor, "x"), "O1")
-        assert Sentence.parsed(description.text) == description
+        description = Change(kind, "behind", "half1.plate", (factor, "x"), "O1")
+        assert Change.parsed(description.text) == description
         assert NAME.fullmatch(f"described.{description.label}")
 
 

@@ -13,7 +13,6 @@ from numpy.polynomial.legendre import legval
 from walop_jax.fit.model_builder import model_without_data
 from walop_jax.fit.model_file import render
 from walop_jax.model.effects import EFFECTS, FreeForm, effect_by_name, in_order
-from walop_jax.model.effects.clp_wobble import ClpWobble
 from walop_jax.model.effects.free_form import BLOCKS
 from walop_jax.model.parameters import leaves
 from walop_jax.model.specification import with_effects
@@ -116,5 +115,5 @@ def test_it_survives_a_model_file():
 
 
 def test_effects_that_no_catalogue_lists_come_last():
-    wobble, free = ClpWobble(), FreeForm.of(scenes.CONTEXT, blocks=())
+    wobble, free = effect_by_name("clp_wobble")(), FreeForm.of(scenes.CONTEXT, blocks=())
     assert [e.name for e in in_order([free, wobble])] == ["clp_wobble", "free_form"]

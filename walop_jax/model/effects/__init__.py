@@ -1,73 +1,14 @@
-"""Physical effects beyond the base model: one file each, and `EFFECTS`, in the order light meets them."""
+"""Physical effects beyond the base model: changes of an instrument, and the catalogue of those that have a name."""
 
 from collections.abc import Iterable, Sequence
 
+from walop_jax.model.effects import cameras, numbers, optics, sources  # noqa: F401  the kinds of changes
 from walop_jax.model.effects.base import Context, Effect
-from walop_jax.model.effects.blemish import Blemish
-from walop_jax.model.effects.camera_gain_drift import CameraGainDrift
-from walop_jax.model.effects.camera_leakage import CameraLeakage
-from walop_jax.model.effects.chwp_in_beam import ChwpInBeam
-from walop_jax.model.effects.chwp_thickness import ChwpThickness
-from walop_jax.model.effects.clp_ellipticity import ClpEllipticity
-from walop_jax.model.effects.clp_extinction import ClpExtinction
-from walop_jax.model.effects.clp_wobble import ClpWobble
-from walop_jax.model.effects.clp_zero import ClpZero
-from walop_jax.model.effects.described import Described
-from walop_jax.model.effects.etalon import Etalon
-from walop_jax.model.effects.filter_shift import FilterShift
-from walop_jax.model.effects.flexure import Flexure
+from walop_jax.model.effects.catalogue import EFFECTS
+from walop_jax.model.effects.change import Change
+from walop_jax.model.effects.described import Described, OtherDescription
 from walop_jax.model.effects.free_form import FreeForm
-from walop_jax.model.effects.ghost import Ghost
-from walop_jax.model.effects.hwp_temperature import HwpTemperature
-from walop_jax.model.effects.lens_birefringence import LensBirefringence
-from walop_jax.model.effects.moon_multiple_scattering import MoonMultipleScattering
-from walop_jax.model.effects.moon_patch import MoonPatch
-from walop_jax.model.effects.nonlinearity import Nonlinearity
-from walop_jax.model.effects.other_description import OtherDescription
-from walop_jax.model.effects.pedestal import Pedestal
-from walop_jax.model.effects.plate_axis import ChwpAxis, Hwp1Axis, Hwp2Axis
-from walop_jax.model.effects.plate_crossing import Hwp1Crossing, Hwp2Crossing
-from walop_jax.model.effects.plate_cut import Hwp1AxisCut, Hwp2AxisCut
-from walop_jax.model.effects.rotator_zero import RotatorZero
-from walop_jax.model.effects.standard_outlier import StandardOutlier
-from walop_jax.model.effects.telescope_polarisation import TelescopePolarisation
-from walop_jax.model.effects.upstream_retarder import UpstreamRetarder
-from walop_jax.model.effects.wollaston_axis import WollastonAxis
 from walop_jax.model.parameters import unknown_name
-
-EFFECTS: tuple[type[Effect], ...] = (
-    MoonMultipleScattering,
-    MoonPatch,
-    RotatorZero,
-    StandardOutlier,
-    TelescopePolarisation,
-    ClpZero,
-    ClpWobble,
-    ClpExtinction,
-    ClpEllipticity,
-    LensBirefringence,
-    UpstreamRetarder,
-    ChwpInBeam,
-    ChwpAxis,
-    ChwpThickness,
-    Flexure,
-    FilterShift,
-    Etalon,
-    HwpTemperature,
-    Hwp1Axis,
-    Hwp2Axis,
-    Hwp1Crossing,
-    Hwp2Crossing,
-    Hwp1AxisCut,
-    Hwp2AxisCut,
-    WollastonAxis,
-    Blemish,
-    CameraLeakage,
-    Ghost,
-    Pedestal,
-    Nonlinearity,
-    CameraGainDrift,
-)
 
 
 def effect_by_name(name: str, catalogue: Sequence[type[Effect]] = EFFECTS) -> type[Effect]:
@@ -76,7 +17,7 @@ def effect_by_name(name: str, catalogue: Sequence[type[Effect]] = EFFECTS) -> ty
         if effect.name == name:
             return effect
     error = unknown_name("effect", name, [effect.name for effect in catalogue])
-    raise ValueError(f"{error}; one of your own needs --effects FILE.py, or catalogue= in Python")
+    raise ValueError(f"{error}; one of your own needs --effects FILE, or catalogue= in Python")
 
 
 def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
@@ -90,6 +31,7 @@ def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
 
 __all__ = [
     "EFFECTS",
+    "Change",
     "Context",
     "Described",
     "Effect",

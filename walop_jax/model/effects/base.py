@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import inspect
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
@@ -18,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.model.conventions import EXTINCTION
+from walop_jax.model.effects.change import Change
 from walop_jax.model.parameters import Component, field_declarations, unknown_name
 
 if TYPE_CHECKING:
@@ -51,7 +54,7 @@ class Effect(Component):
     from which to look for the effect: groups are alternatives, the members of a group are directions that
     are fitted together and that `combine` turns into one effect. `one_sided` names amplitudes that physics
     keeps above neutral; `over_field` says that only a number of field points can show it; `reference` says where
-    the effect is known from; `said` are the sentences that it is (`sentence`), none where no sentence holds it.
+    the effect is known from; `said` are the changes that it is (`change`), none where no change holds it.
     """
 
     name: ClassVar[str] = ""
@@ -118,6 +121,11 @@ class Effect(Component):
         return dataclasses.replace(group[0], **changed)
 
     @classmethod
+    def head(cls) -> str:
+        """Equation, symbols, source, neutral values and what reveals it, for its page: the head of its file."""
+        return inspect.cleandoc(sys.modules[cls.__module__].__doc__ or "").partition("\n")[2].strip("\n")
+
+    @classmethod
     def amplitudes(cls) -> tuple[str, ...]:
         """Names of the parameters in which the effect is linear at neutral."""
         return tuple(name for name in field_declarations(cls) if name not in cls.shape)
@@ -132,12 +140,12 @@ class Effect(Component):
         return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.metadata.get("static")}
 
     def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
-        """The sentences that the effect is in an instrument: what it does to first order is a sum of theirs."""
+        """Descriptions of the changes that the effect is in an instrument: to first order it is a sum of theirs."""
         del instrument
         return self.said
 
-    def sums(self, instrument: Instrument) -> tuple[tuple[str, ...], ...]:
-        """For each amplitude the sentences whose sum it is to first order, factor one each; none if not so plain."""
+    def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
+        """For each amplitude the changes whose sum, with their coefficients, it is to first order; none: not known."""
         del instrument
         return ()
 

@@ -9,15 +9,18 @@ Revealed by a local zero offset of one half, the same in all exposures.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.model.cameras import Transmission
 from walop_jax.model.effects.base import Context, Effect, Scalar, check_camera
+from walop_jax.model.effects.change import Change
 from walop_jax.model.parameters import param
 
 if TYPE_CHECKING:
@@ -26,6 +29,11 @@ if TYPE_CHECKING:
 SOURCE = "dust near a focal plane, or a damaged coating: expected size"
 
 GRID = (-0.25, -0.15, -0.05, 0.05, 0.15, 0.25)  # degrees
+
+
+def _distance(spot: Any, x: Any, y: Any) -> Any:
+    """Half the square of the distance from the centre, in standard deviations."""
+    return ((x - spot.x) ** 2 + (y - spot.y) ** 2) / (2.0 * spot.size**2)
 
 
 class Spot(Transmission):
@@ -40,8 +48,20 @@ class Spot(Transmission):
 
     def factors(self, x: Scalar, y: Scalar) -> Float[Array, " k"]:
         """What the spot leaves of the throughput."""
-        distance = ((x - self.x) ** 2 + (y - self.y) ** 2) / (2.0 * self.size**2)
+        distance = _distance(self, x, y)
         return jnp.ones(self.cameras).at[self.camera].add(-self.depth * jnp.exp(-distance))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Pattern:
+    """The spot as a factor of a column."""
+
+    x: float
+    y: float
+    size: float
+
+    def __call__(self, at: Any) -> Any:
+        return np.exp(-_distance(self, at.x, at.y))
 
 
 class Blemish(Effect):
@@ -75,6 +95,11 @@ class Blemish(Effect):
         """Spots on a grid over the field, in any of the cameras."""
         places = itertools.product(range(context.cameras), GRID, GRID)
         return tuple((cls.of(context, camera=camera, x=x, y=y, size=0.06),) for camera, x, y in places)
+
+    def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
+        """A gain of the camera that goes as the spot."""
+        pattern = _Pattern(float(self.x), float(self.y), float(self.size))
+        return (((-1.0, Change("shade", "of", instrument.cameras.names[self.camera], (pattern,))),),)
 
     def patch(self, instrument: Instrument) -> Instrument:
         """Darken the camera around the spot."""

@@ -22,8 +22,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.model.conventions import REFERENCE_WAVELENGTH
 from walop_jax.model.effects.base import Effect, Scalar
-from walop_jax.model.elements import AirGap, WavePlate
+from walop_jax.model.effects.change import Change
+from walop_jax.model.effects.optics import LARGEST_GAP, with_air_gap
+from walop_jax.model.elements import WavePlate
 from walop_jax.model.parameters import param
 
 if TYPE_CHECKING:
@@ -31,8 +34,6 @@ if TYPE_CHECKING:
 
 SOURCE = "Clarke 2005, A&A 434, 377; Semel 2003, A&A 401, 1"
 
-REFERENCE_WAVELENGTH = 0.62  # µm
-LARGEST_GAP = 60.0  # µm
 GAPS = tuple(np.arange(1.0, LARGEST_GAP, 0.75).tolist())
 QUARTER = REFERENCE_WAVELENGTH / 8.0
 
@@ -81,18 +82,13 @@ class Etalon(Effect):
         gaps = (float(self.gap), float(self.gap) + QUARTER)
         return tuple(f"fringes of {p} * gap {gap:g}" for p in instrument.places(WavePlate) for gap in gaps)
 
-    def sums(self, instrument: Instrument) -> tuple[tuple[str, ...], ...]:
+    def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
         """The fringes of all plates together."""
-        return (tuple(f"fringes of {p} * gap {float(self.gap):g}" for p in instrument.places(WavePlate)),)
+        gap = f"gap {float(self.gap)!r}"
+        return (tuple((1.0, Change("fringes", "of", p, (gap,))) for p in instrument.places(WavePlate)),)
 
     def patch(self, instrument: Instrument) -> Instrument:
         """Put an air gap ahead of every wave plate."""
         for place in instrument.places(WavePlate):
             instrument = with_air_gap(instrument, place, self.contrast, self.gap)
         return instrument
-
-
-def with_air_gap(instrument: Instrument, place: str, contrast: Scalar, gap: Scalar) -> Instrument:
-    """The instrument with one more air gap (µm) ahead of a wave plate."""
-    own = AirGap(contrast, gap, LARGEST_GAP)
-    return instrument.changed(place, air_gaps=lambda gaps: (*gaps, own))

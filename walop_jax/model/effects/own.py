@@ -1,4 +1,4 @@
-"""Effects that users bring along: a Python file beside the catalogue that comes with the package."""
+"""Effects that users bring along: a TOML or Python file beside the catalogue that comes with the package."""
 
 from __future__ import annotations
 
@@ -10,28 +10,34 @@ from walop_jax.io.errors import fail
 from walop_jax.io.own_code import classes_of
 from walop_jax.model.effects import EFFECTS
 from walop_jax.model.effects.base import Effect
+from walop_jax.model.effects.catalogue import own_entries
 
 
 def catalogue_with(
     own: str | os.PathLike[str] | None, catalogue: Sequence[type[Effect]] = EFFECTS
 ) -> tuple[type[Effect], ...]:
-    """The catalogue followed by the effects that the Python file `own` defines (None: nothing more).
+    """The catalogue followed by the effects of a file (None: nothing more): entries of a TOML file, classes of Python.
 
-    The file is run. Raises `DataError` if it cannot be, defines no effect, or one without a name or with that of
+    A Python file is run. Raises `DataError` if it cannot be, defines no effect, or one without a name or with that of
     another.
     """
     if own is None:
         return tuple(catalogue)
-    found = classes_of(
-        own, Effect, "give a Python file with subclasses of Effect (walop-jax docs adding-an-effect)"
-    )
-    found = {name: effect for name, effect in found.items() if not inspect.isabstract(effect)}
+    if os.fspath(own).endswith(".toml"):
+        found = {effect.name: effect for effect in own_entries(own)}
+    else:
+        found = classes_of(
+            own,
+            Effect,
+            "give a TOML file, or Python with subclasses of Effect (walop-jax docs adding-an-effect)",
+        )
+        found = {name: effect for name, effect in found.items() if not inspect.isabstract(effect)}
     if not found:
         raise fail("defines no effect", file=own, advice="see walop-jax docs adding-an-effect")
     taken = {effect.name for effect in catalogue}
     for class_name, effect in found.items():
         if not effect.name or effect.name in taken:
             what = f"{class_name} has {'the name of another effect' if effect.name else 'no name'}"
-            raise fail(what, file=own, advice='write name = "…" into the class')
+            raise fail(what, file=own, advice="give it a name of its own")
         taken.add(effect.name)
     return (*catalogue, *found.values())

@@ -4,7 +4,7 @@ from walop_jax.model.elements.analyser import Analyser
 from walop_jax.model.elements.base import Element
 from walop_jax.model.elements.collimator import Collimator, RadialRetarder
 from walop_jax.model.elements.geometry import FieldShift, PupilMapping, Wedge
-from walop_jax.model.elements.polariser import EncoderError, Polariser
+from walop_jax.model.elements.polariser import Polariser
 from walop_jax.model.elements.simple import AddedPolarisation, Depolariser, Diattenuator, Retarder, Rotator
 from walop_jax.model.elements.spectral import FieldDiattenuator, SpectralElement
 from walop_jax.model.elements.wave_plate import AirGap, Layer, WavePlate
@@ -36,7 +36,6 @@ __all__ = [
     "Depolariser",
     "Diattenuator",
     "Element",
-    "EncoderError",
     "FieldDiattenuator",
     "FieldShift",
     "Layer",

@@ -17,13 +17,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.model import mueller
+from walop_jax.model.conventions import FIELD_SCALE, REFERENCE_WAVELENGTH
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.parameters import number
 from walop_jax.model.ray import Ray
 
 Scalar = Float[Array, ""]
-REFERENCE_RADIUS = 0.3  # degrees
-REFERENCE_WAVELENGTH = 0.62  # µm
 PAPER_II = "Maharana et al. 2022, Paper II"
 
 
@@ -61,15 +60,5 @@ class RadialRetarder(Element):
             delta = delta + self.slope * (ray.wavelength - REFERENCE_WAVELENGTH)
         if self.bend is not None:
             delta = delta + self.bend * (ray.wavelength - REFERENCE_WAVELENGTH) ** 2
-        k = 2.0 * jnp.pi * delta / REFERENCE_RADIUS**2
-        a, b, total = k * (x**2 - y**2), k * 2.0 * x * y, k * (x**2 + y**2)
-        sine = jnp.sinc(total / jnp.pi)  # sin Δ / Δ
-        bend = 0.5 * jnp.sinc(0.5 * total / jnp.pi) ** 2  # (1 − cos Δ) / Δ²
-        one, zero = jnp.ones_like(total), jnp.zeros_like(total)
-        rows = (
-            (one, zero, zero, zero),
-            (zero, one - bend * b**2, bend * a * b, -sine * b),
-            (zero, bend * a * b, one - bend * a**2, sine * a),
-            (zero, sine * b, -sine * a, jnp.cos(total)),
-        )
-        return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+        k = 2.0 * jnp.pi * delta / FIELD_SCALE**2
+        return mueller.general_retarder(k * (x**2 - y**2), k * 2.0 * x * y, jnp.zeros_like(k * x))

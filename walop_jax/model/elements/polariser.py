@@ -1,7 +1,7 @@
 """The calibration polariser: light behind it forgets its past.
 
 Equation    light behind it (1, c cos 2θ, c sin 2θ, v), c = (1 − ε)/(1 + ε), per unit of transmitted light
-            θ = reading + zero + Σ errors of the encoder
+            θ = reading + zero
 Symbols     θ transmission axis in the instrument frame; ε extinction ratio, unwanted over wanted transmission;
             v circular polarisation behind it; reading: encoder [deg]
 Source      Malus' law for a polariser of finite extinction: Goldstein 2003, Polarized Light, ch. 9.
@@ -13,7 +13,6 @@ from __future__ import annotations
 import abc
 from typing import ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -24,18 +23,6 @@ from walop_jax.model.sources.base import ExposureArrays
 
 Scalar = Float[Array, ""]
 Angles = Float[Array, " e"]
-
-
-class EncoderError(Component):
-    """Error of the reading at a harmonic of the turn: amplitude · sin(order · reading − phase)."""
-
-    amplitude: Scalar = number(unit="deg", about="largest error")
-    phase: Scalar = number(unit="rad", about="phase at which there is none")
-    order: int = eqx.field(static=True, default=1)
-
-    def error(self, reading: Angles) -> Angles:
-        """What is added to the reading (rad)."""
-        return jnp.deg2rad(self.amplitude) * jnp.sin(self.order * reading - self.phase)
 
 
 class Film(Component):
@@ -54,7 +41,6 @@ class Polariser(Element):
     extinction: Scalar = number(unit="", about="ε, unwanted over wanted transmission")
     zero: Scalar | None = number(unit="deg", about="added to the encoder reading", default=None)
     ellipticity: Scalar | None = number(unit="", about="circular polarisation behind it", default=None)
-    encoder: tuple[EncoderError, ...] = ()
     films: tuple[Film, ...] = ()
 
     kind: ClassVar[str] = "polariser"
@@ -62,10 +48,7 @@ class Polariser(Element):
 
     def axis_of(self, reading: Angles) -> Angles:
         """Transmission axis (rad) from the encoder reading (rad)."""
-        axis = reading if self.zero is None else reading + jnp.deg2rad(self.zero)
-        for error in self.encoder:
-            axis = axis + error.error(reading)
-        return axis
+        return reading if self.zero is None else reading + jnp.deg2rad(self.zero)
 
     def light(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e 4"]:
         """Stokes vectors behind it at a field point, per unit of transmitted light, one per exposure."""

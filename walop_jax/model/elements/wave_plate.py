@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.model import materials, mueller, plates
+from walop_jax.model.conventions import REFERENCE_WAVELENGTH
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.parameters import Component, Declaration, number
 from walop_jax.model.ray import Ray
@@ -29,7 +30,6 @@ Scalar = Float[Array, ""]
 Real = Float[Array, "..."]
 Known = dict[tuple[str, int], tuple[Real, Real]]
 """Ordinary and extraordinary indices by crystal and array of wavelengths (its `id`, while the rays live)."""
-REFERENCE_WAVELENGTH = 0.62  # µm
 MODELS = {"waves": plates.stack_mueller, "fixed_axis": plates.fixed_axis_mueller}
 
 

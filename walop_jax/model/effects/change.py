@@ -1,0 +1,265 @@
+"""One thing that may be otherwise in an instrument, with one amplitude: a kind, at a place, growing with something.
+
+    KIND PREPOSITION PLACE [* FACTOR ...]
+
+    retardance q behind collimator * r2         a linear retarder with its axis along X, growing as r² over the field
+    turn of polariser * cos 2 CLP               an axis that is turned by an amount that depends on its own reading
+    gain of O1 * hours                          a camera that grows more sensitive
+    light of E1 in O1                           a share of the counts of one camera in another one
+    polarisation q of HD_14069                  a star that is not what the catalogue says
+
+At an amplitude of 0 nothing happens. A kind is a class in a file of its family (`optics`, `numbers`, `cameras`,
+`sources`): it says what a change does to an instrument. Factors (`factors`) multiply each other; without one the
+amplitude is the same everywhere.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import functools
+import re
+from collections.abc import Hashable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from walop_jax.model.effects.factors import FIELD, WAVELENGTH, Exposure, Factor, Gap, factor
+from walop_jax.model.ray import NotPlannedError
+from walop_jax.model.sources import ExposureArrays
+
+if TYPE_CHECKING:  # an instrument holds effects, and effects hold changes
+    from walop_jax.model.instrument import Instrument
+
+Scalar = Float[Array, ""]
+Term = tuple["Change", Scalar]
+OPPOSITE = "opposite"  # the field point, as an origin of light
+SKY, BAND = "sky", "band"  # places that are no element
+
+
+class Amplitude(NamedTuple):
+    """Unit, meaning and plausible size of an amplitude."""
+
+    unit: str
+    about: str
+    width: float
+
+
+AMPLITUDES = {
+    "share": Amplitude("", "share", 0.003),
+    "retardance": Amplitude("rad", "retardance", 0.02),
+    "angle": Amplitude("deg", "angle", 0.1),
+    "displacement": Amplitude("deg", "displacement in the field", 0.005),
+    "length": Amplitude("um", "length", 5.0),
+    "wavelength": Amplitude("um", "displacement of the band", 0.003),
+    "number": Amplitude("", "number", 1.0),
+}
+"""Amplitudes of changes, by the parameter of `described` that holds them."""
+
+
+class Kind(abc.ABC):
+    """A kind of change. `names` begin the texts of its changes, `parameter` is one of `AMPLITUDES`; `test`: what would
+    show it."""
+
+    names: ClassVar[tuple[str, ...]]
+    parameter: ClassVar[str]
+    test: ClassVar[str] = ""
+
+    def __init_subclass__(cls) -> None:
+        for name in vars(cls).get("names", ()):
+            KINDS[name] = cls
+
+    @classmethod
+    def together(cls, change: Change) -> tuple[type[Kind], Hashable]:
+        """Changes for which this is equal are patched together, by the class of it."""
+        return cls, change
+
+    @classmethod
+    @abc.abstractmethod
+    def patch(cls, instrument: Instrument, terms: Sequence[Term]) -> Instrument:
+        """The instrument with changes of some amplitudes.
+
+        Raises `NoSuchPlaceError` where it has no such place, ValueError for a change that cannot be made.
+        """
+
+
+KINDS: dict[str, type[Kind]] = {}
+"""All kinds by their names, filled by their classes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """A kind at a place with its factors; `origin` is where light comes from: another camera, or `OPPOSITE`."""
+
+    kind: str
+    where: str
+    place: str
+    factors: tuple[Any, ...] = ()  # texts; a column may be taken with a function of the exposures instead
+    origin: str = ""
+
+    @classmethod
+    def parsed(cls, text: str) -> Self:
+        """The change of a text. Raises ValueError, with the nearest words, for what is none."""
+        return cls(*_parsed(text))
+
+    @property
+    def text(self) -> str:
+        """The change as it is typed."""
+        origin = f" of {self.origin}" if self.origin else ""
+        return " * ".join((f"{self.kind}{origin} {self.where} {self.place}", *self.factors))
+
+    @property
+    def label(self) -> str:
+        """The same without blanks, for the name of a parameter."""
+        return self.text.replace(" ", "_")
+
+    @property
+    def parameter(self) -> str:
+        """The amplitude, by its name in `AMPLITUDES`."""
+        return KINDS[self.kind].parameter
+
+    @property
+    def grows_with(self) -> tuple[Factor, ...]:
+        """Its factors."""
+        return tuple(map(factor, self.factors))
+
+    def times(self, *factors: str) -> Change:
+        """The change with further factors."""
+        return dataclasses.replace(self, factors=(*self.factors, *factors))
+
+    @property
+    def number(self) -> int:
+        """The exposure that it is about. Raises ValueError for a change of no single one."""
+        return self._only(Exposure, "of which exposure", "exposure 7").number
+
+    @property
+    def gap(self) -> float:
+        """Thickness (µm) of the air whose fringes it is about. Raises ValueError for a change without one."""
+        return self._only(Gap, "of which gap (µm)", "gap 10").thickness
+
+    def _only(self, form: type[Any], what: str, example: str) -> Any:
+        """The only factor of a form."""
+        found = [one for one in self.grows_with if isinstance(one, form)]
+        if len(found) != 1:
+            raise ValueError(f"{self.text!r}: say {what}, as in '{self.kind} of {self.place} * {example}'")
+        return found[0]
+
+    @property
+    def field_factors(self) -> tuple[str, ...]:
+        """Factors that depend on the field point alone."""
+        return tuple(f.text for f in self.grows_with if f.depends_on == FIELD)
+
+    @property
+    def exposure_factors(self) -> tuple[str, ...]:
+        """Factors that depend on the exposure."""
+        return tuple(f.text for f in self.grows_with if f.depends_on not in (FIELD, WAVELENGTH))
+
+    def factor(self, at: Any) -> Any:
+        """Product of its factors (`Factor.value`), 1 without any."""
+        product: Any = 1.0
+        for each in self.grows_with:
+            product = product * each.value(at)
+        return product
+
+    def in_words(self) -> str:
+        """Kind, place and dependence, to be read by people."""
+        origin = "the opposite field point" if self.origin == OPPOSITE else self.origin
+        of = f" of {origin}" if origin else ""
+        return ", ".join((f"{self.kind}{of} {self.where} {self.place}", *(f.words for f in self.grows_with)))
+
+    @property
+    def tested_by(self) -> str:
+        """The observations that would show whether it is so."""
+        advice = [f.test for f in self.grows_with if f.test]
+        if self.origin == OPPOSITE:
+            advice.append("a star dithered over the field: its ghost moves the other way")
+        elif test := KINDS[self.kind].test:
+            advice.append(test)
+        elif self.where == "ahead of" and "." not in self.place:
+            advice.append("standards at several ROTATOR angles: light through the polariser does not have it")
+        elif self.where == "of":
+            advice.append("the same exposures without that element, or with it mounted turned over")
+        else:
+            advice.append(
+                "the calibration plate at 0° and 45°: it turns what is ahead of it, and not what is behind"
+            )
+        return "; ".join(dict.fromkeys(advice))
+
+
+@functools.lru_cache(maxsize=8192)
+def _parsed(text: str) -> tuple[str, str, str, tuple[str, ...], str]:
+    head, *factors = (part.strip() for part in text.split("*"))
+    found = _pattern().fullmatch(head)
+    if found is None:
+        raise ValueError(
+            f"cannot read {text!r}: expected KIND of|in|behind|ahead of PLACE [* FACTOR ...]; kinds are "
+            f"{', '.join(KINDS)}"
+        )
+    for each in factors:
+        factor(each)
+    return found["kind"], found["where"], found["place"], tuple(factors), found["origin"] or ""
+
+
+@functools.cache
+def _pattern() -> re.Pattern[str]:
+    kinds = "|".join(re.escape(name) for name in sorted(KINDS, key=len, reverse=True))
+    return re.compile(
+        rf"(?P<kind>{kinds})(?: of (?P<origin>\S+))? (?P<where>of|in|ahead of|behind) (?P<place>[^\s*]+)"
+    )
+
+
+def patched(instrument: Instrument, terms: Iterable[Term]) -> Instrument:
+    """The instrument with changes of some amplitudes; those of one place that act together are combined."""
+    together: dict[tuple[type[Kind], Hashable], list[Term]] = {}
+    for change, size in terms:
+        together.setdefault(KINDS[change.kind].together(change), []).append((change, size))
+    for (kind, _), some in together.items():
+        instrument = kind.patch(instrument, some)
+    return instrument
+
+
+def add(size: Scalar) -> Any:
+    """What adds an amplitude to a number of an instrument that may not have it."""
+    return lambda value: size if value is None else value + size
+
+
+# ---------------------------------------------------------------------------- what factors may ask for
+
+
+@dataclasses.dataclass(frozen=True)
+class AtPoint:
+    """A field point, and nothing else: whatever a factor asks for beyond that is an error."""
+
+    x: Any
+    y: Any
+
+    def __getattr__(self, name: str) -> Any:
+        raise NotPlannedError(name)
+
+
+@dataclasses.dataclass(frozen=True)
+class InExposures:
+    """A list of exposures at a field point."""
+
+    exposures: ExposureArrays
+    x: Any = 0.0
+    y: Any = 0.0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.exposures, name)
+
+    @property
+    def number(self) -> Any:
+        """Positions in the list."""
+        return jnp.arange(self.exposures.hours.shape[0])
+
+    def angle(self, prefix: str) -> Any:
+        """That of the polariser; NaN where it is out."""
+        del prefix
+        return jnp.where(self.exposures.clp_in, self.exposures.clp_angle, jnp.nan)
+
+
+def in_exposures(change: Change, exposures: ExposureArrays, x: Any = 0.0, y: Any = 0.0) -> Float[Array, " e"]:
+    """The factor of a change in every exposure, 0 where what it asks for is not known."""
+    return jnp.nan_to_num(change.factor(InExposures(exposures, x, y))) * jnp.ones(exposures.hours.shape[0])
