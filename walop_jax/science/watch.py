@@ -49,7 +49,7 @@ from walop_jax.science.watch_found import History, Suspect, Watch, WatchedChange
 
 SEEN = 2.33
 """Standard deviations above the alarm from which 99 % are found."""
-MOST_GROUPS = 400
+MOST_GROUPS = 150
 """Exposure groups that are told apart; neighbours of more are joined."""
 RIVALS = (
     "hwp1_axis",
@@ -156,11 +156,10 @@ class _Watching:
         parameters: Sequence[tuple[str, str]],
         root: Float[np.ndarray, "n n"],
     ) -> None:
-        self.stars, self.cameras, self.optics = (
-            stars,
-            tuple(cameras),
-            list(parameters[: stars.plain.shape[-1]]),
-        )
+        self.stars, self.cameras = stars, tuple(cameras)
+        # Of the parameters those that make any difference to the light of stars.
+        self.seen = np.flatnonzero(np.abs(stars.plain).max(axis=(0, 1)) > 0)
+        self.optics = [parameters[p] for p in self.seen]
         self.root = root[:, np.abs(root).max(axis=0, initial=0.0) > 0]
         self.variance = colour_variance(stars)
         self.time, self.group = grouped(stars.time)
@@ -169,7 +168,7 @@ class _Watching:
         self.histories += [History("drift", g) for g in range(groups - 2)]
         self.histories += [History("once", g) for g in range(1, groups - 1)]
         self.shapes = np.stack([h.over(self.time) for h in self.histories], axis=1)
-        self.tests = len(self.histories) * len(cameras)
+        self.tests = len(self.histories) * (len(cameras) + len(self.optics))
         self.alarm = threshold(ALARM / self.tests)
         # Stars of a single group have a scale with the others of it; those of several groups together.
         low, high = (op.reduceat(self.group, stars.first) for op in (np.minimum, np.maximum))
@@ -204,8 +203,8 @@ class _Watching:
         weight: Float[np.ndarray, " s"],
         share: Float[np.ndarray, " s"],
     ) -> tuple[Float[np.ndarray, "c c"], Float[np.ndarray, " c"]]:
-        """Q and g of the gains of all cameras in all groups (group, camera), errors of the calibration eliminated."""
-        stars, count, groups = self.stars, len(self.cameras), len(self.time)
+        """Q and g of `_changes` in all groups (group, change), errors of the calibration eliminated."""
+        stars, count, groups = self.stars, len(self.cameras) + len(self.optics), len(self.time)
         known = self.root.shape[1] + 2
         gains = np.zeros((groups * count, groups * count))
         cross, nuisance = np.zeros((groups * count, known)), np.eye(known)
@@ -214,7 +213,7 @@ class _Watching:
         for here, part in stars.blocks():
             rows = slice(first[here.start], first[here.start] + len(part))
             group, w, k = self.group[rows], weight[here], share[here]
-            values = np.concatenate([part.model[..., None] * np.eye(count), self._errors(part)], axis=-1)
+            values = np.concatenate([self._changes(part), self._errors(part)], axis=-1)
             free, along = part.projected(values)
             heavy = np.sqrt(w * k)[part.star]
             free = free * heavy[:, None]
@@ -239,8 +238,9 @@ class _Watching:
             np.subtract.at(cross.reshape(groups, count, known), of_group, taken)
             self._subtract(blocks, sums, of_star, of_group)
             normal = residual[rows] * w[part.star, None]
-            np.add.at(score.reshape(groups, count), group, part.model * normal)
-            pull += self._errors(part).reshape(-1, known).T @ normal.ravel()
+            slopes = np.einsum("rkc,rk->rc", values, normal)
+            np.add.at(score.reshape(groups, count), group, slopes[:, :count])
+            pull += slopes[:, count:].sum(axis=0)
         full = np.block([[gains, cross], [cross.T, nuisance]])
         return eliminated(full, np.concatenate([score, pull]), groups * count)
 
@@ -267,6 +267,11 @@ class _Watching:
             flat = dense.reshape(-1, groups * count)
             blocks -= (flat.T @ flat).reshape(blocks.shape)
 
+    def _changes(self, part: StarResiduals) -> Float[np.ndarray, "r k c"]:
+        """Columns of what may change: the gains of the cameras, then the numbers of the optics."""
+        gains = part.model[..., None] * np.eye(len(self.cameras))
+        return np.concatenate([gains, part.plain[..., self.seen]], axis=-1)
+
     def _errors(self, part: StarResiduals) -> Float[np.ndarray, "r k n"]:
         return np.concatenate([part.parameters() @ self.root, part.colour], axis=-1)
 
@@ -278,9 +283,7 @@ class _Watching:
 
         def columns(part: StarResiduals) -> Float[np.ndarray, "r k c"]:
             grown = shapes[part.time.astype(int)]
-            gains = part.model[..., None] * np.eye(count)
-            each = np.concatenate([gains, part.plain], axis=-1)
-            asked = np.einsum("rkc,rh->rkhc", each, grown).reshape(*part.model.shape, -1)
+            asked = np.einsum("rkc,rh->rkhc", self._changes(part), grown).reshape(*part.model.shape, -1)
             return np.concatenate([asked, self._errors(part)], axis=-1)
 
         matrix, score = normal_matrix(stars, residual, columns, weight, share)
@@ -305,13 +308,10 @@ class _Watching:
     ) -> Float[np.ndarray, "r k"]:
         """Residuals behind a change."""
         grown, first = change.history.over(self.time)[self.group] * size, self.stars.first
-        out = []
+        names, out = [*self.cameras, *(name for name, _ in self.optics)], []
         for here, part in self.stars.blocks():
             rows = slice(first[here.start], first[here.start] + len(part))
-            if change.camera:
-                column = part.model * np.eye(len(self.cameras))[self.cameras.index(change.name)]
-            else:
-                column = part.plain[..., [name for name, _ in self.optics].index(change.name)]
+            column = self._changes(part)[..., names.index(change.name)]
             out.append(residual[rows] - part.left(column * grown[rows, None]))
         return np.concatenate(out)
 
@@ -324,8 +324,7 @@ class _Watching:
         matrix, score = first_look = self.scan(residual, weight, share)
         while len(changes) < _MOST_CHANGES:
             z = self.significance(matrix, score)
-            history, camera = np.unravel_index(np.argmax(np.abs(z)), z.shape)
-            if not abs(z[history, camera]) > self.alarm:
+            if not np.abs(z).max() > self.alarm:
                 break
             found, residual = self.settled(residual, z)
             changes.append(found)
@@ -333,9 +332,9 @@ class _Watching:
             matrix, score = self.scan(residual, weight, share)
         return self.told(changes, first_look, matrix, whole)
 
-    def significance(self, matrix: Any, score: Any) -> Float[np.ndarray, "h k"]:
-        """z of every history of every camera."""
-        groups, count = len(self.time), len(self.cameras)
+    def significance(self, matrix: Any, score: Any) -> Float[np.ndarray, "h c"]:
+        """z of every history of every camera and number of the optics."""
+        groups, count = len(self.time), len(self.cameras) + len(self.optics)
         z = np.zeros((len(self.histories), count))
         blocks, slopes = matrix.reshape(groups, count, groups, count), score.reshape(groups, count)
         for k in range(count):
@@ -350,7 +349,7 @@ class _Watching:
         return z
 
     def settled(
-        self, residual: Float[np.ndarray, "r k"], z: Float[np.ndarray, "h k"]
+        self, residual: Float[np.ndarray, "r k"], z: Float[np.ndarray, "h c"]
     ) -> tuple[WatchedChange, Float[np.ndarray, "r k"]]:
         """A change with its rivals, and what is left behind it.
 
@@ -376,8 +375,8 @@ class _Watching:
         assert best is not None
         return WatchedChange(best, tuple(alike), float(self.time[best.history.start])), left
 
-    def near(self, z: Float[np.ndarray, "h k"]) -> list[History]:
-        """The best history of each kind, for all cameras together, and its neighbours in time."""
+    def near(self, z: Float[np.ndarray, "h c"]) -> list[History]:
+        """The best history of each kind, whatever has changed, and its neighbours in time."""
         strength = np.max(np.abs(z), axis=1)
         chosen: list[History] = []
         for kind in ("step", "drift", "once"):
@@ -401,13 +400,14 @@ class _Watching:
         whole: Scale,
     ) -> Watch:
         """The record: gains as they were first seen, accuracies with all that was found taken away."""
-        groups, count = len(self.time), len(self.cameras)
+        groups, cameras = len(self.time), len(self.cameras)
+        count = cameras + len(self.optics)
         blocks = matrix.reshape(groups, count, groups, count)
         slopes = first_look[1].reshape(groups, count)
         seen_first = first_look[0].reshape(groups, count, groups, count)
-        gain, error, smallest = (np.full((groups, count), np.nan) for _ in range(3))
+        gain, error, smallest = (np.full((groups, cameras), np.nan) for _ in range(3))
         steps = np.tril(np.ones((groups, groups)))  # group, start
-        for k in range(count):
+        for k in range(cameras):
             own, then = np.diag(blocks[:, k, :, k]), np.diag(seen_first[:, k, :, k])
             gain[:, k] = slopes[:, k] / np.where(then > 0, then, np.inf)
             error[:, k] = np.where(own > 0, own, np.nan) ** -0.5
