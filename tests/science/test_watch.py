@@ -1,0 +1,123 @@
+"""A calibration watched by its stars: quiet nights, steps and drifts of cameras, optics that change, the bound."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from studies import watch as study
+
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.reports.watch_figures import watch_figure
+from walop_jax.science.star_residuals import noise_scale
+from walop_jax.science.watch import grouped, with_rivals
+
+
+@pytest.fixture(scope="module")
+def vectors(calibration) -> AnalysisVectors:
+    return AnalysisVectors(calibration)
+
+
+@pytest.fixture(autouse=True)
+def _without_rivals(vectors, monkeypatch):
+    """The study on the parameters of the model alone: fewer tables."""
+    monkeypatch.setattr(study, "vectors", lambda: vectors)
+
+
+def test_nothing_is_seen_where_nothing_has_changed():
+    """Through instruments that differ from the calibration by its own errors; gains scatter by what is stated."""
+    found = [study.watched(100, seed) for seed in range(12)]
+    assert all(watch.holds for watch in found)
+    pulls = np.concatenate([(w.gain / w.error)[:, 0] for w in found])  # a night, one camera: independent
+    assert np.sqrt(np.mean(pulls**2)) == pytest.approx(1.0, abs=4 / np.sqrt(2 * len(pulls)))
+
+
+@pytest.mark.parametrize("size", [0.01, 0.003])
+def test_a_step_is_found_at_its_night_with_its_size(size):
+    for camera in range(4):
+        watch = study.watched(600, camera, study.step(size, camera))
+        assert not watch.holds
+        (change,) = watch.changes
+        assert change.time == 60000.0 + study.START
+        assert change.best.history.kind == "step"
+        named = {entry.name: entry for entry in change.alike}
+        mine = named[watch.cameras[camera]]
+        assert mine.size == pytest.approx(size, abs=4 * mine.error)
+        assert change.camera in (None, watch.cameras[camera])
+
+
+def test_the_smallest_step_that_is_promised_is_found():
+    bound = float(study.watched(600, 50).smallest[study.START, 0])
+    assert 2e-4 < bound < 1e-3
+    found = [not study.watched(600, 60 + seed, study.step(bound)).holds for seed in range(12)]
+    assert sum(found) >= 11  # 99 % each
+    missed = [study.watched(600, 60 + seed, study.step(0.4 * bound)).holds for seed in range(12)]
+    assert sum(missed) >= 8
+
+
+def test_a_few_nights_of_few_stars_see_a_gross_change():
+    """Ten stars a night that all lie off are a change, not outliers; three variable stars are no change."""
+    assert study.watched(100, 3, study.step(0.01)).changes[0].time == 60000.0 + study.START
+    assert not study.watched(100, 3, study.step(0.05)).holds
+
+
+def test_a_camera_that_drifts_is_told_as_that():
+    watch = study.watched(600, 1, study.drift(0.01))
+    (change,) = watch.changes
+    assert change.best.history == ("drift", 0)
+    assert change.best.size == pytest.approx(np.sign(change.best.size) * 0.01, rel=0.1)
+    assert "drifting since MJD 60000.0000" in watch.warnings[0]
+
+
+def test_optics_that_change_are_not_named_as_a_camera():
+    watch = study.watched(600, 7, turned=("half2.plate.mgf2", 3.0))
+    change = watch.changes[0]
+    assert change.camera is None
+    assert {"half2.plate.mgf2", "half2.plate.quartz"} & {entry.name for entry in change.alike}
+    assert change.time == 60000.0 + study.START
+
+
+def test_single_exposures_do_not_name_a_camera_that_they_cannot_tell():
+    watch = study.watched(600, 2, study.step(0.003), plates=(None,))
+    (change,) = watch.changes
+    assert change.camera is None
+    assert {"O1", "O2"} <= {entry.name for entry in change.alike}
+
+
+def test_records_of_a_watch():
+    watch = study.watched(100, 4, study.step(0.01))
+    document = watch.document()
+    assert document["holds"] is False
+    assert document["changes"][0]["time"] == 60006.0
+    assert len(document["groups"]) == len(watch.time) == len(watch.to_table())
+    assert "HAS CEASED TO HOLD" in watch.display().text()
+    assert len(watch_figure(watch).axes) == 4
+    assert document["smallest_step_seen"] == pytest.approx(watch.smallest.min())
+
+
+def test_scale_of_noise_is_that_of_the_many():
+    """Of stars with 1 and 4 degrees of freedom, errors 1.5 times too small, one in twenty far off."""
+    rng = np.random.default_rng(0)
+    dof = np.where(np.arange(4000) % 2, 1.0, 4.0)
+    chi2 = 2.25 * rng.chisquare(dof)
+    chi2[::20] *= 400.0
+    scale = noise_scale(chi2, dof)
+    assert scale.value == pytest.approx(2.25, abs=5 * 2.25 * np.sqrt(2 / scale.worth))
+    assert 0.7 * dof.sum() < scale.worth < dof.sum()
+
+
+def test_exposure_groups_are_joined_where_there_are_many():
+    time = np.array([3.0, 1.0, np.nan, 2.0, 2.0])
+    times, group = grouped(time)
+    assert times.tolist() == [1.0, 2.0, 3.0]
+    assert group.tolist() == [2, 0, 0, 1, 1]
+    times, group = grouped(np.arange(10.0), most=4)
+    assert times.tolist() == [0.0, 3.0, 6.0, 9.0]
+    assert group.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3]
+
+
+def test_optics_that_may_have_changed_are_added_at_neutral(calibration):
+    there = with_rivals(calibration)
+    assert {"hwp1_axis", "hwp2_axis", "chwp_axis"} <= set(there.model.effect_names)
+    kept = [there.model.index(name) for name in calibration.model.names]
+    np.testing.assert_array_equal(there.values[kept], calibration.values)
+    assert np.all(there.sigma[np.setdiff1d(np.arange(len(there.values)), kept)] < 1e-8)
