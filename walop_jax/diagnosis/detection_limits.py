@@ -38,7 +38,7 @@ from walop_jax.diagnosis.effect_columns import probes as all_probes
 from walop_jax.diagnosis.examination import Examination, examine, most_points
 from walop_jax.diagnosis.limits_found import PROBABILITY, DetectionLimit, DetectionLimits, over_field
 from walop_jax.diagnosis.policy import POLICY
-from walop_jax.diagnosis.score import noncentrality, separations
+from walop_jax.diagnosis.score import ScoreSpace, noncentrality, separations
 from walop_jax.diagnosis.trust import sampled
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.stand_in import on_field_points
@@ -75,7 +75,8 @@ def detection_limits(
     examination = examine(result, wanted, np.random.default_rng(seed))
     p = float(np.exp(examination.scorer.threshold(POLICY.alarm)))
     tell("comparing the effects")
-    columns = [c for probe in examination.probes for c in _columns(examination, probe, p)]
+    rivals = examination.bare.subset([probe.name for probe in examination.probes])
+    columns = [c for probe in examination.probes for c in _columns(examination, rivals, probe, p)]
     tell("finding what goes unnoticed")
     found = _collected(examination, columns, _errors(examination, columns), fitting)
     return dataclasses.replace(found, conditions=condition_limits(examination.design))
@@ -93,16 +94,18 @@ class _Column:
     rivals: Mapping[str, float]
 
 
-def _columns(examination: Examination, probe: Probe, p: float) -> list[_Column]:
-    space, full = examination.scorer.space, examination.bare
+def _columns(examination: Examination, rivals: ScoreSpace, probe: Probe, p: float) -> list[_Column]:
+    """The amplitudes of a probe; `rivals` is the space of all effects, without what single exposures may have."""
+    space = examination.scorer.space
     at, alive, rank = space.places()[probe.name], space.alive(), space.whitened[probe.name].shape[1]
-    found = []
+    first, found = rivals.places()[probe.name].start, []
     for number, place in enumerate(range(at.start, at.stop)):
         if not alive[place]:
             continue
         detected = float(np.sqrt(noncentrality(p, rank, PROBABILITY) / space.gram[place, place]))
-        square = float(full.gram[place, place])
-        apart = examination.nearest(separations(full, full.gram[:, place], square))
+        own = rivals.gram[:, first + number]
+        square = float(own[first + number])
+        apart = examination.nearest(separations(rivals, own, square))
         del apart[probe.effect.name]
         nearest = min(apart.values(), default=np.inf)
         named = detected
@@ -110,8 +113,8 @@ def _columns(examination: Examination, probe: Probe, p: float) -> list[_Column]:
             named = np.inf
         elif np.isfinite(nearest):
             named = max(detected, POLICY.separation / nearest + stats.norm.ppf(PROBABILITY) / np.sqrt(square))
-        rivals = {name: value * detected for name, value in apart.items()}
-        found.append(_Column(probe, number, probe.parameters[number], detected, float(named), rivals))
+        others = {name: value * detected for name, value in apart.items()}
+        found.append(_Column(probe, number, probe.parameters[number], detected, float(named), others))
     return found
 
 
@@ -133,11 +136,14 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
     starts = np.cumsum([0, *(len(probe.widths) for probe in probes)])
     place = {probe.name: int(start) for probe, start in zip(probes, starts, strict=False)}
     found = np.full((len(columns), len(x)), np.nan)
-    for i, column in enumerate(columns):
-        if column.probe.name not in chosen:
-            continue
-        raw = examination.named[column.probe.name].columns[:, column.number : column.number + 1]
-        taken_up = design.taken_up(design.stacked([raw]))[:, 0]
+    looked_at = [i for i, column in enumerate(columns) if column.probe.name in chosen]
+    if not looked_at:
+        return found
+    raw = [
+        examination.named[c.probe.name].columns[:, c.number, None] for c in (columns[i] for i in looked_at)
+    ]
+    for i, taken_up in zip(looked_at, design.taken_up(design.stacked(raw)).T, strict=True):
+        column = columns[i]
         own = changes[..., place[column.probe.name] + column.number]
         found[i] = change_of_qu(matrix, matrix + column.detected * (own - slopes @ taken_up))
     return found

@@ -30,8 +30,6 @@ GRADIENT_BLOCK = 256
 """Field points whose gradients are worked on together, and largest number that is not cut: they need a quarter."""
 COLUMNS = 256
 """Columns of an image row that are worked on together: the sums of four cameras and 25 exposures take a megabyte."""
-PROBES_AT_ONCE = 6
-"""Shapes of one effect that are worked on together: bounds the memory, and more are no faster."""
 RESPONSES_TOGETHER = 32
 """Field points whose responses are computed together: one program serves sets of any size."""
 RESPONSE_NUMBERS = 4_000_000
@@ -109,8 +107,6 @@ COMPILED_ONCE = 6000
 FITTED_FROM_ROWS = 20_000
 """(Exposure, point) pairs of a set up to which the matrix of a fit is made from its rows, by a program that errors and
 trust need anyway: to compile or to load another one takes longer. The rows take 100 MB at most."""
-SIDE_BY_SIDE = 20_000
-"""(Exposure, point) pairs of a set up to which columns are computed by two threads: each needs half a gigabyte then."""
 CHOICE_ROWS = 6000
 """(Exposure, point) pairs on which other descriptions of an instrument are compared before any of them is fitted."""
 MANY_POINTS = 4
@@ -127,7 +123,7 @@ AMPLITUDES_AT_ONCE = 32
 NULL_DRAWS = 1_000
 """Draws of all scores under the base model: a fifth of them give the number of trials to 7 %."""
 MANY_SHAPES = 8
-"""Shapes of an effect above which they are swept in one compiled loop instead of differentiated together."""
+"""Shapes of an effect above which one of them, of the median size, stands for all in what it does to the matrix."""
 
 # --------------------------------------------------------------------------------------------------- science
 
