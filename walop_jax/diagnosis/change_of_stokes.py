@@ -6,7 +6,6 @@ comes out wrong by A⁻¹ (δm₀ + δA s), at most |A⁻¹ δm₀| + p ‖A⁻�
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -30,7 +29,7 @@ def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p a 3"]:
     instrument, calset = result.model.instrument(result.values), result.calset
     plan = plan_for_settings(instrument, first_setting(calset, instrument), calset.filters)
     vectors = sky_vectors(instrument, plan, calset.points.x, calset.points.y)[:, 0]
-    return np.asarray(light.instrument_matrix(jnp.asarray(vectors), instrument.cameras.pairs))
+    return light.instrument_matrix(vectors, instrument.cameras.pairs)
 
 
 def largest_change(
