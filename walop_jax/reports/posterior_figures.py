@@ -86,8 +86,7 @@ def corner_figure(
         draws, bins=BINS, range=list(zip(lowest - margin, highest + margin, strict=True)), smooth=1.0, labels=shown,
         label_kwargs={"fontsize": 8 if few else 6}, levels=SHARES, plot_density=False, fill_contours=True, quiet=True,
         contour_kwargs={"linewidths": 0.6}, contourf_kwargs={"colors": ["none", "0.75", "0.35"]}, color="k",
-        data_kwargs={"ms": 0.7, "color": "0.5", "alpha": 0.3}, hist_kwargs={"linewidth": 0.8}, labelpad=-0.08,
-        max_n_ticks=3 if few else 0, fig=figure,
+        data_kwargs={"ms": 0.7, "color": "0.5", "alpha": 0.3}, hist_kwargs={"linewidth": 0.8}, max_n_ticks=3 if few else 0, fig=figure,
     )  # fmt: skip
     figure.subplots_adjust(left=0.1, right=0.99, bottom=0.09, top=0.94, wspace=0.05, hspace=0.05)
     low, middle, high = np.quantile(draws, (0.1587, 0.5, 0.8413), axis=0)
@@ -96,10 +95,16 @@ def corner_figure(
         numbers = with_error(float(middle[i]), float(0.5 * (high[i] - low[i])))
         title = f"{label(names[i])}\n{numbers} {units[i]}".rstrip()
         panels[i, i].set_title(title, fontsize=8 if few else 4.5, loc="left")
+        below, left = panels[k - 1, i], panels[i, 0]
+        half = 0.5 * below.get_position().width
+        below.xaxis.set_label_coords(below.get_position().x0 + half, 0.02, transform=figure.transFigure)
+        left.yaxis.set_label_coords(0.015, left.get_position().y0 + half, transform=figure.transFigure)
+        if few:
+            below.xaxis.set_major_formatter(ScalarFormatter(useOffset=False))
+            if i > 0:
+                left.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
         for j, axes in enumerate(panels[i, : i + 1]):
             axes.tick_params(labelsize=6.5, length=2)
-            for axis in (axes.xaxis, axes.yaxis):
-                axis.get_offset_text().set_fontsize(5)
             if reference is not None:
                 axes.axvline(reference[j], color="tab:orange", linewidth=0.8)
                 if i != j:
