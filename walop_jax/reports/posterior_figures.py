@@ -86,7 +86,8 @@ def corner_figure(
         draws, bins=BINS, range=list(zip(lowest - margin, highest + margin, strict=True)), smooth=1.0, labels=shown,
         label_kwargs={"fontsize": 8 if few else 6}, levels=SHARES, plot_density=False, fill_contours=True, quiet=True,
         contour_kwargs={"linewidths": 0.6}, contourf_kwargs={"colors": ["none", "0.75", "0.35"]}, color="k",
-        data_kwargs={"ms": 0.7, "color": "0.5", "alpha": 0.3}, hist_kwargs={"linewidth": 0.8}, max_n_ticks=3 if few else 0, fig=figure,
+        data_kwargs={"ms": 0.7, "color": "0.5", "alpha": 0.3}, hist_kwargs={"linewidth": 0.8},
+        max_n_ticks=3 if few else 0, fig=figure,
     )  # fmt: skip
     figure.subplots_adjust(left=0.1, right=0.99, bottom=0.09, top=0.94, wspace=0.05, hspace=0.05)
     low, middle, high = np.quantile(draws, (0.1587, 0.5, 0.8413), axis=0)
