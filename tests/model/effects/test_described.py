@@ -1,5 +1,6 @@
 """Changes do what effects of the catalogue do that are known by another name, and what Mueller algebra says."""
 
+import dataclasses
 import itertools
 import json
 
@@ -14,9 +15,11 @@ from walop_jax.fit.model_builder import model_without_data
 from walop_jax.fit.model_file import render
 from walop_jax.model import mueller
 from walop_jax.model.carried import left_behind
+from walop_jax.model.compiled import compiled
 from walop_jax.model.effects import Change, Described, effect_by_name
-from walop_jax.model.effects.change import KINDS
+from walop_jax.model.effects.change import AMPLITUDES, KINDS
 from walop_jax.model.effects.factors import PLAIN
+from walop_jax.model.effects.optics import OPTICAL
 from walop_jax.model.parameters import NAME
 
 
@@ -150,15 +153,84 @@ def test_the_same_to_first_order(case):
     assert ours @ theirs > 0.98 * theirs @ theirs
 
 
-def test_neutral_changes_nothing():
-    sentences = (
-        "depolarisation behind chwp * kelvin", "diattenuation diagonal ahead of half1.plate * colour",
-        "gain of half2 * ring 3", "afterglow in O1", "turn of polariser * x", "retardance u of chwp * cos 2 CHWP",
-        "light in E1 * hours", "gain of O2 * exposure 3", "thermal of half1.plate",
-    )  # fmt: skip
-    effect = said(*sentences, values=[0.0] * len(sentences))
-    assert np.abs(scenes.observe(effect) - scenes.observe(plan_of=[effect])).max() < 1e-9 * scenes.FLUX
-    assert effect.labels("share")[0] == "depolarisation_behind_chwp_*_kelvin"
+# Every kind, every factor that the scene can show, every side of a place.
+EVERY_CHANGE = (
+    *(f"{kind} behind collimator" for kind in OPTICAL),
+    "turn of polariser * x",
+    "turn ahead of half1.plate * y",
+    "turn of polariser * x2-y2 * sin 1 CLP",
+    "depolarisation of polariser * cos 2 CLP",
+    "diattenuation v of polariser * xy",
+    "retardance radial of polariser",
+    "retardance u of chwp * cos 2 CHWP",
+    "depolarisation behind chwp * kelvin",
+    "retardance v ahead of half2.plate * hours",
+    "diattenuation diagonal ahead of half1.plate * colour",
+    "added polarisation q ahead of polariser",
+    "added polarisation u behind collimator",
+    "diattenuation q ahead of polariser * r2",
+    "displacement x ahead of pupil * hour angle",
+    "displacement y ahead of pupil",
+    "fringes of half1.plate * gap 2.5",
+    "shift of band",
+    "rotator of sky",
+    "extinction of polariser",
+    "ellipticity of polariser",
+    "axis of half2.plate",
+    "axis of half1.plate.mgf2",
+    "cut of half1.plate.quartz",
+    "thickness of half2.plate.mgf2",
+    "thermal of half1.plate",
+    "polarisation of sky",
+    "polarisation q of sky * exposure 4",
+    "polarisation u of blue_star",
+    "gain of O1 * r2",
+    "gain of half2 * ring 3",
+    "gain of O2 * exposure 3",
+    "gain of E1 * hours 1 to 3",
+    "gain of E2 * counts",
+    "reported gain of O1 * hours",
+    "light in E1 * hours",
+    "light of E1 in O1",
+    "light of opposite in O2",
+    "afterglow in O1",
+)
+
+
+def test_every_kind_is_there():
+    assert {Change.parsed(text).kind for text in EVERY_CHANGE} == {*KINDS}
+
+
+def test_neutral_and_derivatives_of_every_change():
+    """At zero nothing happens; each does something, in proportion: forward derivative = central difference."""
+    layout = scenes.plan([said(*EVERY_CHANGE, values=[0.0] * len(EVERY_CHANGE))])
+    data = scenes.points(layout)
+    width = np.array([AMPLITUDES[Change.parsed(text).parameter].width for text in EVERY_CHANGE])
+
+    def counts(amplitudes):
+        zero = said(*EVERY_CHANGE, values=[0.0] * len(EVERY_CHANGE))
+        held = {name: [] for name in AMPLITUDES}
+        for i, text in enumerate(EVERY_CHANGE):
+            held[Change.parsed(text).parameter].append(amplitudes[i])
+        effect = dataclasses.replace(zero, **{name: jnp.stack(values) for name, values in held.items()})
+        return scenes.counts(scenes.instrument(effect), layout, data)
+
+    step = 1e-3 * np.diag(width)
+    at = jnp.asarray(np.concatenate([np.zeros((1, len(width))), step, -step]))
+    values, slope = compiled(lambda a: (jax.lax.map(counts, a), jax.jacfwd(counts)(a[0])))(at)
+    without = scenes.observe(plan_of=[said(*EVERY_CHANGE, values=[0.0] * len(EVERY_CHANGE))])
+    assert np.abs(np.asarray(values[0]) - without).max() < 1e-12 * scenes.FLUX
+    plus, minus = np.split(np.asarray(values[1:]), 2)
+    for i, text in enumerate(EVERY_CHANGE):
+        derivative = np.asarray(slope[..., i]) * width[i]
+        assert np.abs(derivative / without).max() > 1e-6, f"{text} does nothing"
+        difference = (plus[i] - minus[i]) / 2e-3
+        assert np.abs(difference - derivative).max() < 1e-5 * np.abs(derivative).max(), text
+
+
+def test_labels_are_the_descriptions():
+    effect = said("depolarisation behind chwp * kelvin", values=[0.0])
+    assert effect.labels("share") == ["depolarisation_behind_chwp_*_kelvin"]
 
 
 def test_factors_grow_as_they_say():
