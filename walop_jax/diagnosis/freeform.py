@@ -39,7 +39,7 @@ from walop_jax.model import legendre
 from walop_jax.model.effects.free_form import FINE, HARMONICS, SMOOTH, WIDTH
 from walop_jax.model.instrument import Instrument
 
-RINGS = (3, 4, 5, 6, 7, 8)
+RINGS = (3, 4, 5, 6, 7, 8)  # degrees; the throughput takes up what is smoother
 SINGLE_EXPOSURES = "single exposures"
 STATES = "states"
 

@@ -26,6 +26,7 @@ import numpy as np
 
 from walop_jax.data.records import Exposures
 from walop_jax.diagnosis.effect_columns import FEWEST_POINTS, Probe
+from walop_jax.diagnosis.freeform import RINGS
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import Context, Described, Effect
 from walop_jax.model.effects.etalon import GAPS, QUARTER
@@ -44,7 +45,6 @@ from walop_jax.model.responses import acts
 LINEAR = ("diattenuation", "retardance")
 ALONE = ("diattenuation v", "retardance v", "depolarisation")
 NIGHT = 8.0  # hours without an exposure that part two nights
-RINGS = (3, 4, 5, 6, 7, 8)  # the throughput takes up what is smoother
 HARMONICS = (1, 2)
 HARMONICS_OF_ENCODER = (1, 2, 3, 4, 5, 6)
 

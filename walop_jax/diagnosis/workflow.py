@@ -496,5 +496,5 @@ def _and(found: Unexplained, text: str) -> Unexplained:
 
 def too_many_sentences(state: Examination, said: Sequence[str]) -> Unexplained:
     """What is said where so many sentences were needed that none of them is the thing itself."""
-    text = f"{len(said)} sentences were needed: they say where it sits, no single one of them what it is"
+    text = f"{len(said)} descriptions were needed: they say where it sits, no single one of them what it is"
     return Unexplained(state.table.p_global, f"{text} ({' | '.join(said)})", ())
