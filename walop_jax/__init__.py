@@ -1,9 +1,8 @@
 """Differentiable end-to-end calibration of the WALOP four-camera imaging polarimeters.
 
-Every command has a function of the same name: `read`, `refit`, `diagnose`, `sample`, `matrix`, `apply`, `compare`,
-`certify`, `epoch`, `report`, `simulate`, `trace`; `from_arrays` makes a calibration set of arrays, `limits` says what
-could hide in a fit. The public names are those of `__all__`; everything else lives in the rooms of the package and may
-move.
+Every command is a function of the same name, with the same options: `refit`, `diagnose`, `sample`, `matrix`, `apply`
+and so on. `read` reads whatever the program has written; `from_arrays` makes a calibration set of arrays. The public
+names are those of `__init__.pyi`; everything else lives in the rooms of the package and may move.
 
 Nothing is loaded before it is used, so that importing the package is free of charge. It computes in float64: the first
 name that is asked for switches JAX to it, unless arrays have been made in float32 already. Then switch it on yourself,
@@ -15,132 +14,40 @@ before anything else:
 
 from __future__ import annotations
 
+import functools
 import importlib
 import sys
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from walop_jax.calibration.calibration import Calibration
-    from walop_jax.calibration.residual_map import residual_map
-    from walop_jax.commands.certify import certify
-    from walop_jax.commands.refit import refit
-    from walop_jax.commands.simulate import simulate
-    from walop_jax.data.from_arrays import from_arrays
-    from walop_jax.data.settings import Settings
-    from walop_jax.data.write import write_calibration_set
-    from walop_jax.fit.misfit import describe as describe_misfit
-    from walop_jax.fit.model_builder import base_model
-    from walop_jax.fit.refit import FitResult
-    from walop_jax.io.errors import DataError
-    from walop_jax.likelihood.likelihood import Likelihood
-    from walop_jax.model.build import nominal_instrument
-    from walop_jax.model.effects import EFFECTS, Effect, effect_by_name
-    from walop_jax.model.effects.base import Scalar
-    from walop_jax.model.instrument import Instrument
-    from walop_jax.model.parameters import param
-    from walop_jax.model.specification import with_effects
-    from walop_jax.model.trace import Sightline
-    from walop_jax.posterior import Options
-    from walop_jax.runs.from_python import (
-        apply,
-        compare,
-        diagnose,
-        epoch,
-        limits,
-        matrix,
-        report,
-        sample,
-        trace,
-    )
-    from walop_jax.runs.reading import Run, read
-    from walop_jax.simulation.observing_plan import ObservingPlan
+import types
+from typing import Any
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "EFFECTS",
-    "Calibration",
-    "DataError",
-    "Effect",
-    "FitResult",
-    "Instrument",
-    "Likelihood",
-    "ObservingPlan",
-    "Options",
-    "Run",
-    "Scalar",
-    "Settings",
-    "Sightline",
-    "apply",
-    "base_model",
-    "certify",
-    "compare",
-    "describe_misfit",
-    "diagnose",
-    "effect_by_name",
-    "epoch",
-    "from_arrays",
-    "limits",
-    "matrix",
-    "nominal_instrument",
-    "param",
-    "read",
-    "refit",
-    "report",
-    "residual_map",
-    "sample",
-    "simulate",
-    "trace",
-    "with_effects",
-    "write_calibration_set",
-]
 
-_HOME = {
-    "Calibration": ("calibration.calibration", "Calibration"),
-    "DataError": ("io.errors", "DataError"),
-    "EFFECTS": ("model.effects", "EFFECTS"),
-    "Effect": ("model.effects", "Effect"),
-    "FitResult": ("fit.refit", "FitResult"),
-    "Instrument": ("model.instrument", "Instrument"),
-    "Likelihood": ("likelihood.likelihood", "Likelihood"),
-    "ObservingPlan": ("simulation.observing_plan", "ObservingPlan"),
-    "Options": ("posterior", "Options"),
-    "Run": ("runs.reading", "Run"),
-    "Scalar": ("model.effects.base", "Scalar"),
-    "Settings": ("data.settings", "Settings"),
-    "Sightline": ("model.trace", "Sightline"),
-    "apply": ("runs.from_python", "apply"),
-    "base_model": ("fit.model_builder", "base_model"),
-    "certify": ("commands.certify", "certify"),
-    "compare": ("runs.from_python", "compare"),
-    "describe_misfit": ("fit.misfit", "describe"),
-    "diagnose": ("runs.from_python", "diagnose"),
-    "effect_by_name": ("model.effects", "effect_by_name"),
-    "epoch": ("runs.from_python", "epoch"),
-    "from_arrays": ("data.from_arrays", "from_arrays"),
-    "limits": ("runs.from_python", "limits"),
-    "matrix": ("runs.from_python", "matrix"),
-    "nominal_instrument": ("model.build", "nominal_instrument"),
-    "param": ("model.parameters", "param"),
-    "read": ("runs.reading", "read"),
-    "refit": ("commands.refit", "refit"),
-    "report": ("runs.from_python", "report"),
-    "residual_map": ("calibration.residual_map", "residual_map"),
-    "sample": ("runs.from_python", "sample"),
-    "simulate": ("commands.simulate", "simulate"),
-    "trace": ("runs.from_python", "trace"),
-    "with_effects": ("model.specification", "with_effects"),
-    "write_calibration_set": ("data.write", "write_calibration_set"),
-}
+@functools.cache
+def _homes() -> dict[str, tuple[str, str]]:
+    """Module and name there of every public name: the imports of `__init__.pyi`, which type checkers read as well."""
+    import ast
+    from importlib.resources import files
+
+    stub = ast.parse((files(__name__) / "__init__.pyi").read_text(encoding="utf-8"))
+    lines = [line for line in stub.body if isinstance(line, ast.ImportFrom)]
+    return {str(name.asname): (str(line.module), name.name) for line in lines for name in line.names}
 
 
 def __getattr__(name: str) -> Any:
-    """Load a public name from its room when it is first asked for."""
-    if name not in _HOME:
+    """Load a public name when it is first asked for; functions look at what they are given."""
+    if name == "__all__":
+        return sorted(_homes())
+    if name.startswith("__") or name not in _homes():
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    room, attribute = _HOME[name]
-    found = getattr(importlib.import_module(f"{__name__}.{room}"), attribute)
+    module, attribute = _homes()[name]
+    found = getattr(importlib.import_module(module), attribute)
     _switch_on_float64()
+    if isinstance(found, types.FunctionType) and not hasattr(found, "command"):
+        from walop_jax.commands.door import checked
+
+        found = checked(found, name)
+    globals()[name] = found
     return found
 
 
@@ -154,4 +61,15 @@ def _switch_on_float64() -> None:
 
 
 def __dir__() -> list[str]:
-    return [*__all__, "__version__"]
+    return [*sorted(_homes()), "__version__"]
+
+
+class _Package(types.ModuleType):
+    """The package: importing a room does not hide the public name that is spelled like it (`model`)."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (isinstance(value, types.ModuleType) and name == "model"):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -67,8 +67,8 @@ def certify(job: Job, calibration: Product, effects: Effects = None) -> Outcome[
     from walop_jax.calibration.certify import validity
     from walop_jax.calibration.from_file import product_path
     from walop_jax.calibration.product import read_product
+    from walop_jax.commands.reading import Run
     from walop_jax.fit.refit import FitResult
-    from walop_jax.runs.reading import Run
 
     job.tell("checking")
     if isinstance(calibration, Calibration | FitResult):

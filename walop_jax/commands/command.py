@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Tell = Callable[[str], None]
 Writers = Mapping[str, Callable[[Path], object]]
+Given = Callable[[tuple[Any, ...], dict[str, Any]], tuple[tuple[Any, ...], dict[str, Any]]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,6 +104,12 @@ class Job:
         with output_folder(output, names, overwrite=self.overwrite) as folder:
             yield dataclasses.replace(self, folder=folder)
 
+    @property
+    def out(self) -> OutputFolder:
+        """The reserved folder, where there must be one."""
+        assert self.folder is not None
+        return self.folder
+
     def use_jax(self) -> None:
         """Switch JAX on, for commands that most often do without it."""
         if self.typed:
@@ -122,7 +129,7 @@ class Outcome(Generic[T]):
     `document` is the result as plain data, `text` as a terminal shows it. `files` write the files of the output folder,
     each given its path; the document is written as the file `saved_as`. `warnings` are sentences to bear in mind.
     `failure` says what has gone wrong (exit code 1), `trusted` whether the result can be used (exit code 3 if not).
-    `silent`: nothing of it is shown.
+    `silent`: nothing of it is shown; `markdown`: the text is laid out on a terminal.
     """
 
     value: T
@@ -134,6 +141,7 @@ class Outcome(Generic[T]):
     failure: str = ""
     trusted: bool = True
     silent: bool = False
+    markdown: bool = False
 
     @functools.cached_property
     def content(self) -> Any:
@@ -163,7 +171,7 @@ OLDER = {"catalogue": "effects", "estimator": "debias", "filter_name": "filter"}
 
 
 class Command(Generic[T]):
-    """A command: called, it is the Python function; `job` and `run` are what the program calls."""
+    """A command: `function` is the Python function, `run` is what the program calls."""
 
     def __init__(
         self,
@@ -172,52 +180,53 @@ class Command(Generic[T]):
         writes: Sequence[str] | Literal["file"] | None,
         random: bool,
         jax: bool,
-        given: Callable[[tuple[Any, ...], dict[str, Any]], tuple[tuple[Any, ...], dict[str, Any]]] | None,
+        given: Given | None,
     ) -> None:
-        functools.update_wrapper(self, body)
-        self.name = body.__name__
-        self.body, self.stages, self.writes, self.random, self.jax = body, tuple(stages), writes, random, jax
-        self._given = given
+        self.name, self.body = body.__name__, body
+        self.stages, self.writes, self.random, self.jax, self.given = stages, writes, random, jax, given
         self.own = tuple(inspect.signature(body).parameters.values())[1:]
+        annotations = {p.name: door.annotation(body, p) for p in self.own}
+        notes = {name: getattr(found, "__metadata__", ()) for name, found in annotations.items()}
+        self.options = {
+            name: note for name, found in notes.items() for note in found if isinstance(note, Option)
+        }
 
-    @property
-    def __signature__(self) -> inspect.Signature:
-        """The signature of the Python function."""
-        keyword = inspect.Parameter.KEYWORD_ONLY
-        common = [
-            inspect.Parameter(name, keyword, default=default, annotation=kind)
+    @functools.cached_property
+    def signature(self) -> inspect.Signature:
+        """The signature of the Python function: its own arguments, then those that all commands share."""
+        own = [p.replace(annotation=door.kind_in_short(self.body, p)) for p in self.own]
+        shared = [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
             for (name, (default, _)), kind in zip(COMMON.items(), ("bool", "Tell | None", "int"), strict=True)
             if name != "overwrite" or self.writes is not None
         ]
-        own = list(self.own)
         rest = [own.pop()] if own and own[-1].kind is inspect.Parameter.VAR_KEYWORD else []
-        return inspect.Signature([*own, *common, *rest])
+        return inspect.Signature([*own, *shared, *rest])
 
     @functools.cached_property
-    def options(self) -> dict[str, Option]:
-        """What the program can be given, by parameter: its own options, then those that all commands share."""
-        found = {}
-        for parameter in self.own:
-            for note in getattr(door.annotation(self.body, parameter), "__metadata__", ()):
-                if isinstance(note, Option):
-                    found[parameter.name] = note
-        return found
+    def function(self) -> Callable[..., T]:
+        """The Python function: it takes `overwrite`, `progress` and `seed` as well, and returns the value."""
 
-    def __call__(self, *args: Any, **kwargs: Any) -> T:
-        """The value of the outcome."""
-        if self._given is not None:
-            args, kwargs = self._given(args, kwargs)
-        for old, new in OLDER.items():
-            if (
-                old in kwargs
-                and old not in self.__signature__.parameters
-                and new in self.__signature__.parameters
-            ):
-                kwargs[new] = kwargs.pop(old)
-        bound = door.bound(self.name, self.__signature__, self.body, args, kwargs)
-        common = {name: bound.pop(name) for name in COMMON if name in bound}
-        common["progress"] = common.get("progress") or _silent
-        return self.run(Job(**common), bound).value
+        def call(*args: Any, **kwargs: Any) -> T:
+            if self.given is not None:
+                args, kwargs = self.given(args, kwargs)
+            names = self.signature.parameters
+            kwargs = {
+                OLDER[name] if name not in names and OLDER.get(name) in names else name: value
+                for name, value in kwargs.items()
+            }
+            arguments = door.bound(self.name, self.signature, self.body, args, kwargs)
+            shared = {name: arguments.pop(name) for name in COMMON if name in arguments}
+            shared["progress"] = shared["progress"] or _silent
+            return self.run(Job(**shared), arguments).value
+
+        functools.update_wrapper(call, self.body)
+        del call.__wrapped__
+        call.__signature__ = self.signature  # type: ignore[attr-defined]
+        call.command = self  # type: ignore[attr-defined]
+        described = [f"{name}: {option.help}" for name, option in self.options.items()]
+        call.__doc__ = "\n\n".join((inspect.cleandoc(self.body.__doc__ or ""), "\n".join(described)))
+        return call
 
     def run(self, job: Job, arguments: dict[str, Any]) -> Outcome[T]:
         """Do the work, with results written as they are asked for."""
@@ -242,12 +251,12 @@ def command(
     writes: Sequence[str] | Literal["file"] | None = None,
     random: bool = False,
     jax: bool = True,
-    given: Callable[..., Any] | None = None,
-) -> Callable[[Callable[..., Outcome[T]]], Command[T]]:
-    """Make a command of a body `(job, …) -> Outcome`.
+    given: Given | None = None,
+) -> Callable[[Callable[..., Outcome[T]]], Callable[..., T]]:
+    """Make a command of a body `(job, …) -> Outcome`: the Python function, with the command as its `command`.
 
     `stages` are those that its progress goes through, in their order; `writes` the files of its output folder, or
     "file" if `output` is a single file; () if the body looks after its outputs itself. `random`: its seed matters.
     `jax`: it computes. `given` may rearrange the arguments of a call in Python.
     """
-    return lambda body: Command(body, stages, writes, random, jax, given)
+    return lambda body: Command(body, stages, writes, random, jax, given).function

@@ -67,6 +67,22 @@ def annotation(function: Callable[..., Any], parameter: inspect.Parameter) -> An
     return eval(text, {}, _Light(vars(sys.modules[function.__module__]))) if isinstance(text, str) else text
 
 
+def kind_in_short(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
+    """The annotation of a parameter without what the command line makes of it."""
+    text = parameter.annotation
+    if not isinstance(text, str):
+        return text
+    if text.startswith("Annotated["):
+        inner, depth = text.removeprefix("Annotated["), 0
+        for k, character in enumerate(inner):
+            depth += (character == "[") - (character == "]")
+            if character == "," and depth == 0:
+                return inner[:k]
+    alias = vars(sys.modules[function.__module__]).get(text)
+    kind = typing.get_args(alias)[0] if typing.get_origin(alias) is typing.Annotated else text
+    return kind.__forward_arg__ if isinstance(kind, typing.ForwardRef) else kind
+
+
 def bound(
     name: str, signature: inspect.Signature, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Any
 ) -> dict[str, Any]:
@@ -134,8 +150,12 @@ def _kind(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
 def _fits(value: Any, kind: Any) -> bool:
     """Whether a value is of a kind, as far as that can be told: a doubt is no error."""
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if kind is Any:
+        return True
     if origin is typing.Annotated:
         return _fits(value, inner[0])
+    if isinstance(kind, typing.ForwardRef):
+        return True
     if origin in (typing.Union, types.UnionType):
         return any(_fits(value, one) for one in inner)
     if origin is typing.Literal:

@@ -111,8 +111,8 @@ def calibration_of(given: Product, catalogue: Sequence[type[Effect]]) -> Calibra
     """
     from walop_jax.calibration.calibration import Calibration
     from walop_jax.calibration.from_file import CalibrationFile, read_calibration
+    from walop_jax.commands.reading import Run
     from walop_jax.fit.refit import FitResult
-    from walop_jax.runs.reading import Run
 
     if isinstance(given, Calibration | FitResult):
         there = given if isinstance(given, Calibration) else Calibration.from_fit(given)

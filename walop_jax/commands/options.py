@@ -11,12 +11,12 @@ from walop_jax.commands.command import Argument, Option
 
 if TYPE_CHECKING:
     from walop_jax.calibration.calibration import Calibration
+    from walop_jax.commands.reading import Run
     from walop_jax.data.records import CalibrationSet
     from walop_jax.fit.refit import FitResult
     from walop_jax.model.effects import Effect
     from walop_jax.model.instrument import Instrument
     from walop_jax.model.specification import Model
-    from walop_jax.runs.reading import Run
 
 PathLike = str | os.PathLike[str]
 

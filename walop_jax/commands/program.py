@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import importlib.util
 import inspect
 import os
 import re
@@ -22,6 +21,7 @@ from walop_jax.commands.command import COMMON, Argument, Command, Job, Option, O
 CACHE_VARIABLE = "WALOP_JAX_CACHE"
 DEBUG_VARIABLE = "WALOP_JAX_DEBUG"
 LINE_EVERY = 10.0  # s, of progress that is no terminal's
+WIDEST = 120  # columns: longer lines are hard to read
 UNTRUSTED = 3
 """Exit code of a command that has written a result which is not to be trusted."""
 
@@ -174,13 +174,26 @@ def _show(found: Outcome[Any], quiet: bool, json: bool) -> None:
 
         typer.echo(json_text(found.content), nl=False)
     elif not quiet and (text := found.text()):
-        typer.echo(text.removesuffix("\n"))
+        _print(text, found.markdown)
     if found.failure:
         sys.stdout.flush()
         complain(found.failure)
         raise typer.Exit(1)
     if not found.trusted:
         raise typer.Exit(UNTRUSTED)
+
+
+def _print(text: str, markdown: bool) -> None:
+    """Text as it is; Markdown is laid out on a terminal."""
+    if markdown:
+        from rich.console import Console
+        from rich.markdown import Markdown
+
+        console = Console()
+        if console.is_terminal:
+            Console(width=min(console.width, WIDEST)).print(Markdown(text, hyperlinks=False))
+            return
+    typer.echo(text.removesuffix("\n"))
 
 
 def _is_interrupt(error: BaseException) -> bool:
@@ -291,18 +304,10 @@ def switch_on_jax() -> None:
 
 
 for _name in COMMANDS:
-    if importlib.util.find_spec(f"walop_jax.commands.{_name}") is None:
-        _old = getattr(importlib.import_module(f"walop_jax.cli.{_name}"), _name)
-        from walop_jax.cli.common import accepting_seed, guarded
-
-        app.command(
-            _name.replace("_", "-"), context_settings=HELP, help=_paragraphs(_old), short_help=_in_short(_old)
-        )(guarded(accepting_seed(_old)))
-        continue
-    _command = getattr(importlib.import_module(f"walop_jax.commands.{_name}"), _name)
+    _command = getattr(importlib.import_module(f"walop_jax.commands.{_name}"), _name).command
     app.command(
         _name.replace("_", "-"),
         context_settings=HELP,
-        help=_paragraphs(_command),
-        short_help=_in_short(_command),
+        help=_paragraphs(_command.body),
+        short_help=_in_short(_command.body),
     )(_function(_command))

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import os
 from collections.abc import Mapping, Sequence
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -90,7 +91,7 @@ def simulate(
         if plan is None:
             plan, true = _plan(design_of(instrument), **asked), None
         else:
-            defaults = {p.name: p.default for p in simulate.own}
+            defaults = {p.name: p.default for p in signature(simulate).parameters.values()}
             idle = [name for name, value in asked.items() if value != defaults[name]]
             if idle:
                 raise UsageError(f"the plan says all of that: leave {', '.join(idle)} out", idle[0])

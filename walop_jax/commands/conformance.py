@@ -1,27 +1,32 @@
-"""The questions of `science.conformance` as tables, and the judgement on the answers of another program."""
+"""`walop-jax conformance`: questions on conventions for other programs, and the judgement on their answers."""
 
 from __future__ import annotations
 
 import csv
 import dataclasses
 import io
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+from walop_jax.commands.command import Job, Option, Outcome, UsageError, command
+from walop_jax.commands.options import PathLike
+from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import fail, nearest
-from walop_jax.io.folder import output_folder
 from walop_jax.io.text import read_text
-from walop_jax.science.conformance import Deviation, cases, judge
+
+if TYPE_CHECKING:
+    from walop_jax.science.conformance import Deviation
 
 CASES, GIVEN, ANSWERS, RESULTS = "cases.csv", "given.csv", "answers.csv", "results.csv"
 OUTPUTS = (CASES, GIVEN, ANSWERS, RESULTS)
 NUMBER = "{:.15g}"
+MAKE = Option("Write the questions as tables.", "FOLDER", Path)
+CHECK = Option("Judge FOLDER/results.csv.", "FOLDER", Path)
 
 
-@dataclasses.dataclass(frozen=True)
-class Conformance:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Conformance(Displayed):
     """How many numbers were asked for, and those that are not right."""
 
     asked: int
@@ -35,17 +40,51 @@ class Conformance:
             "deviations": [dataclasses.asdict(entry) for entry in self.deviations],
         }
 
+    def display(self) -> Display:
+        """Every number that is not right, and how many are."""
+        right = self.asked - len(self.deviations)
+        return Display(f"{right} of {self.asked} numbers are right", notes=tuple(map(str, self.deviations)))
 
-def make_conformance(folder: str | os.PathLike[str], *, overwrite: bool = False) -> int:
-    """Write the questions, and a table of results to be filled in; return how many questions there are.
 
-    Raises `DataError` for a folder that cannot be written or holds such tables already while `overwrite` is False.
+@command(jax=False, writes=())
+def conformance(
+    job: Job,
+    *,
+    make: Annotated[PathLike | None, MAKE] = None,
+    check: Annotated[PathLike | None, CHECK] = None,
+) -> Outcome[int | Conformance]:
+    """Put another program to the test: 40 small questions on signs, frames, order of cameras, errors and bias.
+
+    --make writes cases.csv (the questions), given.csv (their numbers), answers.csv and results.csv, whose column VALUE
+    the other program fills in. --check holds that against the answers and names the usual mistakes; exit code 1 if
+    anything differs.
+
+    In Python: the number of questions, or a `Conformance`.
     """
+    if (make is None) == (check is None):
+        raise UsageError("give either --make FOLDER or --check FOLDER")
+    if make is not None:
+        number = _make(job, make)
+        return Outcome(
+            number, lambda: {"output": str(make), "cases": number}, lambda: f"{number} questions: {make}"
+        )
+    assert check is not None
+    found = _checked(check)
+    wrong = f"{check}: {len(found.deviations)} of {found.asked} numbers are not right"
+    return Outcome(
+        found, found.document, lambda: found.display().text(), failure=wrong if found.deviations else ""
+    )
+
+
+def _make(job: Job, folder: PathLike) -> int:
+    """Write the questions, and a table of results to be filled in; return how many questions there are."""
+    from walop_jax.science.conformance import cases
+
     found = list(cases())
     given = [(c.name, key, NUMBER.format(v)) for c in found for key, v in c.given.items()]
     answers = [(c.name, key, NUMBER.format(v)) for c in found for key, v in c.answers.items()]
     head = ("CASE", "QUANTITY", "VALUE")
-    with output_folder(folder, OUTPUTS, overwrite=overwrite) as out, out.filled() as there:
+    with job.reserved(folder, OUTPUTS) as reserved, reserved.out.filled() as there:
         _write(there / CASES, ("CASE", "TOPIC", "QUESTION"), ((c.name, c.topic, c.question) for c in found))
         _write(there / GIVEN, head, given)
         _write(there / ANSWERS, head, answers)
@@ -53,12 +92,14 @@ def make_conformance(folder: str | os.PathLike[str], *, overwrite: bool = False)
     return len(found)
 
 
-def check_conformance(folder: str | os.PathLike[str]) -> Conformance:
+def _checked(folder: PathLike) -> Conformance:
     """Hold `results.csv` of a folder against the right answers.
 
     Raises `DataError` for a file that cannot be read, a case or quantity that is not asked for, and one that is there
     twice.
     """
+    from walop_jax.science.conformance import cases, judge
+
     path = Path(folder) / RESULTS
     asked = {(case.name, quantity) for case in cases() for quantity in case.answers}
     answers: dict[tuple[str, str], float | None] = {}

@@ -1,0 +1,50 @@
+"""The public names, and where they live: the only list of them, for type checkers and for `__init__.py`."""
+
+from walop_jax.calibration.calibration import Calibration as Calibration
+from walop_jax.calibration.residual_map import residual_map as residual_map
+from walop_jax.commands.apply import apply as apply
+from walop_jax.commands.certify import certify as certify
+from walop_jax.commands.cite import cite as cite
+from walop_jax.commands.clip import clip as clip
+from walop_jax.commands.compare import compare as compare
+from walop_jax.commands.compress import compress as compress
+from walop_jax.commands.conformance import conformance as conformance
+from walop_jax.commands.diagnose import diagnose as diagnose
+from walop_jax.commands.docs import docs as docs
+from walop_jax.commands.epoch import epoch as epoch
+from walop_jax.commands.import_zemax import import_zemax as import_zemax
+from walop_jax.commands.inspect import inspect as inspect
+from walop_jax.commands.instrument import instrument as instrument
+from walop_jax.commands.limits import limits as limits
+from walop_jax.commands.matrix import matrix as matrix
+from walop_jax.commands.model import model as model
+from walop_jax.commands.plot import plot as plot
+from walop_jax.commands.reading import Run as Run
+from walop_jax.commands.reading import read as read
+from walop_jax.commands.refit import refit as refit
+from walop_jax.commands.report import report as report
+from walop_jax.commands.sample import sample as sample
+from walop_jax.commands.simulate import simulate as simulate
+from walop_jax.commands.trace import trace as trace
+from walop_jax.data.from_arrays import from_arrays as from_arrays
+from walop_jax.data.records import CalibrationSet as CalibrationSet
+from walop_jax.data.settings import Settings as Settings
+from walop_jax.data.write import write_calibration_set as write_calibration_set
+from walop_jax.fit.model_builder import base_model as base_model
+from walop_jax.fit.refit import FitResult as FitResult
+from walop_jax.io.errors import DataError as DataError
+from walop_jax.likelihood.likelihood import Likelihood as Likelihood
+from walop_jax.model.build import nominal_instrument as nominal_instrument
+from walop_jax.model.effects import EFFECTS as EFFECTS
+from walop_jax.model.effects import Effect as Effect
+from walop_jax.model.effects import effect_by_name as effect_by_name
+from walop_jax.model.effects.base import Scalar as Scalar
+from walop_jax.model.instrument import Instrument as Instrument
+from walop_jax.model.parameters import param as param
+from walop_jax.model.specification import Model as Model
+from walop_jax.model.specification import with_effects as with_effects
+from walop_jax.model.trace import Sightline as Sightline
+from walop_jax.posterior import Options as Options
+from walop_jax.simulation.observing_plan import ObservingPlan as ObservingPlan
+
+__version__: str

@@ -1,0 +1,110 @@
+"""`walop-jax compare`: the published method and the joint model on the same calibration set."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from walop_jax.commands.command import Job, Option, Outcome, Writers, command
+from walop_jax.commands.inputs import (
+    NOT_CARRIED_OVER,
+    calibration_of,
+    catalogue_of,
+    left_out_cards,
+    left_out_sentences,
+    set_and_model,
+    set_of,
+)
+from walop_jax.commands.options import Effects, Folder, InstrumentLike, ModelLike, PathLike, Sets
+
+if TYPE_CHECKING:
+    from walop_jax.calibration.calibration import Calibration
+    from walop_jax.commands.reading import Run
+    from walop_jax.fit.refit import FitResult
+    from walop_jax.paper.comparison import Comparison
+    from walop_jax.science.star_errors import Truth
+
+DOCUMENT, TABLE = "comparison.json", "comparison.fits"
+FIGURES = ("histogram", "map", "offset", "spectral")
+OUTPUTS = (DOCUMENT, TABLE, *(f"comparison_{name}.png" for name in FIGURES))
+TRUTH = Option("True X, Y, M21 … M33 (FITS, CSV), for simulated sets.", "TABLE", Path)
+
+
+@command(stages=("reading", "fitting", "judging"), writes=OUTPUTS, random=True)
+def compare(
+    job: Job,
+    data: Sets,
+    calibration: Calibration | FitResult | Run | PathLike | None = None,
+    *,
+    output: Folder = None,
+    truth: Annotated[Truth | PathLike | None, TRUTH] = None,
+    filter: Annotated[str, Option("Filter to compare in.", "NAME")] = "SDSS-r",
+    model: ModelLike = None,
+    instrument: InstrumentLike = None,
+    effects: Effects = None,
+) -> Outcome[Comparison]:
+    """Compare the method of Paper II, as it is published, with the joint fit.
+
+    A quadratic per grid point, a transmission model per camera, 100 stars with p up to 5 %, corrections Δq and
+    Δu; on the grid points and between them. The reference is the joint model, or the truth that comes with a
+    simulated set. RUN/comparison.json has the statistics, comparison.fits every point, four figures the rest: also
+    the spectral appendix and the full-Moon scheme.
+
+    In Python: a `Comparison`; `calibration` is the joint fit (default: made here). Raises ValueError if that does not
+    converge, and for a `calibration` or `truth` in memory together with `output`.
+    """
+    from walop_jax.calibration.calibration import Calibration
+    from walop_jax.data.field_points import true_matrices
+    from walop_jax.data.user_tables import new_table, write_output_table
+    from walop_jax.diagnosis.trust import examined
+    from walop_jax.fit.refit import refit
+    from walop_jax.paper.comparison import compare as comparison_of
+    from walop_jax.reports import comparison_figures
+    from walop_jax.science.star_errors import Truth
+
+    if output is not None and (calibration is not None or isinstance(truth, Truth)):
+        raise ValueError("with output the joint fit is made anew: leave calibration and truth in memory out")
+    catalogue = catalogue_of(effects)
+    job.tell("reading", "reading")
+    if calibration is None:
+        calset, chosen = set_and_model(data, model, instrument, catalogue, output=output)
+    else:
+        calset, held = set_of(data), calibration_of(calibration, catalogue)
+        chosen = held.calibration.model
+    if isinstance(truth, str | os.PathLike):
+        truth = Truth(*true_matrices(truth, chosen.template.patched()))
+    if calibration is None:
+        job.tell("fitting the joint model", "fitting")
+        result = examined(refit(calset, chosen, progress=job.progress))
+        if not result.converged:
+            raise ValueError(f"the joint fit did not converge ({result.minimum.message})")
+        joint, trusted, warnings = Calibration.from_fit(result), result.trusted, result.warnings
+    else:
+        joint, trusted, warnings = held.calibration, held.product.verdict.trusted, held.warnings
+    job.tell("fitting and judging the polynomials", "judging")
+    found = comparison_of(calset, joint, truth, filter, job.seed)
+    lost = joint.left_behind
+
+    def files() -> Writers:
+        drawn = {name: getattr(comparison_figures, f"{name}_figure")(found) for name in FIGURES}
+        table = new_table(found.columns())
+        return {
+            TABLE: lambda path: write_output_table(path, table, {}, header=left_out_cards(lost)),
+            **{
+                f"comparison_{name}.png": lambda path, figure=figure: figure.savefig(path, dpi=130)
+                for name, figure in drawn.items()
+            },
+        }
+
+    return Outcome(
+        found,
+        lambda: found.document() | {"trusted": trusted, NOT_CARRIED_OVER: list(lost)},
+        lambda: f"{found.display().text()}\n{output}",
+        files,
+        saved_as=DOCUMENT,
+        warnings=(
+            *(() if trusted else (f"the joint fit: {text}" for text in warnings)),
+            *left_out_sentences(lost),
+        ),
+    )

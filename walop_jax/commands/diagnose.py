@@ -1,0 +1,80 @@
+"""`walop-jax diagnose`: find what the model lacks, name it, add it, show the gap shrink."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+from walop_jax.commands.command import Job, Option, Outcome, Writers, command
+from walop_jax.commands.inputs import catalogue_of, set_and_model
+from walop_jax.commands.options import Effects, Folder, InstrumentLike, ModelLike, Sets
+from walop_jax.io.text import json_text
+
+if TYPE_CHECKING:
+    from walop_jax.diagnosis.findings import Diagnosis
+
+MODEL = "model.toml"
+OUTPUTS = ("calibration.fits", "summary.json", "diagnosis.json", "diagnosis.fits", MODEL)
+
+
+@command(stages=("reading", "fitting", "scoring", "naming", "mapping"), writes=OUTPUTS, random=True)
+def diagnose(
+    job: Job,
+    data: Sets,
+    model: ModelLike = None,
+    *,
+    output: Folder = None,
+    instrument: InstrumentLike = None,
+    effects: Effects = None,
+    minutes: Annotated[float, Option("Minutes after which no further name is looked for.", least=0.0)] = 20.0,
+) -> Outcome[Diagnosis]:
+    """Say what is missing from the model, add it, and fit again: RUN/diagnosis.json and RUN/calibration.fits.
+
+    The verdict is consistent, effect_found or unexplained. Effects that the data cannot tell apart are listed
+    together; effects that the data cannot show at all are listed as such. RUN/calibration.fits and RUN/summary.json
+    are of the extended model, and RUN/model.toml is that model, for `refit --model` and `compare --model`;
+    `walop-jax report` draws its figures from RUN/diagnosis.fits.
+
+    In Python: a `Diagnosis`; `effects=(*walop.EFFECTS, MyEffect)` adds one of your own to those that may be named.
+    """
+    from walop_jax.calibration.calibration import Calibration
+    from walop_jax.calibration.product import write_product
+    from walop_jax.calibration.summary import PRODUCT, SUMMARY, summary
+    from walop_jax.diagnosis.findings import DIAGNOSIS, document
+    from walop_jax.diagnosis.figure_data import figure_data
+    from walop_jax.diagnosis.figure_file import FIGURE_DATA, write_figure_data
+    from walop_jax.diagnosis.trust import examined
+    from walop_jax.diagnosis.workflow import diagnose as diagnosis_of
+    from walop_jax.fit.misfit import describe
+    from walop_jax.fit.model_file import render
+    from walop_jax.fit.refit import with_honest_errors
+
+    job.tell("reading", "reading")
+    catalogue = catalogue_of(effects)
+    calset, chosen = set_and_model(data, model, instrument, catalogue, output=output)
+    with job.repeated() as say:
+        found = diagnosis_of(
+            calset, chosen, catalogue=catalogue, seed=job.seed, minutes=minutes, progress=say
+        )
+
+    def files() -> Writers:
+        job.tell("mapping the field", "mapping")
+        after = examined(with_honest_errors(found.after))
+        product = Calibration.from_fit(after).to_product()
+        misfit = None if after.explains_data else describe(after)
+        fitted = summary(after, seconds=job.seconds, misfit=misfit) | {"seed": job.seed}
+        drawn_from = figure_data(found)
+        return {
+            PRODUCT: lambda path: write_product(path, product),
+            SUMMARY: lambda path: path.write_text(json_text(fitted), encoding="utf-8"),
+            FIGURE_DATA: lambda path: write_figure_data(path, drawn_from),
+            MODEL: lambda path: path.write_text(render(after.model), encoding="utf-8"),
+        }
+
+    return Outcome(
+        found,
+        lambda: document(found),
+        lambda: f"{found.display().text()}\n{found.verdict}: {output}   ({found.seconds:.0f} s)",
+        files,
+        saved_as=DIAGNOSIS,
+        warnings=found.after.warnings,
+    )

@@ -1,0 +1,75 @@
+"""`walop-jax docs`: the reference pages that come with the package."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from walop_jax.commands.command import Argument, Job, Outcome, UsageError, command
+from walop_jax.io.errors import nearest
+
+TOPIC = Argument("Page to print, or effect, or element; without it, the list.", "[TOPIC]", str)
+NAME = Argument("Of an effect or a kind of element; none: list them.", "[NAME]", str)
+SINGLE = {
+    "effect": "One effect; without a name, the list of effects and elements.",
+    "element": "One kind of element of an instrument.",
+}
+
+
+@command(jax=False)
+def docs(
+    job: Job, topic: Annotated[str | None, TOPIC] = None, name: Annotated[str | None, NAME] = None
+) -> Outcome[str]:
+    """Print a reference page, or the list of pages.
+
+    Recipes, conventions, file formats, the model, effects, how to add an effect or an instrument, vocabulary, sources;
+    and `effect NAME` or `element NAME` for a page about a single one: equation, parameters, at what size it is found,
+    what it is confused with.
+
+    In Python: its text.
+    """
+    found = pages()
+    if name is not None and topic not in SINGLE:
+        raise UsageError(f"{name!r} follows neither effect nor element", "name")
+    if topic in SINGLE:
+        text = _single(job, topic, name)
+    elif topic is None:
+        listed = {key: about(text) for key, text in found.items()}
+        listed |= {f"{key} NAME": words for key, words in SINGLE.items()}
+        width = max(map(len, listed))
+        text = "\n".join(f"{key:<{width}}   {words}" for key, words in listed.items())
+    elif (text := found.get(topic.lower().removesuffix(".md"), "")) == "":
+        raise UsageError(f"there is no page {topic!r}: {nearest(topic, found)}", "topic")
+    return Outcome(
+        text,
+        lambda: {"topic": topic, "name": name, "text": text},
+        lambda: text,
+        markdown=topic is not None and (name is not None or topic not in SINGLE),
+    )
+
+
+def _single(job: Job, topic: str, name: str | None) -> str:
+    """The page about one effect or element, or the list of all."""
+    job.use_jax()
+    from walop_jax.model import gallery
+
+    if name is None:
+        return gallery.listed()
+    try:
+        return gallery.effect_page(name) if topic == "effect" else gallery.element_page(name)
+    except ValueError as error:
+        raise UsageError(str(error), "name") from None
+
+
+def pages() -> dict[str, str]:
+    """The Markdown text of every page by topic, in alphabetical order."""
+    from importlib.resources import files
+
+    folder = files("walop_jax") / "docs"
+    found = (entry for entry in folder.iterdir() if entry.name.endswith(".md"))
+    texts = {entry.name.removesuffix(".md"): entry.read_text(encoding="utf-8") for entry in found}
+    return dict(sorted(texts.items()))
+
+
+def about(text: str) -> str:
+    """The first sentence of a page, which stands below its title."""
+    return text.splitlines()[2]

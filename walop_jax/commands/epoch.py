@@ -1,0 +1,92 @@
+"""`walop-jax epoch`: does last month's calibration still fit, and what has moved?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command
+from walop_jax.commands.inputs import calibration_of, catalogue_of, set_of
+from walop_jax.commands.options import SETS, Effects, PathLike
+from walop_jax.io.errors import errors_naming
+
+if TYPE_CHECKING:
+    from walop_jax.calibration.calibration import Calibration
+    from walop_jax.commands.reading import Run
+    from walop_jax.data.records import CalibrationSet
+    from walop_jax.fit.refit import FitResult
+    from walop_jax.science.epoch import Epoch
+
+OLD = Argument("Old calibration product, or folder of a run.", "OLD", Path)
+FOLDER = Option("Folder for the new calibration and what was found.", "RUN", Path, "-o")
+OUTPUTS = ("calibration.fits", "epoch.json")
+
+
+@command(stages=("reading", "fitting", "lacking"), writes=OUTPUTS)
+def epoch(
+    job: Job,
+    old: Annotated[Calibration | FitResult | Run | PathLike, OLD],
+    new: Annotated[CalibrationSet | PathLike | Sequence[PathLike], SETS],
+    *,
+    output: Annotated[PathLike | None, FOLDER] = None,
+    effects: Effects = None,
+) -> Outcome[Epoch]:
+    """Fit new calibration sets and compare with an old calibration: is the instrument still the same?
+
+    Lists the parameters by how far they have moved, tests all of them together, and says how far off stars would be if
+    the old calibration were still used. The new fit is that of the old model: plates, effects, priors and what is
+    held. Where that does not explain the new data, what is missing is looked for as walop-jax diagnose does.
+
+    Exit code 0 only where the old calibration still holds; 3 where something has moved, or where the new fit is not
+    to be trusted.
+
+    In Python: an `Epoch`; what is missing is looked for only with `output`.
+    """
+    from walop_jax.calibration.calibration import Calibration
+    from walop_jax.calibration.product import write_product
+    from walop_jax.diagnosis.findings import document
+    from walop_jax.diagnosis.trust import examined
+    from walop_jax.diagnosis.workflow import diagnose
+    from walop_jax.science.epoch import epoch as compared
+    from walop_jax.science.epoch import fit_like
+
+    catalogue = catalogue_of(effects)
+    job.tell("reading", "reading")
+    held, calset = calibration_of(old, catalogue), set_of(new)
+    job.tell("fitting the new set", "fitting")
+    with errors_naming(held.path):
+        result = examined(fit_like(held.calibration, calset))
+        found = compared(held.calibration, result)
+    lacking = None
+    if not found.new_trusted and (output is not None or job.typed):
+        job.tell("looking for what the new fit lacks", "lacking")
+        # Other readings of the data have been tried when its fit was examined.
+        lacking = diagnose(
+            calset, result.model, catalogue=catalogue, as_written=True, seed=job.seed, progress=job.progress
+        )
+
+    def text() -> str:
+        shown = found.display().text()
+        if lacking is None:
+            return shown
+        named = ", ".join(step.effect for step in lacking.steps) or "nothing that has a name"
+        return f"{shown}\nwhat the new fit lacks: {named} ({lacking.verdict})"
+
+    def files() -> Writers:
+        product = Calibration.from_fit(result).to_product()
+        return {OUTPUTS[0]: lambda path: write_product(path, product)}
+
+    return Outcome(
+        found,
+        lambda: (
+            {"old": held.product.content_hash(), "new": [entry.sha256 for entry in calset.inputs]}
+            | found.document()
+            | {"diagnosis": None if lacking is None else document(lacking)}
+        ),
+        text,
+        files,
+        saved_as=OUTPUTS[1],
+        warnings=tuple(f"the new fit: {sentence}" for sentence in found.warnings),
+        trusted=found.holds,
+    )

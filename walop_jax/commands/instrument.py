@@ -1,0 +1,150 @@
+"""`walop-jax instrument`: an instrument as described, printed and checked."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Annotated, Any
+
+from walop_jax.commands.command import Argument, Job, Option, Outcome, command
+from walop_jax.commands.options import PathLike
+from walop_jax.io.display import Display, Displayed
+
+if TYPE_CHECKING:
+    from walop_jax.model.instrument import Instrument
+    from walop_jax.model.specification import Model
+
+SOURCE = Argument("A shipped instrument or a description file; none: list them.", "[NAME|FILE.toml]", str)
+TEXT = Option("Print the description itself, to start one's own from.")
+OFF_AXIS = 0.9  # of the field limit, where the optics are tried
+LARGEST_FIELD = 0.3  # deg: beyond, a description says nothing of the optics
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class CheckedInstrument(Displayed):
+    """An instrument with the model of its parameters; `train` and `arms` name elements in the order light meets them.
+
+    `optical` are the parameters that enter the band integral, `conditions` what the optics ask of an exposure.
+    """
+
+    instrument: Instrument
+    model: Model
+    train: tuple[str, ...]
+    arms: dict[str, tuple[str, ...]]
+    moving: tuple[str, ...]
+    optical: tuple[str, ...]
+    conditions: tuple[str, ...]
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {
+            "name": self.instrument.name,
+            "cameras": list(self.instrument.cameras.names),
+            "train": list(self.train),
+            "arms": {name: list(path) for name, path in self.arms.items()},
+            "moving": list(self.moving),
+            "conditions": list(self.conditions),
+            "field_limit": self.instrument.field_limit,
+            "parameters": {
+                p.name: {
+                    "start": p.start,
+                    "unit": p.unit,
+                    "prior": None if p.prior is None else list(p.prior),
+                    "source": p.source,
+                    "optical": p.name in self.optical,
+                }
+                for p in self.model.parameters
+            },
+        }
+
+    def display(self) -> Display:
+        """The light path and the parameters, but for the coefficients of the throughput."""
+        design = self.instrument
+        shown = [p for p in self.model.parameters if not p.name.startswith("throughput.")]
+        path = [("light path", " > ".join((*self.train, *(("arms",) if len(self.arms) > 1 else ()))))]
+        path += [(f"  {name}", " > ".join(elements)) for name, elements in self.arms.items()]
+        if self.moving:
+            path.append(("moves", ", ".join(f"{prefix}_IN, {prefix}_ANGLE" for prefix in self.moving)))
+        return Display(
+            title=f"{design.name}: {len(design.cameras)} cameras ({', '.join(design.cameras.names)})",
+            facts=(*path, ("field", f"to {design.field_limit:g} deg")),
+            head=("parameter", ">start", "prior", "unit", "about"),
+            rows=tuple(
+                (p.name, f"{p.start:g}", "free" if p.prior is None else f"± {p.prior[1]:g}", p.unit, p.about)
+                for p in shown
+            ),
+            notes=(f"and {len(self.model.parameters) - len(shown)} coefficients of the throughput",),
+        )
+
+
+@command(jax=False)
+def instrument(
+    job: Job,
+    source: Annotated[PathLike | None, SOURCE] = None,
+    *,
+    text: Annotated[bool, TEXT] = False,
+) -> Outcome[Any]:
+    """Print and check an instrument: its elements, cameras and parameters, from its description file.
+
+    The description is read, every element is made, and light is sent through it on the axis and at the edge of the
+    field. Without a name the instruments that come with the package are listed.
+
+    In Python: a `CheckedInstrument`, whose `instrument` is the instrument; without a name, what each is, by name; with
+    `text`, the description. Raises `DataError` for a description that is wrong, and for optics that are not finite or
+    give more light than came in.
+    """
+    from walop_jax.instruments.description import described, read_description, shipped
+
+    if source is None:
+        names = {name: described(name).about for name in shipped()}
+        width = max(map(len, names))
+        return Outcome(
+            names,
+            lambda: names,
+            lambda: "\n".join(f"{name:<{width}}  {about}" for name, about in names.items()),
+        )
+    if text:
+        own = read_description(source).text
+        return Outcome(own, lambda: {"name": str(source), "text": own}, lambda: own)
+    job.use_jax()
+    found = checked(source)
+    return Outcome(found, found.document, lambda: found.display().text())
+
+
+def checked(source: PathLike) -> CheckedInstrument:
+    """Read an instrument and send light through it; errors as for the command."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from walop_jax.fit.model_builder import model_without_data
+    from walop_jax.io.errors import DataError
+    from walop_jax.model import light
+    from walop_jax.model.dependence import needs, optical_indices
+    from walop_jax.model.instrument import Instrument
+    from walop_jax.model.plan import blank_plan
+
+    def camera_vectors(design: Instrument, plan: Any, x: Any, y: Any) -> Any:
+        rows = light.band_rows(design, plan, x, y)
+        return light.camera_vectors(design, rows, light.throughput_at(design, x, y), x, y)
+
+    design = Instrument.read(source)
+    asked = needs(design)
+    plan = blank_plan(design, asked.conditions, asked.median)
+    edge = OFF_AXIS * min(design.field_limit, LARGEST_FIELD)
+    for x, y in ((0.0, 0.0), (edge, -edge)):
+        vectors = np.asarray(jax.jit(camera_vectors)(design, plan, jnp.asarray(x), jnp.asarray(y)))
+        if not np.isfinite(vectors).all():
+            raise DataError(f"{design.name}: the optics are not finite at ({x:g}, {y:g}) deg")
+        # A camera gives no less than nothing for any light, if its vector is longer in I than in (Q, U, V).
+        if np.any(np.linalg.norm(vectors[:, :, 1:], axis=2) > vectors[:, :, 0] * (1.0 + 1e-9)):
+            raise DataError(f"{design.name}: a camera would count less than nothing at ({x:g}, {y:g}) deg")
+    model = model_without_data(design)
+    return CheckedInstrument(
+        instrument=design,
+        model=model,
+        train=design.path,
+        arms={arm.name: arm.path for arm in design.arms},
+        moving=design.moving(),
+        optical=tuple(model.names[i] for i in optical_indices(model.template)),
+        conditions=tuple(sorted(asked.conditions)),
+    )

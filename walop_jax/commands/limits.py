@@ -1,0 +1,105 @@
+"""`walop-jax limits`: what a calibration set can show, before anything is found in it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command
+from walop_jax.commands.inputs import catalogue_of, paths_of, set_and_model
+from walop_jax.commands.options import Effects, InstrumentLike, ModelLike, PathLike
+
+if TYPE_CHECKING:
+    from walop_jax.data.records import CalibrationSet
+    from walop_jax.diagnosis.limits_found import DetectionLimits
+    from walop_jax.fit.refit import FitResult
+    from walop_jax.simulation.observing_plan import ObservingPlan
+
+DATA = Argument(
+    "Calibration sets (FITS), fitted as one, or an observing plan in place of them.",
+    "CALSET...|PLAN.toml",
+    list[Path],
+)
+FOLDER = Option(
+    "Folder for limits.json and its two figures; it may be that of a fit of the same sets.", "RUN", Path, "-o"
+)
+OUTPUTS = ("limits.json", "limits_protection.png", "limits_separation.png")
+
+
+@command(
+    stages=("reading", "fitting", "differentiating", "comparing", "unnoticed"), writes=OUTPUTS, random=True
+)
+def limits(
+    job: Job,
+    data: Annotated[FitResult | ObservingPlan | CalibrationSet | PathLike | Sequence[PathLike], DATA],
+    model: ModelLike = None,
+    *,
+    output: Annotated[PathLike | None, FOLDER] = None,
+    instrument: InstrumentLike = None,
+    effects: Effects = None,
+) -> Outcome[DetectionLimits]:
+    """Say at which size every effect of the catalogue would be detected and named in calibration sets.
+
+    And what those may be that are too small: the largest error of q and u that a single effect can make over
+    the field without being detected. An observing plan (TOML, see walop-jax docs files) says the same before any
+    data are taken.
+
+    In Python: `DetectionLimits`, of a fit, an observing plan, or what `refit` takes; its `to_table()` is a row for each
+    effect and parameter. Raises ValueError for a fit that does not converge.
+    """
+    from walop_jax.diagnosis.detection_limits import detection_limits
+    from walop_jax.diagnosis.trust import examined
+    from walop_jax.fit.refit import FitResult, refit
+    from walop_jax.reports.limits_figures import protection_figure, separation_figure
+    from walop_jax.simulation.observing_plan import ObservingPlan
+    from walop_jax.simulation.plan_file import is_plan, read_plan
+    from walop_jax.simulation.simulate import as_planned
+
+    catalogue = catalogue_of(effects)
+    job.tell("reading", "reading")
+    plan = data if isinstance(data, ObservingPlan) else None
+    if (
+        isinstance(data, str | os.PathLike | Sequence)
+        and len(paths_of(data)) == 1
+        and is_plan(paths_of(data)[0])
+    ):
+        plan = read_plan(paths_of(data)[0], instrument)  # pyright: ignore[reportArgumentType]
+    if isinstance(data, FitResult):
+        result = data
+    else:
+        planned = data if plan is None else as_planned(plan)
+        calset, chosen = set_and_model(planned, model, instrument, catalogue)
+        result = examined(refit(calset, chosen, progress=job.progress))
+    if not result.converged:
+        raise ValueError(f"the fit did not converge ({result.minimum.message})")
+    found = detection_limits(result, catalogue=catalogue, seed=job.seed, progress=job.progress)
+
+    def files() -> Writers:
+        protection, separation = protection_figure(found), separation_figure(found)
+        return {
+            OUTPUTS[1]: lambda path: protection.savefig(path, dpi=130),
+            OUTPUTS[2]: lambda path: separation.savefig(path, dpi=130),
+        }
+
+    return Outcome(
+        found,
+        lambda: (
+            found.document()
+            | {
+                "instrument": result.model.name,
+                "effects_of_the_model": list(result.model.effect_names),
+                "inputs": [
+                    {"path": str(entry.path), "sha256": entry.sha256} for entry in result.calset.inputs
+                ],
+                "plan": None if plan is None else plan.document(),
+                "trusted": result.trusted,
+                "seed": job.seed,
+            }
+        ),
+        lambda: found.display().text(),
+        files,
+        saved_as=OUTPUTS[0],
+        warnings=tuple(f"the fit: {text}" for text in result.warnings),
+    )

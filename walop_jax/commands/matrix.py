@@ -1,0 +1,117 @@
+"""`walop-jax matrix`: the instrument matrix and its errors at field points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from walop_jax.commands.command import Job, Option, Outcome, UsageError, command
+from walop_jax.commands.inputs import (
+    NOT_CARRIED_OVER,
+    calibration_of,
+    catalogue_of,
+    left_out_cards,
+    left_out_sentences,
+    table_of,
+)
+from walop_jax.commands.options import Effects, Posterior, Product, TableFile
+from walop_jax.io.errors import errors_naming, nearest
+
+POINTS = Option("FITS, CSV or ECSV with X, Y in degrees.", "TABLE", Path, required=True)
+
+
+def _table_first(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """A table may stand in the place of x."""
+    x = args[1] if len(args) > 1 else kwargs.get("x")
+    if x is not None and len(args) < 3 and "y" not in kwargs and "points" not in kwargs:
+        args, kwargs = args[:1], {k: v for k, v in kwargs.items() if k != "x"} | {"points": x}
+    return args, kwargs
+
+
+@command(writes="file", given=_table_first)
+def matrix(
+    job: Job,
+    calibration: Product,
+    x: Any = None,
+    y: Any = None,
+    *,
+    points: Annotated[Any, POINTS] = None,
+    output: TableFile = None,
+    posterior: Posterior = None,
+    effects: Effects = None,
+    **columns: Any,
+) -> Outcome[Any]:
+    """Add M21, M22, M23, M31, M32, M33 and their errors to a table of field points (three for each arm).
+
+    X and Y in degrees; optional TEFF, FILTER, TEMP, HA (absent: flat spectrum, SDSS-r, 10 Celsius, on the
+    meridian), and CHWP_ANGLE, CHWP_IN, or those of any other moving element of the instrument (absent: out).
+
+    FLAG is added: 16 high cross-talk (a single exposure can hardly be inverted there), 32 beyond the field
+    points of the calibration, 64 filter or temperature that the calibration has not seen. Beyond the field
+    of the instrument (0.35 degrees for the WALOPs) there is no value: NaN and FLAG 32.
+
+    In Python: an astropy table, for `x`, `y` (degrees or quantities) or for the table `points`: a path, an astropy
+    table, columns by name. `columns` are others of those above, such as teff=5000.
+    """
+    from walop_jax.calibration.matrix_table import matrix_columns, provenance
+    from walop_jax.calibration.records import Quality
+    from walop_jax.data.field_points import POINT_COLUMNS, field_points
+    from walop_jax.data.user_tables import extended, table_format, write_output_table
+    from walop_jax.posterior import with_draws
+
+    if (points is None) == (x is None):
+        raise UsageError("give either x and y, or a table of points", "points")
+    if output is not None:
+        table_format(output)
+    held = calibration_of(calibration, catalogue_of(effects))
+    instrument = held.calibration.model.template.patched()
+    known = [
+        *POINT_COLUMNS,
+        *(f"{prefix}{end}" for prefix in instrument.moving() for end in ("_IN", "_ANGLE")),
+    ]
+    for name in columns:
+        if name.upper() not in known:
+            raise TypeError(
+                f"matrix: there is no argument or column {name!r}; {nearest(name.upper(), known)}"
+            )
+    table = table_of({"X": x, "Y": y} if points is None else points, columns)
+    wanted = field_points(table, instrument, held.calibration.always_in)
+    job.tell("working out the matrix")
+    used = held.calibration if posterior is None else with_draws(held.calibration, posterior)
+    with errors_naming(table.path):
+        added = matrix_columns(used, wanted.x, wanted.y, wanted.settings, wanted.outside)
+    lost, content = used.left_behind, held.product.content_hash()
+    cards = provenance(content, used, drawn=posterior is not None) | left_out_cards(lost)
+    if output is not None:
+        write_output_table(output, table, added, overwrite=job.overwrite, header=cards)
+
+    flag = added["FLAG"][0]
+    bits = (Quality.HIGH_CROSSTALK, Quality.BEYOND_FIELD, Quality.BEYOND_SETTINGS)
+    counts = {bit: int((flag & bit > 0).sum()) for bit in bits}
+    said = {
+        Quality.BEYOND_FIELD: "point(s) beyond the calibrated field: extrapolated, or NaN",
+        Quality.BEYOND_SETTINGS: "row(s) with a filter or temperature not in the calibration",
+    }
+    return Outcome(
+        extended(table, added, cards),
+        lambda: {
+            "output": None if output is None else str(output),
+            "rows": table.rows,
+            "trusted": held.product.verdict.trusted,
+            "flags": {str(int(bit)): count for bit, count in counts.items()},
+            "product": content,
+            NOT_CARRIED_OVER: list(lost),
+        },
+        lambda: (
+            f"{output}: {table.rows} rows, {counts[Quality.HIGH_CROSSTALK]} of them in zones of high cross-talk"
+        ),
+        warnings=(
+            *held.warnings,
+            *left_out_sentences(lost, held.path),
+            *(
+                f"{table.path}: {counts[bit]} {text} (FLAG {bit:d})"
+                for bit, text in said.items()
+                if counts[bit]
+            ),
+        ),
+    )

@@ -1,0 +1,70 @@
+"""`walop-jax plot`: a figure of a run by name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from walop_jax.commands.command import Argument, Job, Option, Outcome, command
+from walop_jax.commands.inputs import catalogue_of
+from walop_jax.commands.options import Effects, PathLike
+from walop_jax.io.errors import fail
+
+if TYPE_CHECKING:
+    from walop_jax.commands.reading import Run
+
+FORMATS = (".pdf", ".png", ".svg", ".eps", ".jpg")
+RUN = Argument("Folder of results; none: list the figures.", "[RUN]", Path)
+NAME = Argument("The figure.", "[NAME]", str)
+FILE = Option("File to write: .pdf, .png, .svg (default: NAME.png).", "FILE", Path, "-o")
+PARAMETERS = Option("Coefficients of a corner or trace plot, by name.", "A,B,…", str)
+
+
+@command(writes=())
+def plot(
+    job: Job,
+    run: Annotated[PathLike | Run | None, RUN] = None,
+    name: Annotated[str | None, NAME] = None,
+    *,
+    output: Annotated[PathLike | None, FILE] = None,
+    parameters: Annotated[str | Sequence[str] | None, PARAMETERS] = None,
+    x: Annotated[float, Option("Field point of transmission and modulation, X (deg).")] = 0.0,
+    y: Annotated[float, Option("The same, Y (deg).")] = 0.0,
+    effects: Effects = None,
+) -> Outcome[Any]:
+    """Draw a figure of a run, by name, as a file.
+
+    Without a name the figures are listed: accuracy of p over the field, maps of the matrix and of the retardance of the
+    half-wave plates, camera transmissions, corner plots, and others. The format follows the name of the file.
+
+    In Python: the matplotlib figure, written if `output` is given; without a name, what each figure shows, by name.
+    Raises `DataError`, with the nearest names, for a figure that does not exist and for what the run lacks.
+    """
+    from walop_jax.commands.reading import Run
+    from walop_jax.io.atomic import check_output
+    from walop_jax.reports.named import FIGURES, Source, draw
+    from walop_jax.reports.posterior_figures import save_figure
+
+    if run is None or name is None:
+        listed = {key: entry.about for key, entry in FIGURES.items()}
+        width = max(map(len, listed))
+        lines = [f"{key:<{width}}  {about}" for key, about in listed.items()]
+        return Outcome(listed, lambda: listed, lambda: "\n".join(lines))
+    path = Path(f"{name}.png") if output is None and job.typed else output and Path(output)
+    if path is not None:
+        if path.suffix.lower() not in FORMATS:
+            raise fail("is no picture that can be written", file=path, advice=f"use {', '.join(FORMATS)}")
+        check_output(path, overwrite=job.overwrite)
+    folder = run.folder if isinstance(run, Run) else Path(run)
+    if not folder.is_dir():
+        raise fail(
+            "is not the folder of a run", file=folder, advice="give the RUN of walop-jax refit or diagnose"
+        )
+    if isinstance(parameters, str):
+        parameters = [part.strip() for part in parameters.split(",") if part.strip()]
+    job.tell(f"drawing {name}")
+    figure = draw(name, Source(folder, tuple(parameters or ()), (x, y), catalogue_of(effects)))
+    if path is not None:
+        save_figure(path, figure, overwrite=job.overwrite)
+    return Outcome(figure, lambda: {"figure": name, "output": str(path)}, lambda: str(path))

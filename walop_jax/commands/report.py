@@ -1,0 +1,110 @@
+"""`walop-jax report`: one self-contained page about a run."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from walop_jax.commands.command import Argument, Job, Option, Outcome, command
+from walop_jax.commands.inputs import catalogue_of
+from walop_jax.commands.options import Effects, PathLike
+from walop_jax.io.display import Display, Displayed
+
+if TYPE_CHECKING:
+    from walop_jax.commands.reading import Run
+
+PAGE = "report.html"
+GENERATOR = '<meta name="generator" content="walop-jax'
+RUN = Argument("Folder of refit, diagnose, compare, epoch or limits.", "RUN", Path)
+FILE = Option("Page to write (default: RUN/report.html).", "FILE", Path, "-o")
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Page(Displayed):
+    """A page that was written: where, its length in bytes, and in words what the run lacked for it."""
+
+    path: Path
+    length: int
+    missing: tuple[str, ...]
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {"page": str(self.path), "bytes": self.length, "missing": list(self.missing)}
+
+    def display(self) -> Display:
+        """Where it is, and what the run lacked for it."""
+        return Display(f"{self.path}: {self.length / 1e6:.1f} MB", notes=self.missing)
+
+
+@command(stages=("reading", "drawing"), writes=())
+def report(
+    job: Job,
+    run: Annotated[PathLike | Run, RUN],
+    output: Annotated[PathLike | None, FILE] = None,
+    *,
+    effects: Effects = None,
+) -> Outcome[Page]:
+    """Write one HTML page about a run, figures inside: it needs no network and no other file, and can be mailed or
+    printed.
+
+    The verdict, the accuracy of p over the field, what the data were, what was found, residuals before and after, maps
+    of the matrix and of its errors, pulls from the priors, all parameters, warnings, inputs and versions, as far as RUN
+    holds them; the page says what is missing. What sample and limits have put into RUN is there as
+    well; compare, epoch and limits have pages of their own. A page that exists is made anew; another file of that
+    name is left alone unless --overwrite is given.
+
+    In Python: a `Page`.
+    """
+    from walop_jax.commands.reading import Run
+    from walop_jax.io.atomic import atomic_path, check_output
+    from walop_jax.io.text import printable
+    from walop_jax.reports.other_pages import kind_of_run, render_other
+    from walop_jax.reports.page import render
+    from walop_jax.reports.run import read_run
+
+    folder = run.folder if isinstance(run, Run) else Path(run)
+    target = folder / PAGE if output is None else Path(output)
+    job.tell("reading", "reading")
+    kind = kind_of_run(folder)
+    found = read_run(folder) if kind == "fit" else None
+    overwrite = job.overwrite or _is_page(target)
+    check_output(target, overwrite=overwrite)
+    if found is None:
+        job.tell("drawing", "drawing")
+        text, missing = render_other(folder, kind)
+    else:
+        job.tell("working out the accuracy of p")
+        accuracy, lacking = _accuracy(found, catalogue_of(effects))
+        job.tell("drawing", "drawing")
+        missing = (*found.missing, *lacking)
+        text = render(dataclasses.replace(found, missing=missing), accuracy)
+    text = printable(text)
+    with atomic_path(target, overwrite=overwrite) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    page = Page(target, len(text.encode()), missing)
+    return Outcome(page, page.document, lambda: page.display().text())
+
+
+def _is_page(path: Path) -> bool:
+    """Whether a file is a page that this program has written: then it is made anew without asking."""
+    try:
+        with path.open(encoding="utf-8") as stream:
+            return GENERATOR in stream.read(1000)
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _accuracy(run: Any, catalogue: Any) -> tuple[Any, tuple[str, ...]]:
+    """The accuracy of p over the field, or in words why it is not known."""
+    from walop_jax.calibration.calibration import Calibration
+    from walop_jax.science.field_accuracy import field_accuracy
+
+    if run.product is None:
+        return None, ()
+    try:
+        found = field_accuracy(Calibration.from_product(run.product, catalogue))
+    except ValueError as error:
+        return None, (f"The accuracy of p over the field is not known: {error}.",)
+    lacking = ("The instrument has a single arm: the accuracy of p depends on how stars are observed.",)
+    return found, () if found is not None else lacking

@@ -1,0 +1,186 @@
+"""`walop-jax sample`: the posterior around a fit; chains kept on the way, then draws, intervals and figures."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command
+from walop_jax.commands.inputs import catalogue_of
+from walop_jax.commands.options import Effects, ModelLike, PathLike
+from walop_jax.io.errors import fail, nearest
+from walop_jax.io.text import read_text
+
+if TYPE_CHECKING:
+    from walop_jax.calibration.product import CalibrationProduct
+    from walop_jax.commands.reading import Run
+    from walop_jax.fit.refit import FitResult
+    from walop_jax.posterior import PosteriorSample, Progress
+
+RUN = Argument("Folder of a `walop-jax refit`.", "RUN", Path)
+STEPS = Option("Stop there at the latest, converged or not; a multiple of --interval.", least=1)
+CHAINS = "sampling"
+"""Folder, in that of the run, of the checkpoints."""
+OUTPUTS = (
+    "posterior.nc", "posterior.fits", "posterior.ecsv", "posterior_corner.png", "posterior_trace.png", "sample.json",
+)  # fmt: skip
+
+
+@command(writes=(), random=True)
+def sample(
+    job: Job,
+    fit: Annotated[FitResult | Run | PathLike, RUN],
+    *,
+    resume: Annotated[bool, Option("Go on from the checkpoints in RUN/sampling.")] = False,
+    model: ModelLike = None,
+    effects: Effects = None,
+    sampler: Annotated[Any, Option("emcee, nuts, or your own as FILE.py:CLASS.", "NAME", str)] = "emcee",
+    inflate: Annotated[bool, Option("Sample a factor on the errors of the data.")] = False,
+    maximum_steps: Annotated[int, STEPS] = 100_000,
+    walkers: Annotated[int, Option("Walkers of an emcee ensemble; 0: at least 64.", least=0)] = 0,
+    interval: Annotated[int, Option("Steps between checkpoints.", least=1)] = 500,
+    moves: Annotated[str, Option("Moves of emcee: laplace, de or stretch.")] = "laplace",
+    parameters: Sequence[str] | None = None,
+    **more: Any,
+) -> Outcome[PosteriorSample]:
+    """Sample the posterior: RUN/posterior.nc, intervals and figures; the covariance goes into calibration.fits.
+
+    Checkpoints lie in RUN/sampling: an interrupted run goes on with --resume, bit for bit, and refuses if
+    data, model, priors, sampler, settings or versions have changed. A chain that has not converged is written and
+    marked so, with exit code 1; the covariance of the fit then stays in calibration.fits.
+
+    In Python: a `PosteriorSample`, of a fit in memory or of a run, which is then written. `parameters` names what is
+    sampled (None: the physics coefficients); other keywords are the fields of `walop.Options`. Raises `DataError` if
+    the run is no folder of a fit, holds a posterior already, or does not fit its data any more.
+    """
+    from walop_jax.commands.reading import Run
+    from walop_jax.fit.refit import FitResult
+    from walop_jax.posterior import Options
+    from walop_jax.posterior import sample as sample_fit
+
+    known = {field.name for field in dataclasses.fields(Options)}
+    if unknown := sorted(set(more) - known):
+        raise TypeError(f"sample: there is no argument {unknown[0]!r}; {nearest(unknown[0], known)}")
+    options = Options(
+        sampler=sampler,
+        seed=job.seed,
+        inflate=inflate,
+        maximum_steps=maximum_steps,
+        walkers=walkers,
+        interval=interval,
+        moves=moves,
+        parameters=None if parameters is None else tuple(parameters),
+        **more,
+    )
+
+    def tell(progress: Progress) -> None:
+        numbers = "" if math.isnan(progress.tau) else f", τ {progress.tau:.1f}, ESS {progress.ess:.0f}"
+        job.tell(f"{progress.stage}: {100 * progress.share:.0f} %{numbers}")
+
+    if isinstance(fit, FitResult):
+        if resume or model is not None:
+            raise ValueError(
+                "a fit in memory has its model and keeps no checkpoints: leave model and resume out"
+            )
+        posterior = sample_fit(fit, options, report=tell)
+        where = "the fit"
+    else:
+        where = fit.folder if isinstance(fit, Run) else Path(fit)
+        posterior = _sampled_run(job, where, options, tell, model, resume, effects)
+    return Outcome(
+        posterior,
+        posterior.document,
+        lambda: f"{posterior.display().text()}\n{posterior.seconds:.0f} s",
+        warnings=posterior.warnings,
+        failure=""
+        if posterior.sampled_well
+        else f"{where}: the posterior has not converged; calibration.fits keeps its covariance",
+        trusted=posterior.trusted,
+    )
+
+
+def _sampled_run(
+    job: Job, folder: Path, options: Any, tell: Any, model: ModelLike, resume: bool, effects: Effects
+) -> PosteriorSample:
+    """The posterior around the fit in a folder, written there, with the covariance in its product if it can be."""
+    from walop_jax.calibration.product import read_product
+    from walop_jax.calibration.summary import PRODUCT
+    from walop_jax.io.folder import output_folder
+    from walop_jax.posterior import Checkpoints, digest_of_fit, fit_of_run
+    from walop_jax.posterior import sample as sample_fit
+
+    catalogue = catalogue_of(effects)
+    if not folder.is_dir():
+        raise fail("is not a folder", file=folder, advice="give the RUN of walop-jax refit")
+    text = None if model is None else read_text(model)
+    found = [name for name in OUTPUTS if (folder / name).exists()]
+    if found and not (job.overwrite or resume):
+        raise fail(f"holds {found[0]} already", file=folder, advice="go on with --resume, or --overwrite it")
+    with output_folder(folder, OUTPUTS, overwrite=True) as out:
+        product = read_product(folder / PRODUCT)
+        result = fit_of_run(product, folder, text, catalogue)
+        if job.overwrite and not resume:
+            Checkpoints(folder / CHAINS, {}).clear()
+        posterior = sample_fit(result, options, folder=folder / CHAINS, resume=resume, report=tell)
+        table = product.parameters
+        fitted = digest_of_fit(product.inputs, table.name.tolist(), table.value)
+        posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted, fit=fitted)
+        with out.filled(OUTPUTS + ((PRODUCT,) if posterior.trusted else ())) as temporary:
+            for name, write in _writers(product, posterior, catalogue).items():
+                write(temporary / name)
+    return posterior
+
+
+def _writers(product: CalibrationProduct, posterior: PosteriorSample, catalogue: Any) -> Writers:
+    """The files of a sampled run."""
+    from walop_jax.calibration.calibration import Calibration
+    from walop_jax.calibration.product import write_product
+    from walop_jax.calibration.summary import PRODUCT
+    from walop_jax.io.plain_tables import write_columns
+    from walop_jax.io.text import json_text
+    from walop_jax.posterior import write_posterior
+    from walop_jax.reports.posterior_figures import corner_figure, save_figure, trace_figure
+
+    units = dict(zip(posterior.names, posterior.units, strict=True))
+    sampled = [units.get(name, "") for name in posterior.sampled]
+    notes = {"TRUSTED": posterior.trusted, "STEPS": posterior.convergence.steps}
+    shown, draws = _in_corner(posterior, product)
+    corner = corner_figure(draws, shown, [units.get(name, "") for name in shown])
+    tau = posterior.convergence.tau
+    trace = trace_figure(posterior.chains, posterior.sampled, sampled, posterior.thin, tau)
+    writers: dict[str, Any] = {
+        "posterior.nc": lambda path: write_posterior(path, posterior),
+        "posterior.fits": lambda path: write_columns(path, posterior.intervals(), notes),
+        "posterior.ecsv": lambda path: write_columns(path, posterior.intervals(), notes),
+        "posterior_corner.png": lambda path: save_figure(path, corner),
+        "posterior_trace.png": lambda path: save_figure(path, trace),
+        "sample.json": lambda path: path.write_text(json_text(posterior.document()), encoding="utf-8"),
+    }
+    if posterior.trusted:
+        held = Calibration.from_product(product, catalogue)
+        verdict = dataclasses.replace(
+            held.verdict, covariance_from="posterior", errors_from=posterior.errors_from
+        )
+        better = dataclasses.replace(held, covariance=posterior.covariance, verdict=verdict).to_product()
+        writers[PRODUCT] = lambda path: write_product(path, better)
+    return writers
+
+
+def _in_corner(posterior: PosteriorSample, product: CalibrationProduct) -> tuple[tuple[str, ...], Any]:
+    """Names and draws of the sampled coefficients that the data constrain best, as many as a figure can label."""
+    import numpy as np
+
+    from walop_jax.reports.posterior_figures import MOST_IN_CORNER, informed
+
+    columns = [posterior.names.index(name) for name in posterior.sampled if name in posterior.names]
+    draws = posterior.draws.reshape(-1, len(posterior.names))[:, columns]
+    if posterior.ln_f is not None:  # the factor on the errors, the last
+        draws = np.concatenate([draws, posterior.ln_f.reshape(-1, 1)], axis=1)
+    spread = dict(zip(posterior.sampled, draws.std(axis=0).tolist(), strict=True))
+    table = product.parameters
+    prior = dict(zip(table.name.tolist(), table.prior_width.tolist(), strict=True))
+    shown = informed(posterior.sampled, spread, prior)[:MOST_IN_CORNER] or posterior.sampled[:MOST_IN_CORNER]
+    return shown, draws[:, [posterior.sampled.index(name) for name in shown]]

@@ -1,0 +1,139 @@
+"""`walop-jax trace`: the light of one source, stage by stage, as a table."""
+
+from __future__ import annotations
+
+import math
+import numbers
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
+from walop_jax.commands.inputs import (
+    NOT_CARRIED_OVER,
+    calibration_of,
+    catalogue_of,
+    design_of,
+    left_out_sentences,
+)
+from walop_jax.commands.options import Effects, InstrumentLike, PathLike
+
+if TYPE_CHECKING:
+    from walop_jax.calibration.calibration import Calibration
+    from walop_jax.commands.reading import Run
+    from walop_jax.fit.refit import FitResult
+    from walop_jax.model.trace import Stage
+
+PRODUCT = Argument("An instrument as fitted; without it, as designed.", "[RUN/calibration.fits]", Path)
+ANGLE = Option("Polariser in, with its axis here (deg).", kind=float)
+AT = Option(
+    "Angle (deg) of a moving element in the beam, named like its columns: CHWP=45. May be repeated.",
+    "P=ANGLE",
+    list[str],
+)
+TEFF = Option("Colour temperature (K); without it, a flat spectrum.", kind=float)
+
+
+def _numbers_first(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """Numbers by their position are x, y, q and u; other keywords are elements, by the prefix of their columns."""
+    if args and isinstance(args[0], numbers.Real):
+        args, kwargs = (), dict(zip(("x", "y", "q", "u"), args, strict=False)) | kwargs
+    return args, kwargs
+
+
+@command(given=_numbers_first)
+def trace(
+    job: Job,
+    calibration: Annotated[Calibration | FitResult | Run | PathLike | None, PRODUCT] = None,
+    *,
+    instrument: InstrumentLike = None,
+    effects: Effects = None,
+    x: Annotated[float, Option("Field position X (deg).")] = 0.0,
+    y: Annotated[float, Option("Field position Y (deg).")] = 0.0,
+    q: Annotated[float, Option("Stokes q of the source, a fraction.")] = 0.0,
+    u: Annotated[float, Option("Stokes u of the source, a fraction.")] = 0.0,
+    angle: Annotated[float | None, ANGLE] = None,
+    at: Annotated[Mapping[str, float] | Sequence[str] | None, AT] = None,
+    teff: Annotated[float | None, TEFF] = None,
+    filter: Annotated[str, Option("Filter of the calibration, or SDSS-r.")] = "SDSS-r",
+    **positions: float,
+) -> Outcome[tuple[Stage, ...]]:
+    """Follow the light of one source through the instrument.
+
+    Every line is the light at one place: Stokes vectors averaged over the band, then the cameras. The
+    last line is what a fit works with.
+
+    In Python: the stages. Angles of moving elements are keywords, chwp=45, or `at`. Raises ValueError, with the nearest
+    names, for an unknown instrument, filter or moving element.
+    """
+    from walop_jax.data.filters import builtin_filter
+    from walop_jax.data.settings import Settings
+    from walop_jax.model.build import nominal_instrument
+    from walop_jax.model.trace import Sightline
+    from walop_jax.model.trace import trace as traced
+
+    there = {name.upper(): value for name, value in positions.items()} | _angles(at)
+    try:
+        setting = Settings.default(1, filter).at(**there)
+        setting.teff[0] = math.nan if teff is None else teff
+        polariser = math.nan if angle is None else angle
+        line = Sightline(x=x, y=y, q=q, u=u, clp_angle=polariser, setting=setting)
+        if calibration is None:
+            design = design_of(instrument) or nominal_instrument()
+            stages, lost, warnings = traced(design, builtin_filter(filter), line), (), ()
+    except ValueError as error:
+        raise UsageError(str(error)) from None  # the options say all there is
+    if calibration is not None:
+        held = calibration_of(calibration, catalogue_of(effects))
+        fitted = held.calibration
+        lost = fitted.left_behind
+        stages = traced(fitted.model.instrument(fitted.values), fitted.filter_curve(filter), line)
+        warnings = (*held.warnings, *left_out_sentences(lost, held.path))
+    return Outcome(
+        stages,
+        lambda: {
+            "stages": [
+                {
+                    "stage": stage.name,
+                    "about": stage.about,
+                    "rows": stage.rows,
+                    "columns": stage.columns,
+                    "value": stage.value.tolist(),
+                }
+                for stage in stages
+            ],
+            NOT_CARRIED_OVER: list(lost),
+        },
+        lambda: "\n".join(table(stages)),
+        warnings=warnings,
+    )
+
+
+def _angles(at: Mapping[str, float] | Sequence[str] | None) -> dict[str, float]:
+    """Angles (deg) by column prefix, also of texts such as CHWP=45."""
+    if isinstance(at, Mapping):
+        return {name.upper(): value for name, value in at.items()}
+    found = {}
+    for text in at or ():
+        prefix, _, angle = text.partition("=")
+        try:
+            found[prefix.strip().upper()] = float(angle)
+        except ValueError:
+            raise UsageError(f"{text!r} is no P=ANGLE, such as CHWP=45", "at") from None
+    return found
+
+
+def table(stages: Sequence[Stage]) -> list[str]:
+    """The stages as lines of text; column names appear where they change."""
+    width = max(len(f"{stage.name} {row}") for stage in stages for row in stage.rows)
+    lines: list[str] = []
+    columns: tuple[str, ...] = ()
+    for stage in stages:
+        if stage.columns != columns:
+            columns = stage.columns
+            lines.append(" " * width + "".join(f"{column:>13}" for column in columns))
+        for i, (row, values) in enumerate(zip(stage.rows, stage.value, strict=True)):
+            name = f"{stage.name} {row}".strip()
+            about = f"   {stage.about}" if i == 0 else ""
+            lines.append(f"{name:<{width}}" + "".join(f"{value:13.6f}" for value in values) + about)
+    return lines
