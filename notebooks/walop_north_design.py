@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+import walop_jax as walop
 from walop_jax.data import read_calibration_set
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.runs.import_zemax import import_folder
 
 REPOSITORY = "https://github.com/HeisenbergK/NewWALOPCalibrate2Dens"
 ELEMENTS = ("m22", "m23", "m32", "m33")
@@ -60,7 +60,7 @@ def design_set(folder: str | Path = "walop_north_design") -> CalibrationSet:
         exports = next(
             path.parent for path in sorted(source.rglob("Config_1")) if path.parent.name != "Unpol"
         )
-        import_folder(exports, made, instrument="WALOP-NORTH")
+        walop.import_zemax(exports, output=made, instrument="WALOP-NORTH")
     return read_calibration_set(made)
 
 

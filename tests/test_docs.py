@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from walop_jax.cli.app import COMMANDS
 
-from walop_jax.cli.docs import about, pages
+from walop_jax.commands import COMMANDS
+from walop_jax.commands.docs import about, pages
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = pages()
@@ -226,7 +226,7 @@ def test_tables_of_the_diagnosis():
 
 
 def test_keys_of_the_sampling():
-    from walop_jax.runs.sample import OUTPUTS
+    from walop_jax.commands.sample import OUTPUTS
 
     assert (
         unexplained(keys_written("walop_jax.posterior.result", "document"), section("files", "Posterior"))

@@ -28,8 +28,6 @@ ROOMS = (
     "plans",
     "paper",
     "reports",
-    "runs",
-    "cli",
     "commands",
 )
 OWNERS = {
@@ -40,9 +38,9 @@ OWNERS = {
     "matplotlib": {"reports"},
     "corner": {"reports"},
     "jinja2": {"reports"},
-    "typer": {"cli", "commands"},
-    "rich": {"cli", "commands"},
-    "tomlkit": {"simulation", "cli", "model", "fit"},
+    "typer": {"commands"},
+    "rich": {"commands"},
+    "tomlkit": {"simulation", "model", "fit"},
 }
 # Imported by nobody: tools of the tests, and what there is no need of.
 STRANGERS = {"pandas", "elli", "beartype", "hypothesis", "pytest", "oracle", "tests"}
@@ -93,10 +91,10 @@ def complaints(source: str, module: str, is_package: bool = False) -> list[str]:
             found.append(f"{where}: only {sorted(OWNERS[top])} may import {top}")
         if top in STRANGERS:
             found.append(f"{where}: {top} has no business in the package")
-    if room not in ("cli", "commands"):
+    if room != "commands":
         for node in ast.walk(ast.parse(source)):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print":
-                found.append(f"{module}:{node.lineno}: prints; that is the business of cli")
+                found.append(f"{module}:{node.lineno}: prints; that is the business of commands")
     return found
 
 
@@ -151,7 +149,7 @@ FAULTS = {
     "from walop_jax.fit import refit": "model must not know fit",
     "import walop_jax.reports.page": "model must not know reports",
     "def f():\n    from walop_jax import likelihood": "model must not know likelihood",
-    "from ..cli import main": "model must not know cli",
+    "from ..commands import main": "model must not know commands",
     "from astropy.io import fits": "may import astropy",
     "import matplotlib.pyplot as plt": "may import matplotlib",
     "import pandas": "pandas has no business",

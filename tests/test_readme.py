@@ -6,7 +6,8 @@ import re
 from pathlib import Path
 
 import pytest
-from walop_jax.cli.app import COMMANDS
+
+from walop_jax.commands import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -9,9 +9,9 @@ import socket
 
 import pytest
 
+from walop_jax.commands.reading import read
 from walop_jax.data import DataError, read_calibration_set
 from walop_jax.io.text import read_text
-from walop_jax.runs.reading import read
 
 HUGE = 2**63
 # card, what stands there in the file, what is written over it, what the message must say

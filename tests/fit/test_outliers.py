@@ -10,13 +10,13 @@ from astropy.io import fits
 from quick import quick
 from small_run import SEED, SMALL, small_fit
 
+from walop_jax.commands.clip import clip
 from walop_jax.data import DataError, DataFlag, TableIntensities, read_calibration_set, write_calibration_set
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.misfit import describe
 from walop_jax.fit.outliers import clipped, outlying
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.runs.clip import clip_sets
 from walop_jax.simulation.simulate import simulate
 
 
@@ -87,7 +87,7 @@ def test_a_fit_tells_that_there_are_some(clean):
 def test_the_file_holds_the_same_rows_and_the_flags(clean, tmp_path):
     calset, hit = with_hits(clean, 0.01, 50.0)
     write_calibration_set(tmp_path / "set.fits", calset)
-    found = clip_sets([tmp_path / "set.fits"], tmp_path / "clean.fits")
+    found = clip(tmp_path / "set.fits", output=tmp_path / "clean.fits")
     with fits.open(tmp_path / "set.fits") as before, fits.open(tmp_path / "clean.fits") as after:
         one, other = before["INTENSITIES"].data, after["INTENSITIES"].data
         for name in one.names:
@@ -100,4 +100,4 @@ def test_the_file_holds_the_same_rows_and_the_flags(clean, tmp_path):
         == found.used - found.rows
     )
     with pytest.raises(DataError, match="exists already"):
-        clip_sets([tmp_path / "set.fits"], tmp_path / "clean.fits")
+        clip(tmp_path / "set.fits", output=tmp_path / "clean.fits")

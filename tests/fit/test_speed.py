@@ -102,7 +102,7 @@ def test_against_scipy(tmp_path):
         command = [sys.executable, "-c", code, *map(str, arguments)]
         return seconds(lambda: subprocess.run(command, check=True, env=environment, capture_output=True))[0]
 
-    refit = "from walop_jax.cli import main; main()"
+    refit = "from walop_jax.commands import main; main()"
     filled = process(refit, "refit", path, "-o", tmp_path / "first")
     cold = min(process(refit, "refit", path, "-o", tmp_path / f"run{n}") for n in range(2))
     calset = read_calibration_set(path)

@@ -10,13 +10,13 @@ import pytest
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import read_calibration
+from walop_jax.commands.refit import refit
 from walop_jax.data import read_calibration_set
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import Model
-from walop_jax.runs.refit import RefitRun, refit_sets
 
 NOTEBOOKS = Path(__file__).resolve().parents[2] / "notebooks"
 sys.path.insert(0, str(NOTEBOOKS))
@@ -36,9 +36,9 @@ def calset(design: Path) -> CalibrationSet:
 
 
 @pytest.fixture(scope="module")
-def run(design: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[RefitRun, Calibration]:
+def run(design: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[FitResult, Calibration]:
     folder = tmp_path_factory.mktemp("north") / "run"
-    return refit_sets([design], folder, instrument="WALOP-NORTH"), read_calibration(folder).calibration
+    return refit(design, output=folder, instrument="WALOP-NORTH"), read_calibration(folder).calibration
 
 
 def off(calibration: Calibration, calset: CalibrationSet) -> np.ndarray:
@@ -53,8 +53,8 @@ def rms(values: np.ndarray) -> float:
 
 def test_the_command_explains_the_design(run, calset):
     made, calibration = run
-    assert made.result.converged
-    assert made.result.minimum.steps <= 12
+    assert made.converged
+    assert made.minimum.steps <= 12
     left = off(calibration, calset)
     assert rms(left) < 0.0008
     assert all(rms(left[..., element]) < 0.0011 for element in range(4))
@@ -62,12 +62,12 @@ def test_the_command_explains_the_design(run, calset):
 
 def test_errors_come_from_what_is_left(run):
     made, calibration = run
-    assert not made.result.explains_data
+    assert not made.explains_data
     assert "300 states" in calibration.verdict.errors_from
     assert "36 cells" in calibration.verdict.errors_from
-    value, error = made.result.value("half2.plate.quartz")
+    value, error = made.value("half2.plate.quartz")
     assert 0.01 < error < 1.0
-    assert value == made.result.value("chwp.quartz")[0]
+    assert value == made.value("chwp.quartz")[0]
 
 
 def started(result: FitResult) -> Model:

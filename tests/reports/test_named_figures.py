@@ -10,6 +10,7 @@ from small_run import SEED, SMALL
 
 from walop_jax.calibration import write_calibration
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.commands.plot import plot
 from walop_jax.data import read_calibration_set, write_calibration_set
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
@@ -18,7 +19,6 @@ from walop_jax.paper.retardance import plate_retardances, retardance
 from walop_jax.reports.named import FIGURES, Source, draw
 from walop_jax.reports.posterior_figures import informed
 from walop_jax.reports.style import element_kind
-from walop_jax.runs.plot import plot_figure
 from walop_jax.simulation.simulate import simulate
 
 WITHOUT = ("corner", "trace", "residual-map", "protection", "separation")  # what this run has not
@@ -51,11 +51,12 @@ def test_names_and_files(source, tmp_path):
     with pytest.raises(DataError, match="did you mean 'efficiency'"):
         draw("eficiency", source)
     with pytest.raises(DataError, match="no picture"):
-        plot_figure(source.folder, "matrix", tmp_path / "matrix.txt")
-    path = plot_figure(source.folder, "matrix", tmp_path / "matrix.svg")
+        plot(source.folder, "matrix", output=tmp_path / "matrix.txt")
+    path = tmp_path / "matrix.svg"
+    plot(source.folder, "matrix", output=path)
     assert path.read_text().startswith("<?xml")
     with pytest.raises(DataError, match="--overwrite"):
-        plot_figure(source.folder, "matrix", path)
+        plot(source.folder, "matrix", output=path)
 
 
 def test_maps_say_their_scale(source):

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from walop_jax.commands.conformance import OUTPUTS, conformance
 from walop_jax.io.errors import DataError
 from walop_jax.model.mueller import retarder
 from walop_jax.model.sources.base import turned
-from walop_jax.runs.conformance import OUTPUTS, check_conformance, make_conformance
 from walop_jax.science.conformance import Case, cases, judge
 from walop_jax.science.estimate import estimate
 from walop_jax.science.polarisation import polarisation
@@ -146,16 +146,16 @@ def fill(folder, change):
 
 def test_tables_are_written_and_judged(tmp_path):
     folder = tmp_path / "pack"
-    assert make_conformance(folder) == 40
+    assert conformance(make=folder) == 40
     assert sorted(entry.name for entry in folder.iterdir()) == sorted(OUTPUTS)
     asked = len(right())
-    assert len(check_conformance(folder).deviations) == asked
+    assert len(conformance(check=folder).deviations) == asked
     fill(folder, lambda number, row: None)
-    assert check_conformance(folder).document() == {"asked": asked, "right": asked, "deviations": []}
+    assert conformance(check=folder).document() == {"asked": asked, "right": asked, "deviations": []}
     fill(folder, lambda number, row: row.update(VALUE="-0.017") if number == 0 else None)
-    assert [entry.quantity for entry in check_conformance(folder).deviations] == ["P"]
+    assert [entry.quantity for entry in conformance(check=folder).deviations] == ["P"]
     with pytest.raises(DataError, match=r"holds cases\.csv already"):
-        make_conformance(folder)
+        conformance(make=folder)
 
 
 @pytest.mark.parametrize(
@@ -167,7 +167,7 @@ def test_tables_are_written_and_judged(tmp_path):
     ],
 )
 def test_results_that_cannot_be_read(tmp_path, change, message):
-    make_conformance(tmp_path / "pack")
+    conformance(make=tmp_path / "pack")
     fill(tmp_path / "pack", lambda number, row: row.update(change) if number == 0 else None)
     with pytest.raises(DataError, match=message):
-        check_conformance(tmp_path / "pack")
+        conformance(check=tmp_path / "pack")

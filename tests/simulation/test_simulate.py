@@ -325,7 +325,7 @@ def test_the_documented_command_makes_the_set_in_fits_data(tmp_path: Path, name:
         str(tmp_path / Path(word).name) if word.startswith("fits_data/") else word
         for word in documented_command(name)
     ]
-    run([sys.executable, "-c", "from walop_jax.cli import main; main()", *arguments], check=True)
+    run([sys.executable, "-c", "from walop_jax.commands import main; main()", *arguments], check=True)
     stored = read_calibration_set(FITS_DATA / f"{name}.fits")
     made = read_calibration_set(tmp_path / f"{name}.fits")
     for part in ("exposures", "points", "sources"):

@@ -38,11 +38,13 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 from runs.conftest import content  # noqa: E402
 from small_run import SEED, SMALL  # noqa: E402
 
-from walop_jax.cli.common import switch_on_jax  # noqa: E402
+from walop_jax.commands.compress import compress  # noqa: E402
+from walop_jax.commands.diagnose import diagnose  # noqa: E402
+from walop_jax.commands.program import switch_on_jax  # noqa: E402
+from walop_jax.commands.refit import refit  # noqa: E402
+from walop_jax.commands.sample import sample  # noqa: E402
 from walop_jax.data import DataError, Grid, write_calibration_set, write_frames  # noqa: E402
 from walop_jax.likelihood import limits  # noqa: E402
-from walop_jax.posterior import Options  # noqa: E402
-from walop_jax.runs import compress, diagnose, refit, sample  # noqa: E402
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn  # noqa: E402
 from walop_jax.simulation.simulate import simulate  # noqa: E402
 
@@ -87,7 +89,7 @@ class Study:
         self.here.mkdir()
         self.run = self.here / "RUN"
         if self.command == "sample":
-            refit.refit_sets([self.sets[1]], self.run)
+            refit(self.sets[1], output=self.run)
         if self.command == "compress":
             self.run.mkdir()
         self.do(0)
@@ -100,14 +102,13 @@ class Study:
     def do(self, number: int = 1) -> None:
         """The command with its first or second input, over what is there."""
         if self.command == "refit":
-            refit.refit_sets([self.sets[number]], self.run, overwrite=True)
+            refit(self.sets[number], output=self.run, overwrite=True)
         elif self.command == "sample":
-            options = Options(interval=50, maximum_steps=100, moves="laplace", seed=number)
-            sample.sample_run(self.run, options, overwrite=True)
+            sample(self.run, interval=50, maximum_steps=100, moves="laplace", seed=number, overwrite=True)
         elif self.command == "compress":
-            compress.compress_frames([self.sets[number]], self.run / "set.fits", overwrite=True)
+            compress(self.sets[number], output=self.run / "set.fits", overwrite=True)
         else:
-            diagnose.diagnose_sets([self.sets[number]], self.run, overwrite=True, minutes=0.0)
+            diagnose(self.sets[number], output=self.run, overwrite=True, minutes=0.0)
 
     def put(self, state: Path) -> None:
         """Bring a state of the disk back."""
@@ -263,7 +264,7 @@ def full(study: Study, count: int) -> tuple[int, list[str]]:
 
 def command_line(study: Study) -> list[str]:
     words = (w.format(set=study.sets[1], run=study.run) for w in LINES[study.command])
-    return [sys.executable, "-c", "from walop_jax.cli import main; main()", *words]
+    return [sys.executable, "-c", "from walop_jax.commands import main; main()", *words]
 
 
 def start(study: Study) -> subprocess.Popen[bytes]:

@@ -27,13 +27,13 @@ COMMANDS = (
     "epoch",
     "model",
     "instrument",
-    "import_zemax",
+    "import-zemax",
     "trace",
     "cite",
     "conformance",
     "docs",
 )
-"""In the order of the help: the function `refit` of `refit.py`, and so on; `import_zemax` is typed `import-zemax`."""
+"""In the order of the help; `import-zemax` is the function `import_zemax` of `import_zemax.py`, and so on."""
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""

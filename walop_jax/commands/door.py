@@ -100,12 +100,20 @@ def bound(
     except TypeError as error:
         raise TypeError(f"{name}: {error}; the arguments are {_listed(signature)}") from None
     hints = {key: _kind(function, p) for key, p in parameters.items() if key in found.arguments}
+    several = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
     wrong = {
         key: value
         for key, value in found.arguments.items()
-        if parameters[key].kind not in (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+        if parameters[key].kind not in several
         and value is not parameters[key].default
         and not _fits(value, hints[key])
+    }
+    wrong |= {
+        key: value
+        for key in hints
+        if parameters[key].kind is inspect.Parameter.VAR_POSITIONAL
+        for value in found.arguments[key]
+        if not _fits(value, hints[key])
     }
     for key, value in wrong.items():
         swapped = [other for other in wrong if other != key and _fits(value, hints[other])]

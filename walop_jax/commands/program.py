@@ -304,9 +304,12 @@ def switch_on_jax() -> None:
 
 
 for _name in COMMANDS:
-    _command = getattr(importlib.import_module(f"walop_jax.commands.{_name}"), _name).command
+    _function_name = _name.replace("-", "_")
+    _command = getattr(
+        importlib.import_module(f"walop_jax.commands.{_function_name}"), _function_name
+    ).command
     app.command(
-        _name.replace("_", "-"),
+        _name,
         context_settings=HELP,
         help=_paragraphs(_command.body),
         short_help=_in_short(_command.body),

@@ -33,7 +33,7 @@ LARGE = """
 import sys
 from walop_jax.likelihood import limits
 limits.LARGE_ABOVE, limits.LARGE_CHUNK, limits.SAMPLE = 0, 256, 1024
-from walop_jax.cli import main
+from walop_jax.commands import main
 main()
 """
 

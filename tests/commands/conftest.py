@@ -1,4 +1,4 @@
-"""A small calibration set on disk and its fit, and what two folders of results have in common."""
+"""A small calibration set on disk, its fit, and what the commands make of it; how two folders are compared."""
 
 from __future__ import annotations
 
@@ -38,25 +38,39 @@ class FittedSet:
 
 
 @pytest.fixture(scope="session")
-def fitted(tmp_path_factory) -> FittedSet:
-    folder = tmp_path_factory.mktemp("fitted")
-    path, run = folder / "small.fits", folder / "RUN"
-    write_calibration_set(path, simulate(SMALL, seed=SEED).calset)
-    calset = read_calibration_set(path)
+def fitted(calset_file, tmp_path_factory) -> FittedSet:
+    run = tmp_path_factory.mktemp("fitted") / "RUN"
+    calset = read_calibration_set(calset_file)
     result = refit(calset).judged()
     calibration = Calibration.from_fit(result)
     run.mkdir()
     write_product(run / "calibration.fits", calibration.to_product())
     (run / "summary.json").write_text(json.dumps(summary(result, seconds=1.0)))
-    return FittedSet(path, calibration, run)
+    return FittedSet(calset_file, calibration, run)
 
 
 @pytest.fixture(scope="session")
-def spoilt(tmp_path_factory) -> Path:
+def calset_file(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("sets") / "small.fits"
+    write_calibration_set(path, simulate(SMALL, seed=SEED).calset)
+    return path
+
+
+@pytest.fixture(scope="session")
+def spoilt_file(tmp_path_factory) -> Path:
     """A set with an effect that the base model does not have."""
-    path = tmp_path_factory.mktemp("spoilt") / "spoilt.fits"
+    path = tmp_path_factory.mktemp("sets") / "spoilt.fits"
     effect = effect_by_name("clp_wobble").of(SMALL.context(), amplitude=0.3, phase=1.0)
     write_calibration_set(path, simulate(SMALL, seed=SEED, effects=(effect,)).calset)
+    return path
+
+
+@pytest.fixture(scope="session")
+def run(call, calset_file, tmp_path_factory) -> Path:
+    """A finished `refit`."""
+    path = tmp_path_factory.mktemp("runs") / "run"
+    result = call("refit", calset_file, "-o", path, "--quiet")
+    assert result.exit_code == 0, result.output
     return path
 
 

@@ -1,4 +1,4 @@
-"""`refit_sets` and `refit`: what a Python caller has of a fit of whole frames, interrupted and taken up again."""
+"""`refit` from Python: a fit of whole frames, interrupted and taken up again."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ import pytest
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import read_product
 from walop_jax.calibration.residual_map import residual_map
+from walop_jax.commands.refit import refit
 from walop_jax.data import Grid, read_calibration_set, write_frames
 from walop_jax.data.records import CalibrationSet, Intensities
 from walop_jax.fit import search
-from walop_jax.fit.refit import refit
 from walop_jax.likelihood import limits, runner
 from walop_jax.likelihood.journal import fingerprint
-from walop_jax.runs.refit import refit_sets
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -67,18 +66,17 @@ class Interrupting:
 
 @pytest.mark.long
 def test_a_run_that_is_interrupted_goes_on_where_it_was(frames, large, tmp_path):
-    whole = refit_sets([frames], tmp_path / "whole")
-    assert whole.result.converged
-    assert whole.residuals is not None
+    whole = refit(frames, output=tmp_path / "whole")
+    assert whole.converged
     assert read_product(tmp_path / "whole" / "calibration.fits").residuals is not None
     stop = Interrupting(12)
     with pytest.raises(StopError):
-        refit_sets([frames], tmp_path / "cut", progress=stop)
+        refit(frames, output=tmp_path / "cut", progress=stop)
     assert stop.told[0] == "reading"
     assert stop.told[1].startswith("preparing the fit; data will take ")
     assert [entry.name for entry in (tmp_path / "cut").iterdir()] == ["partial"]
     told: list[str] = []
-    again = refit_sets([frames], tmp_path / "cut", progress=told.append)
+    again = refit(frames, output=tmp_path / "cut", progress=told.append)
     # The sample is not fitted a second time, and the slabs that were done are not done again.
     assert not any(line.startswith("fit: ") for line in told)
     passes = [line for line in told if "points/s" in line]
@@ -86,7 +84,7 @@ def test_a_run_that_is_interrupted_goes_on_where_it_was(frames, large, tmp_path)
     assert len(first) == SIDE**2 // 64 - 12
     assert first[0].startswith(f"{MATRIX}: 832 of 1,600 points")
     assert told[-1] == "mapping the field"
-    np.testing.assert_array_equal(again.result.values, whole.result.values)
+    np.testing.assert_array_equal(again.values, whole.values)
     assert_same_files(tmp_path / "cut", tmp_path / "whole")
     assert not (tmp_path / "cut" / "partial").exists()
 
@@ -126,25 +124,24 @@ class Doubled(Intensities):
 
 @pytest.mark.long
 def test_the_map_of_a_caller_is_that_of_the_run(frames, large, tmp_path):
-    run = refit_sets([frames], tmp_path / "run")
-    found = residual_map(run.result)
-    np.testing.assert_array_equal(found.values, run.residuals.values)
-    product = Calibration.from_fit(run.result, found).to_product()
+    run = refit(frames, output=tmp_path / "run")
+    product = Calibration.from_fit(run, residual_map(run)).to_product()
     assert product.content_hash() == read_product(tmp_path / "run" / "calibration.fits").content_hash()
 
 
-def test_a_small_set(call, fitted: FittedSet, tmp_path):
+def test_what_a_small_fit_tells(fitted: FittedSet, tmp_path):
     told: list[str] = []
-    found = refit_sets([fitted.calset], tmp_path / "caller", progress=told.append)
+    refit(fitted.calset, output=tmp_path / "RUN", progress=told.append)
     assert told[0] == "reading"
     assert told[-1] == "mapping the field"
     assert [line for line in told if line.startswith("fit: step")] == told[2:-1]
-    assert (found.residuals, found.misfit, found.warnings) == (None, None, ())
-    assert json.loads((tmp_path / "caller" / "summary.json").read_text()) == json.loads(
-        json.dumps(found.summary)
-    )
-    assert call("refit", fitted.calset, "-o", tmp_path / "command", "-q").exit_code == 0
-    assert_same_files(tmp_path / "command", tmp_path / "caller")
+    assert json.loads((tmp_path / "RUN" / "summary.json").read_text())["seed"] == 0
+
+
+def test_two_folders_are_one_too_many(fitted: FittedSet, tmp_path):
+    """`folder` was dropped in silence."""
+    with pytest.raises(ValueError, match="leave folder out"):
+        refit(fitted.calset, output=tmp_path / "RUN", folder=tmp_path / "kept")
 
 
 def test_a_fit_that_does_not_converge_leaves_no_calibration(fitted: FittedSet, tmp_path, monkeypatch):
@@ -153,13 +150,12 @@ def test_a_fit_that_does_not_converge_leaves_no_calibration(fitted: FittedSet, t
 
     search_on = search.minimise
     monkeypatch.setattr(search, "minimise", short)
-    found = refit_sets([fitted.calset], tmp_path / "RUN")
-    assert not found.result.converged
+    found = refit(fitted.calset, output=tmp_path / "RUN")
+    assert not found.converged
     assert [entry.name for entry in (tmp_path / "RUN").iterdir()] == ["summary.failed.json"]
-    assert found.misfit is not None
-    assert len(found.warnings) > len(found.result.warnings)
+    assert json.loads((tmp_path / "RUN" / "summary.failed.json").read_text())["misfit"] is not None
     monkeypatch.undo()
-    refit_sets([fitted.calset], tmp_path / "RUN")
+    refit(fitted.calset, output=tmp_path / "RUN")
     assert sorted(entry.name for entry in (tmp_path / "RUN").iterdir()) == [
         "calibration.fits",
         "summary.json",

@@ -1,13 +1,15 @@
 """An observing plan as a file: what it says, what is wrong with it, and what it is worth before any data."""
 
+import json
+
 import numpy as np
 import pytest
 
+from walop_jax.commands.limits import limits
 from walop_jax.diagnosis.detection_limits import detection_limits
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model.effects import effect_by_name
-from walop_jax.runs.limits import limits_of_sets
 from walop_jax.simulation.plan_file import read_plan
 from walop_jax.simulation.simulate import simulate
 
@@ -62,31 +64,29 @@ def test_what_is_wrong_is_said_with_the_file(plan, text, message):
 
 
 def test_a_plan_has_limits_before_any_data(plan, tmp_path):
-    found = limits_of_sets([plan], tmp_path / "RUN", catalogue=CATALOGUE[:1])
-    assert found.document["plan"]["grid"] == 5
-    assert found.document["trusted"] is True
-    (entry,) = (one for one in found.found.limits if one.effect == "clp_zero")
+    found = limits(plan, output=tmp_path / "RUN", effects=CATALOGUE[:1])
+    document = json.loads((tmp_path / "RUN" / "limits.json").read_text())
+    assert document["plan"]["grid"] == 5
+    assert document["trusted"] is True
+    assert document["seed"] == 0
+    (entry,) = (one for one in found.limits if one.effect == "clp_zero")
     # N photons behind a polariser tell its angle to 1/(2 √N) rad: 5·10⁵ in four cameras, at 29 points and 8 angles.
     photons = np.rad2deg(0.5 / np.sqrt(5e5 * 4 * 29 * 8))
     assert photons < entry.detected[0] < 30 * photons
 
 
 @pytest.mark.long
-def test_limits_of_a_plan_are_those_of_data_taken_so(plan, tmp_path):
+def test_limits_of_a_plan_are_those_of_data_taken_so(plan):
     """Noise moves the fit, and with it the limits, by per cents."""
-    found = limits_of_sets([plan], tmp_path / "RUN", catalogue=CATALOGUE)
-    assert found.document["plan"]["grid"] == 5
-    assert found.document["trusted"] is True
+    found = limits(plan, effects=CATALOGUE)
     assumed = read_plan(plan)
     taken = simulate(assumed, seed=4, instrument=assumed.design)
     data = detection_limits(refit(taken.calset), catalogue=CATALOGUE)
-    by_plan, by_data = (
-        {(e.effect, e.parameter): e.detected for e in one.limits} for one in (found.found, data)
-    )
+    by_plan, by_data = ({(e.effect, e.parameter): e.detected for e in one.limits} for one in (found, data))
     assert by_plan.keys() == by_data.keys()
     for key, (least, _) in by_plan.items():  # the most is that of a camera which hardly shows it
         np.testing.assert_allclose(least, by_data[key][0], rtol=0.1)
     conditions = {one.what: one.detected for one in data.conditions}
     assert len(conditions) >= 5
-    for one in found.found.conditions:
+    for one in found.conditions:
         np.testing.assert_allclose(one.detected, conditions[one.what], rtol=0.1, err_msg=one.what)

@@ -1,26 +1,24 @@
-"""`sample_run`: the posterior of a run for a Python caller, interrupted, resumed, refused."""
+"""`sample` from Python: the posterior of a run, interrupted, resumed, refused."""
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import walop_jax.runs.sample
 from walop_jax.calibration.product import read_product
+from walop_jax.commands.refit import refit
+from walop_jax.commands.sample import OUTPUTS, sample
 from walop_jax.fit.refit import FitResult, covariance
 from walop_jax.io.errors import DataError
-from walop_jax.posterior import Options, Progress, fit_of_run
-from walop_jax.runs.refit import refit_sets
-from walop_jax.runs.sample import OUTPUTS, sample_run
+from walop_jax.posterior import fit_of_run
 
 from .conftest import FittedSet, assert_same_files
 
 STEPS = 300  # 400 are enough
-OPTIONS = Options(interval=100, maximum_steps=STEPS, moves="laplace")
+OPTIONS = {"interval": 100, "maximum_steps": STEPS, "moves": "laplace"}
 
 
 def copied(fitted: FittedSet, folder: Path) -> Path:
@@ -35,59 +33,58 @@ def test_an_interrupted_run_goes_on_as_if_nothing_had_been(
     options = ("--interval", 100, "--maximum-steps", STEPS, "--moves", "laplace", "--quiet")
     assert call("sample", command, *options).exit_code == 1  # so few steps do not converge
 
-    told: list[Progress] = []
+    told: list[str] = []
 
-    def interrupt(progress: Progress) -> None:
-        told.append(progress)
-        if sum(entry.stage == "sampling" for entry in told) == 3:
+    def interrupt(text: str) -> None:
+        told.append(text)
+        if sum(entry.startswith("sampling") for entry in told) == 3:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        sample_run(caller, OPTIONS, progress=interrupt)
-    assert {entry.stage for entry in told} == {"tabulating the model", "starting", "sampling"}
-    assert [np.isfinite(entry.tau) for entry in told][-1]
+        sample(caller, **OPTIONS, progress=interrupt)
+    assert {entry.partition(":")[0] for entry in told} == {"tabulating the model", "starting", "sampling"}
+    assert "τ" in told[-1]
     assert not any((caller / name).exists() for name in OUTPUTS)
     assert len(list((caller / "sampling").glob("block-*.h5"))) == 2
 
     with pytest.raises(DataError, match="holds a chain already"):
-        sample_run(caller, OPTIONS)
-    found = sample_run(caller, OPTIONS, resume=True)
-    assert found.posterior.convergence.steps == found.summary["steps"]
-    assert not found.posterior.trusted
+        sample(caller, **OPTIONS)
+    found = sample(caller, **OPTIONS, resume=True)
+    assert not found.trusted
     assert read_product(caller / "calibration.fits").verdict.covariance_from == "fit"
     assert_same_files(command, caller, but=("sampling", "summary.json"))
 
     with pytest.raises(DataError, match=r"holds posterior\.nc already"):
-        sample_run(caller, OPTIONS)
+        sample(caller, **OPTIONS)
 
     # On to convergence; the files of a posterior that is to be trusted appear together or not at all.
     before = {name: (caller / name).read_bytes() for name in (*OUTPUTS, "calibration.fits")}
-    more = dataclasses.replace(OPTIONS, maximum_steps=100_000)
+    more = OPTIONS | {"maximum_steps": 100_000}
 
     def fail(*args: object) -> None:
         raise OSError("No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(walop_jax.runs.sample, "write_product", fail)
+        patch.setattr("walop_jax.calibration.product.write_product", fail)
         with pytest.raises(DataError, match="what was there is untouched"):
-            sample_run(caller, more, resume=True)
+            sample(caller, **more, resume=True)
     assert {name: (caller / name).read_bytes() for name in before} == before
-    found = sample_run(caller, more, resume=True)
-    assert found.posterior.trusted
+    found = sample(caller, **more, resume=True)
+    assert found.trusted
     product = read_product(caller / "calibration.fits")
     assert product.verdict.covariance_from == "posterior"
-    np.testing.assert_array_equal(product.covariance, found.posterior.covariance)
+    np.testing.assert_array_equal(product.covariance, found.covariance)
 
 
 @pytest.mark.long
-def test_a_posterior_has_the_errors_of_a_fit_that_leaves_too_much(spoilt: Path, tmp_path: Path):
-    refit_sets([spoilt], tmp_path / "RUN")
+def test_a_posterior_has_the_errors_of_a_fit_that_leaves_too_much(spoilt_file: Path, tmp_path: Path):
+    refit(spoilt_file, output=tmp_path / "RUN")
     before = read_product(tmp_path / "RUN" / "calibration.fits")
     assert before.verdict.errors_from.startswith("residuals")
-    found = sample_run(tmp_path / "RUN", dataclasses.replace(OPTIONS, maximum_steps=100_000))
-    assert found.posterior.trusted
+    found = sample(tmp_path / "RUN", **(OPTIONS | {"maximum_steps": 100_000}))
+    assert found.trusted
     after = read_product(tmp_path / "RUN" / "calibration.fits")
-    assert after.verdict.errors_from == before.verdict.errors_from == found.summary["errors_from"]
+    assert after.verdict.errors_from == before.verdict.errors_from == found.errors_from
     free = before.parameters.sigma > 0
     ratio = after.parameters.sigma[free] / before.parameters.sigma[free]
     assert np.all(np.abs(ratio - 1.0) < 0.15)
@@ -103,8 +100,8 @@ def stated_covariance(result: FitResult) -> np.ndarray:
 
 def test_what_is_no_run_is_refused(fitted: FittedSet, tmp_path: Path):
     with pytest.raises(DataError, match="not a folder"):
-        sample_run(fitted.calset)
+        sample(fitted.calset)
     with pytest.raises(DataError, match="no such file"):
-        sample_run(tmp_path)
+        sample(tmp_path)
     with pytest.raises(DataError, match=r"m\.toml: there is no such file"):
-        sample_run(fitted.run, model=tmp_path / "m.toml")
+        sample(fitted.run, model=tmp_path / "m.toml")

@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def program(*args: object, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-c", "from walop_jax.cli import main; main()", *(str(arg) for arg in args)],
+        [sys.executable, "-c", "from walop_jax.commands import main; main()", *(str(arg) for arg in args)],
         capture_output=True,
         text=True,
         check=False,
@@ -31,7 +31,7 @@ def program(*args: object, **environment: str) -> subprocess.CompletedProcess[st
 
 def test_help_comes_without_the_heavy_libraries():
     code = (
-        "import sys, walop_jax.cli\n"
+        "import sys, walop_jax.commands.program\n"
         "heavy = {'jax', 'astropy', 'numpy', 'equinox', 'optimistix', 'matplotlib', 'emcee'} & set(sys.modules)\n"
         "print(sorted(heavy))"
     )
@@ -68,7 +68,7 @@ def test_wrong_usage_and_errors_have_their_exit_codes(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("module", "disguised"), [("typer", False), ("walop_jax.runs.inspect", False), ("numpy", True)]
+    ("module", "disguised"), [("typer", False), ("walop_jax.data.inspection", False), ("numpy", True)]
 )
 def test_an_interrupt_during_imports_is_one_line(tmp_path, module, disguised):
     """Libraries in C turn the interrupt into an error of their own."""
@@ -80,7 +80,7 @@ def test_an_interrupt_during_imports_is_one_line(tmp_path, module, disguised):
         f"        if name == {module!r}:\n"
         f"            {error}\n"
         "sys.meta_path.insert(0, Interrupting())\n"
-        "from walop_jax.cli import main\n"
+        "from walop_jax.commands import main\n"
         "main()\n"
     )
     done = subprocess.run(
@@ -124,7 +124,7 @@ def test_where_no_cache_can_be_kept_a_command_goes_on_without(call, run, tmp_pat
 
 
 def test_a_reader_that_has_gone_is_no_error(calset_file):
-    shell = f'"{sys.executable}" -c "from walop_jax.cli import main; main()" model | head -n 1'
+    shell = f'"{sys.executable}" -c "from walop_jax.commands import main; main()" model | head -n 1'
     done = subprocess.run(
         shell, shell=True, capture_output=True, text=True, check=False,
         env={**os.environ, "PYTHONPATH": str(ROOT)},

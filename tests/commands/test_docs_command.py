@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from walop_jax.cli.docs import about, pages
+from walop_jax.commands.docs import about, pages
 
 
 def test_list_of_pages(call):

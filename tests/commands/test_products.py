@@ -1,0 +1,90 @@
+"""What a run is good for afterwards: checked, held against new data, reported, traced, cited."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import walop_jax as walop
+from walop_jax.calibration.product import read_product, write_product
+from walop_jax.data import builtin_filter
+from walop_jax.data.settings import Settings
+from walop_jax.io.errors import DataError
+from walop_jax.model.trace import Sightline, trace
+
+from .conftest import FittedSet
+
+
+def test_a_certificate_fails_closed(fitted: FittedSet, tmp_path: Path):
+    product = read_product(fitted.run / "calibration.fits")
+    changed = dataclasses.replace(product.maps, values=product.maps.values + 1e-3)
+    write_product(tmp_path / "c.fits", dataclasses.replace(product, maps=changed))
+    found = walop.certify(tmp_path / "c.fits")
+    assert [check.name for check in found.failed] == ["maps"]
+    assert found.document()["valid"] is False
+
+
+def test_epochs_of_one_and_the_same_set(fitted: FittedSet, tmp_path: Path):
+    found = walop.epoch(fitted.run, fitted.calset, output=tmp_path / "EPOCH")
+    # The same data: the same minimum.
+    assert found.fits
+    assert max(abs(entry.new - entry.old) / entry.error for entry in found.moved) < 1e-3
+    document = json.loads((tmp_path / "EPOCH" / "epoch.json").read_text())
+    assert document["fits"] is True
+    assert document["new"] == [entry.sha256 for entry in fitted.calibration.inputs]
+    assert walop.report(tmp_path / "EPOCH").missing == ()
+    assert "still fits" in (tmp_path / "EPOCH" / "report.html").read_text()
+    with pytest.raises(DataError, match="no such file"):
+        walop.epoch(fitted.run / "other.fits", fitted.calset)
+
+
+def test_what_a_new_fit_lacks_is_looked_for_without_trying_other_readings_again(
+    call, fitted: FittedSet, monkeypatch
+):
+    asked: dict[str, object] = {}
+    doubtful = functools.partial(dataclasses.replace, examined=True, doubts=("odd",))
+    monkeypatch.setattr("walop_jax.diagnosis.trust.examined", doubtful)
+    monkeypatch.setattr("walop_jax.diagnosis.workflow.diagnose", lambda *_, **how: asked.update(how))
+    assert call("epoch", fitted.run, fitted.calset, "--seed", 5).exit_code == 3
+    assert asked["as_written"] is True
+    assert asked["seed"] == 5
+
+
+def test_a_report_that_fails_leaves_the_old_one(fitted: FittedSet, tmp_path: Path, monkeypatch):
+    (tmp_path / "page.html").write_text("old")
+
+    def half(path: Path, *args: object, **options: object) -> int:
+        path.write_bytes(b"<!DOCTYPE")
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr("walop_jax.reports.page.render", lambda *args: "<!DOCTYPE html>")
+    monkeypatch.setattr(Path, "write_text", half)
+    with pytest.raises(DataError, match="what stood there before is untouched"):
+        walop.report(fitted.run, tmp_path / "page.html", overwrite=True)
+    assert [(entry.name, entry.read_text()) for entry in tmp_path.iterdir()] == [("page.html", "old")]
+
+
+def test_light_is_traced_through_what_was_fitted(fitted: FittedSet):
+    sun = dataclasses.replace(Settings.default(1), teff=np.array([5772.0]))
+    ray = Sightline(x=0.2, y=-0.1, q=0.03, u=0.01, setting=sun)
+    curve = builtin_filter("SDSS-r")
+    expected = trace(fitted.calibration.model.instrument(fitted.calibration.values), curve, ray)
+    star = {"x": 0.2, "y": -0.1, "q": 0.03, "u": 0.01, "teff": 5772.0}
+    for found in (walop.trace(fitted.run, **star), walop.trace(calibration=fitted.calibration, **star)):
+        np.testing.assert_allclose(found[-1].value, expected[-1].value, rtol=1e-12)
+    designed = walop.trace(0.2, -0.1, 0.03, 0.01, teff=5772.0, instrument="walop-south")
+    assert np.abs(designed[-1].value - expected[-1].value).max() > 1e-4
+    with pytest.raises(ValueError, match="WALOP-SOUTH"):
+        walop.trace(instrument="WALOP-SUOTH")
+    with pytest.raises(DataError, match="SDSS-rr"):
+        walop.trace(fitted.run, filter="SDSS-rr")
+
+
+def test_the_base_model_and_a_run_have_the_same_sources(fitted: FittedSet):
+    assert walop.cite() == walop.cite(fitted.run) == walop.cite(fitted.run / "calibration.fits")
+    assert any("Yeh 1980" in entry.source for entry in walop.cite())

@@ -1,0 +1,304 @@
+"""Every command as a function: the same options, the same results, files, documents and errors as the program."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from astropy.table import Table
+from zemax_exports import write_folder
+
+import walop_jax as walop
+from walop_jax.commands import COMMANDS
+from walop_jax.commands.command import COMMON, Argument
+from walop_jax.data.filters import DEFAULT_FILTER
+from walop_jax.data.zemax import CAMERA_CONFIGURATIONS, RELATIVE_ERROR
+from walop_jax.diagnosis.workflow import diagnose as diagnosis_of
+from walop_jax.fit import outliers
+from walop_jax.posterior import Options
+from walop_jax.science.polarisation import ESTIMATORS
+
+from .conftest import FittedSet, assert_same_files, without_times
+
+FUNCTIONS = {name: getattr(walop, name.replace("-", "_")) for name in COMMANDS}
+# What only Python can say: columns and elements by name, fits in memory, what is no text.
+PYTHON_ONLY = {
+    "refit": {"folder"},
+    "simulate": {"noiseless"},
+    "matrix": {"x", "y", "columns"},
+    "compare": {"calibration"},
+    "trace": {"positions"},
+    "sample": {"parameters", "more"},
+}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_options_are_those_of_the_function(name: str, call):
+    """An argument or option for each parameter, spelled like it, and none else; the rest is said above."""
+    function = FUNCTIONS[name]
+    parameters = inspect.signature(function).parameters
+    command = function.command
+    own = [key for key in parameters if key not in COMMON and key not in PYTHON_ONLY.get(name, ())]
+    assert own == list(command.options)
+    text = call(name, "--help").output
+    for key, option in command.options.items():
+        spelled = option.metavar if isinstance(option, Argument) else f"--{key.replace('_', '-')}"
+        assert spelled in text, key
+        assert " ".join(option.help.split()[:3]) in " ".join(text.split())
+        assert f"\n{key}: {option.help}" in function.__doc__
+    assert ("--overwrite" in text) == ("overwrite" in parameters)
+    assert {"progress", "seed"} <= set(parameters)
+    assert "--json" in text
+    assert "--quiet" in text
+
+
+def test_defaults_are_those_of_what_is_called():
+    def default(name: str, key: str) -> Any:
+        return inspect.signature(FUNCTIONS[name]).parameters[key].default
+
+    assert default("diagnose", "minutes") == inspect.signature(diagnosis_of).parameters["minutes"].default
+    assert default("compare", "filter") == default("trace", "filter") == DEFAULT_FILTER
+    assert default("clip", "sigma") == outliers.BEYOND
+    assert default("apply", "debias") == ESTIMATORS[0]
+    assert default("import-zemax", "cameras") == ",".join(map(str, CAMERA_CONFIGURATIONS))
+    assert default("import-zemax", "error") == RELATIVE_ERROR
+    for key in ("sampler", "walkers", "interval", "maximum_steps", "moves", "inflate"):
+        assert default("sample", key) == getattr(Options(), key)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_an_argument_that_does_not_exist_is_named_with_the_nearest(name: str):
+    given = {"trace": {"ouptut": 1.0}}.get(name, {"sede": 1})
+    with pytest.raises(
+        (TypeError, ValueError), match=r"'(sede|ouptut|OUPTUT)'.*(did you mean|nearest|known)"
+    ):
+        FUNCTIONS[name](*(["x"] if name in ("matrix", "sample") else []), **given)
+
+
+@pytest.mark.parametrize(
+    ("call_it", "message"),
+    [
+        (lambda: walop.refit(3), "refit: data is 3, but a calibration set or a path"),
+        (lambda: walop.refit("x.fits", 7), "refit: model is 7, but a model or a path is wanted"),
+        (lambda: walop.refit("x.fits", overwrite="yes"), "overwrite is the text 'yes'"),
+        (
+            lambda: walop.diagnose("x.fits", minutes="ten"),
+            "minutes is the text 'ten', but a number is wanted",
+        ),
+        (lambda: walop.certify({}), "certify: calibration is a dict, but a calibration or a fit or a run"),
+        (lambda: walop.read(5), "read: paths is 5, but a path or a text is wanted"),
+        (lambda: walop.trace(instrument=[]), "trace: instrument is a list"),
+        (lambda: walop.report(1.0), "report: run is 1.0, but a path or a run is wanted"),
+        (walop.refit, "refit: missing a required argument: 'data'; the arguments are data, model"),
+        (lambda: walop.effect_by_name(3), "effect_by_name: name is 3, but a text is wanted"),
+    ],
+)
+def test_a_wrong_kind_of_argument_is_one_sentence(call_it: Callable[[], Any], message: str):
+    with pytest.raises(TypeError) as raised:
+        call_it()
+    assert message in str(raised.value)
+
+
+def test_exchanged_arguments_are_told(fitted: FittedSet, tmp_path: Path):
+    """The set and its path the other way round were an AttributeError."""
+    calset = walop.read(fitted.calset)
+    with pytest.raises(
+        TypeError, match="path is a calibration set, but a path is wanted; exchange path and calset"
+    ):
+        walop.write_calibration_set(calset, tmp_path / "set.fits")
+    walop.write_calibration_set(tmp_path / "set.fits", calset)
+
+
+def test_names_that_arguments_have_had():
+    zero = walop.effect_by_name("clp_zero")
+    assert walop.model(effect=["clp_zero"], catalogue=[zero]).model.effect_names == ("clp_zero",)
+    with pytest.raises(ValueError, match="'MLE' is neither MAS nor WK"):
+        walop.apply("RUN", {}, estimator="MLE")
+
+
+# ---------------------------------------------------------------------------------------------- run, both ways
+
+
+class Case(NamedTuple):
+    """A command: words of the command line, the call in Python, and the option that names its output, if it has one."""
+
+    words: Callable[[Any], tuple[object, ...]]
+    python: Callable[..., Any]
+    output: str = ""
+    long: bool = False
+
+
+PLAN = {"grid": 3, "standard_grid": 1, "angles": 4, "moon_patches": 2, "standards": 3}
+PLAN_WORDS = [word for key, value in PLAN.items() for word in (f"--{key.replace('_', '-')}", value)]
+CASES = {
+    "inspect": Case(lambda g: (g.calset,), lambda g, **k: walop.inspect(g.calset, **k)),
+    "simulate": Case(
+        lambda g: (*PLAN_WORDS, "--effect", "hwp1_axis=0.3"),
+        lambda g, **k: walop.simulate(**PLAN, effect={"hwp1_axis": 0.3}, **k),
+        "set.fits",
+    ),
+    "refit": Case(lambda g: (g.calset,), lambda g, **k: walop.refit(g.calset, **k), "RUN"),
+    "diagnose": Case(lambda g: (g.calset,), lambda g, **k: walop.diagnose(g.calset, **k), "RUN", True),
+    "limits": Case(
+        lambda g: (g.calset, "--seed", 3), lambda g, **k: walop.limits(g.calset, seed=3, **k), "RUN", True
+    ),
+    "compare": Case(lambda g: (g.calset,), lambda g, **k: walop.compare(g.calset, **k), "RUN", True),
+    "report": Case(lambda g: (g.run,), lambda g, **k: walop.report(g.run, **k), "page.html", True),
+    "plot": Case(lambda g: (g.run, "matrix"), lambda g, **k: walop.plot(g.run, "matrix", **k), "m.png", True),
+    "matrix": Case(
+        lambda g: (g.run, "--points", g.points),
+        lambda g, **k: walop.matrix(g.run, points=g.points, **k),
+        "m.ecsv",
+    ),
+    "apply": Case(lambda g: (g.run, g.stars), lambda g, **k: walop.apply(g.run, g.stars, **k), "s.ecsv"),
+    "certify": Case(lambda g: (g.run,), lambda g, **k: walop.certify(g.run, **k)),
+    "epoch": Case(lambda g: (g.run, g.calset), lambda g, **k: walop.epoch(g.run, g.calset, **k), "RUN", True),
+    "model": Case(
+        lambda g: (g.calset, "--effect", "clp_zero"),
+        lambda g, **k: walop.model(g.calset, effect=["clp_zero"], **k),
+        "m.toml",
+    ),
+    "instrument": Case(lambda g: ("WALOP-SOUTH",), lambda g, **k: walop.instrument("WALOP-SOUTH", **k)),
+    "import-zemax": Case(
+        lambda g: (g.exports,), lambda g, **k: walop.import_zemax(g.exports, **k), "set.fits"
+    ),
+    "trace": Case(lambda g: (g.run, "--x", 0.1), lambda g, **k: walop.trace(g.run, x=0.1, **k)),
+    "cite": Case(lambda g: (g.run,), lambda g, **k: walop.cite(g.run, **k)),
+    "conformance": Case(lambda g: ("--make", g.pack), lambda g, **k: walop.conformance(make=g.pack, **k)),
+    "docs": Case(lambda g: ("files",), lambda g, **k: walop.docs("files", **k)),
+}
+ELSEWHERE = {"compress", "clip", "sample"}  # frames; tests/fit/test_outliers; test_sample
+CHEAP = [name for name, case in CASES.items() if not case.long]
+WRITING = [name for name in CHEAP if CASES[name].output]
+TABLE = [pytest.param(name, marks=[pytest.mark.long] if CASES[name].long else []) for name in CASES]
+
+
+def test_every_command_is_in_the_table():
+    assert set(COMMANDS) == set(CASES) | ELSEWHERE
+
+
+class Given(NamedTuple):
+    calset: Path
+    run: Path
+    points: Path
+    stars: Path
+    exports: Path
+    pack: Path
+
+
+@pytest.fixture
+def given(fitted: FittedSet, tmp_path: Path) -> Given:
+    (tmp_path / "points.csv").write_text("X,Y\n0,0\n0.2,-0.1\n")
+    n = np.array([[2.1e5, 1.9e5, 2e5, 2e5], [1.9e5, 2.1e5, 2e5, 2.1e5]])
+    stars = Table({"X": [0.1, 0.2], "Y": [0.0, 0.1], "N": n, "N_ERR": np.sqrt(n)})
+    stars.write(tmp_path / "stars.fits")
+    exports = write_folder(tmp_path / "exports")
+    return Given(
+        fitted.calset,
+        fitted.run,
+        tmp_path / "points.csv",
+        tmp_path / "stars.fits",
+        exports,
+        tmp_path / "pack",
+    )
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_files_and_document_are_those_of_the_program(name: str, call, given: Given, tmp_path: Path):
+    """With --json nothing else is on stdout; progress is told; the seed is an integer."""
+    case, told = CASES[name], []
+    command, caller = tmp_path / "command", tmp_path / "caller"
+    command.mkdir()
+    caller.mkdir()
+    words = ("-o", command / case.output) if case.output else ()
+    done = call(name, *case.words(given), *words, "--json")
+    assert done.exit_code == 0, done.output
+    document = json.loads(done.stdout)
+    output = {"output": caller / case.output} if case.output else {}
+    again = {"overwrite": True} if name == "conformance" else {}
+    value = case.python(given, progress=told.append, **output, **again)
+    assert value is not None
+    assert_same_files(command, caller)
+    if case.output.startswith("RUN"):
+        assert_same_files(command / case.output, caller / case.output)
+    if name not in ("instrument", "docs", "trace", "cite", "model", "conformance"):
+        assert told
+    if isinstance(document, dict) and "seed" in document:
+        assert isinstance(document["seed"], int)
+    made = getattr(value, "document", None)
+    if made is not None and name not in (
+        "compare",
+        "epoch",
+        "limits",
+        "refit",
+        "diagnose",
+        "report",
+        "model",
+    ):
+        assert without_times(json.loads(json.dumps(made()))) == without_times(document)
+
+
+@pytest.mark.parametrize("name", CHEAP)
+def test_quiet_is_quiet_and_without_output_nothing_is_written(
+    name: str, call, given: Given, tmp_path: Path, monkeypatch
+):
+    case, before = CASES[name], sorted(tmp_path.iterdir())
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    if name != "conformance":
+        assert case.python(given) is not None
+        assert not any((tmp_path / "here").iterdir())
+        assert sorted(entry for entry in tmp_path.iterdir() if entry.name != "here") == before
+    words = ("-o", case.output) if case.output else ()
+    quiet = call(name, *case.words(given), *words, "--quiet")
+    assert (quiet.exit_code, quiet.stdout) == (0, "")
+
+
+@pytest.mark.parametrize("name", WRITING)
+def test_what_exists_stays_unless_told_otherwise(name: str, call, given: Given, tmp_path: Path):
+    case = CASES[name]
+    output = tmp_path / "out" / case.output
+    mine = output / "summary.json" if case.output == "RUN" else output
+    mine.parent.mkdir(parents=True)
+    mine.write_text("mine")
+    refused = call(name, *case.words(given), "-o", output)
+    assert refused.exit_code == 1
+    assert "--overwrite" in refused.stderr
+    with pytest.raises(walop.DataError, match="overwrite=True"):
+        case.python(given, output=output)
+    assert mine.read_text() == "mine"
+    case.python(given, output=output, overwrite=True)
+    assert mine.read_bytes() != b"mine"
+
+
+@pytest.mark.parametrize("error", [OSError("No space left on device"), KeyboardInterrupt()])
+@pytest.mark.parametrize("name", WRITING)
+def test_an_interrupted_command_leaves_nothing(
+    name: str, call, given: Given, tmp_path: Path, monkeypatch, error
+):
+    """Whatever is being written when it stops."""
+
+    def half(*args: Any, **more: Any) -> None:
+        path = next(entry for entry in args if isinstance(entry, Path))
+        path.write_text("half")
+        raise error
+
+    case = CASES[name]
+    (tmp_path / "out").mkdir()
+    for target in ("walop_jax.data.write.sign_and_write", "walop_jax.calibration.product.sign_and_write"):
+        monkeypatch.setattr(target, half)
+    monkeypatch.setattr(Table, "write", lambda self, *args, **more: half(*args))
+    monkeypatch.setattr(Path, "write_text", lambda self, *args, **more: _half_of(self, error))
+    result = call(name, *case.words(given), "-o", tmp_path / "out" / case.output)
+    assert result.exit_code == (130 if isinstance(error, KeyboardInterrupt) else 1)
+    assert not any((tmp_path / "out").iterdir())
+
+
+def _half_of(path: Path, error: BaseException) -> None:
+    path.write_bytes(b"half")
+    raise error

@@ -1,0 +1,132 @@
+"""`matrix` and `apply` of tables: what cannot be carried over, what is refused, what is forced."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.table import Table
+
+import walop_jax as walop
+from walop_jax.calibration.product import write_product
+from walop_jax.fit.verdict import Quality
+from walop_jax.io.errors import DataError
+from walop_jax.model.specification import effect_context, with_effects
+
+from .conftest import FittedSet
+
+POINTS = "X,Y\n0,0\n0.2,-0.1\n0.33,0\n"
+
+
+@pytest.fixture
+def points(tmp_path: Path) -> Path:
+    path = tmp_path / "points.csv"
+    path.write_text(POINTS)
+    return path
+
+
+@pytest.fixture
+def catalogue(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(0)
+    counts = rng.normal(1e6, 1e3, (6, 4))
+    counts[0] = 0.0
+    x, y = rng.uniform(-0.2, 0.2, (2, 6))
+    table = Table({"ID": np.arange(6), "X": x, "Y": y, "N": counts, "N_ERR": np.full((6, 4), 1e3)})
+    table.write(tmp_path / "stars.fits")
+    return tmp_path / "stars.fits"
+
+
+def test_a_table_of_matrices(call, fitted: FittedSet, points: Path, tmp_path: Path):
+    done = call("matrix", fitted.run, "--points", points, "-o", tmp_path / "o.fits", "--json")
+    found = json.loads(done.stdout)
+    assert (found["rows"], found["trusted"], found["flags"]["32"]) == (3, True, 1)
+    assert "points.csv: 1 point(s) beyond the calibrated field" in done.stderr
+    assert found["product"] == fitted.calibration.to_product().content_hash()
+    values, covariance = fitted.calibration.matrix(np.array([0.0, 0.2, 0.33]), np.array([0.0, -0.1, 0.0]))
+    table = Table.read(tmp_path / "o.fits")
+    np.testing.assert_allclose(table["M32"], values[:, 4], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(table["M32_ERR"], np.sqrt(covariance[:, 4, 4]), rtol=1e-9)
+
+
+@pytest.fixture
+def drifting(fitted: FittedSet, tmp_path: Path) -> Path:
+    """The folder of a run whose model has a drift of single exposures, at the values of the fit."""
+    old = fitted.calibration
+    context = effect_context(old.model.template, old.exposures)
+    model = with_effects(old.model, ["camera_gain_drift"], context)
+    place = np.array([model.index(name) for name in old.model.names])
+    values, covariance = model.start.copy(), np.zeros((len(model.names),) * 2)
+    values[place], covariance[np.ix_(place, place)] = old.values, old.covariance
+    changed = dataclasses.replace(old, model=model, values=values, covariance=covariance)
+    (tmp_path / "RUN").mkdir()
+    write_product(tmp_path / "RUN" / "calibration.fits", changed.to_product())
+    return tmp_path / "RUN"
+
+
+@pytest.mark.long
+def test_effects_that_cannot_be_carried_over_are_named(
+    call, fitted: FittedSet, drifting: Path, points: Path, catalogue: Path, tmp_path: Path
+):
+    """In a warning, in the document and in the header; the rest is what it is without them."""
+    for name, words in (("matrix", ("--points", points)), ("apply", (catalogue,))):
+        done = call(name, drifting, *words, "-o", tmp_path / "o.fits", "--overwrite", "--json")
+        plain = call(name, fitted.run, *words, "-o", tmp_path / "plain.fits", "--overwrite", "--json")
+        assert json.loads(done.stdout)["not_carried_over"] == ["camera_gain_drift"]
+        assert "camera_gain_drift" in done.stderr
+        assert "left out" in done.stderr
+        assert json.loads(plain.stdout)["not_carried_over"] == []
+        one, other = Table.read(tmp_path / "o.fits"), Table.read(tmp_path / "plain.fits")
+        assert one.meta["NOTCARR"] == "camera_gain_drift"
+        assert "NOTCARR" not in other.meta
+        column = "M22" if name == "matrix" else "Q"
+        np.testing.assert_allclose(one[column], other[column], rtol=0, atol=1e-12)
+    result = call("trace", drifting, "--json")
+    assert "camera_gain_drift" in result.stderr
+    assert json.loads(result.stdout)["not_carried_over"] == ["camera_gain_drift"]
+
+
+def test_what_cannot_be_is_said_before_any_work(fitted: FittedSet, catalogue: Path, tmp_path: Path):
+    with pytest.raises(ValueError, match="'MLE' is neither MAS nor WK"):
+        walop.apply(tmp_path / "none.fits", catalogue, debias="MLE")
+    with pytest.raises(ValueError, match="above 0"):
+        walop.apply(tmp_path / "none.fits", catalogue, saturation=-1.0)
+    with pytest.raises(DataError, match="no such file"):
+        walop.apply(tmp_path / "none.fits", catalogue, output=tmp_path / "o.fits")
+    with pytest.raises(DataError, match="no such file"):
+        walop.matrix(fitted.run / "other.fits", catalogue, output=tmp_path / "o.fits")
+
+
+def test_a_column_that_does_not_exist_is_no_setting(fitted: FittedSet):
+    """It was added to the table, and the temperature stayed as it was."""
+    with pytest.raises(TypeError, match="'temperature'; did you mean 'TEMP'"):
+        walop.matrix(fitted.run, 0.1, 0.1, temperature=4)
+    cold = walop.matrix(fitted.run, 0.1, 0.1, temp=4)
+    assert cold["TEMP"] == 4
+    assert abs(cold["M23"][0] - walop.matrix(fitted.run, 0.1, 0.1)["M23"][0]) > 1e-6
+
+
+def test_a_filter_that_the_calibration_does_not_cover_is_refused_unless_forced(
+    call, fitted: FittedSet, catalogue: Path, tmp_path: Path
+):
+    """The curve of a second filter is in the product, but none of its exposures was taken in it."""
+    curves = {"r2": fitted.calibration.filter_curve("SDSS-r"), **fitted.calibration.filters}
+    wider = dataclasses.replace(fitted.calibration, filters=curves)
+    write_product(tmp_path / "calibration.fits", wider.to_product())
+    table = Table.read(catalogue)
+    table["FILTER"] = np.where(np.arange(6) == 3, "r2", "SDSS-r")
+    table.write(other := tmp_path / "other.fits")
+    arguments = ("apply", tmp_path, other, "-o", tmp_path / "o.fits")
+    refused = call(*arguments)
+    assert refused.exit_code == 1
+    assert (
+        "other.fits: FILTER: row 3 (counted from 0): r2; the calibration was made in SDSS-r" in refused.stderr
+    )
+    assert not (tmp_path / "o.fits").exists()
+    forced = call(*arguments, "--force")
+    assert forced.exit_code == 0, forced.stderr
+    flag = Table.read(tmp_path / "o.fits")["FLAG"]
+    both = int(Quality.VALIDITY_FORCED | Quality.BEYOND_SETTINGS)
+    assert (flag & both).tolist() == [0, 0, 0, both, 0, 0]
