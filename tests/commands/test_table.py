@@ -285,20 +285,20 @@ def test_an_interrupted_command_leaves_nothing(
 
     def half(*args: Any, **more: Any) -> None:
         path = next(entry for entry in args if isinstance(entry, Path))
-        path.write_text("half")
+        path.write_bytes(b"half")
         raise error
 
-    case = CASES[name]
+    case, written = CASES[name], Path.write_text
     (tmp_path / "out").mkdir()
+
+    def half_of_text(path: Path, *args: Any, **more: Any) -> int:
+        return half(path) if path.is_relative_to(tmp_path) else written(path, *args, **more)
+
     for target in ("walop_jax.data.write.sign_and_write", "walop_jax.calibration.product.sign_and_write"):
         monkeypatch.setattr(target, half)
-    monkeypatch.setattr(Table, "write", lambda self, *args, **more: half(*args))
-    monkeypatch.setattr(Path, "write_text", lambda self, *args, **more: _half_of(self, error))
-    result = call(name, *case.words(given), "-o", tmp_path / "out" / case.output)
+    with monkeypatch.context() as patch:
+        patch.setattr(Table, "write", lambda self, *args, **more: half(*args))
+        patch.setattr(Path, "write_text", half_of_text)
+        result = call(name, *case.words(given), "-o", tmp_path / "out" / case.output)
     assert result.exit_code == (130 if isinstance(error, KeyboardInterrupt) else 1)
     assert not any((tmp_path / "out").iterdir())
-
-
-def _half_of(path: Path, error: BaseException) -> None:
-    path.write_bytes(b"half")
-    raise error
