@@ -18,7 +18,7 @@ from walop_jax.commands import COMMANDS
 from walop_jax.commands.command import COMMON, Argument
 from walop_jax.data.filters import DEFAULT_FILTER
 from walop_jax.data.zemax import CAMERA_CONFIGURATIONS, RELATIVE_ERROR
-from walop_jax.diagnosis.workflow import diagnose as diagnosis_of
+from walop_jax.diagnosis.policy import POLICY
 from walop_jax.fit import outliers
 from walop_jax.posterior import Options
 from walop_jax.science.polarisation import ESTIMATORS
@@ -61,7 +61,7 @@ def test_defaults_are_those_of_what_is_called():
     def default(name: str, key: str) -> Any:
         return inspect.signature(FUNCTIONS[name]).parameters[key].default
 
-    assert default("diagnose", "minutes") == inspect.signature(diagnosis_of).parameters["minutes"].default
+    assert default("diagnose", "minutes") == POLICY.minutes
     assert default("compare", "filter") == default("trace", "filter") == DEFAULT_FILTER
     assert default("clip", "sigma") == outliers.BEYOND
     assert default("apply", "debias") == ESTIMATORS[0]

@@ -39,9 +39,9 @@ def diagnose(
     from walop_jax.calibration.calibration import Calibration
     from walop_jax.calibration.product import write_product
     from walop_jax.calibration.summary import PRODUCT, SUMMARY, summary
-    from walop_jax.diagnosis.findings import DIAGNOSIS, document
     from walop_jax.diagnosis.figure_data import figure_data
     from walop_jax.diagnosis.figure_file import FIGURE_DATA, write_figure_data
+    from walop_jax.diagnosis.findings import DIAGNOSIS, document
     from walop_jax.diagnosis.trust import examined
     from walop_jax.diagnosis.workflow import diagnose as diagnosis_of
     from walop_jax.fit.misfit import describe

@@ -42,6 +42,7 @@ from walop_jax.diagnosis.score import ScoreSpace, noncentrality, separations
 from walop_jax.diagnosis.trust import sampled
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.stand_in import on_field_points
+from walop_jax.io.heartbeat import Stage
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.parameters import field_declarations
@@ -71,13 +72,13 @@ def detection_limits(
     result = sampled(
         on_field_points(result), most_points(calset, template, sum(len(probe.widths) for probe in wanted))
     )
-    tell("differentiating every effect")
+    tell(Stage("differentiating every effect", "differentiating"))
     examination = examine(result, wanted, np.random.default_rng(seed))
     p = float(np.exp(examination.scorer.threshold(POLICY.alarm)))
-    tell("comparing the effects")
+    tell(Stage("comparing the effects", "comparing"))
     rivals = examination.bare.subset([probe.name for probe in examination.probes])
     columns = [c for probe in examination.probes for c in _columns(examination, rivals, probe, p)]
-    tell("finding what goes unnoticed")
+    tell(Stage("finding what goes unnoticed", "unnoticed"))
     found = _collected(examination, columns, _errors(examination, columns), fitting)
     return dataclasses.replace(found, conditions=condition_limits(examination.design))
 

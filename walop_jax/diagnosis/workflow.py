@@ -45,6 +45,7 @@ from walop_jax.diagnosis.trust import examined, pixel_structure
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.stand_in import in_field_points
+from walop_jax.io.heartbeat import Stage
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.thinning import thinned
@@ -93,7 +94,7 @@ def diagnose(
     if readings and readings[0].explained < policy.reading_sure:
         raise refusal(judge.fit, readings)
     before = judge.fit
-    tell("scoring every effect and pattern")
+    tell(Stage("scoring every effect and pattern", "scoring"))
     last = first = judge.examined()
     for _, _, left in search(first, judge, policy):
         last = left
@@ -187,7 +188,7 @@ class Refit(Linear):
         context = effect_context(model.template, calset.exposures)
         fitting = applicable(catalogue, context, model.template)
         every = sentences, fitting, context, model.template
-        tell("fitting the model")
+        tell(Stage("fitting the model", "fitting"))
         return cls(
             calset=calset,
             context=context,
@@ -211,7 +212,7 @@ class Refit(Linear):
         if forgetting:
             forget_programs()  # of columns
         if found.alarm:
-            self.tell(f"p = {found.table.p_global:.2g}: something is missing")
+            self.tell(Stage(f"p = {found.table.p_global:.2g}: something is missing", "naming"))
         return found
 
     # ------------------------------------------------------------------------------------------ as a judge
