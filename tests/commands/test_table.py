@@ -72,12 +72,12 @@ def test_defaults_are_those_of_what_is_called():
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_an_argument_that_does_not_exist_is_named_with_the_nearest(name: str):
+def test_an_argument_that_does_not_exist_is_named_with_the_nearest(name: str, fitted: FittedSet):
     given = {"trace": {"ouptut": 1.0}}.get(name, {"sede": 1})
     with pytest.raises(
         (TypeError, ValueError), match=r"'(sede|ouptut|OUPTUT)'.*(did you mean|nearest|known)"
     ):
-        FUNCTIONS[name](*(["x"] if name in ("matrix", "sample") else []), **given)
+        FUNCTIONS[name](*{"matrix": (fitted.run, 0.0, 0.0), "sample": ("RUN",)}.get(name, ()), **given)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_an_argument_that_does_not_exist_is_named_with_the_nearest(name: str):
             "minutes is the text 'ten', but a number is wanted",
         ),
         (lambda: walop.certify({}), "certify: calibration is a dict, but a calibration or a fit or a run"),
-        (lambda: walop.read(5), "read: paths is 5, but a path or a text is wanted"),
+        (lambda: walop.read(5), "read: paths is 5, but a path is wanted"),
         (lambda: walop.trace(instrument=[]), "trace: instrument is a list"),
         (lambda: walop.report(1.0), "report: run is 1.0, but a path or a run is wanted"),
         (walop.refit, "refit: missing a required argument: 'data'; the arguments are data, model"),

@@ -142,16 +142,17 @@ def _listed(signature: inspect.Signature) -> str:
 
 def _kind(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
     """The kind of argument that a parameter asks for; Any where that cannot be told."""
-    found, module = parameter.annotation, function.__module__
+    from walop_jax.commands import options
+
+    found = parameter.annotation
+    names = _Names(vars(options) | vars(sys.modules[function.__module__]))
     for _ in range(4):
         if isinstance(found, str):
-            found = eval(found, {}, _Names(vars(sys.modules[module])))
+            found = eval(found, {}, names)
         elif typing.get_origin(found) is typing.Annotated:
             found = typing.get_args(found)[0]
-        elif isinstance(
-            found, typing.ForwardRef
-        ):  # an alias of the options: its texts name what is imported there
-            found, module = found.__forward_arg__, "walop_jax.commands.options"
+        elif isinstance(found, typing.ForwardRef):
+            found = found.__forward_arg__
     return found
 
 
