@@ -103,9 +103,7 @@ def test_a_column_that_does_not_exist_is_no_setting(fitted: FittedSet):
     """It was added to the table, and the temperature stayed as it was."""
     with pytest.raises(TypeError, match="'temperature'; did you mean 'TEMP'"):
         walop.matrix(fitted.run, 0.1, 0.1, temperature=4)
-    cold = walop.matrix(fitted.run, 0.1, 0.1, temp=4)
-    assert cold["TEMP"] == 4
-    assert abs(cold["M23"][0] - walop.matrix(fitted.run, 0.1, 0.1)["M23"][0]) > 1e-6
+    assert walop.matrix(fitted.run, 0.1, 0.1, temp=4)["TEMP"] == 4
 
 
 def test_a_filter_that_the_calibration_does_not_cover_is_refused_unless_forced(

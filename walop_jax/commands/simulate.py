@@ -56,7 +56,7 @@ def simulate(
     *,
     output: SetFile = None,
     instrument: InstrumentLike = None,
-    effect: Annotated[Sequence[str | Effect] | Mapping[str, Any] | None, EFFECT] = None,
+    effect: Annotated[str | Sequence[str | Effect] | Mapping[str, Any] | None, EFFECT] = None,
     effects: Effects = None,
     grid: Annotated[int, Option("Field points along each axis.", least=1)] = 12,
     standard_grid: Annotated[int, Option("Places of a standard along each axis.", least=1)] = 5,
@@ -159,7 +159,7 @@ def _plan(
     )
 
 
-def _texts(effect: Sequence[str | Effect] | Mapping[str, Any] | None) -> Sequence[str | Effect]:
+def _texts(effect: str | Sequence[str | Effect] | Mapping[str, Any] | None) -> Sequence[str | Effect]:
     """Effects as the command line writes them, of a dict: {"clp_wobble": {"amplitude": 0.06, "phase": 1.0}}."""
     if not isinstance(effect, Mapping):
         return (effect,) if isinstance(effect, str) else effect or ()
