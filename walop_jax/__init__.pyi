@@ -18,6 +18,7 @@ from walop_jax.commands.instrument import instrument as instrument
 from walop_jax.commands.limits import limits as limits
 from walop_jax.commands.matrix import matrix as matrix
 from walop_jax.commands.model import model as model
+from walop_jax.commands.plan import plan as plan
 from walop_jax.commands.plot import plot as plot
 from walop_jax.commands.reading import Run as Run
 from walop_jax.commands.reading import read as read

@@ -35,7 +35,7 @@ def listen(event, duration, **_):
     count, seconds = seen.get(event, (0, 0.0))
     seen[event] = count + 1, seconds + duration
 jax.monitoring.register_event_duration_secs_listener(listen)
-from walop_jax.cli import main
+from walop_jax.commands import main
 sys.argv = ["walop-jax", "diagnose", sys.argv[1], "--output", sys.argv[2], "--quiet", "--overwrite"]
 try:
     main()
