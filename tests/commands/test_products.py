@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 from pathlib import Path
 
@@ -47,8 +46,7 @@ def test_what_a_new_fit_lacks_is_looked_for_without_trying_other_readings_again(
     call, fitted: FittedSet, monkeypatch
 ):
     asked: dict[str, object] = {}
-    doubtful = functools.partial(dataclasses.replace, examined=True, doubts=("odd",))
-    monkeypatch.setattr("walop_jax.diagnosis.trust.examined", doubtful)
+    monkeypatch.setattr("walop_jax.diagnosis.trust.examined", lambda result: result.judged(["odd"]))
     monkeypatch.setattr("walop_jax.diagnosis.workflow.diagnose", lambda *_, **how: asked.update(how))
     assert call("epoch", fitted.run, fitted.calset, "--seed", 5).exit_code == 3
     assert asked["as_written"] is True

@@ -52,9 +52,9 @@ def apply(
 
     In Python: an astropy table; `catalogue` is a path, an astropy table, or columns by name.
     """
-    from walop_jax.calibration.records import Quality
     from walop_jax.data.catalogue import read_catalogue
     from walop_jax.data.user_tables import extended, table_format, write_output_table
+    from walop_jax.fit.verdict import Quality
     from walop_jax.posterior import with_moments
     from walop_jax.science.apply import apply as apply_to_rows
     from walop_jax.science.polarisation import ESTIMATORS
@@ -83,7 +83,7 @@ def apply(
     columns = stokes_columns(stars, rows.star, debias)
     lost, content = used.left_behind, held.product.content_hash()
     on_the_sky = sum(map(math.isfinite, rows.rotator)) / max(len(rows.rotator), 1)
-    cards = header(content, debias, on_the_sky) | left_out_cards(lost)
+    cards = header(content, debias, on_the_sky, stars.check) | left_out_cards(lost)
     if output is not None:
         write_output_table(output, table, columns, overwrite=job.overwrite, header=cards)
 
@@ -96,6 +96,7 @@ def apply(
         Quality.VALIDITY_FORCED,
         Quality.NO_STOKES,
         Quality.DISAGREES,
+        Quality.UNKNOWN_COLOUR,
     )
     counts = {bit: int((stars.flag & bit > 0).sum()) for bit in bits}
     said = {
@@ -118,11 +119,13 @@ def apply(
             "stars": len(stars.qu),
             "seconds": seconds,
             "estimator": debias,
+            "catalogue": stars.check.document(),
         },
         lambda: f"{output}: {table.rows} rows, {len(stars.qu)} stars, {seconds:.1f} s",
         warnings=(
             *held.warnings,
             *left_out_sentences(lost, held.path),
+            *(f"{table.path}: {text} (FLAG {Quality.CATALOGUE:d})" for text in stars.check.warnings()),
             *(f"{table.path}: {counts[bit]} {text}" for bit, text in said.items() if counts[bit]),
         ),
     )

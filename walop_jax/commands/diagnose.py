@@ -42,11 +42,9 @@ def diagnose(
     from walop_jax.diagnosis.figure_data import figure_data
     from walop_jax.diagnosis.figure_file import FIGURE_DATA, write_figure_data
     from walop_jax.diagnosis.findings import DIAGNOSIS, document
-    from walop_jax.diagnosis.trust import examined
     from walop_jax.diagnosis.workflow import diagnose as diagnosis_of
     from walop_jax.fit.misfit import describe
     from walop_jax.fit.model_file import render
-    from walop_jax.fit.refit import with_honest_errors
 
     job.tell("reading", "reading")
     catalogue = catalogue_of(effects)
@@ -58,7 +56,7 @@ def diagnose(
 
     def files() -> Writers:
         job.tell("mapping the field", "mapping")
-        after = examined(with_honest_errors(found.after))
+        after = found.after
         product = Calibration.from_fit(after).to_product()
         misfit = None if after.explains_data else describe(after)
         fitted = summary(after, seconds=job.seconds, misfit=misfit) | {"seed": job.seed}

@@ -54,9 +54,9 @@ def matrix(
     table, columns by name. `columns` are others of those above, such as teff=5000.
     """
     from walop_jax.calibration.matrix_table import matrix_columns, provenance
-    from walop_jax.calibration.records import Quality
     from walop_jax.data.field_points import POINT_COLUMNS, field_points
     from walop_jax.data.user_tables import extended, table_format, write_output_table
+    from walop_jax.fit.verdict import Quality
     from walop_jax.posterior import with_draws
 
     if (points is None) == (x is None):

@@ -64,7 +64,7 @@ def plot(
     if isinstance(parameters, str):
         parameters = [part.strip() for part in parameters.split(",") if part.strip()]
     job.tell(f"drawing {name}")
-    figure = draw(name, Source(folder, tuple(parameters or ()), (x, y), catalogue_of(effects)))
+    figure = draw(name, Source(folder, catalogue_of(effects), tuple(parameters or ()), (x, y)))
     if path is not None:
         save_figure(path, figure, overwrite=job.overwrite)
     return Outcome(figure, lambda: {"figure": name, "output": str(path)}, lambda: str(path))
