@@ -90,7 +90,7 @@ def product() -> Calibration:
     ramp = np.linspace(-0.03, 0.02, 25).reshape(5, 5)
     maps = MatrixMaps(grid, "band", np.stack([ramp + k for k in range(6)]), np.full((6, 5, 5), 2e-4))
     rows = [
-        (name, entry["unit"], entry["value"], prior, entry["sigma"] > 0)
+        (name, entry["unit"], NAN if prior is None else prior[0], prior, entry["sigma"] > 0)
         for (name, entry), prior in zip(entries.items(), priors, strict=True)
     ]
     return Calibration(

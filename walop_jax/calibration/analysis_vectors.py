@@ -91,7 +91,7 @@ _derivatives_at = compiled(jax.vmap(_derivatives, in_axes=(None, None, 0, 0)))
 
 @dataclasses.dataclass(frozen=True)
 class _Tables:
-    """What is interpolated for one setting, functions in the order (colour, camera, Stokes, …)."""
+    """The interpolated functions of one setting, in the order (colour, camera, Stokes, …)."""
 
     vectors: FieldTable
     derivatives: FieldTable

@@ -265,7 +265,7 @@ class Calibration(Displayed):
         return parameter_table(self.model, self.values, self.sigma)
 
     def display(self) -> Display:
-        """What it is good for, and the parameters."""
+        """The range of the calibration, its verdict and its parameters."""
         v, (low_x, high_x, low_y, high_y) = self.verdict, self.field
         facts = {
             "χ²/dof": f"{v.chi2:.1f} / {v.dof} = {v.chi2 / max(v.dof, 1):.4g}",
@@ -341,7 +341,7 @@ class Calibration(Displayed):
         ), self.hidden.names[worst]
 
     def _of_structure(self, values: Float[np.ndarray, "p m"]) -> Float[np.ndarray, "p m m"]:
-        """What the structure of field points adds to the covariance of the matrix at a place.
+        """Contribution of the structure of field points to the covariance of the matrix at a place.
 
         Gains g of the two cameras of an arm change its elements by (g₁ − g₂)/2 · (1 − m₁², −m₁m₂, −m₁m₃), their
         responses to q and u the last two by half of their difference.

@@ -140,7 +140,7 @@ def _physics(calibration: Calibration) -> Check:
 
 
 def _protection(calibration: Calibration) -> Check:
-    """What could hide is stated, never failed: it is as large as the data leave it."""
+    """A statement of the mistakes that could hide; it never fails, as it is as large as the data leave it."""
     if calibration.hidden is None:
         return Check("protection", True, "nobody asked what could hide")
     limit = min(calibration.model.template.field_limit, float(np.abs(calibration.field).max()))

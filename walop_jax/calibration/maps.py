@@ -1,4 +1,4 @@
-"""Maps over the field: elements of the instrument matrix, and what the smooth model leaves of them."""
+"""Maps over the field: elements of the instrument matrix, and residuals of the smooth model."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class MatrixMaps:
 
 @dataclasses.dataclass(frozen=True)
 class ResidualMap:
-    """What the smooth model leaves, in cells of the field: planes in the order of `residual_names`.
+    """Residuals of the smooth model in cells of the field: planes in the order of `residual_names`.
 
     To be added to the matrix (throughput of an arm: relative); NaN where a cell has too few data. `chi2` is that of the
     residuals before the correction, per degree of freedom. Through `filter`, with the calibration plate at
@@ -101,6 +101,6 @@ class ResidualMap:
         return found
 
     def significance(self) -> float:
-        """How many standard deviations the scatter of all corrections lies above what their errors make it."""
+        """Excess scatter of all corrections over their errors, in standard deviations."""
         squares = (self.values / self.errors)[np.isfinite(self.values)] ** 2
         return float((squares.sum() - squares.size) / np.sqrt(2.0 * max(squares.size, 1)))

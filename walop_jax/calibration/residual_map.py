@@ -1,4 +1,4 @@
-"""What the smooth model leaves of the instrument matrix, cell by cell of the field: a map of superpixels.
+"""Residuals of the smooth model of the instrument matrix, cell by cell of the field: a map of superpixels.
 
 Quantities  In a cell of the field, at one optical setting, δm (three elements for each arm) is added to the instrument
             matrix and the throughput of the cameras of every arm but the first is multiplied by 1 + ρ. To first order,

@@ -1,4 +1,4 @@
-"""Whether the ensembles of a sampler have run long enough, and if not, how far they have to go.
+"""Convergence of the ensembles of a sampler, and the number of steps that are still needed.
 
 An ensemble is an independent run of a sampler, of one walker or of many.
 
@@ -51,7 +51,7 @@ class Convergence:
 
     @property
     def converged(self) -> bool:
-        """Whether all rules hold."""
+        """True if all rules hold."""
         return not self.reasons
 
     @property

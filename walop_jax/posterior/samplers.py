@@ -1,4 +1,4 @@
-"""What a sampler is, and which there are.
+"""The interface of a sampler, the density that it samples, and the samplers by name.
 
 A sampler is a class with a name and two methods. Independent ensembles of it (of one walker or of many) are started and
 taken further, stretch by stretch, by `Ensembles`, which also keeps checkpoints and judges convergence. A sampler of
@@ -78,7 +78,7 @@ class Density:
 
 
 class Stretch(NamedTuple):
-    """What a number of steps gave: positions, their ln p, and the share of proposals accepted.
+    """Result of a number of steps: positions, their ln p, and the share of proposals accepted.
 
     `counts` are numbers that the sampler wants to be reported, summed over all stretches.
     """

@@ -68,7 +68,7 @@ class Ensembles:
 
     @property
     def counts(self) -> dict[str, int]:
-        """What the sampler counted, all ensembles together."""
+        """Counts of the sampler, summed over all ensembles."""
         total: Counter[str] = Counter()
         for block in self.blocks:
             for stretch in block:

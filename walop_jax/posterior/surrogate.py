@@ -82,7 +82,7 @@ class Surrogate:
 
     @property
     def ln_f_unit(self) -> float:
-        """What ln f changes by per unit of its coordinate."""
+        """Change of ln f per unit of its coordinate."""
         return 1.0 / np.sqrt(2.0 * max(self.measured, 1))
 
     def weight(self, z: Draws) -> Float[np.ndarray, " n"]:

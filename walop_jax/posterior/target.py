@@ -74,7 +74,7 @@ class Target:
 
     @property
     def ln_f_unit(self) -> float:
-        """What ln f, the noise inflation, changes by per unit of its coordinate: about its standard error."""
+        """Change of ln f, the noise inflation, per unit of its coordinate: about its standard error."""
         return 1.0 / np.sqrt(2.0 * max(self.measured, 1))
 
     def values(self, x: Vector) -> Float[np.ndarray, " n"]:
@@ -190,7 +190,7 @@ class ExactPosterior:
 
     @property
     def ln_f_unit(self) -> float:
-        """What ln f changes by per unit of its coordinate."""
+        """Change of ln f per unit of its coordinate."""
         return self.target.ln_f_unit
 
     @property

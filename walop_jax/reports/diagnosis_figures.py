@@ -336,7 +336,7 @@ def protection_figure(found: DetectionLimits) -> Figure:
 
 
 def separation_figure(found: DetectionLimits) -> Figure:
-    """How far each effect (column) stays from each other one (row) when that is just detected, in σ."""
+    """Separation (σ) of each effect (column) from each other one (row) when that is just detected."""
     count = len(found.effects)
     size = max(3.0, 0.17 * count)
     figure = empty_figure(size + 2.2, size + 1.2)

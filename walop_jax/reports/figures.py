@@ -172,7 +172,7 @@ def _histogram(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " n
 
 
 def modulation_figure(calset: CalibrationSet, points: Sequence[int]) -> Figure:
-    """What the arms measure behind the calibration polariser against its angle, at some field points.
+    """Signals of the arms behind the calibration polariser against its angle, at some field points.
 
     `points` are rows of `calset.points`. Only exposures with the polariser in and the calibration plate out are shown.
     Two arms measure q_m and u_m; an ideal instrument would follow cos 2θ and sin 2θ, the grey lines.
@@ -253,7 +253,7 @@ def matrix_errors_figure(maps: MatrixMaps) -> Figure:
 
 
 def residual_map_figure(residuals: ResidualMap) -> Figure:
-    """What the smooth model leaves of the matrix and of the ratios of the arms (%), and χ²/dof before that correction.
+    """Residuals of the matrix and of the ratios of the arms (%), and χ²/dof before that correction.
 
     A row for each arm. The elements share one scale, which the largest corrections but one in a hundred set.
     """

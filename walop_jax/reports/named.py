@@ -50,7 +50,7 @@ class Source(Run):
 
     @property
     def limits(self) -> DetectionLimits:
-        """What the data can show."""
+        """The detection limits of the data."""
         return read_limits(self.wanted(LIMITS, "run walop-jax limits -o RUN first"))
 
 

@@ -1,4 +1,4 @@
-"""What all figures share: sizes, colours, blank figures, axes of the field, panels of the instrument matrix."""
+"""Common parts of figures: sizes, colours, blank figures, axes of the field, panels of the instrument matrix."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def element_symbols(arms: int) -> tuple[str, ...]:
 
 
 PAPER_NAMES = ("zero offset", "efficiency", "cross-talk")
-"""What Paper II calls the elements of the arm that measures q: m21, m22, m23; those of u are m31, m33, m32."""
+"""Names in Paper II of the elements of the arm that measures q: m21, m22, m23; those of u are m31, m33, m32."""
 
 
 def element_kind(element: int, arms: int) -> int:

@@ -26,7 +26,7 @@ _PROPER = ("Wollaston", "Moon", "Stokes")
 
 
 def effect_in_words(effect: str) -> str:
-    """What an effect is, in a few words that may stand inside a sentence; empty for a name that is not known."""
+    """A few words on an effect that may stand inside a sentence; empty for a name that is not known."""
     if effect == UNNAMED:
         return "patterns without a name"
     known = next((entry for entry in EFFECTS if entry.name == effect), None)
@@ -52,7 +52,7 @@ def listed(items: Sequence[str]) -> str:
 
 
 def verdict_of_fit(summary: Mapping[str, Any]) -> tuple[str, str]:
-    """Whether a fit may be used, as a label and a sentence that says why."""
+    """The verdict on a fit, as a label and a sentence with the reason."""
     ratio = summary["chi2"] / max(summary["dof"], 1)
     numbers = f"χ²/dof = {ratio:.4g} for {summary['dof']} degrees of freedom"
     if not summary["converged"]:
@@ -73,7 +73,7 @@ def hidden_in_words(summary: Mapping[str, Any]) -> str:
 
 
 def verdict_of_diagnosis(diagnosis: Mapping[str, Any]) -> tuple[str, str]:
-    """What a diagnosis found, as a label and the sentences that a scientist would say."""
+    """The findings of a diagnosis, as a label and the sentences that a scientist would say."""
     steps, p = diagnosis["steps"], probability(diagnosis.get("p_value"))
     before, after = (rounded(diagnosis.get(f"chi2_per_dof_{when}")) for when in ("before", "after"))
     if diagnosis["verdict"] == "consistent":

@@ -1,0 +1,58 @@
+"""Records that commands write: what is read is what was written, whatever the format."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import handmade_run
+import numpy as np
+import pytest
+
+from walop_jax.calibration import read_calibration, write_calibration
+from walop_jax.diagnosis.figure_file import read_figure_data, write_figure_data
+from walop_jax.diagnosis.limits_found import DetectionLimits
+from walop_jax.io.text import json_text, read_json
+
+RECORDS: Mapping[str, tuple[Any, Callable[[Path, Any], None], Callable[[Path], Any]]] = {
+    "calibration.fits": (
+        handmade_run.product(),
+        write_calibration,
+        lambda path: dataclasses.replace(read_calibration(path, rebuild=False), path=None),
+    ),
+    "diagnosis.fits": (handmade_run.figure_data(), write_figure_data, read_figure_data),
+    "limits.json": (
+        handmade_run.limits(),
+        lambda path, limits: path.write_text(json_text(limits.document())),
+        lambda path: DetectionLimits.from_document(read_json(path)),
+    ),
+}
+
+
+def assert_same(one: Any, other: Any, where: str) -> None:
+    """Records are equal; arrays bit for bit, NaN is NaN."""
+    if dataclasses.is_dataclass(one):
+        for field in dataclasses.fields(one):
+            assert_same(getattr(one, field.name), getattr(other, field.name), f"{where}.{field.name}")
+    elif isinstance(one, Mapping):
+        assert list(one) == list(other), where
+        for name in one:
+            assert_same(one[name], other[name], f"{where}[{name}]")
+    elif isinstance(one, tuple):
+        assert len(one) == len(other), where
+        for number, pair in enumerate(zip(one, other, strict=True)):
+            assert_same(*pair, f"{where}[{number}]")
+    else:
+        np.testing.assert_equal(other, one, err_msg=where)
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_what_is_read_is_what_was_written(tmp_path: Path, name: str):
+    record, write, read = RECORDS[name]
+    write(tmp_path / name, record)
+    again = read(tmp_path / name)
+    assert_same(record, again, name)
+    write(tmp_path / f"again_{name}", again)
+    assert (tmp_path / f"again_{name}").read_bytes() == (tmp_path / name).read_bytes()
