@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from builders import exposures, monochromatic
+from builders import NAN, exposures, monochromatic
 
 from walop_jax.calibration import Calibration, ListedModel, MatrixMaps, write_calibration
 from walop_jax.data import empty_sources
