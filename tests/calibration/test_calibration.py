@@ -15,10 +15,10 @@ from small_run import WITH_PLATE, small_fit_with_plate
 from walop_jax.calibration import Calibration, read_calibration, write_calibration
 from walop_jax.data import DataError
 from walop_jax.data.settings import Settings
+from walop_jax.fit.minimise import RESULTS
 from walop_jax.fit.model_builder import model_for, model_without_data
 from walop_jax.fit.model_file import render
 from walop_jax.fit.refit import FitResult
-from walop_jax.fit.solver import RESULTS
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.references import references
 

@@ -40,7 +40,7 @@ def fitted(name: str, start: int) -> Fitted:
     at, scale, noise = data.starts[start], np.abs(data.starts[start]), 1.0
     for _ in range(12):
 
-        def evaluate(x, request, noise=noise):
+        def evaluate(x, noise=noise):
             with np.errstate(over="ignore", invalid="ignore"):  # a trial far away is no place to stay
                 r, j = data.residuals(x) / noise, data.jacobian(x) / noise
                 return Expansion(float(r @ r), j.T @ r, j.T @ j)

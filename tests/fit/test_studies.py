@@ -146,7 +146,7 @@ def test_noiseless_data_return_the_truth():
     np.testing.assert_allclose((result.values - true) / scale, 0.0, atol=1e-5)
     free = model.free
     to_the_end = minimise(
-        lambda x, _: likelihood.expand(model.full(x)), result.values[free], scale[free], tolerance=1e-10
+        lambda x: likelihood.expand(model.full(x)), result.values[free], scale[free], tolerance=1e-10
     )
     np.testing.assert_allclose((model.full(to_the_end.x) - true) / scale, 0.0, atol=1e-8)
 

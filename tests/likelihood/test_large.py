@@ -1,4 +1,4 @@
-"""Large sets: the gradient without the matrix, the minimum from a sample and a pass or two, and what of it is kept."""
+"""Large sets: the minimum from a sample and a pass or two, and what of it is kept."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from walop_jax.fit import misfit, search
 from walop_jax.fit.minimise import minimise
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.fit.solver import WhenStale
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.thinning import thinned
@@ -37,29 +36,10 @@ def fitted(made):
 
 @pytest.fixture
 def large(made, monkeypatch):
-    """The same set, handled as if it were too large for a matrix at every step."""
+    """The same set, handled as if it were too large for many passes."""
     monkeypatch.setattr(limits, "LARGE_ABOVE", 0)
     monkeypatch.setattr(limits, "SAMPLE", 1024)
     return Likelihood.of(made.calset, made.model, points_per_chunk=512)
-
-
-def test_slope_is_that_of_the_expansion(made):
-    values = made.model.start
-    full = made.expand(values)
-    slope = made.slope(values, full)
-    size = np.sqrt(np.diag(full.matrix))
-    assert slope.data == pytest.approx(full.data, rel=1e-12)
-    assert slope.matrix is full.matrix
-    np.testing.assert_allclose(slope.gradient / size, full.gradient / size, atol=1e-10 * np.sqrt(full.data))
-
-
-def test_slope_keeps_the_factor_on_the_errors(made):
-    values = made.model.start
-    full = made.expand(values, noise_scale=3.0)
-    slope = made.slope(values, full)
-    assert slope.objective == pytest.approx(full.objective, rel=1e-12)
-    size = np.sqrt(np.diag(full.matrix))
-    np.testing.assert_allclose(slope.gradient / size, full.gradient / size, atol=1e-10 * np.sqrt(full.data))
 
 
 def test_blocks_change_nothing(made):
@@ -82,7 +62,7 @@ def test_the_fit_of_a_large_set_ends_where_the_usual_one_ends(large, fitted):
     assert found.chi2 == pytest.approx(fitted.chi2, rel=1e-9)
     known = fitted.sigma > 0
     assert (np.abs(found.values - fitted.values)[known] < 2e-3 * fitted.sigma[known]).all()
-    # The matrix is that of the sample's minimum, some nine standard errors away.
+    # The matrix is that of the place before the last step.
     np.testing.assert_allclose(found.sigma, fitted.sigma, rtol=5e-3)
     assert (found.dof, found.n_data) == (fitted.dof, fitted.n_data)
     assert found.posterior.census.field == made_field(large)
@@ -147,12 +127,8 @@ def test_optimistix_on_residuals_in_memory_finds_the_same(made):
     for solver in (optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6), optx.GaussNewton(rtol=1e-12, atol=1e-12)):
         x = optx.least_squares(residuals, solver, x, max_steps=60, throw=False).value
 
-    def evaluate(x, request):
-        values = model.full(x)
-        return likelihood.expand(values) if request.matrix else likelihood.slope(values, request.near)
-
     near = fit(likelihood).values[model.free]
-    ours = minimise(evaluate, near, scale, matrix=WhenStale(), damping=0.0, tolerance=1e-8)
+    ours = minimise(lambda x: likelihood.expand(model.full(x)), near, scale, damping=0.0, tolerance=1e-8)
     assert ours.converged
     reference = model.start + select @ np.asarray(x)
     everything = np.array([p.scale for p in model.parameters])

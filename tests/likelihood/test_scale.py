@@ -153,15 +153,11 @@ def test_cost_per_iteration():
         likelihood = Likelihood.of(calset, base_model(calset))
         values = likelihood.model.start
         near = likelihood.expand(values)  # compiles; fills the memory where the set is kept
-        likelihood.slope(values, near)
         data = seconds(lambda likelihood=likelihood: likelihood._total("data", None, lambda _: (), ()))
         full = seconds(lambda likelihood=likelihood, values=values: likelihood.expand(values))
-        slope = seconds(
-            lambda likelihood=likelihood, values=values, near=near: likelihood.slope(values, near)
-        )
         rows.append((side**2, data, full))
         print(
-            f"\n{side**2:>9,} points: data {data:8.3f} s, gradient {slope:8.3f} s, with the matrix {full:8.3f} s "
+            f"\n{side**2:>9,} points: data {data:8.3f} s, all {full:8.3f} s "
             f"({side**2 / full:9,.0f} points/s), error of the optics {near.optics.error:.0e}, peak {peak():.2f} GB",
             end="",
         )
@@ -254,22 +250,19 @@ def test_errors_fall_with_the_points():
 def test_work_per_point():
     """Floating-point operations and bytes that the compiled code counts, and the rate at which it does them."""
     calset = made(32)
-    likelihood = Likelihood.of(
-        calset, base_model(calset), points_per_chunk=limits.GRADIENT_BLOCK, interpolate=True
-    )
+    likelihood = Likelihood.of(calset, base_model(calset), points_per_chunk=limits.UNCUT, interpolate=True)
     instrument = likelihood.model.instrument()
     arguments = (instrument, likelihood.plan, likelihood.points.chunk(0), likelihood.nodes(instrument)[0])
-    for label, function in (("matrix", engine.normal_equations), ("gradient", engine.slope_equations)):
-        cost = jax.jit(function.__wrapped__).lower(*arguments).compile().cost_analysis()
-        jax.block_until_ready(function(*arguments))
-        best = min(seconds(lambda f=function: jax.block_until_ready(f(*arguments))) for _ in range(5))
-        n = limits.GRADIENT_BLOCK
-        print(
-            f"\n{label}: {cost['flops'] / n / 1e3:.0f} kflop and {cost['bytes accessed'] / n / 1e3:.0f} kB a point; "
-            f"{1e6 * best / n:.1f} µs, {cost['flops'] / best / 1e9:.1f} Gflop/s, "
-            f"{cost['bytes accessed'] / best / 1e9:.1f} GB/s",
-            end="",
-        )
+    function, n = engine.normal_equations, limits.UNCUT
+    cost = jax.jit(function.__wrapped__).lower(*arguments).compile().cost_analysis()
+    jax.block_until_ready(function(*arguments))
+    best = min(seconds(lambda: jax.block_until_ready(function(*arguments))) for _ in range(5))
+    print(
+        f"\n{cost['flops'] / n / 1e3:.0f} kflop and {cost['bytes accessed'] / n / 1e3:.0f} kB a point; "
+        f"{1e6 * best / n:.1f} µs, {cost['flops'] / best / 1e9:.1f} Gflop/s, "
+        f"{cost['bytes accessed'] / best / 1e9:.1f} GB/s",
+        end="",
+    )
 
 
 @pytest.mark.benchmark

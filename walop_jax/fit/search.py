@@ -1,16 +1,21 @@
-"""The search for the minimum of a likelihood: from afar on a small set, from a sample's minimum on a large one."""
+"""The search for the minimum of a likelihood: from afar on a small set, from a sample's minimum on a large one.
+
+Every search ends: a model that is far from the data (χ²/dof above `FAR_OFF`) is given so many passes over them as
+`most_passes` says, all starts together. With residuals of a wrong model, errors of the data are scaled until χ²/dof is
+1, and the plates are tried one order of retardance away; more starts and steps buy nothing then.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.fit.minimise import Minimum, minimise, newton
-from walop_jax.fit.solver import Request, WhenStale
+from walop_jax.fit.minimise import MAXIMUM_STEPS, Minimum, minimise
 from walop_jax.io.errors import fail
 from walop_jax.likelihood import limits, pixels
 from walop_jax.likelihood.expansion import Posterior
@@ -26,6 +31,7 @@ Expand = Callable[[Vector, float, Posterior | None], Posterior]
 FAR_OFF = 25.0  # χ²/dof above which other orders are tried and the errors scaled
 MAXIMUM_RESCALINGS = 4
 FIRST_STEPS = 20
+OTHER_STEPS = 12  # of a start one order of retardance away
 # Scaled gradient of a large set: 10⁻³ of a standard error is 10⁻⁶ in χ², and of a χ² of 10⁹ rounding leaves 10⁻⁷.
 LARGE_TOLERANCE = 1e-3
 
@@ -48,12 +54,21 @@ class Found:
     @property
     def misfit(self) -> float:
         """χ² of the data with their errors as given, per degree of freedom."""
-        return self.posterior.data / max(self.posterior.dof, 1)
+        return _misfit(self.posterior)
+
+
+def _misfit(posterior: Posterior) -> float:
+    return posterior.data / max(posterior.dof, 1)
 
 
 def free_scales(model: Model) -> Vector:
     """The unit in which a solver thinks of each free parameter."""
     return np.array([model.parameters[i].scale for i in model.free])
+
+
+def most_passes(model: Model) -> int:
+    """Passes over the data that a model far from them is worth: the first search, and one for each free parameter."""
+    return FIRST_STEPS + len(model.free)
 
 
 def _search(
@@ -63,6 +78,7 @@ def _search(
     noise_scale: float,
     near: Posterior | None = None,
     expand: Expand | None = None,
+    maximum_steps: int = MAXIMUM_STEPS,
     **how: Any,
 ) -> Found:
     """The minimum from a full vector of start values; `near` is an expansion at similar ones, if there is any.
@@ -76,15 +92,23 @@ def _search(
     def full(x: Vector) -> Float[np.ndarray, " all"]:
         return first + select @ (x - origin)
 
-    def evaluate(x: Vector, request: Request) -> Posterior:
-        if request.matrix:
-            return expand(full(x), noise_scale, request.near or near)
-        return likelihood.slope(full(x), request.near)
+    def evaluate(x: Vector) -> Posterior:
+        nonlocal near
+        near = expand(full(x), noise_scale, near)
+        return near
 
-    def tell(step: int, objective: float) -> None:
-        likelihood.runner.tell(f"{label}: step {step}, χ² {objective:.7g}")
+    def tell(step: int, best: Posterior) -> None:
+        likelihood.runner.tell(f"{label}: step {step} of at most {maximum_steps}, χ²/dof {_misfit(best):.6g}")
 
-    minimum = minimise(evaluate, origin, free_scales(model), progress=tell, **how)
+    minimum = minimise(
+        evaluate,
+        origin,
+        free_scales(model),
+        maximum_steps=maximum_steps,
+        far_off=lambda found: not _misfit(found) < FAR_OFF,
+        progress=tell,
+        **how,
+    )
     return Found(minimum, full(minimum.x))
 
 
@@ -93,64 +117,37 @@ def find_minimum(
 ) -> Found:
     """The minimum of a set from start values that may be far away; of a large one, from that of a sample of it.
 
-    `noise_scale` and `worth` are those of `refit.fit`. Raises `DataError` when the exposures cannot determine the
-    instrument.
+    Of whole frames some strips of image rows come between the sample and all pixels. `noise_scale` and `worth` are
+    those of `refit.fit`. Raises `DataError` when the exposures cannot determine the instrument.
     """
     if not likelihood.layout.large:
-        return _minimum_from_afar(likelihood, first, noise_scale, worth)
-    if stands_for_pixels(likelihood, first):
-        return _minimum_of_pixels(likelihood, first, noise_scale, worth)
-    near, scale, starts = _minimum_of_sample(likelihood, first, noise_scale, worth)
-    found = _search(
-        likelihood,
-        "fit of all points",
-        near,
-        scale,
-        matrix=WhenStale(),
-        damping=0.0,
-        tolerance=LARGE_TOLERANCE,
-    )
+        return _from_afar(likelihood, first, noise_scale, worth)
+    near_end: dict[str, Any] = {"damping": 0.0, "look_at_end": False}
+    if not stands_for_pixels(likelihood, first):
+        values, scale, starts = _of_sample(likelihood, first, noise_scale, worth)
+        label, expand = "fit of all points", likelihood.expand
+    else:
+        values, scale, starts = _of_sample(likelihood, first, noise_scale, worth, limits.PIXEL_SAMPLE)
+        label, expand = "fit of all pixels", functools.partial(_of_pixels, likelihood, 1)
+        every = strips_of(likelihood) // limits.FIRST_STRIPS
+        if every > 1:
+            alone = dataclasses.replace(
+                likelihood, runner=dataclasses.replace(likelihood.runner, journal=None)
+            )
+            some = functools.partial(_of_pixels, alone, every)
+            rows = "fit of some image rows"
+            values = _search(alone, rows, values, scale, expand=some, tolerance=1.0, **near_end).values
+    found = _search(likelihood, label, values, scale, expand=expand, tolerance=LARGE_TOLERANCE, **near_end)
     return dataclasses.replace(found, starts=starts)
 
 
-def _minimum_of_pixels(
-    likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
-) -> Found:
-    """The minimum of whole frames: of a sample, then of some strips of image rows, then of all."""
-    near, scale, starts = _minimum_of_sample(likelihood, first, noise_scale, worth, limits.PIXEL_SAMPLE)
-    every = strips_of(likelihood) // limits.FIRST_STRIPS
-    if every > 1:
-        alone = dataclasses.replace(likelihood, runner=dataclasses.replace(likelihood.runner, journal=None))
-        near = _search_pixels(alone, "fit of some image rows", near, scale, every, 1.0).values
-    found = _search_pixels(likelihood, "fit of all pixels", near, scale, 1, LARGE_TOLERANCE)
-    return dataclasses.replace(found, starts=starts)
+def _of_pixels(
+    likelihood: Likelihood, every: int, values: Vector, noise_scale: float, _: Posterior | None
+) -> Posterior:
+    return pixels.expand(likelihood, values, noise_scale, every)
 
 
-def _search_pixels(
-    likelihood: Likelihood, label: str, first: Vector, noise_scale: float, every: int, tolerance: float
-) -> Found:
-    """The minimum of one strip of image rows in `every`, by Newton steps where these lead there."""
-    model = likelihood.model
-    select, origin = model.selection(), first[model.free]
-
-    def expand(values: Vector, noise_scale: float, _: Posterior | None = None) -> Posterior:
-        return pixels.expand(likelihood, values, noise_scale, every)
-
-    def full(x: Vector) -> Float[np.ndarray, " all"]:
-        return first + select @ (x - origin)
-
-    def tell(step: int, objective: float) -> None:
-        likelihood.runner.tell(f"{label}: pass {step}, χ² {objective:.10g}")
-
-    minimum = newton(
-        lambda x: expand(full(x), noise_scale), origin, free_scales(model), tolerance=tolerance, progress=tell
-    )
-    if minimum is not None:
-        return Found(minimum, full(minimum.x))
-    return _search(likelihood, label, first, noise_scale, expand=expand, damping=0.0, tolerance=tolerance)
-
-
-def _minimum_of_sample(
+def _of_sample(
     likelihood: Likelihood,
     first: Vector,
     noise_scale: float | None,
@@ -179,7 +176,7 @@ def _minimum_of_sample(
     return np.array(values), float(scale), int(starts)
 
 
-def _minimum_from_afar(
+def _from_afar(
     likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
 ) -> Found:
     """The minimum from start values that may be far away, the errors of the data scaled if need be."""
@@ -189,21 +186,44 @@ def _minimum_from_afar(
     promising = found.posterior.objective < worth if worth is not None else found.misfit < FAR_OFF
     if not found.minimum.converged and promising:
         found = _search(likelihood, "fit, continued", found.values, given, found.posterior, damping=0.0)
-    if noise_scale is not None:
+    if noise_scale is not None or found.misfit < FAR_OFF:
         return found
-    for _ in range(MAXIMUM_RESCALINGS):
-        scale = float(np.sqrt(found.misfit))
-        if scale**2 < FAR_OFF or abs(scale / found.posterior.noise_scale - 1.0) < 0.1:
+    return _far_off(likelihood, found)
+
+
+def _far_off(likelihood: Likelihood, found: Found) -> Found:
+    """The best place for a model that is far from the data: errors scaled to what it leaves, other orders tried."""
+    left, starts = most_passes(likelihood.model) - found.minimum.steps, 1
+
+    def search(label: str, values: Vector, scale: float, most: int) -> Found:
+        nonlocal left
+        more = _search(
+            likelihood, label, values, scale, found.posterior, maximum_steps=max(1, min(most, left))
+        )
+        left -= more.minimum.steps
+        return more
+
+    def rescaled(found: Found) -> Found:
+        for _ in range(MAXIMUM_RESCALINGS):
+            scale = float(np.sqrt(max(found.misfit, 1.0))) if found.misfit > FAR_OFF else 1.0
+            if left <= 0 or abs(scale / found.posterior.noise_scale - 1.0) < 0.1:
+                break
+            found = search(
+                f"the model is far off; with errors × {scale:.3g}", found.values, scale, MAXIMUM_STEPS
+            )
+        return found
+
+    found = rescaled(found)
+    others = list(_order_starts(likelihood)) if found.misfit > FAR_OFF else []
+    for number, (label, other) in enumerate(others, start=2):
+        if left <= 0:
             break
-        found = _search(likelihood, f"errors × {scale:.3g}", first, scale, found.posterior)
-    if not found.misfit > FAR_OFF:
-        return found
-    starts = 1
-    for label, other in _order_starts(likelihood):
-        trial = _search(likelihood, label, other, found.posterior.noise_scale, found.posterior)
-        starts += 1
+        label = f"start {number} of {len(others) + 1}, {label}"
+        trial, starts = search(label, other, found.posterior.noise_scale, OTHER_STEPS), starts + 1
         if trial.posterior.objective < found.posterior.objective:
-            found = trial
+            found = rescaled(trial)
+    if not found.minimum.converged and left > 0:
+        found = search("the best of them", found.values, found.posterior.noise_scale, left)
     return dataclasses.replace(found, starts=starts)
 
 

@@ -17,9 +17,7 @@ Exposures      are not compressed beforehand, although light is linear in them: 
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +35,6 @@ from walop_jax.model.parameters import values_of, with_values
 from walop_jax.model.plan import Plan
 
 Vector = Float[Array, " n"]
-Result = TypeVar("Result")
 NEWTON_STEPS = 3  # each squares the share of the detectors' distortion that is missing from the flux
 
 
@@ -225,13 +222,19 @@ def _point_normal(
     return r @ r, jacobian @ r, jacobian @ jacobian.T
 
 
-def _over_blocks(function: Callable[[PointData], Result], data: PointData, block: int) -> Result:
-    """The sum of a function over blocks of points, so that what it needs in between stays in the processor's cache.
+def _normal_equations(
+    instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None = None
+) -> Normal:
+    """Sums over blocks of points, so that what is needed in between stays in the processor's cache.
 
     Points that make no whole number of blocks, and few points, are one block.
     """
-    points = data.x.shape[0]
-    if points <= limits.GRADIENT_BLOCK or points % block:
+
+    def function(part: PointData) -> Normal:
+        return _block_equations(instrument, plan, part, nodes)
+
+    points, block = data.x.shape[0], limits.JACOBIAN_BLOCK
+    if points <= limits.UNCUT or points % block:
         return function(data)
     parts = jax.tree.map(lambda v: v.reshape(-1, block, *v.shape[1:]), data)
     blank = jax.tree.map(
@@ -240,14 +243,6 @@ def _over_blocks(function: Callable[[PointData], Result], data: PointData, block
     return jax.lax.scan(lambda sum_, part: (jax.tree.map(jnp.add, sum_, function(part)), None), blank, parts)[
         0
     ]
-
-
-def _normal_equations(
-    instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None = None
-) -> Normal:
-    return _over_blocks(
-        lambda part: _block_equations(instrument, plan, part, nodes), data, limits.JACOBIAN_BLOCK
-    )
 
 
 def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None) -> Normal:
@@ -273,36 +268,6 @@ def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes:
     matrix = matrix.at[np.ix_(plain, series)].set(cross).at[np.ix_(series, plain)].set(cross.T)
     matrix = matrix.at[np.ix_(series, series)].set(square)
     return Normal(chi2.sum(), g, matrix)
-
-
-def _slope_equations(
-    instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable
-) -> tuple[Float[Array, ""], Vector]:
-    """χ² and gradient of points without the matrix: a fifth of the work.
-
-    The gradient runs backwards, from the residuals to the rows of the table, and only there meets the slopes. χ² does
-    not change with the flux at its best, so that is held.
-    """
-    values, to_instrument = values_of(instrument), with_values(instrument)
-    optical = linear.optical_positions(instrument)
-
-    def slope(part: PointData) -> tuple[Float[Array, ""], Vector]:
-        def chi2(values: Vector, rows: Float[Array, "t b r 4"]) -> Float[Array, ""]:
-            here = to_instrument(values)
-            between = dataclasses.replace(nodes, coefficients=(rows, nodes.coefficients[1]))
-
-            def of_point(point: PointData) -> Float[Array, ""]:
-                unit = point_prediction(here, plan, point, between)
-                flux = jax.lax.stop_gradient(best_flux(here, plan, unit, point))
-                return jnp.sum(((point.counts - real_counts(here, plan, unit, flux)) * point.weight) ** 2)
-
-            return jnp.sum(jax.vmap(of_point)(part))
-
-        value, (direct, by_rows) = jax.value_and_grad(chi2, (0, 1))(values, nodes.coefficients[0])
-        by_optics = jnp.einsum("tbrs,tobrs->o", by_rows, nodes.coefficients[1])
-        return value, 0.5 * direct.at[optical].set(by_optics)
-
-    return _over_blocks(slope, data, limits.GRADIENT_BLOCK)
 
 
 def _residuals(
@@ -352,7 +317,6 @@ incoming = compiled(_incoming, kept_as="incoming")
 
 
 normal_equations = compiled(_normal_equations, kept_as="normal_equations")
-slope_equations = compiled(_slope_equations, kept_as="slope_equations")
 linearised_residuals = compiled(_linearised_residuals, kept_as="linearised_residuals")
 residuals = compiled(_residuals, kept_as="residuals")
 prediction = compiled(_prediction, kept_as="prediction")

@@ -27,7 +27,7 @@ class Layout:
     There are `points` field points, `chunk` in a chunk (one call of the engine) and `slab` in a slab (read together, by
     one thread). `kept` says whether their data stay in memory, `memory` how many bytes going through them takes
     (estimated), of those `allowed`. `interpolated` says whether the optics are to be solved on nodes over `rectangle`
-    (deg) and interpolated, `large` whether a fit should do with as few matrices as can be, `mirrored` whether the
+    (deg) and interpolated, `large` whether a fit should do with as few passes as can be, `mirrored` whether the
     optics of the opposite points are needed too, for ghosts.
     """
 

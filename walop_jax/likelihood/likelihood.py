@@ -34,8 +34,8 @@ class Likelihood:
     """The joint likelihood of one calibration set under one model.
 
     Field points are handled in chunks of equal size, so that a set larger than memory goes through the same code
-    (`likelihood/points.py`), several of them at a time (`likelihood/runner.py`). Where `layout` says so, `expand`,
-    `slope` and `residuals` solve the optics on Chebyshev nodes only (`likelihood/nodes.py`). Immutable: what a pass
+    (`likelihood/points.py`), several of them at a time (`likelihood/runner.py`). Where `layout` says so, `expand`
+    and `residuals` solve the optics on Chebyshev nodes only (`likelihood/nodes.py`). Immutable: what a pass
     finds out beside its sums comes back with them (`Posterior`).
     """
 
@@ -156,54 +156,25 @@ class Likelihood:
         self, values: Vector, terms: DataTerms, noise_scale: float, optics: OpticsUsed
     ) -> Posterior:
         """The posterior from what the data say."""
-        at, select = self.priors.index, self.model.selection()
-        matrix = terms.matrix / noise_scale**2
-        matrix[at, at] += self.priors.width**-2
-        free = select.T @ matrix @ select
-        return self._posterior(values, terms.data, terms.gradient, free, noise_scale, terms.census, optics)
-
-    def slope(self, values: Vector, near: Posterior) -> Posterior:
-        """As `expand`, with the matrix of an expansion nearby: a third of the time, where optics are interpolated."""
-        values = self._agreed(values)
-        instrument, n = self.model.instrument(values), len(values)
-        nodes, optics = self.nodes(instrument, near)
-        if nodes is None:
-            return self.expand(values, near.noise_scale, near)
-        (data, gradient), census = self._total(
-            "χ² and gradient",
-            f"gradient {values.tobytes().hex()}",
-            lambda chunk: engine.slope_equations(instrument, self.plan, chunk, nodes),
-            ((), (n,)),
-        )
-        return self._posterior(values, float(data), gradient, near.matrix, near.noise_scale, census, optics)
-
-    def _agreed(self, values: Vector) -> Vector:
-        return self.runner.processes.agreed("values", np.asarray(values, float))
-
-    def _posterior(
-        self,
-        values: Vector,
-        data: float,
-        gradient: Vector,
-        matrix: Float[np.ndarray, "free free"],
-        noise_scale: float,
-        census: Census,
-        optics: OpticsUsed,
-    ) -> Posterior:
-        rows, gradient = self.priors, gradient / noise_scale**2
-        pull = rows.residuals(values)
+        rows, select, pull = self.priors, self.model.selection(), self.priors.residuals(values)
+        gradient = terms.gradient / noise_scale**2
         gradient[rows.index] += pull / rows.width
+        matrix = terms.matrix / noise_scale**2
+        matrix[rows.index, rows.index] += rows.width**-2
         return Posterior(
-            data=data,
+            data=terms.data,
             priors=float(np.sum(pull[rows.known] ** 2)),
             loose=float(np.sum(pull[~rows.known] ** 2)),
             noise_scale=noise_scale,
-            gradient=self.model.selection().T @ gradient,
-            matrix=matrix,
-            census=census,
-            dof=self._degrees_of_freedom(census),
+            gradient=select.T @ gradient,
+            matrix=select.T @ matrix @ select,
+            census=terms.census,
+            dof=self._degrees_of_freedom(terms.census),
             optics=optics,
         )
+
+    def _agreed(self, values: Vector) -> Vector:
+        return self.runner.processes.agreed("values", np.asarray(values, float))
 
     def _degrees_of_freedom(self, census: Census) -> int:
         return (

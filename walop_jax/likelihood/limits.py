@@ -26,8 +26,8 @@ SLABS = 16
 
 JACOBIAN_BLOCK = 64
 """Field points whose Jacobians are worked on together: these stay in the processor's cache."""
-GRADIENT_BLOCK = 256
-"""Field points whose gradients are worked on together, and largest number that is not cut: they need a quarter."""
+UNCUT = 256
+"""Field points up to which a chunk is not cut into such blocks."""
 COLUMNS = 256
 """Columns of an image row that are worked on together: the sums of four cameras and 25 exposures take a megabyte."""
 RESPONSES_TOGETHER = 32
@@ -49,7 +49,7 @@ SOLVED_TOGETHER = 64
 INTERPOLATE_ABOVE = 4096
 """Field points above which the optics are interpolated: more than ten times the nodes that they need."""
 LARGE_ABOVE = 65536
-"""Field points above which the matrix of a fit is computed as seldom as can be: a pass then takes seconds."""
+"""Field points above which a fit begins with a sample, and does with as few passes as can be: one takes seconds."""
 SAMPLE = 16384
 """Field points of a large set on which its fit begins: a fit of these takes as long as a pass or two of the set."""
 PIXEL_SAMPLE = 1024
