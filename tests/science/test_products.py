@@ -22,7 +22,7 @@ from walop_jax.fit.model_builder import model_for
 from walop_jax.fit.refit import refit
 from walop_jax.fit.verdict import Doubt, Quality
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.science.epoch import chi2_of_change, epoch, fit_like
+from walop_jax.science.epoch import chi2_of_change, epoch, fit_like, largest_change
 from walop_jax.simulation.simulate import simulate
 
 
@@ -150,6 +150,50 @@ def test_a_change_is_found_and_named(first):
     assert found.moved[0].new - found.moved[0].old == pytest.approx(5e-4, abs=4 * found.moved[0].error)
     assert found.chi2_old > found.chi2_new + 100
     assert found.star_errors["u"]["max"] > 0.05
+
+
+def test_one_number_that_has_changed_by_five_standard_errors_is_not_hidden_by_all_others(first):
+    """The parameter that hangs together least with others: of some seventy directions the sum does not see it."""
+    truth, old = first
+    result = fit_like(old, simulate(SMALL, seed=5, instrument=truth).calset)
+    same = Calibration.from_fit(result)
+    quiet = epoch(same, result)
+    assert quiet.fits
+    assert quiet.p_value == 1.0
+    # Well measured: known three times better than before, or not known at all before.
+    prior = {p.name: (p.prior or (0.0, np.inf))[1] for p in result.model.parameters}
+    moved = [entry for entry in quiet.moved if result.value(entry.name)[1] < prior[entry.name] / 3.0]
+    names = [entry.name for entry in moved]
+    i = np.array([result.model.index(name) for name in names])
+    correlation = result.covariance[np.ix_(i, i)] / np.outer(result.sigma[i], result.sigma[i])
+    lone = int(np.argmin(np.abs(correlation - np.eye(len(i))).max(axis=0)))
+    values = same.values.copy()
+    values[i[lone]] -= 5.5 * moved[lone].error
+    found = epoch(dataclasses.replace(same, values=values), result)
+    assert stats.chi2.sf(found.test, found.directions) > 0.01
+    assert not found.fits
+    assert found.largest.name == names[lone]
+    assert found.largest.z == pytest.approx(5.5, rel=0.2)
+    # What could have been missed: five standard errors of the change, √2 times those of one fit at most.
+    x, y = np.meshgrid(*(np.linspace(*same.field[k : k + 2], 4) for k in (0, 2)))
+    _, covariance = same.matrix(x.ravel(), y.ravel())
+    error = 100 * np.median(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), axis=0)
+    for seen, of_one in zip(found.visible.values(), error, strict=True):
+        assert 3.0 * of_one < seen <= 5.0 * np.sqrt(2.0) * of_one * (1.0 + 1e-6)
+
+
+def test_of_many_changes_the_largest_is_held_to_their_number():
+    """By hand: of three independent changes 3 standard errors have p = 0.0027, and six are asked for."""
+    unit = np.eye(3)
+    found = largest_change(["a", "b", "c"], np.array([0.5, -3.0, 1.0]), unit, np.ones(3))
+    assert (found.name, found.asked) == ("b", 6)
+    assert found.z == pytest.approx(-3.0)
+    assert found.p_value == pytest.approx(1.0 - (1.0 - 0.0026998) ** 6, rel=1e-3)
+    # Of two that hang together by 0.8 the one that has changed alone stands out further than it does by itself.
+    pair = np.array([[1.0, 0.8], [0.8, 1.0]])
+    alone = largest_change(["a", "b"], np.array([3.0, 0.0]), pair, np.ones(2))
+    assert (alone.name, alone.alone) == ("a", True)
+    assert alone.z == pytest.approx(3.0 / 0.6)
 
 
 def test_the_new_set_is_fitted_with_the_old_model(first, monkeypatch):

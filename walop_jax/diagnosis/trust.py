@@ -50,6 +50,7 @@ from walop_jax.diagnosis.variance_components import (
     with_structure,
 )
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
+from walop_jax.fit.search import FAR_OFF
 from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points, with_pixels
 from walop_jax.fit.verdict import Structure
 from walop_jax.likelihood import limits
@@ -77,6 +78,8 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
     """
     result = with_pixels(result)
     if not result.converged:
+        if not as_written and result.chi2 > FAR_OFF * max(result.dof, 1):
+            refuse_mixups(result)
         return result.judged()
     if not (result.explains_data or result.nearly_explains_data):
         if not as_written:

@@ -224,7 +224,16 @@ def _far_off(likelihood: Likelihood, found: Found) -> Found:
             found = rescaled(trial)
     if not found.minimum.converged and left > 0:
         found = search("the best of them", found.values, found.posterior.noise_scale, left)
-    return dataclasses.replace(found, starts=starts)
+    minimum = found.minimum
+    if not minimum.converged and found.misfit > FAR_OFF:
+        passes = most_passes(likelihood.model) - left
+        message = (
+            f"given up after {passes} steps from {starts} starts: χ²/dof stays near {found.misfit:.3g}, and more steps "
+            "buy nothing; check the columns of the set, INSTRUME and the description of the instrument, or look for "
+            "what is missing (walop-jax diagnose)"
+        )
+        minimum = dataclasses.replace(minimum, message=message)
+    return dataclasses.replace(found, minimum=minimum, starts=starts)
 
 
 def check_identifiable(likelihood: Likelihood) -> None:

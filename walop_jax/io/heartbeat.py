@@ -9,7 +9,7 @@ from collections.abc import Callable, Generator
 
 Tell = Callable[[str], None]
 
-EVERY = 15.0  # s
+EVERY = 4.0  # s
 
 
 class Stage(str):

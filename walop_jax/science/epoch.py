@@ -1,10 +1,16 @@
 """Does an old calibration still fit new data, and what has moved?
 
 The new set is fitted with the old model: plates, effects, priors and what is held. What both fits have in common, the
-instrument's parameters, is compared: Δ = new − old with the covariance V, z = Δ/√V_ii, and over all directions
-T = Δᵀ V⁻¹ Δ, which is χ² for an instrument that has not changed.
+instrument's parameters, is compared: Δ = new − old with the covariance V.
 
     V = C_old + C_new − C_old P C_new − C_new P C_old
+    T = Δᵀ V⁻¹ Δ                        everything at once: χ² for an instrument that has not changed
+    z = Δ_i/√V_ii                       one parameter, whatever the others did
+    a = (V⁻¹Δ)_i/√(V⁻¹)_ii              one parameter, if it alone has changed
+
+T of seventy directions hides one that has changed by five standard errors. So the largest |z| or |a| is asked as well,
+corrected for as many as there are (Šidák 1967, JASA 62, 626); the verdict is that of the smaller p, taken twice. What
+could have been missed is said for the matrix: five standard errors of its change, √(J V Jᵀ).
 
 P is the inverse covariance of the priors: both fits lean on the same ones, which makes them more alike than two
 independent measurements; where neither has measured anything V vanishes, and such directions are left out.
@@ -13,7 +19,8 @@ independent measurements; where neither has measured anything V vanishes, and su
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -30,12 +37,20 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.rounding import probability, two_digits, value_and_error, with_minus_sign
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.conventions import matrix_elements
 from walop_jax.model.specification import Model
 from walop_jax.science.star_errors import determinant, joint_errors, sample_stars, statistics
 
+Vector = Float[np.ndarray, " k"]
+Matrix = Float[np.ndarray, "k k"]
+
 CHANCE = 0.01
 _SHOWN = 8  # parameters
+SURE = 5.0  # standard errors
 _KNOWN = 1e-7  # share of the largest eigenvalue below which a direction was measured by neither
+_LEANS = (
+    1e-4  # of the variances of both fits, below which both lean on the prior and rounding is all that differs
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,11 +65,28 @@ class MovedParameter:
     z: float
 
 
+@dataclasses.dataclass(frozen=True)
+class LargestChange:
+    """The parameter whose change stands out most, `z` standard errors of it, of so many changes that were `asked` for.
+
+    `alone` says that the change is that of this parameter with all others as they were. `p_value` is corrected for the
+    number of changes.
+    """
+
+    name: str
+    z: float
+    alone: bool
+    asked: int
+    p_value: float
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class Epoch(Displayed):
     """The verdict: `fits` unless the change is one that chance makes in less than 1 % of cases.
 
-    `moved` sorts parameters by |z|; `chi2_old` is of the new data with the old instrument; `star_errors` are
+    `largest` is the change that stands out most by itself, `p_value` the chance of it and of the sum taken together.
+    `visible` is the smallest change of each element of the matrix (per cent, median over the field) that would have been
+    seen with certainty, five standard errors of it. `moved` sorts parameters by |z|; `chi2_old` is of the new data with the old instrument; `star_errors` are
     statistics (per cent) of what stars would be off, outside the zone without u, if the old calibration
     were used and the new one true. `new_trusted` and `warnings` are what the fit of the new set is worth: where it is
     not to be trusted, neither are the parameters that seem to have moved.
@@ -64,6 +96,8 @@ class Epoch(Displayed):
     p_value: float
     test: float
     directions: int
+    largest: LargestChange
+    visible: dict[str, float]
     chi2_old: float
     chi2_new: float
     dof: int
@@ -101,7 +135,19 @@ class Epoch(Displayed):
             facts=(
                 (
                     "chance",
-                    f"p {probability(self.p_value)} (χ² = {self.test:.1f} in {self.directions} directions)",
+                    f"p {probability(self.p_value)} (χ² = {self.test:.1f} in {self.directions} directions, and the "
+                    "largest change)",
+                ),
+                (
+                    "largest change",
+                    f"{self.largest.name} by {with_minus_sign(f'{self.largest.z:+.1f}')} standard errors"
+                    f"{' if it alone has changed' if self.largest.alone else ''}: "
+                    f"p {probability(self.largest.p_value)} for the largest of {self.largest.asked}",
+                ),
+                (
+                    "would be seen",
+                    f"a change of {', '.join(f'{n} {two_digits(v)} %' for n, v in self.visible.items())} "
+                    "(5 standard errors, median over the field)",
                 ),
                 (
                     "stars with the old one",
@@ -138,7 +184,9 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
     width = np.array([(model[name].prior or (0.0, np.inf))[1] for name in names])
     both = before @ (after / width[:, None] ** 2)
     covariance = before + after - both - both.T
-    test, directions = chi2_of_change(change, covariance, np.sqrt(np.diag(before + after)))
+    sigma = np.sqrt(np.diag(before + after))
+    test, directions = chi2_of_change(change, covariance, sigma)
+    largest = largest_change(names, change, covariance, sigma)
     values = new.values.copy()
     values[b] = old.values[a]
     error = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
@@ -147,12 +195,16 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
         for n, i, j, d, s in zip(names, a, b, change, error, strict=True)
         if s > 0
     ]
-    p_value = float(special.chdtrc(directions, test))
+    p_value = min(1.0, 2.0 * min(float(special.chdtrc(directions, test)), largest.p_value))
+    of_all = np.zeros_like(new.covariance)
+    of_all[np.ix_(b, b)] = covariance
     return Epoch(
         fits=p_value > CHANCE,
         p_value=p_value,
         test=test,
         directions=directions,
+        largest=largest,
+        visible=_visible(dataclasses.replace(new, covariance=of_all)),
         chi2_old=result.likelihood.expand(values, near=result.posterior).chi2,
         chi2_new=result.chi2,
         dof=result.dof,
@@ -169,16 +221,63 @@ def shared_parameters(old: Model, new: Model) -> list[str]:
     return [name for name in new.names if name in free[0] & free[1] and not name.startswith(SKY_AND_STARS)]
 
 
-def chi2_of_change(
-    change: Float[np.ndarray, " k"], covariance: Float[np.ndarray, "k k"], sigma: Float[np.ndarray, " k"]
-) -> tuple[float, int]:
+class _Measured(NamedTuple):
+    """A change in units of `sigma`, for the parameters that were known at all, and V⁻¹ over what was measured of it."""
+
+    change: Float[np.ndarray, " k"]
+    covariance: Float[np.ndarray, "k k"]
+    inverse: Float[np.ndarray, "k k"]
+    directions: int
+
+    @classmethod
+    def of(cls, change: Vector, covariance: Matrix, sigma: Vector) -> _Measured:
+        scaled = covariance / np.outer(sigma, sigma)
+        value, vector = np.linalg.eigh(scaled)
+        good = value > _KNOWN * value[-1]
+        inverse = (vector[:, good] / value[good]) @ vector[:, good].T
+        return cls(change / sigma, scaled, inverse, int(good.sum()))
+
+
+def chi2_of_change(change: Vector, covariance: Matrix, sigma: Vector) -> tuple[float, int]:
     """Δᵀ V⁻¹ Δ over the directions that were measured, and their number; `sigma` sets the scale of each parameter."""
     known = sigma > 0
-    scaled = covariance[np.ix_(known, known)] / np.outer(sigma[known], sigma[known])
-    value, vector = np.linalg.eigh(scaled)
-    good = value > _KNOWN * value[-1]
-    along = vector[:, good].T @ (change[known] / sigma[known])
-    return float(np.sum(along**2 / value[good])), int(good.sum())
+    found = _Measured.of(change[known], covariance[np.ix_(known, known)], sigma[known])
+    return float(found.change @ found.inverse @ found.change), found.directions
+
+
+def largest_change(names: Sequence[str], change: Vector, covariance: Matrix, sigma: Vector) -> LargestChange:
+    """The largest of the changes of single parameters, each by itself and as if nothing else had changed."""
+    known = sigma > 0
+    found = _Measured.of(change[known], covariance[np.ix_(known, known)], sigma[known])
+    each, alone = np.diag(found.covariance), np.diag(found.inverse)
+    z = np.stack(
+        [
+            np.where(each > _LEANS, found.change / np.sqrt(np.where(each > _LEANS, each, 1.0)), 0.0),
+            np.where(
+                alone > 0, (found.inverse @ found.change) / np.sqrt(np.where(alone > 0, alone, 1.0)), 0.0
+            ),
+        ]
+    )
+    way, i = np.unravel_index(np.abs(z).argmax(), z.shape)
+    asked = int((each > _LEANS).sum() + (alone > 0).sum())
+    p = float(special.chdtrc(1, z[way, i] ** 2))
+    corrected = float(-np.expm1(asked * np.log1p(-p))) if p < 1.0 else 1.0
+    name = np.asarray(names)[known][i]
+    return LargestChange(str(name), float(z[way, i]), bool(way), asked, corrected)
+
+
+def _visible(changed: Calibration) -> dict[str, float]:
+    """`SURE` standard errors of each matrix element, median over the field, per cent; covariance: that of the change."""
+    (low_x, high_x, low_y, high_y), side = changed.field, 4
+    x, y = (
+        part.ravel()
+        for part in np.meshgrid(np.linspace(low_x, high_x, side), np.linspace(low_y, high_y, side))
+    )
+    name = str(np.unique(changed.exposures.filter)[-1])
+    _, covariance = changed.matrix(x, y, changed.usual_settings(1, name))
+    error = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
+    elements = matrix_elements(len(changed.model.template.arms))
+    return dict(zip(elements, (100.0 * SURE * np.median(error, axis=0)).tolist(), strict=True))
 
 
 def _star_errors(old: Calibration, new: Calibration) -> dict[str, dict[str, float]]:

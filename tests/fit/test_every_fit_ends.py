@@ -1,0 +1,91 @@
+"""A model that cannot explain its data: bounded work, the best place so far with its verdict, and what to do."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from small_run import SEED, SMALL
+
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.refit import refit
+from walop_jax.fit.search import FAR_OFF, most_passes
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.simulation.simulate import simulate
+
+
+def as_it_is(calset, rng):
+    return calset
+
+
+def with_cameras_exchanged(calset, rng):
+    block = calset.intensities.block(0, len(calset.points))
+    order = [2, 1, 0, 3]
+    block = dataclasses.replace(block, counts=block.counts[..., order], sigma=block.sigma[..., order])
+    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
+
+
+def with_random_intensities(calset, rng):
+    block = calset.intensities.block(0, len(calset.points))
+    counts = rng.uniform(1e5, 1e6, block.counts.shape)
+    block = dataclasses.replace(block, counts=counts, sigma=np.sqrt(counts))
+    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
+
+
+def with_scrambled_angles(calset, rng):
+    e = calset.exposures
+    angle, there = e.clp_angle.copy(), np.flatnonzero(e.clp_in)
+    angle[there] = rng.permutation(angle[there])
+    return dataclasses.replace(calset, exposures=dataclasses.replace(e, clp_angle=angle))
+
+
+def from_elsewhere(calset, rng):
+    return dataclasses.replace(calset, instrument="WALOP-NORTH")
+
+
+MISTAKES = [
+    with_cameras_exchanged,
+    with_random_intensities,
+    with_scrambled_angles,
+    pytest.param(from_elsewhere, marks=pytest.mark.long),
+]
+
+
+@pytest.fixture
+def passes(monkeypatch):
+    """How often the data are gone through."""
+    count, plain = [0], Likelihood.data_terms
+
+    def counted(self, *args, **options):
+        count[0] += 1
+        return plain(self, *args, **options)
+
+    monkeypatch.setattr(Likelihood, "data_terms", counted)
+    return count
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_bad_data_cost_no_more_passes_than_they_are_worth(mistake, passes):
+    calset = mistake(simulate(SMALL, seed=SEED).calset, np.random.default_rng(1))
+    model, told = base_model(calset), []
+    result = refit(calset, model, progress=told.append)
+    assert passes[0] <= most_passes(model)
+    assert not result.trusted
+    assert result.chi2 > FAR_OFF * result.dof
+    assert result.converged or "walop-jax diagnose" in result.minimum.message
+    steps = [line for line in told if "step" in line]
+    assert all(" of at most " in line and "χ²/dof" in line for line in steps)
+    assert any(f"start {result.starts} of 5" in line for line in steps)
+    # The best of all places looked at is what comes back.
+    scaled = result.posterior.noise_scale
+    at_start = Likelihood.of(calset, model).expand(model.start, scaled)
+    assert result.posterior.objective <= at_start.objective
+
+
+def test_good_data_cost_what_they_did(passes):
+    calset = simulate(SMALL, seed=SEED).calset
+    result = refit(calset)
+    assert result.explains_data
+    assert passes[0] <= 7
