@@ -85,11 +85,11 @@ class Epoch(Displayed):
     """The verdict: `fits` unless the change is one that chance makes in less than 1 % of cases.
 
     `largest` is the change that stands out most by itself, `p_value` the chance of it and of the sum taken together.
-    `visible` is the smallest change of each element of the matrix (per cent, median over the field) that would have been
-    seen with certainty, five standard errors of it. `moved` sorts parameters by |z|; `chi2_old` is of the new data with the old instrument; `star_errors` are
-    statistics (per cent) of what stars would be off, outside the zone without u, if the old calibration
-    were used and the new one true. `new_trusted` and `warnings` are what the fit of the new set is worth: where it is
-    not to be trusted, neither are the parameters that seem to have moved.
+    `visible` is the smallest change of each element of the matrix (per cent, median over the field) that would have
+    been seen with certainty, five standard errors of it. `moved` sorts parameters by |z|; `chi2_old` is of the new data
+    with the old instrument; `star_errors` are statistics (per cent) of what stars would be off, outside the zone
+    without u, if the old calibration were used and the new one true. `new_trusted` and `warnings` are what the fit of
+    the new set is worth: where it is not to be trusted, neither are the parameters that seem to have moved.
     """
 
     fits: bool
@@ -267,7 +267,7 @@ def largest_change(names: Sequence[str], change: Vector, covariance: Matrix, sig
 
 
 def _visible(changed: Calibration) -> dict[str, float]:
-    """`SURE` standard errors of each matrix element, median over the field, per cent; covariance: that of the change."""
+    """`SURE` errors of each matrix element, median over the field, per cent; the covariance is that of the change."""
     (low_x, high_x, low_y, high_y), side = changed.field, 4
     x, y = (
         part.ravel()
