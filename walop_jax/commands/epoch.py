@@ -59,7 +59,7 @@ def epoch(
         result = examined(fit_like(held.calibration, calset))
         found = compared(held.calibration, result)
     lacking = None
-    if not found.new_trusted and calibration.verdict.trusted and (output is not None or job.typed):
+    if not found.new_trusted and held.calibration.verdict.trusted and (output is not None or job.typed):
         job.tell("looking for what the new fit lacks", "lacking")
         # Other readings of the data have been tried when its fit was examined.
         lacking = diagnose(

@@ -124,15 +124,15 @@ def _guarded(command: Command[Any], given: dict[str, Any]) -> None:
     With the environment variable WALOP_JAX_DEBUG set, errors keep their traceback.
     """
     try:
-        _run(command, given)
-        sys.stdout.flush()
+        with interrupts_answered(_interrupted):
+            _run(command, given)
+            sys.stdout.flush()
     except BrokenPipeError:
         # The reader of stdout has gone (`| head`): not an error, and Python must not complain at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(1) from None
     except KeyboardInterrupt:
-        complain("interrupted; nothing was left half-written")
-        raise typer.Exit(INTERRUPTED) from None
+        raise typer.Exit(_interrupted()) from None
     except MemoryError:
         complain("out of memory: use fewer field points, or a machine with more")
         raise typer.Exit(1) from None
@@ -144,14 +144,19 @@ def _guarded(command: Command[Any], given: dict[str, Any]) -> None:
         raise typer.BadParameter(str(error), param_hint=option) from None
     except Exception as error:
         if _is_interrupt(error):  # that came while a compiled library was imported
-            complain("interrupted; nothing was left half-written")
-            raise typer.Exit(INTERRUPTED) from None
+            raise typer.Exit(_interrupted()) from None
         if os.environ.get(DEBUG_VARIABLE) or type(error).__module__.split(".")[0] in ("typer", "click"):
             raise
         expected = isinstance(error, ValueError | OSError)
         hint = "" if expected else f" (unexpected {type(error).__name__}; {DEBUG_VARIABLE}=1 shows where)"
         complain(f"{error}{hint}")
         raise typer.Exit(1) from None
+
+
+def _interrupted() -> int:
+    """Say that the command was interrupted; gives its exit code."""
+    complain("interrupted; nothing was left half-written")
+    return INTERRUPTED
 
 
 def _run(command: Command[Any], given: dict[str, Any]) -> None:
