@@ -10,7 +10,8 @@ from small_run import WITH_PLATE
 
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood import engine, limits, nodes
+from walop_jax.likelihood import engine, limits
+from walop_jax.likelihood import field_table as nodes
 from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.chebyshev import Rectangle

@@ -1,7 +1,7 @@
 """A calibration set of some hundred field points that says what all pixels of whole frames say.
 
 Method      Blocks of cells are given n × n field points, at the nodes of the Gauss–Legendre rule; the sums of the cells
-            (`cell_sums.py`) are shared between these by their Lagrange polynomials. At each point counts and errors are
+            (`frames.py`) are shared between these by their Lagrange polynomials. At each point counts and errors are
             made from the sums there: with Ω = Σ F²w² and F the mean flux
                 N = F (u + Ω⁻¹ g),   σ = F Ω^(−½),
             so that the usual likelihood of these points has the gradient and the matrix of the pixels.

@@ -8,16 +8,14 @@ from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.expansion import Census, DataTerms, OpticsUsed, Posterior
-from walop_jax.likelihood.field_table import FieldTable
+from walop_jax.likelihood.field_table import FieldTable, accurate_nodes
 from walop_jax.likelihood.layout import Layout
-from walop_jax.likelihood.nodes import accurate_nodes
 from walop_jax.likelihood.points import MeasuredPoints, measured_points
-from walop_jax.likelihood.priors import PriorRows, prior_rows
 from walop_jax.likelihood.runner import Runner, SlabSums
 from walop_jax.model.compiled import require_double_precision
 from walop_jax.model.dependence import optical_indices
@@ -29,13 +27,54 @@ from walop_jax.model.specification import Model
 Vector = Float[np.ndarray, " n"]
 
 
+@dataclasses.dataclass(frozen=True)
+class PriorRows:
+    """Rows (θ − mean) / width of the parameters at `index`; those that are not `known` are weak pulls.
+
+    A free parameter has one row: its prior if it has one, else the weak pull to its start value, if it has that. A
+    frozen one has none, for it does not vary; nor has a tied one, whose value is that of another: what is known of that
+    one is said there, and once.
+    """
+
+    index: Int[np.ndarray, " k"]
+    mean: Float[np.ndarray, " k"]
+    width: Float[np.ndarray, " k"]
+    known: Bool[np.ndarray, " k"]
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def residuals(self, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " k"]:
+        """The rows at a full vector of values."""
+        return (values[self.index] - self.mean) / self.width
+
+    def jacobian(self, selection: Float[np.ndarray, "n f"]) -> Float[np.ndarray, "k f"]:
+        """Derivatives of the rows with respect to the free parameters; `selection` is that of the model."""
+        return selection[self.index] / self.width[:, None]
+
+
+def prior_rows(model: Model) -> PriorRows:
+    """All that a model says of its free parameters beforehand."""
+    rows = []
+    for i in model.free.tolist():
+        p = model.parameters[i]
+        if p.prior is not None:
+            rows.append((i, *p.prior, True))
+        elif p.loose is not None:
+            rows.append((i, p.start, p.loose, False))
+    index, mean, width, known = zip(*rows, strict=True) if rows else ((), (), (), ())
+    return PriorRows(
+        np.array(index, int), np.array(mean, float), np.array(width, float), np.array(known, bool)
+    )
+
+
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Likelihood:
     """The joint likelihood of one calibration set under one model.
 
     Field points are handled in chunks of equal size, so that a set larger than memory goes through the same code
     (`likelihood/points.py`), several of them at a time (`likelihood/runner.py`). Where `layout` says so, `expand`
-    and `residuals` solve the optics on Chebyshev nodes only (`likelihood/nodes.py`). Immutable: what a pass
+    and `residuals` solve the optics on Chebyshev nodes only (`likelihood/field_table.py`). Immutable: what a pass
     finds out beside its sums comes back with them (`Posterior`).
     """
 

@@ -4,7 +4,7 @@ Equation    The counts of light of unit flux, u, and their derivatives J are smo
             Lagrange polynomials of n × n Chebyshev nodes the half gradient of χ² and its Gauss–Newton matrix are
                 −Σ_p J(x_p)ᵀ g_p = −Σ_i J(x_i)ᵀ g_i,   g_i = Σ_p ℓ_i(x_p) g_p,
                 Σ_p J(x_p)ᵀ K_p J(x_p) = Σ_i J(x_i)ᵀ K_i J(x_i),   K_i = Σ_p ℓ_i(x_p) K_p,
-            for J that are polynomials of degree n − 1, or half of it; g and K as in `cell_sums`.
+            for J that are polynomials of degree n − 1, or half of it; g and K as in `frames`.
 Limits      g is that of the pixels; K is made from Σ F²w² of cells and u in their middle, which leaves out what falls
             with the fourth power of their side (Richardson 1911): some 10⁻⁴ of a standard error in its size.
 Source      Trefethen 2013, Approximation Theory and Approximation Practice, ch. 2–5 (interpolation on such nodes).
