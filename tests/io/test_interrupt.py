@@ -7,6 +7,11 @@ import subprocess
 import sys
 import time
 
+# A shell starts what it runs in the background with interrupts ignored.
+HEARD = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+"""
 LONG_WORK = """
 import hashlib, sys
 from walop_jax.io.interrupt import interrupts_answered
@@ -17,7 +22,7 @@ def end():
 
 with interrupts_answered(end):
     print("at work", flush=True)
-    hashlib.pbkdf2_hmac("sha256", b"one call", b"without an instruction of Python", 300_000_000)
+    hashlib.pbkdf2_hmac("sha256", b"one call", b"without an instruction of Python", 100_000_000)
 """
 QUICK_WORK = """
 import time
@@ -35,7 +40,7 @@ for _ in range(2):
 
 def started(text):
     process = subprocess.Popen(
-        [sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", HEARD + text], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     assert process.stdout.readline() == "at work\n"
     return process

@@ -205,12 +205,12 @@ def _far_off(likelihood: Likelihood, found: Found) -> Found:
 
     def rescaled(found: Found) -> Found:
         for _ in range(MAXIMUM_RESCALINGS):
-            scale = float(np.sqrt(max(found.misfit, 1.0))) if found.misfit > FAR_OFF else 1.0
+            scale = float(np.sqrt(found.misfit)) if found.misfit > FAR_OFF else 1.0
             if left <= 0 or abs(scale / found.posterior.noise_scale - 1.0) < 0.1:
                 break
-            found = search(
-                f"the model is far off; with errors × {scale:.3g}", found.values, scale, MAXIMUM_STEPS
-            )
+            # Half of what is left at most: the other orders are to be tried as well.
+            label = f"the model is far off; errors × {scale:.3g}"
+            found = search(label, found.values, scale, max(FIRST_STEPS, left // 2))
         return found
 
     found = rescaled(found)
