@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from handmade_run import listed
+from scipy import stats
 from small_run import SMALL
 from typer.testing import CliRunner
 

@@ -29,7 +29,7 @@ def cite(
     from walop_jax.calibration.calibration import model_of_product
     from walop_jax.calibration.from_file import product_path
     from walop_jax.calibration.product import read_product
-    from walop_jax.fit import solver
+    from walop_jax.fit import minimise
     from walop_jax.fit.model_builder import model_without_data
     from walop_jax.model.bibtex import bibtex as entries
     from walop_jax.model.build import nominal_instrument
@@ -41,7 +41,7 @@ def cite(
         path = product_path(run)
         with errors_naming(path):
             model = model_of_product(read_product(path), catalogue_of(effects))
-    found = (*references(model), Reference("fit", solver.SOURCE))
+    found = (*references(model), Reference("fit", minimise.SOURCE))
     lines = [f"{entry.what}: {entry.source}" for entry in found]
     return Outcome(
         found,
