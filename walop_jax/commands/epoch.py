@@ -36,7 +36,8 @@ def epoch(
 
     Lists the parameters by how far they have moved, tests all of them together, and says how far off stars would be if
     the old calibration were still used. The new fit is that of the old model: plates, effects, priors and what is
-    held. Where that does not explain the new data, what is missing is looked for as walop-jax diagnose does.
+    held. Where that does not explain the new data and did explain the old ones, what is missing is looked for as
+    walop-jax diagnose does.
 
     Exit code 0 only where the old calibration still holds; 3 where something has moved, or where the new fit is not
     to be trusted.
