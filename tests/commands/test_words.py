@@ -10,7 +10,7 @@ from walop_jax.commands import COMMANDS
 from walop_jax.commands.program import step_counter
 from walop_jax.io.heartbeat import Stage
 
-RANDOM = ("simulate", "sample", "diagnose", "limits", "compare")
+RANDOM = ("simulate", "sample", "diagnose", "limits", "compare", "plan")
 
 
 @pytest.mark.parametrize("name", COMMANDS)

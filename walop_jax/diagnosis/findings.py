@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -235,14 +236,6 @@ class Diagnosis(Displayed):
                 texts = value_and_error(value, sigma)
                 rows.append((step.effect, name, *texts, unit, f"{step.p_value:.1g}"))
         before, after = (fit.chi2 / max(fit.dof, 1) for fit in (self.before, self.after))
-        notes = [
-            f"{s.effect}: these data cannot tell it from {', '.join((*s.equivalent, *s.nameless))}"
-            for s in self.steps
-            if s.equivalent or s.nameless
-        ]
-        notes += [f"{told.words}: {told.tested_by}" for s in self.steps for told in s.told]
-        notes += [self.unexplained.description] if self.unexplained is not None else []
-        notes += [self.caution] if self.caution else []
         return Display(
             title=f"Diagnosis: {self.verdict}",
             facts=(
@@ -252,7 +245,7 @@ class Diagnosis(Displayed):
             ),
             head=("effect", "parameter", ">value", ">error", "unit", ">p"),
             rows=tuple(rows),
-            notes=tuple(notes),
+            notes=tuple(sentences(document(self))),
         )
 
 
@@ -330,6 +323,63 @@ def _step(step: Step) -> dict[str, Any]:
             if math.isfinite(value)
         },
     }
+
+
+def sentences(found: Mapping[str, Any]) -> Iterator[str]:
+    """What stands beside the numbers of a diagnosis, from the content of diagnosis.json: `print`, the command and the
+    page say the same."""
+    for step in found["steps"]:
+        yield from _of_step(step)
+    left = found.get("unexplained")
+    if left:
+        yield left["description"]
+        if left.get("free_form"):
+            yield (
+                f"added as a free-form term ({', '.join(left['free_form'])}): χ² {left['chi2_before']:.1f} → "
+                f"{left['chi2_after']:.1f}"
+            )
+    choices = found.get("choices", ())
+    fitted = [one for one in choices if one["better_by"] is not None]
+    if choices:
+        yield f"{len(choices)} other descriptions of the instrument were compared, {len(fitted)} of them fitted"
+    for one in fitted:
+        sense = "smaller" if one["better_by"] > 0 else "larger"
+        yield f"{one['change']}: χ² {sense} by {abs(one['better_by']):.4g}"
+    for alike in found.get("classes", ()):
+        yield (
+            f"these data cannot tell {alike['effect']} from {', '.join(alike['equivalent'])}; to tell them apart: "
+            f"{alike['separated_by']}"
+        )
+    if found.get("cannot_be_tested"):
+        yield f"cannot be tested with these data: {', '.join(found['cannot_be_tested'])}"
+    if found.get("caution"):
+        yield found["caution"]
+
+
+def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
+    """The sentences about one effect that was found."""
+    name = step["effect"]
+    for told in step.get("sentences", ()):
+        yield f"{told['words']}: {told['tested_by']}"
+    for other in step.get("alternatives", ()):
+        yield f"{name}: equally consistent with {other}"
+    held = ""
+    if step.get("heldout_before") is not None and step.get("heldout_after") is not None:
+        means = f"{step['heldout_before']:.4f} → {step['heldout_after']:.4f}"
+        held = f"; held out ({step.get('heldout_scheme', '')}) {means}"
+    yield f"{name}: χ² {step['chi2_before']:.1f} → {step['chi2_after']:.1f}{held}"
+    if step.get("change_of_qu") is not None:
+        size = f"{100 * step['change_of_qu']:.2g} %"
+        yield f"{name} changes calibrated q and u by up to {size}{', which is negligible' * bool(step['negligible'])}"
+    if step.get("where"):
+        yield f"{name}: " + "; ".join(
+            f"{key.replace('_', ' ')}: {value}" for key, value in step["where"].items()
+        )
+    rivals = (*step.get("equivalent", ()), *step.get("nameless", ()))
+    if rivals:
+        yield f"{name}: these data cannot tell it from {', '.join(rivals)}"
+    if rivals and step.get("separated_by"):
+        yield f"to tell them apart: {step['separated_by']}"
 
 
 def document(diagnosis: Diagnosis) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from walop_jax.diagnosis.findings import sentences
 from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import fail
@@ -87,6 +88,7 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         "summary": summary,
         "ratio": summary["chi2"] / max(summary["dof"], 1),
         "diagnosis": diagnosis,
+        "said": [] if diagnosis is None else tuple(sentences(diagnosis)),
         "label": label,
         "sentence": sentence,
         "fit_sentence": ": ".join(verdict_of_fit(summary)),

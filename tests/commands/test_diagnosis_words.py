@@ -1,0 +1,73 @@
+"""What a diagnosis found is told by `print`, by the command and by the page in the same sentences."""
+
+from __future__ import annotations
+
+import dataclasses
+import html
+import json
+
+import handmade_run
+import numpy as np
+import pytest
+from small_run import small_fit
+
+from walop_jax.diagnosis.design import HeldOut
+from walop_jax.diagnosis.findings import Alike, Diagnosis, Step, Told, Unexplained, document
+
+
+@pytest.fixture(scope="module")
+def found() -> Diagnosis:
+    fit = small_fit().judged()
+    held = HeldOut("exposures", np.ones(2), np.ones(2, int))
+    told = Told(
+        "turn of polariser * x", "turn", "of polariser", ("grows with x",), 0.1, 0.01, "deg",
+        "the polariser is turned, more towards +X", "turn the polariser by half a turn",
+    )  # fmt: skip
+    step = Step(
+        effect="described",
+        parameters={"turn": (0.1, 0.01, "deg")},
+        score=100.0,
+        p_value=1e-9,
+        log_bayes=40.0,
+        chi2_before=2000.0,
+        chi2_after=1000.0,
+        heldout_before=held,
+        heldout_after=held,
+        change_of_qu=0.01,
+        equivalent=("clp_zero",),
+        separated_by="a polarised standard",
+        where={"kind": "clp 100%"},
+        told=(told,),
+        nameless=("a step of the polariser in exposure 4",),
+        alternatives=("camera = 2",),
+    )
+    left = Unexplained(1e-5, "patterns over the field are left", (), ("gain",), 1000.0, 900.0)
+    return Diagnosis(
+        "effect_found", (step,), (), (), ("etalon",), left, 1e-9, 0.5, fit, fit, 1.0, 29,
+        classes=(Alike("hwp1_axis", ("hwp2_axis",), "stars in the other half"),),
+    )  # fmt: skip
+
+
+def test_print_command_and_page_say_the_same(found: Diagnosis, call, calset_file, tmp_path, monkeypatch):
+    monkeypatch.setattr("walop_jax.diagnosis.workflow.diagnose", lambda *args, **how: found)
+    monkeypatch.setattr("walop_jax.diagnosis.figure_data.figure_data", lambda found: None)
+    monkeypatch.setattr(
+        "walop_jax.diagnosis.figure_file.write_figure_data", lambda path, data: path.write_bytes(b"")
+    )
+    run = handmade_run.make_refit(tmp_path / "run")
+    (run / "diagnosis.json").write_text(json.dumps(document(dataclasses.replace(found))))
+    shown = call("diagnose", calset_file, "-o", tmp_path / "made").stdout
+    call("report", run)
+    page = html.unescape((run / "report.html").read_text())
+    for text in (
+        "the polariser is turned, more towards +X: turn the polariser by half a turn",
+        "these data cannot tell it from clp_zero, a step of the polariser in exposure 4",
+        "to tell them apart: a polarised standard",
+        "equally consistent with camera = 2",
+        "added as a free-form term (gain): χ² 1000.0 → 900.0",
+        "these data cannot tell hwp1_axis from hwp2_axis; to tell them apart: stars in the other half",
+        "cannot be tested with these data: etalon",
+        "χ² 2000.0 → 1000.0",
+    ):
+        for said in (repr(found), shown, page):
+            assert text in said
