@@ -372,7 +372,9 @@ class _Block:
         sites = [np.stack([one, -one], 1)[:, : self.sites] for one in (x, y)]
         padded = np.pad(np.array(every), (0, -len(every) % GAPS_TOGETHER), mode="edge")
         parts = [
-            np.asarray(_fringes_at(self.of.instrument, self.of.fringe_plan, jnp.asarray(some), *sites))
+            np.asarray(
+                _fringes_at(self.of.instrument, self.of.fringe_plan, jnp.asarray(some), *sites, once=True)
+            )
             for some in np.split(padded, len(padded) // GAPS_TOGETHER)
         ]
         whole = np.concatenate(parts, axis=3)
