@@ -187,6 +187,13 @@ class _Application:
         derivative = np.add.reduceat(-derivative, first)
         root = derivative @ vectors.root
         calibration = root @ root.swapaxes(1, 2)
+        structure = vectors.calibration.verdict.structure
+        if structure:
+            # A gain of every camera at the place of the star, the same in all of its rows.
+            lit = np.einsum("rks,rs->rk", there, s)
+            each = calibration_shift(found.gain, lit[:, :, None] * np.eye(vectors.cameras), star)
+            square = structure.gain**2 + structure.response**2 * np.sum(found.qu**2, axis=1)
+            calibration = calibration + square[:, None, None] * (each @ each.swapaxes(1, 2))
 
         def change_of(weights: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r k"]:
             return np.einsum("rc,rcks,rs->rk", weights, spectra, s, optimize=True)
