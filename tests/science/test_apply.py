@@ -16,7 +16,7 @@ from walop_jax.data import DataError
 from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
-from walop_jax.fit.verdict import Quality, Structure
+from walop_jax.fit.verdict import Hidden, Quality, Structure
 from walop_jax.model.build import nominal_instrument
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, make_model, with_effects
@@ -614,3 +614,29 @@ def apply_plain(vectors, calibration, table, tmp_path, monkeypatch):
     """Covariance from the calibration alone, without any structure."""
     monkeypatch.setattr(application, "AnalysisVectors", lambda _: vectors)
     return apply(calibration, read(table, tmp_path)).calibration
+
+
+def test_structure_and_hidden_mistakes_of_the_calibration_reach_the_stars(vectors, calibration, tmp_path):
+    """Gains of field points, 2·10⁻³ in every camera: pulls of unit width. What could hide is what it does to a star."""
+    rng = np.random.default_rng(4)
+    table, qu = stars(vectors, 600, plate=(None, 22.5), flux=4e9)
+    gains = np.tile(1.0 + 2e-3 * rng.standard_normal((600, 4)), (2, 1))
+    table["N"] = np.asarray(table["N"]) * gains
+    verdict = dataclasses.replace(calibration.verdict, structure=Structure(gain=2e-3))
+    change = np.zeros((2, len(calibration.values)))
+    index = calibration.model.index("half2.efficiency")
+    change[1, index] = 1e-3
+    hidden = Hidden(("nothing", "efficiency"), (1.0, 1.0), ("", ""), change)
+    known = dataclasses.replace(calibration, verdict=verdict, hidden=hidden)
+    found = apply(known, read(table, tmp_path))
+    assert found.check.holds
+    pull = (found.qu - qu) / np.sqrt(np.einsum("sii->si", found.covariance))
+    assert np.mean(np.abs(pull) < 1.0) == pytest.approx(0.683, abs=0.04)
+    assert np.mean(np.abs(pull) < 1.96) == pytest.approx(0.954, abs=0.02)
+    values = calibration.values.copy()
+    values[index] += 1e-3
+    clean, _ = stars(vectors, 30)
+    other = apply(dataclasses.replace(calibration, values=values), read(clean, tmp_path))
+    plain = apply(known, read(clean, tmp_path))
+    np.testing.assert_allclose(plain.hidden, np.abs(other.qu - plain.qu), rtol=0.02, atol=1e-6)
+    assert np.isnan(apply(calibration, read(clean, tmp_path)).hidden).all()

@@ -47,11 +47,12 @@ class Stars:
     """Stokes parameters of the stars of a catalogue, in the order of `Catalogue.star`.
 
     On the sky (equatorial frame) where the catalogue has a ROTATOR, in the instrument frame elsewhere. `covariance`
-    is the sum of `photon`, `calibration` (parameters of the optics and of the detectors), `spectrum`: a star without
-    TEFF has the colour of a population (`COOL`, `HOT`), and `changed`: what the whole catalogue says has changed since
-    the calibration. `colour` is the error of (q, u) if TEFF were ignored;
-    without TEFF, half the difference between stars of 3500 K and 10 000 K. `flag` holds bits of `Quality`; `rows`
-    counts the rows of a star. `check` is what all stars say together.
+    is the sum of `photon`, `calibration` (parameters of the optics and of the detectors), `spectrum`: a star
+    without TEFF has the colour of a population (`COOL`, `HOT`), and `changed`: what the whole catalogue says has
+    changed since the calibration. `colour` is the error of (q, u) if TEFF were ignored; without TEFF, half the
+    difference between stars of 3500 K and 10 000 K. `hidden` is the largest shift of q and u by a single mistake
+    that the data of the calibration would not have shown (NaN: nobody asked). `flag` holds bits of `Quality`;
+    `rows` counts the rows of a star. `check` is what all stars say together.
     """
 
     qu: Float[np.ndarray, "s 2"]
@@ -60,6 +61,7 @@ class Stars:
     spectrum: Float[np.ndarray, "s 2 2"]
     changed: Float[np.ndarray, "s 2 2"]
     colour: Float[np.ndarray, "s 2"]
+    hidden: Float[np.ndarray, "s 2"]
     chi2: Float[np.ndarray, " s"]
     dof: Int[np.ndarray, " s"]
     rows: Int[np.ndarray, " s"]
@@ -218,6 +220,7 @@ class _Application:
             spectrum=spectrum,
             changed=nothing,
             colour=shift(change_of(_ignored_colour(teff))),
+            hidden=_hidden(vectors, derivative),
             chi2=found.chi2,
             dof=found.dof,
             rows=np.diff(first, append=len(rows)),
@@ -269,6 +272,7 @@ class _Application:
             basis=vectors.basis(x, y),
             colour=scale * block.colour[r],
             together=vectors.instrument.cameras.together,
+            structure=vectors.calibration.verdict.structure.gain,
         )
         return [left]
 
@@ -513,6 +517,14 @@ def _detector_slopes(
         along = jnp.zeros_like(values).at[vectors.parameters[place]].set(1.0)
         _, change = jax.jvp(lambda v: reported(v, true), (values,), (along,))
         yield int(place), -np.asarray(change / slope)
+
+
+def _hidden(vectors: AnalysisVectors, derivative: Float[np.ndarray, "s 2 n"]) -> Float[np.ndarray, "s 2"]:
+    """Largest shift of q and u by one of the mistakes that would not have been found; NaN where nobody asked."""
+    hidden = vectors.calibration.hidden
+    if hidden is None or not len(hidden):
+        return np.full(derivative.shape[:2], np.nan if hidden is None else 0.0)
+    return np.abs(derivative @ hidden.changes[:, vectors.parameters].T).max(axis=2)
 
 
 def _rotator_zero(vectors: AnalysisVectors) -> tuple[float, Float[np.ndarray, " n"]]:

@@ -27,15 +27,16 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.rounding import with_error, with_minus_sign
 from walop_jax.science.star_residuals import (
+    CROWDED,
     NO_NOISE,
     Scale,
     StarResiduals,
     chance_of_scale,
-    colour_variance,
     eliminated,
     is_off,
     noise_scale,
     normal_matrix,
+    own_variance,
     shared_by_rows,
 )
 
@@ -314,7 +315,8 @@ class _Search:
         root: Float[np.ndarray, "n n"],
     ) -> None:
         self.stars = stars
-        self.variance = colour_variance(stars)
+        self.variance = own_variance(stars)
+        self.crowded = bool(np.median(self.variance) > CROWDED)
         self.root = root[:, np.abs(root).max(axis=0, initial=0.0) > 0]
         self.edge = max(float(np.abs(np.concatenate([stars.x, stars.y])).max()), 1e-9)
         times = stars.time[np.isfinite(stars.time)]
@@ -376,7 +378,7 @@ class _Search:
         rows = shared_by_rows(stars, residual, self.variance)
         known = self.asked + 2
         alarm = ALARM / known
-        single = noise.value if noise.value > 1 or is_off(noise, alarm) else 1.0
+        single = noise.value if noise.value > 1 or (is_off(noise, alarm) and not self.crowded) else 1.0
         several = single
         if rows is not None and _chance_beside(rows, noise) < alarm:
             several = max(single, rows.value)
@@ -405,13 +407,13 @@ class _Search:
             answers = self._beside(look.matrix, look.score, chosen)
         changes = tuple(self._change(look, sizes, chosen, n) for n in chosen)
         noise, rows = look.noise, look.rows
-        rows_p = 1.0 if rows is None else _chance_beside(rows, noise)
+        rows_p = 1.0 if rows is None or self.crowded else _chance_beside(rows, noise)
         found = CatalogueCheck(
             stars=len(self.stars.photon),
             rows_used=len(self.stars),
             asked=self.asked + 2,
             noise=noise.value,
-            noise_p=chance_of_scale(noise),
+            noise_p=1.0 if self.crowded else chance_of_scale(noise),
             rows=None if rows is None else rows.value,
             rows_p=rows_p,
             scale=(1.0, 1.0),

@@ -31,6 +31,8 @@ from walop_jax.likelihood.flux import Sharing, project_flux
 from walop_jax.likelihood.linear import through_series
 
 TRIMMED = 1e-3
+CROWDED = 1.5
+"""Variance over that of the noise from which scatter says nothing of N_ERR: most of it is structure, or colours."""
 NO_NOISE = 1e-4
 """χ² per degree of freedom below which counts hold no noise at all: they were computed, not measured."""
 _ROUNDS = 50
@@ -47,7 +49,7 @@ class StarResiduals:
     in degrees, `time` in days (NaN: not known). `plain` and `throughput` are derivatives of the model over σ to
     parameters and to the throughputs of the cameras, `basis` the terms of their series at the row; `colour` the changes
     of the model for stars without TEFF: mean and standard deviation of their colours. `together` is 1 where two
-    cameras share a flux (None: all do).
+    cameras share a flux (None: all do); `structure` is the rms gain of a camera at a field point.
     """
 
     star: Int[np.ndarray, " r"]
@@ -64,6 +66,7 @@ class StarResiduals:
     basis: Float[np.ndarray, "r t"]
     colour: Float[np.ndarray, "r k 2"]
     together: Float[np.ndarray, "k k"] | None = None
+    structure: float = 0.0
 
     @classmethod
     def joined(cls, parts: list[StarResiduals]) -> StarResiduals:
@@ -71,11 +74,11 @@ class StarResiduals:
         values = {
             f.name: np.concatenate([getattr(p, f.name) for p in parts])
             for f in dataclasses.fields(cls)
-            if f.name not in ("star", "together")
+            if f.name not in ("star", "together", "structure")
         }
         first = np.cumsum([0, *(len(p.photon) for p in parts[:-1])])
         star = np.concatenate([p.star + start for p, start in zip(parts, first, strict=True)])
-        return cls(star=star, together=parts[0].together, **values)
+        return cls(star=star, together=parts[0].together, structure=parts[0].structure, **values)
 
     def __len__(self) -> int:
         return len(self.star)
@@ -106,7 +109,7 @@ class StarResiduals:
         cut = {
             f.name: getattr(self, f.name)[rows]
             for f in dataclasses.fields(self)
-            if f.name not in ("star", "photon", "together")
+            if f.name not in ("star", "photon", "together", "structure")
         }
         return StarResiduals(
             star=self.star[rows] - start, photon=self.photon[stars], together=self.together, **cut
@@ -141,13 +144,16 @@ class StarResiduals:
         return np.where(self.root > 0, free[0] - np.einsum("rik,ri->rk", self.tangent, moved), 0.0)
 
 
-def colour_variance(stars: StarResiduals) -> Float[np.ndarray, " s"]:
-    """Variance of residuals over that of the noise, where colours that are unknown star by star add to it; else 1."""
+def own_variance(stars: StarResiduals) -> Float[np.ndarray, " s"]:
+    """Variance of residuals over that of noise: unknown colours and structure of the field add to it."""
     spread = np.zeros(len(stars.photon))
-    if stars.colour.any():
-        for n in range(stars.colour.shape[-1]):
-            spread += np.add.reduceat(np.sum(stars.left(stars.colour[..., n]) ** 2, axis=1), stars.first)
-    return 1.0 + spread / np.maximum(stars.dof, 1)
+    columns = [stars.colour[..., n] for n in range(stars.colour.shape[-1])] if stars.colour.any() else []
+    if stars.structure > 0:
+        columns += [stars.structure * stars.model * each for each in np.eye(stars.model.shape[1])]
+    for column in columns:
+        spread += np.add.reduceat(np.sum(stars.left(column) ** 2, axis=1), stars.first)
+    # Gains of the cameras make fewer independent residuals than a star of several rows has.
+    return 1.0 + spread / np.clip(stars.dof, 1, stars.model.shape[1] - 1)
 
 
 Columns = Callable[[StarResiduals], Float[np.ndarray, "r k c"]]

@@ -38,6 +38,14 @@ def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) ->
         "U_PHOTON": (photon[:, 1], "the share of the photons in U_ERR"),
         "Q_COLOUR": (stars.colour[:, 0], "error of Q if TEFF is ignored"),
         "U_COLOUR": (stars.colour[:, 1], "error of U if TEFF is ignored"),
+        "Q_HIDDEN": (
+            stars.hidden[:, 0],
+            "largest shift of Q by a mistake that calibration data would not show",
+        ),
+        "U_HIDDEN": (
+            stars.hidden[:, 1],
+            "largest shift of U by a mistake that calibration data would not show",
+        ),
         "CHI2": (stars.chi2, "chi squared of the rows of the star"),
         "DOF": (stars.dof.astype(np.int32), "degrees of freedom of CHI2"),
         "NROWS": (stars.rows.astype(np.int32), "rows that were combined"),

@@ -37,13 +37,14 @@ from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.science.apply import residuals_of
 from walop_jax.science.catalogue_check import ALARM, RIVAL, threshold
 from walop_jax.science.star_residuals import (
+    CROWDED,
     Scale,
     StarResiduals,
-    colour_variance,
     eliminated,
     is_off,
     noise_scale,
     normal_matrix,
+    own_variance,
 )
 from walop_jax.science.watch_found import History, Suspect, Watch, WatchedChange
 
@@ -115,7 +116,7 @@ def with_rivals(calibration: Calibration) -> Calibration:
     values[old] = calibration.values
     covariance[np.ix_(old, old)] = calibration.covariance
     covariance[new, new] = _CERTAIN**2
-    return dataclasses.replace(calibration, model=model, values=values, covariance=covariance)
+    return dataclasses.replace(calibration, fitted=model, values=values, covariance=covariance, hidden=None)
 
 
 def watch_stars(
@@ -161,7 +162,7 @@ class _Watching:
         self.seen = np.flatnonzero(np.abs(stars.plain).max(axis=(0, 1)) > 0)
         self.optics = [parameters[p] for p in self.seen]
         self.root = root[:, np.abs(root).max(axis=0, initial=0.0) > 0]
-        self.variance = colour_variance(stars)
+        self.variance = own_variance(stars)
         self.time, self.group = grouped(stars.time)
         groups = len(self.time)
         self.histories = [History("step", g) for g in range(groups)]
@@ -184,13 +185,14 @@ class _Watching:
         dof = self.stars.dof.astype(float)
         alarm = ALARM / (len(self.time) + 1)
         whole = noise_scale(chi2, dof)
-        common = whole.value if is_off(whole, alarm) else 1.0
+        least = 1.0 if np.median(self.variance) > CROWDED else 0.0
+        common = max(whole.value, least) if is_off(whole, alarm) else 1.0
         weight, share = np.where(whole.kept, 1.0 / common, 0.0), whole.share.copy()
         for pool in np.unique(self.pool):
             here = np.flatnonzero(self.pool == pool)
             own = noise_scale(chi2[here], dof[here])
             if len(here) >= _FEW and is_off(own, alarm):
-                weight[here], share[here] = np.where(own.kept, 1.0 / own.value, 0.0), own.share
+                weight[here], share[here] = np.where(own.kept, 1.0 / max(own.value, least), 0.0), own.share
             elif len(here) >= _FEW:
                 weight[here], share[here] = np.where(own.kept, 1.0 / common, 0.0), own.share
         return weight / self.variance, share, whole
