@@ -158,6 +158,9 @@ CASES = {
     "apply": Case(lambda g: (g.run, g.stars), lambda g, **k: walop.apply(g.run, g.stars, **k), "s.ecsv"),
     "certify": Case(lambda g: (g.run,), lambda g, **k: walop.certify(g.run, **k)),
     "epoch": Case(lambda g: (g.run, g.calset), lambda g, **k: walop.epoch(g.run, g.calset, **k), "RUN", True),
+    "watch": Case(
+        lambda g: (g.run, g.catalogue), lambda g, **k: walop.watch(g.run, g.stars, **k), "RUN", True
+    ),
     "model": Case(
         lambda g: (g.calset, "--effect", "clp_zero"),
         lambda g, **k: walop.model(g.calset, effect=["clp_zero"], **k),
@@ -234,6 +237,7 @@ def test_files_and_document_are_those_of_the_program(name: str, call, given: Giv
     if made is not None and name not in (
         "compare",
         "epoch",
+        "watch",
         "limits",
         "refit",
         "diagnose",

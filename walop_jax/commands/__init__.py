@@ -25,6 +25,7 @@ COMMANDS = (
     "compare",
     "certify",
     "epoch",
+    "watch",
     "model",
     "instrument",
     "import-zemax",

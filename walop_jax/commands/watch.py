@@ -1,0 +1,73 @@
+"""`walop-jax watch`: when a calibration ceased to hold, as the stars of many nights tell it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command
+from walop_jax.commands.inputs import calibration_of, catalogue_of, table_of
+from walop_jax.commands.options import Effects, PathLike, Product
+
+if TYPE_CHECKING:
+    from walop_jax.science.watch import Watch
+
+CATALOGUES = Argument("FITS, CSV or ECSV with X, Y, N, N_ERR, and MJD.", "CATALOGUE...", list[Path])
+FOLDER = Option("Folder for watch.json, watch.fits and watch.png.", "RUN", Path, "-o")
+FORCE = Option("Also stars whose filter or temperature the calibration does not cover.")
+OUTPUTS = ("watch.json", "watch.fits", "watch.png")
+
+
+@command(stages=("reading", "tabulating", "watching"), writes=OUTPUTS)
+def watch(
+    job: Job,
+    calibration: Product,
+    catalogues: Annotated[Any, CATALOGUES],
+    *,
+    output: Annotated[PathLike | None, FOLDER] = None,
+    effects: Effects = None,
+    force: Annotated[bool, FORCE] = False,
+) -> Outcome[Watch]:
+    """Say when a calibration ceased to hold, from the stars of many nights: no calibration exposures are needed.
+
+    Four cameras have three unknowns: one number of every row is left. Rows of one MJD are an exposure group; catalogues
+    without MJD are a group each, in their order. Steps, drifts and single exposures of every camera are looked for,
+    with their size, date, and the smallest that would have been seen. Stars that are seen at several settings of the
+    plate or the rotator tell which camera it is; others hardly can. What the optics may have done as well is told.
+
+    Exit code 0 only where the calibration still holds, 3 where it does not.
+
+    In Python: a `Watch`; `catalogues` is a path, an astropy table, columns by name, or several of them in a list.
+    """
+    from walop_jax.data.catalogue import read_catalogue
+    from walop_jax.io.errors import errors_naming
+    from walop_jax.reports.watch_figures import watch_figure
+    from walop_jax.science.watch import watch as watched
+
+    job.tell("reading", "reading")
+    held = calibration_of(calibration, catalogue_of(effects))
+    given = list(catalogues) if isinstance(catalogues, list | tuple) else [catalogues]
+    instrument, always_in = held.calibration.model.template.patched(), held.calibration.always_in
+    rows = [read_catalogue(table_of(entry, {}), instrument, always_in=always_in) for entry in given]
+    job.tell("tabulating the analysis vectors", "tabulating")
+    names = ", ".join(str(entry) for entry in given if isinstance(entry, str | os.PathLike))
+    with errors_naming(names or None):
+        found = watched(held.calibration, rows, force=force)
+
+    def files() -> Writers:
+        figure, table = watch_figure(found), found.to_table()
+        return {
+            OUTPUTS[1]: lambda path: table.write(path, format="fits"),
+            OUTPUTS[2]: lambda path: figure.savefig(path, dpi=130),
+        }
+
+    return Outcome(
+        found,
+        lambda: {"product": held.product.content_hash()} | found.document(),
+        lambda: found.display().text(),
+        files,
+        saved_as=OUTPUTS[0],
+        warnings=held.warnings,
+        trusted=found.holds,
+    )
