@@ -15,9 +15,8 @@ from astropy.io import fits
 from command import call, no_cache
 from small_run import SEED, SMALL
 
+from walop_jax.calibration import summary, write_calibration
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.product import write_product
-from walop_jax.calibration.summary import summary
 from walop_jax.data import read_calibration_set, write_calibration_set
 from walop_jax.fit.refit import refit
 from walop_jax.model.effects import effect_by_name
@@ -44,7 +43,7 @@ def fitted(calset_file, tmp_path_factory) -> FittedSet:
     result = refit(calset).judged()
     calibration = Calibration.from_fit(result)
     run.mkdir()
-    write_product(run / "calibration.fits", calibration.to_product())
+    write_calibration(run / "calibration.fits", calibration)
     (run / "summary.json").write_text(json.dumps(summary(result, seconds=1.0)))
     return FittedSet(calset_file, calibration, run)
 

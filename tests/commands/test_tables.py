@@ -11,7 +11,7 @@ import pytest
 from astropy.table import Table
 
 import walop_jax as walop
-from walop_jax.calibration.product import write_product
+from walop_jax.calibration import write_calibration
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import DataError
 from walop_jax.model.specification import effect_context, with_effects
@@ -44,7 +44,7 @@ def test_a_table_of_matrices(call, fitted: FittedSet, points: Path, tmp_path: Pa
     found = json.loads(done.stdout)
     assert (found["rows"], found["trusted"], found["flags"]["32"]) == (3, True, 1)
     assert "points.csv: 1 point(s) beyond the calibrated field" in done.stderr
-    assert found["product"] == fitted.calibration.to_product().content_hash()
+    assert found["product"] == fitted.calibration.content_hash()
     values, covariance = fitted.calibration.matrix(np.array([0.0, 0.2, 0.33]), np.array([0.0, -0.1, 0.0]))
     table = Table.read(tmp_path / "o.fits")
     np.testing.assert_allclose(table["M32"], values[:, 4], rtol=0, atol=1e-12)
@@ -62,7 +62,7 @@ def drifting(fitted: FittedSet, tmp_path: Path) -> Path:
     values[place], covariance[np.ix_(place, place)] = old.values, old.covariance
     changed = dataclasses.replace(old, model=model, values=values, covariance=covariance)
     (tmp_path / "RUN").mkdir()
-    write_product(tmp_path / "RUN" / "calibration.fits", changed.to_product())
+    write_calibration(tmp_path / "RUN" / "calibration.fits", changed)
     return tmp_path / "RUN"
 
 
@@ -112,7 +112,7 @@ def test_a_filter_that_the_calibration_does_not_cover_is_refused_unless_forced(
     """The curve of a second filter is in the product, but none of its exposures was taken in it."""
     curves = {"r2": fitted.calibration.filter_curve("SDSS-r"), **fitted.calibration.filters}
     wider = dataclasses.replace(fitted.calibration, filters=curves)
-    write_product(tmp_path / "calibration.fits", wider.to_product())
+    write_calibration(tmp_path / "calibration.fits", wider)
     table = Table.read(catalogue)
     table["FILTER"] = np.where(np.arange(6) == 3, "r2", "SDSS-r")
     table.write(other := tmp_path / "other.fits")

@@ -8,8 +8,7 @@ import json
 import numpy as np
 import pytest
 
-from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.product import read_product
+from walop_jax.calibration import read_calibration
 from walop_jax.data import builtin_filter
 from walop_jax.data.settings import Settings
 from walop_jax.model.build import nominal_instrument
@@ -32,7 +31,7 @@ def test_as_designed(call):
 def test_as_fitted(call, run):
     result = call("trace", run, *STAR, "--json")
     assert result.exit_code == 0, result.output
-    calibration = Calibration.from_product(read_product(run / "calibration.fits"))
+    calibration = read_calibration(run / "calibration.fits", rebuild=False).rebuilt()
     stages = trace(calibration.model.instrument(calibration.values), builtin_filter("SDSS-r"), RAY)
     np.testing.assert_allclose(json.loads(result.stdout)["stages"][-1]["value"], stages[-1].value, rtol=1e-12)
 

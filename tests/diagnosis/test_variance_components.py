@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from small_run import SMALL, small_fit
 
+from walop_jax.calibration import read_calibration, write_calibration
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.product import read_product, write_product
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.design import Design
@@ -119,8 +119,8 @@ def test_errors_of_one_place_hold_its_structure(rough, tmp_path):
     added = np.sqrt(covariance[0, 0, 0] - smooth[0, 0, 0])
     gain = rough.verdict.structure.gain
     assert added == pytest.approx(gain / np.sqrt(2.0) * (1.0 - values[0, 0] ** 2), rel=1e-6)
-    write_product(tmp_path / "rough.fits", calibration.to_product())
-    again = read_product(tmp_path / "rough.fits")
+    write_calibration(tmp_path / "rough.fits", calibration)
+    again = read_calibration(tmp_path / "rough.fits", rebuild=False)
     assert again.verdict.structure.gain == pytest.approx(gain, rel=1e-12)
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from walop_jax.calibration import read_calibration
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.product import read_calibration
 from walop_jax.commands.refit import refit
 from walop_jax.data import read_calibration_set
 from walop_jax.data.records import CalibrationSet

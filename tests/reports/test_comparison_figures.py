@@ -12,7 +12,7 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.settings import Settings
 from walop_jax.paper.comparison import compare
-from walop_jax.reports import comparison_figures as figures
+from walop_jax.reports import paper_figures as figures
 from walop_jax.science.star_errors import plate_errors
 
 

@@ -10,8 +10,7 @@ import pytest
 from html_page import Page
 
 from walop_jax.io.errors import DataError
-from walop_jax.reports.other_pages import kind_of_run, render_other
-from walop_jax.reports.page import render
+from walop_jax.reports.page import kind_of_run, render, render_other
 from walop_jax.reports.run import read_limits, read_run
 from walop_jax.science.field_accuracy import FieldAccuracy
 

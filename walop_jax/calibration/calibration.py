@@ -219,28 +219,6 @@ class Calibration(Displayed):
         """The description file of an instrument that does not come with the package, line by line in ASCII."""
         return _lines(self.model.template.description)
 
-    # names of before
-    def to_product(self) -> Calibration:
-        """Return it."""
-        return self
-
-    @classmethod
-    def from_product(cls, product: Calibration, catalogue: Sequence[type[Effect]] = EFFECTS) -> Calibration:
-        """Return it rebuilt."""
-        return product.rebuilt(catalogue)
-
-    product = property(to_product)
-    calibration = property(to_product)
-
-    @property
-    def parameters(self) -> Any:
-        """Return the columns."""
-        import types
-
-        return types.SimpleNamespace(**{n.lower(): v for n, v in self.parameter_columns().items()})
-
-    # end of names of before
-
     @property
     def sigma(self) -> Vector:
         """Standard errors of all parameters."""
@@ -554,8 +532,3 @@ class Calibration(Displayed):
 
 def _lines(text: str) -> tuple[str, ...]:
     return tuple(in_ascii(line) for line in text.splitlines() if line.strip())
-
-
-def model_of_product(product: Calibration, catalogue: Sequence[type[Effect]] = EFFECTS) -> Model:
-    """Name of before."""
-    return product.rebuilt(catalogue).model

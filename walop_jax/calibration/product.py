@@ -104,9 +104,6 @@ def write_calibration(
         sign_and_write(_hdus(calibration, path), temporary)
 
 
-write_product, CalibrationProduct = write_calibration, Calibration
-
-
 def _hdus(c: Calibration, path: object) -> list[Any]:
     tables = {
         "PARAMETERS": c.parameter_columns(),
@@ -271,11 +268,6 @@ def read_calibration(
             raise fail(f"cannot be read: {one_line(error)}", file=path, advice=_AGAIN) from error
     with errors_naming(path):
         return found.rebuilt(catalogue) if rebuild else found
-
-
-def read_product(path: str | os.PathLike[str]) -> Calibration:
-    """Name of before."""
-    return read_calibration(path, rebuild=False)
 
 
 def product_path(run: str | os.PathLike[str]) -> Path:

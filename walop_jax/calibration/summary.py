@@ -6,7 +6,6 @@ import dataclasses
 from typing import Any
 
 from walop_jax.calibration.maps import ResidualMap
-from walop_jax.calibration.product import PRODUCT as PRODUCT
 from walop_jax.fit.misfit import Misfit
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.software import software_versions

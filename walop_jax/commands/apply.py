@@ -69,19 +69,19 @@ def apply(
     job.tell("reading", "reading")
     held = calibration_of(calibration, catalogue_of(effects))
     table = table_of(catalogue, {})
-    instrument = held.calibration.model.template.patched()
+    instrument = held.model.template.patched()
     limit = math.inf if saturation is None else saturation
-    rows = read_catalogue(table, instrument, limit, always_in=held.calibration.always_in)
+    rows = read_catalogue(table, instrument, limit, always_in=held.always_in)
 
     job.tell("tabulating the analysis vectors", "tabulating")
-    used = held.calibration if posterior is None else with_moments(held.calibration, posterior)
+    used = held if posterior is None else with_moments(held, posterior)
     with errors_naming(table.path):
         stars = apply_to_rows(
             used, rows, lambda done, total: job.tell(f"{done} of {total} rows"), force=force
         )
     job.tell("writing", "writing")
     columns = stokes_columns(stars, rows.star, debias)
-    lost, content = used.left_behind, held.product.content_hash()
+    lost, content = used.left_behind, held.content_hash()
     on_the_sky = sum(map(math.isfinite, rows.rotator)) / max(len(rows.rotator), 1)
     cards = header(content, debias, on_the_sky, stars.check) | left_out_cards(lost)
     if output is not None:
@@ -112,7 +112,7 @@ def apply(
         lambda: {
             "output": None if output is None else str(output),
             "rows": table.rows,
-            "trusted": held.product.verdict.trusted,
+            "trusted": held.verdict.trusted,
             "flags": {str(int(bit)): count for bit, count in counts.items()},
             "product": content,
             NOT_CARRIED_OVER: list(lost),

@@ -62,21 +62,20 @@ def certify(job: Job, calibration: Product, effects: Effects = None) -> Outcome[
     In Python: a `Certificate`. Raises `DataError` for a file that cannot be read, has been changed, or is of another
     version.
     """
+    from walop_jax.calibration import product_path, read_calibration
     from walop_jax.calibration.calibration import Calibration
     from walop_jax.calibration.certify import certify as checks_of
     from walop_jax.calibration.certify import validity
-    from walop_jax.calibration.from_file import product_path
-    from walop_jax.calibration.product import read_product
     from walop_jax.commands.reading import Run
     from walop_jax.fit.refit import FitResult
 
     job.tell("checking")
     if isinstance(calibration, Calibration | FitResult):
         there = Calibration.from_fit(calibration) if isinstance(calibration, FitResult) else calibration
-        path, product = Path(IN_MEMORY), there.to_product()
+        path, product = Path(IN_MEMORY), there
     else:
         path = product_path(calibration.folder if isinstance(calibration, Run) else calibration)
-        product = read_product(path)
+        product = read_calibration(path, rebuild=False)
     with errors_naming(path):
         checks = tuple(checks_of(product, catalogue_of(effects)))
     parents = tuple(entry.sha256 for entry in product.inputs)

@@ -26,9 +26,7 @@ def cite(
 ) -> Outcome[tuple[Reference, ...]]:
     """List the sources of the physics in a fitted model, effects included."""
     from walop_jax import __version__
-    from walop_jax.calibration.calibration import model_of_product
-    from walop_jax.calibration.from_file import product_path
-    from walop_jax.calibration.product import read_product
+    from walop_jax.calibration import product_path, read_calibration
     from walop_jax.fit import minimise
     from walop_jax.fit.model_builder import model_without_data
     from walop_jax.model.bibtex import bibtex as entries
@@ -40,7 +38,7 @@ def cite(
     else:
         path = product_path(run)
         with errors_naming(path):
-            model = model_of_product(read_product(path), catalogue_of(effects))
+            model = read_calibration(path, catalogue_of(effects)).model
     found = (*references(model), Reference("fit", minimise.SOURCE))
     lines = [f"{entry.what}: {entry.source}" for entry in found]
     return Outcome(

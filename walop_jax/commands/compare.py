@@ -60,7 +60,7 @@ def compare(
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.refit import refit
     from walop_jax.paper.comparison import compare as comparison_of
-    from walop_jax.reports import comparison_figures
+    from walop_jax.reports import paper_figures as comparison_figures
     from walop_jax.science.star_errors import Truth
 
     if output is not None and (calibration is not None or isinstance(truth, Truth)):
@@ -71,7 +71,7 @@ def compare(
         calset, chosen = set_and_model(data, model, instrument, catalogue, output=output)
     else:
         calset, held = set_of(data), calibration_of(calibration, catalogue)
-        chosen = held.calibration.model
+        chosen = held.model
     if isinstance(truth, str | os.PathLike):
         truth = Truth(*true_matrices(truth, chosen.template.patched()))
     if calibration is None:
@@ -81,7 +81,7 @@ def compare(
             raise ValueError(f"the joint fit did not converge ({result.minimum.message})")
         joint, trusted, warnings = Calibration.from_fit(result), result.trusted, result.warnings
     else:
-        joint, trusted, warnings = held.calibration, held.product.verdict.trusted, held.warnings
+        joint, trusted, warnings = held, held.verdict.trusted, held.warnings
     job.tell("fitting and judging the polynomials", "judging")
     found = comparison_of(calset, joint, truth, filter, job.seed)
     lost = joint.left_behind

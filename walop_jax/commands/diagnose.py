@@ -36,9 +36,8 @@ def diagnose(
 
     In Python: a `Diagnosis`; `effects=(*walop.EFFECTS, MyEffect)` adds one of your own to those that may be named.
     """
+    from walop_jax.calibration import PRODUCT, SUMMARY, summary, write_calibration
     from walop_jax.calibration.calibration import Calibration
-    from walop_jax.calibration.product import write_product
-    from walop_jax.calibration.summary import PRODUCT, SUMMARY, summary
     from walop_jax.diagnosis.figure_data import figure_data
     from walop_jax.diagnosis.figure_file import FIGURE_DATA, write_figure_data
     from walop_jax.diagnosis.findings import DIAGNOSIS, document
@@ -57,12 +56,12 @@ def diagnose(
     def files() -> Writers:
         job.tell("mapping the field", "mapping")
         after = found.after
-        product = Calibration.from_fit(after).to_product()
+        product = Calibration.from_fit(after)
         misfit = None if after.explains_data else describe(after)
         fitted = summary(after, seconds=job.seconds, misfit=misfit) | {"seed": job.seed}
         drawn_from = figure_data(found)
         return {
-            PRODUCT: lambda path: write_product(path, product),
+            PRODUCT: lambda path: write_calibration(path, product),
             SUMMARY: lambda path: path.write_text(json_text(fitted), encoding="utf-8"),
             FIGURE_DATA: lambda path: write_figure_data(path, drawn_from),
             MODEL: lambda path: path.write_text(render(after.model), encoding="utf-8"),

@@ -44,8 +44,8 @@ def epoch(
 
     In Python: an `Epoch`; what is missing is looked for only with `output`.
     """
+    from walop_jax.calibration import write_calibration
     from walop_jax.calibration.calibration import Calibration
-    from walop_jax.calibration.product import write_product
     from walop_jax.diagnosis.findings import document
     from walop_jax.diagnosis.trust import examined
     from walop_jax.diagnosis.workflow import diagnose
@@ -57,8 +57,8 @@ def epoch(
     held, calset = calibration_of(old, catalogue), set_of(new)
     job.tell("fitting the new set", "fitting")
     with errors_naming(held.path):
-        result = examined(fit_like(held.calibration, calset))
-        found = compared(held.calibration, result)
+        result = examined(fit_like(held, calset))
+        found = compared(held, result)
     lacking = None
     if not found.new_trusted and held.calibration.verdict.trusted and (output is not None or job.typed):
         job.tell("looking for what the new fit lacks", "lacking")
@@ -75,13 +75,13 @@ def epoch(
         return f"{shown}\nwhat the new fit lacks: {named} ({lacking.verdict})"
 
     def files() -> Writers:
-        product = Calibration.from_fit(result).to_product()
-        return {OUTPUTS[0]: lambda path: write_product(path, product)}
+        product = Calibration.from_fit(result)
+        return {OUTPUTS[0]: lambda path: write_calibration(path, product)}
 
     return Outcome(
         found,
         lambda: (
-            {"old": held.product.content_hash(), "new": [entry.sha256 for entry in calset.inputs]}
+            {"old": held.content_hash(), "new": [entry.sha256 for entry in calset.inputs]}
             | found.document()
             | {"diagnosis": None if lacking is None else document(lacking)}
         ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ from walop_jax.io.errors import errors_naming
 from walop_jax.io.text import read_text
 
 if TYPE_CHECKING:
-    from walop_jax.calibration.from_file import CalibrationFile
+    from walop_jax.calibration import Calibration
     from walop_jax.commands.options import Effects, InstrumentLike, ModelLike, PathLike, Product, Sets
     from walop_jax.data.records import CalibrationSet
     from walop_jax.data.user_tables import InputTable
@@ -104,19 +105,18 @@ def set_and_model(
         return calset, model_for(calset, text, design, catalogue)
 
 
-def calibration_of(given: Product, catalogue: Sequence[type[Effect]]) -> CalibrationFile:
+def calibration_of(given: Product, catalogue: Sequence[type[Effect]]) -> Calibration:
     """A calibration: as given, that of a fit, or that of a product or run, with what its file says.
 
     Raises `DataError` for a file that cannot be read.
     """
-    from walop_jax.calibration.calibration import Calibration
-    from walop_jax.calibration.from_file import CalibrationFile, read_calibration
+    from walop_jax.calibration import Calibration, read_calibration
     from walop_jax.commands.reading import Run
     from walop_jax.fit.refit import FitResult
 
     if isinstance(given, Calibration | FitResult):
         there = given if isinstance(given, Calibration) else Calibration.from_fit(given)
-        return CalibrationFile(Path(IN_MEMORY), there.to_product(), there)
+        return there if there.path is not None else dataclasses.replace(there, path=Path(IN_MEMORY))
     return read_calibration(given.folder if isinstance(given, Run) else given, catalogue)
 
 
@@ -148,6 +148,6 @@ def left_out_sentences(names: Sequence[str], source: PathLike | None = None) -> 
 
 def left_out_cards(names: Sequence[str]) -> dict[str, str]:
     """The card NOTCARR of a table, which lists the effects that cannot be carried over; none where all are in it."""
-    from walop_jax.calibration.records import in_ascii
+    from walop_jax.io.text import in_ascii
 
     return {"NOTCARR": in_ascii(", ".join(names))} if names else {}

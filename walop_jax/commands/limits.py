@@ -52,7 +52,7 @@ def limits(
     from walop_jax.diagnosis.detection_limits import detection_limits
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.refit import FitResult, refit
-    from walop_jax.reports.limits_figures import protection_figure, separation_figure
+    from walop_jax.reports.diagnosis_figures import protection_figure, separation_figure
     from walop_jax.simulation.observing_plan import ObservingPlan
     from walop_jax.simulation.plan_file import is_plan, read_plan
     from walop_jax.simulation.simulate import as_planned

@@ -53,7 +53,6 @@ def matrix(
     In Python: an astropy table, for `x`, `y` (degrees or quantities) or for the table `points`: a path, an astropy
     table, columns by name. `columns` are others of those above, such as teff=5000.
     """
-    from walop_jax.calibration.matrix_table import matrix_columns, provenance
     from walop_jax.data.field_points import POINT_COLUMNS, field_points
     from walop_jax.data.user_tables import extended, table_format, write_output_table
     from walop_jax.fit.verdict import Quality
@@ -64,7 +63,7 @@ def matrix(
     if output is not None:
         table_format(output)
     held = calibration_of(calibration, catalogue_of(effects))
-    instrument = held.calibration.model.template.patched()
+    instrument = held.model.template.patched()
     known = [
         *POINT_COLUMNS,
         *(f"{prefix}{end}" for prefix in instrument.moving() for end in ("_IN", "_ANGLE")),
@@ -75,13 +74,13 @@ def matrix(
                 f"matrix: there is no argument or column {name!r}; {nearest(name.upper(), known)}"
             )
     table = table_of({"X": x, "Y": y} if points is None else points, columns)
-    wanted = field_points(table, instrument, held.calibration.always_in)
+    wanted = field_points(table, instrument, held.always_in)
     job.tell("working out the matrix")
-    used = held.calibration if posterior is None else with_draws(held.calibration, posterior)
+    used = held if posterior is None else with_draws(held, posterior)
     with errors_naming(table.path):
-        added = matrix_columns(used, wanted.x, wanted.y, wanted.settings, wanted.outside)
-    lost, content = used.left_behind, held.product.content_hash()
-    cards = provenance(content, used, drawn=posterior is not None) | left_out_cards(lost)
+        added = used.matrix_columns(wanted.x, wanted.y, wanted.settings, wanted.outside)
+    lost, content = used.left_behind, held.content_hash()
+    cards = used.provenance(content) | left_out_cards(lost)
     if output is not None:
         write_output_table(output, table, added, overwrite=job.overwrite, header=cards)
 
@@ -97,7 +96,7 @@ def matrix(
         lambda: {
             "output": None if output is None else str(output),
             "rows": table.rows,
-            "trusted": held.product.verdict.trusted,
+            "trusted": held.verdict.trusted,
             "flags": {str(int(bit)): count for bit, count in counts.items()},
             "product": content,
             NOT_CARRIED_OVER: list(lost),

@@ -55,10 +55,9 @@ def refit(
     In Python: the fit. Without `output`, finished slabs are kept in `folder` (default: nowhere), and the same call
     goes on from them. Raises `DataError` for data that cannot be trusted, ValueError for a model that does not fit.
     """
+    from walop_jax.calibration import FAILED, PARTIAL, PRODUCT, SUMMARY, summary, write_calibration
     from walop_jax.calibration.calibration import Calibration
-    from walop_jax.calibration.product import write_product
     from walop_jax.calibration.residual_map import residual_map
-    from walop_jax.calibration.summary import FAILED, PARTIAL, PRODUCT, SUMMARY, summary
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.misfit import describe
     from walop_jax.fit.refit import refit as fit
@@ -88,8 +87,8 @@ def refit(
             seconds = job.seconds
 
             def files() -> Writers:
-                product = Calibration.from_fit(result, residuals).to_product()
-                return {PRODUCT: lambda path: write_product(path, product)}
+                product = Calibration.from_fit(result, residuals)
+                return {PRODUCT: lambda path: write_calibration(path, product)}
 
             found = Outcome(
                 result,

@@ -59,8 +59,7 @@ def report(
     from walop_jax.commands.reading import Run
     from walop_jax.io.atomic import atomic_path, check_output
     from walop_jax.io.text import printable
-    from walop_jax.reports.other_pages import kind_of_run, render_other
-    from walop_jax.reports.page import render
+    from walop_jax.reports.page import kind_of_run, render, render_other
     from walop_jax.reports.run import read_run
 
     folder = run.folder if isinstance(run, Run) else Path(run)
@@ -97,13 +96,12 @@ def _is_page(path: Path) -> bool:
 
 def _accuracy(run: Any, catalogue: Any) -> tuple[Any, tuple[str, ...]]:
     """The accuracy of p over the field, or in words why it is not known."""
-    from walop_jax.calibration.calibration import Calibration
     from walop_jax.science.field_accuracy import field_accuracy
 
     if run.product is None:
         return None, ()
     try:
-        found = field_accuracy(Calibration.from_product(run.product, catalogue))
+        found = field_accuracy(run.product.rebuilt(catalogue))
     except ValueError as error:
         return None, (f"The accuracy of p over the field is not known: {error}.",)
     lacking = ("The instrument has a single arm: the accuracy of p depends on how stars are observed.",)

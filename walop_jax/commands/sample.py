@@ -15,7 +15,7 @@ from walop_jax.io.errors import fail, nearest
 from walop_jax.io.text import read_text
 
 if TYPE_CHECKING:
-    from walop_jax.calibration.product import CalibrationProduct
+    from walop_jax.calibration import Calibration
     from walop_jax.commands.reading import Run
     from walop_jax.fit.refit import FitResult
     from walop_jax.posterior import PosteriorSample, Progress
@@ -106,10 +106,9 @@ def _sampled_run(
     job: Job, folder: Path, options: Any, tell: Any, model: ModelLike, resume: bool, effects: Effects
 ) -> PosteriorSample:
     """The posterior around the fit in a folder, written there, with the covariance in its product if it can be."""
-    from walop_jax.calibration.product import read_product
-    from walop_jax.calibration.summary import PRODUCT
+    from walop_jax.calibration import PRODUCT, read_calibration
     from walop_jax.io.folder import output_folder
-    from walop_jax.posterior import Checkpoints, digest_of_fit, fit_of_run
+    from walop_jax.posterior import Checkpoints, Run, digest_of_fit
     from walop_jax.posterior import sample as sample_fit
 
     catalogue = catalogue_of(effects)
@@ -120,13 +119,12 @@ def _sampled_run(
     if found and not (job.overwrite or resume):
         raise fail(f"holds {found[0]} already", file=folder, advice="go on with --resume, or --overwrite it")
     with output_folder(folder, OUTPUTS, overwrite=True) as out:
-        product = read_product(folder / PRODUCT)
-        result = fit_of_run(product, folder, text, catalogue)
+        product = read_calibration(folder / PRODUCT, rebuild=False)
+        result = Run(folder, catalogue).fit(text)
         if job.overwrite and not resume:
             Checkpoints(folder / CHAINS, {}).clear()
         posterior = sample_fit(result, options, folder=folder / CHAINS, resume=resume, report=tell)
-        table = product.parameters
-        fitted = digest_of_fit(product.inputs, table.name.tolist(), table.value)
+        fitted = digest_of_fit(product.inputs, product.fitted.names, product.values)
         posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted, fit=fitted)
         with out.filled(OUTPUTS + ((PRODUCT,) if posterior.trusted else ())) as temporary:
             for name, write in _writers(product, posterior, catalogue).items():
@@ -134,11 +132,9 @@ def _sampled_run(
     return posterior
 
 
-def _writers(product: CalibrationProduct, posterior: PosteriorSample, catalogue: Any) -> Writers:
+def _writers(product: Calibration, posterior: PosteriorSample, catalogue: Any) -> Writers:
     """The files of a sampled run."""
-    from walop_jax.calibration.calibration import Calibration
-    from walop_jax.calibration.product import write_product
-    from walop_jax.calibration.summary import PRODUCT
+    from walop_jax.calibration import PRODUCT, write_calibration
     from walop_jax.io.plain_tables import write_columns
     from walop_jax.io.text import json_text
     from walop_jax.posterior import write_posterior
@@ -160,16 +156,12 @@ def _writers(product: CalibrationProduct, posterior: PosteriorSample, catalogue:
         "sample.json": lambda path: path.write_text(json_text(posterior.document()), encoding="utf-8"),
     }
     if posterior.trusted:
-        held = Calibration.from_product(product, catalogue)
-        verdict = dataclasses.replace(
-            held.verdict, covariance_from="posterior", errors_from=posterior.errors_from
-        )
-        better = dataclasses.replace(held, covariance=posterior.covariance, verdict=verdict).to_product()
-        writers[PRODUCT] = lambda path: write_product(path, better)
+        better = product.rebuilt(catalogue).with_covariance(posterior.covariance, posterior.errors_from)
+        writers[PRODUCT] = lambda path: write_calibration(path, better)
     return writers
 
 
-def _in_corner(posterior: PosteriorSample, product: CalibrationProduct) -> tuple[tuple[str, ...], Any]:
+def _in_corner(posterior: PosteriorSample, product: Calibration) -> tuple[tuple[str, ...], Any]:
     """Names and draws of the sampled coefficients that the data constrain best, as many as a figure can label."""
     import numpy as np
 
@@ -180,7 +172,8 @@ def _in_corner(posterior: PosteriorSample, product: CalibrationProduct) -> tuple
     if posterior.ln_f is not None:  # the factor on the errors, the last
         draws = np.concatenate([draws, posterior.ln_f.reshape(-1, 1)], axis=1)
     spread = dict(zip(posterior.sampled, draws.std(axis=0).tolist(), strict=True))
-    table = product.parameters
-    prior = dict(zip(table.name.tolist(), table.prior_width.tolist(), strict=True))
-    shown = informed(posterior.sampled, spread, prior)[:MOST_IN_CORNER] or posterior.sampled[:MOST_IN_CORNER]
+    shown = (
+        informed(posterior.sampled, spread, product.prior_width)[:MOST_IN_CORNER]
+        or posterior.sampled[:MOST_IN_CORNER]
+    )
     return shown, draws[:, [posterior.sampled.index(name) for name in shown]]

@@ -85,7 +85,7 @@ def trace(
         raise UsageError(str(error)) from None  # the options say all there is
     if calibration is not None:
         held = calibration_of(calibration, catalogue_of(effects))
-        fitted = held.calibration
+        fitted = held
         lost = fitted.left_behind
         stages = traced(fitted.model.instrument(fitted.values), fitted.filter_curve(filter), line)
         warnings = (*held.warnings, *left_out_sentences(lost, held.path))

@@ -17,7 +17,7 @@ from walop_jax.posterior.files import (
 )
 from walop_jax.posterior.nuts import Nuts
 from walop_jax.posterior.result import Options, PosteriorSample, Progress, Report
-from walop_jax.posterior.run import Run, fit_of_run
+from walop_jax.posterior.run import Run
 from walop_jax.posterior.samplers import SAMPLERS, Density, Sampler, State, Stretch, make_sampler
 from walop_jax.posterior.sampling import Ensembles, sample, sandwich_adjusted
 from walop_jax.posterior.surrogate import Accuracy, Surrogate, build_surrogate, compare_with_exact
@@ -49,7 +49,6 @@ __all__ = [
     "compare_with_exact",
     "digest_of_fit",
     "exact_density",
-    "fit_of_run",
     "inference_data",
     "make_sampler",
     "near_linear",

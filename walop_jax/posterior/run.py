@@ -158,8 +158,3 @@ class Run(Displayed):
         return dataclasses.replace(
             inner, title=f"Run {self.folder}. {inner.title}".removesuffix(". "), facts=(*facts, *inner.facts)
         )
-
-
-def fit_of_run(product, run, model_text=None, catalogue=EFFECTS):  # type: ignore[no-untyped-def]
-    """Name of before."""
-    return Run(run, catalogue).fit(model_text)
