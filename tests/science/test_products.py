@@ -156,7 +156,7 @@ def test_a_change_is_found_and_named(first):
 def test_one_number_that_has_changed_by_five_standard_errors_is_not_hidden_by_all_others(first):
     """The parameter that hangs together least with others: of some seventy directions the sum does not see it."""
     truth, old = first
-    result = fit_like(old, simulate(SMALL, seed=5, instrument=truth).calset)
+    result = fit_like(old, simulate(SMALL, seed=5, instrument=truth).calset).judged()
     same = Calibration.from_fit(result)
     quiet = epoch(same, result)
     assert quiet.fits
@@ -215,7 +215,7 @@ def test_the_new_set_is_fitted_with_the_old_model(first, monkeypatch):
     earlier = dataclasses.replace(SMALL, grid=4, moon_patches=0)
     model = model_for(simulate(earlier, seed=5).calset, text)
     size = len(model.names)
-    assumed = dataclasses.replace(old, model=model, values=model.start, covariance=1e-12 * np.eye(size))
+    assumed = dataclasses.replace(old, fitted=model, values=model.start, covariance=1e-12 * np.eye(size))
     asked: list[Likelihood] = []
 
     def fitted(likelihood):
