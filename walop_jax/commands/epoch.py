@@ -60,7 +60,7 @@ def epoch(
         result = examined(fit_like(held, calset))
         found = compared(held, result)
     lacking = None
-    if not found.new_trusted and held.calibration.verdict.trusted and (output is not None or job.typed):
+    if not found.new_trusted and held.verdict.trusted and (output is not None or job.typed):
         job.tell("looking for what the new fit lacks", "lacking")
         # Other readings of the data have been tried when its fit was examined.
         lacking = diagnose(

@@ -48,12 +48,12 @@ def watch(
     job.tell("reading", "reading")
     held = calibration_of(calibration, catalogue_of(effects))
     given = list(catalogues) if isinstance(catalogues, list | tuple) else [catalogues]
-    instrument, always_in = held.calibration.model.template.patched(), held.calibration.always_in
+    instrument, always_in = held.model.template.patched(), held.always_in
     rows = [read_catalogue(table_of(entry, {}), instrument, always_in=always_in) for entry in given]
     job.tell("tabulating the analysis vectors", "tabulating")
     names = ", ".join(str(entry) for entry in given if isinstance(entry, str | os.PathLike))
     with errors_naming(names or None):
-        found = watched(held.calibration, rows, force=force)
+        found = watched(held, rows, force=force)
 
     def files() -> Writers:
         figure, table = watch_figure(found), found.to_table()
@@ -64,7 +64,7 @@ def watch(
 
     return Outcome(
         found,
-        lambda: {"product": held.product.content_hash()} | found.document(),
+        lambda: {"product": held.content_hash()} | found.document(),
         lambda: found.display().text(),
         files,
         saved_as=OUTPUTS[0],

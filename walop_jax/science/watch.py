@@ -323,7 +323,7 @@ class _Watching:
         """Histories of cameras, the strongest first, until nothing is left."""
         residual, changes = self.stars.residual, []
         weight, share, whole = self.weights(residual)
-        matrix, score = first_look = self.scan(residual, weight, share)
+        matrix, score = self.scan(residual, weight, share)
         while len(changes) < _MOST_CHANGES:
             z = self.significance(matrix, score)
             if not np.abs(z).max() > self.alarm:
@@ -332,7 +332,7 @@ class _Watching:
             changes.append(found)
             weight, share, whole = self.weights(residual)
             matrix, score = self.scan(residual, weight, share)
-        return self.told(changes, first_look, matrix, whole)
+        return self.told(changes, matrix, score, whole)
 
     def significance(self, matrix: Any, score: Any) -> Float[np.ndarray, "h c"]:
         """z of every history of every camera and number of the optics."""
@@ -397,21 +397,23 @@ class _Watching:
     def told(
         self,
         changes: list[WatchedChange],
-        first_look: tuple[Any, Any],
         matrix: Float[np.ndarray, "c c"],
+        score: Float[np.ndarray, " c"],
         whole: Scale,
     ) -> Watch:
-        """The record: gains as they were first seen, accuracies with all that was found taken away."""
+        """The record: gains are what is left behind the changes, and the changes that each camera may be."""
         groups, cameras = len(self.time), len(self.cameras)
         count = cameras + len(self.optics)
         blocks = matrix.reshape(groups, count, groups, count)
-        slopes = first_look[1].reshape(groups, count)
-        seen_first = first_look[0].reshape(groups, count, groups, count)
+        slopes = score.reshape(groups, count)
         gain, error, smallest = (np.full((groups, cameras), np.nan) for _ in range(3))
         steps = np.tril(np.ones((groups, groups)))  # group, start
         for k in range(cameras):
-            own, then = np.diag(blocks[:, k, :, k]), np.diag(seen_first[:, k, :, k])
-            gain[:, k] = slopes[:, k] / np.where(then > 0, then, np.inf)
+            own = np.diag(blocks[:, k, :, k])
+            gain[:, k] = slopes[:, k] / np.where(own > 0, own, np.inf)
+            for change in changes:
+                mine = next((entry for entry in change.alike if entry.name == self.cameras[k]), None)
+                gain[:, k] += 0.0 if mine is None else mine.size * mine.history.over(self.time)
             error[:, k] = np.where(own > 0, own, np.nan) ** -0.5
             information = np.einsum("gh,gf,fh->h", steps, blocks[:, k, :, k], steps, optimize=True)
             smallest[:, k] = (self.alarm + SEEN) * np.where(information > 0, information, np.nan) ** -0.5
