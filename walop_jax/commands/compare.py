@@ -67,14 +67,14 @@ def compare(
         raise ValueError("with output the joint fit is made anew: leave calibration and truth in memory out")
     catalogue = catalogue_of(effects)
     job.tell("reading", "reading")
-    if calibration is None:
+    held = None if calibration is None else calibration_of(calibration, catalogue)
+    if held is None:
         calset, chosen = set_and_model(data, model, instrument, catalogue, output=output)
     else:
-        calset, held = set_of(data), calibration_of(calibration, catalogue)
-        chosen = held.model
+        calset, chosen = set_of(data), held.model
     if isinstance(truth, str | os.PathLike):
         truth = Truth(*true_matrices(truth, chosen.template.patched()))
-    if calibration is None:
+    if held is None:
         job.tell("fitting the joint model", "fitting")
         result = examined(refit(calset, chosen, progress=job.progress))
         if not result.converged:

@@ -60,7 +60,7 @@ def plan(
         wanted = ObservingPlan(str(could))
     if not minutes > 0:
         raise fail("nothing can be observed in no time", advice="give --minutes")
-    known = None if after is None else calibration_of(after, catalogue_of(None)).calibration
+    known = None if after is None else calibration_of(after, catalogue_of(None))
     job.tell("information of exposures", "information")
     with job.repeated() as say:
         found = plan_exposures(wanted, minutes, known=known, draws=draws, seed=job.seed, progress=say)

@@ -51,7 +51,8 @@ def plot(
         width = max(map(len, listed))
         lines = [f"{key:<{width}}  {about}" for key, about in listed.items()]
         return Outcome(listed, lambda: listed, lambda: "\n".join(lines))
-    path = Path(f"{name}.png") if output is None and job.typed else output and Path(output)
+    chosen = f"{name}.png" if output is None and job.typed else output
+    path = None if chosen is None else Path(chosen)
     if path is not None:
         if path.suffix.lower() not in FORMATS:
             raise fail("is no picture that can be written", file=path, advice=f"use {', '.join(FORMATS)}")

@@ -78,16 +78,16 @@ def trace(
         setting.teff[0] = math.nan if teff is None else teff
         polariser = math.nan if angle is None else angle
         line = Sightline(x=x, y=y, q=q, u=u, clp_angle=polariser, setting=setting)
+        stages, lost, warnings = (), (), ()
         if calibration is None:
             design = design_of(instrument) or nominal_instrument()
-            stages, lost, warnings = traced(design, builtin_filter(filter), line), (), ()
+            stages = traced(design, builtin_filter(filter), line)
     except ValueError as error:
         raise UsageError(str(error)) from None  # the options say all there is
     if calibration is not None:
         held = calibration_of(calibration, catalogue_of(effects))
-        fitted = held
-        lost = fitted.left_behind
-        stages = traced(fitted.model.instrument(fitted.values), fitted.filter_curve(filter), line)
+        lost = held.left_behind
+        stages = traced(held.model.instrument(held.values), held.filter_curve(filter), line)
         warnings = (*held.warnings, *left_out_sentences(lost, held.path))
     return Outcome(
         stages,

@@ -261,7 +261,9 @@ class _Root:
         if not len(seen):
             return
         scaled = gram[np.ix_(seen, seen)] / np.outer(norm[seen], norm[seen])
-        factor, pivots, self.rank, _ = linalg.lapack.dpstrf(scaled, tol=ROOT_TOLERANCE, overwrite_a=True)
+        factor, pivots, self.rank, _ = linalg.lapack.dpstrf(  # pyright: ignore[reportAttributeAccessIssue]
+            scaled, tol=ROOT_TOLERANCE, overwrite_a=True
+        )
         order = seen[pivots - 1]
         upper = np.triu(factor)[: self.rank]
         self.whole = np.zeros((len(norm), self.rank))

@@ -263,15 +263,13 @@ class Refit(Linear):
         if self.fit.noise_scale == 1.0 or len(even) < 2:
             return trials
         exact = [
-            dataclasses.replace(t, fit=fit(t.fit.likelihood, start=t.fit.values, noise_scale=1.0))
-            for t in even
-            if t.fit is not None
+            (t, fit(t.fit.likelihood, start=t.fit.values, noise_scale=1.0)) for t in even if t.fit is not None
         ]
-        exact.sort(key=lambda t: t.fit.posterior.objective)
-        best = exact[0].fit.posterior.objective
+        exact.sort(key=lambda pair: pair[1].posterior.objective)
+        best = exact[0][1].posterior.objective
         clearly = [
-            dataclasses.replace(t, evidence=t.evidence - 0.5 * (t.fit.posterior.objective - best))
-            for t in exact
+            dataclasses.replace(t, fit=f, evidence=t.evidence - 0.5 * (f.posterior.objective - best))
+            for t, f in exact
         ]
         return [*clearly, *trials[len(even) :]]
 

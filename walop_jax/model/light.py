@@ -217,7 +217,8 @@ def camera_vectors(
 def beams(instrument: Instrument, rows: Float[Array, "b r 4"]) -> Float[Array, "b k 4"]:
     """What the beam of each camera takes of the rows of its analyser."""
     index, shares = _beams(instrument)
-    return sum(shares[:, j, None] * rows[:, index[:, j]] for j in range(index.shape[1]))
+    taken = (shares[:, j, None] * rows[:, index[:, j]] for j in range(index.shape[1]))
+    return functools.reduce(jnp.add, taken)
 
 
 def behind_throughput(

@@ -183,7 +183,8 @@ def values_of(component: Component) -> Vector:
     """The parameters of a component as one vector."""
     arrays = jax.tree_util.tree_leaves(component)
     chosen = [arrays[i] for i, _ in parameter_places(component)]
-    if not any(isinstance(array, jax.core.Tracer) for array in chosen):
+    tracer: Any = jax.core.Tracer  # pyright: ignore[reportAttributeAccessIssue]
+    if not any(isinstance(array, tracer) for array in chosen):
         # By numpy: operations of JAX outside of a program are each compiled as one of their own.
         return jnp.asarray(np.concatenate([np.zeros(0), *map(np.ravel, chosen)]))
     return jnp.concatenate([jnp.ravel(array) for array in chosen])

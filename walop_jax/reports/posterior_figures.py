@@ -91,7 +91,7 @@ def corner_figure(
     )  # fmt: skip
     figure.subplots_adjust(left=0.1, right=0.99, bottom=0.09, top=0.94, wspace=0.05, hspace=0.05)
     low, middle, high = np.quantile(draws, (0.1587, 0.5, 0.8413), axis=0)
-    panels = np.reshape(figure.axes, (k, k))
+    panels = np.array(figure.axes, dtype=object).reshape(k, k)
     for i in range(k):
         numbers = with_error(float(middle[i]), float(0.5 * (high[i] - low[i])))
         title = f"{label(names[i])}\n{numbers} {units[i]}".rstrip()
