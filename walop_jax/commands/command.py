@@ -221,7 +221,7 @@ class Command(Generic[T]):
             return self.run(Job(**shared), arguments).value
 
         functools.update_wrapper(call, self.body)
-        del call.__wrapped__  # pyright: ignore[reportAttributeAccessIssue]
+        del call.__dict__["__wrapped__"]
         call.__signature__ = self.signature  # type: ignore[attr-defined]
         call.command = self  # type: ignore[attr-defined]
         described = [f"{name}: {option.help}" for name, option in self.options.items()]

@@ -70,7 +70,7 @@ def limits(
         result = data
     else:
         planned = data if plan is None else as_planned(plan)
-        calset, chosen = set_and_model(planned, model, instrument, catalogue)
+        calset, chosen = set_and_model(planned, model, instrument, catalogue)  # pyright: ignore[reportArgumentType]
         result = examined(refit(calset, chosen, progress=job.progress))
     if not result.converged:
         raise ValueError(f"the fit did not converge ({result.minimum.message})")

@@ -108,12 +108,15 @@ def _sampled_run(
     """The posterior around the fit in a folder, written there, with the covariance in its product if it can be."""
     from walop_jax.calibration import PRODUCT, read_calibration
     from walop_jax.io.folder import output_folder
+    from walop_jax.model.specification import Model
     from walop_jax.posterior import Checkpoints, Run, digest_of_fit
     from walop_jax.posterior import sample as sample_fit
 
     catalogue = catalogue_of(effects)
     if not folder.is_dir():
         raise fail("is not a folder", file=folder, advice="give the RUN of walop-jax refit")
+    if isinstance(model, Model):
+        raise ValueError("with a run, give the model as a file, so that the run can be made again")
     text = None if model is None else read_text(model)
     found = [name for name in OUTPUTS if (folder / name).exists()]
     if found and not (job.overwrite or resume):

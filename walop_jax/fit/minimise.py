@@ -132,7 +132,7 @@ def minimise(
     for a numerical outcome: the gates, `result` and `message` say what happened.
     """
     x = trial = np.asarray(start, float)
-    region = _REGION.init(jnp.zeros(len(x)), None)
+    region = _REGION.init(jnp.zeros(len(x)), None)  # pyright: ignore[reportArgumentType]
     region = eqx.tree_at(lambda s: s.step_size, region, jnp.asarray(1.0 / damping if damping > 0 else np.inf))
     here, near, history, best = None, None, [], []
     distance, before, condition = np.inf, np.inf, np.inf
@@ -171,11 +171,12 @@ def minimise(
             result, why = RESULTS.stagnation, "no step lowers χ² any more"
             break
         trial = x + scale * np.asarray(step)
+    assert here is not None
     return Minimum(
         x=x,
         expansion=here,
-        result=result,
-        message=_in_words(result, why, len(history), distance, condition),
+        result=result,  # pyright: ignore[reportArgumentType]
+        message=_in_words(result, why, len(history), distance, condition),  # pyright: ignore[reportArgumentType]
         steps=len(history),
         scaled_gradient=distance,
         condition=condition,

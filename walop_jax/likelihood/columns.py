@@ -9,6 +9,9 @@ Symbols     w = 1/σ, F flux, f what the change grows with, P projection off the
 Limits      first order. Where detectors are not linear their derivative stands ahead of w.
 """
 
+# Arrays of numpy and of JAX go through the same algebra here.
+# pyright: reportArgumentType=false, reportReturnType=false
+
 from __future__ import annotations
 
 import dataclasses

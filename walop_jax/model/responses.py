@@ -520,7 +520,7 @@ def light_responses(
 
     def stokes(change: Float[Array, " l"]) -> Float[Array, "e 4"]:
         own = dict(zip(LIGHT, change, strict=True))
-        return light.stokes(_lit(instrument, own, count), exposures, sky, source, x, y)
+        return light.stokes(_lit(instrument, own, count), exposures, sky, source, x, y)  # pyright: ignore[reportArgumentType]
 
     value, push = jax.linearize(stokes, jnp.zeros(len(LIGHT)))
     sight = Sight(exposures, sky, source, x, y)

@@ -137,13 +137,14 @@ def candidates(
         tell(f"information of {label}")
         rows = np.flatnonzero(there.exposures().kind == "clp")
         information = np.stack([_information(there, model, seed + draw, rows) for draw in range(draws)])
-        families.append(Circle.sampled(information, _cost(there, rows, overhead)[0]))
+        family = Circle.sampled(information, _cost(there, rows, overhead)[0])
+        families.append(family)
         labels.append(label)
         if len(families) == 1:
             # Held against what it stands for, at angles between those of the series.
             turned = tuple(np.array(there.polariser_angles) + 90.0 / angles)
             between = dataclasses.replace(there, polariser_angles=turned)
-            truncation = _between(families[0], between, _information(between, model, seed, rows))
+            truncation = _between(family, between, _information(between, model, seed, rows))
     exposures = sky.exposures()
     for kind in dict.fromkeys(k for k in exposures.kind.tolist() if k != "clp"):
         tell(f"information of {kind} exposures")

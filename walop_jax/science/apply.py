@@ -97,7 +97,7 @@ def apply(
         if progress is not None:
             progress(done, len(catalogue))
     columns = [f.name for f in dataclasses.fields(Stars) if f.name != "check"]
-    stars = Stars(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
+    stars = Stars(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))  # pyright: ignore[reportArgumentType]
     return work.together(stars, work.checked(watched))
 
 

@@ -160,7 +160,7 @@ class _Watching:
         self.stars, self.cameras = stars, tuple(cameras)
         # Of the parameters those that make any difference to the light of stars.
         self.seen = np.flatnonzero(np.abs(stars.plain).max(axis=(0, 1)) > 0)
-        self.optics = [parameters[p] for p in self.seen]
+        self.optics = [parameters[p] for p in self.seen]  # pyright: ignore[reportArgumentType, reportCallIssue]
         self.root = root[:, np.abs(root).max(axis=0, initial=0.0) > 0]
         self.variance = own_variance(stars)
         self.time, self.group = grouped(stars.time)
@@ -222,7 +222,7 @@ class _Watching:
             own, other = free[:count], free[count:].reshape(known, -1)
             each = np.einsum("arc,brc->rab", own, own, optimize=True)
             blocks = gains.reshape(groups, count, groups, count)
-            np.add.at(blocks, (group, slice(None), group), each)
+            np.add.at(blocks, (group, slice(None), group), each)  # pyright: ignore[reportArgumentType]
             mixed = np.einsum("arc,nrc->ran", own, free[count:], optimize=True)
             np.add.at(cross.reshape(groups, count, known), group, mixed)
             nuisance += other @ other.T
@@ -257,7 +257,7 @@ class _Watching:
         pairs = np.bincount(of_star)
         alone = pairs[of_star] == 1
         own = np.einsum("pia,pib->pab", sums[alone], sums[alone])
-        np.subtract.at(blocks, (of_group[alone], slice(None), of_group[alone]), own)
+        np.subtract.at(blocks, (of_group[alone], slice(None), of_group[alone]), own)  # pyright: ignore[reportArgumentType]
         groups, count = blocks.shape[:2]
         several = np.flatnonzero(~alone)
         numbers, place = np.unique(of_star[several], return_inverse=True)
