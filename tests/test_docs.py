@@ -18,12 +18,14 @@ from walop_jax.commands.docs import about, pages
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = pages()
 TOPICS = (
+    "adding-a-command",
     "adding-an-effect",
     "adding-an-instrument",
     "conventions",
     "effects",
     "files",
     "model",
+    "organisation",
     "recipes",
     "sources",
     "vocabulary",
