@@ -235,7 +235,7 @@ def test_flags_and_columns(calibration):
 
 def test_maps_are_of_a_setting_that_was_used(calibration):
     """The plate was never out, the retarder sometimes was."""
-    maps = calibration.maps(5)
+    maps = calibration.new_maps(5)
     assert maps.values.shape == (3, 5, 5)
     assert maps.positions == {"HWP": 0.0}
     points = maps.grid.points

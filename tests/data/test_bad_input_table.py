@@ -231,7 +231,7 @@ ELSEWHERE = {
     "38": "fit/test_outliers.py::test_cosmic_rays_are_flagged_and_nothing_else",
     "42": "model/effects/test_effects_contract.py::test_neutral_and_derivatives",
     "43": "diagnosis/test_detection_limits.py::test_two_effects_that_do_the_same_are_told_as_a_class",
-    "44": "cli/test_commands.py::test_no_convergence_no_product",
+    "44": "commands/test_commands.py::test_no_convergence_no_product",
     "45": "posterior/test_chains.py::test_a_killed_run_loses_one_block_and_ends_up_the_same",
     "46": "posterior/test_chains.py::test_checkpoints_come_back_and_refuse_what_is_not_theirs",
     "47": "posterior/test_full_disk.py::test_full_disk_is_an_error_and_leaves_what_was_there",
@@ -240,8 +240,8 @@ ELSEWHERE = {
     "50": "likelihood/test_large.py::test_memory_is_bounded_by_what_is_allowed",
     "51": "likelihood/test_runner.py::test_a_dead_process_is_an_error_in_the_others",
     "52": "calibration/test_product.py::test_what_is_not_as_written_is_refused",
-    "53": "runs/test_tables.py::test_a_filter_that_the_calibration_does_not_cover_is_refused_unless_forced",
-    "54": "cli/test_program.py::test_a_path_that_is_not_utf_8",
+    "53": "commands/test_tables.py::test_a_filter_that_the_calibration_does_not_cover_is_refused_unless_forced",
+    "54": "commands/test_program.py::test_a_path_that_is_not_utf_8",
     "55": "data/test_hostile_headers.py::test_impossible_counts_are_refused_by_name",
 }
 

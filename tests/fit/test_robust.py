@@ -13,6 +13,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.diagnosis.trust import examined
 from walop_jax.fit import robust
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit, refit
@@ -56,7 +57,7 @@ def pulls(result: FitResult, true: dict[str, float]) -> np.ndarray:
 
 
 def test_a_good_fit_keeps_its_errors(clean):
-    result = refit(clean[0])
+    result = examined(refit(clean[0]))
     assert result.errors_from == STATED
     assert summary(result, seconds=0.0)["errors_from"] == "N_ERR"
 

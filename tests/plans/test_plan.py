@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.plans.exposures import candidates
@@ -39,7 +40,7 @@ def test_the_promise_is_the_error_of_a_fit(small):
     angles = (0.0, 20.0, 41.0, 77.0, 100.0, 120.0, 147.0, 170.0)
     plan = dataclasses.replace(SMALL, stops=tuple(Stop(a) for a in angles), patches=(0, 2), stars=(1, 1, 0))
     calset = simulate(plan, seed=0, noiseless=True, steady=True).calset
-    calibration = Calibration.from_fit(refit(calset, base_model(calset, throughput_degree=2)))
+    calibration = Calibration.from_fit(examined(refit(calset, base_model(calset, throughput_degree=2))))
     families = small.families
     places = np.deg2rad(2 * np.array(angles))[:, None]
     total = small.prior + np.tensordot(families[0].coefficients(places).sum(axis=0), families[0].basis[0], 1)

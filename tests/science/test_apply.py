@@ -461,7 +461,7 @@ def test_every_instrument_can_be_tabulated(calibration, instrument, edge):
     model = make_model(instrument, nominal_instrument(instrument, throughput_degree=0))
     other = dataclasses.replace(
         calibration,
-        model=model,
+        fitted=model,
         values=model.start,
         covariance=np.zeros((len(model.start),) * 2),
         field=(-edge, edge, -edge, edge),

@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import hashlib
+import importlib
 import os
 import random
 import resource
@@ -35,9 +36,11 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
-from runs.conftest import content  # noqa: E402
+from commands.conftest import content  # noqa: E402
 from small_run import SEED, SMALL  # noqa: E402
 
+sampling = importlib.import_module("walop_jax.commands.sample")
+diagnosing = importlib.import_module("walop_jax.commands.diagnose")
 from walop_jax.commands.compress import compress  # noqa: E402
 from walop_jax.commands.diagnose import diagnose  # noqa: E402
 from walop_jax.commands.program import switch_on_jax  # noqa: E402
@@ -51,9 +54,9 @@ from walop_jax.simulation.simulate import simulate  # noqa: E402
 DEAD = 4194303  # no process has this number
 COMMANDS = ("refit", "sample", "diagnose", "compress")
 OUTPUTS = {
-    "refit": refit.OUTPUTS,
-    "sample": sample.OUTPUTS,
-    "diagnose": diagnose.OUTPUTS,
+    "refit": ("calibration.fits", "summary.json"),
+    "sample": sampling.OUTPUTS,
+    "diagnose": diagnosing.OUTPUTS,
     "compress": ("set.fits",),
 }
 EVENTS = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.truncate", "os.chmod")
