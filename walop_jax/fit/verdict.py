@@ -117,7 +117,7 @@ class Hidden:
     def __len__(self) -> int:
         return len(self.names)
 
-    def in_words(self, most: int = 3) -> str:
+    def in_words(self, most: int = 1) -> str:
         """The worst of them in a sentence."""
         sizes = [
             f"{name} of {size:.2g} {unit}".rstrip()
@@ -125,7 +125,7 @@ class Hidden:
         ]
         more = f" and {len(sizes) - most} more" if len(sizes) > most else ""
         listed = ", ".join(sizes[:most]) + more
-        return f"would not be seen in these data, and move the result by more than its errors: {listed}"
+        return f"too small to be seen, yet beyond the errors: {listed}"
 
 
 @dataclasses.dataclass(frozen=True)
