@@ -158,7 +158,7 @@ ERRORS = (
     planted("diagnosis/score.py", "amplitudes=-w @ z", "amplitudes=w @ z", "diagnosis/test_score.py"),
     planted("diagnosis/score.py", "jacobian.shape[0] - jacobian.shape[1] - eliminated",
             "jacobian.shape[0] - jacobian.shape[1]", "diagnosis/test_score.py"),
-    planted("diagnosis/score.py", "- 0.5 * np.sum(np.log(information)))", "+ 0.5 * np.sum(np.log(information)))", "diagnosis/test_score.py"),
+    planted("diagnosis/score.py", "- 0.5 * np.sum(np.log", "+ 0.5 * np.sum(np.log", "diagnosis/test_score.py"),
     planted("diagnosis/trust.py", "2.0 * min(above, 1.0 - above)", "min(above, 1.0)", "diagnosis/test_trust.py"),
     planted("diagnosis/trust.py", "variance = 2.0 * (own[0]", "variance = 4.0 * (own[0]", "diagnosis/test_trust.py"),
     planted("diagnosis/variance_components.py", "first = whole - np.trace(m)", "first = whole",
