@@ -8,7 +8,7 @@ import pytest
 
 from walop_jax.commands import COMMANDS
 from walop_jax.commands.program import step_counter
-from walop_jax.io.heartbeat import Stage
+from walop_jax.io.progress import Stage
 
 RANDOM = ("simulate", "sample", "diagnose", "limits", "compare", "plan")
 

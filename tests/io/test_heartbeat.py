@@ -3,7 +3,7 @@
 import threading
 import time
 
-from walop_jax.io.heartbeat import repeated
+from walop_jax.io.progress import repeated
 
 
 def test_silence_is_broken_and_ends_with_the_work():

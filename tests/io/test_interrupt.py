@@ -14,7 +14,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 """
 LONG_WORK = """
 import hashlib, sys
-from walop_jax.io.interrupt import interrupts_answered
+from walop_jax.io.progress import interrupts_answered
 
 def end():
     print("interrupted", file=sys.stderr, flush=True)
@@ -26,7 +26,7 @@ with interrupts_answered(end):
 """
 QUICK_WORK = """
 import time
-from walop_jax.io.interrupt import interrupts_answered
+from walop_jax.io.progress import interrupts_answered
 
 for _ in range(2):
     try:

@@ -8,7 +8,7 @@ from typing import Any
 from walop_jax.calibration.maps import ResidualMap
 from walop_jax.fit.misfit import Misfit
 from walop_jax.fit.refit import FitResult
-from walop_jax.io.software import software_versions
+from walop_jax.io.code import software_versions
 
 SUMMARY, FAILED = "summary.json", "summary.failed.json"
 PARTIAL = "partial"

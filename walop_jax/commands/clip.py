@@ -9,7 +9,7 @@ from walop_jax.commands.command import Job, Option, Outcome, command
 from walop_jax.commands.inputs import IN_MEMORY, catalogue_of, set_and_model
 from walop_jax.commands.options import Effects, InstrumentLike, ModelLike, SetFile, Sets
 from walop_jax.io.errors import fail
-from walop_jax.io.heartbeat import Stage
+from walop_jax.io.progress import Stage
 
 if TYPE_CHECKING:
     from walop_jax.fit.outliers import Clipped

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from walop_jax.commands import door
-from walop_jax.io.heartbeat import Stage
+from walop_jax.io.progress import Stage
 
 if TYPE_CHECKING:
     from walop_jax.io.folder import OutputFolder
@@ -88,7 +88,7 @@ class Job:
     @contextlib.contextmanager
     def repeated(self) -> Iterator[Tell]:
         """`progress`, told again where nothing new can be said for long."""
-        from walop_jax.io.heartbeat import repeated
+        from walop_jax.io.progress import repeated
 
         with repeated(self.progress) as say:
             yield say

@@ -17,7 +17,7 @@ import typer
 
 from walop_jax.commands import COMMANDS, INTERRUPTED
 from walop_jax.commands.command import COMMON, Argument, Command, Job, Option, Outcome, UsageError
-from walop_jax.io.interrupt import interrupts_answered
+from walop_jax.io.progress import interrupts_answered
 
 CACHE_VARIABLE = "WALOP_JAX_CACHE"
 DEBUG_VARIABLE = "WALOP_JAX_DEBUG"

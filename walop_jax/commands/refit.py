@@ -61,8 +61,7 @@ def refit(
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.misfit import describe
     from walop_jax.fit.refit import refit as fit
-    from walop_jax.io.atomic import atomic_path
-    from walop_jax.io.temporary import remove
+    from walop_jax.io.atomic import atomic_path, remove
     from walop_jax.io.text import json_text
 
     if output is not None and folder is not None:

@@ -17,11 +17,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.data.schema import Column, Place, convert_unit
-from walop_jax.io.atomic import atomic_path, check_output
 from walop_jax.io.errors import DataError, fail, rows_text
 from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits
-from walop_jax.io.inputs import check_input
-from walop_jax.io.plain_tables import table_format
+from walop_jax.io.plain_tables import table_format, write_table
+from walop_jax.io.text import check_input
 
 _TRUE, _FALSE = ("true", "t", "1", "yes"), ("false", "f", "0", "no", "")
 
@@ -222,15 +221,7 @@ def write_output_table(
     the table (CSV has none). The file appears whole or not at all. Raises `DataError` as `atomic_path` does, and
     for an unknown extension.
     """
-    kind = table_format(path)
-    check_output(path, overwrite=overwrite)
-    table = extended(source, added, header)
-    with atomic_path(path, overwrite=overwrite) as temporary, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            table.write(temporary, format=kind, overwrite=True)
-        except (ValueError, TypeError) as error:
-            raise fail(f"cannot be written: {one_line(error)}", file=path, advice="try .ecsv") from error
+    write_table(path, extended(source, added, header), overwrite=overwrite)
 
 
 def extended(source: InputTable, added: Mapping[str, Any], header: Mapping[str, Any] | None = None) -> Any:

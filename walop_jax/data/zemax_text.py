@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.io.errors import DataError, fail
-from walop_jax.io.inputs import check_input
+from walop_jax.io.text import check_input
 
 HEADING = "Polarization Transmission Data"
 """First line of every export."""

@@ -42,7 +42,7 @@ from walop_jax.diagnosis.score import ScoreSpace, noncentrality, separations
 from walop_jax.diagnosis.trust import sampled
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.stand_in import on_field_points
-from walop_jax.io.heartbeat import Stage
+from walop_jax.io.progress import Stage
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.parameters import field_declarations

@@ -45,7 +45,7 @@ from walop_jax.diagnosis.trust import examined, pixel_structure
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.stand_in import in_field_points
-from walop_jax.io.heartbeat import Stage
+from walop_jax.io.progress import Stage
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.thinning import thinned

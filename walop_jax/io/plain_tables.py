@@ -66,11 +66,19 @@ def write_columns(
 
     The format follows the name. Raises `DataError` as `atomic_path` does, and for an unknown extension.
     """
+    write_table(path, astropy_table(columns, notes), overwrite=overwrite)
+
+
+def write_table(path: str | os.PathLike[str], table: Table, *, overwrite: bool = False) -> None:
+    """Write an astropy table in the format of the name; whole or not at all.
+
+    Raises `DataError` as `atomic_path` does, for an unknown extension, and for what the format cannot hold.
+    """
     kind = table_format(path)
-    table = astropy_table(columns, notes)
     with atomic_path(path, overwrite=overwrite) as temporary, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
             table.write(temporary, format=kind, overwrite=True)
-        except ValueError as error:
-            raise fail(f"cannot be written: {error}", file=path, advice="try .ecsv") from error
+        except (ValueError, TypeError) as error:
+            what = f"cannot be written: {' '.join(str(error).split())[:300]}"
+            raise fail(what, file=path, advice="try .ecsv") from error

@@ -1,16 +1,16 @@
-"""Text files, and plain data as JSON that every reader takes: without NaN and infinities."""
+"""Files to be read are ordinary ones; text, TOML, and plain data as JSON without NaN and infinities."""
 
 from __future__ import annotations
 
 import json
 import math
 import os
+import stat
 import tomllib
 from pathlib import Path
 from typing import Any
 
 from walop_jax.io.errors import fail
-from walop_jax.io.inputs import check_input
 
 _DEEPEST = 30
 _DEEP = "not valid TOML here: tables nested too deep"
@@ -91,3 +91,33 @@ def in_ascii(text: str) -> str:
     for sign, word in _SPELT.items():
         text = text.replace(sign, word)
     return " ".join(text.encode("ascii", "backslashreplace").decode("ascii").split())
+
+
+_OTHERS = {
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+
+
+def check_input(path: str | os.PathLike[str]) -> Path:
+    """Return `path` if it is that of an ordinary file, or of a link to one.
+
+    Raises `DataError` if nothing is there, and for folders, named pipes, sockets and devices: opening a pipe waits
+    for a writer, and a device may never end.
+    """
+    path = Path(path)
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        raise fail("there is no such file", file=path, advice="check the name") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise fail(f"cannot be read: {reason}", file=path, advice="check the name") from None
+    if stat.S_ISDIR(mode):
+        raise fail("is a folder", file=path, advice="give the name of a file in it")
+    if not stat.S_ISREG(mode):
+        what = _OTHERS.get(stat.S_IFMT(mode), "no ordinary file")
+        raise fail(f"is {what}", file=path, advice="copy its content to a file first")
+    return path

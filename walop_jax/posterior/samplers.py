@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from walop_jax.io.code import classes_of
 from walop_jax.io.errors import fail, nearest
-from walop_jax.io.own_code import classes_of
 from walop_jax.model.compiled import compiled
 
 SAMPLERS = {

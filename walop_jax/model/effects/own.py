@@ -6,8 +6,8 @@ import inspect
 import os
 from collections.abc import Sequence
 
+from walop_jax.io.code import classes_of
 from walop_jax.io.errors import fail
-from walop_jax.io.own_code import classes_of
 from walop_jax.model.effects import EFFECTS
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.effects.catalogue import own_entries

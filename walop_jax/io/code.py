@@ -1,10 +1,13 @@
-"""Code that users bring along as a file: run it, and find the classes in it."""
+"""Code: classes in a file that users bring along, and versions of the software that results rest on."""
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import os
+import platform
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TypeVar
 
@@ -36,3 +39,23 @@ def classes_of(path: str | os.PathLike[str], base: type[T], advice: str) -> dict
         for name, value in vars(module).items()
         if isinstance(value, type) and issubclass(value, base) and value.__module__ == module_name
     }
+
+
+SOFTWARE = ("walop-jax", "jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy", "astropy")
+
+
+def versions_of(names: Iterable[str]) -> dict[str, str]:
+    """Versions of packages; "unknown" for what is not installed."""
+    return {name: _version(name) for name in names}
+
+
+def software_versions() -> dict[str, str]:
+    """Versions of Python, of this package and of what its results rest on."""
+    return {"python": platform.python_version()} | versions_of(SOFTWARE)
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"

@@ -1,0 +1,103 @@
+"""While compiled code keeps the main thread busy, for many seconds at times: progress is told again, Ctrl-C answered.
+
+Python tells its main thread of a signal between two of its own instructions; compiling a program or decomposing a large
+matrix is one. So a thread of its own hears of the signal as well, by `signal.set_wakeup_fd`, and ends the process where
+the main thread has not by then. Files are written beside their place and moved there when they are whole, and finished
+parts of a large fit are kept: nothing is lost that a fresh start would not make again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator
+
+Tell = Callable[[str], None]
+
+EVERY = 4.0  # s
+
+
+class Stage(str):
+    """A message of progress that begins a stage of the work: `stage` is its name, whatever the message says."""
+
+    stage: str
+
+    def __new__(cls, text: str, stage: str) -> Stage:
+        """Make the message `text`, which begins `stage`."""
+        self = super().__new__(cls, text)
+        self.stage = stage
+        return self
+
+
+@contextlib.contextmanager
+def repeated(tell: Tell, every: float = EVERY) -> Generator[Tell, None, None]:
+    """A function that tells what is being done, and tells it again, with how long, after `every` s of silence.
+
+    What it repeats is told from another thread, never at the same time as anything else.
+    """
+    lock, over = threading.Lock(), threading.Event()
+    now = time.monotonic()
+    text, since, told = "starting", now, now
+
+    def say(new: str) -> None:
+        nonlocal text, since, told
+        with lock:
+            text, since = new, time.monotonic()
+            told = since
+            tell(new)
+
+    def again() -> None:
+        nonlocal told
+        while not over.wait(every / 15.0):
+            with lock:
+                moment = time.monotonic()
+                if moment - told >= every and not over.is_set():
+                    told = moment
+                    tell(f"{text} (for {moment - since:.0f} s)")
+
+    thread = threading.Thread(target=again, daemon=True)
+    thread.start()
+    try:
+        yield say
+    finally:
+        over.set()
+        thread.join()
+
+
+PATIENCE = 1.5  # s
+
+
+@contextlib.contextmanager
+def interrupts_answered(end: Callable[[], int], patience: float = PATIENCE) -> Iterator[None]:
+    """Within it an interrupt that is not answered in `patience` s ends the process with the code that `end` returns.
+
+    `end` is called from another thread, to say so. Outside of the main thread nothing is changed.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    hears, told = socket.socketpair()
+    told.setblocking(False)
+    over = threading.Event()
+
+    def listen() -> None:
+        while not over.is_set():
+            if signal.SIGINT in hears.recv(64) and not over.wait(patience):
+                os._exit(end())
+
+    thread = threading.Thread(target=listen, daemon=True)
+    before = signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        signal.set_wakeup_fd(before)
+        told.send(b"\0")  # any other byte than that of the signal
+        thread.join()
+        hears.close()
+        told.close()
