@@ -86,7 +86,7 @@ def setting_plan(
 def as_built(instrument: Instrument, rng: np.random.Generator, sigmas: float = 1.0) -> Instrument:
     """An instrument whose numbers scatter around the given ones by prior widths (or solver scales)."""
     values = np.asarray(values_of(instrument))
-    width = [leaf.declaration.width or leaf.declaration.scale for leaf in leaves(instrument)]
+    width = [leaf.width or leaf.scale for leaf in leaves(instrument)]
     return with_values(instrument)(
         jnp.asarray(values + sigmas * np.array(width) * rng.standard_normal(values.size))
     )

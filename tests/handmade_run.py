@@ -25,7 +25,7 @@ from walop_jax.diagnosis.figure_file import (
 from walop_jax.diagnosis.limits_found import DetectionLimit, DetectionLimits
 from walop_jax.fit.verdict import Verdict
 from walop_jax.io.text import json_text
-from walop_jax.model.specification import Parameter
+from walop_jax.model.parameters import Parameter
 
 INPUT = "night <b>one</b> & two.fits"
 X, Y = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.2, 0.2, 3), np.linspace(-0.2, 0.2, 3)))
@@ -78,7 +78,8 @@ def listed(calibration: Calibration, **changes: Any) -> Calibration:
 def parameters(*rows: tuple[str, str, float, tuple[float, float] | None, bool]) -> tuple[Parameter, ...]:
     """Parameters typed by hand: name, unit, start, prior, free."""
     return tuple(
-        Parameter(name, unit, "", "", start, prior, free, 1.0) for name, unit, start, prior, free in rows
+        Parameter(name, unit, "", "", start, prior, free, 1.0, part=name.partition(".")[0])
+        for name, unit, start, prior, free in rows
     )
 
 

@@ -41,7 +41,7 @@ def same(one, other, rtol=1e-8):
 
 
 def scales(instrument):
-    every = [leaf.declaration.width or leaf.declaration.scale or 1.0 for leaf in leaves(instrument)]
+    every = [leaf.width or leaf.scale or 1.0 for leaf in leaves(instrument)]
     return np.array(every)[list(optical_indices(instrument))]
 
 

@@ -60,7 +60,7 @@ def table(instrument: Instrument) -> dict[str, tuple[float, float | None, str]]:
     """Start, width of the prior and unit of every parameter."""
     values = np.asarray(values_of(instrument))
     return {
-        leaf.name: (float(value), leaf.declaration.width, leaf.declaration.unit)
+        leaf.name: (float(value), leaf.width, leaf.unit)
         for leaf, value in zip(leaves(instrument), values, strict=True)
     }
 
@@ -103,8 +103,8 @@ def test_what_is_fixed_is_that_of_the_design(name):
 
 def test_sources_of_the_numbers_are_said():
     for name in SHIPPED:
-        assert all(leaf.declaration.source for leaf in leaves(nominal_instrument(name)))
-        assert all(leaf.declaration.about for leaf in leaves(nominal_instrument(name)))
+        assert all(leaf.source for leaf in leaves(nominal_instrument(name)))
+        assert all(leaf.about for leaf in leaves(nominal_instrument(name)))
 
 
 def test_names_of_the_family_stay_where_more_are_known():
@@ -155,7 +155,7 @@ def test_a_file_of_ones_own(own):
     ]
     assert instrument.moving() == ("WIN",)
     assert instrument.cameras.pairs == ((1, 0),)
-    every = {leaf.name: leaf.declaration for leaf in leaves(instrument)}
+    every = {leaf.name: leaf for leaf in leaves(instrument)}
     assert every["window.delta"].source == "a measurement"
     assert every["eta"].source == "description file"
     assert every["main.plate.second.axis"].loose == 2.0

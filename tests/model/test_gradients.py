@@ -81,7 +81,7 @@ def test_derivatives_agree(case):
     assert np.isfinite(ahead).all()
     np.testing.assert_allclose(reverse_jacobian(jnp.asarray(values), *point), ahead, rtol=1e-9, atol=1e-13)
     for i, leaf in enumerate(leaves(TEMPLATE)):
-        step = 1e-2 * (leaf.declaration.width or leaf.declaration.scale)
+        step = 1e-2 * (leaf.width or leaf.scale)
         sides = []
         for signed in (step, -step, 2 * step, -2 * step):
             moved = values.copy()

@@ -46,7 +46,7 @@ def matrices(instrument: Instrument, x: float, y: float, plate: float | None) ->
 def anywhere(rng: np.random.Generator) -> Instrument:
     """An instrument with every number anywhere within three prior widths."""
     start = np.asarray(values_of(scenes.BASE))
-    width = np.array([leaf.declaration.width or 0.0 for leaf in leaves(scenes.BASE)])
+    width = np.array([leaf.width or 0.0 for leaf in leaves(scenes.BASE)])
     return with_values(scenes.BASE)(jnp.asarray(start + WIDTHS * width * rng.uniform(-1, 1, len(start))))
 
 

@@ -71,10 +71,10 @@ WRONG = {
         r"\[elements\.window\] axis = that must be a finite number",
     ),
     "far too large": (("axis = 10.0", f"axis = 1{'0' * 5000}"), r"digits"),
-    "bool": (("axis = 10.0", "axis = true"), r"\[elements\.window\] axis = True must be a number"),
+    "bool": (("axis = 10.0", "axis = true"), r"\[elements\.window\] axis = True must be a finite number"),
     "text for a number": (
         ("axis = 10.0", 'axis = "10"'),
-        r"\[elements\.window\] axis = '10' must be a number",
+        r"\[elements\.window\] axis = '10' must be a finite number",
     ),
     "a date": (
         ("axis = 10.0", "axis = 2026-01-01"),

@@ -8,7 +8,8 @@ import numpy as np
 
 from walop_jax.likelihood.expansion import STATED
 from walop_jax.model.build import nominal_instrument
-from walop_jax.model.specification import Model, Parameter, make_model
+from walop_jax.model.parameters import Parameter
+from walop_jax.model.specification import Model, make_model
 from walop_jax.posterior import Convergence, PosteriorSample, sandwich_adjusted
 
 # Three parameters, the third tied to the first.

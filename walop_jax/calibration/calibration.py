@@ -39,7 +39,8 @@ from walop_jax.model.build import adapted, build, nominal_instrument
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.specification import Model, Parameter, effect_context
+from walop_jax.model.parameters import Parameter
+from walop_jax.model.specification import Model, effect_context
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]

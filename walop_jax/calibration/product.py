@@ -51,8 +51,7 @@ from walop_jax.io.fits_reading import UNREADABLE, OpenFile, one_line, open_fits
 from walop_jax.io.text import in_ascii
 from walop_jax.likelihood.expansion import STATED
 from walop_jax.model.effects import EFFECTS, Effect
-from walop_jax.model.parameters import NAME
-from walop_jax.model.specification import Parameter
+from walop_jax.model.parameters import NAME, Parameter
 
 PRODUCT = "calibration.fits"
 PRODVERS = 2
@@ -532,5 +531,8 @@ def _listed(table: Mapping[str, Any], model_lines: Sequence[str]) -> tuple[Param
         entry, prior = written.get(name, {}), (float(mean), float(width)) if np.isfinite(width) else None
         start = float(entry.get("start", np.nan if prior is None else mean))
         tie = entry.get("tie")
-        found.append(Parameter(str(name), str(unit), "", "", start, prior, bool(free), 1.0, tie=tie))
+        part = str(name).partition(".")[0]  # names are all that a file has
+        found.append(
+            Parameter(str(name), str(unit), "", "", start, prior, bool(free), 1.0, tie=tie, part=part)
+        )
     return tuple(found)

@@ -58,8 +58,10 @@ class CheckedInstrument(Displayed):
 
     def display(self) -> Display:
         """The light path and the parameters, but for the coefficients of the throughput."""
+        from walop_jax.model.specification import THROUGHPUT
+
         design = self.instrument
-        shown = [p for p in self.model.parameters if not p.name.startswith("throughput.")]
+        shown = [p for p in self.model.parameters if p.part != THROUGHPUT]
         path = [("light path", " > ".join((*self.train, *(("arms",) if len(self.arms) > 1 else ()))))]
         path += [(f"  {name}", " > ".join(elements)) for name, elements in self.arms.items()]
         if self.moving:

@@ -176,7 +176,7 @@ def truth_document(plan: ObservingPlan, seed: int, instrument: Instrument) -> di
     from walop_jax.model.parameters import leaves
     from walop_jax.simulation.simulate import truth_values
 
-    units = {leaf.name: leaf.declaration.unit for leaf in leaves(instrument)}
+    units = {leaf.name: leaf.unit for leaf in leaves(instrument)}
     return {
         "instrument": plan.name,
         "seed": seed,

@@ -184,7 +184,7 @@ def with_refuted_priors_widened(model: Model, values: Float[np.ndarray, " n"], n
 def beyond_prior(result: FitResult, name: str) -> dict[str, float]:
     """Amplitudes of an effect that lie beyond the prior of their declaration, widened or not, in its widths."""
     effect = result.model.template.effect(name)
-    declared = {f"{name}.{leaf.name}": leaf.declaration.width for leaf in leaves(effect)}
+    declared = {f"{name}.{leaf.name}": leaf.width for leaf in leaves(effect)}
     found = {}
     for i in amplitude_positions(result.model, name):
         p = result.model.parameters[i]

@@ -19,12 +19,13 @@ from walop_jax.likelihood import limits
 from walop_jax.model.build import adapted, as_designed, nominal_instrument
 from walop_jax.model.effects import EFFECTS, Context, Effect, effect_by_name
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.specification import Model, effect_context, make_model, with_effects
+from walop_jax.model.sources import MoonSky, Standards
+from walop_jax.model.specification import THROUGHPUT, Model, effect_context, make_model, with_effects
 
 Catalogue = Sequence[type[Effect]]
 
 GAUGE = "throughput.n0.p00"
-SKY_AND_STARS = ("sky.", "standard.")  # parameters of the sky and of stars, not of the instrument
+SKY_AND_STARS = (MoonSky.name, Standards.name)  # parts that are not the instrument's
 LEVEL = 0.5  # of a throughput whose scale is a gauge
 
 
@@ -65,7 +66,7 @@ def base_model(
         priors[f"standard.{name}.q"] = (float(sources.q[i]), float(sources.q_err[i]))
         priors[f"standard.{name}.u"] = (float(sources.u[i]), float(sources.u_err[i]))
     model = make_model(calset.instrument, instrument, priors=priors)
-    for i in model.positions("throughput"):
+    for i in model.positions(THROUGHPUT):
         p = model.parameters[i]
         model = model.change(p.name, scale=p.scale * level / LEVEL, loose=level)
     for name in _gauges(model, has_known_flux(calset)):
@@ -153,7 +154,7 @@ def model_like(calset: CalibrationSet, old: Model) -> Model:
     model = base_model(calset, old.template, plates=header.plates, throughput_degree=header.throughput_degree)
     own = tuple(type(effect) for effect in old.template.effects)
     model = _with_effects(model, header, effect_context(model.template, calset.exposures), own)
-    kept = {p.name: p for p in old.parameters if p.name != GAUGE and not p.name.startswith(SKY_AND_STARS)}
+    kept = {p.name: p for p in old.parameters if p.name != GAUGE and p.part not in SKY_AND_STARS}
     parameters = tuple(
         dataclasses.replace(p, free=kept[p.name].free, prior=kept[p.name].prior, tie=kept[p.name].tie)
         if p.name in kept

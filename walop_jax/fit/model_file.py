@@ -29,7 +29,8 @@ from typing import Any
 import tomlkit
 
 from walop_jax.io.text import parse_toml
-from walop_jax.model.specification import Model, Parameter, unknown_name
+from walop_jax.model.parameters import Parameter, unknown_name
+from walop_jax.model.specification import Model
 
 TABLES = ("model", "effects", "parameters")
 MODEL_KEYS = ("instrument", "plates", "throughput_degree", "effects")

@@ -9,14 +9,14 @@ from jaxtyping import Float
 
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.rounding import value_and_error, with_error, with_minus_sign
-from walop_jax.model.specification import Model, Parameter
+from walop_jax.model.parameters import Parameter
+from walop_jax.model.specification import THROUGHPUT, Model
 
 Vector = Float[np.ndarray, " n"]
 Columns = dict[str, tuple[np.ndarray, str, str]]
 
 PRIOR_ONLY = 0.99  # of the prior width: an error above it owes nothing to the data
 HEAD = ("parameter", ">value", ">error", "unit", ">start", "prior", "")
-HIDDEN = "throughput."  # smooth maps: their terms mean nothing one by one
 
 
 def unconstrained(model: Model, sigma: Vector) -> tuple[str, ...]:
@@ -52,7 +52,7 @@ def parameter_rows(model: Model, values: Vector, sigma: Vector) -> tuple[tuple[s
     idle = unconstrained(model, sigma)
     rows = []
     for p, value, s in zip(model.parameters, values, sigma, strict=True):
-        if p.name.startswith(HIDDEN):
+        if p.part == THROUGHPUT:
             continue
         prior = "" if p.prior is None else with_error(p.prior[0] + 0.0, p.prior[1])
         same = p.prior is not None and p.prior[0] == p.start
@@ -64,7 +64,7 @@ def parameter_rows(model: Model, values: Vector, sigma: Vector) -> tuple[tuple[s
 
 def parameter_notes(model: Model, sigma: Vector) -> tuple[str, ...]:
     """What a table of `parameter_rows` leaves out, and which parameters the data do not constrain."""
-    hidden = sum(name.startswith(HIDDEN) for name in model.names)
+    hidden = len(model.positions(THROUGHPUT))
     idle = unconstrained(model, sigma)
     notes = [f"{hidden} throughput terms not shown; to_table() has them"] if hidden else []
     if idle:

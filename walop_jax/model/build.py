@@ -1,9 +1,11 @@
-"""From the description of an instrument to the instrument: every element that a file names is made here."""
+"""From the description of an instrument to the instrument: every element that a file names is made and checked here."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import itertools
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -11,54 +13,56 @@ import numpy as np
 
 from walop_jax.data.records import POLARISER, PREFIX
 from walop_jax.instruments.description import (
-    ArmText,
     Description,
-    ElementText,
-    Given,
+    Reader,
+    Table,
     default_name,
     described,
+    is_named,
     shipped,
 )
-from walop_jax.io.errors import DataError, nearest
-from walop_jax.model import legendre, materials
+from walop_jax.io.errors import nearest
+from walop_jax.model import legendre
 from walop_jax.model.cameras import Cameras, Throughput
-from walop_jax.model.elements import ELEMENTS, Analyser, Element, Layer, Polariser, WavePlate, Wedge
-from walop_jax.model.elements.geometry import FRAMES
+from walop_jax.model.elements import ELEMENTS, Analyser, Element, Layer, Polariser, WavePlate
 from walop_jax.model.elements.wave_plate import MODELS
 from walop_jax.model.instrument import Arm, Instrument
-from walop_jax.model.parameters import Component, Declaration, numbers_of, unknown_name
+from walop_jax.model.parameters import Component, Parameter, is_row, leaves, numbers_of, unknown_name
 from walop_jax.model.sources import SOURCES, Source, Standards
-from walop_jax.model.well_formed import check
 
 PLATE_MODELS = tuple(MODELS)
 STAR = tuple[str, float, float]
 OWN = ("name", "moves", "declared", "model")  # what a file says otherwise, or not at all
+NUMBER_KEYS = ("value", "sigma", "unit", "source", "name", "scale", "loose", "tie")
 SERIES = "Legendre coefficient P_i(x/h) P_j(y/h)"
 FREE = "smooth vignetting and coatings: free"
+TAKEN = ("throughput", "cameras", "effects")
+"""Names of other parts of an instrument."""
+
+Declared = tuple[tuple[str, Parameter], ...]
 
 
 def build(description: Description, *, elements: Sequence[type[Element]] = (), **options: Any) -> Instrument:
     """The instrument that a description describes, at the values that it gives; options as for `adapted`.
 
-    `elements` are further kinds of elements that the description may name. Raises `DataError` for a kind of
-    element, or a number of one, that does not exist.
+    `elements` are further kinds of elements that the description may name. Raises `DataError`, naming table and key,
+    for what does not exist or would do nothing where it stands.
     """
-    make = _Maker(description, {kind.kind: kind for kind in (*ELEMENTS, *elements)})
-    arms = tuple(make.arm(arm) for arm in description.arms)
-    given = description.throughput
-    series = Declaration(unit="", about=SERIES, source=FREE, scale=given.scale, loose=given.loose)
-    coefficients = np.zeros((len(description.cameras), len(legendre.terms(description.throughput_degree))))
-    coefficients[:, 0] = given.value
+    make = _Maker(description.read, description.source, {kind.kind: kind for kind in (*ELEMENTS, *elements)})
+    elements_ = tuple(make.elements(description.elements, description.path, "elements"))
+    arms = tuple(make.arm(name, table) for name, table in description.arms.items())
+    coefficients = np.zeros((len(description.cameras), len(legendre.terms(description.degree))))
+    coefficients[:, 0] = description.level
     instrument = Instrument(
         name=description.name,
         sources=sources(),
-        elements=tuple(make.element(text) for text in description.elements),
+        elements=elements_,
         arms=arms,
         throughput=Throughput(
-            degree=description.throughput_degree,
+            degree=description.degree,
             coefficients=jnp.asarray(coefficients),
             scale=description.field_scale,
-            declared=series,
+            declared=Parameter("", "", SERIES, FREE, scale=description.scale, loose=description.loose),
         ),
         cameras=_cameras(description, arms),
         path=description.path,
@@ -67,7 +71,7 @@ def build(description: Description, *, elements: Sequence[type[Element]] = (), *
         raster=(description.raster, description.edge),
         description="" if description.name in shipped() else description.text,
     )
-    check(instrument)
+    _check(instrument, description.read)
     return adapted(instrument, **options)
 
 
@@ -123,150 +127,205 @@ def _standards(stars: Sequence[STAR]) -> Standards:
 
 
 def _cameras(description: Description, arms: Sequence[Arm]) -> Cameras:
-    names = description.cameras
+    names, fault = description.cameras, description.read.fault
     pairs = []
     for arm in arms:
         beams = arm.analyser.cameras
         for name in beams:
             if name not in names:
-                raise DataError(f"[arms.{arm.name}] camera {name!r} does not exist; {nearest(name, names)}")
+                raise fault(f"arms.{arm.name}", f"camera {name!r} does not exist; {nearest(name, names)}")
         pairs.append((names.index(beams[0]), names.index(beams[1])))
     seen = [camera for pair in pairs for camera in pair]
     if sorted(seen) != list(range(len(names))):
-        raise DataError(f"[cameras] every camera must stand behind one analyser: {', '.join(names)}")
+        raise fault("cameras", f"every camera must stand behind one analyser: {', '.join(names)}")
     return Cameras(names=names, pairs=tuple(pairs), split=description.split, floor=description.floor)
+
+
+def _check(instrument: Instrument, read: Reader) -> None:
+    """Raise `DataError` for a part that would do nothing where it stands, and for a name that is there twice."""
+    for element in instrument.elements:
+        if isinstance(element, Analyser):
+            raise read.fault(
+                f"elements.{element.name}", "an analyser ends an arm: move it to the path of one"
+            )
+    polarisers = [element.name for element in instrument.train() if isinstance(element, Polariser)]
+    if len(polarisers) > 1:
+        raise read.fault(f"elements.{polarisers[1]}", "is a second polariser; there can be one")
+    for arm in instrument.arms:
+        for element in arm.train():
+            if isinstance(element, Analyser | Polariser):
+                where = "ends its arm" if isinstance(element, Analyser) else "stands ahead of the arms"
+                raise read.fault(f"arms.{arm.name}.elements.{element.name}", f"a {element.kind} {where}")
+    parts = itertools.chain(instrument.sources, instrument.elements, instrument.arms)
+    for name, count in Counter([*(part.name for part in parts), *TAKEN]).items():
+        if count > 1:
+            raise read.fault(name, "more than one part of the instrument has this name; give it another one")
+    for name, count in Counter(parameter.name for parameter in leaves(instrument)).items():
+        if count > 1:
+            raise read.fault("", f"{count} parameters have the name {name!r}; give them different ones")
+    try:
+        instrument.telescope()
+    except ValueError as error:
+        raise read.fault("elements", str(error)) from None
 
 
 @dataclasses.dataclass(frozen=True)
 class _Maker:
-    description: Description
+    read: Reader
+    source: str
     kinds: Mapping[str, type[Element]]
 
-    def arm(self, text: ArmText) -> Arm:
-        place = f"arms.{text.name}"
-        elements = tuple(self.element(entry, f"{place}.elements.") for entry in text.elements)
-        arm = Arm(name=text.name, elements=elements, path=text.path)
-        if not isinstance(elements[[e.name for e in elements].index(text.path[-1])], Analyser):
-            raise DataError(f"[{place}] its path must end with an analyser, not with {text.path[-1]!r}")
+    def arm(self, name: str, content: Any) -> Arm:
+        place = f"arms.{self.read.name(name, 'arms')}"
+        table = self.read.table(content, place)
+        self.read.known(table, ("path", "elements"), place)
+        path = self.read.words(table.get("path"), "path", place)
+        described = self.read.table(table.get("elements", {}), place, "elements = ")
+        arm = Arm(name, tuple(self.elements(described, path, f"{place}.elements")), path)
+        if not isinstance(next(one for one in arm.elements if one.name == path[-1]), Analyser):
+            raise self.read.fault(place, f"its path must end with an analyser, not with {path[-1]!r}")
         if len(arm.analyser.cameras) != 2:
-            raise DataError(f"[arms.{text.name}] its analyser needs the names of two cameras")
+            raise self.read.fault(place, "its analyser needs the names of two cameras")
         return arm
 
-    def element(self, text: ElementText, prefix: str = "elements.") -> Element:
-        place = f"{prefix}{text.name}"
-        if text.kind not in self.kinds:
-            raise DataError(
-                f"[{place}] unknown kind of element {text.kind!r}; {nearest(text.kind, self.kinds)}"
-            )
-        kind = self.kinds[text.kind]
-        fields, declared = self.numbers(kind, text.values, place)
+    def elements(self, table: Table, path: tuple[str, ...], place: str) -> Iterator[Element]:
+        for name in path:
+            if name not in table:
+                what = f"path names {name!r}, which is not described; {nearest(name, table)}"
+                raise self.read.fault(place, what)
+        for name, content in table.items():
+            here = f"{place}.{self.read.name(name, place)}"
+            if name not in path:
+                raise self.read.fault(here, "is described but does not stand in the path")
+            yield self.element(name, self.read.table(content, here), here)
+
+    def element(self, name: str, table: Table, place: str) -> Element:
+        if "kind" not in table:
+            raise self.read.fault(place, "has no kind")
+        kind = self.kinds.get(self.read.text(table["kind"], "kind", place))
+        if kind is None:
+            what = f"unknown kind of element {table['kind']!r}; {nearest(table['kind'], self.kinds)}"
+            raise self.read.fault(place, what)
+        moves, layers = table.get("moves"), table.get("layers", [])
+        values = {k: v for k, v in table.items() if k not in ("kind", "moves", "layers")}
+        fields, declared = self.fields(kind, values, place)
         if kind is WavePlate:
-            if not text.layers:
-                raise DataError(f"[{place}] a wave plate needs layers")
-            fields |= {"layers": tuple(self.layer(layer, place) for layer in text.layers)}
-        elif text.layers:
-            raise DataError(f"[{place}] an element of kind {text.kind!r} has no layers")
-        if kind is Wedge and fields.get("material", Wedge.material) not in materials.GLASSES:
-            glass = str(fields["material"])
-            raise DataError(f"[{place}] unknown glass {glass!r}; {nearest(glass, materials.GLASSES)}")
-        if kind is Wedge and fields.get("frame", FRAMES[0]) not in FRAMES:
-            raise DataError(f"[{place}] frame = {fields['frame']!r} of a wedge must be {' or '.join(FRAMES)}")
-        try:
-            made = kind(name=text.name, moves=text.moves, declared=declared, **fields)
-        except ValueError as error:
-            raise DataError(f"[{place}] {error}") from None
+            fields["layers"] = tuple(self.layers(layers, place))
+        elif layers:
+            raise self.read.fault(place, f"an element of kind {kind.kind!r} has no layers")
+        if moves is not None:
+            moves = self.read.text(moves, "moves", place)
+        made = self.made(kind, place, name=name, moves=moves, declared=declared, **fields)
         self.check_moves(made, place)
         return made
+
+    def made(self, kind: type[Any], place: str, **fields: Any) -> Any:
+        """A component; what it says of its numbers is an error of the file."""
+        try:
+            return kind(**fields)
+        except ValueError as error:
+            raise self.read.fault(place, str(error)) from None
 
     def check_moves(self, made: Element, place: str) -> None:
         moves, what = made.moves, f"an element of kind {made.kind!r}"
         if isinstance(made, Polariser):
             if moves not in (None, POLARISER):
-                raise DataError(f"[{place}] moves = {moves!r}: the columns of a polariser are {POLARISER}")
+                raise self.read.fault(place, f"moves = {moves!r}: the columns of a polariser are {POLARISER}")
         elif moves is None:
             return
         elif not PREFIX.fullmatch(moves):
-            raise DataError(
-                f"[{place}] moves = {moves!r} cannot begin the names of columns: capital letters, digits and _, a "
-                "letter first"
-            )
+            what = f"moves = {moves!r} cannot begin the names of columns: capital letters, digits and _, a letter first"
+            raise self.read.fault(place, what)
         elif isinstance(made, Analyser):
-            raise DataError(f"[{place}] an analyser does not move")
+            raise self.read.fault(place, "an analyser does not move")
         elif not hasattr(made, "axis"):
-            raise DataError(f"[{place}] moves, but {what} has no axis that could turn")
+            raise self.read.fault(place, f"moves, but {what} has no axis that could turn")
         elif type(made).ray is not Element.ray:
-            raise DataError(f"[{place}] {what} changes the ray and cannot move")
+            raise self.read.fault(place, f"{what} changes the ray and cannot move")
 
-    def layer(self, values: Mapping[str, Any], place: str) -> Layer:
-        name = values["name"]
-        rest = {key: value for key, value in values.items() if key != "name"}
-        place = f"{place}.layers.{name}"
-        fields, declared = self.numbers(Layer, rest, place)
-        if not fields.get("thickness", 0.0) >= 0.0 or "thickness" not in fields:
-            raise DataError(f"[{place}] needs a thickness (um) that is not below 0")
-        material = fields.get("material", "")
-        if material not in materials.CRYSTALS:
-            raise DataError(
-                f"[{place}] unknown crystal {material!r}; {nearest(str(material), materials.CRYSTALS)}"
-            )
-        return Layer(name=name, declared=declared, **fields)
+    def layers(self, tables: Any, place: str) -> Iterator[Layer]:
+        if not is_named(tables):
+            raise self.read.fault(place, "layers must be a list of tables with a name each")
+        if not tables:
+            raise self.read.fault(place, "a wave plate needs layers")
+        self.read.words([table["name"] for table in tables], "layers", place)
+        for table in tables:
+            name = self.read.name(table["name"], f"{place}.layers")
+            here = f"{place}.layers.{name}"
+            fields, declared = self.fields(Layer, {k: v for k, v in table.items() if k != "name"}, here)
+            if not fields.get("thickness", -1.0) >= 0.0:
+                raise self.read.fault(here, "needs a thickness (um) that is not below 0")
+            yield self.made(Layer, here, name=name, declared=declared, **fields)
 
-    def numbers(
-        self, kind: type[Component], values: Mapping[str, Any], place: str
-    ) -> tuple[dict[str, Any], tuple[tuple[str, Declaration], ...]]:
+    def fields(self, kind: type[Component], table: Table, place: str) -> tuple[dict[str, Any], Declared]:
         """Fields of a component from what a file says of it, and which of them are parameters."""
         known = numbers_of(kind)
-        static = {f.name: f.default for f in dataclasses.fields(kind) if f.metadata.get("static", False)}
-        plain = {name: default for name, default in static.items() if name not in OWN}
-        fields: dict[str, Any] = {}
-        declared: list[tuple[str, Declaration]] = []
-        for key, value in values.items():
-            if key not in known and key not in plain:
-                raise DataError(f"[{place}] {unknown_name('key', key, [*known, *plain])}")
+        plain = {
+            f.name: f.default
+            for f in dataclasses.fields(kind)
+            if f.metadata.get("static", False) and f.name not in OWN
+        }
+        values: dict[str, Any] = {}
+        declared: dict[str, Parameter] = {}
+        for key, value in table.items():
             if key in plain:
-                fields[key] = self.fixed(value, plain[key], f"[{place}] {key}")
-                continue
-            if not isinstance(value, Given):
-                raise DataError(f"[{place}] {key} = {value!r} must be a number")
-            if known[key].several is not isinstance(value.value, tuple):
-                wanted = "a list of numbers" if known[key].several else "one number"
-                raise DataError(f"[{place}] {key} = {value.value!r} must be {wanted}")
-            if value.unit is not None and value.unit != known[key].unit:
-                raise DataError(
-                    f"[{place}] {key} is in {known[key].unit!r}, not in {value.unit!r}; convert it"
-                )
-            fields[key] = value.value
-            if value.parameter:
-                declared.append((key, self.declaration(value, known[key].unit, known[key].about)))
+                values[key] = self.choice(value, plain[key], key, place)
+            elif key in known:
+                values[key], said = self.number(value, known[key], is_row(kind, key), key, place)
+                if said is not None:
+                    declared[key] = said
+            else:
+                raise self.read.fault(place, str(unknown_name("key", key, [*known, *plain])))
         # In the order of the class, as the tree is flattened.
-        order = list(known)
-        return fields, tuple(sorted(declared, key=lambda entry: order.index(entry[0])))
+        return values, tuple((key, declared[key]) for key in known if key in declared)
 
-    def fixed(self, value: Any, default: Any, what: str) -> Any:
-        """A choice that is no parameter, of the type of its default."""
-        if isinstance(value, Given):
-            if value.parameter:
-                raise DataError(f"{what} cannot be a parameter")
-            value = value.value
-        if isinstance(value, bool) is not isinstance(default, bool):
-            kind = "true or false" if isinstance(default, bool) else "no truth value"
-            raise DataError(f"{what} = {value!r} must be {kind}")
-        if isinstance(default, int | float):
-            if not isinstance(value, int | float):
-                raise DataError(f"{what} = {value!r} must be one number")
-            return type(default)(value)
-        if isinstance(default, str | tuple) and not isinstance(value, type(default)):
-            raise DataError(f"{what} = {value!r} must be a {'name' if isinstance(default, str) else 'list'}")
-        return value
-
-    def declaration(self, given: Given, unit: str, about: str) -> Declaration:
-        return Declaration(
-            unit=unit,
-            about=about,
-            source=given.source or self.description.source,
-            width=given.sigma,
-            scale=given.scale,
-            loose=given.loose,
-            name=given.name,
-            tie=given.tie,
+    def number(
+        self, given: Any, known: Parameter, row: bool, key: str, place: str
+    ) -> tuple[float | tuple[float, ...], Parameter | None]:
+        """The value of a number, or of a row of them; the parameter that it is where more is said than its value."""
+        several = self.read.numbers if row else self.read.number
+        if not isinstance(given, Mapping):
+            return several(given, key, place), None
+        here = f"{place}.{key}"
+        self.read.known(given, NUMBER_KEYS, here)
+        if "value" not in given:
+            raise self.read.fault(here, "has no value")
+        if given.get("unit", known.unit) != known.unit:
+            what = f"{key} is in {known.unit!r}, not in {given['unit']!r}; convert it"
+            raise self.read.fault(place, what)
+        advice = "; leave it out where there is none"
+        widths = {
+            k: self.read.positive(given[k], k, here, advice)
+            for k in ("sigma", "scale", "loose")
+            if k in given
+        }
+        texts = {k: self.read.text(given[k], k, here) for k in ("source", "name", "tie") if k in given}
+        declared = dataclasses.replace(
+            known,
+            name=texts.get("name", ""),
+            source=texts.get("source", self.source),
+            prior=(0.0, widths["sigma"]) if "sigma" in widths else None,
+            scale=widths.get("scale", 0.0),
+            loose=widths.get("loose"),
+            tie=texts.get("tie"),
         )
+        return several(given["value"], "value", here), declared
+
+    def choice(self, value: Any, default: Any, key: str, place: str) -> Any:
+        """A choice that is no parameter, of the type of its default."""
+        if isinstance(value, Mapping):
+            raise self.read.fault(place, f"{key} cannot be a parameter")
+        if isinstance(default, bool):
+            if not isinstance(value, bool):
+                raise self.read.fault(place, f"{key} = {value!r} must be true or false")
+            return value
+        if isinstance(default, int | float):
+            return type(default)(self.read.number(value, key, place))
+        if isinstance(default, str):
+            if not isinstance(value, str):
+                raise self.read.fault(place, f"{key} = {value!r} must be a name")
+            return self.read.text(value, key, place)
+        if not isinstance(value, list):
+            raise self.read.fault(place, f"{key} = {value!r} must be a list")
+        texts = bool(value) and isinstance(value[0], str)
+        return self.read.words(value, key, place) if texts else self.read.numbers(value, key, place)

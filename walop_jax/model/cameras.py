@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float
 
 from walop_jax.model import legendre
 from walop_jax.model.conventions import FIELD_SCALE
-from walop_jax.model.parameters import Component, Declaration
+from walop_jax.model.parameters import Component, Parameter
 from walop_jax.model.sources import ExposureArrays
 
 Scalar = Float[Array, ""]
@@ -36,10 +36,10 @@ class Throughput(Component):
 
     degree: int = eqx.field(static=True)
     coefficients: Float[Array, "k t"]
-    declared: Declaration = eqx.field(static=True)
+    declared: Parameter = eqx.field(static=True)
     scale: float = eqx.field(static=True, default=FIELD_SCALE)  # h, degrees
 
-    def declarations(self) -> Mapping[str, Declaration]:
+    def declarations(self) -> Mapping[str, Parameter]:
         """The series is a parameter of every instrument."""
         return {"coefficients": self.declared}
 

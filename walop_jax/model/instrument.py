@@ -19,7 +19,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.instruments.description import read_description
-from walop_jax.io.errors import errors_naming
 from walop_jax.model.cameras import Cameras, Throughput
 from walop_jax.model.elements import Analyser, Element, Polariser, WavePlate
 from walop_jax.model.parameters import Component, number, unknown_name
@@ -103,9 +102,7 @@ class Instrument(Component):
         """
         from walop_jax.model.build import build
 
-        description = read_description(source)
-        with errors_naming(source):
-            return build(description, **options)
+        return build(read_description(source), **options)
 
     # ------------------------------------------------------------------------------- asking for parts
 

@@ -1,10 +1,10 @@
 """Parameters that know their unit, meaning, source and prior; names derived from the tree that holds them.
 
-A component declares what it can be asked about in two ways. `param` declares a parameter for good: whoever holds the
-component has it. `number` declares a number that an instrument may leave fixed; which of them are parameters, with
-which prior and from which source, the description of the instrument says (`Element.declared`). Nobody types a second
-list of names: they follow from the tree. The value in the tree carries the unit of the declaration (e.g. um or deg),
-conversions stand in the equations.
+`Parameter` is the one record of a number. A component declares what it can be asked about in two ways. `param` declares
+a parameter for good: whoever holds the component has it. `number` declares a number that an instrument may leave fixed;
+which of them are parameters, with which prior and from which source, its description says (`Element.declared`). Nobody
+types a second list of names: they follow from the tree. The value in the tree carries the unit of the declaration (e.g.
+um or deg), conversions stand in the equations.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import difflib
 import functools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -24,6 +24,7 @@ from jaxtyping import Array, Float
 
 PARAMETER = "walop_jax.parameter"
 NUMBER = "walop_jax.number"
+SEVERAL = "walop_jax.several"
 
 Vector = Float[Array, " n"]
 Shapes = tuple[tuple[tuple[int, ...], str], ...]
@@ -34,31 +35,59 @@ AnyComponent = TypeVar("AnyComponent", bound="Component")
 
 
 @dataclasses.dataclass(frozen=True)
-class Declaration:
-    """What is known of a parameter beforehand.
+class Parameter:
+    """One number of an instrument: what it is called, what is known of it, whether it varies.
 
-    `width` is the standard deviation of the as-built value (None: no prior), `scale` the step a solver should think
-    in (the width where there is one). `loose` is the width of a very weak pull toward the start value that keeps
-    combinations which the data hardly see from running away; it is no prior knowledge and is not counted as such.
-    `name` replaces the name that follows from the tree; `tie` is the name of the parameter whose value it takes.
+    `prior` is (mean, standard deviation) or None, `scale` the step that a solver should think in, `loose` the width of
+    a very weak pull toward `start`, which keeps combinations that the data hardly see from running away and is no prior
+    knowledge; `tie` is the name of the parameter whose value this one takes. `part` is the place of what holds it, as
+    for `Instrument.changed`: "half1.plate", "throughput", "sky", or the name of an effect.
+
+    Before a number has a value (`declared`), the mean of its prior is counted from that value, the step may be 0 (then
+    the prior or the value says it), and a name replaces the one that follows from the tree.
     """
 
+    name: str
     unit: str
     about: str
     source: str
-    width: float | None = None
-    scale: float | None = None
+    start: float = 0.0
+    prior: tuple[float, float] | None = None
+    free: bool = True
+    scale: float = 0.0
     loose: float | None = None
-    name: str | None = None
     tie: str | None = None
+    part: str = ""
 
+    @property
+    def width(self) -> float | None:
+        """Standard deviation of the prior, None where there is none."""
+        return None if self.prior is None else self.prior[1]
 
-class Number(NamedTuple):
-    """Unit and meaning of a number that an instrument may leave fixed; `several`: a row of them, at wavelengths."""
+    def is_of(self, place: str) -> bool:
+        """Whether it belongs to a part of the instrument, or to a part of that."""
+        return f"{self.part}.".startswith(f"{place}.")
 
-    unit: str
-    about: str
-    several: bool = False
+    def at(self, value: float, prior: tuple[float, float] | None = None) -> Parameter:
+        """A declared parameter at a value; `prior` replaces what is declared."""
+        if prior is None and self.prior is not None:
+            prior = value + self.prior[0], self.prior[1]
+        scale = prior[1] if prior is not None else self.scale or max(abs(value), 1e-3)
+        return dataclasses.replace(self, start=value, prior=prior, scale=scale)
+
+    def checked(self) -> Parameter:
+        """Itself. Raises ValueError for a name that files could not hold, and for numbers that mean nothing."""
+        if not NAME.fullmatch(self.name):
+            raise ValueError(f"parameter {self.name!r}: a name has letters, digits and _ . + - * only")
+        if not np.isfinite(self.start):
+            raise ValueError(f"parameter {self.name}: start value {self.start} is not finite")
+        if self.prior is not None and not (np.isfinite(self.prior[0]) and self.prior[1] > 0):
+            raise ValueError(
+                f"parameter {self.name}: prior {self.prior} needs a finite mean and a width above 0"
+            )
+        if not self.scale > 0:
+            raise ValueError(f"parameter {self.name}: scale {self.scale} must be above 0")
+        return self
 
 
 def param(
@@ -72,14 +101,19 @@ def param(
     default: float | None = None,
 ) -> Any:
     """Declare a parameter of an Equinox module; values become float64 arrays."""
-    declaration = Declaration(unit, about, source, width, scale, loose)
+    prior = None if width is None else (0.0, width)
+    declared = Parameter("", unit, about, source, prior=prior, scale=scale or 0.0, loose=loose)
     extra: dict[str, Any] = {} if default is None else {"default": default}
-    return eqx.field(metadata={PARAMETER: declaration}, converter=_array, **extra)
+    return eqx.field(metadata={PARAMETER: declared}, converter=_array, **extra)
 
 
 def number(*, unit: str, about: str, default: float | None = 0.0, several: bool = False) -> Any:
-    """Declare a number of an Equinox module; values become float64 arrays, None stays: nothing of the kind."""
-    return eqx.field(metadata={NUMBER: Number(unit, about, several)}, converter=_array, default=default)
+    """Declare a number of an Equinox module that a description may make a parameter; `several`: a row of them.
+
+    Values become float64 arrays, None stays: nothing of the kind.
+    """
+    declared = Parameter("", unit, about, "")
+    return eqx.field(metadata={NUMBER: declared, SEVERAL: several}, converter=_array, default=default)
 
 
 def _array(value: Any) -> Any:
@@ -102,61 +136,62 @@ class Component(eqx.Module):
         """Names, within this component, of the elements of the parameter `field`; "" is the component's own name."""
         return (field,)
 
-    def declarations(self) -> Mapping[str, Declaration]:
+    def declarations(self) -> Mapping[str, Parameter]:
         """Its parameters, by field."""
         return field_declarations(type(self))
 
 
-@dataclasses.dataclass(frozen=True)
-class Leaf:
-    """One number of the tree: its name, its declaration and the field that holds it."""
-
-    name: str
-    declaration: Declaration
-    holder: tuple[str, ...]
+Holder = tuple[str, ...]
+"""Fields and positions that lead to an array of the tree."""
 
 
-def _arrays(component: Component, prefix: str, place: tuple[str, ...]) -> Iterator[tuple[Leaf, ...]]:
-    """The numbers of every parameter array, in the order in which a tree is flattened."""
+def _arrays(
+    component: Component, part: str = "", path: Holder = ()
+) -> Iterator[tuple[Holder, tuple[Parameter, ...]]]:
+    """The parameters of every array of a tree, in the order in which it is flattened."""
     declared = component.declarations()
     for field in dataclasses.fields(component):
         if field.metadata.get("static", False):
             continue
-        value = getattr(component, field.name)
-        here = (*place, field.name)
+        value, here = getattr(component, field.name), (*path, field.name)
         if field.name in declared:
-            labels, declaration = component.labels(field.name), declared[field.name]
+            labels, own = component.labels(field.name), declared[field.name]
             if len(labels) != np.size(value):
                 raise ValueError(
                     f"{type(component).__name__}.{field.name}: {len(labels)} labels, {np.size(value)} values"
                 )
-            names = (declaration.name or f"{prefix}{label}".rstrip(".") for label in labels)
-            yield tuple(Leaf(name, declaration, here) for name in names)
+            names = (own.name or f"{part}.{label}".strip(".") for label in labels)
+            yield here, tuple(dataclasses.replace(own, name=name, part=part) for name in names)
         elif isinstance(value, tuple):
             for i, child in enumerate(value):
                 if isinstance(child, Component) and hasattr(child, "name"):
-                    yield from _arrays(child, f"{prefix}{_name(child)}.", (*here, str(i)))
+                    yield from _arrays(child, f"{part}.{_name(child)}".strip("."), (*here, str(i)))
         elif isinstance(value, Component):
-            yield from _arrays(value, f"{prefix}{field.name}.", here)
+            yield from _arrays(value, f"{part}.{field.name}".strip("."), here)
 
 
 def _name(component: Any) -> str:
     return component.name
 
 
-def leaves(component: Component) -> tuple[Leaf, ...]:
-    """Every parameter of a component, in the order of `values_of`."""
-    return tuple(leaf for array in _arrays(component, "", ()) for leaf in array)
+def leaves(component: Component) -> tuple[Parameter, ...]:
+    """Every parameter of a component as declared, with its name and place, in the order of `values_of`."""
+    return tuple(parameter for _, array in _arrays(component) for parameter in array)
 
 
-def field_declarations(kind: type[Component]) -> dict[str, Declaration]:
+def field_declarations(kind: type[Component]) -> dict[str, Parameter]:
     """The parameters that a component class declares for good, by field name."""
     return {f.name: f.metadata[PARAMETER] for f in dataclasses.fields(kind) if PARAMETER in f.metadata}
 
 
-def numbers_of(kind: type[Component]) -> dict[str, Number]:
+def numbers_of(kind: type[Component]) -> dict[str, Parameter]:
     """The numbers that a component class has, by field name."""
     return {f.name: f.metadata[NUMBER] for f in dataclasses.fields(kind) if NUMBER in f.metadata}
+
+
+def is_row(kind: type[Component], number: str) -> bool:
+    """Whether a number of a component class is a row of values."""
+    return next(f.metadata[SEVERAL] for f in dataclasses.fields(kind) if f.name == number)
 
 
 # -------------------------------------------------------------------------------- the tree and the vector
@@ -172,7 +207,7 @@ def _places(structure: Any, shapes: Shapes) -> tuple[tuple[int, int], ...]:
     component = of_shapes(structure, shapes)
     flat, _ = jax.tree_util.tree_flatten_with_path(component)
     position = {tuple(_key(entry) for entry in path): i for i, (path, _) in enumerate(flat)}
-    return tuple((position[array[0].holder], len(array)) for array in _arrays(component, "", ()) if array)
+    return tuple((position[here], len(array)) for here, array in _arrays(component) if array)
 
 
 def _key(entry: Any) -> str:

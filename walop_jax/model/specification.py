@@ -19,29 +19,11 @@ from walop_jax.model.conventions import EXTINCTION
 from walop_jax.model.effects import effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import NAME, leaves, unknown_name, values_of, with_values
+from walop_jax.model.parameters import Parameter, leaves, unknown_name, values_of, with_values
 
 Vector = Float[np.ndarray, " n"]
-
-
-@dataclasses.dataclass(frozen=True)
-class Parameter:
-    """One number of the model.
-
-    `prior` is (mean, standard deviation) or None; `tie` the name of the parameter whose value this one takes.
-    `scale` is the unit a solver thinks in, `loose` the width of the weak pull to `start` of `Declaration`.
-    """
-
-    name: str
-    unit: str
-    about: str
-    source: str
-    start: float
-    prior: tuple[float, float] | None
-    free: bool
-    scale: float
-    loose: float | None = None
-    tie: str | None = None
+THROUGHPUT = "throughput"
+"""The part of an instrument that is a smooth map: its terms mean nothing one by one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,16 +37,7 @@ class Model:
     def __post_init__(self) -> None:
         names = self.names
         for p in self.parameters:
-            if not NAME.fullmatch(p.name):
-                raise ValueError(f"parameter {p.name!r}: a name has letters, digits and _ . + - * only")
-            if not np.isfinite(p.start):
-                raise ValueError(f"parameter {p.name}: start value {p.start} is not finite")
-            if p.prior is not None and not (np.isfinite(p.prior[0]) and p.prior[1] > 0):
-                raise ValueError(
-                    f"parameter {p.name}: prior {p.prior} needs a finite mean and a width above 0"
-                )
-            if not p.scale > 0:
-                raise ValueError(f"parameter {p.name}: scale {p.scale} must be above 0")
+            p.checked()
             if p.tie is not None and (
                 p.tie not in names or self.parameters[names.index(p.tie)].tie is not None
             ):
@@ -93,8 +66,8 @@ class Model:
             raise unknown_name("parameter", name, self.names) from None
 
     def positions(self, component: str) -> Int[np.ndarray, " _"]:
-        """Positions of the parameters of a component or an effect, in tree order; none where the model has none."""
-        return np.array([i for i, name in enumerate(self.names) if name.startswith(f"{component}.")], int)
+        """Positions of the parameters of a part or an effect, in tree order; none where the model has none."""
+        return np.array([i for i, p in enumerate(self.parameters) if p.is_of(component)], int)
 
     def change(self, name: str, **changes: Any) -> Model:
         """The model with fields of one parameter replaced."""
@@ -140,7 +113,7 @@ class Model:
 
 def series_indices(instrument: Instrument) -> tuple[int, ...]:
     """Positions of the throughput coefficients (cameras × terms, contiguous)."""
-    return tuple(i for i, leaf in enumerate(leaves(instrument)) if leaf.holder[0] == "throughput")
+    return tuple(i for i, leaf in enumerate(leaves(instrument)) if leaf.part == THROUGHPUT)
 
 
 def make_template(instrument: Instrument) -> Instrument:
@@ -160,17 +133,10 @@ def make_model(
     `priors` adds priors by name (catalogue errors of standards), `frozen` names parameters that do not vary.
     """
     priors = dict(priors or {})
-    parameters = []
-    for leaf, value in zip(leaves(instrument), np.asarray(values_of(instrument)), strict=True):
-        d = leaf.declaration
-        prior = priors.pop(leaf.name, None) or ((float(value), d.width) if d.width is not None else None)
-        scale = prior[1] if prior is not None else (d.scale or max(abs(float(value)), 1e-3))
-        parameters.append(
-            Parameter(
-                name=leaf.name, unit=d.unit, about=d.about, source=d.source, start=float(value), prior=prior,
-                free=leaf.name not in frozen, scale=scale, loose=d.loose, tie=d.tie,
-            )
-        )  # fmt: skip
+    parameters = [
+        dataclasses.replace(p.at(value, priors.pop(p.name, None)), free=p.name not in frozen)
+        for p, value in zip(leaves(instrument), np.asarray(values_of(instrument)).tolist(), strict=True)
+    ]
     names = [p.name for p in parameters]
     for master in [p.tie for p in parameters if p.tie is not None and p.tie not in names]:
         raise unknown_name("parameter to tie to", master, names)

@@ -218,7 +218,7 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
 def shared_parameters(old: Model, new: Model) -> list[str]:
     """Names of the instrument's parameters that are free in both models."""
     free = [{m.parameters[i].name for i in m.free} for m in (old, new)]
-    return [name for name in new.names if name in free[0] & free[1] and not name.startswith(SKY_AND_STARS)]
+    return [name for name in new.names if name in free[0] & free[1] and new[name].part not in SKY_AND_STARS]
 
 
 class _Measured(NamedTuple):

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from walop_jax.model.parameters import Component, Declaration
+from walop_jax.model.parameters import Component, Parameter
 from walop_jax.model.ray import Ray
 
 Mueller = Float[Array, "... 4 4"]
@@ -30,12 +30,12 @@ class Element(Component):
 
     name: str = eqx.field(static=True, default="")
     moves: str | None = eqx.field(static=True, default=None)
-    declared: tuple[tuple[str, Declaration], ...] = eqx.field(static=True, default=())
+    declared: tuple[tuple[str, Parameter], ...] = eqx.field(static=True, default=())
 
     kind: ClassVar[str] = ""
     reference: ClassVar[str] = ""
 
-    def declarations(self) -> Mapping[str, Declaration]:
+    def declarations(self) -> Mapping[str, Parameter]:
         """Its parameters: those of the class and those that the instrument has declared."""
         return {**super().declarations(), **dict(self.declared)}
 

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from walop_jax.io.errors import nearest
 from walop_jax.model import materials, mueller, optics
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.parameters import number
@@ -55,6 +56,12 @@ class Wedge(Element):
 
     kind: ClassVar[str] = "wedge"
     reference: ClassVar[str] = "Born & Wolf, Principles of Optics, 1.5.1"
+
+    def __check_init__(self) -> None:
+        if self.material not in materials.GLASSES:
+            raise ValueError(f"unknown glass {self.material!r}; {nearest(self.material, materials.GLASSES)}")
+        if self.frame not in FRAMES:
+            raise ValueError(f"frame = {self.frame!r} of a wedge must be {' or '.join(FRAMES)}")
 
     def labels(self, field: str) -> tuple[str, ...]:
         """The angle has the name of the wedge."""

@@ -20,10 +20,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from walop_jax.io.errors import nearest
 from walop_jax.model import materials, mueller, plates
 from walop_jax.model.conventions import REFERENCE_WAVELENGTH
 from walop_jax.model.elements.base import Element, Mueller
-from walop_jax.model.parameters import Component, Declaration, number
+from walop_jax.model.parameters import Component, Parameter, number
 from walop_jax.model.ray import Ray
 
 Scalar = Float[Array, ""]
@@ -44,9 +45,15 @@ class Layer(Component):
     slope: Scalar | None = number(unit="um-1", about="dispersion: a of n_e − n_o", default=None)
     bend: Scalar | None = number(unit="um-2", about="dispersion: b of n_e − n_o", default=None)
     twist: Scalar | None = number(unit="um-3", about="dispersion: c of n_e − n_o", default=None)
-    declared: tuple[tuple[str, Declaration], ...] = eqx.field(static=True, default=())
+    declared: tuple[tuple[str, Parameter], ...] = eqx.field(static=True, default=())
 
-    def declarations(self) -> Mapping[str, Declaration]:
+    def __check_init__(self) -> None:
+        if self.material not in materials.CRYSTALS:
+            raise ValueError(
+                f"unknown crystal {self.material!r}; {nearest(self.material, materials.CRYSTALS)}"
+            )
+
+    def declarations(self) -> Mapping[str, Parameter]:
         """What the instrument has declared."""
         return dict(self.declared)
 
