@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from walop_jax.model.effects import EFFECTS
-from walop_jax.simulation.effect_text import effect_from_text
 from walop_jax.simulation.observing_plan import ObservingPlan
+from walop_jax.simulation.simulate import effect_from_text
 
 CONTEXT = ObservingPlan().context()
 

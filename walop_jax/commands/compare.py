@@ -56,9 +56,9 @@ def compare(
     """
     from walop_jax.calibration.calibration import Calibration
     from walop_jax.data.field_points import true_matrices
-    from walop_jax.data.user_tables import new_table, write_output_table
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.refit import refit
+    from walop_jax.io.plain_tables import write_columns
     from walop_jax.paper.comparison import compare as comparison_of
     from walop_jax.reports import paper_figures as comparison_figures
     from walop_jax.science.star_errors import Truth
@@ -88,9 +88,9 @@ def compare(
 
     def files() -> Writers:
         drawn = {name: getattr(comparison_figures, f"{name}_figure")(found) for name in FIGURES}
-        table = new_table(found.columns())
+        columns = {name: (values, "", about) for name, (values, about) in found.columns().items()}
         return {
-            TABLE: lambda path: write_output_table(path, table, {}, header=left_out_cards(lost)),
+            TABLE: lambda path: write_columns(path, columns, left_out_cards(lost)),
             **{
                 f"comparison_{name}.png": lambda path, figure=figure: figure.savefig(path, dpi=130)
                 for name, figure in drawn.items()

@@ -81,8 +81,8 @@ def simulate(
     from walop_jax.data.write import write_calibration_set
     from walop_jax.io.atomic import atomic_path, check_output
     from walop_jax.model.instrument import Instrument
-    from walop_jax.simulation.effect_text import effect_from_text
     from walop_jax.simulation.plan_file import read_plan
+    from walop_jax.simulation.simulate import effect_from_text
     from walop_jax.simulation.simulate import simulate as simulated
 
     asked = {name: value for name, value in locals().items() if name in OF_A_PLAN}

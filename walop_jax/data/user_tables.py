@@ -195,18 +195,6 @@ def _numbers(
     return np.where(empty, float("nan" if rule.missing is None else str(rule.missing)), numbers)
 
 
-def new_table(columns: Mapping[str, Any]) -> InputTable:
-    """A table of columns (arrays, or pairs of an array and its description), to be written."""
-    from astropy.table import Column as TableColumn
-    from astropy.table import Table
-
-    table = Table()
-    for name, values in columns.items():
-        values, description = values if isinstance(values, tuple) else (values, "")
-        table.add_column(TableColumn(values, name=name, description=description or None))
-    return InputTable(Path(), len(table), table)
-
-
 def write_output_table(
     path: str | os.PathLike[str],
     source: InputTable,
