@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 
 import pytest
 
+import walop_jax as walop
 from walop_jax.commands import COMMANDS
 from walop_jax.commands.program import step_counter
 from walop_jax.io.progress import Stage
@@ -26,6 +28,14 @@ def test_help_of_every_command(call, name):
             assert all(len(line) > 55 for line in lines[:-1]), text
     assert ("--seed" in shown.output) == (name in RANDOM)
     assert not re.search(r"\ba [aeio]|may take\.|\bgiven away\b", shown.output), shown.output
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_line_of_the_list_begins_the_page_of_its_command(name):
+    """Up to a colon or semicolon."""
+    page = inspect.cleandoc(getattr(walop, name.replace("-", "_")).__doc__)
+    first = re.split(r"[:;.](?:\s|$)", " ".join(page.split()))[0]
+    assert COMMANDS[name] == f"{first}."
 
 
 def test_every_command_takes_a_seed(call):

@@ -1,6 +1,7 @@
 """One file for each command: the Python function, what it shows, and what makes it a command of the program.
 
-Nothing heavy is imported here, nor at the head of the files of commands, so that help appears at once.
+The list of commands is all that help needs: the file of a command is read when it is asked for. Nothing heavy is
+imported at its head, so that its options appear at once.
 """
 
 from __future__ import annotations
@@ -8,33 +9,36 @@ from __future__ import annotations
 import os
 import sys
 
-COMMANDS = (
-    "inspect",
-    "simulate",
-    "refit",
-    "compress",
-    "clip",
-    "diagnose",
-    "limits",
-    "plan",
-    "sample",
-    "report",
-    "plot",
-    "matrix",
-    "apply",
-    "compare",
-    "certify",
-    "epoch",
-    "watch",
-    "model",
-    "instrument",
-    "import-zemax",
-    "trace",
-    "cite",
-    "conformance",
-    "docs",
-)
-"""In the order of the help; `import-zemax` is the function `import_zemax` of `import_zemax.py`, and so on."""
+COMMANDS = {
+    "inspect": "Say what is in calibration sets and what is wrong with them.",
+    "simulate": "Make a calibration set of an instrument whose as-built values are drawn from their priors.",
+    "refit": "Fit all field points of calibration sets jointly.",
+    "compress": "Make of whole frames a calibration set of some hundred field points that says the same.",
+    "clip": "Flag single intensities that lie far from a fit of all others.",
+    "diagnose": "Say what is missing from the model, add it, and fit again.",
+    "limits": "Say at which size every effect of the catalogue would be detected and named in calibration sets.",
+    "plan": "Plan the calibration exposures of a night.",
+    "sample": "Sample the posterior.",
+    "report": "Write one HTML page about a run, figures inside.",
+    "plot": "Draw a figure of a run, by name, as a file.",
+    "matrix": "Add M21, M22, M23, M31, M32, M33 and their errors to a table of field points (three for each arm).",
+    "apply": "Turn the intensities of stars into Stokes parameters.",
+    "compare": "Compare the method of Paper II, as it is published, with the joint fit.",
+    "certify": "Check a calibration product from its checksums to its physics.",
+    "epoch": "Fit new calibration sets and compare with an old calibration.",
+    "watch": "Say when a calibration ceased to hold, from the stars of many nights.",
+    "model": "Write the base model as a file.",
+    "instrument": "Print and check an instrument.",
+    "import-zemax": "Make a calibration set (KIND flux) of the transmissions that an optical design program gives.",
+    "trace": "Follow the light of one source through the instrument.",
+    "cite": "List the sources of the physics in a fitted model, effects included.",
+    "conformance": "Put another program to the test.",
+    "docs": "Print a reference page, or the list of pages.",
+}
+"""Every command in the order of the help, with its line there: the first sentence of its docstring.
+
+`import-zemax` is the function `import_zemax` of `import_zemax.py`, and so on.
+"""
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""

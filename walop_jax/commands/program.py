@@ -6,7 +6,6 @@ import contextlib
 import importlib
 import inspect
 import os
-import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from walop_jax.commands import COMMANDS, INTERRUPTED
 from walop_jax.commands.command import COMMON, Argument, Command, Job, Option, Outcome, UsageError
@@ -34,8 +34,29 @@ EXIT_CODES = (
 QUIET = Option("Print nothing but warnings and errors.", short="-q", kind=bool)
 JSON = Option("Machine-readable result to stdout, nothing else.", kind=bool)
 
+
+class _Commands(TyperGroup):
+    """All commands: their list is a table, the file of one is read when it is asked for."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        self.commands: dict[str, Any] = dict.fromkeys(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """A command, with its options."""
+        if cmd_name in self.commands and self.commands[cmd_name] is None:
+            self.commands[cmd_name] = _command(cmd_name)
+        return self.commands.get(cmd_name)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """The list."""
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+
 app = typer.Typer(
     name="walop-jax",
+    cls=_Commands,
     help="Calibrate the WALOP imaging polarimeters with one differentiable model of the instrument.\n\n"
     "To begin: walop-jax refit CALSET -o RUN, then walop-jax report RUN.",
     no_args_is_help=True,
@@ -76,11 +97,6 @@ def _paragraphs(function: Callable[..., Any]) -> str:
     return "\n\n".join(" ".join(part.split()) for part in text.split("\n\n"))
 
 
-def _in_short(function: Callable[..., Any]) -> str:
-    """The first sentence of a command's docstring, up to a colon or semicolon: its line in the list."""
-    return re.split(r"[:;.](?:\s|$)", _paragraphs(function))[0] + "."
-
-
 def _parameter(name: str, option: Option, default: Any, hidden: bool = False) -> inspect.Parameter:
     """A parameter of the function that typer is given."""
     kind = option.kind or type(default)
@@ -100,6 +116,16 @@ def _parameter(name: str, option: Option, default: Any, hidden: bool = False) ->
         default=inspect.Parameter.empty if needed else default,
         annotation=Annotated[kind, note],
     )
+
+
+def _command(name: str) -> Any:
+    """A command as typer makes it."""
+    word = name.replace("-", "_")
+    command: Command[Any] = getattr(importlib.import_module(f"walop_jax.commands.{word}"), word).command
+    alone = typer.Typer(add_completion=False, rich_markup_mode=None)
+    described = {"help": _paragraphs(command.body), "short_help": COMMANDS[name]}
+    alone.command(name, context_settings=HELP, **described)(_function(command))
+    return typer.main.get_command(alone)
 
 
 def _function(command: Command[Any]) -> Callable[..., None]:
@@ -307,16 +333,3 @@ def switch_on_jax() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
         jax.config.update("jax_raise_persistent_cache_errors", False)
-
-
-for _name in COMMANDS:
-    _function_name = _name.replace("-", "_")
-    _command = getattr(
-        importlib.import_module(f"walop_jax.commands.{_function_name}"), _function_name
-    ).command
-    app.command(
-        _name,
-        context_settings=HELP,
-        help=_paragraphs(_command.body),
-        short_help=_in_short(_command.body),
-    )(_function(_command))
