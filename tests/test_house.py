@@ -25,6 +25,7 @@ ROOMS = (
     "posterior",
     "science",
     "diagnosis",
+    "nights",
     "plans",
     "paper",
     "reports",

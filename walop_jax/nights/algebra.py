@@ -1,0 +1,659 @@
+"""Normal equations of many nights under laws of time: pure linear algebra, which knows no instrument.
+
+A unit (the exposures of one file in one night) says of the values θ of all parameters, counted from a common origin,
+
+    χ²_u(θ) = χ²_u + 2 g_uᵀ θ + θᵀ H_u θ,        θ = D_u x,
+
+with D_u what the laws make of the unknowns x: `globals`, each with a function of time, and locals, that belong to one
+cell, which is a night, or several that a file joins. With A the equations of the globals, T those of the locals (block
+tridiagonal, as a random walk couples neighbours and nothing else does) and B what lies between,
+
+    S_c  = T_c − C_c S_{c−1}⁻¹ C_cᵀ,      B'_c = B_c − C_c S_{c−1}⁻¹ B'_{c−1}          forwards
+    K    = A − Σ B'_cᵀ S_c⁻¹ B'_c                                                      the globals
+    x_c  = S_c⁻¹ (r'_c − B'_c β − C_{c+1}ᵀ x_{c+1})                                    backwards
+
+are exact, and so are the covariances (Rauch, Tung & Striebel 1965; bordered systems as in Millepede II, Blobel 2006).
+A change h of parameter j from cell b on, or in cell b alone, has the score s = −Σ (g_u + H_u θ_u)_j and the information
+
+    I = a − c_xᵀ T⁻¹ c_x − eᵀ K⁻¹ e,       e = c_g − Bᵀ T⁻¹ c_x,
+
+c its cross terms with locals and globals: for all b and j at once from an elimination forwards and one backwards. Then
+z = s/√I is the change in its standard errors with everything else fitted anew, s/I its size.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import linalg
+
+from walop_jax.nights.laws import ALWAYS, Form, Law
+
+Vector = Float[np.ndarray, " _"]
+Matrix = Float[np.ndarray, "_ _"]
+
+NOTHING = 1e-9  # share of its information below which a change is taken up by the laws altogether
+
+
+@dataclasses.dataclass(frozen=True)
+class Equations:
+    """Normal equations of units in the order of time, about a common origin, each parameter in units of `scale`.
+
+    `night` numbers the nights and `file` the files; χ² is of the data alone.
+    """
+
+    mjd: Float[np.ndarray, " u"]
+    night: Int[np.ndarray, " u"]
+    file: Int[np.ndarray, " u"]
+    chi2: Float[np.ndarray, " u"]
+    gradient: Float[np.ndarray, "u n"]
+    matrix: Float[np.ndarray, "u n n"]
+    scale: Float[np.ndarray, " n"]
+
+    def __len__(self) -> int:
+        return len(self.mjd)
+
+    def only(self, keep: Bool[np.ndarray, " u"]) -> Equations:
+        """The equations of some units."""
+        parts = {name: getattr(self, name)[keep] for name in ("mjd", "night", "file", "chi2", "gradient", "matrix")}
+        return dataclasses.replace(self, **parts)
+
+
+class Global(NamedTuple):
+    """An unknown of all nights: the parameter that it belongs to, its function of time, its prior (mean, precision)."""
+
+    parameter: int
+    form: Form
+    mean: float
+    precision: float
+
+
+class Cell(NamedTuple):
+    """Unknowns of a cell: parameters, the units that each acts in, prior means and precisions, times of walk states."""
+
+    units: Int[np.ndarray, " v"]
+    parameter: Int[np.ndarray, " k"]
+    covers: Float[np.ndarray, "k v"]
+    mean: Float[np.ndarray, " k"]
+    precision: Float[np.ndarray, " k"]
+    mjd: Float[np.ndarray, " k"]  # NaN: not a state of a walk
+
+
+class Eliminated(NamedTuple):
+    """A cell in the elimination: its own block and border, coupling to the cell before, what is left of both."""
+
+    block: Matrix
+    border: Float[np.ndarray, "_ _"]
+    before: Float[np.ndarray, "_ _"]
+    factor: tuple[Matrix, bool]  # of S_c
+    left: Float[np.ndarray, "_ _"]  # B'_c
+    right: Vector  # r'_c
+
+
+def _precision(width: float) -> float:
+    return 0.0 if not np.isfinite(width) else width**-2
+
+
+@dataclasses.dataclass(frozen=True)
+class System:
+    """The unknowns of equations under laws: what `solve` eliminates."""
+
+    equations: Equations
+    laws: tuple[Law | None, ...]
+    globals: tuple[Global, ...]
+    cells: tuple[Cell, ...]
+    rates: Float[np.ndarray, " n"]  # per √day, NaN where there is no walk
+    spread: Float[np.ndarray, " n"]
+
+    @classmethod
+    def of(
+        cls,
+        equations: Equations,
+        laws: Sequence[Law | None],
+        mean: Vector,
+        width: Vector,
+        means: Bool[np.ndarray, " n"],
+    ) -> System:
+        """`mean` and `width` (inf: none) are the priors, about the origin; `means`: which have a value by default."""
+        scale, forms = equations.scale, []
+        middle = float(equations.mjd.mean())
+        rates, spread = np.full((2, len(laws)), np.nan)
+        local = []
+        for i, law in enumerate(laws):
+            if law is None:
+                continue
+            for form, known in law.forms(bool(means[i]), middle):
+                prior = (mean[i] / scale[i], _precision(width[i] / scale[i])) if known else (0.0, 0.0)
+                forms.append(Global(i, form, *prior))
+            if law.rate is not None:
+                rates[i] = law.rate / scale[i]
+            if law.spread is not None:
+                spread[i] = law.spread / scale[i]
+            if law.base in ("night", "file", "walk"):
+                local.append(i)
+        cells = _cells(equations, laws, local, mean / scale, width / scale, spread)
+        return cls(equations, tuple(laws), tuple(forms), cells, rates, spread)
+
+    @functools.cached_property
+    def at(self) -> Int[np.ndarray, " g"]:
+        """The parameter of every global unknown."""
+        return np.array([entry.parameter for entry in self.globals], int)
+
+    @functools.cached_property
+    def basis(self) -> Float[np.ndarray, "u g"]:
+        """The functions of time of the global unknowns at the units."""
+        return self.functions(self.equations.mjd)
+
+    def functions(self, mjd: Any) -> Float[np.ndarray, "t g"]:
+        """The functions of time of the global unknowns."""
+        made = {form: form.at(mjd) for form in dict.fromkeys(entry.form for entry in self.globals)}
+        found = np.ones((len(np.atleast_1d(mjd)), len(self.globals)))
+        for g, entry in enumerate(self.globals):
+            found[:, g] = made[entry.form]
+        return found
+
+
+def _cells(
+    equations: Equations,
+    laws: Sequence[Law | None],
+    local: Sequence[int],
+    mean: Vector,
+    width: Vector,
+    spread: Vector,
+) -> tuple[Cell, ...]:
+    label = equations.night.copy()
+    if any(laws[i].base == "file" for i in local):  # type: ignore[union-attr]
+        for _ in range(len(label)):
+            low, high = (
+                np.array([function(label[equations.file == f]) for f in range(equations.file.max() + 1)])
+                for function in (np.min, np.max)
+            )
+            joined = label.copy()
+            for first, last in zip(low, high, strict=True):
+                joined[(label >= first) & (label <= last)] = np.minimum(joined[(label >= first) & (label <= last)], first)
+            if np.array_equal(joined, label):
+                break
+            label = joined
+    cells = []
+    for number in np.unique(label):
+        units = np.flatnonzero(label == number)
+        parameter, covers, means, precisions, times = [], [], [], [], []
+        for i in local:
+            law = laws[i]
+            assert law is not None
+            groups = equations.file[units] if law.base == "file" else equations.night[units]
+            for group in np.unique(groups):
+                parameter.append(i)
+                covers.append((groups == group).astype(float))
+                first = law.base == "walk" and not cells and group == groups.min()
+                if law.base == "walk":
+                    known = (mean[i], _precision(width[i])) if first else (0.0, 0.0)
+                elif np.isfinite(spread[i]):
+                    known = (0.0, spread[i] ** -2)
+                else:
+                    known = (mean[i], _precision(width[i]))
+                means.append(known[0])
+                precisions.append(known[1])
+                times.append(equations.mjd[units][groups == group].mean() if law.base == "walk" else np.nan)
+        cells.append(
+            Cell(
+                units, np.array(parameter, int), np.array(covers).reshape(-1, len(units)), np.array(means, float),
+                np.array(precisions, float), np.array(times, float),
+            )
+        )  # fmt: skip
+    return tuple(cells)
+
+
+class UndeterminedError(ValueError):
+    """Nothing determines an unknown; `parameter` is the one, `unit` one of its units, None: of all nights."""
+
+    def __init__(self, parameter: int, unit: int | None) -> None:
+        super().__init__("the nights do not determine a parameter under its law")
+        self.parameter, self.unit = parameter, unit
+
+
+def _factored(matrix: Matrix, parameters: Int[np.ndarray, " k"], unit: int | None) -> tuple[Matrix, bool]:
+    """The Cholesky factor; `UndeterminedError` names the first parameter that has nothing left."""
+    factor, failed = linalg.lapack.dpotrf(matrix, lower=1, clean=1)
+    if failed:
+        raise UndeterminedError(int(parameters[failed - 1]), unit)
+    small = np.diag(factor) ** 2 < 1e-14 * np.maximum(np.diag(matrix), 1e-300)
+    if small.any():
+        raise UndeterminedError(int(parameters[np.argmax(small)]), unit)
+    return factor, True
+
+
+def solve(system: System) -> Solution:
+    """The most probable values of all unknowns. Raises `UndeterminedError` where there is none."""
+    e, at, basis = system.equations, system.at, system.basis
+    size = len(at)
+    top, right = np.zeros((size, size)), np.zeros(size)
+    every = bool(np.all(basis == 1.0))
+    if every:
+        total, slope = e.matrix.sum(axis=0), e.gradient.sum(axis=0)
+        top, right = total[np.ix_(at, at)].copy(), -slope[at]
+    else:
+        # Functions of time meet in pairs: units are summed once for every pair of functions that differ.
+        kinds, which = np.unique(basis, axis=1, return_inverse=True)
+        rows = [np.flatnonzero(which == k) for k in range(kinds.shape[1])]
+        for a, mine in enumerate(rows):
+            right[mine] = -(kinds[:, a] @ e.gradient[:, at[mine]])
+            for b, others in enumerate(rows[: a + 1]):
+                weight = kinds[:, a] * kinds[:, b]
+                if weight.any():
+                    summed = np.tensordot(weight, e.matrix, 1)[np.ix_(at[mine], at[others])]
+                    top[np.ix_(mine, others)] = summed
+                    top[np.ix_(others, mine)] = summed.T
+    precision = np.array([entry.precision for entry in system.globals])
+    means = np.array([entry.mean for entry in system.globals])
+    top[np.diag_indices(size)] += precision
+    right += precision * means
+    constant = float(e.chi2.sum() + precision @ means**2)
+    logdet, rows_of = 0.0, []
+    before: Cell | None = None
+    last: Eliminated | None = None
+    for cell in system.cells:
+        block, border, own = _block(system, cell)
+        constant += float(cell.precision @ cell.mean**2)
+        logdet -= float(np.log(cell.precision[cell.precision > 0]).sum())
+        coupling, logs = _walks(system, cell, before, block, rows_of)
+        logdet += logs
+        rows_of.append((block, border, own, coupling))
+        before = cell
+    # Forwards. A block knows what the walk to the next cell adds to it only when that cell was made.
+    done: list[Eliminated] = []
+    for cell, (block, border, own, coupling) in zip(system.cells, rows_of, strict=True):
+        left_block, left, rest = block, border, own
+        if last is not None and coupling.any():
+            gain = linalg.cho_solve(last.factor, coupling.T, check_finite=False).T
+            left_block, left, rest = block - gain @ coupling.T, border - gain @ last.left, own - gain @ last.right
+        factor = _factored(left_block, cell.parameter, int(cell.units[0])) if len(own) else (left_block, True)
+        last = Eliminated(block, border, coupling, factor, left, rest)
+        done.append(last)
+        if len(own):
+            logdet += 2.0 * float(np.log(np.diag(factor[0])).sum())
+            gain = linalg.cho_solve(factor, np.column_stack([left, rest]), check_finite=False)
+            top -= left.T @ gain[:, :-1]
+            right -= left.T @ gain[:, -1]
+    factor = _factored(0.5 * (top + top.T), at, None) if size else (top, True)
+    logdet += 2.0 * float(np.log(np.diag(factor[0])).sum()) if size else 0.0
+    shared = linalg.cho_solve(factor, right) if size else right
+    values: list[Vector] = [np.zeros(0)] * len(done)
+    for c in range(len(done) - 1, -1, -1):
+        if len(done[c].right):
+            rest = done[c].right - done[c].left @ shared
+            if c + 1 < len(done) and len(values[c + 1]):
+                rest = rest - done[c + 1].before.T @ values[c + 1]
+            values[c] = linalg.cho_solve(done[c].factor, rest, check_finite=False)
+    solution = Solution(system, shared, tuple(values), tuple(done), factor, 0.0)
+    return dataclasses.replace(solution, evidence=-0.5 * (solution.chi2 + solution.penalty + logdet))
+
+
+def _block(system: System, cell: Cell) -> tuple[Matrix, Float[np.ndarray, "_ _"], Vector]:
+    """Own block, border and right side of a cell: priors and data, without walks."""
+    e, p = system.equations, cell.parameter
+    block = np.diag(cell.precision)
+    border, right = np.zeros((len(p), len(system.at))), cell.precision * cell.mean
+    if len(p):
+        for v, unit in enumerate(cell.units):
+            some = e.matrix[unit][p] * cell.covers[:, v : v + 1]
+            block += some[:, p] * cell.covers[:, v]
+            border += some[:, system.at] * system.basis[unit]
+            right = right - cell.covers[:, v] * e.gradient[unit][p]
+    return block, border, right
+
+
+def _walks(
+    system: System, cell: Cell, before: Cell | None, block: Matrix, made: Sequence[Any]
+) -> tuple[Float[np.ndarray, "_ _"], float]:
+    """Add the steps of walks that end in a cell to its block and the one before; coupling, and log of variances."""
+    coupling, logs = np.zeros((len(cell.mjd), 0 if before is None else len(before.mjd))), 0.0
+    for k in np.flatnonzero(np.isfinite(cell.mjd)):
+        i = cell.parameter[k]
+        here = np.flatnonzero((cell.parameter == i) & (cell.mjd < cell.mjd[k]))
+        there = np.zeros(0, int) if before is None else np.flatnonzero(before.parameter == i)
+        if not len(here) and not len(there):
+            continue
+        times, own = (cell.mjd, True) if len(here) else (before.mjd, False)  # type: ignore[union-attr]
+        last = (here if own else there)[np.argmax(times[here if own else there])]
+        variance = system.rates[i] ** 2 * (cell.mjd[k] - times[last])
+        logs += float(np.log(variance))
+        block[k, k] += 1.0 / variance
+        if own:
+            block[last, last] += 1.0 / variance
+            block[k, last] -= 1.0 / variance
+            block[last, k] -= 1.0 / variance
+        else:
+            made[-1][0][last, last] += 1.0 / variance
+            coupling[k, last] = -1.0 / variance
+    return coupling, logs
+
+
+@dataclasses.dataclass(frozen=True)
+class Solution:
+    """Unknowns that fit best, in units of `Equations.scale`, with their covariances; `evidence` is a logarithm.
+
+    The evidence compares rates and spreads of the same laws: constants of what has no prior are left out.
+    """
+
+    system: System
+    shared: Vector
+    local: tuple[Vector, ...]
+    cells: tuple[Eliminated, ...]
+    factor: tuple[Matrix, bool]
+    evidence: float
+
+    @functools.cached_property
+    def values(self) -> Float[np.ndarray, "u n"]:
+        """The parameters in every unit, from the origin, scaled."""
+        system = self.system
+        found = np.zeros((len(system.equations), len(system.laws)))
+        for g, i in enumerate(system.at):
+            found[:, i] += system.basis[:, g] * self.shared[g]
+        for cell, local in zip(system.cells, self.local, strict=True):
+            for k, i in enumerate(cell.parameter):
+                found[cell.units, i] += cell.covers[k] * local[k]
+        return found
+
+    @functools.cached_property
+    def slopes(self) -> Float[np.ndarray, "u n"]:
+        """Half the gradient of χ² of every unit with respect to its parameters, at the solution."""
+        e = self.system.equations
+        return e.gradient + (e.matrix @ self.values[:, :, None])[:, :, 0]
+
+    @functools.cached_property
+    def unit_chi2(self) -> Float[np.ndarray, " u"]:
+        """χ² of the data of every unit at the solution."""
+        e = self.system.equations
+        return e.chi2 + np.sum((e.gradient + self.slopes) * self.values, axis=1)
+
+    @property
+    def chi2(self) -> float:
+        """χ² of the data."""
+        return float(self.unit_chi2.sum())
+
+    @functools.cached_property
+    def penalty(self) -> float:
+        """χ² of priors and of the steps of walks."""
+        system = self.system
+        entries = zip(system.globals, self.shared, strict=True)
+        total = sum(entry.precision * (value - entry.mean) ** 2 for entry, value in entries)
+        last: dict[int, tuple[float, float]] = {}
+        for cell, local in zip(system.cells, self.local, strict=True):
+            total += float(cell.precision @ (local - cell.mean) ** 2)
+            for k in np.argsort(cell.mjd):
+                if np.isfinite(cell.mjd[k]):
+                    i = int(cell.parameter[k])
+                    if i in last:
+                        gone = cell.mjd[k] - last[i][0]
+                        total += (local[k] - last[i][1]) ** 2 / (system.rates[i] ** 2 * gone)
+                    last[i] = (float(cell.mjd[k]), float(local[k]))
+        return float(total)
+
+    @functools.cached_property
+    def covariance(self) -> Matrix:
+        """Covariance of the global unknowns."""
+        size = len(self.shared)
+        return linalg.cho_solve(self.factor, np.eye(size)) if size else np.zeros((0, 0))
+
+    @functools.cached_property
+    def _smoothed(self) -> list[tuple[Matrix, Matrix, Matrix]]:
+        """Of every cell the covariance of its unknowns, that with the globals, and that with the next cell's."""
+        found: list[tuple[Matrix, Matrix, Matrix]] = []
+        later: tuple[Matrix, Matrix] | None = None
+        for c in range(len(self.cells) - 1, -1, -1):
+            entry, size = self.cells[c], len(self.local[c])
+            if not size:
+                later = (np.zeros((0, 0)), np.zeros((0, len(self.shared))))
+                found.append((*later, np.zeros((0, 0))))
+                continue
+            after = None if c + 1 == len(self.cells) else self.cells[c + 1].before
+            joint, sides = self.covariance, entry.left
+            if after is not None and after.any():
+                own, cross = later  # type: ignore[misc]
+                joint = np.block([[joint, cross.T], [cross, own]])
+                sides = np.hstack([sides, after.T])
+            gain = linalg.cho_solve(entry.factor, sides, check_finite=False)
+            with_others = -gain @ joint
+            own = linalg.cho_solve(entry.factor, np.eye(size)) - with_others @ gain.T
+            split = len(self.shared)
+            next_one = with_others[:, split:]
+            if after is not None and not next_one.size and len(after):
+                # Independent locals of neighbours share the globals alone.
+                next_one = -gain @ later[1].T  # type: ignore[index]
+            later = (own, with_others[:, :split])
+            found.append((own, with_others[:, :split], next_one))
+        return found[::-1]
+
+    def predict(self, mjd: float, night: int | None = None) -> tuple[Vector, Matrix]:
+        """All parameters at a time (MJD), from the origin, scaled, and their covariance.
+
+        `night` is the number of the night that the time belongs to, None for one without equations. A walk is
+        interpolated between nights (a Brownian bridge) and goes on behind the last; values of single nights and files
+        are known in these alone, elsewhere they scatter as they do over the nights.
+        """
+        system, n = self.system, len(self.system.laws)
+        function = system.functions(mjd)[0]
+        parts: list[tuple[int, int, int, float]] = []  # parameter, cell, place in it, weight
+        extra = np.zeros(n)
+        value = np.zeros(n)
+        nights = [system.equations.night[cell.units] for cell in system.cells]
+        here = next((c for c, some in enumerate(nights) if night is not None and night in some), None)
+        for i, law in enumerate(system.laws):
+            if law is None or law.base not in ("night", "file", "walk"):
+                continue
+            if law.base == "walk":
+                parts += self._bridge(i, mjd, extra)
+                continue
+            own = [] if here is None else self._own(i, here, mjd, night)
+            if own:
+                parts.append((i, here, own[0], 1.0))  # type: ignore[arg-type]
+                continue
+            if np.isfinite(system.spread[i]):
+                extra[i] += system.spread[i] ** 2
+                continue
+            scatter = self.values[:, i]
+            value[i], extra[i] = scatter.mean(), scatter.var(ddof=1) if len(scatter) > 1 else np.inf
+        design = np.zeros((n, len(self.shared) + len(parts)))
+        design[system.at, np.arange(len(self.shared))] = function
+        for k, (i, _, _, weight) in enumerate(parts):
+            design[i, len(self.shared) + k] = weight
+        local = np.array([self.local[c][k] for _, c, k, _ in parts])
+        value += design @ np.concatenate([self.shared, local])
+        covariance = design @ self._joint(parts) @ design.T
+        covariance[np.diag_indices(n)] += extra
+        return value, covariance
+
+    def _own(self, i: int, c: int, mjd: float, night: int | None) -> list[int]:
+        """The unknown of a parameter in a cell that holds at a time of a night."""
+        e, cell = self.system.equations, self.system.cells[c]
+        in_night = np.flatnonzero(e.night[cell.units] == night)
+        unit = in_night[np.argmin(np.abs(e.mjd[cell.units[in_night]] - mjd))]
+        return np.flatnonzero((cell.parameter == i) & (cell.covers[:, unit] > 0)).tolist()
+
+    @functools.cached_property
+    def _states(self) -> dict[int, list[tuple[float, int, int]]]:
+        """The states of every walk: time, cell, place."""
+        found: dict[int, list[tuple[float, int, int]]] = {}
+        for c, cell in enumerate(self.system.cells):
+            for k in np.flatnonzero(np.isfinite(cell.mjd)):
+                found.setdefault(int(cell.parameter[k]), []).append((float(cell.mjd[k]), c, int(k)))
+        return {i: sorted(some) for i, some in found.items()}
+
+    def _bridge(self, i: int, mjd: float, extra: Vector) -> list[tuple[int, int, int, float]]:
+        states, rate = self._states[i], self.system.rates[i]
+        times = [time for time, _, _ in states]
+        after = int(np.searchsorted(times, mjd))
+        if after in (0, len(times)):
+            time, c, k = states[min(after, len(times) - 1)]
+            extra[i] += rate**2 * abs(mjd - time)
+            return [(i, c, k, 1.0)]
+        (start, *one), (stop, *two) = states[after - 1], states[after]
+        share = (mjd - start) / (stop - start)
+        extra[i] += rate**2 * (mjd - start) * (1.0 - share)
+        return [(i, one[0], one[1], 1.0 - share), (i, two[0], two[1], share)]
+
+    def _joint(self, parts: Sequence[tuple[int, int, int, float]]) -> Matrix:
+        """Covariance of the globals and of unknowns of at most two neighbouring cells."""
+        size = len(self.shared)
+        joint = np.zeros((size + len(parts), size + len(parts)))
+        joint[:size, :size] = self.covariance
+        for a, (_, c, k, _) in enumerate(parts):
+            own, cross, after = self._smoothed[c]
+            joint[size + a, :size] = joint[:size, size + a] = cross[k]
+            for b, (_, d, m, _) in enumerate(parts[: a + 1]):
+                if c == d:
+                    value = own[k, m]
+                elif d == c + 1:
+                    value = after[k, m]
+                else:
+                    value = self._smoothed[d][2][m, k]
+                joint[size + a, size + b] = joint[size + b, size + a] = value
+        return joint
+
+    def errors(self) -> Float[np.ndarray, "u n"]:
+        """Standard errors of the parameters in every unit, scaled."""
+        system = self.system
+        found = np.zeros_like(self.values)
+        shared = np.array_equal(system.basis, np.ones_like(system.basis))
+        fixed = np.zeros(len(system.laws))
+        np.add.at(fixed, system.at, np.diag(self.covariance))
+        local = {i for cell in system.cells[:1] for i in cell.parameter}
+        for u in range(len(found)):
+            if shared:
+                found[u] = fixed
+            else:
+                design = np.zeros((len(system.laws), len(self.shared)))
+                design[system.at, np.arange(len(self.shared))] = system.basis[u]
+                found[u] = np.einsum("ng,gh,nh->n", design, self.covariance, design, optimize=True)
+        if local:
+            for c, cell in enumerate(system.cells):
+                own, cross, _ = self._smoothed[c]
+                for k, i in enumerate(cell.parameter):
+                    some = cell.units[cell.covers[k] > 0]
+                    mine = np.flatnonzero(system.at == i)
+                    found[some, i] += own[k, k] + 2.0 * system.basis[np.ix_(some, mine)] @ cross[k, mine]
+        return np.sqrt(np.clip(found, 0.0, None))
+
+
+# ------------------------------------------------------------------------------------------------------- changes
+
+
+class Scan(NamedTuple):
+    """Scores and informations of changes of every parameter (n), from every cell on, and in every cell alone (c).
+
+    The information is 0 where the laws take the change up. Scaled as the equations.
+    """
+
+    step_score: Float[np.ndarray, "c n"]
+    step_information: Float[np.ndarray, "c n"]
+    once_score: Float[np.ndarray, "c n"]
+    once_information: Float[np.ndarray, "c n"]
+
+
+def _information(
+    of: Solution, own: Vector, cross: Float[np.ndarray, "_ n"], taken: Vector
+) -> Float[np.ndarray, " n"]:
+    """Own information less what locals and globals take."""
+    left = own - taken
+    if len(cross):
+        lower = linalg.solve_triangular(of.factor[0], cross, lower=True, check_finite=False)
+        left = left - np.einsum("gn,gn->n", lower, lower)
+    return np.where(left > NOTHING * np.maximum(own, 1e-300), left, 0.0)
+
+
+def scan(of: Solution) -> Scan:
+    """The changes of every parameter and candidate at every cell."""
+    system, e = of.system, of.system.equations
+    n, count, globals_ = len(system.laws), len(system.cells), len(system.at)
+    found = Scan(*(np.zeros((count, n)) for _ in range(4)))
+    cross, own, score = np.zeros((globals_, n)), np.zeros(n), np.zeros(n)
+    taken, border_taken = np.zeros(n), np.zeros((globals_, n))
+    after: tuple[tuple[Matrix, bool], Matrix, Matrix] | None = None  # of the cell behind: U, B̃, c̃
+    for c in range(count - 1, -1, -1):
+        cell, entry = system.cells[c], of.cells[c]
+        here = np.zeros((globals_, n))
+        local, mine = np.zeros((len(cell.parameter), n)), np.zeros(n)
+        for v, unit in enumerate(cell.units):
+            matrix = e.matrix[unit]
+            here += system.basis[unit][:, None] * matrix[system.at]
+            local += cell.covers[:, v : v + 1] * matrix[cell.parameter]
+            mine += np.diag(matrix)
+        cross, own = cross + here, own + mine
+        alone = -of.slopes[cell.units].sum(axis=0)
+        score = score + alone
+        if len(cell.parameter):
+            block, border, moved = entry.block, entry.border, local
+            if after is not None and of.cells[c + 1].before.any():
+                link = of.cells[c + 1].before
+                gain = linalg.cho_solve(after[0], link, check_finite=False).T
+                block, border = block - gain @ link, border - gain @ after[1]
+                moved = local - gain @ after[2]
+            # Precision of the cell given all others, from before and from behind; without the globals.
+            lower = entry.factor[0]
+            both = linalg.cho_factor(lower @ lower.T + block - entry.block, lower=True, check_finite=False)
+            sides = border + entry.left - entry.border
+            for columns, kept, base, into in (
+                (moved, taken, border_taken, 1),
+                (local, np.zeros(n), np.zeros((globals_, n)), 3),
+            ):
+                solved = linalg.cho_solve(both, columns, check_finite=False)
+                rest = (cross if into == 1 else here) - base - sides.T @ solved
+                more = kept + np.einsum("kn,kn->n", columns, solved)
+                found[into][c] = _information(of, own if into == 1 else mine, rest, more)
+            factor = linalg.cho_factor(block, lower=True, check_finite=False)
+            solved = linalg.cho_solve(factor, moved, check_finite=False)
+            taken = taken + np.einsum("kn,kn->n", moved, solved)
+            border_taken = border_taken + border.T @ solved
+            after = (factor, border, moved)
+        else:
+            found[1][c] = _information(of, own, cross - border_taken, taken)
+            found[3][c] = _information(of, mine, here, np.zeros(n))
+        found[0][c], found[2][c] = score, alone
+    found[1][0] = 0.0  # from the first night on is no change
+    return found
+
+
+def changes_together(
+    of: Solution, first: Int[np.ndarray, " v"], last: Int[np.ndarray, " v"], parameter: Int[np.ndarray, " v"]
+) -> tuple[Vector, Matrix]:
+    """Scores of a few changes, each of a parameter in the cells from `first` up to `last`, and their information.
+
+    A dense elimination, for few changes: cells one by one, forwards.
+    """
+    system, e = of.system, of.system.equations
+    count = len(parameter)
+    own, cross, score = np.zeros((count, count)), np.zeros((len(system.at), count)), np.zeros(count)
+    taken, border_taken = np.zeros((count, count)), np.zeros((len(system.at), count))
+    moved = np.zeros((0, count))
+    for c, cell in enumerate(system.cells):
+        active = ((first <= c) & (c < last)).astype(float)
+        local = np.zeros((len(cell.parameter), count))
+        for v, unit in enumerate(cell.units):
+            some = e.matrix[unit][:, parameter] * active
+            own += some[parameter] * active[:, None]
+            cross += system.basis[unit][:, None] * some[system.at]
+            local += cell.covers[:, v : v + 1] * some[cell.parameter]
+            score -= of.slopes[unit][parameter] * active
+        entry = of.cells[c]
+        if len(cell.parameter):
+            if c and entry.before.any():
+                gain = linalg.cho_solve(of.cells[c - 1].factor, entry.before.T, check_finite=False).T
+                local = local - gain @ moved
+            solved = linalg.cho_solve(entry.factor, local, check_finite=False)
+            taken += local.T @ solved
+            border_taken += entry.left.T @ solved
+        moved = local
+    information = own - taken
+    if len(system.at):
+        lower = linalg.solve_triangular(of.factor[0], cross - border_taken, lower=True, check_finite=False)
+        information = information - lower.T @ lower
+    return score, information
+
+
+__all__ = ["ALWAYS", "Equations", "Scan", "Solution", "System", "UndeterminedError", "changes_together", "scan", "solve"]

@@ -1,0 +1,203 @@
+"""Laws of parameters: how a number of an instrument may change with time. Data; what is computed with them is `algebra`.
+
+    shared      one value for all nights; what holds if nothing is said
+    night       a value for every night      } `spread`: standard deviation of the values about their mean;
+    file        a value for every file       } without it every value has the prior of the parameter, if there is one
+    walk        a random walk: what it gains in Δt days has standard deviation `rate` √Δt
+    interval    a value up to the first date of `at`, another up to the second, …
+    step        another value from every date of `at` on
+    bad         another value between the two dates of every entry of `bad`: a night that differs
+    linear      a drift, per year of 365.25 days
+    annual      a cosine and a sine with that period
+
+In a model file, for a parameter or, with * and ?, for a group of them:
+
+    [law."half2.plate.axis"]
+    per = "night"
+
+    [law."throughput.n?.p00"]
+    per = ["walk", "step"]
+    rate = 2e-5
+    at = [61250.0]
+
+Dates are MJD (UTC); an interval holds its first moment and not its last. Steps, bad nights, drifts and annual terms are
+added to what holds otherwise. A candidate (an amplitude beyond the model) is absent unless it has a law; one with steps
+or bad nights alone is 0 before and after.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import fnmatch
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from walop_jax.io.errors import nearest
+
+YEAR = 365.25  # days
+BASES = ("shared", "night", "file", "walk", "interval")
+ADDED = ("step", "bad", "linear", "annual")
+KEYS = ("per", "spread", "rate", "at", "bad")
+_NEEDS = {"rate": "walk", "at": "interval or step", "bad": "bad", "spread": "night or file"}
+
+
+class Form(NamedTuple):
+    """A function of time that a value multiplies: constant, 1 from `start` to `stop`, linear, cosine or sine."""
+
+    kind: str
+    start: float = -math.inf
+    stop: float = math.inf
+
+    def at(self, mjd: Any) -> Any:
+        """The function at times (MJD)."""
+        mjd = np.asarray(mjd, float)
+        if self.kind == "window":
+            return ((mjd >= self.start) & (mjd < self.stop)).astype(float)
+        years = (mjd - self.start) / YEAR
+        if self.kind == "linear":
+            return years
+        turn = 2.0 * np.pi * mjd / YEAR
+        return np.cos(turn) if self.kind == "cosine" else np.sin(turn)
+
+    @property
+    def words(self) -> str:
+        """The function in a few words."""
+        if self.kind != "window":
+            return {"linear": "per year"}.get(self.kind, f"annual {self.kind}")
+        if math.isinf(self.start):
+            return "" if math.isinf(self.stop) else f"before {self.stop:g}"
+        return f"from {self.start:.2f}" + ("" if math.isinf(self.stop) else f" to {self.stop:.2f}")
+
+
+ALWAYS = Form("window")
+
+
+@dataclasses.dataclass(frozen=True)
+class Law:
+    """How a parameter may change. `per` are words of the table above, `rate` per √day, `at` and `bad` MJD.
+
+    Raises ValueError for words that do not go together and for numbers that are missing or of no use.
+    """
+
+    per: tuple[str, ...] = ("shared",)
+    spread: float | None = None
+    rate: float | None = None
+    at: tuple[float, ...] = ()
+    bad: tuple[tuple[float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        for word in self.per:
+            if word not in BASES + ADDED:
+                raise ValueError(f"per = {word!r}: no such law; {nearest(word, BASES + ADDED)}")
+        if len([word for word in self.per if word in BASES]) > 1:
+            raise ValueError(f"per = {list(self.per)}: only one of {', '.join(BASES)} may hold")
+        if "interval" in self.per and "step" in self.per:
+            raise ValueError("per: interval and step would both use the dates of at; name one")
+        for key, wanted in _NEEDS.items():
+            given, used = getattr(self, key) not in (None, ()), set(self.per) & set(wanted.split(" or "))
+            if given and not used:
+                raise ValueError(f"{key} is used with per = {wanted} only")
+            if used and not given and key != "spread":
+                raise ValueError(f"per = {sorted(used)[0]!r} needs {key}")
+        for key in ("spread", "rate"):
+            value = getattr(self, key)
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{key} = {value} must be above 0")
+        dates = [*self.at, *itertools.chain(*self.bad)]
+        if not all(map(math.isfinite, dates)) or sorted(set(self.at)) != list(self.at):
+            raise ValueError("dates must be finite MJD, those of at in ascending order, each once")
+        if any(not start < stop for start, stop in self.bad):
+            raise ValueError("bad: the first date of a pair must be before the second")
+
+    @property
+    def base(self) -> str:
+        """The one of `BASES` that holds; "" where nothing but additions is named."""
+        return next((word for word in self.per if word in BASES), "")
+
+    def forms(self, mean: bool, middle: float) -> Iterator[tuple[Form, bool]]:
+        """Functions of time with one value each, and whether that value has the prior of the parameter.
+
+        `mean`: the parameter has a value when nothing is added; drifts are counted from `middle` (MJD).
+        """
+        if self.base == "interval":
+            edges = (-math.inf, *self.at, math.inf)
+            yield from ((Form("window", *pair), True) for pair in itertools.pairwise(edges))
+        elif self.base == "shared" or (self.base in ("night", "file") and self.spread) or (mean and not self.base):
+            yield ALWAYS, True
+        if "step" in self.per:
+            yield from ((Form("window", date), False) for date in self.at)
+        yield from ((Form("window", *pair), False) for pair in self.bad)
+        if "linear" in self.per:
+            yield Form("linear", middle), False
+        if "annual" in self.per:
+            yield from ((Form(kind), False) for kind in ("cosine", "sine"))
+
+    def with_step(self, date: float) -> Law:
+        """The law with a step more; with intervals an edge more."""
+        per = self.per if {"interval", "step"} & set(self.per) else (*self.per, "step")
+        return dataclasses.replace(self, per=per, at=tuple(sorted({*self.at, date})))
+
+    def with_bad(self, start: float, stop: float) -> Law:
+        """The law with a time more at which the value differs."""
+        return dataclasses.replace(
+            self, per=tuple(dict.fromkeys((*self.per, "bad"))), bad=tuple(sorted({*self.bad, (start, stop)}))
+        )
+
+    def document(self) -> dict[str, Any]:
+        """The entry of a model file, as plain data."""
+        found = {key: getattr(self, key) for key in KEYS[1:]}
+        return {"per": list(self.per)} | {key: value for key, value in found.items() if value not in (None, ())}
+
+
+SHARED = Law()
+Laws = Mapping[str, Law]
+
+
+def laws_of(tables: Mapping[str, Any]) -> dict[str, Law]:
+    """The laws of the [law] tables of a model file. Raises ValueError naming the table and key that is wrong."""
+    found = {}
+    for name, entry in tables.items():
+        where = f'[law."{name}"]'
+        if not isinstance(entry, Mapping):
+            raise ValueError(f"{where} must be a table; names with dots stand in quotes")
+        for key in entry:
+            if key not in KEYS:
+                raise ValueError(f"{where} {key}: no such key; {nearest(key, KEYS)}")
+        try:
+            found[name] = _law(entry)
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{where} {error}") from None
+    return found
+
+
+def _law(entry: Mapping[str, Any]) -> Law:
+    per = entry.get("per", "shared")
+    words = (per,) if isinstance(per, str) else tuple(map(str, per))
+    at = entry.get("at", ())
+    dates = tuple(map(float, (at,) if isinstance(at, int | float) else at))
+    bad = tuple((float(start), float(stop)) for start, stop in entry.get("bad", ()))
+    numbers = {key: None if entry.get(key) is None else float(entry[key]) for key in ("spread", "rate")}
+    return Law(words, at=dates, bad=bad, **numbers)
+
+
+def resolved(
+    laws: Laws, names: Sequence[str], candidates: Sequence[str]
+) -> tuple[Law | None, ...]:
+    """A law for every parameter, then for every candidate (None: absent); an exact name wins over a group.
+
+    Raises ValueError for a name or group that nothing bears.
+    """
+    found: dict[str, Law | None] = dict.fromkeys(names, SHARED) | dict.fromkeys(candidates, None)
+    for exact in (False, True):
+        for key, law in laws.items():
+            if (key in found) != exact:
+                continue
+            some = [key] if exact else fnmatch.filter(found, key)
+            if not some:
+                raise ValueError(f'[law."{key}"]: no such parameter; {nearest(key, found)}')
+            found |= dict.fromkeys(some, law)
+    return tuple(found.values())
