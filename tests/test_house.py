@@ -32,7 +32,7 @@ ROOMS = (
     "commands",
 )
 OWNERS = {
-    "astropy": {"io", "data", "sky", "calibration", "diagnosis"},
+    "astropy": {"io", "data", "sky", "calibration", "diagnosis", "nights"},
     "optimistix": {"fit"},
     "emcee": {"posterior"},
     "arviz": {"posterior"},

@@ -17,7 +17,7 @@ LAWS = {
     "night": (Law(("night",)), Law(), Law(("night",), spread=0.3), Law(), Law(), None),
     "file": (Law(("file",)), Law(("night",)), Law(), Law(("file",), spread=0.2), Law(), None),
     "walk": (Law(("walk",), rate=0.1), Law(("walk",), rate=0.02), Law(), Law(), Law(("night",)), None),
-    "all walk": tuple(Law(("walk",), rate=0.05 * (k + 1)) for k in range(5)) + (None,),
+    "all walk": (*(Law(("walk",), rate=0.05 * (k + 1)) for k in range(5)), None),
     "trends": (
         Law(("linear",)), Law(("annual",)), Law(("interval",), at=(170.5, 222.0)), Law(("step",), at=(205.0,)),
         Law(("walk", "step", "bad"), rate=0.05, at=(190.0,), bad=((200.0, 222.0),)), Law(("step",), at=(205.0,)),
@@ -47,7 +47,7 @@ def world(seed=0, nights=9, files=2, spanning=False):
 
 
 def dense(laws, equations, mean, width):
-    """Design (unit, parameter, unknown), prior precision and its mean over all unknowns, from the meaning of the laws."""
+    """Design (unit, parameter, unknown), prior precision and its pull on the unknowns, as the laws mean them."""
     columns, precision, centre = [], [], []
     units, middle = len(equations), equations.mjd.mean()
 
@@ -117,20 +117,22 @@ CASES = [(name, False) for name in LAWS] + [("file", True)]
 
 @pytest.mark.parametrize(("name", "spanning"), CASES)
 def test_values_and_errors_equal_dense_least_squares(name, spanning):
-    found, design, jacobian, data, covariance, pull, rows = solved(name, spanning)
+    found, design, jacobian, data, covariance, pull, _ = solved(name, spanning)
     x = covariance @ (jacobian.T @ data + pull)
     scale = found.system.equations.scale
     truth = design @ x
     error = np.sqrt(np.einsum("uix,xy,uiy->ui", design, covariance, design))
     assert np.abs(found.values * scale - truth).max() < 1e-6 * error.max()
-    assert np.abs(found.values * scale - truth)[error > 0] == pytest.approx(0.0, abs=1e-6 * error[error > 0].min())
+    assert np.abs(found.values * scale - truth)[error > 0] == pytest.approx(
+        0.0, abs=1e-6 * error[error > 0].min()
+    )
     assert found.errors() * scale == pytest.approx(error, rel=1e-6, abs=1e-12)
     assert found.chi2 == pytest.approx(np.sum((data - jacobian @ x) ** 2), rel=1e-9)
 
 
 @pytest.mark.parametrize("name", LAWS)
 def test_prediction_in_a_night_holds_all_covariances(name):
-    found, design, jacobian, data, covariance, _, _ = solved(name)
+    found, design, _, _, covariance, _, _ = solved(name)
     e = found.system.equations
     for unit in (0, 7, 17):
         night_mean = e.mjd[e.night == e.night[unit]].mean()
@@ -144,7 +146,7 @@ def test_prediction_in_a_night_holds_all_covariances(name):
 
 @pytest.mark.parametrize(("name", "spanning"), CASES)
 def test_scores_of_changes_equal_a_fit_with_one_column_more(name, spanning):
-    found, design, jacobian, data, covariance, pull, rows = solved(name, spanning)
+    found, _, jacobian, data, covariance, pull, rows = solved(name, spanning)
     e, scan = found.system.equations, algebra.scan(found)
     residual = data - jacobian @ (covariance @ (jacobian.T @ data + pull))
     left = np.eye(len(data)) - jacobian @ covariance @ jacobian.T
@@ -182,14 +184,20 @@ def test_a_few_changes_together(name):
 
 
 def test_a_walk_is_a_gaussian_process():
-    """One parameter, one datum a night: kriging with the kernel w² + r² (min(t, t') − t₀), between nights and beyond."""
+    """One parameter, one datum a night: kriging with the kernel w² + r² (min(t, t') − t₀)."""
     rng = np.random.default_rng(3)
     mjd = 100.0 + np.cumsum(rng.exponential(4.0, 40))
     rate, width, noise = 0.1, 2.0, rng.uniform(0.1, 0.5, 40)
     data = np.cumsum(rng.normal(size=40)) * 0.2 + noise * rng.normal(size=40)
     one = np.arange(40)
     equations = algebra.Equations(
-        mjd, one, one, (data / noise) ** 2, -(data / noise**2)[:, None], (noise**-2.0)[:, None, None], np.ones(1)
+        mjd,
+        one,
+        one,
+        (data / noise) ** 2,
+        -(data / noise**2)[:, None],
+        (noise**-2.0)[:, None, None],
+        np.ones(1),
     )
     law = (Law(("walk",), rate=rate),)
     system = algebra.System.of(equations, law, np.zeros(1), np.full(1, width), np.ones(1, bool))
@@ -200,14 +208,19 @@ def test_a_walk_is_a_gaussian_process():
 
     times = np.concatenate([mjd[:5], 0.5 * (mjd[1:] + mjd[:-1]), [mjd[-1] + 30.0]])
     weight = np.linalg.solve(kernel(mjd, mjd) + np.diag(noise**2), kernel(mjd, times))
-    wanted, variance = weight.T @ data, np.diag(kernel(times, times)) - np.sum(kernel(mjd, times) * weight, axis=0)
+    wanted, variance = (
+        weight.T @ data,
+        np.diag(kernel(times, times)) - np.sum(kernel(mjd, times) * weight, axis=0),
+    )
     for k, time in enumerate(times):
         value, covariance = found.predict(float(time))
         assert value[0] == pytest.approx(wanted[k], abs=1e-6 * np.sqrt(variance[k]))
         assert covariance[0, 0] == pytest.approx(variance[k], rel=1e-6)
     # The evidence is that of the process, up to a constant: compared between two rates.
     other = algebra.solve(
-        algebra.System.of(equations, (Law(("walk",), rate=0.3),), np.zeros(1), np.full(1, width), np.ones(1, bool))
+        algebra.System.of(
+            equations, (Law(("walk",), rate=0.3),), np.zeros(1), np.full(1, width), np.ones(1, bool)
+        )
     )
 
     def evidence(rate):
@@ -220,7 +233,11 @@ def test_a_walk_is_a_gaussian_process():
 def test_what_nothing_determines_is_named():
     equations, *_ = world()
     matrix, gradient = equations.matrix.copy(), equations.gradient.copy()
-    matrix[4:6, 1], matrix[4:6, :, 1], gradient[4:6, 1] = 0.0, 0.0, 0.0  # the third night says nothing of parameter 1
+    matrix[4:6, 1], matrix[4:6, :, 1], gradient[4:6, 1] = (
+        0.0,
+        0.0,
+        0.0,
+    )  # the third night says nothing of parameter 1
     poor = algebra.Equations(
         equations.mjd, equations.night, equations.file, equations.chi2, gradient, matrix, equations.scale
     )

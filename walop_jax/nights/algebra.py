@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import linalg
 
-from walop_jax.nights.laws import ALWAYS, Form, Law
+from walop_jax.nights.laws import Form, Law
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
@@ -60,7 +60,9 @@ class Equations:
 
     def only(self, keep: Bool[np.ndarray, " u"]) -> Equations:
         """The equations of some units."""
-        parts = {name: getattr(self, name)[keep] for name in ("mjd", "night", "file", "chi2", "gradient", "matrix")}
+        parts = {
+            name: getattr(self, name)[keep] for name in ("mjd", "night", "file", "chi2", "gradient", "matrix")
+        }
         return dataclasses.replace(self, **parts)
 
 
@@ -175,7 +177,9 @@ def _cells(
             )
             joined = label.copy()
             for first, last in zip(low, high, strict=True):
-                joined[(label >= first) & (label <= last)] = np.minimum(joined[(label >= first) & (label <= last)], first)
+                joined[(label >= first) & (label <= last)] = np.minimum(
+                    joined[(label >= first) & (label <= last)], first
+                )
             if np.array_equal(joined, label):
                 break
             label = joined
@@ -271,7 +275,11 @@ def solve(system: System) -> Solution:
         left_block, left, rest = block, border, own
         if last is not None and coupling.any():
             gain = linalg.cho_solve(last.factor, coupling.T, check_finite=False).T
-            left_block, left, rest = block - gain @ coupling.T, border - gain @ last.left, own - gain @ last.right
+            left_block, left, rest = (
+                block - gain @ coupling.T,
+                border - gain @ last.left,
+                own - gain @ last.right,
+            )
         factor = _factored(left_block, cell.parameter, int(cell.units[0])) if len(own) else (left_block, True)
         last = Eliminated(block, border, coupling, factor, left, rest)
         done.append(last)
@@ -654,6 +662,3 @@ def changes_together(
         lower = linalg.solve_triangular(of.factor[0], cross - border_taken, lower=True, check_finite=False)
         information = information - lower.T @ lower
     return score, information
-
-
-__all__ = ["ALWAYS", "Equations", "Scan", "Solution", "System", "UndeterminedError", "changes_together", "scan", "solve"]

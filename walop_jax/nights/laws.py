@@ -1,4 +1,4 @@
-"""Laws of parameters: how a number of an instrument may change with time. Data; what is computed with them is `algebra`.
+"""Laws of parameters: how a number of an instrument may change with time. Data; `algebra` computes with them.
 
     shared      one value for all nights; what holds if nothing is said
     night       a value for every night      } `spread`: standard deviation of the values about their mean;
@@ -126,7 +126,11 @@ class Law:
         if self.base == "interval":
             edges = (-math.inf, *self.at, math.inf)
             yield from ((Form("window", *pair), True) for pair in itertools.pairwise(edges))
-        elif self.base == "shared" or (self.base in ("night", "file") and self.spread) or (mean and not self.base):
+        elif (
+            self.base == "shared"
+            or (self.base in ("night", "file") and self.spread)
+            or (mean and not self.base)
+        ):
             yield ALWAYS, True
         if "step" in self.per:
             yield from ((Form("window", date), False) for date in self.at)
@@ -150,7 +154,9 @@ class Law:
     def document(self) -> dict[str, Any]:
         """The entry of a model file, as plain data."""
         found = {key: getattr(self, key) for key in KEYS[1:]}
-        return {"per": list(self.per)} | {key: value for key, value in found.items() if value not in (None, ())}
+        return {"per": list(self.per)} | {
+            key: value for key, value in found.items() if value not in (None, ())
+        }
 
 
 SHARED = Law()
@@ -184,9 +190,7 @@ def _law(entry: Mapping[str, Any]) -> Law:
     return Law(words, at=dates, bad=bad, **numbers)
 
 
-def resolved(
-    laws: Laws, names: Sequence[str], candidates: Sequence[str]
-) -> tuple[Law | None, ...]:
+def resolved(laws: Laws, names: Sequence[str], candidates: Sequence[str]) -> tuple[Law | None, ...]:
     """A law for every parameter, then for every candidate (None: absent); an exact name wins over a group.
 
     Raises ValueError for a name or group that nothing bears.

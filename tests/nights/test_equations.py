@@ -1,0 +1,132 @@
+"""Normal equations of nights against fits of the whole, and the table of bad input."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from small_run import SMALL
+
+from walop_jax.data.merge import merge_calibration_sets
+from walop_jax.data.records import Site
+from walop_jax.fit.model_builder import base_model
+from walop_jax.io.errors import DataError
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects import effect_by_name
+from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.nights import equations, night_file
+from walop_jax.nights.equations import night_equations, night_numbers, together
+from walop_jax.simulation.simulate import simulate
+
+SAAO = Site("SAAO", -32.4, 20.8, 1798.0)
+
+
+@pytest.fixture(scope="module")
+def two():
+    """Two nights, a week apart, of one instrument."""
+    first = simulate(SMALL, seed=1)
+    later = dataclasses.replace(SMALL, mjd=SMALL.start + 7.0)
+    return first.calset, simulate(later, seed=2, instrument=first.truth).calset
+
+
+@pytest.fixture(scope="module")
+def nights(two):
+    model = base_model(two[0])
+    return [night for calset in two for night in night_equations(calset, model, model.start)]
+
+
+def test_a_night_lasts_from_noon_to_noon():
+    """Local mean noon at 20.8° east is 10:37 UTC."""
+    mjd = 61000.0 + np.array([10.5, 10.7, 23.9, 24.1, 34.5, 34.7]) / 24.0
+    assert night_numbers(mjd, SAAO).tolist() == [60999, 61000, 61000, 61000, 61000, 61001]
+    nowhere = dataclasses.replace(SAAO, longitude=np.nan)
+    assert night_numbers(mjd, nowhere).tolist() == [61000, 61000, 61000 + 0, 61000, 61001, 61001]
+
+
+def test_equations_are_those_of_the_fit(two, nights):
+    """χ², gradient and matrix in the free parameters, against the pass of a fit: another program."""
+    model = base_model(two[0])
+    terms, _ = Likelihood.of(two[0], model).data_terms(model.start)
+    select, night = model.selection(), nights[0]
+    n = len(model.free)
+    assert night.chi2 == pytest.approx(terms.data, rel=1e-9)
+    assert night.gradient[:n] == pytest.approx(select.T @ terms.gradient, rel=1e-7, abs=1e-6)
+    assert night.matrix[:n, :n] == pytest.approx(select.T @ terms.matrix @ select, rel=1e-7, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name", ["clp_zero.angle", "hwp2_axis.angle", "telescope_polarisation.q", "filter_shift.wavelength"]
+)
+def test_candidates_are_effects_at_neutral(two, nights, name):
+    """Gradient and curvature of an amplitude that the model lacks: those of the model that has it."""
+    model = base_model(two[0])
+    kind, _, parameter = name.partition(".")
+    context = effect_context(model.template, two[0].exposures)
+    larger = with_effects(model, [effect_by_name(kind).neutral(context)], context)
+    terms, _ = Likelihood.of(two[0], larger).data_terms(larger.start)
+    i, k = larger.index(f"{kind}.{parameter}"), nights[0].names.index(name)
+    assert nights[0].gradient[k] == pytest.approx(terms.gradient[i], rel=1e-6)
+    assert nights[0].matrix[k, k] == pytest.approx(terms.matrix[i, i], rel=1e-6)
+
+
+def test_a_set_of_two_nights_comes_apart(two, nights):
+    whole = merge_calibration_sets(*two)
+    apart = night_equations(whole, base_model(whole), base_model(whole).start)
+    assert [night.number for night in apart] == [night.number for night in nights]
+    for one, other in zip(apart, nights, strict=True):
+        names = [name for name in other.names if name in one.names]
+        a, b = (np.array([n.names.index(name) for name in names]) for n in (one, other))
+        assert one.chi2 == pytest.approx(other.chi2, rel=1e-9)
+        assert one.gradient[a] == pytest.approx(other.gradient[b], rel=1e-6, abs=1e-4)
+
+
+def test_nights_are_written_and_read(tmp_path, nights):
+    path = tmp_path / "night.fits"
+    night_file.write_nights(path, nights[:1])
+    (found,) = night_file.read_nights(path)
+    for field in dataclasses.fields(found):
+        if field.name != "parameters":
+            assert np.all(getattr(found, field.name) == getattr(nights[0], field.name)), field.name
+    assert [(p.name, p.prior, p.loose) for p in found.parameters] == [
+        (p.name, p.prior, p.loose) for p in nights[0].parameters
+    ]
+    damaged = path.read_bytes()
+    path.write_bytes(damaged[:-5000] + bytes(10) + damaged[-4990:])
+    with pytest.raises(DataError, match="do not agree"):
+        night_file.read_nights(path)
+
+
+def test_the_order_of_nights_does_not_matter(nights):
+    one, other = together(nights), together(nights[::-1])
+    assert [n.number for n in one.nights] == [n.number for n in other.nights]
+    assert np.array_equal(one.equations.matrix, other.equations.matrix)
+
+
+def test_a_night_twice_is_refused(nights):
+    with pytest.raises(DataError, match="twice: the same data"):
+        together([*nights, nights[0]])
+    copied = dataclasses.replace(nights[0], sha256="0" * 64, source="copy.fits")
+    with pytest.raises(DataError, match=r"exposures of the same times are in .* copy.fits; leave one out"):
+        together([*nights, copied])
+
+
+def test_other_instruments_and_models_are_refused(nights):
+    with pytest.raises(DataError, match=r"two instruments, .* stack the instruments apart"):
+        together([nights[0], dataclasses.replace(nights[1], instrument="WALOP-NORTH")])
+    with pytest.raises(DataError, match="two models"):
+        together([nights[0], dataclasses.replace(nights[1], model="f" * 64)])
+
+
+def test_exposures_without_a_time_are_refused(two):
+    e = two[0].exposures
+    lost = dataclasses.replace(e, mjd=np.where(np.arange(len(e)) == 1, np.nan, e.mjd))
+    with pytest.raises(DataError, match="MJD: not given in 1 of"):
+        list(equations.split(dataclasses.replace(two[0], exposures=lost)))
+
+
+@pytest.mark.parametrize("hours", [2.0, -7.0])
+def test_clocks_in_local_time_are_refused(two, hours):
+    e = two[0].exposures
+    equations.check_clock(e, two[0].site)
+    local = dataclasses.replace(e, mjd=e.mjd + hours / 24.0)
+    with pytest.raises(DataError, match=rf"is [+-]{abs(hours):.2f} h from UTC"):
+        equations.check_clock(local, two[0].site)

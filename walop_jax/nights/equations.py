@@ -1,0 +1,399 @@
+"""What a night leaves: the normal equations of its data in all free parameters and in candidates, at reference values.
+
+    χ²(θ) = χ² + 2 gᵀ(θ − θ₀) + (θ − θ₀)ᵀ H (θ − θ₀),      g = Jᵀr,   H = JᵀJ
+
+of the data alone: priors are laid on when nights are stacked, once. J holds the derivatives of the normalised residuals
+r, fluxes eliminated, with respect to the free parameters and to the amplitudes of effects that the model lacks (at 0):
+what is not in the model can be asked for afterwards without the data.
+
+Nights follow from the exposures: from noon to noon of the mean Sun at the site; where the longitude is not known, a gap
+of eight hours parts two nights. A set of several nights is taken apart; each file and night is a unit of its own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from walop_jax.data.records import CalibrationSet, Exposures, Site
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.fit.model_builder import SKY_AND_STARS, model_like
+from walop_jax.fit.model_file import header_of
+from walop_jax.fit.refit import FitResult
+from walop_jax.io.errors import DataError, fail
+from walop_jax.likelihood import engine
+from walop_jax.likelihood.columns import Columns
+from walop_jax.likelihood.journal import fingerprint
+from walop_jax.likelihood.likelihood import Likelihood, used_rows
+from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.parameters import Parameter, leaves
+from walop_jax.model.specification import Model, effect_context
+from walop_jax.nights.algebra import Equations
+from walop_jax.sky.moon import local_sidereal_time
+
+GAP = 8.0  # hours without an exposure that part two nights where the longitude of the site is not known
+OF_ONE_SET = ("moon_patch", "standard_outlier")
+"""Effects that belong to single exposures, or are parameters of the base model already: no candidates."""
+MOST_SHAPES = (
+    4  # of an effect whose shapes are all candidates: cameras and plates, not places and thicknesses
+)
+SIDEREAL = 1.00273791  # sidereal hours in an hour
+CLOCK = (
+    0.2,
+    0.05,
+)  # hours by which hour angles disagree with MJD, and their scatter, that tell of another clock
+
+Vector = Float[np.ndarray, " _"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Night:
+    """The normal equations of one file in one night.
+
+    `number` is the MJD of the evening, `begin`, `end` and `mjd` (UTC) the first, last and mean exposure; `source` and
+    `sha256` the data, `model` a hash of what the model holds fixed. `dof` counts data less fluxes. The last parameters
+    are `candidates`, amplitudes beyond the model with reference 0; `gradient` and `matrix` are halves of the
+    derivatives of `chi2`.
+    """
+
+    instrument: str
+    model: str
+    number: int
+    begin: float
+    end: float
+    mjd: float
+    filters: tuple[str, ...]
+    source: str
+    sha256: str
+    n_data: int
+    dof: int
+    chi2: float
+    parameters: tuple[Parameter, ...]
+    candidates: int
+    reference: Float[np.ndarray, " n"]
+    gradient: Float[np.ndarray, " n"]
+    matrix: Float[np.ndarray, "n n"]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, candidates last."""
+        return tuple(p.name for p in self.parameters)
+
+
+# ------------------------------------------------------------------------------------------------ nights of a set
+
+
+def night_numbers(mjd: Float[np.ndarray, " e"], site: Site) -> Int[np.ndarray, " e"]:
+    """The night of every exposure: MJD of its evening at the site. `mjd` is UTC.
+
+    Raises `DataError` for an exposure without a time.
+    """
+    if np.any(bad := ~np.isfinite(mjd)):
+        raise DataError(
+            f"[EXPOSURES] MJD: not given in {int(bad.sum())} of {len(mjd)} exposures, so that they belong to no night; "
+            "add the times (UTC)"
+        )
+    if np.isfinite(site.longitude):
+        return np.floor(mjd + site.longitude / 360.0 - 0.5).astype(int)
+    order = np.argsort(mjd, kind="stable")
+    first = np.flatnonzero(np.diff(mjd[order], prepend=-np.inf) > GAP / 24.0)
+    label = np.empty(len(mjd), int)
+    label[order] = np.repeat(np.floor(mjd[order][first]), np.diff(np.append(first, len(mjd))))
+    return label
+
+
+def check_clock(exposures: Exposures, site: Site) -> None:
+    """Raise `DataError` where the hour angles of the sky exposures say that MJD is not UTC: clocks in local time."""
+    sky = np.isfinite(exposures.mjd + exposures.ha + exposures.ra) & (exposures.kind != "clp")
+    if not np.isfinite(site.longitude) or sky.sum() < 2:
+        return
+    sidereal = local_sidereal_time(exposures.mjd[sky], site.longitude)
+    off = (np.mod(sidereal - exposures.ra[sky] - 15.0 * exposures.ha[sky] + 180.0, 360.0) - 180.0) / 15.0
+    shift = float(np.median(off)) / SIDEREAL
+    if abs(shift) > CLOCK[0] and np.median(np.abs(off / SIDEREAL - shift)) < CLOCK[1]:
+        raise DataError(
+            f"[EXPOSURES] MJD: is {shift:+.2f} h from UTC, as HA and RA of {int(sky.sum())} exposures say: is "
+            "the clock in local time? Correct MJD"
+        )
+
+
+def of_exposures(calset: CalibrationSet, keep: Bool[np.ndarray, " e"]) -> CalibrationSet:
+    """The set with some of its exposures. Raises `DataError` for frames, and for a set that stands for frames."""
+    if keep.all():
+        return calset
+    whole = calset.intensities
+    if not isinstance(whole, TableIntensities) or calset.compression is not None:
+        raise DataError("frames of several nights are in one set; give each night as a file of its own")
+    rows, place = keep[whole.exposure], np.cumsum(keep) - 1
+    some = {
+        name: getattr(whole, name)[rows] for name in ("point", "source", "counts", "sigma", "flag", "used")
+    }
+    table = TableIntensities(int(keep.sum()), whole.points, exposure=place[whole.exposure[rows]], **some)
+    return dataclasses.replace(calset, exposures=calset.exposures[keep], intensities=table)
+
+
+def split(calset: CalibrationSet) -> Iterator[tuple[int, CalibrationSet]]:
+    """The nights of a set, each with its number. Raises `DataError` for times that are missing or not UTC."""
+    check_clock(calset.exposures, calset.site)
+    numbers = night_numbers(calset.exposures.mjd, calset.site)
+    for number in np.unique(numbers).tolist():
+        yield number, of_exposures(calset, numbers == number)
+
+
+# ------------------------------------------------------------------------------------------------------ candidates
+
+Change = tuple[tuple[float, Any], ...]
+
+
+def candidates_of(
+    model: Model, exposures: Exposures, catalogue: Sequence[type[Effect]] = EFFECTS
+) -> dict[str, tuple[Parameter, Change]]:
+    """Amplitudes of the effects that a model lacks, by name, each with the change that it is to first order."""
+    context, found = effect_context(model.template, exposures), {}
+    for kind in catalogue:
+        if kind.is_structural() or kind.name in (*OF_ONE_SET, *model.effect_names):
+            continue
+        groups = kind.probes(context)
+        if len(groups) > MOST_SHAPES or not kind.neutral(context).fits(model.template):
+            continue
+        for g, group in enumerate(groups):
+            for m, member in enumerate(group):
+                each = member.first_order(model.template)
+                of = [leaf for leaf in leaves(member) if leaf.name.split(".")[0] in kind.amplitudes()]
+                if not each or not all(each) or len(each) != len(of):
+                    continue
+                for leaf, change in zip(of, each, strict=True):
+                    name = f"{kind.name}{f'#{g}' if len(groups) > 1 else ''}.{leaf.name}" + (
+                        f"#{m}" if m else ""
+                    )
+                    found[name] = dataclasses.replace(leaf, name=name, part=kind.name, start=0.0), change
+    return found
+
+
+def with_candidates(
+    likelihood: Likelihood, values: Vector, changes: Sequence[Change]
+) -> tuple[float, Vector, Float[np.ndarray, "_ _"]]:
+    """χ², gradient and matrix of the data of a table in free parameters and candidates (0: cannot be computed)."""
+    instrument, select = likelihood.model.instrument(values), likelihood.model.selection()
+    residuals, slopes = [], []
+    for chunk in likelihood.points:
+        residual, slope = engine.linearised_residuals(instrument, likelihood.plan, chunk)
+        residuals.append(used_rows(residual[..., None], chunk)[:, 0])
+        slopes.append(used_rows(slope, chunk) @ select)
+    r, jacobian = np.concatenate(residuals), np.concatenate(slopes)
+    if changes:
+        columns = Columns(likelihood, values)
+        there = [k for k, change in enumerate(changes) if columns.has(change)]
+        added = np.zeros((len(r), len(changes)))
+        added[:, there] = columns.of([changes[k] for k in there])
+        jacobian = np.hstack([jacobian, added])
+    return float(r @ r), jacobian.T @ r, jacobian.T @ jacobian
+
+
+# ---------------------------------------------------------------------------------------------------------- nights
+
+
+def model_hash(model: Model) -> str:
+    """Of all that nights must have in common: instrument, physics, effects, ties and values that are held."""
+    header = header_of(model)
+    held = [
+        f"{p.name} {p.tie or repr(p.start)}"
+        for p in model.parameters
+        if (p.tie or not p.free) and not p.name.startswith(SKY_AND_STARS)
+    ]
+    text = "\n".join([repr(header), model.template.description, *held])
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def night_equations(
+    calset: CalibrationSet,
+    model: Model,
+    values: Vector | Mapping[str, float],
+    catalogue: Sequence[type[Effect]] = EFFECTS,
+    *,
+    candidates: bool = True,
+) -> list[Night]:
+    """The nights of a set, linearised at values of the parameters: a full vector, or by name (others: start values).
+
+    Of sets too large for a table of derivatives no candidates are kept. Raises `DataError` as `split` does.
+    """
+    if isinstance(values, Mapping):
+        values = np.array([values.get(p.name, p.start) for p in model.parameters])
+    source = ", ".join(str(entry.path) for entry in calset.inputs) or calset.origin
+    found = []
+    for number, some in split(calset):
+        likelihood = Likelihood.of(some, model)
+        changes = candidates_of(model, some.exposures, catalogue) if candidates else {}
+        if likelihood.layout.large:
+            terms, _ = likelihood.data_terms(values)
+            select = model.selection()
+            chi2, gradient, matrix = terms.data, select.T @ terms.gradient, select.T @ terms.matrix @ select
+            changes, census = {}, terms.census
+        else:
+            chi2, gradient, matrix = with_candidates(likelihood, values, [c for _, c in changes.values()])
+            census = likelihood.census
+        e = some.exposures
+        found.append(
+            Night(
+                instrument=model.name,
+                model=model_hash(model),
+                number=number,
+                begin=float(e.mjd.min()),
+                end=float(e.mjd.max()),
+                mjd=float(e.mjd.mean()),
+                filters=tuple(np.unique(e.filter).tolist()),
+                source=source,
+                sha256=data_hash(calset),
+                n_data=census.n_data,
+                dof=round(float(census.rows @ likelihood.data_per_row)),
+                chi2=chi2,
+                parameters=(*(model.parameters[i] for i in model.free), *(p for p, _ in changes.values())),
+                candidates=len(changes),
+                reference=np.concatenate([values[model.free], np.zeros(len(changes))]),
+                gradient=gradient,
+                matrix=matrix,
+            )
+        )
+    return found
+
+
+def data_hash(calset: CalibrationSet) -> str:
+    """SHA-256 of the files of a set, of its content if it comes from none."""
+    if not calset.inputs:
+        return fingerprint(calset)
+    together = "".join(entry.sha256 for entry in calset.inputs)
+    return together if len(calset.inputs) == 1 else hashlib.sha256(together.encode()).hexdigest()
+
+
+def nights_like(
+    calset: CalibrationSet,
+    old: Model,
+    values: Mapping[str, float],
+    catalogue: Sequence[type[Effect]] = EFFECTS,
+) -> list[Night]:
+    """The nights of a set under the model of an earlier fit, linearised at the values of that: no fit is needed."""
+    return night_equations(calset, model_like(calset, old), values, catalogue)
+
+
+def nights_of_fit(result: FitResult, catalogue: Sequence[type[Effect]] = EFFECTS) -> list[Night]:
+    """The nights of a fitted set, linearised at the fit."""
+    return night_equations(result.calset, result.model, result.values, catalogue)
+
+
+# -------------------------------------------------------------------------------------------------------- together
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Together:
+    """Nights in the order of time, with equations in the parameters of all: what a stack is solved from.
+
+    `origin` are the values that equations count from; `mean` and `width` (inf: none) the priors in the same way.
+    """
+
+    nights: tuple[Night, ...]
+    parameters: tuple[Parameter, ...]
+    candidates: int
+    origin: Vector
+    mean: Vector
+    width: Vector
+    equations: Equations
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, candidates last."""
+        return tuple(p.name for p in self.parameters)
+
+    @property
+    def has_value(self) -> Bool[np.ndarray, " n"]:
+        """True for parameters of the model, False for candidates."""
+        return np.arange(len(self.parameters)) < len(self.parameters) - self.candidates
+
+
+def together(nights: Sequence[Night]) -> Together:
+    """Nights in the order of time, in the parameters of all. Raises `DataError` as `check_together` does."""
+    if not nights:
+        raise fail("no night was given", advice="make them with walop-jax nights, or refit --nights")
+    ordered = tuple(sorted(nights, key=lambda night: (night.mjd, night.sha256)))
+    check_together(ordered)
+    known: dict[str, Parameter] = {}
+    for candidate in (False, True):
+        for night in ordered:
+            cut = len(night.parameters) - night.candidates
+            for p in night.parameters[cut:] if candidate else night.parameters[:cut]:
+                known.setdefault(p.name, p)
+    of_model = {
+        p.name for night in ordered for p in night.parameters[: len(night.parameters) - night.candidates]
+    }
+    names, n = list(known), len(known)
+    place, origin = {name: k for k, name in enumerate(names)}, np.full(n, np.nan)
+    gradient, matrix = np.zeros((len(ordered), n)), np.zeros((len(ordered), n, n))
+    chi2 = np.zeros(len(ordered))
+    for night in ordered:
+        at = np.array([place[name] for name in night.names])
+        origin[at] = np.where(np.isnan(origin[at]), night.reference, origin[at])
+    for u, night in enumerate(ordered):
+        at = np.array([place[name] for name in night.names])
+        moved = origin[at] - night.reference
+        slope = night.matrix @ moved
+        chi2[u] = night.chi2 + 2.0 * night.gradient @ moved + moved @ slope
+        gradient[u, at] = night.gradient + slope
+        matrix[np.ix_([u], at, at)] = night.matrix
+    mean, width = np.zeros(n), np.full(n, np.inf)
+    for k, p in enumerate(known.values()):
+        if p.name in of_model and (p.prior is not None or p.loose is not None):
+            centre, width[k] = p.prior if p.prior is not None else (p.start, p.loose)
+            mean[k] = centre - origin[k]
+    total = np.einsum("uii->i", matrix) + np.where(np.isfinite(width), width**-2.0, 0.0)
+    scale = 1.0 / np.sqrt(np.where(total > 0, total, 1.0))
+    gradient *= scale
+    matrix *= scale
+    matrix *= scale[:, None]
+    _, file = np.unique([night.sha256 for night in ordered], return_inverse=True)
+    equations = Equations(
+        np.array([night.mjd for night in ordered]),
+        _numbers(ordered),
+        file.astype(int),
+        chi2,
+        gradient,
+        matrix,
+        scale,
+    )
+    return Together(ordered, tuple(known.values()), n - len(of_model), origin, mean, width, equations)
+
+
+def _numbers(nights: Sequence[Night]) -> Int[np.ndarray, " u"]:
+    """Nights counted from 0 in the order of time."""
+    return np.unique([night.number for night in nights], return_inverse=True)[1].astype(int)
+
+
+def check_together(nights: Sequence[Night]) -> None:
+    """Raise `DataError` for nights of other instruments or models, and for data that are there twice."""
+    first = nights[0]
+    advice = {
+        "instrument": "stack the instruments apart",
+        "model": "linearise all nights with one model (walop-jax nights --like RUN)",
+    }
+    for name, remedy in advice.items():
+        for night in nights:
+            if getattr(night, name) != getattr(first, name):
+                one, other = (f"{getattr(entry, name)[:12]} ({entry.source})" for entry in (first, night))
+                raise fail(f"the nights are of two {name}s, {one} and {other}", advice=remedy)
+    seen: dict[Any, Night] = {}
+    for night in nights:
+        for key in ((night.sha256, night.number), (night.begin, night.end)):
+            if key in seen:
+                what = (
+                    "the same data" if key == (night.sha256, night.number) else "exposures of the same times"
+                )
+                where = f"{what} are in {seen[key].source} and {night.source}"
+                raise fail(f"the night of MJD {night.number} is there twice: {where}", advice="leave one out")
+            seen[key] = night
+
+
+Again = Callable[[Night, Mapping[str, float]], Night | None]
+"""Linearises a night again at other values; None where its data cannot be had."""

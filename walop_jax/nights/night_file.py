@@ -1,0 +1,194 @@
+"""The file of nights (FITS): normal equations that are kept.
+
+    PRIMARY      NIGHTVER, INSTRUME, MODEL (hash of what the model holds fixed), CREATOR, SOFT1, … versions
+    PARAMETERS   NAME, UNIT, START, PRIOR_MEAN, PRIOR_WIDTH, LOOSE, SCALE (NaN: none), CANDIDATE
+    NIGHTS       a row for each file and night: NIGHT, MJD_BEG, MJD_END, MJD, FILTERS, SOURCE, SHA256, NDATA, DOF, CHI2,
+                 and, in the order of PARAMETERS, REFERENCE, GRADIENT and MATRIX: its lower triangle, row by row
+
+A row of 127 parameters takes 67 kB. All extensions carry checksums; the file appears whole or not at all.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+
+from walop_jax.data.schema import Column, Place, read_table
+from walop_jax.data.write import sign_and_write, table_hdu
+from walop_jax.io.atomic import atomic_path
+from walop_jax.io.errors import DataError, fail
+from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits, primary_keywords
+from walop_jax.io.text import in_ascii
+from walop_jax.model.parameters import Parameter
+from walop_jax.nights.equations import Night
+
+NIGHTVER = 1
+NIGHTS = "nights.fits"
+_NAN = float("nan")
+_AGAIN = "make the nights again: walop-jax nights"
+_PARAMETERS = {
+    "NAME": Column("str"),
+    "UNIT": Column("str"),
+    **{
+        name: Column("float", missing=_NAN)
+        for name in ("START", "PRIOR_MEAN", "PRIOR_WIDTH", "LOOSE", "SCALE")
+    },
+    "CANDIDATE": Column("bool"),
+}
+_NIGHTS = {
+    "NIGHT": Column("int"),
+    **{name: Column("float", "d") for name in ("MJD_BEG", "MJD_END", "MJD")},
+    **{name: Column("str") for name in ("FILTERS", "SOURCE", "SHA256")},
+    **{name: Column("int") for name in ("NDATA", "DOF")},
+    "CHI2": Column("float"),
+    **{name: Column("float", width=None) for name in ("REFERENCE", "GRADIENT", "MATRIX")},
+}
+
+
+def write_nights(path: str | os.PathLike[str], nights: Sequence[Night], *, overwrite: bool = False) -> None:
+    """Write nights of the same parameters to a file, which appears whole or not at all.
+
+    Raises `DataError` if the file exists and `overwrite` is False, and ValueError for nights of different parameters.
+    """
+    first = nights[0]
+    if any(night.names != first.names or night.model != first.model for night in nights):
+        raise ValueError("nights of different parameters go into files of their own")
+    priors = np.array([p.prior or (_NAN, _NAN) for p in first.parameters]).reshape(-1, 2)
+    n, lower = len(first.names), np.tril_indices(len(first.names))
+    parameters = {
+        "NAME": _texts(first.names),
+        "UNIT": _texts(p.unit for p in first.parameters),
+        "START": np.array([p.start for p in first.parameters]),
+        "PRIOR_MEAN": priors[:, 0],
+        "PRIOR_WIDTH": priors[:, 1],
+        "LOOSE": np.array([_NAN if p.loose is None else p.loose for p in first.parameters]),
+        "SCALE": np.array([p.scale for p in first.parameters]),
+        "CANDIDATE": np.arange(n) >= n - first.candidates,
+    }
+    rows: dict[str, Any] = {
+        name: np.array([getattr(night, of) for night in nights])
+        for name, of in (
+            ("NIGHT", "number"), ("MJD_BEG", "begin"), ("MJD_END", "end"), ("MJD", "mjd"), ("NDATA", "n_data"),
+            ("DOF", "dof"), ("CHI2", "chi2"), ("REFERENCE", "reference"), ("GRADIENT", "gradient"),
+        )
+    }  # fmt: skip
+    rows |= {
+        "FILTERS": _texts(" ".join(night.filters) for night in nights),
+        "SOURCE": _texts(night.source for night in nights),
+        "SHA256": _texts(night.sha256 for night in nights),
+        "MATRIX": np.stack([night.matrix[lower] for night in nights]),
+    }
+    primary = fits.PrimaryHDU()
+    cards = {"NIGHTVER": NIGHTVER, "INSTRUME": first.instrument, "CREATOR": "walop-jax"}
+    for name, value in cards.items():
+        primary.header[name] = value
+    primary.header["MODEL"] = (first.model, "")
+    hdus = [
+        primary,
+        table_hdu("PARAMETERS", parameters, path, _PARAMETERS),
+        table_hdu("NIGHTS", rows, path, _NIGHTS),
+    ]
+    with atomic_path(path, overwrite=overwrite) as temporary:
+        sign_and_write(hdus, temporary)
+
+
+def _texts(values: Iterable[str]) -> np.ndarray:
+    return np.array([in_ascii(str(value)) for value in values], dtype=np.str_)
+
+
+def is_night_file(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is one of nights, by its header."""
+    return "NIGHTVER" in primary_keywords(path)
+
+
+def read_nights(path: str | os.PathLike[str]) -> list[Night]:
+    """The nights of a file. Raises `DataError`, with advice, for one that is damaged, of another kind, or newer."""
+    with open_fits(path) as opened:
+        try:
+            return _nights(opened)
+        except DataError:
+            raise
+        except UNREADABLE as error:
+            raise fail(f"cannot be read: {one_line(error)}", file=path, advice=_AGAIN) from error
+
+
+def _nights(opened: Any) -> list[Night]:
+    path, header = opened.path, opened.hdus[0].header
+    version = header.get("NIGHTVER")
+    if not isinstance(version, int) or isinstance(version, bool):
+        raise fail("is no file of nights", file=path, column="NIGHTVER", advice=_AGAIN)
+    if version > NIGHTVER:
+        raise fail(f"is of version {version}, newer than this program", file=path, advice="update walop-jax")
+    hdus = {hdu.name.strip().upper(): hdu for hdu in opened.hdus[1:]}
+    for name in ("PARAMETERS", "NIGHTS"):
+        if name not in hdus:
+            raise fail("the extension is missing", file=path, extension=name, advice=_AGAIN)
+    table, _ = read_table(hdus["PARAMETERS"], _PARAMETERS, Place(path, "PARAMETERS"))
+    rows, _ = read_table(hdus["NIGHTS"], _NIGHTS, Place(path, "NIGHTS"))
+    n = len(table["NAME"])
+    for name, width in (("REFERENCE", n), ("GRADIENT", n), ("MATRIX", n * (n + 1) // 2)):
+        if rows[name].shape[1] != width or not np.isfinite(rows[name]).all():
+            raise fail(
+                f"is not {width} finite numbers a row",
+                file=path,
+                extension="NIGHTS",
+                column=name,
+                advice=_AGAIN,
+            )
+    priors = np.stack([table["PRIOR_MEAN"], table["PRIOR_WIDTH"]], axis=1).tolist()
+    parameters = tuple(
+        Parameter(
+            name=str(table["NAME"][k]),
+            unit=str(table["UNIT"][k]),
+            about="",
+            source="",
+            start=float(table["START"][k]),
+            prior=None if np.isnan(priors[k][1]) else (priors[k][0], priors[k][1]),
+            scale=float(table["SCALE"][k]),
+            loose=None if np.isnan(table["LOOSE"][k]) else float(table["LOOSE"][k]),
+        )
+        for k in range(n)
+    )
+    lower, found = np.tril_indices(n), []
+    for k in range(len(rows["NIGHT"])):
+        matrix = np.zeros((n, n))
+        matrix[lower] = rows["MATRIX"][k]
+        matrix = matrix + np.tril(matrix, -1).T
+        found.append(
+            Night(
+                instrument=str(header.get("INSTRUME", "")),
+                model=str(header.get("MODEL", "")),
+                number=int(rows["NIGHT"][k]),
+                begin=float(rows["MJD_BEG"][k]),
+                end=float(rows["MJD_END"][k]),
+                mjd=float(rows["MJD"][k]),
+                filters=tuple(str(rows["FILTERS"][k]).split()),
+                source=str(rows["SOURCE"][k]),
+                sha256=str(rows["SHA256"][k]),
+                n_data=int(rows["NDATA"][k]),
+                dof=int(rows["DOF"][k]),
+                chi2=float(rows["CHI2"][k]),
+                parameters=parameters,
+                candidates=int(table["CANDIDATE"].sum()),
+                reference=rows["REFERENCE"][k],
+                gradient=rows["GRADIENT"][k],
+                matrix=matrix,
+            )
+        )
+    return found
+
+
+def nights_in(place: str | os.PathLike[str]) -> list[Night]:
+    """The nights of a file, or of all files of a folder (RUN, or a folder of night files). `DataError` for none."""
+    path = Path(place)
+    if not path.is_dir():
+        return read_nights(path)
+    files = [path / NIGHTS] if (path / NIGHTS).exists() else sorted(path.glob("night*.fits"))
+    if not files:
+        raise fail("holds no nights", file=place, advice="make them: walop-jax nights, or refit --nights")
+    return [night for file in files for night in read_nights(file)]
