@@ -124,6 +124,7 @@ def simulate(
     effects: Sequence[Effect] = (),
     noiseless: bool = False,
     steady: bool = False,
+    catalogue_seed: int | None = None,
 ) -> Simulated:
     """Simulate a calibration run: the same plan, seed and effects give the same set, bit for bit.
 
@@ -131,9 +132,12 @@ def simulate(
     replaced by those of the simulated catalogue, `effects` are added to it. `noiseless` leaves the expected
     counts as they are and states the errors that they would have; `steady` gives every exposure the mean transparency
     and every star the mean brightness. Effects that depend on the run are made
-    with `plan.context()`.
+    with `plan.context()`. `catalogue_seed` draws the standards apart from the rest (default: from `seed`): nights of one
+    survey share their stars.
     """
     build, stars, sky, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
+    if catalogue_seed is not None:
+        stars = np.random.default_rng(np.random.SeedSequence(catalogue_seed).spawn(4)[1])
     sources, standards = _catalogue(plan, stars)
     if instrument is None:
         nominal = adapted(plan.design, throughput_degree=plan.throughput_degree, throughput=LEVEL)
