@@ -8,7 +8,7 @@ import itertools
 import numpy as np
 import pytest
 
-from walop_jax.nights import algebra
+from walop_jax.nights import algebra, changes
 from walop_jax.nights.laws import Law
 
 N = 6  # parameters, the last one a candidate
@@ -147,7 +147,7 @@ def test_prediction_in_a_night_holds_all_covariances(name):
 @pytest.mark.parametrize(("name", "spanning"), CASES)
 def test_scores_of_changes_equal_a_fit_with_one_column_more(name, spanning):
     found, _, jacobian, data, covariance, pull, rows = solved(name, spanning)
-    e, scan = found.system.equations, algebra.scan(found)
+    e, scan = found.system.equations, changes.scan(found)
     residual = data - jacobian @ (covariance @ (jacobian.T @ data + pull))
     left = np.eye(len(data)) - jacobian @ covariance @ jacobian.T
     for c, cell in enumerate(found.system.cells):
@@ -172,14 +172,14 @@ def test_scores_of_changes_equal_a_fit_with_one_column_more(name, spanning):
 @pytest.mark.parametrize("name", ["night", "walk", "trends"])
 def test_a_few_changes_together(name):
     found, *_ = solved(name)
-    scan = algebra.scan(found)
+    scan = changes.scan(found)
     first, last, parameter = np.array([3, 5, 2]), np.array([9, 9, 3]), np.array([5, 5, 1])
-    score, information = algebra.changes_together(found, first, last, parameter)
+    score, information = changes.changes_together(found, first, last, parameter)
     assert score == pytest.approx([scan[0][3, 5], scan[0][5, 5], scan[2][2, 1]], rel=1e-7, abs=1e-7)
     assert np.diag(information) == pytest.approx([scan[1][3, 5], scan[1][5, 5], scan[3][2, 1]], rel=1e-6)
     assert np.linalg.eigvalsh(information).min() > 0
     # A step less a later one is a change between them: its variance is that of the difference.
-    between = algebra.changes_together(found, np.array([3]), np.array([5]), np.array([5]))[1][0, 0]
+    between = changes.changes_together(found, np.array([3]), np.array([5]), np.array([5]))[1][0, 0]
     assert information[0, 0] + information[1, 1] - 2 * information[0, 1] == pytest.approx(between, rel=1e-6)
 
 

@@ -105,7 +105,9 @@ def test_a_night_twice_is_refused(nights):
     with pytest.raises(DataError, match="twice: the same data"):
         together([*nights, nights[0]])
     copied = dataclasses.replace(nights[0], sha256="0" * 64, source="copy.fits")
-    with pytest.raises(DataError, match=r"exposures of the same times are in copy.fits and .*; leave one out"):
+    with pytest.raises(
+        DataError, match=r"exposures of the same times are in copy.fits and .*; leave one out"
+    ):
         together([*nights, copied])
 
 

@@ -132,8 +132,8 @@ def simulate(
     replaced by those of the simulated catalogue, `effects` are added to it. `noiseless` leaves the expected
     counts as they are and states the errors that they would have; `steady` gives every exposure the mean transparency
     and every star the mean brightness. Effects that depend on the run are made
-    with `plan.context()`. `catalogue_seed` draws the standards apart from the rest (default: from `seed`): nights of one
-    survey share their stars.
+    with `plan.context()`. `catalogue_seed` draws the standards apart from the rest (default: from `seed`): nights of
+    one survey share their stars.
     """
     build, stars, sky, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
     if catalogue_seed is not None:

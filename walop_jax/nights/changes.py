@@ -1,0 +1,136 @@
+"""Changes of parameters that a solution does not have: scores of all of them at once. Pure linear algebra.
+
+A change h of parameter j from cell b on, or in cell b alone, has the score s = −Σ (g_u + H_u θ_u)_j and the information
+
+    I = a − c_xᵀ T⁻¹ c_x − eᵀ K⁻¹ e,       e = c_g − Bᵀ T⁻¹ c_x,
+
+c its cross terms with locals and globals: for all b and j at once from an elimination forwards and one backwards. Then
+z = s/√I is the change in its standard errors with everything else fitted anew, s/I its size.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy import linalg
+
+from walop_jax.nights.algebra import Solution
+
+Vector = Float[np.ndarray, " _"]
+Matrix = Float[np.ndarray, "_ _"]
+
+NOTHING = 1e-9  # share of its information below which a change is taken up by the laws altogether
+
+
+class Scan(NamedTuple):
+    """Scores and informations of changes of every parameter (n), from every cell on, and in every cell alone (c).
+
+    The information is 0 where the laws take the change up. Scaled as the equations.
+    """
+
+    step_score: Float[np.ndarray, "c n"]
+    step_information: Float[np.ndarray, "c n"]
+    once_score: Float[np.ndarray, "c n"]
+    once_information: Float[np.ndarray, "c n"]
+
+
+def _information(
+    of: Solution, own: Vector, cross: Float[np.ndarray, "_ n"], taken: Vector
+) -> Float[np.ndarray, " n"]:
+    """Own information less what locals and globals take."""
+    left = own - taken
+    if len(cross):
+        lower = linalg.solve_triangular(of.factor[0], cross, lower=True, check_finite=False)
+        left = left - np.einsum("gn,gn->n", lower, lower)
+    return np.where(left > NOTHING * np.maximum(own, 1e-300), left, 0.0)
+
+
+def scan(of: Solution) -> Scan:
+    """The changes of every parameter and candidate at every cell."""
+    system, e = of.system, of.system.equations
+    n, count, globals_ = len(system.laws), len(system.cells), len(system.at)
+    found = Scan(*(np.zeros((count, n)) for _ in range(4)))
+    cross, own, score = np.zeros((globals_, n)), np.zeros(n), np.zeros(n)
+    taken, border_taken = np.zeros(n), np.zeros((globals_, n))
+    after: tuple[tuple[Matrix, bool], Matrix, Matrix] | None = None  # of the cell behind: U, B̃, c̃
+    for c in range(count - 1, -1, -1):
+        cell, entry = system.cells[c], of.cells[c]
+        here = np.zeros((globals_, n))
+        local, mine = np.zeros((len(cell.parameter), n)), np.zeros(n)
+        for v, unit in enumerate(cell.units):
+            matrix = e.matrix[unit]
+            here += system.basis[unit][:, None] * matrix[system.at]
+            local += cell.covers[:, v : v + 1] * matrix[cell.parameter]
+            mine += np.diag(matrix)
+        cross, own = cross + here, own + mine
+        alone = -of.slopes[cell.units].sum(axis=0)
+        score = score + alone
+        if len(cell.parameter):
+            block, border, moved = entry.block, entry.border, local
+            if after is not None and of.cells[c + 1].before.any():
+                link = of.cells[c + 1].before
+                gain = linalg.cho_solve(after[0], link, check_finite=False).T
+                block, border = block - gain @ link, border - gain @ after[1]
+                moved = local - gain @ after[2]
+            # Precision of the cell given all others, from before and from behind; without the globals.
+            lower = entry.factor[0]
+            both = linalg.cho_factor(lower @ lower.T + block - entry.block, lower=True, check_finite=False)
+            sides = border + entry.left - entry.border
+            for columns, kept, base, into in (
+                (moved, taken, border_taken, 1),
+                (local, np.zeros(n), np.zeros((globals_, n)), 3),
+            ):
+                solved = linalg.cho_solve(both, columns, check_finite=False)
+                rest = (cross if into == 1 else here) - base - sides.T @ solved
+                more = kept + np.einsum("kn,kn->n", columns, solved)
+                found[into][c] = _information(of, own if into == 1 else mine, rest, more)
+            factor = linalg.cho_factor(block, lower=True, check_finite=False)
+            solved = linalg.cho_solve(factor, moved, check_finite=False)
+            taken = taken + np.einsum("kn,kn->n", moved, solved)
+            border_taken = border_taken + border.T @ solved
+            after = (factor, border, moved)
+        else:
+            found[1][c] = _information(of, own, cross - border_taken, taken)
+            found[3][c] = _information(of, mine, here, np.zeros(n))
+        found[0][c], found[2][c] = score, alone
+    found[1][0] = 0.0  # from the first night on is no change
+    return found
+
+
+def changes_together(
+    of: Solution, first: Int[np.ndarray, " v"], last: Int[np.ndarray, " v"], parameter: Int[np.ndarray, " v"]
+) -> tuple[Vector, Matrix]:
+    """Scores of a few changes, each of a parameter in the cells from `first` up to `last`, and their information.
+
+    A dense elimination, for few changes: cells one by one, forwards.
+    """
+    system, e = of.system, of.system.equations
+    count = len(parameter)
+    own, cross, score = np.zeros((count, count)), np.zeros((len(system.at), count)), np.zeros(count)
+    taken, border_taken = np.zeros((count, count)), np.zeros((len(system.at), count))
+    moved = np.zeros((0, count))
+    for c, cell in enumerate(system.cells):
+        active = ((first <= c) & (c < last)).astype(float)
+        local = np.zeros((len(cell.parameter), count))
+        for v, unit in enumerate(cell.units):
+            some = e.matrix[unit][:, parameter] * active
+            own += some[parameter] * active[:, None]
+            cross += system.basis[unit][:, None] * some[system.at]
+            local += cell.covers[:, v : v + 1] * some[cell.parameter]
+            score -= of.slopes[unit][parameter] * active
+        entry = of.cells[c]
+        if len(cell.parameter):
+            if c and entry.before.any():
+                gain = linalg.cho_solve(of.cells[c - 1].factor, entry.before.T, check_finite=False).T
+                local = local - gain @ moved
+            solved = linalg.cho_solve(entry.factor, local, check_finite=False)
+            taken += local.T @ solved
+            border_taken += entry.left.T @ solved
+        moved = local
+    information = own - taken
+    if len(system.at):
+        lower = linalg.solve_triangular(of.factor[0], cross - border_taken, lower=True, check_finite=False)
+        information = information - lower.T @ lower
+    return score, information
