@@ -13,7 +13,6 @@ import pytest
 from walop_jax.fit.minimise import (
     LEAST_GAIN,
     PATIENCE,
-    RESULTS,
     ROUGH,
     WELL_PREDICTED,
     distance_to_minimum,
@@ -136,7 +135,8 @@ def test_work_is_bounded_and_the_best_place_so_far_comes_back():
     squares = rosenbrock()
     found = minimise(squares, np.array([-1.2, 1.0]), np.ones(2), maximum_steps=5)
     assert (found.steps, squares.looked) == (5, 5)
-    assert bool(found.result == RESULTS.nonlinear_max_steps_reached)
+    assert not found.converged
+    assert "not converged after 5 steps" in found.message
     assert found.expansion.objective == min(found.history) == squares(found.x).objective
 
 
@@ -183,15 +183,15 @@ def test_the_steps_are_those_of_optimistix():
             max_steps=steps,
             throw=False,
         )
-        assert bool(ours.result == theirs.result)
-        assert bool(ours.result == RESULTS.nonlinear_max_steps_reached)
+        assert bool(theirs.result == optx.RESULTS.nonlinear_max_steps_reached)
+        assert ours.steps == steps
         np.testing.assert_allclose(ours.x, theirs.value, rtol=1e-10)
 
 
 def test_numbers_that_are_not_finite_never_pass():
     found = minimise(Squares(lambda x: x * np.nan, np.diag), np.ones(2), np.ones(2))
     assert not found.converged
-    assert bool(found.result == RESULTS.nonfinite)
+    assert "not finite" in found.message
 
 
 @pytest.mark.parametrize("damping", [1.0, 0.0])
@@ -200,7 +200,6 @@ def test_parameters_that_cannot_be_told_apart_never_pass(damping):
     squares = Squares(lambda x: design @ x - 1.0, lambda _: design)
     found = minimise(squares, np.zeros(2), np.ones(2), damping=damping)
     assert not found.converged
-    assert bool(found.result == RESULTS.conlim)
     assert "condition number" in found.message
 
 
@@ -209,7 +208,7 @@ def test_a_function_that_cannot_be_lowered_is_given_up():
     found = minimise(
         lambda x: Expansion(1.0 + float(x @ x), np.ones(1) - x, np.eye(1)), np.zeros(1), np.ones(1)
     )
-    assert bool(found.result == RESULTS.stagnation)
+    assert "no step lowers" in found.message
     assert not found.converged
     assert abs(found.x[0]) < 1e-5  # as far as rounding hides that it leads upwards
 

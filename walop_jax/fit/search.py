@@ -83,10 +83,9 @@ def _search(
 ) -> Found:
     """The minimum from a full vector of start values; `near` is an expansion at similar ones, if there is any.
 
-    `expand` takes the place of `Likelihood.expand`.
+    `expand` takes the place of `Likelihood.expand`; `how` goes to `minimise`.
     """
-    expand = expand or likelihood.expand
-    model = likelihood.model
+    expand, model = expand or likelihood.expand, likelihood.model
     select, origin = model.selection(), first[model.free]
 
     def full(x: Vector) -> Float[np.ndarray, " all"]:
@@ -120,25 +119,29 @@ def find_minimum(
     Of whole frames some strips of image rows come between the sample and all pixels. `noise_scale` and `worth` are
     those of `refit.fit`. Raises `DataError` when the exposures cannot determine the instrument.
     """
-    if not likelihood.layout.large:
+    layout = likelihood.layout
+    if not layout.large:
         return _from_afar(likelihood, first, noise_scale, worth)
-    near_end: dict[str, Any] = {"damping": 0.0, "look_at_end": False}
-    if not stands_for_pixels(likelihood, first):
-        values, scale, starts = _of_sample(likelihood, first, noise_scale, worth)
-        label, expand = "fit of all points", likelihood.expand
-    else:
-        values, scale, starts = _of_sample(likelihood, first, noise_scale, worth, limits.PIXEL_SAMPLE)
-        label, expand = "fit of all pixels", functools.partial(_of_pixels, likelihood, 1)
+    on_pixels = stands_for_pixels(likelihood, first)
+    points = limits.PIXEL_SAMPLE if on_pixels else max(limits.SAMPLE, layout.points // limits.FARTHEST)
+    values, scale, starts = _of_sample(likelihood, first, noise_scale, worth, points)
+    passes = [("fit of all points", likelihood, None, LARGE_TOLERANCE)]
+    if on_pixels:
         every = strips_of(likelihood) // limits.FIRST_STRIPS
-        if every > 1:
-            alone = dataclasses.replace(
-                likelihood, runner=dataclasses.replace(likelihood.runner, journal=None)
-            )
-            some = functools.partial(_of_pixels, alone, every)
-            rows = "fit of some image rows"
-            values = _search(alone, rows, values, scale, expand=some, tolerance=1.0, **near_end).values
-    found = _search(likelihood, label, values, scale, expand=expand, tolerance=LARGE_TOLERANCE, **near_end)
+        passes = [("fit of some image rows", _unkept(likelihood), every, 1.0)] if every > 1 else []
+        passes.append(("fit of all pixels", likelihood, 1, LARGE_TOLERANCE))
+    for label, whole, every, tolerance in passes:
+        expand = None if every is None else functools.partial(_of_pixels, whole, every)
+        found = _search(
+            whole, label, values, scale, None, expand, tolerance=tolerance, damping=0.0, look_at_end=False
+        )
+        values = found.values
     return dataclasses.replace(found, starts=starts)
+
+
+def _unkept(likelihood: Likelihood) -> Likelihood:
+    """The same for passes that are not worth keeping."""
+    return dataclasses.replace(likelihood, runner=dataclasses.replace(likelihood.runner, journal=None))
 
 
 def _of_pixels(
@@ -148,24 +151,19 @@ def _of_pixels(
 
 
 def _of_sample(
-    likelihood: Likelihood,
-    first: Vector,
-    noise_scale: float | None,
-    worth: float | None,
-    points: int | None = None,
+    likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None, points: int
 ) -> tuple[Vector, float, int]:
     """The minimum of a sample of a large set, the factor on the errors, and from how many places it was sought.
 
-    Without a number of `points` the sample of a very large set is large itself.
+    The sample of a very large set is large itself.
     """
-    points = points or max(limits.SAMPLE, likelihood.layout.points // limits.FARTHEST)
 
     def make() -> Vector:
         sample = Likelihood.of(
             thinned(likelihood.calset, points),
             likelihood.model,
             memory=likelihood.layout.allowed,
-            runner=dataclasses.replace(likelihood.runner, journal=None),
+            runner=_unkept(likelihood).runner,
         )
         found = find_minimum(sample, first, noise_scale, worth)
         return np.append(found.values, [found.posterior.noise_scale, found.starts])
