@@ -32,7 +32,7 @@ from walop_jax.data.from_arrays import from_arrays as from_arrays
 from walop_jax.data.records import CalibrationSet as CalibrationSet
 from walop_jax.data.settings import Settings as Settings
 from walop_jax.data.write import write_calibration_set as write_calibration_set
-from walop_jax.fit.model_builder import base_model as base_model
+from walop_jax.fit.model_file import base_model as base_model
 from walop_jax.fit.refit import FitResult as FitResult
 from walop_jax.io.errors import DataError as DataError
 from walop_jax.likelihood.likelihood import Likelihood as Likelihood

@@ -32,7 +32,7 @@ def program(*args: object, **environment: str) -> subprocess.CompletedProcess[st
 def test_help_comes_without_the_heavy_libraries():
     code = (
         "import sys, walop_jax.commands.program\n"
-        "heavy = {'jax', 'astropy', 'numpy', 'equinox', 'optimistix', 'matplotlib', 'emcee'} & set(sys.modules)\n"
+        "heavy = {'jax', 'astropy', 'numpy', 'equinox', 'scipy', 'matplotlib', 'emcee'} & set(sys.modules)\n"
         "print(sorted(heavy))"
     )
     shown = subprocess.run(

@@ -18,7 +18,7 @@ from walop_jax.data import Grid, read_calibration_set, write_frames
 from walop_jax.data.records import CalibrationSet, Intensities
 from walop_jax.fit import search
 from walop_jax.likelihood import limits, runner
-from walop_jax.likelihood.journal import fingerprint
+from walop_jax.likelihood.runner import fingerprint
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 

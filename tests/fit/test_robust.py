@@ -18,7 +18,7 @@ from walop_jax.fit import robust
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import FitResult, fit, refit
 from walop_jax.fit.robust import field_cells, larger, states
-from walop_jax.likelihood.expansion import STATED
+from walop_jax.fit.verdict import STATED
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate, truth_values

@@ -13,8 +13,8 @@ from walop_jax.fit.minimise import minimise
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood import engine, limits
+from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.thinning import thinned
 from walop_jax.model.parameters import with_values
 from walop_jax.simulation.simulate import simulate
 

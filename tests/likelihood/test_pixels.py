@@ -22,13 +22,12 @@ from walop_jax.data.merge import without_frames
 from walop_jax.data.raw_rows import RowReader, float64
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points
+from walop_jax.fit.stand_in import FARTHEST, compressed, moved, on_field_points
 from walop_jax.io.errors import DataError
-from walop_jax.likelihood import limits, pixels
-from walop_jax.likelihood.compression import compressed
-from walop_jax.likelihood.frames import Cells, stands_for_pixels
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.frames import Cells, PixelPosterior, expand_pixels, stands_for_pixels
+from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.thinning import thinned
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.effects.blemish import Blemish
 from walop_jax.model.specification import effect_context, with_effects
@@ -70,7 +69,7 @@ def truth_values(usual):
 
 @pytest.fixture(scope="module")
 def both(likelihood, truth_values):
-    return pixels.expand(likelihood, truth_values), likelihood.expand(truth_values)
+    return expand_pixels(likelihood, truth_values), likelihood.expand(truth_values)
 
 
 def assert_same(ours, reference):
@@ -91,7 +90,7 @@ def test_one_pass_is_the_expansion_of_all_pixels(both):
 
 def test_a_strip_in_two_is_some_of_the_pixels(likelihood, truth_values, monkeypatch):
     monkeypatch.setattr(limits, "STRIP_ROWS", 8)
-    some = pixels.expand(likelihood, truth_values, every=2)
+    some = expand_pixels(likelihood, truth_values, every=2)
     assert some.census.n_data == likelihood.census.n_data * 5 / 9
 
 
@@ -108,7 +107,7 @@ def test_flagged_pixels_and_other_types_are_as_before(path, likelihood, truth_va
         hdus.writeto(tmp_path / "flagged.fits", checksum=True)
     calset = read_calibration_set(tmp_path / "flagged.fits")
     other = Likelihood.of(calset, likelihood.model, interpolate=True)
-    assert_same(pixels.expand(other, truth_values), other.expand(truth_values))
+    assert_same(expand_pixels(other, truth_values), other.expand(truth_values))
 
 
 def test_the_words_of_a_file_are_its_numbers(path, likelihood):
@@ -129,7 +128,7 @@ def test_an_error_that_is_not_positive_is_told_with_its_place(path, likelihood, 
         hdus.writeto(tmp_path / "bad.fits", checksum=True)
     calset = read_calibration_set(tmp_path / "bad.fits")
     with pytest.raises(DataError, match=r"E1.*plane 4, row 47, column 17"):
-        pixels.expand(Likelihood.of(calset, likelihood.model, interpolate=True), truth_values)
+        expand_pixels(Likelihood.of(calset, likelihood.model, interpolate=True), truth_values)
 
 
 def test_the_residual_map_of_the_sums_is_that_of_the_pixels(likelihood, both, truth_values, monkeypatch):
@@ -179,7 +178,7 @@ def test_frames_and_a_table_are_gone_through_each_in_its_way(with_stars):
     values = model.start + 0.1 * sigma * np.random.default_rng(2).standard_normal(
         len(sigma)
     ) * model.selection().any(1)
-    assert_same(pixels.expand(with_stars, values), with_stars.expand(values))
+    assert_same(expand_pixels(with_stars, values), with_stars.expand(values))
 
 
 @pytest.mark.parametrize("most", [100, 17, 12])
@@ -204,7 +203,7 @@ def test_the_set_that_stands_for_frames_keeps_the_table_beside_them(with_stars, 
     monkeypatch.setattr(limits, "LARGE_ABOVE", 0)
     calset = with_stars.calset
     found = fit(Likelihood.of(calset, with_stars.model, interpolate=True))
-    assert isinstance(found.posterior, pixels.PixelPosterior)
+    assert isinstance(found.posterior, PixelPosterior)
     small = compressed(found.posterior)
     assert small.compression.pixels == SIDE**2
     table = without_frames(calset)
@@ -243,7 +242,7 @@ def fitted(path):
 
 @pytest.fixture(scope="module")
 def stand_in(fitted):
-    assert isinstance(fitted.posterior, pixels.PixelPosterior)
+    assert isinstance(fitted.posterior, PixelPosterior)
     return compressed(fitted.posterior)
 
 

@@ -20,11 +20,9 @@ from small_run import SEED, SMALL
 
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood import limits, processes
-from walop_jax.likelihood.journal import Journal
+from walop_jax.likelihood import limits, runner
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.processes import LostProcessError, Processes
-from walop_jax.likelihood.runner import Runner
+from walop_jax.likelihood.runner import Journal, LostProcessError, Processes, Runner
 from walop_jax.simulation.simulate import simulate
 
 RUN = frame_run(40)
@@ -103,10 +101,10 @@ def free_port() -> int:
 
 
 SHARED = """
-from walop_jax.likelihood import limits, processes
+from walop_jax.likelihood import limits, runner
 from walop_jax.likelihood.runner import Runner
 limits.LARGE_ABOVE, limits.SAMPLE = 0, 400
-here = processes.join(sys.argv[1])
+here = runner.join(sys.argv[1])
 p = made(runner=Runner(processes=here))
 assert p.layout.large
 """
@@ -159,9 +157,9 @@ if here.index == 1:
     time.sleep(600)
 try:
     p.expand(p.model.start)
-except processes.LostProcessError as error:
+except runner.LostProcessError as error:
     print(error, flush=True)
-    processes.leave_at_once(3)
+    runner.leave_at_once(3)
 """
     )
     port = free_port()
@@ -196,7 +194,7 @@ def test_processes_at_different_work_are_found_out(monkeypatch):
 @pytest.mark.parametrize("place", ["", "1/2", "0/2@host", "2/2@host:1", "a/2@host:1", "0/2@host:port"])
 def test_a_place_that_is_none_is_refused(place):
     with pytest.raises(ValueError, match="INDEX"):
-        processes.join(place)
+        runner.join(place)
 
 
 def test_more_processes_than_slabs_are_refused(likelihood):

@@ -40,11 +40,10 @@ from walop_jax.data.records import Block, CalibrationSet, Intensities
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_builder import base_model
 from walop_jax.fit.refit import fit
+from walop_jax.fit.stand_in import compressed
 from walop_jax.likelihood import engine, limits
-from walop_jax.likelihood.compression import compressed
-from walop_jax.likelihood.frames import frame_sums
+from walop_jax.likelihood.frames import PixelPosterior, frame_sums
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.pixels import PixelPosterior
 from walop_jax.likelihood.points import StreamedPoints
 from walop_jax.model.light import instrument_matrix
 from walop_jax.model.parameters import values_of

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from walop_jax.likelihood.expansion import STATED
+from walop_jax.fit.verdict import STATED
 from walop_jax.model.build import nominal_instrument
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.specification import Model, make_model

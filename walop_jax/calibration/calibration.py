@@ -27,13 +27,12 @@ from walop_jax.fit.model_builder import model_without_data, standard_names
 from walop_jax.fit.model_file import render
 from walop_jax.fit.parameter_table import HEAD, parameter_notes, parameter_rows, parameter_table
 from walop_jax.fit.refit import FitResult
-from walop_jax.fit.verdict import Hidden, Quality, Verdict
+from walop_jax.fit.verdict import STATED, Hidden, Quality, Verdict
 from walop_jax.instruments.description import parsed
 from walop_jax.io.code import software_versions
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.text import in_ascii
-from walop_jax.likelihood.expansion import STATED
 from walop_jax.model import carried
 from walop_jax.model.build import adapted, build, nominal_instrument
 from walop_jax.model.dependence import needs

@@ -44,12 +44,11 @@ from walop_jax.data.frames import Grid, read_grid
 from walop_jax.data.records import PREFIX, InputFile, Site
 from walop_jax.data.schema import Column, Place, column_names, read_table, table_rules
 from walop_jax.data.write import exposures_hdu, filter_columns, grid_cards, sign_and_write, table_hdu
-from walop_jax.fit.verdict import Hidden, Structure, Verdict
+from walop_jax.fit.verdict import STATED, Hidden, Structure, Verdict
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import DataError, errors_naming, fail
 from walop_jax.io.fits_reading import UNREADABLE, OpenFile, one_line, open_fits
 from walop_jax.io.text import in_ascii
-from walop_jax.likelihood.expansion import STATED
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.parameters import NAME, Parameter
 

@@ -27,12 +27,10 @@ from walop_jax.data.records import CALIBRATION_PLATE
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import engine, limits
-from walop_jax.likelihood.expansion import Census, Posterior
 from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.flux import project_flux, sharing
-from walop_jax.likelihood.frames import FrameSums
-from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.pixels import PixelPosterior, in_blocks, information
+from walop_jax.likelihood.frames import FrameSums, PixelPosterior, in_blocks, information
+from walop_jax.likelihood.likelihood import Census, Likelihood, Posterior
 from walop_jax.likelihood.runner import SlabSums
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled

@@ -37,9 +37,8 @@ def compress(
     from walop_jax.data.write import write_calibration_set
     from walop_jax.diagnosis.trust import pixel_structure
     from walop_jax.fit.refit import refit
-    from walop_jax.fit.stand_in import with_pixel_structure
-    from walop_jax.likelihood.compression import compressed
-    from walop_jax.likelihood.pixels import PixelPosterior
+    from walop_jax.fit.stand_in import compressed, with_pixel_structure
+    from walop_jax.likelihood.frames import PixelPosterior
 
     job.tell("reading", "reading")
     calset, chosen = set_and_model(data, model, instrument, catalogue_of(effects))

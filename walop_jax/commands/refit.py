@@ -16,7 +16,7 @@ from walop_jax.commands.options import Effects, Folder, InstrumentLike, Memory, 
 
 if TYPE_CHECKING:
     from walop_jax.fit.refit import FitResult
-    from walop_jax.likelihood.processes import Processes
+    from walop_jax.likelihood.runner import Processes
 
 ProcessesOption = Option(
     "Share a large set with other processes that run the same command; auto: as Slurm or Open MPI say.",
@@ -128,7 +128,7 @@ def _crew(processes: Processes | str | None) -> Iterator[Processes]:
 
     When one that was joined here fails it ends at once, with its line of error: the others notice that it has gone.
     """
-    from walop_jax.likelihood.processes import Processes, join, leave_at_once
+    from walop_jax.likelihood.runner import Processes, join, leave_at_once
 
     if not isinstance(processes, str):
         yield processes or Processes()

@@ -23,8 +23,8 @@ from walop_jax.diagnosis.findings import Choice
 from walop_jax.diagnosis.policy import Policy
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import limits
+from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.thinning import thinned
 from walop_jax.model.alternatives import JOINED, alternatives, other_curves
 from walop_jax.model.effects import Context, OtherDescription
 from walop_jax.model.specification import Model, with_effects

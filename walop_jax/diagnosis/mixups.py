@@ -32,8 +32,8 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.fit.search import FAR_OFF
 from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
+from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.thinning import thinned
 from walop_jax.model.specification import Model
 
 _POINTS, _FEW = 16, 64  # field points that are looked at; sets of so few are looked at whole

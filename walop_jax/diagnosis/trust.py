@@ -54,9 +54,9 @@ from walop_jax.fit.search import FAR_OFF
 from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points, with_pixels
 from walop_jax.fit.verdict import Structure
 from walop_jax.likelihood import limits
+from walop_jax.likelihood.frames import PixelPosterior
+from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.pixels import PixelPosterior
-from walop_jax.likelihood.thinning import thinned
 
 UNEVEN = 1.25
 """Factor between the squared residuals of a group and those of all below which it is a matter of the stated errors."""

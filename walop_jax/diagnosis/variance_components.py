@@ -40,8 +40,7 @@ from scipy import stats
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.score import local_p
 from walop_jax.fit.refit import FitResult
-from walop_jax.fit.verdict import Structure
-from walop_jax.likelihood.expansion import STATED
+from walop_jax.fit.verdict import STATED, Structure
 
 ALARM = 1e-3
 """Probability that noise alone raises a doubt, all groupings together."""

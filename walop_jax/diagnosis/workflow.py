@@ -47,8 +47,8 @@ from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.stand_in import in_field_points
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood import limits
+from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.thinning import thinned
 from walop_jax.model.compiled import forget_programs
 from walop_jax.model.effects import EFFECTS, Context, Described, Effect, FreeForm, OtherDescription
 from walop_jax.model.parameters import values_of

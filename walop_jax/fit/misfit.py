@@ -17,8 +17,8 @@ from jaxtyping import Float
 from walop_jax.fit.outliers import BEYOND, MOST, outlying
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import limits
+from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.thinning import thinned
 from walop_jax.model.conventions import matrix_elements
 
 

@@ -20,15 +20,12 @@ from walop_jax.fit.model_file import render
 from walop_jax.fit.parameter_table import HEAD, parameter_notes, parameter_rows, parameter_table
 from walop_jax.fit.robust import robust_errors
 from walop_jax.fit.search import find_minimum, free_scales
-from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Hidden, Quality, Structure, Verdict
+from walop_jax.fit.verdict import NO_STRUCTURE, STATED, Doubt, Hidden, Quality, Structure, Verdict
 from walop_jax.io.code import software_versions
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.progress import Stage
-from walop_jax.likelihood.expansion import STATED, Posterior
-from walop_jax.likelihood.journal import Journal, fingerprint
-from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.processes import Processes
-from walop_jax.likelihood.runner import Progress, Runner
+from walop_jax.likelihood.likelihood import Likelihood, Posterior
+from walop_jax.likelihood.runner import Journal, Processes, Progress, Runner, fingerprint
 from walop_jax.model.specification import Model
 
 Vector = Float[np.ndarray, " n"]

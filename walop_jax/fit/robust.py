@@ -23,9 +23,8 @@ from jaxtyping import Float, Int
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.likelihood import engine, limits
-from walop_jax.likelihood.expansion import Posterior
-from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.thinning import thinned
+from walop_jax.likelihood.layout import thinned
+from walop_jax.likelihood.likelihood import Likelihood, Posterior
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]

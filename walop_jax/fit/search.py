@@ -17,11 +17,10 @@ from jaxtyping import Float
 
 from walop_jax.fit.minimise import MAXIMUM_STEPS, Minimum, minimise
 from walop_jax.io.errors import fail
-from walop_jax.likelihood import limits, pixels
-from walop_jax.likelihood.expansion import Posterior
-from walop_jax.likelihood.frames import stands_for_pixels, strips_of
-from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.thinning import thinned
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.frames import expand_pixels, stands_for_pixels, strips_of
+from walop_jax.likelihood.layout import thinned
+from walop_jax.likelihood.likelihood import Likelihood, Posterior
 from walop_jax.model import materials
 from walop_jax.model.specification import Model
 
@@ -147,7 +146,7 @@ def _unkept(likelihood: Likelihood) -> Likelihood:
 def _of_pixels(
     likelihood: Likelihood, every: int, values: Vector, noise_scale: float, _: Posterior | None
 ) -> Posterior:
-    return pixels.expand(likelihood, values, noise_scale, every)
+    return expand_pixels(likelihood, values, noise_scale, every)
 
 
 def _of_sample(

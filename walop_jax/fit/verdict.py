@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.likelihood.expansion import STATED
+STATED = "N_ERR"
+"""What errors of a fit are made from where it explains the data: the stated errors."""
 
 
 class Quality(enum.IntFlag):

@@ -3,7 +3,7 @@
 Three layers, each with its own small Jacobian:
 
 1. optics      band rows of a field point, derivatives with respect to the ~10 optical parameters only,
-               once per (point, band), however many exposures there are; or from a table of them (`nodes.py`);
+               once per (point, band), however many exposures there are; or from a table of them (`field_table.py`);
 2. data        counts and normalised residuals of all exposures of the point: dot products;
 3. field       throughput is a series over the field, so at one point only its four values matter; the small
                Gram matrix of the point is expanded through the series afterwards.
@@ -12,7 +12,7 @@ Flux           of every (exposure, point) is eliminated (`flux.py`). Where an ef
                is D(F a), F follows by Newton steps and ∂D/∂F takes the place of a.
 Exposures      are not compressed beforehand, although light is linear in them: with the flux eliminated what could
                be kept of a point holds only near one set of values, as F and â depend on them. Whole frames, whose
-               counts are smooth over the field, are summed over cells near one set of values instead (`pixels.py`).
+               counts are smooth over the field, are summed over cells near one set of values instead (`frames.py`).
 """
 
 from __future__ import annotations

@@ -4,6 +4,17 @@ Slabs are worked on by as many threads as there are processor cores, or by two f
 process; and they are dealt to the processes in turn. Sums are added in the order of the slabs, so that a result
 depends on no timing and not on the number of threads. (One array sharded over two CPU devices took 12 µs a point where
 two threads took 10 and one 15: the engine's work on a block is too small to be cut further.)
+
+Processes   Every process runs the same program on the same files, takes its share of the slabs, and the sums (some ten
+            kilobytes) are exchanged at the end, added in the order of the processes: all go on with the same numbers,
+            to the last bit. On CPUs JAX lets gloo carry them. A process that dies breaks the exchange, which is an
+            error in all the others.
+Journal     Sums over slabs are kept on disk, so that a fit of hours goes on where it was interrupted. A pass is known
+            by everything its result depends on: the set, the model, the software, the parameter values, the cut into
+            slabs. Its file is named by the hash of that, and holds one record per finished slab,
+                number of the slab (int64), n sums (float64), SHA-256 of these bytes,
+            appended as they come. A record that does not agree with its checksum, as a crash may leave at the end, is
+            done again, and all after it.
 """
 
 from __future__ import annotations
@@ -11,20 +22,205 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import hashlib
 import os
 import time
 from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import jax
 import numpy as np
+from jax.experimental import multihost_utils
 from jaxtyping import Float
 
-from walop_jax.likelihood.journal import Journal
-from walop_jax.likelihood.layout import Layout
-from walop_jax.likelihood.processes import Processes
+from walop_jax.data.records import CalibrationSet
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.layout import Layout, thinned
 
 Vector = Float[np.ndarray, " n"]
+
+
+# ------------------------------------------------------------------------------------------------------------ journal
+
+_CHECK = 32  # bytes of a SHA-256
+
+
+@dataclasses.dataclass(frozen=True)
+class Journal:
+    """A folder of finished work of one fit; `identity` is what all of its passes have in common."""
+
+    folder: Path
+    identity: str
+
+    def path(self, key: str) -> Path:
+        """The file of a pass."""
+        name = hashlib.sha256(f"{self.identity} {key}".encode()).hexdigest()
+        return self.folder / f"{name[:24]}.sums"
+
+    def read(self, key: str) -> dict[int, Vector]:
+        """The finished records of a pass by number; what follows a damaged one is cut off."""
+        path = self.path(key)
+        if not path.exists():
+            return {}
+        content = path.read_bytes()
+        size = int.from_bytes(content[:8], "little")
+        step = 8 + 8 * size + _CHECK
+        found: dict[int, Vector] = {}
+        good = 8
+        while good + step <= len(content):
+            body, check = content[good : good + step - _CHECK], content[good + step - _CHECK : good + step]
+            if hashlib.sha256(body).digest() != check:
+                break
+            found[int.from_bytes(body[:8], "little")] = np.frombuffer(body, "<f8", offset=8).copy()
+            good += step
+        if good != len(content):
+            with path.open("r+b") as file:
+                file.truncate(good if found else 0)
+        return found
+
+    def append(self, key: str, number: int, sums: Vector) -> None:
+        """Add the record of a finished slab."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        body = number.to_bytes(8, "little") + np.asarray(sums, "<f8").tobytes()
+        with self.path(key).open("ab") as file:
+            head = b"" if file.tell() else len(sums).to_bytes(8, "little")
+            file.write(head + body + hashlib.sha256(body).digest())
+
+    def remembered(self, key: str, make: Callable[[], Vector]) -> Vector:
+        """The result of `make`, from the journal if it holds it."""
+        found = self.read(key)
+        if not found:
+            found = {0: np.asarray(make(), float)}
+            self.append(key, 0, found[0])
+        return found[0]
+
+
+def fingerprint(calset: CalibrationSet) -> str:
+    """SHA-256 of what sums over a set depend on: its exposures and sources, and its measurements.
+
+    Of a set that was read, its files stand for the measurements, with a sample of these in case that they were changed
+    since; of one made in memory all of them are gone through.
+    """
+    total = hashlib.sha256()
+    for record in (calset.site, calset.exposures, calset.sources):
+        total.update(_bytes(record))
+    for name, curve in sorted(calset.filters.items()):
+        total.update(name.encode() + _bytes(curve))
+    for entry in calset.inputs:
+        total.update(entry.sha256.encode())
+    some = thinned(calset, limits.FINGERPRINT_POINTS) if calset.inputs else calset
+    for start in range(0, len(some.points), limits.FINGERPRINT_POINTS):
+        stop = min(start + limits.FINGERPRINT_POINTS, len(some.points))
+        total.update(_bytes(some.intensities.block(start, stop)))
+    return total.hexdigest()
+
+
+def _bytes(record: object) -> bytes:
+    """The content of a dataclass of arrays, texts and numbers."""
+    values = (getattr(record, field.name) for field in dataclasses.fields(record))  # type: ignore[arg-type]
+    arrays = (np.asarray(value) for value in values)
+    return b"".join(
+        array.tobytes() if array.dtype.kind not in "OUS" else repr(array.tolist()).encode()
+        for array in arrays
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------- processes
+
+HEARTBEAT = 30
+"""Seconds of silence after which a process counts as dead."""
+
+
+class LostProcessError(ConnectionError):
+    """Another process of the same computation has gone or does something else."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Processes:
+    """This process, counted from 0, and how many there are."""
+
+    index: int = 0
+    count: int = 1
+
+    @classmethod
+    def present(cls) -> Processes:
+        """Those that `jax.distributed` knows of."""
+        return cls(jax.process_index(), jax.process_count())
+
+    def share(self, count: int) -> range:
+        """Which of `count` pieces of work are this process's."""
+        return range(self.index, count, self.count)
+
+    def gather(self, label: str, values: Vector) -> Float[np.ndarray, "processes n"]:
+        """The values of every process, one row each.
+
+        Raises LostProcessError when another process does not answer, or is at other work than `label`.
+        """
+        if self.count == 1:
+            return values[None]
+        mark = int.from_bytes(hashlib.sha256(label.encode()).digest()[:6])  # fits into a float exactly
+        try:
+            rows = np.asarray(multihost_utils.process_allgather(np.append(float(mark), values)))
+        except (ValueError, RuntimeError) as error:
+            raise LostProcessError(
+                f"process {self.index} of {self.count} has lost another one ({_first_line(error)}): start all again"
+            ) from error
+        if not (rows[:, 0] == mark).all():
+            raise LostProcessError(
+                "the processes are not at the same work: give all of them the same command, files and version"
+            )
+        return rows[:, 1:]
+
+    def agreed(self, label: str, values: Vector) -> Vector:
+        """The values of the first process, for all: machines may round differently."""
+        return self.gather(label, values)[0]
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
+
+
+def join(place: str) -> Processes:
+    """Bring the processes of one computation together; to be called before JAX computes anything.
+
+    `place` is INDEX/COUNT@HOST:PORT, the address being that of process 0, or "auto" under Slurm, Open MPI and other
+    launchers that JAX knows. Raises ValueError for another form, LostProcessError when the others do not come.
+    """
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    where: dict[str, object] = {}
+    if place != "auto":
+        numbers, at, address = place.partition("@")
+        index, slash, count = numbers.partition("/")
+        host, colon, port = address.rpartition(":")
+        if not (at and slash and colon and host and index.isdigit() and count.isdigit() and port.isdigit()):
+            raise ValueError(f"{place!r}: give INDEX/COUNT@HOST:PORT, such as 0/2@localhost:4321, or auto")
+        if not int(index) < int(count):
+            raise ValueError(f"{place!r}: INDEX counts from 0 to {int(count) - 1}")
+        where = {"coordinator_address": address, "num_processes": int(count), "process_id": int(index)}
+    try:
+        jax.distributed.initialize(
+            **where,  # pyright: ignore[reportArgumentType]
+            initialization_timeout=10 * HEARTBEAT,
+            heartbeat_timeout_seconds=HEARTBEAT,
+            shutdown_timeout_seconds=HEARTBEAT,
+        )
+    except (RuntimeError, ValueError) as error:
+        raise LostProcessError(
+            f"the processes did not find each other at {place}: {_first_line(error)}"
+        ) from error
+    here = Processes.present()
+    here.gather("joined", np.zeros(1))  # whoever cannot be reached is missed now
+    return here
+
+
+def leave_at_once(code: int) -> None:
+    """End this process without waiting for the others, which may have gone."""
+    os._exit(code)
+
+
+# --------------------------------------------------------------------------------------------- passes over the points
+
 Progress = Callable[[str], None]
 """Is told in a line what is being done."""
 

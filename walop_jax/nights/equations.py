@@ -28,8 +28,8 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import DataError, fail
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.columns import Columns
-from walop_jax.likelihood.journal import fingerprint
 from walop_jax.likelihood.likelihood import Likelihood, used_rows
+from walop_jax.likelihood.runner import fingerprint
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.parameters import Parameter, leaves
 from walop_jax.model.specification import Model, effect_context

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.fit.verdict import STATED
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.rounding import value_and_error
-from walop_jax.likelihood.expansion import STATED
 from walop_jax.posterior.convergence import Chains, Convergence
 from walop_jax.posterior.samplers import Sampler, make_sampler
 from walop_jax.posterior.surrogate import Accuracy

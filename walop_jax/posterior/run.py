@@ -15,11 +15,11 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data import CalibrationSet, read_calibration_set
 from walop_jax.fit.model_builder import model_for
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
+from walop_jax.fit.verdict import STATED
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import fail
 from walop_jax.io.text import read_json
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.expansion import STATED
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.posterior.files import read_inference_data

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from walop_jax.fit.refit import FitResult, covariance
+from walop_jax.fit.verdict import STATED
 from walop_jax.io.code import versions_of
 from walop_jax.io.errors import fail
-from walop_jax.likelihood.expansion import STATED
 from walop_jax.model.specification import Model
 from walop_jax.posterior.convergence import Chains, Convergence, assess
 from walop_jax.posterior.files import Checkpoints, digest, digest_of_fit
