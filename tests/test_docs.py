@@ -239,7 +239,7 @@ def test_keys_of_the_sampling():
 
 def test_example_of_a_model_file():
     """The example is read, and does what it says."""
-    from walop_jax.fit.model_builder import model_without_data
+    from walop_jax.fit.model_file import model_without_data
 
     lines = [line for line in section("files", "MODEL.toml").splitlines() if line.startswith("    ")]
     text = "\n".join(line.removeprefix("    ") for line in lines)

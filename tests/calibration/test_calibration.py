@@ -16,8 +16,7 @@ from walop_jax.calibration import Calibration, read_calibration, write_calibrati
 from walop_jax.data import DataError
 from walop_jax.data.settings import Settings
 from walop_jax.fit.minimise import RESULTS
-from walop_jax.fit.model_builder import model_for, model_without_data
-from walop_jax.fit.model_file import render
+from walop_jax.fit.model_file import model_for, model_without_data, render
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.references import references

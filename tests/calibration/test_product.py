@@ -20,8 +20,7 @@ from walop_jax.calibration import (
 )
 from walop_jax.data import DataError, read_calibration_set
 from walop_jax.data.frames import Grid
-from walop_jax.fit.model_builder import model_without_data
-from walop_jax.fit.model_file import render
+from walop_jax.fit.model_file import model_without_data, render
 from walop_jax.fit.verdict import Verdict
 from walop_jax.io.text import in_ascii
 from walop_jax.model.effects import Context, Described

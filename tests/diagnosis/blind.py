@@ -32,7 +32,7 @@ from walop_jax.diagnosis.naming import Trial
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.score import Scorer, separations, whitening
 from walop_jax.diagnosis.search import Linear, joined, search
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Described

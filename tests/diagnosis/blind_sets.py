@@ -25,7 +25,7 @@ from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Effect

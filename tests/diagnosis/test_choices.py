@@ -11,7 +11,7 @@ from walop_jax.diagnosis.choices import Choices
 from walop_jax.diagnosis.findings import Choice, document
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.alternatives import alternatives, changed

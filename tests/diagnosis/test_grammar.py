@@ -11,7 +11,7 @@ from own_instrument import OWN
 from walop_jax.data.records import Position
 from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.effect_columns import all_candidates, applicable, effect_candidates, probes
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.instruments.description import parsed
 from walop_jax.likelihood.likelihood import Likelihood

@@ -16,7 +16,7 @@ from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.freeform import Measured, strata
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.columns import own_columns
 from walop_jax.likelihood.likelihood import Likelihood

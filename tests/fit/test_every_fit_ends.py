@@ -9,7 +9,7 @@ import pytest
 from small_run import SEED, SMALL
 
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.fit.search import FAR_OFF, most_passes
 from walop_jax.likelihood.likelihood import Likelihood

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_run import SEED, SMALL
 
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.search import _order_starts
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.simulate import simulate

@@ -23,7 +23,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import lil_matrix
 
 from walop_jax.data import read_calibration_set, write_calibration_set
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.observing_plan import ObservingPlan

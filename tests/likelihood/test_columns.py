@@ -9,7 +9,7 @@ from small_run import SMALL, WITH_PLATE
 
 from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.effect_columns import applicable, probes, showable
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood.columns import Columns, columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.pieces import NoColumnError

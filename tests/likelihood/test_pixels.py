@@ -20,7 +20,7 @@ from walop_jax.data import (
 )
 from walop_jax.data.merge import without_frames
 from walop_jax.data.raw_rows import RowReader, float64
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.fit.stand_in import FARTHEST, compressed, moved, on_field_points
 from walop_jax.io.errors import DataError

@@ -12,7 +12,7 @@ from frame_run import frame_run
 
 from walop_jax.data import Grid, read_calibration_set, write_frames
 from walop_jax.data.records import Intensities
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.layout import bytes_per_point, thinned

@@ -18,7 +18,7 @@ from frame_run import frame_run
 from jax import monitoring
 from small_run import SEED, SMALL
 
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood import limits, runner
 from walop_jax.likelihood.likelihood import Likelihood

@@ -38,7 +38,7 @@ from walop_jax.calibration.residual_map import residual_map
 from walop_jax.data import Grid, read_calibration_set, write_frames
 from walop_jax.data.records import Block, CalibrationSet, Intensities
 from walop_jax.data.settings import Settings
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.fit.stand_in import compressed
 from walop_jax.likelihood import engine, limits

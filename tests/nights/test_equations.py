@@ -8,7 +8,7 @@ from small_run import SMALL
 
 from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.records import Site
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import effect_by_name

@@ -14,7 +14,7 @@ from outside.lossy_wedge import LossyWedge
 from outside.twilight import Twilight
 
 from walop_jax.diagnosis.workflow import diagnose
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.model import light, materials, optics, plates
 from walop_jax.model.build import nominal_instrument

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 
-from walop_jax.paper.bench import PAPER_CROSS_TALK, PAPER_ERRORS, TILTS, bench_table
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "notebooks"))
+from bench import PAPER_CROSS_TALK, PAPER_ERRORS, TILTS, bench_table
 
 
 def test_bench_table():

@@ -9,10 +9,10 @@ import pytest
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data import DataError
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.model.effects import effect_by_name
-from walop_jax.paper import full_moon as moon
+from walop_jax.paper import polynomial as moon
 from walop_jax.paper import polynomial as paper
 from walop_jax.science import star_errors as accuracy
 from walop_jax.simulation.observing_plan import ObservingPlan

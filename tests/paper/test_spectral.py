@@ -8,7 +8,7 @@ import pytest
 from oracle import forward
 
 from walop_jax.paper.polynomial import fit_paper
-from walop_jax.paper.spectral import TEMPERATURES, colour_spread, efficiencies, spread_document
+from walop_jax.paper.wavelength import TEMPERATURES, colour_spread, efficiencies, spread_document
 
 X, Y = np.array([-0.2, 0.1, 0.25]), np.array([0.15, -0.05, 0.12])
 

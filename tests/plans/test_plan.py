@@ -9,7 +9,7 @@ import pytest
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.diagnosis.trust import examined
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.plans.exposures import candidates
 from walop_jax.plans.plan import plan_from

@@ -14,13 +14,12 @@ from scipy import stats
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.noise import PhotonNoise
 from walop_jax.model.specification import Model
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
-from walop_jax.simulation.simulate import simulate
+from walop_jax.simulation.simulate import PhotonNoise, simulate
 
 PLAN = ObservingPlan(
     grid=4,

@@ -15,7 +15,7 @@ from walop_jax.data import read_calibration_set, write_calibration_set
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model import mueller
-from walop_jax.paper.retardance import plate_retardances, retardance
+from walop_jax.paper.wavelength import plate_retardances, retardance
 from walop_jax.reports.named import FIGURES, Source, draw
 from walop_jax.reports.posterior_figures import informed
 from walop_jax.reports.style import element_kind

@@ -19,7 +19,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify, validity
 from walop_jax.commands.program import app
 from walop_jax.data import write_calibration_set
-from walop_jax.fit.model_builder import model_for
+from walop_jax.fit.model_file import model_for
 from walop_jax.fit.refit import refit
 from walop_jax.fit.verdict import Doubt, Quality
 from walop_jax.likelihood.likelihood import Likelihood

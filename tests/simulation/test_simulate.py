@@ -20,7 +20,7 @@ from walop_jax.data import (
     read_calibration_set,
     write_calibration_set,
 )
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
 from walop_jax.model.build import nominal_instrument

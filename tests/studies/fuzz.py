@@ -51,8 +51,11 @@ from walop_jax.data import DataError, read_calibration_set  # noqa: E402
 from walop_jax.data.catalogue import read_catalogue  # noqa: E402
 from walop_jax.data.frames import Grid  # noqa: E402
 from walop_jax.data.user_tables import read_input_table  # noqa: E402
-from walop_jax.fit.model_builder import base_model, model_for  # noqa: E402
-from walop_jax.fit.model_file import render  # noqa: E402
+from walop_jax.fit.model_file import (  # noqa: E402
+    base_model,
+    model_for,
+    render,
+)
 from walop_jax.fit.verdict import Verdict  # noqa: E402
 from walop_jax.model.build import nominal_instrument  # noqa: E402
 

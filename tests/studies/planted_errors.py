@@ -120,7 +120,7 @@ ERRORS = (
             "matrix = terms.matrix / noise_scale",
             "likelihood/test_engine.py", "likelihood/test_priors.py", "likelihood/test_large.py"),
     # noise
-    planted("likelihood/noise.py", "np.maximum(counts, 0.0) + self.read_noise**2",
+    planted("simulation/simulate.py", "np.maximum(counts, 0.0) + self.read_noise**2",
             "np.maximum(counts, 0.0) + self.read_noise", "likelihood/test_noise.py"),
     # fit
     planted("fit/search.py", "start[likelihood.model.index(name)] += sign * one_wave",
@@ -142,8 +142,8 @@ ERRORS = (
             "self.centre + z[:, : self.along.shape[1]] @ self.along.T - s", "posterior/test_surrogate.py"),
     planted("posterior/surrogate.py", "mean + np.sqrt(variance) * rng", "mean + variance * rng",
             "posterior/test_surrogate.py"),
-    planted("posterior/convergence.py", "steps <= LENGTHS * history[2]", "steps <= history[2]", _CHAINS),
-    planted("posterior/convergence.py", "if not np.max(rhat) < LARGEST_RHAT", "if np.max(rhat) < 0", _CHAINS),
+    planted("posterior/result.py", "steps <= LENGTHS * history[2]", "steps <= history[2]", _CHAINS),
+    planted("posterior/result.py", "if not np.max(rhat) < LARGEST_RHAT", "if np.max(rhat) < 0", _CHAINS),
     # science
     planted("science/estimate.py", "np.where(used, sigma, 1.0) ** 2", "np.where(used, sigma, 1.0)",
             "science/test_estimate.py"),

@@ -23,8 +23,7 @@ from walop_jax.data.frames import Grid
 from walop_jax.data.quantities import in_unit
 from walop_jax.data.records import CALIBRATION_PLATE, Exposures, FilterCurve, InputFile, Site, Sources
 from walop_jax.data.settings import Settings
-from walop_jax.fit.model_builder import model_without_data, standard_names
-from walop_jax.fit.model_file import render
+from walop_jax.fit.model_file import model_without_data, render, standard_names
 from walop_jax.fit.parameter_table import HEAD, parameter_notes, parameter_rows, parameter_table
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import STATED, Hidden, Quality, Verdict

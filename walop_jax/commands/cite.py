@@ -28,7 +28,7 @@ def cite(
     from walop_jax import __version__
     from walop_jax.calibration import product_path, read_calibration
     from walop_jax.fit import minimise
-    from walop_jax.fit.model_builder import model_without_data
+    from walop_jax.fit.model_file import model_without_data
     from walop_jax.model.bibtex import bibtex as entries
     from walop_jax.model.build import nominal_instrument
     from walop_jax.model.references import Reference, references

@@ -86,7 +86,7 @@ def set_and_model(
 
     Raises `DataError` for files that cannot be read, ValueError, naming the file, for a model that does not fit.
     """
-    from walop_jax.fit.model_builder import model_for
+    from walop_jax.fit.model_file import model_for
     from walop_jax.model.instrument import Instrument
     from walop_jax.model.specification import Model
 

@@ -118,7 +118,7 @@ def checked(source: PathLike) -> CheckedInstrument:
     import jax.numpy as jnp
     import numpy as np
 
-    from walop_jax.fit.model_builder import model_without_data
+    from walop_jax.fit.model_file import model_without_data
     from walop_jax.io.errors import DataError
     from walop_jax.model import light
     from walop_jax.model.dependence import needs, optical_indices

@@ -74,8 +74,7 @@ def model(
     In Python: a `ModelFile`, whose `model` is the model and `text` the file. Raises ValueError, with the nearest names,
     for an unknown instrument or effect, and for an instrument that is not the sets'.
     """
-    from walop_jax.fit.model_builder import effects_text, model_for, model_without_data
-    from walop_jax.fit.model_file import render
+    from walop_jax.fit.model_file import effects_text, model_for, model_without_data, render
     from walop_jax.io.atomic import atomic_path
     from walop_jax.model.build import nominal_instrument
 

@@ -12,7 +12,7 @@ from walop_jax.data import CalibrationSet, read_calibration_set
 from walop_jax.io.errors import fail
 from walop_jax.io.fits_reading import primary_keywords
 from walop_jax.model.effects import EFFECTS, Effect
-from walop_jax.posterior.run import DOCUMENTS, Run
+from walop_jax.posterior.files import DOCUMENTS, Run
 
 
 def read(

@@ -27,7 +27,7 @@ import numpy as np
 from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, CalibrationSet, Exposures, Points
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.policy import POLICY
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.search import FAR_OFF
 from walop_jax.instruments.description import shipped

@@ -42,7 +42,7 @@ from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.search import Linear, search
 from walop_jax.diagnosis.stated_conditions import rival_conditions
 from walop_jax.diagnosis.trust import examined, pixel_structure
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.stand_in import in_field_points
 from walop_jax.io.progress import Stage

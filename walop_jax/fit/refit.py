@@ -15,8 +15,7 @@ from jaxtyping import Float
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.minimise import Minimum
-from walop_jax.fit.model_builder import base_model
-from walop_jax.fit.model_file import render
+from walop_jax.fit.model_file import base_model, render
 from walop_jax.fit.parameter_table import HEAD, parameter_notes, parameter_rows, parameter_table
 from walop_jax.fit.robust import robust_errors
 from walop_jax.fit.search import find_minimum, free_scales

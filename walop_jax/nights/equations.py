@@ -22,8 +22,7 @@ from jaxtyping import Bool, Float, Int
 
 from walop_jax.data.records import CalibrationSet, Exposures, Site
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.model_builder import SKY_AND_STARS, model_like
-from walop_jax.fit.model_file import header_of
+from walop_jax.fit.model_file import SKY_AND_STARS, header_of, model_like
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import DataError, fail
 from walop_jax.likelihood import engine

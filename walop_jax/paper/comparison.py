@@ -29,18 +29,19 @@ from walop_jax.data.settings import Settings
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError
 from walop_jax.io.rounding import two_digits
-from walop_jax.paper.full_moon import full_moon_scheme, judge_patches
 from walop_jax.paper.polynomial import (
     PaperCalibration,
     fit_paper,
     fit_polynomials,
+    full_moon_scheme,
+    judge_patches,
     measured_qu,
     polariser_exposures,
     polariser_states,
     polynomial_terms,
     with_test_stars,
 )
-from walop_jax.paper.spectral import DEGREE, TEMPERATURES, colour_spread, efficiencies, spread_document
+from walop_jax.paper.wavelength import DEGREE, TEMPERATURES, colour_spread, efficiencies, spread_document
 from walop_jax.science.star_errors import (
     GOAL,
     LARGEST_P,

@@ -28,7 +28,7 @@ from jaxtyping import Float, Int
 from walop_jax.calibration.matrix import matrix_slopes
 from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet
 from walop_jax.data.settings import Settings
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
 from walop_jax.model.specification import Model
 from walop_jax.plans.families import Circle, Family, Listed

@@ -3,10 +3,10 @@
 This room samples and says how far to believe it. It draws no figures, and knows no FITS.
 """
 
-from walop_jax.posterior.convergence import Convergence, assess, r_hat
 from walop_jax.posterior.emcee import MOVES, Emcee
 from walop_jax.posterior.files import (
     Checkpoints,
+    Run,
     digest_of_fit,
     inference_data,
     read_draws,
@@ -16,8 +16,7 @@ from walop_jax.posterior.files import (
     write_posterior,
 )
 from walop_jax.posterior.nuts import Nuts
-from walop_jax.posterior.result import Options, PosteriorSample, Progress, Report
-from walop_jax.posterior.run import Run
+from walop_jax.posterior.result import Convergence, Options, PosteriorSample, Progress, Report, assess, r_hat
 from walop_jax.posterior.samplers import SAMPLERS, Density, Sampler, State, Stretch, make_sampler
 from walop_jax.posterior.sampling import Ensembles, sample, sandwich_adjusted
 from walop_jax.posterior.surrogate import Accuracy, Surrogate, build_surrogate, compare_with_exact

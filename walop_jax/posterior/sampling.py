@@ -20,9 +20,17 @@ from walop_jax.fit.verdict import STATED
 from walop_jax.io.code import versions_of
 from walop_jax.io.errors import fail
 from walop_jax.model.specification import Model
-from walop_jax.posterior.convergence import Chains, Convergence, assess
 from walop_jax.posterior.files import Checkpoints, digest, digest_of_fit
-from walop_jax.posterior.result import BURN_IN, Options, PosteriorSample, Progress, Report
+from walop_jax.posterior.result import (
+    BURN_IN,
+    Chains,
+    Convergence,
+    Options,
+    PosteriorSample,
+    Progress,
+    Report,
+    assess,
+)
 from walop_jax.posterior.samplers import Density, Sampler, State, Stretch
 from walop_jax.posterior.surrogate import Surrogate, build_surrogate, compare_with_exact
 from walop_jax.posterior.target import ExactPosterior, Target, choose_sampled

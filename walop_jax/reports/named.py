@@ -13,7 +13,7 @@ from walop_jax.calibration import PRODUCT, Calibration, MatrixMaps
 from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.io.errors import fail, nearest
 from walop_jax.posterior import Run
-from walop_jax.posterior.run import LIMITS, POSTERIOR
+from walop_jax.posterior.files import LIMITS, POSTERIOR
 from walop_jax.reports import diagnosis_figures, figures, paper_figures, posterior_figures
 from walop_jax.reports.run import read_limits
 from walop_jax.science.field_accuracy import field_accuracy

@@ -18,7 +18,7 @@ from walop_jax.io.errors import DataError
 from walop_jax.io.rounding import with_minus_sign
 from walop_jax.paper.comparison import Comparison
 from walop_jax.paper.polynomial import fit_paper, fit_transmissions, polariser_states
-from walop_jax.paper.retardance import plate_names, plate_retardances
+from walop_jax.paper.wavelength import plate_names, plate_retardances
 from walop_jax.reports.style import DIVERGING, FONT, SMALL, empty_figure, field_axes, outer_labels
 from walop_jax.science.star_errors import GOAL, QUANTITIES, MethodErrors, plate_errors
 

@@ -16,7 +16,7 @@ from walop_jax.diagnosis.figure_file import FIGURE_DATA, DiagnosisFigureData, re
 from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.text import read_json
-from walop_jax.posterior.run import (
+from walop_jax.posterior.files import (
     COMPARISON,
     CORNER,
     DIAGNOSIS,

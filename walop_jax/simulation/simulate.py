@@ -13,23 +13,21 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from walop_jax.data.records import Block, CalibrationSet, Sources
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.noise import PhotonNoise
 from walop_jax.model import legendre, light
 from walop_jax.model.build import adapted
-from walop_jax.model.compiled import compiled
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects import EFFECTS, effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.elements import Analyser
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations, leaves, unknown_name, values_of
-from walop_jax.model.plan import Plan, with_median
+from walop_jax.model.plan import with_median
 from walop_jax.model.sources import Standards
 from walop_jax.model.specification import Model, make_model, make_template, series_indices
 from walop_jax.simulation.observing_plan import ObservingPlan
@@ -114,6 +112,39 @@ def _catalogue(plan: ObservingPlan, rng: np.random.Generator) -> tuple[Sources, 
         teff=rng.uniform(*_STAR_TEFF, n),
     )
     return sources, Standards(q=true[0], u=true[1], names=plan.star_names)
+
+
+@dataclasses.dataclass(frozen=True)
+class PhotonNoise:
+    """Photon noise and read noise (electron rms per measurement): N = Poisson(μ) + Normal(0, read_noise²).
+
+    What an observer states as N_ERR comes from the measured counts, σ(N): counts that came out low are given more
+    weight, which biases a mean by −1 electron. Source: Howell 2006, Handbook of CCD Astronomy, 4.4.
+    """
+
+    read_noise: float = 30.0
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.read_noise) and self.read_noise > 0):
+            raise ValueError(f"read noise {self.read_noise} must be a positive number of electrons")
+
+    def sigma(self, counts: Float[np.ndarray, ...]) -> Float[np.ndarray, ...]:
+        """Standard deviation of a measurement that expects `counts` (electron), or that found them."""
+        return np.sqrt(np.maximum(counts, 0.0) + self.read_noise**2)
+
+    def draw(
+        self, rng: np.random.Generator, expected: Float[np.ndarray, ...]
+    ) -> tuple[Float[np.ndarray, ...], Float[np.ndarray, ...]]:
+        """Return measured counts and the N_ERR that an observer would state for them.
+
+        Raises ValueError for expected counts that are negative or not finite.
+        """
+        if not (np.isfinite(expected).all() and np.all(expected >= 0.0)):
+            raise ValueError("expected counts must be finite and non-negative")
+        # Read noise first: how many random numbers a Poisson draw takes depends on what is expected.
+        read = self.read_noise * rng.standard_normal(expected.shape)
+        counts = rng.poisson(expected) + read
+        return counts, self.sigma(counts)
 
 
 def simulate(
@@ -214,13 +245,8 @@ def _expected(blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, 
     for _ in range(_MEDIAN_ROUNDS if needs(truth).median else 1):
         seen = np.where(likelihood.used[:, :, None], counts, np.nan)
         plan = with_median(likelihood.plan, np.nanmedian(seen, axis=0))
-        counts = np.asarray(_detected(truth, plan, jnp.asarray(light_counts)))
+        counts = np.asarray(engine.detected(truth, plan, jnp.asarray(light_counts)))
     return counts
-
-
-@compiled
-def _detected(instrument: Instrument, plan: Plan, counts: Float[Array, "p e k"]) -> Float[Array, "p e k"]:
-    return jax.vmap(light.detected, (None, None, 0))(instrument, plan.exposures, counts)
 
 
 def effect_from_text(text: str, context: Context, catalogue: Sequence[type[Effect]] = EFFECTS) -> Effect:

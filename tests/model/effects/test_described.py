@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, expm_frechet
 
-from walop_jax.fit.model_builder import model_without_data
-from walop_jax.fit.model_file import render
+from walop_jax.fit.model_file import model_without_data, render
 from walop_jax.model import mueller
 from walop_jax.model.carried import left_behind
 from walop_jax.model.compiled import compiled

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from numpy.polynomial.legendre import legval
 
-from walop_jax.fit.model_builder import model_without_data
-from walop_jax.fit.model_file import render
+from walop_jax.fit.model_file import model_without_data, render
 from walop_jax.model.effects import EFFECTS, FreeForm, effect_by_name, in_order
 from walop_jax.model.effects.free_form import BLOCKS
 from walop_jax.model.parameters import leaves

@@ -19,7 +19,7 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.settings import Settings
 from walop_jax.diagnosis.trust import examined
-from walop_jax.fit.model_builder import base_model
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.model.build import adapted
 from walop_jax.model.instrument import Instrument
