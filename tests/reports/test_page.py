@@ -295,8 +295,23 @@ def test_accuracy_comes_first_and_says_its_share(tmp_path):
     page = Page(render(read_run(handmade_run.make_refit(tmp_path / "run")), accuracy))
     assert page.headings[:2] == ["Accuracy of p over the field", "The data"]
     text = " ".join(page.text.split())
-    assert "uncertain by 0.07 % in the median of the field" in text  # of 0.02, 0.05, 0.09 and 2 %
+    assert "uncertain by 0.070 % in the median of the field" in text  # of 0.02, 0.05, 0.09 and 2 %
     assert "over 75 % of the field" in text
+    assert "Error of p, median of the field0.070 %" in text  # on the first screen
+    assert "walop-jax apply run STARS.fits" in text
+
+
+def test_what_is_not_trusted_looks_like_it(tmp_path):
+    """No number stands out, figures are grey, and the accuracy is called what it would be."""
+    accuracy = FieldAccuracy(np.full((2, 2), 5e-4), (-0.2, 0.2, -0.2, 0.2), "SDSS-r", trusted=False)
+    html = render(read_run(handmade_run.make_refit(tmp_path / "run", trusted=False, quality=8192)), accuracy)
+    assert '<body class="untrusted">' in html
+    page = Page(html)
+    text = " ".join(page.text.split())
+    assert "If the model explained the data, the error would be 0.050 %" in text
+    assert "<strong>0.050" not in html
+    assert "not known: the calibration is not trusted" in text
+    assert "walop-jax apply" not in text
 
 
 def test_the_data_are_told_of(tmp_path):

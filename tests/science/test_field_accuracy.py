@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from small_run import small_fit
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.science.field_accuracy import field_accuracy, p_errors
+from walop_jax.fit.verdict import Hidden
+from walop_jax.science.field_accuracy import GROUPS, field_accuracy, p_errors
 from walop_jax.science.star_errors import sample_stars
 
 IDEAL = np.array([[0.0, 1.0, 0.0, 0.0, 0.0, 1.0]])
@@ -50,3 +53,24 @@ def test_map_of_a_fit():
     assert found.filter == "SDSS-r"
     assert 0 < found.median < 0.01
     assert found.share == np.mean(found.error < 1e-3)
+
+
+def test_what_limits_it_is_what_alone_is_uncertain():
+    """With all but one part known exactly, that part makes the whole variance; with a mistake that hides, it is told."""
+    calibration = Calibration.from_fit(small_fit())
+    parts = np.array([name.split(".")[0] for name in calibration.model.names])
+    for part in ("collimator", "throughput"):
+        only = np.outer(parts == part, parts == part)
+        one = dataclasses.replace(calibration, covariance=np.where(only, calibration.covariance, 0.0))
+        found = field_accuracy(one, size=3)
+        assert found is not None
+        assert found.limited_by == f"{GROUPS[part]} (100 % of the variance)"
+    change = np.where(np.array(calibration.model.names) == "collimator.q", 0.002, 0.0)
+    hidden = Hidden(("the scale of X and Y",), (0.02,), ("",), change[None])
+    found = field_accuracy(dataclasses.replace(calibration, hidden=hidden), size=3)
+    assert found is not None
+    # A diattenuation of the light ahead of everything is an offset of q: 0.002, but for what p does to second order.
+    np.testing.assert_allclose(found.hidden, 0.002, rtol=0.1)
+    told = dict(found.facts())
+    assert told["could hide"].endswith("from the scale of X and Y (wrong by 0.02)")
+    assert told["to see that"] == "an independent check of the field positions"

@@ -17,7 +17,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from walop_jax.calibration.maps import MatrixMaps, ResidualMap, matrix_names
-from walop_jax.calibration.matrix import change_of_qu, matrices, matrix_draws, matrix_slopes
+from walop_jax.calibration.matrix import (
+    change_of_qu,
+    matrices,
+    matrix_draws,
+    matrix_slopes,
+    p_errors,
+    sample_stars,
+)
 from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter, single_wavelength
 from walop_jax.data.frames import Grid
 from walop_jax.data.quantities import in_unit
@@ -464,6 +471,10 @@ class Calibration(Displayed):
         }
         for name, column in zip(names, errors.T, strict=True):
             columns[f"{name}_ERR"] = column, f"standard error of {name}"
+        if len(names) == 6:
+            known = np.full(len(x), np.nan)
+            known[inside] = p_errors(there, covariance, sample_stars())
+            columns["P_ERR"] = known, "error of p of a star with p <= 5 %, of the calibration alone"
         columns["FLAG"] = flag, "16 high cross-talk, 32 beyond the calibrated field, 64 filter or temperature"
         return columns
 

@@ -34,7 +34,7 @@ from walop_jax.model.specification import Model
 Scalar = Float[Array, ""]
 Vector = Float[np.ndarray, " p"]
 
-LARGEST_P = 0.05
+STARS, LARGEST_P = 100, 0.05
 
 
 def _point_vectors(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
@@ -206,6 +206,33 @@ def change_of_qu(
     offset = np.linalg.norm(inverse @ change[:, :, :1], axis=(1, 2))
     found[good] = offset + p * np.linalg.norm(inverse @ change[:, :, 1:], ord=2, axis=(1, 2))
     return found
+
+
+def sample_stars(count: int = STARS, largest: float = LARGEST_P, seed: int = 0) -> Float[np.ndarray, "n 2"]:
+    """(q, u) of sources with p evenly up to `largest` and any angle."""
+    rng = np.random.default_rng(seed)
+    p, angle = rng.uniform(0.0, largest, count), rng.uniform(0.0, np.pi, count)
+    return np.stack([p * np.cos(2 * angle), p * np.sin(2 * angle)], axis=1)
+
+
+def p_errors(
+    matrix: Float[np.ndarray, "p 6"], covariance: Float[np.ndarray, "p 6 6"], stars: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, " p"]:
+    """Error of p for stars (q, u), rms over them, from the six elements of the matrix and their covariance."""
+    form = p_forms(matrix, stars)
+    variance = np.einsum("pni,pij,pnj->pn", form, covariance, form, optimize=True)
+    return np.sqrt(np.mean(variance, axis=1))
+
+
+def p_forms(matrix: Float[np.ndarray, "p 6"], stars: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "p n 6"]:
+    """δp = −e · M⁻¹ · (δm s) of every star as a linear form of the six elements."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        (a, b), (c, d) = matrix[:, 1:3].T, matrix[:, 4:].T
+        inverse = np.stack([np.stack([d, -b], -1), np.stack([-c, a], -1)], 1) / (a * d - b * c)[:, None, None]
+        along = stars / np.hypot(*stars.T)[:, None]
+        s = np.concatenate([np.ones((len(stars), 1)), stars], axis=1)
+        left = np.einsum("nc,pcr->pnr", along, inverse)
+        return np.einsum("pnr,ns->pnrs", left, s).reshape(len(matrix), len(stars), 6)
 
 
 def effect_slopes(

@@ -31,6 +31,7 @@ def summary(
         p.name: {"value": float(value), "sigma": float(sigma), "unit": p.unit}
         for p, value, sigma in zip(result.model.parameters, result.values, result.sigma, strict=True)
     }
+    known = result.answer() if result.answer is not None and result.converged else None
     return {
         "chi2": result.chi2,
         "dof": result.dof,
@@ -54,6 +55,7 @@ def summary(
                 result.hidden.names, result.hidden.sizes, result.hidden.units, strict=True
             )
         ],
+        "accuracy_of_p": None if known is None else known.document(),
         "instrument": result.model.name,
         "effects": list(result.model.effect_names),
         "free_parameters": len(result.model.free),

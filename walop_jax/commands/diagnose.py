@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Job, Option, Outcome, Writers, command
@@ -11,6 +12,8 @@ from walop_jax.io.text import json_text
 
 if TYPE_CHECKING:
     from walop_jax.diagnosis.findings import Diagnosis
+    from walop_jax.fit.refit import FitResult
+    from walop_jax.io.display import Display
 
 MODEL = "model.toml"
 OUTPUTS = ("calibration.fits", "summary.json", "diagnosis.json", "diagnosis.fits", MODEL)
@@ -44,6 +47,7 @@ def diagnose(
     from walop_jax.diagnosis.workflow import diagnose as diagnosis_of
     from walop_jax.fit.misfit import describe
     from walop_jax.fit.model_file import render
+    from walop_jax.science.field_accuracy import answered
 
     job.tell("reading", "reading")
     catalogue = catalogue_of(effects)
@@ -53,9 +57,10 @@ def diagnose(
             calset, chosen, catalogue=catalogue, seed=job.seed, minutes=minutes, progress=say
         )
 
+    after = answered(found.after)
+
     def files() -> Writers:
         job.tell("mapping the field", "mapping")
-        after = found.after
         product = Calibration.from_fit(after)
         misfit = None if after.explains_data else describe(after)
         fitted = summary(after, seconds=job.seconds, misfit=misfit) | {"seed": job.seed}
@@ -70,8 +75,17 @@ def diagnose(
     return Outcome(
         found,
         lambda: document(found),
-        lambda: f"{found.display().text()}\n{found.verdict}: {output}   ({found.seconds:.0f} s)",
+        lambda: f"{_with_answer(found, after).text()}\nWritten to {output}.",
         files,
         saved_as=DIAGNOSIS,
         warnings=found.after.warnings,
+        next=(f"walop-jax report {output}", f"walop-jax apply {output} STARS.fits -o OUT.fits")
+        if after.trusted
+        else (f"walop-jax report {output}",),
     )
+
+
+def _with_answer(found: Diagnosis, after: FitResult) -> Display:
+    """What was found, and how well stars are known with the extended model."""
+    shown, known = found.display(), after.answer() if after.answer is not None and after.converged else None
+    return dataclasses.replace(shown, facts=(*shown.facts, *(known.facts() if known is not None else ())))

@@ -19,6 +19,7 @@ from walop_jax.commands import COMMANDS, INTERRUPTED
 from walop_jax.commands.command import COMMON, Argument, Command, Job, Option, Outcome, UsageError
 from walop_jax.io.progress import interrupts_answered
 
+STARTED = time.perf_counter()
 CACHE_VARIABLE = "WALOP_JAX_CACHE"
 DEBUG_VARIABLE = "WALOP_JAX_DEBUG"
 LINE_EVERY = 10.0  # s, of progress that is no terminal's
@@ -207,12 +208,24 @@ def _show(found: Outcome[Any], quiet: bool, json: bool) -> None:
         typer.echo(json_text(found.content), nl=False)
     elif not quiet and (text := found.text()):
         _print(text, found.markdown)
+        if found.next and not found.failure:
+            typer.echo(f"Done in {seconds_since_start():.0f} s. Next: {' or '.join(found.next)}")
     if found.failure:
         sys.stdout.flush()
         complain(found.failure)
         raise typer.Exit(1)
     if not found.trusted:
         raise typer.Exit(UNTRUSTED)
+
+
+def seconds_since_start() -> float:
+    """Seconds since the process was started, its imports among them, as `time` of a shell counts them."""
+    try:
+        # The 22nd field of Linux; the name of the program, in brackets, may hold blanks.
+        ticks = float(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
+        return time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
+    except (OSError, AttributeError, ValueError, IndexError):
+        return time.perf_counter() - STARTED
 
 
 def _print(text: str, markdown: bool) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Job, Option, Outcome, Writers, command
-from walop_jax.commands.inputs import catalogue_of, in_bytes, set_and_model
+from walop_jax.commands.inputs import catalogue_of, in_bytes, paths_of, set_and_model
 from walop_jax.commands.options import Effects, Folder, InstrumentLike, Memory, ModelLike, PathLike, Sets
 
 if TYPE_CHECKING:
@@ -63,6 +63,7 @@ def refit(
     from walop_jax.fit.refit import refit as fit
     from walop_jax.io.atomic import atomic_path, remove
     from walop_jax.io.text import json_text
+    from walop_jax.science.field_accuracy import answered
 
     if output is not None and folder is not None:
         raise ValueError("with output, finished slabs are kept in its folder partial: leave folder out")
@@ -76,9 +77,10 @@ def refit(
             calset, chosen = set_and_model(data, model, instrument, catalogue_of(effects), output=output)
             kept = folder if output is None else Path(output) / PARTIAL
             with job.repeated() as say:
-                result = examined(
-                    fit(calset, chosen, folder=kept, progress=say, memory=in_bytes(memory), processes=crew)
+                fitted = fit(
+                    calset, chosen, folder=kept, progress=say, memory=in_bytes(memory), processes=crew
                 )
+                result = answered(examined(fitted))
             wanted = output is not None
             mapped = wanted and result.likelihood.layout.large and result.converged
             residuals = residual_map(result) if mapped else None
@@ -91,17 +93,20 @@ def refit(
 
             found = Outcome(
                 result,
-                lambda: summary(result, seconds=seconds, misfit=misfit, residuals=residuals) | {"seed": job.seed},
-                lambda: "\n".join((
-                    dataclasses.replace(result.display(), notes=result.notes).text(),
-                    f"{result.checked_verdict().words}: {output}   ({seconds:.1f} s)",
-                )),
+                lambda: (
+                    summary(result, seconds=seconds, misfit=misfit, residuals=residuals) | {"seed": job.seed}
+                ),
+                lambda: (
+                    f"{dataclasses.replace(result.display(), notes=result.notes).text()}\n"
+                    f"The calibration can{'' if result.trusted else 'not'} be trusted; written to {output}."
+                ),
                 files,
                 saved_as=SUMMARY,
+                next=next_steps(result.trusted, output, data),
                 warnings=(*result.warnings, *(() if misfit is None else misfit.sentences())),
                 trusted=result.trusted,
                 silent=not first,
-            )  # fmt: skip
+            )
             if not result.converged:
                 found = dataclasses.replace(
                     found,
@@ -120,6 +125,14 @@ def refit(
                 temporary.write_text(json_text(found.content), encoding="utf-8")
             remove(job.folder.path / PARTIAL)
             return found
+
+
+def next_steps(trusted: bool, output: PathLike | None, data: Sets) -> tuple[str, ...]:
+    """What to type after a fit."""
+    if trusted:
+        return (f"walop-jax report {output}", f"walop-jax apply {output} STARS.fits -o OUT.fits")
+    sets = " ".join(str(path) for path in paths_of(data)) if output is not None else "CALSET"
+    return (f"walop-jax report {output}", f"walop-jax diagnose {sets} -o {output}_diagnosis")
 
 
 @contextlib.contextmanager

@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,8 @@ class FitResult(Displayed):
     `values` and `covariance` are of all parameters in tree order, frozen ones with zero variance. `verdict` is None
     until the residuals were examined (`diagnosis.trust.examined`); to ask for `trusted` before is an error.
     `errors_from` is what the covariance was made from, the stated errors of the data (`STATED`) or residuals; `hidden`
-    are mistakes that the residuals would not show, None until these were examined.
+    are mistakes that the residuals would not show, None until these were examined. `answer` works out how well stars
+    are known with it (`science.field_accuracy.answered`), which is shown first.
     """
 
     likelihood: Likelihood
@@ -60,6 +61,7 @@ class FitResult(Displayed):
     errors_from: str = STATED
     verdict: Verdict | None = None
     hidden: Hidden | None = None
+    answer: Callable[[], Any] | None = None
 
     @property
     def model(self) -> Model:
@@ -200,15 +202,16 @@ class FitResult(Displayed):
     def notes(self) -> tuple[str, ...]:
         """What its table leaves out, what the data do not constrain, and which mistakes they would not show."""
         notes = parameter_notes(self.model, self.sigma)
-        return notes if self.hidden is None or not len(self.hidden) else (*notes, self.hidden.in_words())
+        told = self.answer is not None or self.hidden is None or not len(self.hidden)
+        return notes if told else (*notes, self.hidden.in_words())
 
     def display(self) -> Display:
         """The verdict and the parameters."""
         verdict = "not examined" if self.verdict is None else self.verdict.words
-        facts = {
-            "χ²/dof": f"{self.chi2:.1f} / {self.dof} = {self.chi2 / max(self.dof, 1):.4g}",
-            "intensities": str(self.n_data),
-            "free parameters": str(len(self.model.free)),
+        known = self.answer() if self.answer is not None and self.converged else None
+        facts = dict(known.facts() if known is not None else ()) | {
+            "χ²/dof": f"{self.chi2:.1f} / {self.dof} = {self.chi2 / max(self.dof, 1):.4g}, from {self.n_data} "
+            f"intensities, {len(self.model.free)} free parameters",
             "effects": ", ".join(self.model.effect_names) or "none beyond the base model",
             "errors from": self.errors_from,
         }
@@ -332,8 +335,8 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
     elif not result.explains_data:
         yield Doubt(
             Quality.UNEXPLAINED | excess,
-            f"χ²/dof = {ratio:.4g} lies {result.excess:.3g} standard deviations above 1: the model does not explain "
-            "the data; do not trust the calibration (walop-jax diagnose looks for what is missing)",
+            f"the model does not explain the data: χ²/dof = {ratio:.4g}, where 1 is expected; do not use this "
+            "calibration (walop-jax diagnose looks for what is missing)",
         )
     elif result.errors_too_large and not noiseless:
         yield Doubt(

@@ -16,6 +16,7 @@ from astropy.table import Table
 
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail
+from walop_jax.io.rounding import two_digits, with_error, with_minus_sign
 
 FORMATS = {
     ".fits": "fits",
@@ -27,6 +28,36 @@ FORMATS = {
     ".votable": "votable",
 }
 """Extensions of tables that are read, and what astropy calls the format."""
+
+
+class MatrixTable(Table):
+    """Field points with the instrument matrix; a few of them are printed as elements with their errors."""
+
+    FEW = 4
+
+    def __str__(self) -> str:
+        return "\n".join(map(self._block, range(len(self)))) if len(self) <= self.FEW else super().__str__()
+
+    __repr__ = __str__
+
+    def _block(self, row: int) -> str:
+        def number(name: str) -> float:
+            return float(np.asarray(self[name])[row])
+
+        x, y = (with_minus_sign(f"{number(name):+.3f}°") for name in ("X", "Y"))
+        names = [name for name in self.colnames if f"{name}_ERR" in self.colnames and name.startswith("M")]
+        cells = [f"{name.lower()} {with_error(number(name), number(f'{name}_ERR'))}" for name in names]
+        width = max(map(len, cells)) + 3
+        lines = [f"field point X {x}, Y {y}"]
+        lines += [
+            "  " + "".join(f"{cell:<{width}}" for cell in cells[k : k + 3]) for k in range(0, len(cells), 3)
+        ]
+        if "P_ERR" in self.colnames:
+            known = f"{two_digits(100 * number('P_ERR'))} %"
+            lines.append(
+                f"  error of p of a star with p ≤ 5 %, calibration alone: {known}; FLAG {number('FLAG'):.0f}"
+            )
+        return "\n".join(line.rstrip() for line in lines)
 
 
 def table_format(path: str | os.PathLike[str]) -> str:

@@ -86,7 +86,6 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         "name": run.folder.resolve().name,
         "instrument": summary.get("instrument", "WALOP"),
         "summary": summary,
-        "ratio": summary["chi2"] / max(summary["dof"], 1),
         "diagnosis": diagnosis,
         "said": [] if diagnosis is None else tuple(sentences(diagnosis)),
         "label": label,
@@ -111,17 +110,34 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         "figures": _figures(run, accuracy),
         "versions": summary["versions"],
         "accuracy": None if accuracy is None else _accuracy_in_words(accuracy),
+        "facts": [] if accuracy is None else accuracy.facts(),
+        "next": _next(run, good and bool(summary.get("trusted", summary["converged"]))),
         "data": [] if run.product is None else data_in_words(run.product),
         "limits": limits_in_words(run.limits),
         "symbols": "" if run.corner is None else symbols_in_words(_in_corner(run)),
     }
 
 
+def _next(run: RunContents, trusted: bool) -> list[tuple[str, str]]:
+    """What to do next: words and a command line."""
+    name = run.folder.resolve().name
+    sets = " ".join(str(entry["path"]) for entry in run.summary["inputs"]) or "CALSET"
+    steps = [("correct stars", f"walop-jax apply {name} STARS.fits -o OUT.fits")] if trusted else []
+    if run.diagnosis is None:
+        steps.append(("look for what is missing", f"walop-jax diagnose {sets} -o {name}_diagnosis"))
+    if run.limits is None and trusted:
+        steps.append(("see what could hide in these data", f"walop-jax limits {sets} -o {name}"))
+    return [*steps, ("plan better exposures", "walop-jax plan WALOP-SOUTH")]
+
+
 def _accuracy_in_words(accuracy: FieldAccuracy) -> dict[str, str]:
     return {
-        "median": f"{100 * accuracy.median:.2g}",
+        "median": two_digits(100 * accuracy.median),
         "share": f"{100 * accuracy.share:.0f}",
         "filter": accuracy.filter,
+        "hidden": two_digits(100 * accuracy.hidden) if accuracy.hidden > 0 else "",
+        "hidden_by": accuracy.hidden_by,
+        "remedy": accuracy.remedy,
     }
 
 

@@ -58,9 +58,10 @@ def verdict_of_fit(summary: Mapping[str, Any]) -> tuple[str, str]:
     if not summary["converged"]:
         return "Not trusted", f"The fit did not converge ({summary['message']}); {numbers}."
     if not summary.get("trusted", True):
-        against = summary.get("doubts") or summary.get("warnings") or ["the model does not explain the data"]
-        return "Not trusted", f"The fit converged, with {numbers}, but {against[0]}."
-    return "Trusted", f"The fit converged, and the data are consistent with the model: {numbers}."
+        doubts = summary.get("doubts") or summary.get("warnings") or ["the model does not explain the data"]
+        told = "" if "χ²/dof" in doubts[0] else f" ({numbers})"
+        return "Not trusted", f"{doubts[0][:1].upper()}{doubts[0][1:]}{told}."
+    return "Trusted", f"The data are consistent with the model: {numbers}."
 
 
 def hidden_in_words(summary: Mapping[str, Any]) -> str:

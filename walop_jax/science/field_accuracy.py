@@ -1,32 +1,66 @@
-"""How well a calibration knows the degree of polarisation over the field: what its covariance promises.
+"""How well a calibration knows the degree of polarisation over the field, what limits it, and what could hide.
 
 Stars with p ≤ 5 % at any angle, without photon noise. An error δm of the instrument matrix makes
 δ(q, u) = −M⁻¹ (δm₁ + δM (q, u)), hence its variance along the polarisation, averaged over the stars, is the error of p.
+What limits it are the parameters without whose errors that variance would shrink most: with a group G of them known
+exactly, covariance C becomes C − C_G C_GG⁻¹ C_Gᵀ.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.science.star_errors import GOAL, sample_stars
+from walop_jax.calibration.matrix import matrix_slopes, p_errors, p_forms, sample_stars
+from walop_jax.data.settings import Settings
+from walop_jax.fit.refit import FitResult
+from walop_jax.io.rounding import two_digits
+from walop_jax.science.star_errors import GOAL
 
 SIZE = 31  # points along each axis of the map
+COARSE = 8  # the same where the question is what limits it
+FEW_STARS = 20
+
+GROUPS = {
+    "throughput": "the relative throughput of the cameras",
+    "collimator": "the diattenuation of the collimator",
+    "standard": "the catalogue values of the standards",
+    "sky": "the polarisation of the moonlit sky",
+    "pupil": "the mapping from the field to the pupil",
+    "half1": "the plates and the wedge of HWP1",
+    "half2": "the plates and the wedge of HWP2",
+    "chwp": "the plates of the calibration half-wave plate",
+}
+"""Parameters by the first part of their names, in words."""
+
+REMEDIES = (
+    (("scattered light", "a non-linearity"), "exposures at a second light level"),
+    (("X of", "Y of", "the scale", "the field"), "an independent check of the field positions"),
+    (("TEFF", "the filter", "filter"), "a measured spectrum of the lamp and of the filter"),
+)
+"""What tells a mistake, by the beginning of its name: a measurement of the quantity itself."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FieldAccuracy:
     """Standard error of p (a fraction) over the field, from the calibration alone: rms over stars with p ≤ 5 %.
 
-    `extent` is left, right, bottom and top in degrees.
+    `extent` is left, right, bottom and top in degrees. `limited_by` is what most of the error comes from. A
+    mistake that the data would not have shown, the worst of them `hidden_by`, can make q or u wrong by `hidden`, the
+    median over the field (NaN: nobody asked), at its just undetected size.
     """
 
     error: Float[np.ndarray, "y x"]
     extent: tuple[float, float, float, float]
     filter: str
+    limited_by: str = ""
+    hidden: float = np.nan
+    hidden_by: str = ""
+    trusted: bool = True
 
     @property
     def share(self) -> float:
@@ -38,21 +72,38 @@ class FieldAccuracy:
         """Median over the field."""
         return float(np.median(self.error))
 
+    @property
+    def remedy(self) -> str:
+        """The measurement that would show the mistake that could hide."""
+        return next((what for names, what in REMEDIES if self.hidden_by.startswith(names)), "")
 
-def p_errors(
-    matrix: Float[np.ndarray, "p 6"], covariance: Float[np.ndarray, "p 6 6"], stars: Float[np.ndarray, "n 2"]
-) -> Float[np.ndarray, " p"]:
-    """Error of p for stars (q, u), rms over them, from the six elements of the matrix and their covariance."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        (a, b), (c, d) = matrix[:, 1:3].T, matrix[:, 4:].T
-        inverse = np.stack([np.stack([d, -b], -1), np.stack([-c, a], -1)], 1) / (a * d - b * c)[:, None, None]
-        along = stars / np.hypot(*stars.T)[:, None]
-        s = np.concatenate([np.ones((len(stars), 1)), stars], axis=1)
-        # δp = −e · M⁻¹ · (δm s): a linear form of the six elements for every star.
-        left = np.einsum("nc,pcr->pnr", along, inverse)
-        form = np.einsum("pnr,ns->pnrs", left, s).reshape(len(matrix), len(stars), 6)
-        variance = np.einsum("pni,pij,pnj->pn", form, covariance, form, optimize=True)
-        return np.sqrt(np.mean(variance, axis=1))
+    def document(self) -> dict[str, object]:
+        """As plain data, `accuracy_of_p` of summary.json; shares, not per cent."""
+        return {
+            "median": self.median, "share_below_goal": self.share, "goal": GOAL, "filter": self.filter,
+            "limited_by": self.limited_by, "hidden": self.hidden, "hidden_by": self.hidden_by,
+        }  # fmt: skip
+
+    def facts(self) -> tuple[tuple[str, str], ...]:
+        """The answer in a few lines: how well, limited by what, and what could hide."""
+        if not self.trusted:
+            return (("p of a star", "not known: the calibration is not trusted"),)
+        known = f"{two_digits(100 * self.median)} % (standard error for p ≤ 5 %, median over the field)"
+        lines = [("p of a star", f"{known}; below 0.1 % over {100 * self.share:.0f} % of it")]
+        if self.limited_by:
+            lines.append(("limited by", self.limited_by))
+        if self.hidden > 0:
+            size = f"q or u off by {two_digits(100 * self.hidden)} % (median)"
+            lines.append(("could hide", f"{size} from {self.hidden_by}"))
+        if self.hidden > 0 and self.remedy:
+            lines.append(("to see that", self.remedy))
+        return tuple(lines)
+
+
+def answered(result: FitResult) -> FitResult:
+    """The fit, able to say how well stars are known with it; worked out when it is first asked."""
+    made = functools.cache(lambda: field_accuracy(Calibration.from_fit(result)))
+    return dataclasses.replace(result, answer=made)
 
 
 def field_accuracy(calibration: Calibration, size: int = SIZE) -> FieldAccuracy | None:
@@ -63,8 +114,64 @@ def field_accuracy(calibration: Calibration, size: int = SIZE) -> FieldAccuracy 
     settings = calibration.usual_settings()
     if str(settings.filter[0]) not in used:
         settings = calibration.usual_settings(filter_name=used[0])
+    x, y = _grid(calibration, size)
+    matrix, covariance = calibration.matrix(x, y, settings)
+    error = p_errors(matrix, covariance, sample_stars()).reshape(size, size)
+    x, y = _grid(calibration, COARSE)
+    hidden, worst = calibration.protection(x, y, settings)
+    known = hidden[np.isfinite(hidden)]
+    return FieldAccuracy(
+        error,
+        calibration.field,
+        str(settings.filter[0]),
+        limited_by=_limited_by(calibration, settings, x, y),
+        hidden=float(np.median(known)) if known.size else np.nan,
+        hidden_by=_with_size(calibration, worst),
+        trusted=calibration.verdict.trusted,
+    )
+
+
+def _with_size(calibration: Calibration, name: str) -> str:
+    """A mistake that could hide, with the size at which it would just be seen."""
+    hidden = calibration.hidden
+    if hidden is None or name not in hidden.names:
+        return ""
+    at = hidden.names.index(name)
+    return f"{name} (wrong by {hidden.sizes[at]:.2g} {hidden.units[at]}".rstrip() + ")"
+
+
+def _grid(calibration: Calibration, size: int) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
     low_x, high_x, low_y, high_y = calibration.field
     x, y = np.meshgrid(np.linspace(low_x, high_x, size), np.linspace(low_y, high_y, size))
-    matrix, covariance = calibration.matrix(x.ravel(), y.ravel(), settings)
-    error = p_errors(matrix, covariance, sample_stars()).reshape(size, size)
-    return FieldAccuracy(error, calibration.field, str(settings.filter[0]))
+    return x.ravel(), y.ravel()
+
+
+def _limited_by(
+    calibration: Calibration, settings: Settings, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]
+) -> str:
+    """The group of parameters with most of the variance of p, in the median of the field, in words."""
+    name = str(settings.filter[0])
+    curves = {name: calibration.filter_curve(name)}
+    instrument = calibration.model.instrument(calibration.values)
+    matrix, slopes = matrix_slopes(instrument, settings, curves, x, y)
+    form = p_forms(matrix.reshape(len(x), 6), sample_stars(FEW_STARS)) @ slopes.reshape(len(x), 6, -1)
+    covariance = calibration.covariance
+    seen = form @ covariance
+    total = np.mean(np.sum(seen * form, axis=-1), axis=1)
+    parts = np.array([str(name).split(".")[0] for name in calibration.model.names])
+    shares = {}
+    for part in dict.fromkeys(parts.tolist()):
+        group = np.flatnonzero((parts == part) & (np.diag(covariance) > 0))
+        if group.size:
+            sigma = np.sqrt(np.diag(covariance)[group])
+            inverse = np.linalg.pinv(
+                covariance[np.ix_(group, group)] / np.outer(sigma, sigma), hermitian=True
+            )
+            one = seen[..., group] / sigma
+            gone = np.mean(np.einsum("pnj,jk,pnk->pn", one, inverse, one, optimize=True), axis=1)
+            shares[part] = float(np.nanmedian(gone / total))
+    most = max(shares, key=lambda part: shares[part], default="")
+    if not most:
+        return ""
+    share = f"{100 * min(shares[most], 1.0):.0f} % of the variance"
+    return f"{GROUPS.get(most, f'the parameters {most}.*')} ({share})"

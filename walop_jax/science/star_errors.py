@@ -14,10 +14,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.calibration.matrix import LARGEST_P as LARGEST_P
+from walop_jax.calibration.matrix import STARS as STARS
+from walop_jax.calibration.matrix import sample_stars as sample_stars
 from walop_jax.data.settings import Settings
 from walop_jax.science.estimate import estimate, estimate_with
 
-STARS, LARGEST_P = 100, 0.05
 GOAL = 0.001
 QUANTITIES = ("q", "u", "p")
 _ELECTRONS = 1e6  # of the stars; their photon noise does not enter
@@ -26,13 +28,6 @@ Vectors = Float[np.ndarray, "p *r k 3"]
 """Analysis vectors at field points, of one exposure or of several (r) in which a star is seen."""
 QuPairs = Float[np.ndarray, "n 2"]
 CameraPairs = tuple[tuple[int, int], ...]
-
-
-def sample_stars(count: int = STARS, largest: float = LARGEST_P, seed: int = 0) -> QuPairs:
-    """(q, u) of sources with p evenly up to `largest` and any angle."""
-    rng = np.random.default_rng(seed)
-    p, angle = rng.uniform(0.0, largest, count), rng.uniform(0.0, np.pi, count)
-    return np.stack([p * np.cos(2 * angle), p * np.sin(2 * angle)], axis=1)
 
 
 def transmitted(vectors: Vectors, stars: QuPairs) -> Float[np.ndarray, "p n *r k"]:
