@@ -56,7 +56,7 @@ def test_map_of_a_fit():
 
 
 def test_what_limits_it_is_what_alone_is_uncertain():
-    """With all but one part known exactly, that part makes the whole variance; with a mistake that hides, it is told."""
+    """With all but one part known exactly, that part makes the whole variance; a mistake that hides is told."""
     calibration = Calibration.from_fit(small_fit())
     parts = np.array([name.split(".")[0] for name in calibration.model.names])
     for part in ("collimator", "throughput"):
