@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matrix_at import matrix_at
 from scenes import PLAN
 from scipy import integrate, stats
 
@@ -195,12 +196,39 @@ def vectors(design):
     return [measured.candidate(one) for one in strata(measured) if one.block == "vectors"]
 
 
-def test_patterns_that_hold_at_no_other_setting_do_not_predict_it():
-    """Errors of single settings are smooth over the field: they predict parts of it that they have not seen."""
+@pytest.fixture(scope="module")
+def slips():
     calset = slipped()
-    slips = Design.of(fit(Likelihood.of(calset, base_model(calset))))
+    return Design.of(fit(Likelihood.of(calset, base_model(calset))))
+
+
+def test_patterns_that_hold_at_no_other_setting_do_not_predict_it(slips):
+    """Errors of single settings are smooth over the field: they predict parts of it that they have not seen."""
     assert slips.fit.chi2 > 1.5 * slips.fit.dof
     assert not naming.predicts_unseen(slips, vectors(slips), POLICY.useful)
+
+
+def gains(seed=3):
+    """A set whose cameras have a gain of their own in every exposure, and the instrument that made it."""
+    pattern = FreeForm.of(PLAN.context(), blocks=("exposures",))
+    own = np.abs(1e-3 * np.random.default_rng(seed).standard_normal(pattern.exposures.shape))
+    return simulate(PLAN, seed=seed, effects=[dataclasses.replace(pattern, exposures=own)])[:2]
+
+
+@pytest.mark.parametrize("hidden", ["slips", "gains"])
+def test_a_term_is_useful_where_the_matrix_is_closer_to_the_truth_with_it(hidden, slips):
+    """Gains of single exposures, for settings that slip and for gains: slips are only made probable by being broad."""
+    calset, truth = (slips.fit.calset, simulate(PLAN, seed=1).truth) if hidden == "slips" else gains()
+    model = base_model(calset)
+    context = effect_context(model.template, calset.exposures)
+    term = with_effects(model, [FreeForm.of(context, blocks=("exposures",))], context)
+    before, after = (fit(Likelihood.of(calset, one)) for one in (model, term))
+    true = matrix_at(truth, calset)
+    off = [np.std(matrix_at(f.model.instrument(f.values), calset) - true) for f in (before, after)]
+    assert off[1] < 0.5 * off[0] if hidden == "gains" else off[1] > 1.5 * off[0]
+    design = Design.of(before)
+    columns = [design.measured.candidate(one) for one in strata(design.measured) if one.block == "exposures"]
+    assert naming.predicts_unseen(design, columns, POLICY.useful) == (hidden == "gains")
 
 
 def test_patterns_of_the_optics_predict_settings_that_they_have_not_seen():

@@ -290,14 +290,15 @@ def refitted_in_order(steps: Sequence[Step], start: Design, end: Design) -> list
 def predicts_unseen(
     design: Design, terms: Sequence[Candidate], least: float, *, of_states: bool = True
 ) -> bool:
-    """Whether terms without a name predict states and parts of the field that it has not seen.
+    """Whether terms without a name predict states and parts of the field that they have not seen.
 
     One Gauss–Newton step of everything, with and without the terms, from all data but those of a unit gives the
     density of that unit, ln p = −½ (dᵀΣ⁻¹d + ln det Σ), Σ = s² (1 + A H⁻¹ Aᵀ): it is broad where the step leaves it
     open, and s² is the χ²/dof that a model leaves, 1 or more. Units are states (exposures that differ in nothing but
     the filter; not where the terms are about single ones), and the cells of the field. The mean gain must exceed
     `least` times its standard error over the units, for both: a term that only follows what each setting of an element
-    does by itself predicts the field, and no other setting.
+    does by itself predicts the field, and no other setting. Nor must it bend the rest of the model: the mean of dᵀd
+    over the states must not grow, where a density may become more probable by being broader alone.
 
     Symbols     d prediction error of the unit, A its rows of the Jacobian, H normal matrix of all others and priors
     """
@@ -307,25 +308,30 @@ def predicts_unseen(
     rows = np.vstack([np.hstack([design.jacobian, own]), np.hstack([prior, np.diag(1.0 / widths)])])
     residual = np.append(design.residual, np.zeros(len(widths)))
     calset = design.fit.calset
-    units = [field_cells(calset)[design.point]]
+    units = {"cells": field_cells(calset)[design.point]}
     if of_states:
-        units.append(states(calset)[design.exposure])
-    for unit in units:
-        before = _predictive_density(design.jacobian, design.residual, unit, design.projector.free)
-        after = _predictive_density(rows, residual, unit, design.projector.free)
-        gain = after - before
+        units["states"] = states(calset)[design.exposure]
+    for kind, unit in units.items():
+        before = _predictions(design.jacobian, design.residual, unit, design.projector.free)
+        after = _predictions(rows, residual, unit, design.projector.free)
+        gain, closer = (after - before).T
         if len(gain) < 2 or gain.mean() < least * gain.std(ddof=1) / np.sqrt(len(gain)):
+            return False
+        if kind == "states" and closer.mean() > 0.0:
             return False
     return True
 
 
-def _predictive_density(
+def _predictions(
     rows: Float[np.ndarray, "r n"],
     residual: Float[np.ndarray, " r"],
     unit: Int[np.ndarray, " d"],
     free: int,
-) -> Float[np.ndarray, " u"]:
-    """ln p of the data rows of each unit as all the others predict them; rows beyond those of `unit` are priors."""
+) -> Float[np.ndarray, "u 2"]:
+    """ln p of the data rows of each unit as all the others predict them, and the square of how far they are off.
+
+    Rows beyond those of `unit` are priors.
+    """
     norm = np.linalg.norm(rows, axis=0)
     scaled = rows / np.where(norm > 0, norm, 1.0)
     ridge = 1e-12 * np.eye(len(norm))
@@ -341,5 +347,6 @@ def _predictive_density(
         pull = a.T @ d
         square = d @ d - pull @ np.linalg.solve(gram, pull)
         spread = whole - np.linalg.slogdet(rest)[1]
-        found.append(-0.5 * (square / scale + spread + len(r) * free / len(unit) * np.log(scale)))
+        density = -0.5 * (square / scale + spread + len(r) * free / len(unit) * np.log(scale))
+        found.append((density, float(d @ d)))
     return np.array(found)

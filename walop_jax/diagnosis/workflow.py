@@ -333,8 +333,8 @@ class Refit(Linear):
         if nameless is not None or len(self.said) <= self.policy.most_sentences:
             return state, nameless
         # Something that no sentence holds looks like several that are there.
-        nameless = too_many_sentences(state, self.said)
-        if predicts_unseen(first.design, [first.said[name] for name in self.said], self.policy.useful):
+        nameless, said = too_many_sentences(state, self.said), [first.said[name] for name in self.said]
+        if predicts_unseen(first.design, said, self.policy.useful):
             return state, nameless
         self._without(Described.name)
         state = self.examined(first)
@@ -407,21 +407,19 @@ class Refit(Linear):
     def _unexplained(self, state: Examination) -> Unexplained:
         patterns = tuple(state.patterns_needed())
         found = unexplained(state, patterns)
-        blocks: dict[str, list[str]] = {}
-        for name, _ in patterns:
-            if (block := state.blocks[name]) is not None:
-                blocks.setdefault(block, []).append(name)
+        blocks = dict.fromkeys(block for name, _ in patterns if (block := state.blocks[name]) is not None)
         if len(self.calset.exposures) > limits.FREE_EXPOSURES:
             blocks.pop("exposures", None)
         if FreeForm.name in self.fit.model.effect_names or not blocks or not self.time_left():
             return found
+        # A block has all patterns of its kind: those that are not needed cost errors as well.
         measured, every = state.design.measured, list(strata(state.design.measured))
         useful = tuple(
             block
-            for block, names in blocks.items()
+            for block in blocks
             if predicts_unseen(
                 state.design,
-                [measured.candidate(one) for one in every if one.name in names],
+                [measured.candidate(one) for one in every if one.block == block],
                 self.policy.useful,
             )
         )
