@@ -21,8 +21,7 @@ from walop_jax.data.settings import Settings
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
-from walop_jax.model.build import adapted
-from walop_jax.model.instrument import Instrument
+from walop_jax.model.instrument import Instrument, adapted
 from walop_jax.paper.polynomial import fit_paper, measured_qu, sample_stars, transmitted, with_test_stars
 from walop_jax.science.star_errors import joint_errors, star_errors
 from walop_jax.simulation.observing_plan import ObservingPlan

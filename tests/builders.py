@@ -13,10 +13,9 @@ from oracle import forward
 
 from walop_jax.data.records import Exposures, FilterCurve
 from walop_jax.model import light
-from walop_jax.model.build import nominal_instrument
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects.base import Effect
-from walop_jax.model.instrument import Instrument
+from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.parameters import leaves, values_of, with_values
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for

@@ -13,6 +13,7 @@ from walop_jax.commands.diagnose import diagnose as diagnose
 from walop_jax.commands.docs import docs as docs
 from walop_jax.commands.epoch import epoch as epoch
 from walop_jax.commands.import_zemax import import_zemax as import_zemax
+from walop_jax.commands.inputs import read as read
 from walop_jax.commands.inspect import inspect as inspect
 from walop_jax.commands.instrument import instrument as instrument
 from walop_jax.commands.limits import limits as limits
@@ -20,8 +21,6 @@ from walop_jax.commands.matrix import matrix as matrix
 from walop_jax.commands.model import model as model
 from walop_jax.commands.plan import plan as plan
 from walop_jax.commands.plot import plot as plot
-from walop_jax.commands.reading import Run as Run
-from walop_jax.commands.reading import read as read
 from walop_jax.commands.refit import refit as refit
 from walop_jax.commands.report import report as report
 from walop_jax.commands.sample import sample as sample
@@ -36,17 +35,18 @@ from walop_jax.fit.model_file import base_model as base_model
 from walop_jax.fit.refit import FitResult as FitResult
 from walop_jax.io.errors import DataError as DataError
 from walop_jax.likelihood.likelihood import Likelihood as Likelihood
-from walop_jax.model.build import nominal_instrument as nominal_instrument
 from walop_jax.model.effects import EFFECTS as EFFECTS
 from walop_jax.model.effects import Effect as Effect
 from walop_jax.model.effects import effect_by_name as effect_by_name
 from walop_jax.model.effects.base import Scalar as Scalar
 from walop_jax.model.instrument import Instrument as Instrument
+from walop_jax.model.instrument import nominal_instrument as nominal_instrument
 from walop_jax.model.parameters import param as param
 from walop_jax.model.specification import Model as Model
 from walop_jax.model.specification import with_effects as with_effects
 from walop_jax.model.trace import Sightline as Sightline
 from walop_jax.posterior import Options as Options
+from walop_jax.posterior.files import Run as Run
 from walop_jax.simulation.observing_plan import ObservingPlan as ObservingPlan
 
 __version__: str

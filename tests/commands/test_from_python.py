@@ -167,7 +167,7 @@ def test_an_effect_of_ones_own_from_a_file(call, fitted, tmp_path):
 
 
 def _own(path):
-    from walop_jax.model.effects.own import catalogue_with
+    from walop_jax.model.effects.catalogue import catalogue_with
 
     return catalogue_with(path)
 

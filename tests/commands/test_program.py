@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from south_sets import CUTS
 
-from walop_jax.commands.program import CACHE_VARIABLE, cache_folder
+from walop_jax.commands.command import CACHE_VARIABLE, cache_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -11,7 +11,7 @@ import pytest
 from walop_jax.calibration import read_calibration
 from walop_jax.data import builtin_filter
 from walop_jax.data.settings import Settings
-from walop_jax.model.build import nominal_instrument
+from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.trace import Sightline, trace
 
 STAR = ("--x", 0.2, "--y", -0.1, "--q", 0.03, "--u", 0.01, "--teff", 5772)

@@ -9,7 +9,7 @@ import socket
 
 import pytest
 
-from walop_jax.commands.reading import read
+from walop_jax.commands.inputs import read
 from walop_jax.data import DataError, read_calibration_set
 from walop_jax.io.text import read_text
 

@@ -10,7 +10,7 @@ from astropy.table import MaskedColumn, Table
 from walop_jax.data import DataError
 from walop_jax.data.field_points import field_points
 from walop_jax.data.user_tables import read_input_table, write_output_table
-from walop_jax.model.build import nominal_instrument
+from walop_jax.model.instrument import nominal_instrument
 
 SOUTH = nominal_instrument("WALOP-SOUTH")
 

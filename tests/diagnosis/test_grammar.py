@@ -15,8 +15,8 @@ from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.instruments.description import parsed
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.build import build
 from walop_jax.model.effects import EFFECTS
+from walop_jax.model.instrument import build
 from walop_jax.model.specification import effect_context
 from walop_jax.simulation.simulate import simulate
 

@@ -14,7 +14,7 @@ from walop_jax.likelihood.columns import Columns, columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.pieces import NoColumnError
 from walop_jax.model.effects import EFFECTS, Described, effect_by_name
-from walop_jax.model.effects.sentence import Sentence
+from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.simulation.simulate import simulate
 

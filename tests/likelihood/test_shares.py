@@ -13,8 +13,7 @@ from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.build import nominal_instrument
-from walop_jax.model.instrument import Instrument
+from walop_jax.model.instrument import Instrument, nominal_instrument
 
 POINTS = 3
 RNG = np.random.default_rng(8)

@@ -17,12 +17,11 @@ from walop_jax.data.records import Sources
 from walop_jax.data.settings import Settings
 from walop_jax.likelihood import engine
 from walop_jax.model import carried, light, mueller
-from walop_jax.model.build import nominal_instrument
 from walop_jax.model.cameras import DetectorPart
 from walop_jax.model.effects import EFFECTS, FreeForm, effect_by_name
 from walop_jax.model.effects.base import Context, Effect, Scalar
 from walop_jax.model.elements import Element
-from walop_jax.model.instrument import Instrument
+from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.parameters import number, param, values_of
 from walop_jax.model.plan import with_median
 from walop_jax.model.planning import plan_for, plan_for_settings

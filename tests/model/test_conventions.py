@@ -7,7 +7,7 @@ import pytest
 from oracle import forward
 
 from walop_jax.model import conventions, mueller
-from walop_jax.model.build import nominal_instrument
+from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.planning import plan_for
 
 LAM = 0.62

@@ -14,8 +14,7 @@ from quick import quick
 from walop_jax.data.records import Exposures, Position
 from walop_jax.instruments.description import parsed
 from walop_jax.model import light
-from walop_jax.model.build import build
-from walop_jax.model.instrument import Instrument
+from walop_jax.model.instrument import Instrument, build
 from walop_jax.model.planning import plan_for
 
 # Three arms, seven elements that are not the identity, three of which move: one of two ahead of the arms is

@@ -10,8 +10,8 @@ from quick import quick
 
 from walop_jax.data.records import Sources
 from walop_jax.model import light
-from walop_jax.model.build import nominal_instrument
 from walop_jax.model.compiled import compiled
+from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.parameters import leaves, values_of, with_values
 from walop_jax.model.planning import plan_for
 

@@ -7,7 +7,7 @@ from oracle import forward
 from scipy.optimize import least_squares
 
 from walop_jax.data import builtin_filter
-from walop_jax.model.build import nominal_instrument
+from walop_jax.model.instrument import nominal_instrument
 
 # Paper II, table of the laboratory results: tilt (deg), cross-talk from q into u_m
 TILT = np.array([12.0, 14.0, 16.0, 18.0, 20.0])

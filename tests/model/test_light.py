@@ -10,7 +10,7 @@ from oracle import forward
 from walop_jax.instruments.description import parsed
 from walop_jax.io.errors import DataError
 from walop_jax.model import light
-from walop_jax.model.build import build, nominal_instrument
+from walop_jax.model.instrument import build, nominal_instrument
 from walop_jax.model.planning import plan_for
 
 SETTINGS = (None, 0.0, 45.0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from walop_jax.model.build import nominal_instrument
+from walop_jax.model.instrument import nominal_instrument
 
 NAME = "walop_north_design.fits"
 EVERY = 5  # field points

@@ -12,8 +12,8 @@ import pytest
 from walop_jax.instruments.description import described
 from walop_jax.io.errors import DataError
 from walop_jax.model import materials
-from walop_jax.model.build import nominal_instrument
 from walop_jax.model.elements import Layer, PupilMapping, RadialRetarder, Rotator, WavePlate, Wedge
+from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.ray import Conditions, Ray
 
 WAVELENGTH = jnp.array([0.62])
@@ -77,7 +77,7 @@ def test_wedge_keeps_the_frame_unless_told():
     assert Wedge(angle=0.2).mueller(ray(0.1, 0.1)) is None
     text = described("WALOP-NORTH").text.replace('frame = "turned"', 'frame = "twisted"', 1)
     from walop_jax.instruments.description import parsed
-    from walop_jax.model.build import build
+    from walop_jax.model.instrument import build
 
     with pytest.raises(DataError, match="kept or turned"):
         build(parsed(text, "here"))

@@ -15,11 +15,11 @@ from scipy.interpolate import CubicSpline
 from walop_jax.data.records import FilterCurve, Position
 from walop_jax.io.errors import DataError
 from walop_jax.model.elements import Analyser, SpectralElement
+from walop_jax.model.elements.spectral import spline
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import leaves
 from walop_jax.model.planning import plan_for
 from walop_jax.model.ray import Conditions, Ray
-from walop_jax.model.spline import spline
 
 KNOTS = (1.1, 1.3, 1.45, 2.0, 2.4)
 VALUES = np.array([0.3, -0.2, 1.1, 0.9, 2.5])

@@ -13,9 +13,9 @@ from quick import quick
 from walop_jax.data import builtin_filter
 from walop_jax.data.settings import Settings
 from walop_jax.model import light
-from walop_jax.model.build import nominal_instrument
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.effects.base import Context
+from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.planning import plan_for
 from walop_jax.model.trace import STOKES, Sightline, Stage, trace
 

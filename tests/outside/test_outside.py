@@ -17,9 +17,8 @@ from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.model import light, materials, optics, plates
-from walop_jax.model.build import nominal_instrument
 from walop_jax.model.effects import EFFECTS
-from walop_jax.model.instrument import Instrument
+from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.planning import plan_for
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn

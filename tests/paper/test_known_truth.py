@@ -17,7 +17,7 @@ from walop_jax.calibration.maps import SMALLEST_DETERMINANT
 from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
-from walop_jax.model.build import nominal_instrument
+from walop_jax.model.instrument import nominal_instrument
 from walop_jax.paper import polynomial as paper
 from walop_jax.science import star_errors as accuracy
 from walop_jax.science.apply import apply

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from walop_jax.fit.verdict import STATED
-from walop_jax.model.build import nominal_instrument
+from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.specification import Model, make_model
 from walop_jax.posterior import Convergence, PosteriorSample, sandwich_adjusted

@@ -17,8 +17,8 @@ from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.fit.verdict import Hidden, Quality, Structure
-from walop_jax.model.build import nominal_instrument
 from walop_jax.model.effects import effect_by_name
+from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.specification import effect_context, make_model, with_effects
 from walop_jax.science import apply as application
 from walop_jax.science.apply import COOL, HOT, apply, linearised

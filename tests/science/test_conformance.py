@@ -12,7 +12,7 @@ import pytest
 from walop_jax.commands.conformance import OUTPUTS, conformance
 from walop_jax.io.errors import DataError
 from walop_jax.model.mueller import retarder
-from walop_jax.model.sources.base import turned
+from walop_jax.model.sources import turned
 from walop_jax.science.conformance import Case, cases, judge
 from walop_jax.science.estimate import estimate
 from walop_jax.science.polarisation import polarisation

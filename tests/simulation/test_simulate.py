@@ -23,8 +23,8 @@ from walop_jax.data import (
 from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
-from walop_jax.model.build import nominal_instrument
 from walop_jax.model.effects import effect_by_name
+from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.specification import make_model, with_effects
 from walop_jax.simulation.observing_plan import (

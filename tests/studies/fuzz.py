@@ -57,7 +57,7 @@ from walop_jax.fit.model_file import (  # noqa: E402
     render,
 )
 from walop_jax.fit.verdict import Verdict  # noqa: E402
-from walop_jax.model.build import nominal_instrument  # noqa: E402
+from walop_jax.model.instrument import nominal_instrument  # noqa: E402
 
 SLOWEST = 10  # seconds
 OUTCOMES = ("error", "same", "word", "silent", "traceback", "slow")

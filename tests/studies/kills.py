@@ -41,9 +41,9 @@ from small_run import SEED, SMALL  # noqa: E402
 
 sampling = importlib.import_module("walop_jax.commands.sample")
 diagnosing = importlib.import_module("walop_jax.commands.diagnose")
+from walop_jax.commands.command import switch_on_jax  # noqa: E402
 from walop_jax.commands.compress import compress  # noqa: E402
 from walop_jax.commands.diagnose import diagnose  # noqa: E402
-from walop_jax.commands.program import switch_on_jax  # noqa: E402
 from walop_jax.commands.refit import refit  # noqa: E402
 from walop_jax.commands.sample import sample  # noqa: E402
 from walop_jax.data import DataError, Grid, write_calibration_set, write_frames  # noqa: E402

@@ -81,7 +81,7 @@ ERRORS = (
             "model/test_light.py"),
     planted("model/elements/analyser.py", "jnp.stack([kappa, -kappa])", "jnp.stack([kappa, kappa])",
             "model/test_spectral_element.py", "model/test_light.py", "model/effects/test_effects_of_plates.py"),
-    planted("model/effects/factors.py", "(self.order * angle)", "(2 * self.order * angle)",
+    planted("model/effects/factors.py", "(int(order) * angle)", "(2 * int(order) * angle)",
             "model/effects/test_effects_of_light.py"),
     planted("model/effects/optics.py", "else (x, y + by)", "else (x + by, y)",
             "model/effects/test_effects_of_light.py", "model/effects/test_effects_of_plates.py"),

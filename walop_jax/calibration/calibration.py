@@ -9,7 +9,7 @@ import dataclasses
 import datetime
 import functools
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,10 +40,9 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.text import in_ascii
 from walop_jax.model import carried
-from walop_jax.model.build import adapted, build, nominal_instrument
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects import EFFECTS, Effect
-from walop_jax.model.instrument import Instrument
+from walop_jax.model.instrument import Instrument, adapted, build, nominal_instrument
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.specification import Model, effect_context
 
@@ -65,7 +64,8 @@ class ListedModel(NamedTuple):
     """The model of a calibration as its file holds it, not rebuilt: parameters, and what follows from the model.
 
     `name` is that of the instrument; `maps` are of the matrix; `lines` those of the model file of the fit,
-    `description` those of the description of an instrument that does not come with the package.
+    `description` those of the description of an instrument that does not come with the package; `catalogue` are the
+    effects that the model may have.
     """
 
     name: str
@@ -73,6 +73,7 @@ class ListedModel(NamedTuple):
     maps: MatrixMaps
     lines: tuple[str, ...]
     description: tuple[str, ...] = ()
+    catalogue: tuple[type[Effect], ...] = EFFECTS
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -148,11 +149,10 @@ class Calibration(Displayed):
             hidden=result.hidden,
         )
 
-    def rebuilt(self, catalogue: Sequence[type[Effect]] = EFFECTS) -> Calibration:
+    def rebuilt(self) -> Calibration:
         """The calibration with its model rebuilt from the lines of its file; parameters go by name.
 
-        `catalogue` are the effects that the model may have. Raises ValueError if it cannot be rebuilt, or has other
-        parameters than the file lists.
+        Raises ValueError if it cannot be rebuilt, or has other parameters than the file lists.
         """
         if isinstance(self.fitted, Model):
             return self
@@ -161,7 +161,7 @@ class Calibration(Displayed):
         context = effect_context(adapted(self.design, standards=standards), self.exposures)
         text = "\n".join(self.model_lines)
         model = model_without_data(
-            self.design, text, standards=standards, context=context, catalogue=catalogue
+            self.design, text, standards=standards, context=context, catalogue=self.fitted.catalogue
         )
         if sorted(model.names) != sorted(names):
             odd = sorted(set(model.names) ^ set(names)) or ["one of them twice"]

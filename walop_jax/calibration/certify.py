@@ -7,7 +7,6 @@ model); what is left to find out is whether it says what its own parameters say,
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,6 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.filters import BUILTIN_FILTERS
 from walop_jax.fit.verdict import Quality
-from walop_jax.model.effects import EFFECTS, Effect
 
 MAP_TOLERANCE = 1e-7  # between maps in the file and maps of its parameters, on another machine
 DARKEST = 1e-4  # of the response to unpolarised light: what "less than no light" may be
@@ -51,11 +49,11 @@ def _range(values: Float[np.ndarray, " e"]) -> tuple[float, float]:
     return (float(known.min()), float(known.max())) if known.size else (float("nan"), float("nan"))
 
 
-def certify(product: Calibration, catalogue: Sequence[type[Effect]] = EFFECTS) -> list[Check]:
+def certify(product: Calibration) -> list[Check]:
     """All checks of a product that could be read, in a fixed order; those behind a failed one may be missing."""
     checks = [*_verdict(product), _covariance(product), _validity(product), _parents(product)]
     try:
-        calibration = product.rebuilt(catalogue)
+        calibration = product.rebuilt()
     except ValueError as error:
         return [*checks, Check("model", False, f"cannot be rebuilt: {error}")]
     checks.append(Check("model", True, f"{len(calibration.model.names)} parameters rebuilt by name"))

@@ -8,6 +8,7 @@ Derivatives  to all parameters, and to the amplitudes of effects that are not th
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
@@ -91,23 +92,19 @@ def analysis_vectors(
     x: Vector,
     y: Vector,
     size: int | None = None,
+    *,
+    from_sky: bool = False,
 ) -> Float[np.ndarray, "p b k 4"]:
-    """Analysis vectors (point, band, camera, Stokes) for light behind the telescope, at field positions in degrees.
+    """Analysis vectors (point, band, camera, Stokes) at field positions in degrees; `size` as for `in_chunks`.
 
-    `size` as for `in_chunks`.
+    For light behind the telescope, or `from_sky`, which passes the telescope first.
     """
-    return in_chunks(lambda a, b: (_vectors(instrument, plan, a, b),), x, y, size=size)[0]
+    program = _sky_vectors if from_sky else _vectors
+    return in_chunks(lambda a, b: (program(instrument, plan, a, b),), x, y, size=size)[0]
 
 
-def sky_vectors(
-    instrument: Instrument,
-    plan: Plan,
-    x: Vector,
-    y: Vector,
-    size: int | None = None,
-) -> Float[np.ndarray, "p b k 4"]:
-    """As `analysis_vectors`, for light from the sky, which passes the telescope first."""
-    return in_chunks(lambda a, b: (_sky_vectors(instrument, plan, a, b),), x, y, size=size)[0]
+sky_vectors = functools.partial(analysis_vectors, from_sky=True)
+"""Analysis vectors for light from the sky."""
 
 
 def matrices(

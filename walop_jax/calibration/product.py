@@ -259,13 +259,13 @@ def read_calibration(
     path = product_path(run)
     with open_fits(path) as opened:
         try:
-            found = _Reader(opened).calibration()
+            found = _Reader(opened).calibration(tuple(catalogue))
         except DataError:
             raise
         except UNREADABLE as error:
             raise fail(f"cannot be read: {one_line(error)}", file=path, advice=_AGAIN) from error
     with errors_naming(path):
-        return found.rebuilt(catalogue) if rebuild else found
+        return found.rebuilt() if rebuild else found
 
 
 def product_path(run: str | os.PathLike[str]) -> Path:
@@ -288,7 +288,7 @@ class _Reader:
                 raise fail("is there twice", file=self.path, extension=name, advice="remove one")
             self.hdus[name] = hdu
 
-    def calibration(self) -> Calibration:
+    def calibration(self, catalogue: tuple[type[Effect], ...]) -> Calibration:
         """The calibration as the file lists it, its content hash checked."""
         covariance = self.image("COVARIANCE")
         maps = self.maps()
@@ -309,6 +309,7 @@ class _Reader:
                 maps=maps,
                 lines=model_lines,
                 description=tuple(description["LINE"].tolist()) if description else (),
+                catalogue=catalogue,
             ),
             values=table["VALUE"],
             covariance=covariance,

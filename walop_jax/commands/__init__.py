@@ -21,7 +21,7 @@ COMMANDS = {
     "sample": "Sample the posterior.",
     "report": "Write one HTML page about a run, figures inside.",
     "plot": "Draw a figure of a run, by name, as a file.",
-    "matrix": "Add M21, M22, M23, M31, M32, M33 and their errors to a table of field points (three for each arm).",
+    "matrix": "Say what the instrument matrix is at a field point, or at every point of a table.",
     "apply": "Turn the intensities of stars into Stokes parameters.",
     "compare": "Compare the method of Paper II, as it is published, with the joint fit.",
     "certify": "Check a calibration product from its checksums to its physics.",

@@ -8,14 +8,14 @@ from typing import Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
 from walop_jax.commands.inputs import (
-    NOT_CARRIED_OVER,
+    Effects,
+    Posterior,
+    Product,
+    TableFile,
     calibration_of,
-    catalogue_of,
-    left_out_cards,
-    left_out_sentences,
     table_of,
+    table_outcome,
 )
-from walop_jax.commands.options import Effects, Posterior, Product, TableFile
 from walop_jax.io.errors import errors_naming
 
 CATALOGUE = Argument("FITS, CSV or ECSV with X, Y, N, N_ERR.", "CATALOGUE", Path)
@@ -53,7 +53,7 @@ def apply(
     In Python: an astropy table; `catalogue` is a path, an astropy table, or columns by name.
     """
     from walop_jax.data.catalogue import read_catalogue
-    from walop_jax.data.user_tables import extended, table_format, write_output_table
+    from walop_jax.data.user_tables import table_format
     from walop_jax.fit.verdict import Quality
     from walop_jax.posterior import with_moments
     from walop_jax.science.apply import apply as apply_to_rows
@@ -66,66 +66,48 @@ def apply(
         raise UsageError(f"{saturation} must be above 0 electrons", "saturation")
     if output is not None:
         table_format(output)
-    job.tell("reading", "reading")
-    held = calibration_of(calibration, catalogue_of(effects))
+    job.begin("reading")
+    held = calibration_of(calibration, effects)
     table = table_of(catalogue, {})
-    instrument = held.model.template.patched()
     limit = math.inf if saturation is None else saturation
-    rows = read_catalogue(table, instrument, limit, always_in=held.always_in)
-
+    rows = read_catalogue(table, held.model.template.patched(), limit, always_in=held.always_in)
     job.tell("tabulating the analysis vectors", "tabulating")
     used = held if posterior is None else with_moments(held, posterior)
     with errors_naming(table.path):
         stars = apply_to_rows(
             used, rows, lambda done, total: job.tell(f"{done} of {total} rows"), force=force
         )
-    job.tell("writing", "writing")
-    columns = stokes_columns(stars, rows.star, debias)
-    lost, content = used.left_behind, held.content_hash()
+    job.begin("writing")
     on_the_sky = sum(map(math.isfinite, rows.rotator)) / max(len(rows.rotator), 1)
-    cards = header(content, debias, on_the_sky, stars.check) | left_out_cards(lost)
-    if output is not None:
-        write_output_table(output, table, columns, overwrite=job.overwrite, header=cards)
-
-    bits = (
-        Quality.HIGH_CROSSTALK,
-        Quality.BEYOND_FIELD,
-        Quality.BEYOND_SETTINGS,
-        Quality.CAMERA_MISSING,
-        Quality.SATURATED,
-        Quality.VALIDITY_FORCED,
-        Quality.NO_STOKES,
-        Quality.DISAGREES,
-        Quality.UNKNOWN_COLOUR,
-    )
-    counts = {bit: int((stars.flag & bit > 0).sum()) for bit in bits}
-    said = {
-        Quality.NO_STOKES: "star(s) without a result (FLAG 16384)",
-        Quality.BEYOND_FIELD: "star(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)",
-        Quality.BEYOND_SETTINGS: "star(s) with a filter, temperature or TEFF beyond the calibration",
-        Quality.DISAGREES: "star(s) whose intensities disagree with the calibration (FLAG 131072, CHI2): is "
-        "the background subtracted, are the cameras in order?",
-    }
-    seconds = job.seconds
-    return Outcome(
-        extended(table, columns, cards),
-        lambda: {
-            "output": None if output is None else str(output),
-            "rows": table.rows,
-            "trusted": held.verdict.trusted,
-            "flags": {str(int(bit)): count for bit, count in counts.items()},
-            "product": content,
-            NOT_CARRIED_OVER: list(lost),
+    return table_outcome(
+        job,
+        held,
+        table,
+        stokes_columns(stars, rows.star, debias),
+        header(held.content_hash(), debias, on_the_sky, stars.check),
+        output,
+        flag=stars.flag,
+        told={
+            Quality.NO_STOKES: "star(s) without a result (FLAG 16384)",
+            Quality.BEYOND_FIELD: "star(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)",
+            Quality.BEYOND_SETTINGS: "star(s) with a filter, temperature or TEFF beyond the calibration",
+            Quality.DISAGREES: "star(s) whose intensities disagree with the calibration (FLAG 131072, CHI2): is "
+            "the background subtracted, are the cameras in order?",
+        },
+        untold=(
+            Quality.HIGH_CROSSTALK,
+            Quality.CAMERA_MISSING,
+            Quality.SATURATED,
+            Quality.VALIDITY_FORCED,
+            Quality.UNKNOWN_COLOUR,
+        ),
+        lost=used.left_behind,
+        more={
             "stars": len(stars.qu),
-            "seconds": seconds,
+            "seconds": job.seconds,
             "estimator": debias,
             "catalogue": stars.check.document(),
         },
-        lambda: f"{output}: {table.rows} rows, {len(stars.qu)} stars, {seconds:.1f} s",
-        warnings=(
-            *held.warnings,
-            *left_out_sentences(lost, held.path),
-            *(f"{table.path}: {text} (FLAG {Quality.CATALOGUE:d})" for text in stars.check.warnings()),
-            *(f"{table.path}: {counts[bit]} {text}" for bit, text in said.items() if counts[bit]),
-        ),
+        text=lambda n: f"{output}: {table.rows} rows, {len(stars.qu)} stars, {job.seconds:.1f} s",
+        warnings=[f"{text} (FLAG {Quality.CATALOGUE:d})" for text in stars.check.warnings()],
     )

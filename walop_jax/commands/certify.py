@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands.command import Job, Outcome, command
-from walop_jax.commands.inputs import IN_MEMORY, catalogue_of
-from walop_jax.commands.options import Effects, Product
+from walop_jax.commands.inputs import IN_MEMORY, Effects, Product, catalogue_of, folder_of
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import errors_naming
 
@@ -62,28 +61,24 @@ def certify(job: Job, calibration: Product, effects: Effects = None) -> Outcome[
     In Python: a `Certificate`. Raises `DataError` for a file that cannot be read, has been changed, or is of another
     version.
     """
+    from walop_jax import Calibration, FitResult
     from walop_jax.calibration import product_path, read_calibration
-    from walop_jax.calibration.calibration import Calibration
     from walop_jax.calibration.certify import certify as checks_of
     from walop_jax.calibration.certify import validity
-    from walop_jax.commands.reading import Run
-    from walop_jax.fit.refit import FitResult
 
     job.tell("checking")
     if isinstance(calibration, Calibration | FitResult):
         there = Calibration.from_fit(calibration) if isinstance(calibration, FitResult) else calibration
         path, product = Path(IN_MEMORY), there
     else:
-        path = product_path(calibration.folder if isinstance(calibration, Run) else calibration)
-        product = read_calibration(path, rebuild=False)
+        path = product_path(folder_of(calibration))
+        product = read_calibration(path, catalogue_of(effects), rebuild=False)
     with errors_naming(path):
-        checks = tuple(checks_of(product, catalogue_of(effects)))
+        checks = tuple(checks_of(product))
     parents = tuple(entry.sha256 for entry in product.inputs)
     found = Certificate(path, checks, validity(product), product.content_hash(), parents)
     why = "; ".join(f"{check.name} ({check.found})" for check in found.failed)
     return Outcome(
         found,
-        found.document,
-        lambda: found.display().text(),
         failure=f"{path}: not valid: {why}" if found.failed else "",
     )

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.inputs import catalogue_of
-from walop_jax.commands.options import Effects, PathLike
+from walop_jax.commands.inputs import Effects, PathLike, catalogue_of
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
@@ -29,9 +28,9 @@ def cite(
     from walop_jax.calibration import product_path, read_calibration
     from walop_jax.fit import minimise
     from walop_jax.fit.model_file import model_without_data
-    from walop_jax.model.bibtex import bibtex as entries
-    from walop_jax.model.build import nominal_instrument
+    from walop_jax.model.instrument import nominal_instrument
     from walop_jax.model.references import Reference, references
+    from walop_jax.model.references import bibtex as entries
 
     if run is None:
         model = model_without_data(nominal_instrument())

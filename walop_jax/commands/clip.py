@@ -6,8 +6,15 @@ import dataclasses
 from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Job, Option, Outcome, command
-from walop_jax.commands.inputs import IN_MEMORY, catalogue_of, set_and_model
-from walop_jax.commands.options import Effects, InstrumentLike, ModelLike, SetFile, Sets
+from walop_jax.commands.inputs import (
+    IN_MEMORY,
+    Effects,
+    InstrumentLike,
+    ModelLike,
+    SetFile,
+    Sets,
+    set_and_model,
+)
 from walop_jax.io.errors import fail
 from walop_jax.io.progress import Stage
 
@@ -45,8 +52,8 @@ def clip(
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.outliers import clipped
 
-    job.tell("reading", "reading")
-    calset, chosen = set_and_model(data, model, instrument, catalogue_of(effects))
+    job.begin("reading")
+    calset, chosen = set_and_model(data, model, instrument, effects)
     if not isinstance(calset.intensities, TableIntensities) or calset.compression is not None:
         raise fail(
             "cannot be clipped",
@@ -59,7 +66,7 @@ def clip(
         # Of too many rows the model lacks something: no need to ask what.
         result = found.result.judged() if found.too_many else examined(found.result, as_written=True)
         found = dataclasses.replace(found, result=result)
-    job.tell("writing", "writing")
+    job.begin("writing")
     if output is not None:
         write_calibration_set(output, found.calset, overwrite=job.overwrite)
     share = f"{100 * found.share:.2g} %"

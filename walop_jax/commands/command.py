@@ -23,6 +23,8 @@ from walop_jax.io.progress import Stage
 if TYPE_CHECKING:
     from walop_jax.io.folder import OutputFolder
 
+CACHE_VARIABLE = "WALOP_JAX_CACHE"
+
 T = TypeVar("T")
 Tell = Callable[[str], None]
 Writers = Mapping[str, Callable[[Path], object]]
@@ -80,6 +82,10 @@ class Job:
         """Say what is being done; `stage` is the one of the command that begins with it."""
         self.progress(Stage(text, stage) if stage else text)
 
+    def begin(self, stage: str) -> None:
+        """Say that a stage of the command begins, by its name."""
+        self.tell(stage, stage)
+
     @property
     def seconds(self) -> float:
         """The time since the command began."""
@@ -113,9 +119,17 @@ class Job:
     def use_jax(self) -> None:
         """Switch JAX on, for commands that most often do without it."""
         if self.typed:
-            from walop_jax.commands.program import switch_on_jax
-
             switch_on_jax()
+
+
+def text_file(text: str) -> Callable[[Path], object]:
+    """What writes a file of text."""
+    return lambda path: path.write_text(text, encoding="utf-8")
+
+
+def figure_file(figure: Any) -> Callable[[Path], object]:
+    """What writes a figure as a picture."""
+    return lambda path: figure.savefig(path, dpi=130)
 
 
 def _nothing() -> Writers:
@@ -126,7 +140,8 @@ def _nothing() -> Writers:
 class Outcome(Generic[T]):
     """What a command has found: `value` for Python; the rest is worked out when it is asked for.
 
-    `document` is the result as plain data, `text` as a terminal shows it. `files` write the files of the output folder,
+    `document` is the result as plain data, `text` as a terminal shows it: what the value says of itself, unless given.
+    `files` write the files of the output folder,
     each given its path; the document is written as the file `saved_as`. `warnings` are sentences to bear in mind.
     `failure` says what has gone wrong (exit code 1), `trusted` whether the result can be used (exit code 3 if not).
     `next` are command lines that one might want to type next. `silent`: nothing of it is shown; `markdown`: the text is
@@ -134,8 +149,8 @@ class Outcome(Generic[T]):
     """
 
     value: T
-    document: Callable[[], Any]
-    text: Callable[[], str]
+    document: Callable[[], Any] | None = None
+    text: Callable[[], str] | None = None
     files: Callable[[], Writers] = _nothing
     saved_as: str = ""
     warnings: Sequence[str] = ()
@@ -148,7 +163,13 @@ class Outcome(Generic[T]):
     @functools.cached_property
     def content(self) -> Any:
         """The document, made once."""
-        return self.document()
+        value: Any = self.value
+        return (self.document or value.document)()
+
+    def shown(self) -> str:
+        """The text."""
+        value: Any = self.value
+        return value.display().text() if self.text is None else self.text()
 
     def save(self, folder: OutputFolder, drop: Sequence[str] = ()) -> None:
         """Put all files into the output folder: they appear together, or none does."""
@@ -158,7 +179,7 @@ class Outcome(Generic[T]):
             for name, write in self.files().items():
                 write(temporary / name)
             if self.saved_as:
-                (temporary / self.saved_as).write_text(json_text(self.content), encoding="utf-8")
+                text_file(json_text(self.content))(temporary / self.saved_as)
 
 
 COMMON = {
@@ -262,3 +283,40 @@ def command(
     `jax`: it computes. `given` may rearrange the arguments of a call in Python.
     """
     return lambda body: Command(body, stages, writes, random, jax, given).function
+
+
+# --------------------------------------------------------------------------------------------- the compiled programs
+
+
+def cache_folder() -> Path | None:
+    """Where compiled code is kept between runs; None when that is switched off or impossible.
+
+    WALOP_JAX_CACHE names the folder ("off": none), otherwise it is walop-jax/xla in the user's cache folder.
+    """
+    chosen = os.environ.get(CACHE_VARIABLE, "")
+    if chosen.lower() in ("off", "0", "none"):
+        return None
+    try:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(chosen) if chosen else Path(base) / "walop-jax" / "xla"
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # no home
+        return None
+    return folder if os.access(folder, os.W_OK | os.X_OK) else None
+
+
+def switch_on_jax() -> None:
+    """Import JAX with float64 and with the cache of compiled code, which makes later runs start fast."""
+    import jax
+
+    from walop_jax.model import kept_programs
+
+    jax.config.update("jax_enable_x64", True)
+    folder = cache_folder()
+    if folder is not None:
+        with contextlib.suppress(OSError):
+            (folder / kept_programs.FOLDER).mkdir(exist_ok=True)
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+        jax.config.update("jax_raise_persistent_cache_errors", False)

@@ -6,22 +6,24 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Job, Option, Outcome, Writers, command
+from walop_jax.commands.command import Job, Option, Outcome, Writers, command, figure_file
 from walop_jax.commands.inputs import (
     NOT_CARRIED_OVER,
+    Effects,
+    Folder,
+    InstrumentLike,
+    ModelLike,
+    PathLike,
+    Sets,
     calibration_of,
-    catalogue_of,
     left_out_cards,
     left_out_sentences,
     set_and_model,
     set_of,
 )
-from walop_jax.commands.options import Effects, Folder, InstrumentLike, ModelLike, PathLike, Sets
 
 if TYPE_CHECKING:
-    from walop_jax.calibration.calibration import Calibration
-    from walop_jax.commands.reading import Run
-    from walop_jax.fit.refit import FitResult
+    from walop_jax import Calibration, FitResult, Run
     from walop_jax.paper.comparison import Comparison
     from walop_jax.science.star_errors import Truth
 
@@ -54,22 +56,21 @@ def compare(
     In Python: a `Comparison`; `calibration` is the joint fit (default: made here). Raises ValueError if that does not
     converge, and for a `calibration` or `truth` in memory together with `output`.
     """
-    from walop_jax.calibration.calibration import Calibration
+    from walop_jax import Calibration
     from walop_jax.data.field_points import true_matrices
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.refit import refit
     from walop_jax.io.plain_tables import write_columns
     from walop_jax.paper.comparison import compare as comparison_of
-    from walop_jax.reports import paper_figures as comparison_figures
+    from walop_jax.reports import paper_figures
     from walop_jax.science.star_errors import Truth
 
     if output is not None and (calibration is not None or isinstance(truth, Truth)):
         raise ValueError("with output the joint fit is made anew: leave calibration and truth in memory out")
-    catalogue = catalogue_of(effects)
-    job.tell("reading", "reading")
-    held = None if calibration is None else calibration_of(calibration, catalogue)
+    job.begin("reading")
+    held = None if calibration is None else calibration_of(calibration, effects)
     if held is None:
-        calset, chosen = set_and_model(data, model, instrument, catalogue, output=output)
+        calset, chosen = set_and_model(data, model, instrument, effects, output=output)
     else:
         calset, chosen = set_of(data), held.model
     if isinstance(truth, str | os.PathLike):
@@ -87,14 +88,11 @@ def compare(
     lost = joint.left_behind
 
     def files() -> Writers:
-        drawn = {name: getattr(comparison_figures, f"{name}_figure")(found) for name in FIGURES}
+        drawn = {name: getattr(paper_figures, f"{name}_figure")(found) for name in FIGURES}
         columns = {name: (values, "", about) for name, (values, about) in found.columns().items()}
         return {
             TABLE: lambda path: write_columns(path, columns, left_out_cards(lost)),
-            **{
-                f"comparison_{name}.png": lambda path, figure=figure: figure.savefig(path, dpi=130)
-                for name, figure in drawn.items()
-            },
+            **{f"comparison_{name}.png": figure_file(figure) for name, figure in drawn.items()},
         }
 
     return Outcome(

@@ -6,12 +6,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from walop_jax.commands.command import Job, Outcome, command
-from walop_jax.commands.inputs import IN_MEMORY, catalogue_of, in_bytes, set_and_model
-from walop_jax.commands.options import Effects, InstrumentLike, Memory, ModelLike, SetFile, Sets
+from walop_jax.commands.inputs import (
+    IN_MEMORY,
+    Effects,
+    InstrumentLike,
+    Memory,
+    ModelLike,
+    SetFile,
+    Sets,
+    in_bytes,
+    path_text,
+    set_and_model,
+)
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
-    from walop_jax.data.records import CalibrationSet
+    from walop_jax import CalibrationSet
 
 
 @command(stages=("reading", "fitting", "compressing"), writes="file")
@@ -40,8 +50,8 @@ def compress(
     from walop_jax.fit.stand_in import compressed, with_pixel_structure
     from walop_jax.likelihood.frames import PixelPosterior
 
-    job.tell("reading", "reading")
-    calset, chosen = set_and_model(data, model, instrument, catalogue_of(effects))
+    job.begin("reading")
+    calset, chosen = set_and_model(data, model, instrument, effects)
     with job.repeated() as say:
         result = refit(calset, chosen, progress=say, memory=in_bytes(memory))
     if not isinstance(result.posterior, PixelPosterior):
@@ -53,7 +63,7 @@ def compress(
         )
     if not result.converged:
         raise ValueError(f"the fit of the frames did not converge ({result.minimum.message})")
-    job.tell("compressing", "compressing")
+    job.begin("compressing")
     found = with_pixel_structure(compressed(result.posterior), pixel_structure(result))
     if output is not None:
         write_calibration_set(output, found, overwrite=job.overwrite)
@@ -64,7 +74,7 @@ def compress(
     return Outcome(
         found,
         lambda: {
-            "output": None if output is None else str(output),
+            "output": path_text(output),
             "points": points,
             "pixels": record.pixels,
             "chi2": record.chi2,

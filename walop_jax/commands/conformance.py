@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Job, Option, Outcome, UsageError, command
-from walop_jax.commands.options import PathLike
+from walop_jax.commands.inputs import PathLike
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import fail, nearest
 from walop_jax.io.text import read_text

@@ -5,9 +5,15 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Job, Option, Outcome, Writers, command
-from walop_jax.commands.inputs import catalogue_of, set_and_model
-from walop_jax.commands.options import Effects, Folder, InstrumentLike, ModelLike, Sets
+from walop_jax.commands.command import Job, Option, Outcome, Writers, command, text_file
+from walop_jax.commands.inputs import (
+    Effects,
+    Folder,
+    InstrumentLike,
+    ModelLike,
+    Sets,
+    set_and_model,
+)
 from walop_jax.io.text import json_text
 
 if TYPE_CHECKING:
@@ -39,8 +45,8 @@ def diagnose(
 
     In Python: a `Diagnosis`; `effects=(*walop.EFFECTS, MyEffect)` adds one of your own to those that may be named.
     """
+    from walop_jax import Calibration
     from walop_jax.calibration import PRODUCT, SUMMARY, summary, write_calibration
-    from walop_jax.calibration.calibration import Calibration
     from walop_jax.diagnosis.figure_data import figure_data
     from walop_jax.diagnosis.figure_file import FIGURE_DATA, write_figure_data
     from walop_jax.diagnosis.findings import DIAGNOSIS, document
@@ -49,13 +55,10 @@ def diagnose(
     from walop_jax.fit.model_file import render
     from walop_jax.science.field_accuracy import answered
 
-    job.tell("reading", "reading")
-    catalogue = catalogue_of(effects)
-    calset, chosen = set_and_model(data, model, instrument, catalogue, output=output)
+    job.begin("reading")
+    calset, chosen = set_and_model(data, model, instrument, effects, output=output)
     with job.repeated() as say:
-        found = diagnosis_of(
-            calset, chosen, catalogue=catalogue, seed=job.seed, minutes=minutes, progress=say
-        )
+        found = diagnosis_of(calset, chosen, seed=job.seed, minutes=minutes, progress=say)
 
     after = answered(found.after)
 
@@ -67,9 +70,9 @@ def diagnose(
         drawn_from = figure_data(found)
         return {
             PRODUCT: lambda path: write_calibration(path, product),
-            SUMMARY: lambda path: path.write_text(json_text(fitted), encoding="utf-8"),
+            SUMMARY: text_file(json_text(fitted)),
             FIGURE_DATA: lambda path: write_figure_data(path, drawn_from),
-            MODEL: lambda path: path.write_text(render(after.model), encoding="utf-8"),
+            MODEL: text_file(render(after.model)),
         }
 
     return Outcome(

@@ -18,6 +18,10 @@ import typing
 from collections.abc import Callable, Mapping
 from typing import Any
 
+PathLike = str | os.PathLike[str]
+SHARED = {"Any": Any, "Mapping": Mapping, "PathLike": PathLike, "Sequence": collections.abc.Sequence}
+"""Names that the annotations of shared arguments use."""
+
 WORDS = {
     "CalibrationSet": "a calibration set",
     "Model": "a model",
@@ -142,10 +146,8 @@ def _listed(signature: inspect.Signature) -> str:
 
 def _kind(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
     """The kind of argument that a parameter asks for; Any where that cannot be told."""
-    from walop_jax.commands import options
-
     found = parameter.annotation
-    names = _Names(vars(options) | vars(sys.modules[function.__module__]))
+    names = _Names(SHARED | vars(sys.modules[function.__module__]))
     for _ in range(4):
         if isinstance(found, str):
             found = eval(found, {}, names)

@@ -7,15 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command
-from walop_jax.commands.inputs import calibration_of, catalogue_of, set_of
-from walop_jax.commands.options import SETS, Effects, PathLike
+from walop_jax.commands.inputs import SETS, Effects, PathLike, calibration_of, catalogue_of, set_of
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
-    from walop_jax.calibration.calibration import Calibration
-    from walop_jax.commands.reading import Run
-    from walop_jax.data.records import CalibrationSet
-    from walop_jax.fit.refit import FitResult
+    from walop_jax import Calibration, CalibrationSet, FitResult, Run
     from walop_jax.science.epoch import Epoch
 
 OLD = Argument("Old calibration product, or folder of a run.", "OLD", Path)
@@ -44,17 +40,16 @@ def epoch(
 
     In Python: an `Epoch`; what is missing is looked for only with `output`.
     """
+    from walop_jax import Calibration
     from walop_jax.calibration import write_calibration
-    from walop_jax.calibration.calibration import Calibration
     from walop_jax.diagnosis.findings import document
     from walop_jax.diagnosis.trust import examined
     from walop_jax.diagnosis.workflow import diagnose
     from walop_jax.science.epoch import epoch as compared
     from walop_jax.science.epoch import fit_like
 
-    catalogue = catalogue_of(effects)
-    job.tell("reading", "reading")
-    held, calset = calibration_of(old, catalogue), set_of(new)
+    job.begin("reading")
+    held, calset = calibration_of(old, effects), set_of(new)
     job.tell("fitting the new set", "fitting")
     with errors_naming(held.path):
         result = examined(fit_like(held, calset))
@@ -64,7 +59,12 @@ def epoch(
         job.tell("looking for what the new fit lacks", "lacking")
         # Other readings of the data have been tried when its fit was examined.
         lacking = diagnose(
-            calset, result.model, catalogue=catalogue, as_written=True, seed=job.seed, progress=job.progress
+            calset,
+            result.model,
+            catalogue=catalogue_of(effects),
+            as_written=True,
+            seed=job.seed,
+            progress=job.progress,
         )
 
     def text() -> str:

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.options import PathLike, SetFile
+from walop_jax.commands.inputs import PathLike, SetFile, path_text
 from walop_jax.io.errors import nearest
 
 if TYPE_CHECKING:
-    from walop_jax.data.records import CalibrationSet
+    from walop_jax import CalibrationSet
 
 FOLDER = Argument('Folder of "Polarization Transmission" text exports.', "FOLDER", Path)
 INSTRUMENT = Option("Which instrument; default: what the titles say.", kind=str)
@@ -60,7 +60,7 @@ def import_zemax(
     if output is not None:
         write_calibration_set(output, made, overwrite=job.overwrite)
     document = {
-        "output": None if output is None else str(output),
+        "output": path_text(output),
         "instrument": made.instrument,
         "wavelengths": [float(curve.wavelength[0]) for curve in made.filters.values()],
         "exposures": len(made.exposures),

@@ -1,24 +1,26 @@
-"""What was given as what: sets, models, calibrations and tables, in memory or in files."""
+"""What commands share: the arguments that several take, on the command line and in Python, and how they are read.
+
+Sets, models, calibrations and tables may be given in memory or as files; `read` is the door for whatever the program
+has written.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.io.errors import errors_naming
-from walop_jax.io.text import read_text
+from walop_jax.commands.command import Argument, Job, Option, Outcome
+from walop_jax.commands.door import PathLike
+from walop_jax.io.errors import errors_naming, fail
+from walop_jax.io.text import in_ascii, read_text
 
 if TYPE_CHECKING:
-    from walop_jax.calibration import Calibration
-    from walop_jax.commands.options import Effects, InstrumentLike, ModelLike, PathLike, Product, Sets
-    from walop_jax.data.records import CalibrationSet
+    from walop_jax import Calibration, CalibrationSet, Effect, FitResult, Instrument, Model, Run
     from walop_jax.data.user_tables import InputTable
-    from walop_jax.model.effects import Effect
-    from walop_jax.model.instrument import Instrument
-    from walop_jax.model.specification import Model
+    from walop_jax.fit.verdict import Quality
 
 GIGABYTE = 1e9
 IN_MEMORY = "in memory"
@@ -27,10 +29,78 @@ IN_MEMORY = "in memory"
 NOT_CARRIED_OVER = "not_carried_over"
 """Where results in JSON list the effects of a model that had to be left out."""
 
+# --------------------------------------------------------------------------------------------------- options
+
+SETS = Argument("Calibration sets (FITS), fitted as one.", metavar="CALSET...", kind=list[Path])
+EFFECTS = Option(
+    "Effects of your own beside those of the catalogue; see walop-jax docs adding-an-effect.", "FILE.py", Path
+)
+
+Sets = Annotated["CalibrationSet | PathLike | Sequence[PathLike]", SETS]
+ModelLike = Annotated[
+    "Model | PathLike | None", Option("Model file: what is free, tied, known, added.", "MODEL.toml", Path)
+]
+InstrumentLike = Annotated[
+    "Instrument | PathLike | None",
+    Option(
+        "An instrument that comes with the package, or a description file; see walop-jax instrument.",
+        "NAME|FILE.toml",
+        str,
+    ),
+]
+Effects = Annotated["PathLike | Sequence[type[Effect]] | None", EFFECTS]
+Product = Annotated[
+    "Calibration | FitResult | Run | PathLike",
+    Argument("Calibration product, or the folder of a run.", "RUN/calibration.fits", Path),
+]
+Posterior = Annotated[
+    "PathLike | None",
+    Option("Use draws of walop-jax sample, not the covariance.", "posterior.nc", Path),
+]
+Memory = Annotated["float | None", Option("Memory for the data, in GB.", "GB", float, least=0.1)]
+
+Folder = Annotated["PathLike | None", Option("Folder of the results.", "RUN", Path, "-o", required=True)]
+SetFile = Annotated[
+    "PathLike | None", Option("Calibration set to write (FITS).", "SET.fits", Path, "-o", required=True)
+]
+TableFile = Annotated[
+    "PathLike | None", Option("Table to write (.fits, .csv, .ecsv).", "OUT", Path, "-o", required=True)
+]
+
+
+# ---------------------------------------------------------------------------------------------------- reading
+
+
+def read(
+    *paths: PathLike, kinds: Collection[str] = (), catalogue: Effects = None
+) -> CalibrationSet | Calibration | Run:
+    """Read calibration sets (several become one), a calibration product, or the folder of a run.
+
+    `kinds` are kinds of exposures beyond those of the format, `catalogue` the effects that a fitted model may have.
+    Raises `DataError`, naming file, extension, column and row, for what cannot be read or trusted.
+    """
+    from walop_jax import Run
+    from walop_jax.calibration import FAILED, PRODUCT, read_calibration
+    from walop_jax.data import read_calibration_set
+    from walop_jax.io.fits_reading import primary_keywords
+    from walop_jax.posterior.files import DOCUMENTS
+
+    if not paths:
+        raise fail("no file was given", advice="name a calibration set, a calibration product or a run")
+    first = Path(paths[0])
+    if len(paths) == 1 and first.is_dir():
+        if not any((first / name).exists() for name in (*DOCUMENTS.values(), PRODUCT)):
+            what = f"holds no results{', its fit did not converge' if (first / FAILED).exists() else ''}"
+            raise fail(what, file=first, advice="give the RUN of a command, or a FITS file")
+        return Run(first, catalogue_of(catalogue))
+    if len(paths) == 1 and "PRODVERS" in primary_keywords(first):
+        return read_calibration(first, catalogue_of(catalogue))
+    return read_calibration_set(*paths, kinds=kinds)
+
 
 def catalogue_of(effects: Effects) -> tuple[type[Effect], ...]:
     """The effects that a model may have: those of the package, of the package and a file, or those given."""
-    from walop_jax.model.effects.own import catalogue_with
+    from walop_jax.model.effects.catalogue import catalogue_with
 
     if effects is None or isinstance(effects, str | os.PathLike):
         return catalogue_with(effects)
@@ -39,14 +109,14 @@ def catalogue_of(effects: Effects) -> tuple[type[Effect], ...]:
 
 def design_of(instrument: InstrumentLike) -> Instrument | None:
     """The instrument as designed: as given, or read; None if nothing was given."""
-    from walop_jax.model.instrument import Instrument
+    from walop_jax import Instrument
 
     return Instrument.read(instrument) if isinstance(instrument, str | os.PathLike) else instrument
 
 
 def paths_of(data: Sets) -> tuple[PathLike, ...]:
     """The files of calibration sets; ValueError for a set that comes from none."""
-    from walop_jax.data.records import CalibrationSet
+    from walop_jax import CalibrationSet
 
     if isinstance(data, CalibrationSet):
         paths = tuple(entry.path for entry in data.inputs)
@@ -58,9 +128,10 @@ def paths_of(data: Sets) -> tuple[PathLike, ...]:
 
 def set_of(data: Sets, instrument: Instrument | None = None) -> CalibrationSet:
     """A checked set: files are checked as they are read, tables in memory here."""
+    from walop_jax import CalibrationSet
     from walop_jax.data import read_calibration_set
     from walop_jax.data.from_arrays import checked
-    from walop_jax.data.records import KINDS, CalibrationSet
+    from walop_jax.data.records import KINDS
     from walop_jax.data.table_intensities import TableIntensities
 
     if not isinstance(data, CalibrationSet):
@@ -74,21 +145,20 @@ def set_and_model(
     data: Sets,
     model: ModelLike,
     instrument: InstrumentLike,
-    catalogue: Sequence[type[Effect]],
+    effects: Effects = None,
     *,
     output: PathLike | None = None,
 ) -> tuple[CalibrationSet, Model]:
     """Calibration sets as one, and the model to fit to them.
 
     `model` is one, or a model file (None: the base model); `instrument` as designed, or its name or description file
-    (None: what the sets say); `catalogue` are the effects that a model file may name. With `output` the folder of a
+    (None: what the sets say); `effects` are those that a model file may name. With `output` the folder of a
     run is written: it is made from files, so that it can be made again.
 
     Raises `DataError` for files that cannot be read, ValueError, naming the file, for a model that does not fit.
     """
+    from walop_jax import Instrument, Model
     from walop_jax.fit.model_file import model_for
-    from walop_jax.model.instrument import Instrument
-    from walop_jax.model.specification import Model
 
     text = read_text(model) if isinstance(model, str | os.PathLike) else ""
     if output is not None:
@@ -100,24 +170,31 @@ def set_and_model(
     design = design_of(instrument)
     calset = set_of(data, design)
     if isinstance(model, Model):
-        return calset, model
+        known = model.catalogue if effects is None else catalogue_of(effects)
+        return calset, dataclasses.replace(model, catalogue=known)
     with errors_naming(model):
-        return calset, model_for(calset, text, design, catalogue)
+        return calset, model_for(calset, text, design, catalogue_of(effects))
 
 
-def calibration_of(given: Product, catalogue: Sequence[type[Effect]]) -> Calibration:
+def calibration_of(given: Product, effects: Effects = None) -> Calibration:
     """A calibration: as given, that of a fit, or that of a product or run, with what its file says.
 
     Raises `DataError` for a file that cannot be read.
     """
-    from walop_jax.calibration import Calibration, read_calibration
-    from walop_jax.commands.reading import Run
-    from walop_jax.fit.refit import FitResult
+    from walop_jax import Calibration, FitResult
+    from walop_jax.calibration import read_calibration
 
     if isinstance(given, Calibration | FitResult):
         there = given if isinstance(given, Calibration) else Calibration.from_fit(given)
         return there if there.path is not None else dataclasses.replace(there, path=Path(IN_MEMORY))
-    return read_calibration(given.folder if isinstance(given, Run) else given, catalogue)
+    return read_calibration(folder_of(given), catalogue_of(effects))
+
+
+def folder_of(run: Run | PathLike) -> Path:
+    """The folder of a run, or whatever else a path names."""
+    from walop_jax import Run
+
+    return run.folder if isinstance(run, Run) else Path(run)
 
 
 def table_of(given: Any, columns: dict[str, Any]) -> InputTable:
@@ -148,6 +225,58 @@ def left_out_sentences(names: Sequence[str], source: PathLike | None = None) -> 
 
 def left_out_cards(names: Sequence[str]) -> dict[str, str]:
     """The card NOTCARR of a table, which lists the effects that cannot be carried over; none where all are in it."""
-    from walop_jax.io.text import in_ascii
-
     return {"NOTCARR": in_ascii(", ".join(names))} if names else {}
+
+
+def table_outcome(
+    job: Job,
+    held: Calibration,
+    table: InputTable,
+    columns: Mapping[str, tuple[Any, ...]],
+    cards: Mapping[str, Any],
+    output: PathLike | None,
+    *,
+    flag: Any,
+    told: Mapping[Quality, str],
+    untold: Sequence[Quality],
+    lost: Sequence[str],
+    text: Callable[[Mapping[Quality, int]], str],
+    more: Mapping[str, Any] | None = None,
+    warnings: Sequence[str] = (),
+) -> Outcome[Any]:
+    """A table with what a calibration adds to it, written if it has an output.
+
+    `flag` are the bits of its rows: those `told` have a warning each, those `untold` are counted only. `lost` are the
+    effects that could not be carried over, `more` goes into the document, `text` is given the counts.
+    """
+    from walop_jax.data.user_tables import extended, write_output_table
+
+    cards = {**cards, **left_out_cards(lost)}
+    if output is not None:
+        write_output_table(output, table, columns, overwrite=job.overwrite, header=cards)
+    counts = {bit: int((flag & bit > 0).sum()) for bit in sorted((*told, *untold))}
+    document = {
+        "output": path_text(output),
+        "rows": table.rows,
+        "trusted": held.verdict.trusted,
+        "flags": {str(int(bit)): count for bit, count in counts.items()},
+        "product": held.content_hash(),
+        NOT_CARRIED_OVER: list(lost),
+        **(more or {}),
+    }
+    return Outcome(
+        extended(table, columns, cards),
+        lambda: document,
+        lambda: text(counts),
+        warnings=(
+            *held.warnings,
+            *left_out_sentences(lost, held.path),
+            *(f"{table.path}: {sentence}" for sentence in warnings),
+            *(f"{table.path}: {counts[bit]} {sentence}" for bit, sentence in told.items() if counts[bit]),
+        ),
+    )
+
+
+def path_text(output: PathLike | None) -> str | None:
+    """A path as documents hold it; None where nothing is written."""
+    return None if output is None else str(output)

@@ -7,8 +7,7 @@ import math
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Outcome, command
-from walop_jax.commands.inputs import IN_MEMORY, paths_of
-from walop_jax.commands.options import SETS, Sets
+from walop_jax.commands.inputs import IN_MEMORY, SETS, Sets, paths_of
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError
 
@@ -109,15 +108,15 @@ def inspect(
     In Python: an `InspectedSets`. Raises `DataError` only if the sets cannot be one: what is wrong with a single file
     is among its faults.
     """
+    from walop_jax import CalibrationSet
     from walop_jax.data import read_calibration_set
     from walop_jax.data.inspection import inspect as inspection_of
-    from walop_jax.data.records import CalibrationSet
 
     if isinstance(data, CalibrationSet):
         one = inspection_of(data)
         bad = tuple(str(entry) for entry in one.findings if entry.severity == "fault")
         made = InspectedSets(((", ".join(one.files) or IN_MEMORY, one),), None, bad)
-        return Outcome(made, made.document, lambda: made.display().text(), failure="; ".join(bad))
+        return Outcome(made, failure="; ".join(bad))
     sets: list[tuple[str, Inspection | DataError]] = []
     faults: list[str] = []
     paths = paths_of(data)

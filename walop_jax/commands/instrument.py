@@ -6,12 +6,11 @@ import dataclasses
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.options import PathLike
+from walop_jax.commands.inputs import PathLike
 from walop_jax.io.display import Display, Displayed
 
 if TYPE_CHECKING:
-    from walop_jax.model.instrument import Instrument
-    from walop_jax.model.specification import Model
+    from walop_jax import Instrument, Model
 
 SOURCE = Argument("A shipped instrument or a description file; none: list them.", "[NAME|FILE.toml]", str)
 TEXT = Option("Print the description itself, to start one's own from.")
@@ -109,7 +108,7 @@ def instrument(
         return Outcome(own, lambda: {"name": str(source), "text": own}, lambda: own)
     job.use_jax()
     found = checked(source)
-    return Outcome(found, found.document, lambda: found.display().text())
+    return Outcome(found)
 
 
 def checked(source: PathLike) -> CheckedInstrument:
@@ -118,11 +117,10 @@ def checked(source: PathLike) -> CheckedInstrument:
     import jax.numpy as jnp
     import numpy as np
 
+    from walop_jax import DataError, Instrument
     from walop_jax.fit.model_file import model_without_data
-    from walop_jax.io.errors import DataError
     from walop_jax.model import light
     from walop_jax.model.dependence import needs, optical_indices
-    from walop_jax.model.instrument import Instrument
     from walop_jax.model.plan import blank_plan
 
     def camera_vectors(design: Instrument, plan: Any, x: Any, y: Any) -> Any:

@@ -7,15 +7,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command
-from walop_jax.commands.inputs import catalogue_of, paths_of, set_and_model
-from walop_jax.commands.options import Effects, InstrumentLike, ModelLike, PathLike
+from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command, figure_file
+from walop_jax.commands.inputs import (
+    Effects,
+    InstrumentLike,
+    ModelLike,
+    PathLike,
+    catalogue_of,
+    paths_of,
+    set_and_model,
+)
 
 if TYPE_CHECKING:
-    from walop_jax.data.records import CalibrationSet
+    from walop_jax import CalibrationSet, FitResult, ObservingPlan
     from walop_jax.diagnosis.limits_found import DetectionLimits
-    from walop_jax.fit.refit import FitResult
-    from walop_jax.simulation.observing_plan import ObservingPlan
 
 DATA = Argument(
     "Calibration sets (FITS), fitted as one, or an observing plan in place of them.",
@@ -49,16 +54,16 @@ def limits(
     In Python: `DetectionLimits`, of a fit, an observing plan, or what `refit` takes; its `to_table()` is a row for each
     effect and parameter. Raises ValueError for a fit that does not converge.
     """
+    from walop_jax import FitResult, ObservingPlan
     from walop_jax.diagnosis.detection_limits import detection_limits
     from walop_jax.diagnosis.trust import examined
-    from walop_jax.fit.refit import FitResult, refit
+    from walop_jax.fit.refit import refit
     from walop_jax.reports.diagnosis_figures import protection_figure, separation_figure
-    from walop_jax.simulation.observing_plan import ObservingPlan
     from walop_jax.simulation.plan_file import is_plan, read_plan
     from walop_jax.simulation.simulate import as_planned
 
-    catalogue = catalogue_of(effects)
-    job.tell("reading", "reading")
+    job.begin("reading")
+    asked = None if effects is None else catalogue_of(effects)
     plan = data if isinstance(data, ObservingPlan) else None
     if (
         isinstance(data, str | os.PathLike | Sequence)
@@ -70,17 +75,16 @@ def limits(
         result = data
     else:
         planned = data if plan is None else as_planned(plan)
-        calset, chosen = set_and_model(planned, model, instrument, catalogue)  # pyright: ignore[reportArgumentType]
+        calset, chosen = set_and_model(planned, model, instrument, effects)  # pyright: ignore[reportArgumentType]
         result = examined(refit(calset, chosen, progress=job.progress))
     if not result.converged:
         raise ValueError(f"the fit did not converge ({result.minimum.message})")
-    found = detection_limits(result, catalogue=catalogue, seed=job.seed, progress=job.progress)
+    found = detection_limits(result, catalogue=asked, seed=job.seed, progress=job.progress)
 
     def files() -> Writers:
-        protection, separation = protection_figure(found), separation_figure(found)
         return {
-            OUTPUTS[1]: lambda path: protection.savefig(path, dpi=130),
-            OUTPUTS[2]: lambda path: separation.savefig(path, dpi=130),
+            OUTPUTS[1]: figure_file(protection_figure(found)),
+            OUTPUTS[2]: figure_file(separation_figure(found)),
         }
 
     return Outcome(
@@ -98,8 +102,7 @@ def limits(
                 "seed": job.seed,
             }
         ),
-        lambda: found.display().text(),
-        files,
+        files=files,
         saved_as=OUTPUTS[0],
         warnings=tuple(f"the fit: {text}" for text in result.warnings),
     )

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated, Any
 
 from walop_jax.commands.command import Job, Option, Outcome, UsageError, command
 from walop_jax.commands.inputs import (
-    NOT_CARRIED_OVER,
+    Effects,
+    PathLike,
+    Posterior,
+    Product,
     calibration_of,
-    catalogue_of,
-    left_out_cards,
-    left_out_sentences,
     table_of,
+    table_outcome,
 )
-from walop_jax.commands.options import Effects, PathLike, Posterior, Product
 from walop_jax.io.errors import errors_naming, nearest
 
 POINTS = Option("FITS, CSV, ECSV or VOTable with X, Y in degrees.", "TABLE", Path)
@@ -42,10 +43,10 @@ def matrix(
     effects: Effects = None,
     **columns: Any,
 ) -> Outcome[Any]:
-    """Say what the instrument matrix is at a field point, or add M21, M22, M23, M31, M32, M33 and their errors to a
-    table of field points (three for each arm).
+    """Say what the instrument matrix is at a field point, or at every point of a table.
 
-    P_ERR is added: the standard error of p of a star with p ≤ 5 %, from the calibration alone.
+    Added are M21, M22, M23, M31, M32, M33 and their errors (three for each arm), and P_ERR: the standard error of p of
+    a star with p ≤ 5 %, from the calibration alone.
 
     X and Y in degrees; optional TEFF, FILTER, TEMP, HA (absent: flat spectrum, SDSS-r, 10 Celsius, on the
     meridian), and CHWP_ANGLE, CHWP_IN, or those of any other moving element of the instrument (absent: out).
@@ -58,7 +59,7 @@ def matrix(
     table, columns by name. `columns` are others of those above, such as teff=5000.
     """
     from walop_jax.data.field_points import POINT_COLUMNS, field_points
-    from walop_jax.data.user_tables import extended, table_format, write_output_table
+    from walop_jax.data.user_tables import table_format
     from walop_jax.fit.verdict import Quality
     from walop_jax.io.plain_tables import MatrixTable
     from walop_jax.posterior import with_draws
@@ -71,64 +72,41 @@ def matrix(
         raise UsageError("say where the table is to be written", "output")
     if output is not None:
         table_format(output)
-    held = calibration_of(calibration, catalogue_of(effects))
+    held = calibration_of(calibration, effects)
     instrument = held.model.template.patched()
-    known = [
-        *POINT_COLUMNS,
-        *(f"{prefix}{end}" for prefix in instrument.moving() for end in ("_IN", "_ANGLE")),
-    ]
+    moving = (f"{prefix}{end}" for prefix in instrument.moving() for end in ("_IN", "_ANGLE"))
+    known = (*POINT_COLUMNS, *moving)
     for name in columns:
         if name.upper() not in known:
-            raise TypeError(
-                f"matrix: there is no argument or column {name!r}; {nearest(name.upper(), known)}"
-            )
+            what = f"there is no argument or column {name!r}; {nearest(name.upper(), known)}"
+            raise TypeError(f"matrix: {what}")
     table = table_of({"X": x, "Y": y} if points is None else points, columns)
     wanted = field_points(table, instrument, held.always_in)
     job.tell("working out the matrix")
     used = held if posterior is None else with_draws(held, posterior)
     with errors_naming(table.path):
         added = used.matrix_columns(wanted.x, wanted.y, wanted.settings, wanted.outside)
-    lost, content = used.left_behind, held.content_hash()
-    cards = used.provenance(content) | left_out_cards(lost)
-    if output is not None:
-        write_output_table(output, table, added, overwrite=job.overwrite, header=cards)
-
-    flag = added["FLAG"][0]
-    bits = (Quality.HIGH_CROSSTALK, Quality.BEYOND_FIELD, Quality.BEYOND_SETTINGS)
-    counts = {bit: int((flag & bit > 0).sum()) for bit in bits}
-    said = {
-        Quality.BEYOND_FIELD: "point(s) beyond the calibrated field: extrapolated, or NaN",
-        Quality.BEYOND_SETTINGS: "row(s) with a filter or temperature not in the calibration",
-    }
-    made = MatrixTable(extended(table, added, cards), copy=False)
-    return Outcome(
-        made,
-        lambda: {
-            "output": None if output is None else str(output),
-            **(
-                {"matrix": {name: column[0].tolist() for name, column in added.items()}}
-                if x is not None
-                else {}
-            ),
-            "rows": table.rows,
-            "trusted": held.verdict.trusted,
-            "flags": {str(int(bit)): count for bit, count in counts.items()},
-            "product": content,
-            NOT_CARRIED_OVER: list(lost),
+    crossed = Quality.HIGH_CROSSTALK
+    numbers = {"matrix": {name: column[0].tolist() for name, column in added.items()}}
+    found = table_outcome(
+        job,
+        held,
+        table,
+        added,
+        used.provenance(held.content_hash()),
+        output,
+        flag=added["FLAG"][0],
+        told={
+            Quality.BEYOND_FIELD: "point(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)",
+            Quality.BEYOND_SETTINGS: "row(s) with a filter or temperature not in the calibration (FLAG 64)",
         },
-        lambda: (
-            str(made)
-            if output is None
-            else f"{output}: {table.rows} rows, {counts[Quality.HIGH_CROSSTALK]} of them in zones of high cross-talk"
-        ),
-        next=() if output is not None else ("walop-jax matrix RUN --points TABLE -o OUT, for many points",),
-        warnings=(
-            *held.warnings,
-            *left_out_sentences(lost, held.path),
-            *(
-                f"{table.path}: {counts[bit]} {text} (FLAG {bit:d})"
-                for bit, text in said.items()
-                if counts[bit]
-            ),
-        ),
+        untold=(crossed,),
+        lost=used.left_behind,
+        more={} if x is None else numbers,
+        text=lambda n: f"{output}: {table.rows} rows, {n[crossed]} of them in zones of high cross-talk",
     )
+    made = MatrixTable(found.value, copy=False)
+    if output is not None:
+        return dataclasses.replace(found, value=made)
+    advice = ("walop-jax matrix RUN --points TABLE -o OUT, for many points",)
+    return dataclasses.replace(found, value=made, text=lambda: str(made), next=advice)

@@ -8,13 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.inputs import catalogue_of, design_of, set_of
-from walop_jax.commands.options import Effects, InstrumentLike, PathLike
+from walop_jax.commands.inputs import Effects, InstrumentLike, PathLike, catalogue_of, design_of, set_of
 from walop_jax.io.display import Display, Displayed
 
 if TYPE_CHECKING:
-    from walop_jax.data.records import CalibrationSet
-    from walop_jax.model.specification import Model
+    from walop_jax import CalibrationSet, Model
 
 SETS = Argument("Calibration sets that the model is for: standards, gauges.", "[CALSET...]", list[Path])
 FILE = Option("File to write; default: stdout.", "MODEL.toml", Path, "-o")
@@ -76,7 +74,7 @@ def model(
     """
     from walop_jax.fit.model_file import effects_text, model_for, model_without_data, render
     from walop_jax.io.atomic import atomic_path
-    from walop_jax.model.build import nominal_instrument
+    from walop_jax.model.instrument import nominal_instrument
 
     catalogue = catalogue_of(effects)
     changes = effects_text(effect or ())
@@ -90,4 +88,4 @@ def model(
         with atomic_path(output, overwrite=job.overwrite) as temporary:
             temporary.write_text(text, encoding="utf-8")
     found = ModelFile(made, text, None if output is None else Path(output))
-    return Outcome(found, found.document, lambda: text if output is None else found.display().text())
+    return Outcome(found, text=(lambda: text) if output is None else None)

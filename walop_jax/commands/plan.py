@@ -5,14 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command
-from walop_jax.commands.inputs import calibration_of, catalogue_of
-from walop_jax.commands.options import Folder, PathLike
+from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command, text_file
+from walop_jax.commands.inputs import Folder, PathLike, calibration_of
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
+    from walop_jax import ObservingPlan
     from walop_jax.plans.plan import ExposurePlan
-    from walop_jax.simulation.observing_plan import ObservingPlan
 
 PLAN, RESULT = "plan.toml", "plan.json"
 
@@ -48,8 +47,8 @@ def plan(
 
     In Python: the plan. Raises ValueError for a time that pays for nothing or determines nothing.
     """
+    from walop_jax import ObservingPlan
     from walop_jax.plans.plan import plan_exposures
-    from walop_jax.simulation.observing_plan import ObservingPlan
     from walop_jax.simulation.plan_file import is_plan, plan_text, read_plan
 
     if isinstance(could, ObservingPlan):
@@ -60,19 +59,17 @@ def plan(
         wanted = ObservingPlan(str(could))
     if not minutes > 0:
         raise fail("nothing can be observed in no time", advice="give --minutes")
-    known = None if after is None else calibration_of(after, catalogue_of(None))
+    known = None if after is None else calibration_of(after)
     job.tell("information of exposures", "information")
     with job.repeated() as say:
         found = plan_exposures(wanted, minutes, known=known, draws=draws, seed=job.seed, progress=say)
 
     def files() -> Writers:
-        text = plan_text(found.observing_plan)
-        return {PLAN: lambda path: path.write_text(text, encoding="utf-8")}
+        return {PLAN: text_file(plan_text(found.observing_plan))}
 
     return Outcome(
         found,
         lambda: found.document() | {"seed": job.seed},
-        lambda: found.display().text(),
-        files,
+        files=files,
         saved_as=RESULT,
     )

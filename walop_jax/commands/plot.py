@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.inputs import catalogue_of
-from walop_jax.commands.options import Effects, PathLike
+from walop_jax.commands.inputs import Effects, PathLike, catalogue_of, folder_of
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
-    from walop_jax.commands.reading import Run
+    from walop_jax import Run
 
 FORMATS = (".pdf", ".png", ".svg", ".eps", ".jpg")
 RUN = Argument("Folder of results; none: list the figures.", "[RUN]", Path)
@@ -41,7 +40,6 @@ def plot(
     In Python: the matplotlib figure, written if `output` is given; without a name, what each figure shows, by name.
     Raises `DataError`, with the nearest names, for a figure that does not exist and for what the run lacks.
     """
-    from walop_jax.commands.reading import Run
     from walop_jax.io.atomic import check_output
     from walop_jax.reports.named import FIGURES, Source, draw
     from walop_jax.reports.posterior_figures import save_figure
@@ -57,7 +55,7 @@ def plot(
         if path.suffix.lower() not in FORMATS:
             raise fail("is no picture that can be written", file=path, advice=f"use {', '.join(FORMATS)}")
         check_output(path, overwrite=job.overwrite)
-    folder = run.folder if isinstance(run, Run) else Path(run)
+    folder = folder_of(run)
     if not folder.is_dir():
         raise fail(
             "is not the folder of a run", file=folder, advice="give the RUN of walop-jax refit or diagnose"

@@ -16,11 +16,19 @@ import typer
 from typer.core import TyperGroup
 
 from walop_jax.commands import COMMANDS, INTERRUPTED
-from walop_jax.commands.command import COMMON, Argument, Command, Job, Option, Outcome, UsageError
+from walop_jax.commands.command import (
+    COMMON,
+    Argument,
+    Command,
+    Job,
+    Option,
+    Outcome,
+    UsageError,
+    switch_on_jax,
+)
 from walop_jax.io.progress import interrupts_answered
 
 STARTED = time.perf_counter()
-CACHE_VARIABLE = "WALOP_JAX_CACHE"
 DEBUG_VARIABLE = "WALOP_JAX_DEBUG"
 LINE_EVERY = 10.0  # s, of progress that is no terminal's
 WIDEST = 120  # columns: longer lines are hard to read
@@ -206,7 +214,7 @@ def _show(found: Outcome[Any], quiet: bool, json: bool) -> None:
         from walop_jax.io.text import json_text
 
         typer.echo(json_text(found.content), nl=False)
-    elif not quiet and (text := found.text()):
+    elif not quiet and (text := found.shown()):
         _print(text, found.markdown)
         if found.next and not found.failure:
             typer.echo(f"Done in {seconds_since_start():.0f} s. Next: {' or '.join(found.next)}")
@@ -309,40 +317,3 @@ def step_counter(stages: Sequence[str]) -> Callable[[str], str]:
         return f"step {reached} of {len(stages)}: {message}" if reached else message
 
     return numbered
-
-
-# --------------------------------------------------------------------------------------------- the compiled programs
-
-
-def cache_folder() -> Path | None:
-    """Where compiled code is kept between runs; None when that is switched off or impossible.
-
-    WALOP_JAX_CACHE names the folder ("off": none), otherwise it is walop-jax/xla in the user's cache folder.
-    """
-    chosen = os.environ.get(CACHE_VARIABLE, "")
-    if chosen.lower() in ("off", "0", "none"):
-        return None
-    try:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        folder = Path(chosen) if chosen else Path(base) / "walop-jax" / "xla"
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError):  # no home
-        return None
-    return folder if os.access(folder, os.W_OK | os.X_OK) else None
-
-
-def switch_on_jax() -> None:
-    """Import JAX with float64 and with the cache of compiled code, which makes later runs start fast."""
-    import jax
-
-    from walop_jax.model import kept_programs
-
-    jax.config.update("jax_enable_x64", True)
-    folder = cache_folder()
-    if folder is not None:
-        with contextlib.suppress(OSError):
-            (folder / kept_programs.FOLDER).mkdir(exist_ok=True)
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-        jax.config.update("jax_raise_persistent_cache_errors", False)

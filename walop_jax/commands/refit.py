@@ -11,11 +11,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Job, Option, Outcome, Writers, command
-from walop_jax.commands.inputs import catalogue_of, in_bytes, paths_of, set_and_model
-from walop_jax.commands.options import Effects, Folder, InstrumentLike, Memory, ModelLike, PathLike, Sets
+from walop_jax.commands.inputs import (
+    Effects,
+    Folder,
+    InstrumentLike,
+    Memory,
+    ModelLike,
+    PathLike,
+    Sets,
+    in_bytes,
+    paths_of,
+    set_and_model,
+)
 
 if TYPE_CHECKING:
-    from walop_jax.fit.refit import FitResult
+    from walop_jax import FitResult
     from walop_jax.likelihood.runner import Processes
 
 ProcessesOption = Option(
@@ -55,8 +65,8 @@ def refit(
     In Python: the fit. Without `output`, finished slabs are kept in `folder` (default: nowhere), and the same call
     goes on from them. Raises `DataError` for data that cannot be trusted, ValueError for a model that does not fit.
     """
+    from walop_jax import Calibration
     from walop_jax.calibration import FAILED, PARTIAL, PRODUCT, SUMMARY, summary, write_calibration
-    from walop_jax.calibration.calibration import Calibration
     from walop_jax.calibration.residual_map import residual_map
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.misfit import describe
@@ -73,8 +83,8 @@ def refit(
         job = dataclasses.replace(job, progress=tell)
         # Of several processes the first one writes; it alone holds the folder.
         with job.reserved(output if first else None, (PRODUCT, SUMMARY)) as job:
-            job.tell("reading", "reading")
-            calset, chosen = set_and_model(data, model, instrument, catalogue_of(effects), output=output)
+            job.begin("reading")
+            calset, chosen = set_and_model(data, model, instrument, effects, output=output)
             kept = folder if output is None else Path(output) / PARTIAL
             with job.repeated() as say:
                 fitted = fit(

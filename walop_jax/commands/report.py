@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.inputs import catalogue_of
-from walop_jax.commands.options import Effects, PathLike
+from walop_jax.commands.inputs import Effects, PathLike, catalogue_of, folder_of
 from walop_jax.io.display import Display, Displayed
 
 if TYPE_CHECKING:
-    from walop_jax.commands.reading import Run
+    from walop_jax import Run
 
 PAGE = "report.html"
 GENERATOR = '<meta name="generator" content="walop-jax'
@@ -56,17 +55,16 @@ def report(
 
     In Python: a `Page`.
     """
-    from walop_jax.commands.reading import Run
     from walop_jax.io.atomic import atomic_path, check_output
     from walop_jax.io.text import printable
     from walop_jax.reports.page import kind_of_run, render, render_other
     from walop_jax.reports.run import read_run
 
-    folder = run.folder if isinstance(run, Run) else Path(run)
+    folder = folder_of(run)
     target = folder / PAGE if output is None else Path(output)
-    job.tell("reading", "reading")
+    job.begin("reading")
     kind = kind_of_run(folder)
-    found = read_run(folder) if kind == "fit" else None
+    found = read_run(Run(folder, catalogue_of(effects))) if kind == "fit" else None
     overwrite = job.overwrite or _is_page(target)
     check_output(target, overwrite=overwrite)
     if found is None:
@@ -74,7 +72,7 @@ def report(
         text, missing = render_other(folder, kind)
     else:
         job.tell("working out the accuracy of p")
-        accuracy, lacking = _accuracy(found, catalogue_of(effects))
+        accuracy, lacking = _accuracy(found)
         job.tell("drawing", "drawing")
         missing = (*found.missing, *lacking)
         text = render(dataclasses.replace(found, missing=missing), accuracy)
@@ -82,7 +80,7 @@ def report(
     with atomic_path(target, overwrite=overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")
     page = Page(target, len(text.encode()), missing)
-    return Outcome(page, page.document, lambda: page.display().text())
+    return Outcome(page)
 
 
 def _is_page(path: Path) -> bool:
@@ -94,14 +92,14 @@ def _is_page(path: Path) -> bool:
         return False
 
 
-def _accuracy(run: Any, catalogue: Any) -> tuple[Any, tuple[str, ...]]:
+def _accuracy(run: Any) -> tuple[Any, tuple[str, ...]]:
     """The accuracy of p over the field, or in words why it is not known."""
     from walop_jax.science.field_accuracy import field_accuracy
 
     if run.product is None:
         return None, ()
     try:
-        found = field_accuracy(run.product.rebuilt(catalogue))
+        found = field_accuracy(run.product.rebuilt())
     except ValueError as error:
         return None, (f"The accuracy of p over the field is not known: {error}.",)
     lacking = ("The instrument has a single arm: the accuracy of p depends on how stars are observed.",)

@@ -9,15 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command
-from walop_jax.commands.inputs import catalogue_of
-from walop_jax.commands.options import Effects, ModelLike, PathLike
+from walop_jax.commands.inputs import Effects, ModelLike, PathLike, catalogue_of, folder_of
 from walop_jax.io.errors import fail, nearest
 from walop_jax.io.text import read_text
 
 if TYPE_CHECKING:
-    from walop_jax.calibration import Calibration
-    from walop_jax.commands.reading import Run
-    from walop_jax.fit.refit import FitResult
+    from walop_jax import Calibration, FitResult, Run
     from walop_jax.posterior import PosteriorSample, Progress
 
 RUN = Argument("Folder of a `walop-jax refit`.", "RUN", Path)
@@ -56,9 +53,7 @@ def sample(
     sampled (None: the physics coefficients); other keywords are the fields of `walop.Options`. Raises `DataError` if
     the run is no folder of a fit, holds a posterior already, or does not fit its data any more.
     """
-    from walop_jax.commands.reading import Run
-    from walop_jax.fit.refit import FitResult
-    from walop_jax.posterior import Options
+    from walop_jax import FitResult, Options
     from walop_jax.posterior import sample as sample_fit
 
     known = {field.name for field in dataclasses.fields(Options)}
@@ -88,12 +83,11 @@ def sample(
         posterior = sample_fit(fit, options, report=tell)
         where = "the fit"
     else:
-        where = fit.folder if isinstance(fit, Run) else Path(fit)
+        where = folder_of(fit)
         posterior = _sampled_run(job, where, options, tell, model, resume, effects)
     return Outcome(
         posterior,
-        posterior.document,
-        lambda: f"{posterior.display().text()}\n{posterior.seconds:.0f} s",
+        text=lambda: f"{posterior.display().text()}\n{posterior.seconds:.0f} s",
         warnings=posterior.warnings,
         failure=""
         if posterior.sampled_well
@@ -106,10 +100,10 @@ def _sampled_run(
     job: Job, folder: Path, options: Any, tell: Any, model: ModelLike, resume: bool, effects: Effects
 ) -> PosteriorSample:
     """The posterior around the fit in a folder, written there, with the covariance in its product if it can be."""
+    from walop_jax import Model, Run
     from walop_jax.calibration import PRODUCT, read_calibration
     from walop_jax.io.folder import output_folder
-    from walop_jax.model.specification import Model
-    from walop_jax.posterior import Checkpoints, Run, digest_of_fit
+    from walop_jax.posterior import Checkpoints, digest_of_fit
     from walop_jax.posterior import sample as sample_fit
 
     catalogue = catalogue_of(effects)
@@ -122,7 +116,7 @@ def _sampled_run(
     if found and not (job.overwrite or resume):
         raise fail(f"holds {found[0]} already", file=folder, advice="go on with --resume, or --overwrite it")
     with output_folder(folder, OUTPUTS, overwrite=True) as out:
-        product = read_calibration(folder / PRODUCT, rebuild=False)
+        product = read_calibration(folder / PRODUCT, catalogue, rebuild=False)
         result = Run(folder, catalogue).fit(text)
         if job.overwrite and not resume:
             Checkpoints(folder / CHAINS, {}).clear()
@@ -130,12 +124,12 @@ def _sampled_run(
         fitted = digest_of_fit(product.inputs, product.fitted.names, product.values)
         posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted, fit=fitted)
         with out.filled(OUTPUTS + ((PRODUCT,) if posterior.trusted else ())) as temporary:
-            for name, write in _writers(product, posterior, catalogue).items():
+            for name, write in _writers(product, posterior).items():
                 write(temporary / name)
     return posterior
 
 
-def _writers(product: Calibration, posterior: PosteriorSample, catalogue: Any) -> Writers:
+def _writers(product: Calibration, posterior: PosteriorSample) -> Writers:
     """The files of a sampled run."""
     from walop_jax.calibration import PRODUCT, write_calibration
     from walop_jax.io.plain_tables import write_columns
@@ -159,7 +153,7 @@ def _writers(product: Calibration, posterior: PosteriorSample, catalogue: Any) -
         "sample.json": lambda path: path.write_text(json_text(posterior.document()), encoding="utf-8"),
     }
     if posterior.trusted:
-        better = product.rebuilt(catalogue).with_covariance(posterior.covariance, posterior.errors_from)
+        better = product.rebuilt().with_covariance(posterior.covariance, posterior.errors_from)
         writers[PRODUCT] = lambda path: write_calibration(path, better)
     return writers
 

@@ -11,14 +11,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import catalogue_of, design_of
-from walop_jax.commands.options import Effects, InstrumentLike, PathLike, SetFile
+from walop_jax.commands.inputs import (
+    Effects,
+    InstrumentLike,
+    PathLike,
+    SetFile,
+    catalogue_of,
+    design_of,
+    path_text,
+)
 from walop_jax.io.text import json_text
 
 if TYPE_CHECKING:
-    from walop_jax.model.effects import Effect
-    from walop_jax.model.instrument import Instrument
-    from walop_jax.simulation.observing_plan import ObservingPlan
+    from walop_jax import Effect, Instrument, ObservingPlan
     from walop_jax.simulation.simulate import Simulated
 
 PLAN = Argument("Observing plan (TOML), in place of the options that make one.", "[PLAN.toml]", Path)
@@ -78,9 +83,9 @@ def simulate(
     plan, an `Instrument` as `instrument` is the true one, not drawn. `noiseless`: expected counts, with the errors that
     they would have. The same plan, seed and effects give the same set, bit for bit.
     """
+    from walop_jax import Instrument
     from walop_jax.data.write import write_calibration_set
     from walop_jax.io.atomic import atomic_path, check_output
-    from walop_jax.model.instrument import Instrument
     from walop_jax.simulation.plan_file import read_plan
     from walop_jax.simulation.simulate import effect_from_text
     from walop_jax.simulation.simulate import simulate as simulated
@@ -109,7 +114,7 @@ def simulate(
         check_output(truth, overwrite=job.overwrite)
     job.tell("following the light", "following")
     made = simulated(plan, job.seed, instrument=true, effects=hidden, noiseless=noiseless)
-    job.tell("writing", "writing")
+    job.begin("writing")
     with contextlib.ExitStack() as stack:
         if truth is not None:
             temporary = stack.enter_context(atomic_path(truth, overwrite=job.overwrite))
@@ -117,14 +122,14 @@ def simulate(
         if output is not None:
             write_calibration_set(output, made.calset, overwrite=job.overwrite)
     document = {
-        "output": None if output is None else str(output),
+        "output": path_text(output),
         "instrument": plan.name,
         "seed": job.seed,
         "exposures": len(made.calset.exposures),
         "points": len(made.calset.points),
         "rows": made.calset.intensities.rows,
         "effects": [one.name for one in hidden],
-        "truth": None if truth is None else str(truth),
+        "truth": path_text(truth),
     }
     return Outcome(
         made,
@@ -140,8 +145,9 @@ def _plan(
     design: Instrument | None, *, angles: int, full_turn: bool, plate: bool, narrow_bands: bool, **more: Any
 ) -> ObservingPlan:
     """The plan that the options ask for."""
-    from walop_jax.model.build import nominal_instrument
-    from walop_jax.simulation.observing_plan import NARROW_BANDS, ObservingPlan, polariser_turn
+    from walop_jax import ObservingPlan
+    from walop_jax.model.instrument import nominal_instrument
+    from walop_jax.simulation.observing_plan import NARROW_BANDS, polariser_turn
 
     design = design or nominal_instrument()
     turn = polariser_turn(angles, full_turn=full_turn)

@@ -11,17 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
 from walop_jax.commands.inputs import (
     NOT_CARRIED_OVER,
+    Effects,
+    InstrumentLike,
+    PathLike,
     calibration_of,
-    catalogue_of,
     design_of,
     left_out_sentences,
 )
-from walop_jax.commands.options import Effects, InstrumentLike, PathLike
 
 if TYPE_CHECKING:
-    from walop_jax.calibration.calibration import Calibration
-    from walop_jax.commands.reading import Run
-    from walop_jax.fit.refit import FitResult
+    from walop_jax import Calibration, FitResult, Run
     from walop_jax.model.trace import Stage
 
 PRODUCT = Argument("An instrument as fitted; without it, as designed.", "[RUN/calibration.fits]", Path)
@@ -66,10 +65,9 @@ def trace(
     In Python: the stages. Angles of moving elements are keywords, chwp=45, or `at`. Raises ValueError, with the nearest
     names, for an unknown instrument, filter or moving element.
     """
+    from walop_jax import Settings, Sightline
     from walop_jax.data.filters import builtin_filter
-    from walop_jax.data.settings import Settings
-    from walop_jax.model.build import nominal_instrument
-    from walop_jax.model.trace import Sightline
+    from walop_jax.model.instrument import nominal_instrument
     from walop_jax.model.trace import trace as traced
 
     there = {name.upper(): value for name, value in positions.items()} | _angles(at)
@@ -85,7 +83,7 @@ def trace(
     except ValueError as error:
         raise UsageError(str(error)) from None  # the options say all there is
     if calibration is not None:
-        held = calibration_of(calibration, catalogue_of(effects))
+        held = calibration_of(calibration, effects)
         lost = held.left_behind
         stages = traced(held.model.instrument(held.values), held.filter_curve(filter), line)
         warnings = (*held.warnings, *left_out_sentences(lost, held.path))

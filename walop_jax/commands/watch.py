@@ -6,9 +6,8 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command
-from walop_jax.commands.inputs import calibration_of, catalogue_of, table_of
-from walop_jax.commands.options import Effects, PathLike, Product
+from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command, figure_file
+from walop_jax.commands.inputs import Effects, PathLike, Product, calibration_of, table_of
 
 if TYPE_CHECKING:
     from walop_jax.science.watch import Watch
@@ -45,8 +44,8 @@ def watch(
     from walop_jax.reports.watch_figures import watch_figure
     from walop_jax.science.watch import watch as watched
 
-    job.tell("reading", "reading")
-    held = calibration_of(calibration, catalogue_of(effects))
+    job.begin("reading")
+    held = calibration_of(calibration, effects)
     given = list(catalogues) if isinstance(catalogues, list | tuple) else [catalogues]
     instrument, always_in = held.model.template.patched(), held.always_in
     rows = [read_catalogue(table_of(entry, {}), instrument, always_in=always_in) for entry in given]
@@ -56,17 +55,16 @@ def watch(
         found = watched(held, rows, force=force)
 
     def files() -> Writers:
-        figure, table = watch_figure(found), found.to_table()
+        table = found.to_table()
         return {
             OUTPUTS[1]: lambda path: table.write(path, format="fits"),
-            OUTPUTS[2]: lambda path: figure.savefig(path, dpi=130),
+            OUTPUTS[2]: figure_file(watch_figure(found)),
         }
 
     return Outcome(
         found,
         lambda: {"product": held.content_hash()} | found.document(),
-        lambda: found.display().text(),
-        files,
+        files=files,
         saved_as=OUTPUTS[0],
         warnings=held.warnings,
         trusted=found.holds,

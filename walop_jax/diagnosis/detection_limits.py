@@ -44,7 +44,7 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.fit.stand_in import on_field_points
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood import limits
-from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects import Effect
 from walop_jax.model.parameters import field_declarations
 from walop_jax.model.specification import effect_context
 
@@ -55,7 +55,7 @@ _ABSORBED = 1e-9  # share of the square of a column that a rival leaves below wh
 def detection_limits(
     result: FitResult,
     *,
-    catalogue: Sequence[type[Effect]] = EFFECTS,
+    catalogue: Sequence[type[Effect]] | None = None,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> DetectionLimits:
@@ -66,6 +66,7 @@ def detection_limits(
     """
     tell = progress or (lambda text: None)
     template, calset = result.model.template, result.calset
+    catalogue = result.model.catalogue if catalogue is None else catalogue
     context = effect_context(template, calset.exposures)
     fitting = applicable(catalogue, context, template)
     wanted = list(all_probes(fitting, context))

@@ -18,7 +18,7 @@ from walop_jax.likelihood.columns import Change, Columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.dependence import changed_elements, conditions_asked_by
 from walop_jax.model.effects import Context, Effect
-from walop_jax.model.effects.sentence import Sentence
+from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations
 from walop_jax.model.ray import CONDITIONS

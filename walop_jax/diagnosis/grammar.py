@@ -29,15 +29,11 @@ from walop_jax.diagnosis.effect_columns import FEWEST_POINTS, Probe
 from walop_jax.diagnosis.freeform import RINGS
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import Context, Described, Effect
+from walop_jax.model.effects.change import BAND, OPPOSITE, SKY
+from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.etalon import GAPS, QUARTER
-from walop_jax.model.effects.sentence import (
-    BAND,
-    DISPLACEMENTS,
-    OPPOSITE,
-    POLARISATION,
-    SKY,
-    Sentence,
-)
+from walop_jax.model.effects.optics import Displacement
+from walop_jax.model.effects.sources import Polarisation
 from walop_jax.model.elements import Polariser, PupilMapping, WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.responses import acts
@@ -304,14 +300,14 @@ def _of_field_and_band(instrument: Instrument, asked: _Asked) -> Iterator[tuple[
     yield (Sentence("shift", "of", BAND),)
     for element in instrument.train() if asked.over_field else ():
         if isinstance(element, PupilMapping):
-            moved = tuple(Sentence(kind, "ahead of", element.name) for kind in DISPLACEMENTS)
+            moved = tuple(Sentence(kind, "ahead of", element.name) for kind in Displacement.names)
             yield moved
             for factor in (*asked.slow(), *asked.hour_angle()):
                 yield _times(moved, factor)
 
 
 def _of_sources(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
-    own = tuple(Sentence(kind, "of", SKY) for kind in POLARISATION)
+    own = tuple(Sentence(kind, "of", SKY) for kind in Polarisation.names)
     moon = np.flatnonzero((asked.exposures.kind == "moon") & ~asked.exposures.clp_in)
     if moon.size:
         yield own[2:]
@@ -321,7 +317,7 @@ def _of_sources(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentenc
         if len(each) > 1:
             yield tuple(itertools.chain(*each))
     for name in instrument.standard.names:
-        yield tuple(Sentence(kind, "of", name.replace(" ", "_")) for kind in POLARISATION[:2])
+        yield tuple(Sentence(kind, "of", name.replace(" ", "_")) for kind in Polarisation.names[:2])
 
 
 def _together(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:

@@ -50,7 +50,7 @@ from walop_jax.likelihood import limits
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.compiled import forget_programs
-from walop_jax.model.effects import EFFECTS, Context, Described, Effect, FreeForm, OtherDescription
+from walop_jax.model.effects import Context, Described, Effect, FreeForm, OtherDescription
 from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import Model, effect_context
 
@@ -62,7 +62,7 @@ def diagnose(
     calset: CalibrationSet,
     model: Model | None = None,
     *,
-    catalogue: Sequence[type[Effect]] = EFFECTS,
+    catalogue: Sequence[type[Effect]] | None = None,
     seed: int = 0,
     minutes: float | None = None,
     as_written: bool = False,
@@ -71,9 +71,10 @@ def diagnose(
 ) -> Diagnosis:
     """Find what `model` (default: the base model) lacks to explain a calibration set.
 
-    `catalogue` are the effects that may be named, `policy` the thresholds. Of a set with more than
-    `limits.DIAGNOSED_ROWS` (exposure, point) pairs, or whose columns would be more than `limits.DIAGNOSED_NUMBERS`,
-    points spread over the field are looked at. Nothing further is tried after `minutes` (default: those of the policy);
+    `catalogue` are the effects that may be named (default: those that the model knows), `policy` the thresholds. Of a
+    set with more than `limits.DIAGNOSED_ROWS` (exposure, point) pairs, or whose columns would be more than
+    `limits.DIAGNOSED_NUMBERS`, points spread over the field are looked at. Nothing further is tried after `minutes`
+    (default: those of the policy);
     what is left then has no name, and `Diagnosis.caution` says so. Both fits are examined. Other readings of the data
     are not tried where the caller has done that already (`as_written`). Raises what `fit` raises, and `DataError` for
     data that another reading explains (`mixups`).
@@ -82,6 +83,7 @@ def diagnose(
     tell = progress or (lambda text: None)
     policy = policy if minutes is None else dataclasses.replace(policy, minutes=minutes)
     model = model or base_model(calset)
+    catalogue = model.catalogue if catalogue is None else catalogue
     calset = in_field_points(calset, model, tell, pixel_structure)
     context = effect_context(model.template, calset.exposures)
     every = grammar.sentences(model.template, calset.exposures, len(calset.points))

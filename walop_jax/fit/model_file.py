@@ -9,6 +9,9 @@
     [effects.blemish]           # discrete choices of an effect that has some
     camera = 2
 
+    [catalogue.stressed_window] # entries of effects of one's own: docs adding-an-effect
+    about = "…"
+
     [parameters."half2.plate.mgf2"]
     start = 1930.0
     prior = [1930.0, 1.0]       # mean and standard deviation, or "none"
@@ -36,39 +39,44 @@ from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
 from walop_jax.io.text import parse_toml
 from walop_jax.likelihood import limits
-from walop_jax.model.build import adapted, as_designed, nominal_instrument
 from walop_jax.model.effects import EFFECTS, Context, Effect, effect_by_name
-from walop_jax.model.instrument import Instrument
+from walop_jax.model.effects.catalogue import entries, is_own
+from walop_jax.model.instrument import Instrument, adapted, as_designed, nominal_instrument
 from walop_jax.model.parameters import Parameter, unknown_name
 from walop_jax.model.sources import MoonSky, Standards
 from walop_jax.model.specification import THROUGHPUT, Model, effect_context, make_model, with_effects
 
-TABLES = ("model", "effects", "parameters")
+TABLES = ("model", "effects", "catalogue", "parameters")
 MODEL_KEYS = ("instrument", "plates", "throughput_degree", "effects")
 PARAMETER_KEYS = ("start", "prior", "free", "tie", "unit", "scale", "about")
 
 
 @dataclasses.dataclass(frozen=True)
 class Header:
-    """The [model] table: what decides which parameters there are. None: as in the base model."""
+    """The [model] table: what decides which parameters there are. None: as in the base model.
+
+    `choices` are those of effects, `entries` those of effects that do not come with the package.
+    """
 
     instrument: str | None = None
     plates: str | None = None
     throughput_degree: int | None = None
     effects: tuple[str, ...] = ()
     choices: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    entries: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
 def header_of(model: Model) -> Header:
     """What decides which parameters a model has."""
     instrument = model.template
-    choices = {effect.name: effect.choices() for effect in instrument.effects}
+    choices = {effect.name: effect.choices() for effect in model.effects}
     return Header(
         instrument=model.name,
         plates=instrument.plates,
         throughput_degree=instrument.throughput.degree,
         effects=model.effect_names,
         choices={name: values for name, values in choices.items() if values},
+        entries={effect.name: effect.entry for effect in model.effects if is_own(effect)},
     )
 
 
@@ -88,6 +96,8 @@ def render(model: Model) -> str:
     document["model"] = table
     if header.choices:
         document["effects"] = dict(header.choices)
+    if header.entries:
+        document["catalogue"] = dict(header.entries)
     parameters = tomlkit.table(is_super_table=True)
     for p in model.parameters:
         entry = tomlkit.table()
@@ -119,7 +129,7 @@ def parse(text: str, build: Callable[[Header], Model]) -> Model:
             raise unknown_name("table", key, TABLES)
         if not isinstance(content[key], Mapping):
             raise ValueError(f"{key} = {content[key]!r} must be a table, [{key}]")
-    header = _header(content.get("model", {}), content.get("effects", {}))
+    header = _header(*(content.get(table, {}) for table in TABLES[:3]))
     model = build(header)
     if header.instrument is not None and header.instrument != model.name:
         raise ValueError(f"[model] instrument is {header.instrument}, but the data come from {model.name}")
@@ -133,7 +143,7 @@ def parse(text: str, build: Callable[[Header], Model]) -> Model:
     return dataclasses.replace(model, parameters=changed)
 
 
-def _header(table: Mapping[str, Any], choices: Mapping[str, Any]) -> Header:
+def _header(table: Mapping[str, Any], choices: Mapping[str, Any], entries: Mapping[str, Any]) -> Header:
     for key in table:
         if key not in MODEL_KEYS:
             raise unknown_name("key of [model]", key, MODEL_KEYS)
@@ -148,7 +158,7 @@ def _header(table: Mapping[str, Any], choices: Mapping[str, Any]) -> Header:
             raise unknown_name("effect (it has choices but is not in the list of [model])", name, effects)
         if not isinstance(values, Mapping):
             raise ValueError(f"[effects] {name} = {values!r} must be a table, [effects.{name}]")
-    return Header(table.get("instrument"), table.get("plates"), degree, tuple(effects), choices)
+    return Header(table.get("instrument"), table.get("plates"), degree, tuple(effects), choices, entries)
 
 
 def _number(name: str, key: str, value: Any) -> float:
@@ -188,6 +198,9 @@ def _changes(parameter: Parameter, entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 Catalogue = Sequence[type[Effect]]
+OWN_ENTRIES = "walop_jax_own_entries"
+"""Module of the effects that a model file brings along."""
+
 
 GAUGE = "throughput.n0.p00"
 SKY_AND_STARS = (MoonSky.name, Standards.name)  # parts that are not the instrument's
@@ -304,8 +317,9 @@ def model_for(
         model = base_model(
             calset, instrument, plates=header.plates, throughput_degree=header.throughput_degree
         )
+        model = dataclasses.replace(model, catalogue=known_to(header, catalogue))
         context = effect_context(model.template, calset.exposures)
-        return _with_effects(model, header, context, catalogue)
+        return _with_effects(model, header, context)
 
     return parse(text, build)
 
@@ -317,8 +331,9 @@ def model_like(calset: CalibrationSet, old: Model) -> Model:
     """
     header = header_of(old)
     model = base_model(calset, old.template, plates=header.plates, throughput_degree=header.throughput_degree)
-    own = tuple(type(effect) for effect in old.template.effects)
-    model = _with_effects(model, header, effect_context(model.template, calset.exposures), own)
+    own = dict.fromkeys((*map(type, old.template.effects), *old.catalogue))
+    model = dataclasses.replace(model, catalogue=tuple(own))
+    model = _with_effects(model, header, effect_context(model.template, calset.exposures))
     kept = {p.name: p for p in old.parameters if p.name != GAUGE and p.part not in SKY_AND_STARS}
     parameters = tuple(
         dataclasses.replace(p, free=kept[p.name].free, prior=kept[p.name].prior, tie=kept[p.name].tie)
@@ -350,17 +365,25 @@ def model_without_data(
             design, standards=standards, plates=header.plates, throughput_degree=header.throughput_degree
         )
         model = make_model(nominal.name, nominal, frozen=(GAUGE,))
+        model = dataclasses.replace(model, catalogue=known_to(header, catalogue))
         known = context or Context(sources=nominal.standard.names)
-        return _with_effects(model, header, known, catalogue)
+        return _with_effects(model, header, known)
 
     return parse(text, build)
 
 
-def _with_effects(model: Model, header: Header, context: Context, catalogue: Catalogue) -> Model:
+def known_to(header: Header, catalogue: Catalogue) -> tuple[type[Effect], ...]:
+    """A catalogue with the entries that a model file brings along; those of the catalogue stay."""
+    names = {effect.name for effect in catalogue}
+    own = {name: table for name, table in header.entries.items() if name not in names}
+    return (*catalogue, *entries(own, OWN_ENTRIES))
+
+
+def _with_effects(model: Model, header: Header, context: Context) -> Model:
     effects: list[Any] = []
     for name in header.effects:
         choices: Mapping[str, Any] = header.choices.get(name, {})
-        kind = effect_by_name(name, catalogue)
+        kind = effect_by_name(name, model.catalogue)
         effects.append(kind.of(context, **choices) if choices else kind)
     return with_effects(model, effects, context) if effects else model
 

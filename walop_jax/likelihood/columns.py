@@ -1,6 +1,6 @@
 """What small changes of an instrument would do to the residuals: the columns of the score test, all from one program.
 
-A change is a sum of sentences (`model.effects.sentence`), with a coefficient each. Its column is the derivative of the
+A change is a sum of sentences (`model.effects.change`), with a coefficient each. Its column is the derivative of the
 used residuals with respect to its amplitude, at neutral: what it does to the light or to the analysis vectors
 (`model.responses`) meets the exposures, is multiplied by what it grows with, and the flux takes up its part.
 
@@ -36,8 +36,8 @@ from walop_jax.model import light, responses
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects.base import Effect, with_amplitudes
 from walop_jax.model.effects.cameras import REFERENCE_COUNTS
+from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.optics import LARGEST_GAP
-from walop_jax.model.effects.sentence import Sentence
 from walop_jax.model.elements import WavePlate
 from walop_jax.model.elements.wave_plate import AirGap
 from walop_jax.model.instrument import Instrument

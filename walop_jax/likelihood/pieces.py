@@ -25,7 +25,9 @@ import numpy as np
 
 from walop_jax.model import responses
 from walop_jax.model.effects.cameras import cameras_of
-from walop_jax.model.effects.sentence import BAND, NUMBERS, OPPOSITE, SKY, Sentence
+from walop_jax.model.effects.change import BAND, OPPOSITE, SKY
+from walop_jax.model.effects.change import Change as Sentence
+from walop_jax.model.effects.numbers import NUMBERS
 from walop_jax.model.elements import Element, WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.responses import GENERATORS, LIGHT, Place

@@ -1,172 +1,75 @@
-"""From the description of an instrument to the instrument: every element that a file names is made and checked here."""
+"""From the description of an instrument to its parts: every element that a file names is made and checked here."""
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from walop_jax.data.records import POLARISER, PREFIX
-from walop_jax.instruments.description import (
-    Description,
-    Reader,
-    Table,
-    default_name,
-    described,
-    is_named,
-    shipped,
-)
+from walop_jax.instruments.description import Description, Reader, Table, is_named
 from walop_jax.io.errors import nearest
 from walop_jax.model import legendre
 from walop_jax.model.cameras import Cameras, Throughput
 from walop_jax.model.elements import ELEMENTS, Analyser, Element, Layer, Polariser, WavePlate
-from walop_jax.model.elements.wave_plate import MODELS
-from walop_jax.model.instrument import Arm, Instrument
-from walop_jax.model.parameters import Component, Parameter, is_row, leaves, numbers_of, unknown_name
-from walop_jax.model.sources import SOURCES, Source, Standards
+from walop_jax.model.parameters import Component, Parameter, is_row, numbers_of, unknown_name
 
-PLATE_MODELS = tuple(MODELS)
-STAR = tuple[str, float, float]
 OWN = ("name", "moves", "declared", "model")  # what a file says otherwise, or not at all
 NUMBER_KEYS = ("value", "sigma", "unit", "source", "name", "scale", "loose", "tie")
 SERIES = "Legendre coefficient P_i(x/h) P_j(y/h)"
 FREE = "smooth vignetting and coatings: free"
-TAKEN = ("throughput", "cameras", "effects")
-"""Names of other parts of an instrument."""
 
+Arm = tuple[str, tuple[Element, ...], tuple[str, ...]]
 Declared = tuple[tuple[str, Parameter], ...]
 
 
-def build(description: Description, *, elements: Sequence[type[Element]] = (), **options: Any) -> Instrument:
-    """The instrument that a description describes, at the values that it gives; options as for `adapted`.
+class Parts(NamedTuple):
+    """What a description makes of an instrument; an arm is its name, its elements and their order."""
 
-    `elements` are further kinds of elements that the description may name. Raises `DataError`, naming table and key,
-    for what does not exist or would do nothing where it stands.
+    elements: tuple[Element, ...]
+    arms: tuple[Arm, ...]
+    throughput: Throughput
+    cameras: Cameras
+
+
+def parts(description: Description, elements: Sequence[type[Element]] = ()) -> Parts:
+    """The parts of an instrument that a description describes, at the values that it gives.
+
+    `elements` are further kinds of elements that it may name. Raises `DataError`, naming table and key, for what is
+    wrong.
     """
     make = _Maker(description.read, description.source, {kind.kind: kind for kind in (*ELEMENTS, *elements)})
-    elements_ = tuple(make.elements(description.elements, description.path, "elements"))
+    common = tuple(make.elements(description.elements, description.path, "elements"))
     arms = tuple(make.arm(name, table) for name, table in description.arms.items())
     coefficients = np.zeros((len(description.cameras), len(legendre.terms(description.degree))))
     coefficients[:, 0] = description.level
-    instrument = Instrument(
-        name=description.name,
-        sources=sources(),
-        elements=elements_,
-        arms=arms,
-        throughput=Throughput(
-            degree=description.degree,
-            coefficients=jnp.asarray(coefficients),
-            scale=description.field_scale,
-            declared=Parameter("", "", SERIES, FREE, scale=description.scale, loose=description.loose),
-        ),
-        cameras=_cameras(description, arms),
-        path=description.path,
-        field_limit=description.field_limit,
-        site=description.place,
-        raster=(description.raster, description.edge),
-        description="" if description.name in shipped() else description.text,
+    series = Throughput(
+        degree=description.degree,
+        coefficients=jnp.asarray(coefficients),
+        scale=description.field_scale,
+        declared=Parameter("", "", SERIES, FREE, scale=description.scale, loose=description.loose),
     )
-    _check(instrument, description.read)
-    return adapted(instrument, **options)
-
-
-def adapted(
-    instrument: Instrument,
-    *,
-    standards: Sequence[STAR] = (),
-    plates: str | None = None,
-    throughput_degree: int | None = None,
-    throughput: float | None = None,
-) -> Instrument:
-    """An instrument for the data at hand.
-
-    `standards` are (name, q, u) in the equatorial frame; `plates` is the model of the wave plates,
-    `throughput_degree` that of the series, `throughput` the level of all cameras; None leaves what the instrument
-    says. Raises ValueError for an unknown plate model.
-    """
-    instrument = instrument.with_source(_standards(standards))
-    if plates is not None:
-        if plates not in PLATE_MODELS:
-            raise ValueError(f"unknown plate model {plates!r}: choose one of {', '.join(PLATE_MODELS)}")
-        for place in instrument.places(WavePlate):
-            instrument = instrument.changed(place, model=plates)
-    series = instrument.throughput
-    degree = series.degree if throughput_degree is None else throughput_degree
-    level = np.asarray(series.coefficients)[:, 0] if throughput is None else throughput
-    coefficients = np.zeros((len(instrument.cameras), len(legendre.terms(degree))))
-    coefficients[:, 0] = level
-    return dataclasses.replace(
-        instrument,
-        throughput=dataclasses.replace(series, degree=degree, coefficients=jnp.asarray(coefficients)),
-    )
-
-
-def as_designed(instrument: Instrument) -> Instrument:
-    """The instrument without effects: they are added by name."""
-    return dataclasses.replace(instrument, effects=())
-
-
-def nominal_instrument(name: str | None = None, **options: Any) -> Instrument:
-    """A shipped instrument as designed (default: the first of the family); options as for `build`."""
-    return build(described(name or default_name()), **options)
-
-
-def sources() -> tuple[Source, ...]:
-    """The sources that every instrument can look at."""
-    return tuple(_standards(()) if kind is Standards else kind() for kind in SOURCES)
-
-
-def _standards(stars: Sequence[STAR]) -> Standards:
-    names, q, u = zip(*stars, strict=True) if stars else ((), (), ())
-    return Standards(names=tuple(names), q=jnp.asarray(np.array(q, float)), u=jnp.asarray(np.array(u, float)))
+    return Parts(common, arms, series, _cameras(description, arms))
 
 
 def _cameras(description: Description, arms: Sequence[Arm]) -> Cameras:
     names, fault = description.cameras, description.read.fault
     pairs = []
-    for arm in arms:
-        beams = arm.analyser.cameras
+    for arm, elements, path in arms:
+        (analyser,) = (one for one in elements if one.name == path[-1])
+        assert isinstance(analyser, Analyser)
+        beams = analyser.cameras
         for name in beams:
             if name not in names:
-                raise fault(f"arms.{arm.name}", f"camera {name!r} does not exist; {nearest(name, names)}")
+                raise fault(f"arms.{arm}", f"camera {name!r} does not exist; {nearest(name, names)}")
         pairs.append((names.index(beams[0]), names.index(beams[1])))
     seen = [camera for pair in pairs for camera in pair]
     if sorted(seen) != list(range(len(names))):
         raise fault("cameras", f"every camera must stand behind one analyser: {', '.join(names)}")
     return Cameras(names=names, pairs=tuple(pairs), split=description.split, floor=description.floor)
-
-
-def _check(instrument: Instrument, read: Reader) -> None:
-    """Raise `DataError` for a part that would do nothing where it stands, and for a name that is there twice."""
-    for element in instrument.elements:
-        if isinstance(element, Analyser):
-            raise read.fault(
-                f"elements.{element.name}", "an analyser ends an arm: move it to the path of one"
-            )
-    polarisers = [element.name for element in instrument.train() if isinstance(element, Polariser)]
-    if len(polarisers) > 1:
-        raise read.fault(f"elements.{polarisers[1]}", "is a second polariser; there can be one")
-    for arm in instrument.arms:
-        for element in arm.train():
-            if isinstance(element, Analyser | Polariser):
-                where = "ends its arm" if isinstance(element, Analyser) else "stands ahead of the arms"
-                raise read.fault(f"arms.{arm.name}.elements.{element.name}", f"a {element.kind} {where}")
-    parts = itertools.chain(instrument.sources, instrument.elements, instrument.arms)
-    for name, count in Counter([*(part.name for part in parts), *TAKEN]).items():
-        if count > 1:
-            raise read.fault(name, "more than one part of the instrument has this name; give it another one")
-    for name, count in Counter(parameter.name for parameter in leaves(instrument)).items():
-        if count > 1:
-            raise read.fault("", f"{count} parameters have the name {name!r}; give them different ones")
-    try:
-        instrument.telescope()
-    except ValueError as error:
-        raise read.fault("elements", str(error)) from None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,12 +84,13 @@ class _Maker:
         self.read.known(table, ("path", "elements"), place)
         path = self.read.words(table.get("path"), "path", place)
         described = self.read.table(table.get("elements", {}), place, "elements = ")
-        arm = Arm(name, tuple(self.elements(described, path, f"{place}.elements")), path)
-        if not isinstance(next(one for one in arm.elements if one.name == path[-1]), Analyser):
+        elements = tuple(self.elements(described, path, f"{place}.elements"))
+        last = next(one for one in elements if one.name == path[-1])
+        if not isinstance(last, Analyser):
             raise self.read.fault(place, f"its path must end with an analyser, not with {path[-1]!r}")
-        if len(arm.analyser.cameras) != 2:
+        if len(last.cameras) != 2:
             raise self.read.fault(place, "its analyser needs the names of two cameras")
-        return arm
+        return name, elements, path
 
     def elements(self, table: Table, path: tuple[str, ...], place: str) -> Iterator[Element]:
         for name in path:

@@ -75,7 +75,7 @@ def backward(
     for arm, analyser in zip(arms, analysers, strict=True):
         matrix: Mueller | None = None
         for i, (element, _) in enumerate(arm):
-            own = _stacked(matrices, number + i, element, moving, keys)
+            own = stacked(matrices, number + i, element, moving, keys)
             if own is not None:
                 matrix = own if matrix is None else own @ matrix
         number += len(arm)
@@ -114,7 +114,7 @@ def _branched(
     return (rows if order == list(range(len(keys))) else rows[np.array(order)]), list(parents)
 
 
-def _stacked(
+def stacked(
     matrices: Solved, number: int, element: Element, moving: Sequence[str], keys: Sequence[State]
 ) -> Mueller | None:
     """Matrices of a station in every state, None where it is the identity in all."""
@@ -147,7 +147,7 @@ def _multiplied(
         own = matrices[number, None]
         return rows if own is None else rows @ own
     inside = [i for i, at in enumerate(positions(element, moving, keys)) if at is not None]
-    own = _stacked(matrices, number, element, moving, [keys[i] for i in inside]) if inside else None
+    own = stacked(matrices, number, element, moving, [keys[i] for i in inside]) if inside else None
     if own is None:
         return rows
     if len(inside) == len(keys):

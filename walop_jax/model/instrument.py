@@ -6,31 +6,44 @@ effects change, and everything that asks for light asks the patched one.
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import functools
 import itertools
 import os
-from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from walop_jax.instruments.description import read_description
+from walop_jax.instruments.description import (
+    Description,
+    Reader,
+    default_name,
+    described,
+    read_description,
+    shipped,
+)
+from walop_jax.model import legendre
+from walop_jax.model.build import parts
 from walop_jax.model.cameras import Cameras, Throughput
 from walop_jax.model.elements import Analyser, Element, Polariser, WavePlate
-from walop_jax.model.parameters import Component, number, unknown_name
+from walop_jax.model.elements.wave_plate import MODELS
+from walop_jax.model.parameters import Component, leaves, number, unknown_name
 from walop_jax.model.ray import NotPlannedError, Ray
-from walop_jax.model.sources import MoonSky, Source, Standards
-
-if TYPE_CHECKING:
-    from walop_jax.model.effects.base import Effect
+from walop_jax.model.sources import SOURCES, MoonSky, Source, Standards
 
 Scalar = Float[Array, ""]
-Any_ = TypeVar("Any_", bound=Component)
-
+AnyPart = TypeVar("AnyPart", bound=Component)
+PLATE_MODELS = tuple(MODELS)
+STAR = tuple[str, float, float]
+TAKEN = ("throughput", "cameras", "effects")
+"""Names of other parts of an instrument."""
 
 NAN = float("nan")
 NO_SITE = ("", NAN, NAN, NAN, NAN)
@@ -38,15 +51,6 @@ NO_SITE = ("", NAN, NAN, NAN, NAN)
 
 class NoSuchPlaceError(ValueError):
     """An effect asks for an element that this instrument does not have."""
-
-
-class Placed(Protocol):
-    """Whatever has a name within its holder."""
-
-    @property
-    def name(self) -> str:
-        """The name."""
-        ...
 
 
 class Arm(Component):
@@ -70,6 +74,16 @@ class Arm(Component):
         return last
 
 
+class Patch(Component):
+    """What changes an instrument: an effect."""
+
+    name: ClassVar[str] = ""
+
+    @abc.abstractmethod
+    def patch(self, instrument: Instrument) -> Instrument:
+        """The instrument with the effect. Raises `NoSuchPlaceError` where it has no element that the effect acts on."""
+
+
 class Instrument(Component):
     """Everything that is fitted. `path` names the elements ahead of the arms in the order light meets them.
 
@@ -86,7 +100,7 @@ class Instrument(Component):
     throughput: Throughput
     cameras: Cameras
     path: tuple[str, ...] = eqx.field(static=True)
-    effects: tuple[Effect, ...] = ()
+    effects: tuple[Patch, ...] = ()
     rotator_zero: Scalar | None = number(unit="deg", about="true ROTATOR minus the header's", default=None)
     filter_shift: Scalar | None = number(unit="um", about="displacement of broad bands", default=None)
     field_limit: float = eqx.field(static=True, default=90.0)
@@ -96,12 +110,10 @@ class Instrument(Component):
 
     @classmethod
     def read(cls, source: str | os.PathLike[str], **options: Any) -> Instrument:
-        """The instrument of a description file, or a shipped one by name; options as for `build.build`.
+        """The instrument of a description file, or a shipped one by name; options as for `build`.
 
         Raises `DataError`, naming file, table and key, for a file that is wrong.
         """
-        from walop_jax.model.build import build
-
         return build(read_description(source), **options)
 
     # ------------------------------------------------------------------------------- asking for parts
@@ -177,7 +189,7 @@ class Instrument(Component):
         elements = (*self.elements, *(element for arm in self.arms for element in arm.elements))
         return next((element.model for element in elements if isinstance(element, WavePlate)), None)
 
-    def effect(self, name: str) -> Effect:
+    def effect(self, name: str) -> Any:
         """The active effect of a name; ValueError when there is none."""
         for effect in self.effects:
             if effect.name == name:
@@ -233,7 +245,7 @@ class Instrument(Component):
         )
 
 
-def _member(members: tuple[Any_, ...], name: str, what: str) -> Any_:
+def _member(members: tuple[AnyPart, ...], name: str, what: str) -> AnyPart:
     for member in members:
         if _name(member) == name:
             return member
@@ -253,7 +265,7 @@ def _name(member: Any) -> str:
     return member.name
 
 
-def _changed(part: Any_, rest: list[str], fields: dict[str, Any], place: str) -> Any_:
+def _changed(part: AnyPart, rest: list[str], fields: dict[str, Any], place: str) -> AnyPart:
     if not rest:
         known = [field.name for field in dataclasses.fields(part)]
         for name in fields:
@@ -288,4 +300,107 @@ def _inserted(holder: Any, element: Element, neighbour: str, after: bool) -> Any
     )
 
 
-Change = Callable[[Instrument], Instrument]
+# ------------------------------------------------------------------------------------ from a description
+
+
+def build(description: Description, *, elements: Sequence[type[Element]] = (), **options: Any) -> Instrument:
+    """The instrument that a description describes, at the values that it gives; options as for `adapted`.
+
+    `elements` are further kinds of elements that the description may name. Raises `DataError`, naming table and key,
+    for what does not exist or would do nothing where it stands.
+    """
+    made = parts(description, elements)
+    instrument = Instrument(
+        name=description.name,
+        sources=sources(),
+        elements=made.elements,
+        arms=tuple(Arm(*arm) for arm in made.arms),
+        throughput=made.throughput,
+        cameras=made.cameras,
+        path=description.path,
+        field_limit=description.field_limit,
+        site=description.place,
+        raster=(description.raster, description.edge),
+        description="" if description.name in shipped() else description.text,
+    )
+    _check(instrument, description.read)
+    return adapted(instrument, **options)
+
+
+def adapted(
+    instrument: Instrument,
+    *,
+    standards: Sequence[STAR] = (),
+    plates: str | None = None,
+    throughput_degree: int | None = None,
+    throughput: float | None = None,
+) -> Instrument:
+    """An instrument for the data at hand.
+
+    `standards` are (name, q, u) in the equatorial frame; `plates` is the model of the wave plates,
+    `throughput_degree` that of the series, `throughput` the level of all cameras; None leaves what the instrument
+    says. Raises ValueError for an unknown plate model.
+    """
+    instrument = instrument.with_source(_standards(standards))
+    if plates is not None:
+        if plates not in PLATE_MODELS:
+            raise ValueError(f"unknown plate model {plates!r}: choose one of {', '.join(PLATE_MODELS)}")
+        for place in instrument.places(WavePlate):
+            instrument = instrument.changed(place, model=plates)
+    series = instrument.throughput
+    degree = series.degree if throughput_degree is None else throughput_degree
+    level = np.asarray(series.coefficients)[:, 0] if throughput is None else throughput
+    coefficients = np.zeros((len(instrument.cameras), len(legendre.terms(degree))))
+    coefficients[:, 0] = level
+    return dataclasses.replace(
+        instrument,
+        throughput=dataclasses.replace(series, degree=degree, coefficients=jnp.asarray(coefficients)),
+    )
+
+
+def as_designed(instrument: Instrument) -> Instrument:
+    """The instrument without effects: they are added by name."""
+    return dataclasses.replace(instrument, effects=())
+
+
+def nominal_instrument(name: str | None = None, **options: Any) -> Instrument:
+    """A shipped instrument as designed (default: the first of the family); options as for `build`."""
+    return build(described(name or default_name()), **options)
+
+
+def sources() -> tuple[Source, ...]:
+    """The sources that every instrument can look at."""
+    return tuple(_standards(()) if kind is Standards else kind() for kind in SOURCES)
+
+
+def _standards(stars: Sequence[STAR]) -> Standards:
+    names, q, u = zip(*stars, strict=True) if stars else ((), (), ())
+    return Standards(names=tuple(names), q=jnp.asarray(np.array(q, float)), u=jnp.asarray(np.array(u, float)))
+
+
+def _check(instrument: Instrument, read: Reader) -> None:
+    """Raise `DataError` for a part that would do nothing where it stands, and for a name that is there twice."""
+    for element in instrument.elements:
+        if isinstance(element, Analyser):
+            raise read.fault(
+                f"elements.{element.name}", "an analyser ends an arm: move it to the path of one"
+            )
+    polarisers = [element.name for element in instrument.train() if isinstance(element, Polariser)]
+    if len(polarisers) > 1:
+        raise read.fault(f"elements.{polarisers[1]}", "is a second polariser; there can be one")
+    for arm in instrument.arms:
+        for element in arm.train():
+            if isinstance(element, Analyser | Polariser):
+                where = "ends its arm" if isinstance(element, Analyser) else "stands ahead of the arms"
+                raise read.fault(f"arms.{arm.name}.elements.{element.name}", f"a {element.kind} {where}")
+    parts = itertools.chain(instrument.sources, instrument.elements, instrument.arms)
+    for name, count in Counter([*(part.name for part in parts), *TAKEN]).items():
+        if count > 1:
+            raise read.fault(name, "more than one part of the instrument has this name; give it another one")
+    for name, count in Counter(parameter.name for parameter in leaves(instrument)).items():
+        if count > 1:
+            raise read.fault("", f"{count} parameters have the name {name!r}; give them different ones")
+    try:
+        instrument.telescope()
+    except ValueError as error:
+        raise read.fault("elements", str(error)) from None

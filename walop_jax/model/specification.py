@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 from walop_jax.data.records import Exposures
 from walop_jax.model.conventions import EXTINCTION
-from walop_jax.model.effects import effect_by_name, in_order
+from walop_jax.model.effects import EFFECTS, effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Parameter, leaves, unknown_name, values_of, with_values
@@ -28,11 +28,15 @@ THROUGHPUT = "throughput"
 
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """An instrument with what may vary in it. Immutable: every change returns a new model."""
+    """An instrument with what may vary in it. Immutable: every change returns a new model.
+
+    `catalogue` are the effects that it may be given by name.
+    """
 
     name: str
     template: Instrument
     parameters: tuple[Parameter, ...]
+    catalogue: tuple[type[Effect], ...] = EFFECTS
 
     def __post_init__(self) -> None:
         names = self.names
@@ -49,6 +53,11 @@ class Model:
     def names(self) -> tuple[str, ...]:
         """Names of all parameters, in tree order."""
         return tuple(p.name for p in self.parameters)
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The active effects, in the order light meets them."""
+        return tuple(effect for effect in self.template.effects if isinstance(effect, Effect))
 
     @property
     def effect_names(self) -> tuple[str, ...]:
@@ -169,7 +178,7 @@ def with_effects(model: Model, effects: Sequence[str | type[Effect] | Effect], c
     starts = {}
     for effect in effects:
         if not isinstance(effect, Effect):
-            kind = effect_by_name(effect) if isinstance(effect, str) else effect
+            kind = effect_by_name(effect, model.catalogue) if isinstance(effect, str) else effect
             effect = next((group[0] for group in kind.probes(context)), kind.neutral(context))
         if effect.name in (other.name for other in active):
             raise ValueError(f"effect {effect.name!r} is in the model already")

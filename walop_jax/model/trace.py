@@ -10,6 +10,9 @@ Units       Stokes vectors in units of the flux that arrives; counts per unit of
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -82,39 +85,32 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
     stages = [_one("source", "polariser" if through else "sky", beam)]
 
     # One Stokes vector per node, and its average over the band.
-    weight, ray = light.band_weights(instrument, plan)[0], light.ray_at(instrument, plan, x, y)
+    wavelength, weight = light.node_wavelengths(instrument, plan), light.band_weights(instrument, plan)[0]
+
+    def along(wavelength: Float[Array, " n"]) -> _Way:
+        return _followed(instrument, plan, beam, Ray.entering(x, y, (wavelength, plan.conditions)))
+
+    behind, ahead = along(wavelength)
     train = light.divided(instrument)
-    common, ray = fold.stations((*train.leading, *train.banded), ray)
-    arms = [fold.stations(tuple(arm.train()), ray)[0] for arm in instrument.arms]
-    matrices = fold.solved(
-        [*common, *(station for arm in arms for station in arm)], plan.moving, [plan.settings[0][0]]
-    )
-    nodes = jnp.broadcast_to(beam, (len(weight), 4))
-    for number, (element, _) in enumerate(common):
-        nodes, about = _through(element, matrices, number, nodes, plan)
-        if about is not None:
-            stages.append(_one(element.name, about, weight @ nodes))
-    ahead, number = [], len(common)
-    for own in arms:
-        here = nodes
-        for element, _ in own:
-            here, _ = _through(element, matrices, number, here, plan)
-            number += 1
-        ahead.append(weight @ here)
+    for element, nodes in zip((*train.leading, *train.banded), behind, strict=True):
+        if nodes is not None:
+            stages.append(_one(element.name, _about(element, plan), weight @ nodes))
     # Where the beams of an analyser differ in wavelength, they see what λ ∂/∂λ of the light there adds as well.
-    slopes = [None] * len(ahead)
-    if any(arm.analyser.dispersion is not None for arm in instrument.arms):
-        slopes = [weight @ slope for slope in _slopes_ahead(instrument, plan, beam, x, y)]
-    wavelength = weight @ light.node_wavelengths(instrument, plan)
+    slopes: Sequence[Any] = [None] * len(ahead)
+    if light.is_dispersed(instrument):
+        slopes = jax.jvp(lambda w: along(w).ahead, (wavelength,), (wavelength,))[1]
+    mean = weight @ wavelength
     beams = jnp.zeros(len(instrument.cameras))
-    for arm, mean, slope in zip(instrument.arms, ahead, slopes, strict=True):
+    for arm, nodes, slope in zip(instrument.arms, ahead, slopes, strict=True):
         cameras = np.array([instrument.cameras.names.index(name) for name in arm.analyser.cameras])
-        seen = arm.analyser.shares() @ _seen(arm.analyser, mean, wavelength)
+        seen = arm.analyser.shares() @ _seen(arm.analyser, weight @ nodes, mean)
         if slope is not None:
-            seen = seen + arm.analyser.shares_of_slopes() @ _seen(arm.analyser, slope, wavelength)
+            seen = seen + arm.analyser.shares_of_slopes() @ _seen(arm.analyser, weight @ slope, mean)
         beams = beams.at[cameras].set(seen)
     names = tuple(arm.name for arm in instrument.arms)
-    stages.append(Stage("arms", "ahead of the analysers", names, STOKES, np.asarray(jnp.stack(ahead))))
+    stages.append(
+        Stage("arms", "ahead of the analysers", names, STOKES, np.asarray(weight @ jnp.stack(ahead)))
+    )
     stages.append(_cameras(instrument, "analysers", "share of the light in each beam of its arm", beams))
 
     throughput = light.throughput_at(instrument, x, y)
@@ -137,47 +133,45 @@ def _seen(analyser: Analyser, light: Float[Array, " 4"], wavelength: Float[Array
     return analyser.in_band(seen[None], wavelength[None])[0, :, 0]
 
 
-def _slopes_ahead(
-    instrument: Instrument, plan: Plan, beam: Float[Array, " 4"], x: Float[Array, ""], y: Float[Array, ""]
-) -> list[Float[Array, "n 4"]]:
-    """λ ∂/∂λ of the light ahead of the analyser of each arm, at every node."""
-    train, state = light.divided(instrument), [plan.settings[0][0]]
+class _Way(NamedTuple):
+    """The light at every node: behind each element of the common train (None: it does nothing), ahead of analysers."""
 
-    def ahead(wavelength: Float[Array, " n"]) -> list[Float[Array, "n 4"]]:
-        ray = Ray.entering(x, y, (wavelength, plan.conditions))
-        common, ray = fold.stations((*train.leading, *train.banded), ray)
-        arms = [fold.stations(tuple(arm.train()), ray)[0] for arm in instrument.arms]
-        matrices = fold.solved([*common, *(one for arm in arms for one in arm)], plan.moving, state)
-        nodes, number, found = jnp.broadcast_to(beam, (len(wavelength), 4)), len(common), []
-        for n, (element, _) in enumerate(common):
-            nodes, _ = _through(element, matrices, n, nodes, plan)
-        for arm in arms:
-            here = nodes
-            for element, _ in arm:
-                here, _ = _through(element, matrices, number, here, plan)
-                number += 1
-            found.append(here)
-        return found
-
-    wavelength = light.node_wavelengths(instrument, plan)
-    return jax.jvp(ahead, (wavelength,), (wavelength,))[1]
+    behind: list[Float[Array, "n 4"] | None]
+    ahead: list[Float[Array, "n 4"]]
 
 
-def _through(
-    element: Element, matrices: fold.Solved, number: int, nodes: Float[Array, "n 4"], plan: Plan
-) -> tuple[Float[Array, "n 4"], str | None]:
-    """The light behind an element, and what to say of it; None where it does nothing to polarisation."""
-    if element.moves is None:
-        own, about = matrices[number, None], type(element).__doc__ or ""
-    else:
-        angle = fold.positions(element, plan.moving, [plan.settings[0][0]])[0]
-        own = None if angle is None else matrices[number, angle]
-        about = "out of the beam" if angle is None else f"at {angle:g}°"
+def _followed(instrument: Instrument, plan: Plan, beam: Float[Array, " 4"], ray: Ray) -> _Way:
+    train, (state, *_) = light.divided(instrument), plan.settings[0]
+    common, ray = fold.stations((*train.leading, *train.banded), ray)
+    arms = [fold.stations(tuple(arm.train()), ray)[0] for arm in instrument.arms]
+    matrices = fold.solved([*common, *(one for arm in arms for one in arm)], plan.moving, [state])
+    nodes, numbers = jnp.broadcast_to(beam, (len(plan.wavelength), 4)), itertools.count()
+
+    def through(element: Element, nodes: Float[Array, "n 4"]) -> Float[Array, "n 4"] | None:
+        own = fold.stacked(matrices, next(numbers), element, plan.moving, [state])
         if own is None:
-            return nodes, about
-    if own is None:
-        return nodes, None
-    return nodes @ own.T if own.ndim == 2 else jnp.einsum("nst,nt->ns", own, nodes), about
+            return nodes if element.moves else None
+        return jnp.einsum("...st,...t->...s", own[0] if element.moves else own, nodes)
+
+    behind, ahead = [], []
+    for element, _ in common:
+        behind.append(through(element, nodes))
+        nodes = nodes if behind[-1] is None else behind[-1]
+    for arm in arms:
+        here = nodes
+        for element, _ in arm:
+            there = through(element, here)
+            here = here if there is None else there
+        ahead.append(here)
+    return _Way(behind, ahead)
+
+
+def _about(element: Element, plan: Plan) -> str:
+    """What to say of an element: what it is, or where it stands."""
+    if element.moves is None:
+        return type(element).__doc__ or ""
+    (angle,) = fold.positions(element, plan.moving, [plan.settings[0][0]])
+    return "out of the beam" if angle is None else f"at {angle:g}°"
 
 
 def _with_source(instrument: Instrument, sightline: Sightline) -> Instrument:

@@ -367,7 +367,7 @@ class Run(Displayed):
     @functools.cached_property
     def product(self) -> Calibration | None:
         """The calibration as its file holds it, its model not rebuilt."""
-        return read_calibration(self.folder, rebuild=False) if PRODUCT in self else None
+        return read_calibration(self.folder, self.catalogue, rebuild=False) if PRODUCT in self else None
 
     @functools.cached_property
     def calibration(self) -> Calibration | None:

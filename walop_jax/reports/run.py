@@ -58,13 +58,14 @@ class RunContents:
     missing: tuple[str, ...]
 
 
-def read_run(folder: Path) -> RunContents:
+def read_run(run: Run | Path) -> RunContents:
     """Read the folder of a `refit` or `diagnose`, with what `sample` may have added.
 
     Raises `DataError`, with advice, if it is no such folder or if its summary or diagnosis cannot be read; other
     files that are absent or damaged are left out and listed in `missing`.
     """
-    run = Run(folder)
+    run = Run(run) if isinstance(run, Path) else run
+    folder = run.folder
     run.wanted(SUMMARY, "give the RUN of walop-jax refit or diagnose")
     missing: list[str] = []
 

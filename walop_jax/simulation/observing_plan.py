@@ -14,9 +14,8 @@ from jaxtyping import Bool, Float
 from walop_jax.data.filters import DEFAULT_FILTER, builtin_filter
 from walop_jax.data.records import Exposures, FilterCurve, Points, Position, Site
 from walop_jax.instruments.description import default_name, described, shipped
-from walop_jax.model.build import as_designed, nominal_instrument
 from walop_jax.model.effects.base import Context
-from walop_jax.model.instrument import Instrument
+from walop_jax.model.instrument import Instrument, as_designed, nominal_instrument
 from walop_jax.model.parameters import unknown_name
 from walop_jax.sky.moon import local_sidereal_time, moon_direction, offset_direction
 

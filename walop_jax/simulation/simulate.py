@@ -20,12 +20,11 @@ from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre, light
-from walop_jax.model.build import adapted
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects import EFFECTS, effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.elements import Analyser
-from walop_jax.model.instrument import Instrument
+from walop_jax.model.instrument import Instrument, adapted
 from walop_jax.model.parameters import field_declarations, leaves, unknown_name, values_of
 from walop_jax.model.plan import with_median
 from walop_jax.model.sources import Standards

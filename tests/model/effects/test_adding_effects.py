@@ -10,9 +10,10 @@ import effect_scenes as scenes
 import numpy as np
 import pytest
 
+from walop_jax.fit.model_file import model_without_data, render
 from walop_jax.io.errors import DataError
 from walop_jax.model.effects import EFFECTS, effect_by_name
-from walop_jax.model.effects.own import catalogue_with
+from walop_jax.model.effects.catalogue import catalogue_with
 from walop_jax.model.specification import effect_context, make_model, with_effects
 
 MODEL = make_model("WALOP-SOUTH", builders.south(standards=scenes.STARS)).change(
@@ -94,6 +95,26 @@ def test_an_entry_of_a_file_is_an_effect(tmp_path):
     assert [n for n in names if n.startswith("stressed")] == ["stressed_window.axis", "stressed_window.delta"]
     assert "M = Ret(delta, axis)" in own.head()
     assert pickle.loads(pickle.dumps(ours)) == ours
+
+
+def test_a_model_file_brings_the_entries_of_its_effects_along(tmp_path):
+    """As does the product of a fit, which holds one: nobody needs the file of effects any more."""
+    path = tmp_path / "window.toml"
+    path.write_text(example("An entry", "[stressed_window]"), encoding="utf-8")
+    text = '[model]\neffects = ["stressed_window", "clp_zero"]\n'
+    with pytest.raises(ValueError, match=r"unknown effect 'stressed_window'.*--effects"):
+        model_without_data("WALOP-SOUTH", text)
+    model = model_without_data("WALOP-SOUTH", text, catalogue=catalogue_with(path))
+    again = model_without_data("WALOP-SOUTH", render(model))
+    assert again.effect_names == ("clp_zero", "stressed_window")
+    assert again.parameters == model.parameters
+    assert render(again) == render(model)
+    assert "[catalogue" not in render(model_without_data("WALOP-SOUTH", '[model]\neffects = ["clp_zero"]'))
+    values = model.start + 1e-3
+    np.testing.assert_array_equal(
+        scenes.observe(again.instrument(values).effect("stressed_window")),
+        scenes.observe(model.instrument(values).effect("stressed_window")),
+    )
 
 
 def test_the_class_of_the_page_is_an_effect(tmp_path):

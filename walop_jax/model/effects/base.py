@@ -7,12 +7,11 @@ not active is not in the tree and costs nothing.
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -21,10 +20,8 @@ from jaxtyping import Array, Float
 
 from walop_jax.model.conventions import EXTINCTION
 from walop_jax.model.effects.change import Change
-from walop_jax.model.parameters import Component, field_declarations, unknown_name
-
-if TYPE_CHECKING:
-    from walop_jax.model.instrument import Instrument
+from walop_jax.model.instrument import Instrument, NoSuchPlaceError, Patch
+from walop_jax.model.parameters import field_declarations, unknown_name
 
 Scalar = Float[Array, ""]
 
@@ -45,7 +42,7 @@ class Context(NamedTuple):
     extinction: float = EXTINCTION
 
 
-class Effect(Component):
+class Effect(Patch):
     """A physical effect beyond the base model.
 
     Its parameters are the `param` fields; static fields are its discrete choices (which camera, which
@@ -57,7 +54,6 @@ class Effect(Component):
     the effect is known from; `said` are the changes that it is (`change`), none where no change holds it.
     """
 
-    name: ClassVar[str] = ""
     shape: ClassVar[tuple[str, ...]] = ()
     starts: ClassVar[tuple[tuple[Mapping[str, Any], ...], ...]] = (({},),)
     one_sided: ClassVar[tuple[str, ...]] = ()
@@ -66,10 +62,6 @@ class Effect(Component):
     separated_by: ClassVar[str] = ""
     reference: ClassVar[str] = ""
     said: ClassVar[tuple[str, ...]] = ()
-
-    @abc.abstractmethod
-    def patch(self, instrument: Instrument) -> Instrument:
-        """The instrument with the effect. Raises `NoSuchPlaceError` where it has no element that the effect acts on."""
 
     # ---------------------------------------------------------------------------------- making and describing
 
@@ -163,8 +155,6 @@ class Effect(Component):
 
     def fits(self, instrument: Instrument) -> bool:
         """Whether the instrument has what the effect acts on."""
-        from walop_jax.model.instrument import NoSuchPlaceError
-
         try:
             jax.eval_shape(lambda: self.patch(dataclasses.replace(instrument, effects=())))
         except NoSuchPlaceError:

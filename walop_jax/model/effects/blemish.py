@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,10 +21,8 @@ from jaxtyping import Array, Float
 from walop_jax.model.cameras import Transmission
 from walop_jax.model.effects.base import Context, Effect, Scalar, check_camera
 from walop_jax.model.effects.change import Change
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import param
-
-if TYPE_CHECKING:
-    from walop_jax.model.instrument import Instrument
 
 SOURCE = "dust near a focal plane, or a damaged coating: expected size"
 

@@ -12,7 +12,7 @@ Symbols     a amplitude, f product of the factors; the place is a camera, or an 
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,11 +22,9 @@ from jaxtyping import Array, Bool, Float
 from walop_jax.model.cameras import DetectorPart, ExposurePart, GhostPart, Mixing, Transmission
 from walop_jax.model.effects.change import OPPOSITE, AtPoint, Change, Kind, Scalar, Term, in_exposures
 from walop_jax.model.effects.factors import COUNTS
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Component, unknown_name
 from walop_jax.model.sources import ExposureArrays
-
-if TYPE_CHECKING:
-    from walop_jax.model.instrument import Instrument
 
 Weights = tuple[float, ...]
 REFERENCE_COUNTS = 1e6  # electron

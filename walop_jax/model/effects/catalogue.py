@@ -30,29 +30,30 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import inspect
 import itertools
 import os
 import sys
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from walop_jax.io.code import classes_of
 from walop_jax.io.errors import fail
 from walop_jax.io.text import parse_toml
+from walop_jax.model.alternatives import alternatives, changed
 from walop_jax.model.conventions import EXTINCTION
 from walop_jax.model.effects.base import Context, Effect, Scalar, check_camera
 from walop_jax.model.effects.change import Change, patched
 from walop_jax.model.elements import WavePlate
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations, param, unknown_name
-
-if TYPE_CHECKING:
-    from walop_jax.model.instrument import Instrument
 
 FILE = "catalogue.toml"
 TEXTS = (
@@ -107,6 +108,7 @@ class Entry(Effect):
     options: ClassVar[Mapping[str, Any]] = {}
     arrangement: ClassVar[str] = ""
     page: ClassVar[Mapping[str, str]] = {}
+    entry: ClassVar[Mapping[str, Any]] = {}
 
     def __check_init__(self) -> None:
         for choice, known in self.options.items():
@@ -186,8 +188,6 @@ class Entry(Effect):
         """Whether the instrument has what the effect acts on."""
         if not self.arrangement:
             return super().fits(instrument)
-        from walop_jax.model.alternatives import alternatives
-
         return self.arrangement in alternatives(dataclasses.replace(instrument, effects=()))
 
     # ------------------------------------------------------------------------------------ what it does
@@ -195,8 +195,6 @@ class Entry(Effect):
     def patch(self, instrument: Instrument) -> Instrument:
         """All changes at their sizes."""
         if self.arrangement:
-            from walop_jax.model.alternatives import changed
-
             return changed(instrument, self.arrangement)
         terms = [
             (change, size * value)
@@ -301,12 +299,12 @@ def _behind(change: Change, instrument: Instrument) -> Change:
 # ------------------------------------------------------------------------------------------- from a file
 
 
-def entries(text: str, module: str) -> tuple[type[Effect], ...]:
-    """The effects that a TOML text describes, as classes of a module.
+def entries(content: Mapping[str, Any], module: str) -> tuple[type[Effect], ...]:
+    """The effects that tables describe, by name, as classes of a module.
 
     Raises ValueError, naming entry and key, for what is wrong.
     """
-    content = parse_toml(text)
+    sys.modules.setdefault(module, types.ModuleType(module))
     found = []
     for name, table in content.items():
         if not isinstance(table, Mapping):
@@ -356,7 +354,7 @@ def _made(name: str, table: Mapping[str, Any], module: str) -> type[Effect]:
         "Note": table.get("note", ""),
     }
     space: dict[str, Any] = {
-        "__module__": module, "__doc__": f"{table['about']}.", "name": name, "members": tuple(members),
+        "__module__": module, "entry": table, "__doc__": f"{table['about']}.", "name": name, "members": tuple(members),
         "options": choices, "arrangement": table.get("arrangement", ""), "page": page, "reference": table["source"],
         "revealed_by": table["revealed_by"], "separated_by": table["separated_by"],
         "one_sided": tuple(table.get("one_sided", ())), "over_field": bool(table.get("over_field", False)),
@@ -431,17 +429,51 @@ def own_entries(path: str | os.PathLike[str]) -> tuple[type[Effect], ...]:
     except OSError as error:
         raise fail(f"cannot be read: {error.strerror}", file=path) from error
     module = f"walop_jax_own_{os.path.splitext(os.path.basename(path))[0]}"
-    sys.modules[module] = types.ModuleType(module)
     try:
-        return entries(text, module)
+        return entries(parse_toml(text), module)
     except ValueError as error:
         raise fail(str(error), file=path, advice="see walop-jax docs adding-an-effect") from None
 
 
 _TEXT = (files("walop_jax.model.effects") / FILE).read_text(encoding="utf-8")
-EFFECTS = entries(_TEXT, __name__)
+EFFECTS = entries(parse_toml(_TEXT), __name__)
 """All effects, in the order in which light meets them."""
 PARTS: Mapping[str, str] = {
     name: table["part"] for name, table in parse_toml(_TEXT).items() if "part" in table
 }
 """Parts of the page of effects, by the effect that each begins with."""
+
+
+def is_own(effect: Effect) -> bool:
+    """Whether an effect is an entry that does not come with the package."""
+    return isinstance(effect, Entry) and type(effect) not in EFFECTS
+
+
+def catalogue_with(
+    own: str | os.PathLike[str] | None, catalogue: Sequence[type[Effect]] = EFFECTS
+) -> tuple[type[Effect], ...]:
+    """The catalogue followed by the effects of a file (None: nothing more): entries of a TOML file, classes of Python.
+
+    A Python file is run. Raises `DataError` if it cannot be, defines no effect, or one without a name or with that of
+    another.
+    """
+    if own is None:
+        return tuple(catalogue)
+    if os.fspath(own).endswith(".toml"):
+        found = {effect.name: effect for effect in own_entries(own)}
+    else:
+        found = classes_of(
+            own,
+            Effect,
+            "give a TOML file, or Python with subclasses of Effect (walop-jax docs adding-an-effect)",
+        )
+        found = {name: effect for name, effect in found.items() if not inspect.isabstract(effect)}
+    if not found:
+        raise fail("defines no effect", file=own, advice="see walop-jax docs adding-an-effect")
+    taken = {effect.name for effect in catalogue}
+    for class_name, effect in found.items():
+        if not effect.name or effect.name in taken:
+            what = f"{class_name} has {'the name of another effect' if effect.name else 'no name'}"
+            raise fail(what, file=own, advice="give it a name of its own")
+        taken.add(effect.name)
+    return (*catalogue, *found.values())

@@ -20,17 +20,15 @@ import dataclasses
 import functools
 import re
 from collections.abc import Hashable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from walop_jax.model.effects.factors import FIELD, WAVELENGTH, Exposure, Factor, Gap, factor
+from walop_jax.model.effects.factors import FIELD, WAVELENGTH, Factor, factor
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.ray import NotPlannedError
 from walop_jax.model.sources import ExposureArrays
-
-if TYPE_CHECKING:  # an instrument holds effects, and effects hold changes
-    from walop_jax.model.instrument import Instrument
 
 Scalar = Float[Array, ""]
 Term = tuple["Change", Scalar]
@@ -131,16 +129,16 @@ class Change:
     @property
     def number(self) -> int:
         """The exposure that it is about. Raises ValueError for a change of no single one."""
-        return self._only(Exposure, "of which exposure", "exposure 7").number
+        return int(self._only("exposure", "of which exposure", "exposure 7"))
 
     @property
     def gap(self) -> float:
         """Thickness (µm) of the air whose fringes it is about. Raises ValueError for a change without one."""
-        return self._only(Gap, "of which gap (µm)", "gap 10").thickness
+        return float(self._only("gap", "of which gap (µm)", "gap 10"))
 
-    def _only(self, form: type[Any], what: str, example: str) -> Any:
-        """The only factor of a form."""
-        found = [one for one in self.grows_with if isinstance(one, form)]
+    def _only(self, form: str, what: str, example: str) -> str:
+        """What is given in the only factor of a form."""
+        found = [one.given[0] for one in self.grows_with if one.form == form]
         if len(found) != 1:
             raise ValueError(f"{self.text!r}: say {what}, as in '{self.kind} of {self.place} * {example}'")
         return found[0]

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -21,13 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from walop_jax.model.alternatives import changed
 from walop_jax.model.effects.base import Context, Effect, Scalar
 from walop_jax.model.effects.change import AMPLITUDES, Change, patched
 from walop_jax.model.effects.optics import SOURCE
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import param, unknown_name
-
-if TYPE_CHECKING:
-    from walop_jax.model.instrument import Instrument
 
 
 def _amplitude(name: str) -> Any:
@@ -149,6 +148,4 @@ class OtherDescription(Effect):
 
     def patch(self, instrument: Instrument) -> Instrument:
         """Arrange the instrument as the change says. Raises ValueError for a change that it has no place for."""
-        from walop_jax.model.alternatives import changed
-
         return changed(instrument, self.change)

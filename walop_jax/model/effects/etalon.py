@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -27,10 +27,8 @@ from walop_jax.model.effects.base import Effect, Scalar
 from walop_jax.model.effects.change import Change
 from walop_jax.model.effects.optics import LARGEST_GAP, with_air_gap
 from walop_jax.model.elements import WavePlate
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import param
-
-if TYPE_CHECKING:
-    from walop_jax.model.instrument import Instrument
 
 SOURCE = "Clarke 2005, A&A 434, 377; Semel 2003, A&A 401, 1"
 

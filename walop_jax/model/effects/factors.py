@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Self, final
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -28,257 +29,130 @@ LARGEST_SQUARE = 2.0  # of the field radius, in units of FIELD_SCALE: the corner
 FIELD, WAVELENGTH, EXPOSURE, COUNTS, SHAPE = "field", "wavelength", "exposure", "counts", "shape"
 MORE_POINTS = "more field points along that direction; dither: what is of the optics stays where it is"
 ONCE_MORE = "the same exposures once more"
+NUMBER = r"(-?\d*\.?\d+|-?\d+\.)"
 
 
-@final
 @dataclasses.dataclass(frozen=True)
-class Plain:
-    """A factor without a number of its own."""
+class Factor:
+    """One factor; `form` is the first word of those that have numbers or names in them, `given` are these."""
 
     text: str
     depends_on: str
     words: str
     test: str
-    of: Callable[[Any], Any]
-
-    def value(self, at: Any) -> Any:
-        """Its value."""
-        return self.of(at)
+    value: Callable[[Any], Any]
+    form: str = ""
+    given: tuple[str, ...] = ()
 
 
-@final
-@dataclasses.dataclass(frozen=True)
-class Ring:
+# ------------------------------------------------------------------------------- with numbers or names in them
+
+
+def _ring(degree: str) -> Factor:
     """Legendre polynomial of some degree in (X² + Y²)/(0.3°)² − 1."""
 
-    degree: int
-
-    form: ClassVar[str] = "ring N"
-    depends_on: ClassVar[str] = FIELD
-    test: ClassVar[str] = MORE_POINTS
-
-    @classmethod
-    def parsed(cls, first: str, rest: list[str]) -> Self | None:
-        """The factor of its words; None where they are none."""
-        return cls(int(rest[0])) if first == "ring" and len(rest) == 1 and rest[0].isdecimal() else None
-
-    @property
-    def text(self) -> str:
-        """The factor as it is typed."""
-        return f"ring {self.degree}"
-
-    @property
-    def words(self) -> str:
-        """The dependence in words."""
-        return f"in rings over the field (Legendre polynomial {self.degree} of the radius squared)"
-
-    def value(self, at: Any) -> Any:
-        """Its value."""
+    def value(at: Any) -> Any:
         square = (at.x**2 + at.y**2) / FIELD_SCALE**2
-        return legendre.polynomial(self.degree, 2.0 * square / LARGEST_SQUARE - 1.0)
+        return legendre.polynomial(int(degree), 2.0 * square / LARGEST_SQUARE - 1.0)
+
+    words = f"in rings over the field (Legendre polynomial {degree} of the radius squared)"
+    return Factor(f"ring {degree}", FIELD, words, MORE_POINTS, value, "ring", (degree,))
 
 
-@final
-@dataclasses.dataclass(frozen=True)
-class Harmonic:
+def _harmonic(wave: str, order: str, prefix: str) -> Factor:
     """Cosine or sine of a multiple of the angle of a moving element, by the prefix of its columns."""
 
-    wave: str
-    order: int
-    prefix: str
+    def value(at: Any) -> Any:
+        angle = at.angle(prefix)
+        return getattr(np if isinstance(angle, np.ndarray) else jnp, wave)(int(order) * angle)
 
-    form: ClassVar[str] = "cos N PREFIX, sin N PREFIX"
-    depends_on: ClassVar[str] = EXPOSURE
-    test: ClassVar[str] = (
-        "a full turn at more angles in random order, then with the element mounted turned by 90°"
-    )
-
-    @classmethod
-    def parsed(cls, first: str, rest: list[str]) -> Self | None:
-        """The factor of its words; None where they are none."""
-        if first not in ("cos", "sin") or len(rest) != 2 or not rest[0].isdecimal():
-            return None
-        return cls(first, int(rest[0]), rest[1])
-
-    @property
-    def text(self) -> str:
-        """The factor as it is typed."""
-        return f"{self.wave} {self.order} {self.prefix}"
-
-    @property
-    def words(self) -> str:
-        """The dependence in words."""
-        name = {"cos": "cosine", "sin": "sine"}[self.wave]
-        return f"as the {name} of {self.order} × the angle of {self.prefix}"
-
-    def value(self, at: Any) -> Any:
-        """Its value."""
-        angle = at.angle(self.prefix)
-        return getattr(np if isinstance(angle, np.ndarray) else jnp, self.wave)(self.order * angle)
+    words = f"as the {'cosine' if wave == 'cos' else 'sine'} of {order} × the angle of {prefix}"
+    test = "a full turn at more angles in random order, then with the element mounted turned by 90°"
+    return Factor(f"{wave} {order} {prefix}", EXPOSURE, words, test, value, wave, (order, prefix))
 
 
-@final
-@dataclasses.dataclass(frozen=True)
-class Span:
-    """1 from one time to another (hours since the first exposure), 0 elsewhere; times as they are typed."""
+def _span(start: str, stop: str) -> Factor:
+    """1 from one time to another (hours since the first exposure), 0 elsewhere."""
+    words = f"from {start} to {stop} h after the first exposure"
 
-    start: str
-    stop: str
+    def value(at: Any) -> Any:
+        return ((at.hours >= float(start)) & (at.hours < float(stop))) * 1.0
 
-    form: ClassVar[str] = "hours A to B"
-    depends_on: ClassVar[str] = EXPOSURE
-    test: ClassVar[str] = ONCE_MORE
-
-    @classmethod
-    def parsed(cls, first: str, rest: list[str]) -> Self | None:
-        """The factor of its words; None where they are none."""
-        if (
-            first != "hours"
-            or len(rest) != 3
-            or rest[1] != "to"
-            or not (_number(rest[0]) and _number(rest[2]))
-        ):
-            return None
-        return cls(rest[0], rest[2])
-
-    @property
-    def text(self) -> str:
-        """The factor as it is typed."""
-        return f"hours {self.start} to {self.stop}"
-
-    @property
-    def words(self) -> str:
-        """The dependence in words."""
-        return f"from {self.start} to {self.stop} h after the first exposure"
-
-    def value(self, at: Any) -> Any:
-        """Its value."""
-        return ((at.hours >= float(self.start)) & (at.hours < float(self.stop))) * 1.0
+    return Factor(f"hours {start} to {stop}", EXPOSURE, words, ONCE_MORE, value, "hours", (start, stop))
 
 
-@final
-@dataclasses.dataclass(frozen=True)
-class Exposure:
+def _exposure(number: str) -> Factor:
     """1 in one exposure of the list, counted from 0; 0 in all others."""
+    words = f"in exposure {number} of the list (the first is 0)"
 
-    number: int
+    def value(at: Any) -> Any:
+        return (at.number == int(number)) * 1.0
 
-    form: ClassVar[str] = "exposure N"
-    depends_on: ClassVar[str] = EXPOSURE
-    test: ClassVar[str] = ONCE_MORE
-
-    @classmethod
-    def parsed(cls, first: str, rest: list[str]) -> Self | None:
-        """The factor of its words; None where they are none."""
-        return cls(int(rest[0])) if first == "exposure" and len(rest) == 1 and rest[0].isdecimal() else None
-
-    @property
-    def text(self) -> str:
-        """The factor as it is typed."""
-        return f"exposure {self.number}"
-
-    @property
-    def words(self) -> str:
-        """The dependence in words."""
-        return f"in exposure {self.number} of the list (the first is 0)"
-
-    def value(self, at: Any) -> Any:
-        """Its value."""
-        return (at.number == self.number) * 1.0
+    return Factor(f"exposure {number}", EXPOSURE, words, ONCE_MORE, value, "exposure", (number,))
 
 
-@final
-@dataclasses.dataclass(frozen=True)
-class Gap:
-    """Thickness (µm) of the air whose fringes a change is, as it is typed: 1, the fringes themselves know it."""
-
-    typed: str
-
-    form: ClassVar[str] = "gap N"
-    depends_on: ClassVar[str] = SHAPE
-    test: ClassVar[str] = ""
-
-    @classmethod
-    def parsed(cls, first: str, rest: list[str]) -> Self | None:
-        """The factor of its words; None where they are none."""
-        good = first == "gap" and len(rest) == 1 and _number(rest[0]) and not rest[0].startswith("-")
-        return cls(rest[0]) if good else None
-
-    @property
-    def thickness(self) -> float:
-        """In µm."""
-        return float(self.typed)
-
-    @property
-    def text(self) -> str:
-        """The factor as it is typed."""
-        return f"gap {self.typed}"
-
-    @property
-    def words(self) -> str:
-        """The dependence in words."""
-        return f"of {self.typed} µm of air (amplitude at a maximum)"
-
-    def value(self, at: Any) -> Any:
-        """1."""
-        del at
-        return 1.0
+def _gap(thickness: str) -> Factor:
+    """Thickness (µm) of the air whose fringes a change is: 1, the fringes themselves know it."""
+    words = f"of {thickness} µm of air (amplitude at a maximum)"
+    return Factor(f"gap {thickness}", SHAPE, words, "", lambda at: 1.0, "gap", (thickness,))
 
 
-def _number(text: str) -> bool:
-    return text.removeprefix("-").replace(".", "", 1).isdecimal()
+FORMS: Mapping[str, tuple[str, Callable[..., Factor]]] = {
+    "ring N": (r"ring (\d+)", _ring),
+    "cos N PREFIX, sin N PREFIX": (r"(cos|sin) (\d+) (\S+)", _harmonic),
+    "hours A to B": (rf"hours {NUMBER} to {NUMBER}", _span),
+    "exposure N": (r"exposure (\d+)", _exposure),
+    "gap N": (rf"gap (?!-){NUMBER}", _gap),
+}
+"""Factors with numbers or names in them, as messages name them: how they are typed, and what makes one."""
 
 
-Factor = Plain | Ring | Harmonic | Span | Exposure | Gap
+# ------------------------------------------------------------------------------------------------------ plain ones
 
 
-def _at(what: str, depends_on: str, words: str, test: str, of: Callable[[Any], Any]) -> tuple[str, Factor]:
-    return what, Plain(what, depends_on, words, test, of)
-
-
-PLAIN: Mapping[str, Factor] = dict(
-    (
-        _at("x", FIELD, "growing with X (amplitude at 0.3°)", MORE_POINTS, lambda at: at.x / FIELD_SCALE),
-        _at("y", FIELD, "growing with Y (amplitude at 0.3°)", MORE_POINTS, lambda at: at.y / FIELD_SCALE),
-        _at(
+def _plain() -> Mapping[str, Factor]:
+    made = (
+        Factor("x", FIELD, "growing with X (amplitude at 0.3°)", MORE_POINTS, lambda at: at.x / FIELD_SCALE),
+        Factor("y", FIELD, "growing with Y (amplitude at 0.3°)", MORE_POINTS, lambda at: at.y / FIELD_SCALE),
+        Factor(
             "r2", FIELD, "growing with the field radius squared (amplitude at 0.3°)", MORE_POINTS,
             lambda at: (at.x**2 + at.y**2) / FIELD_SCALE**2,
         ),
-        _at(
+        Factor(
             "x2-y2", FIELD, "as X² − Y² over the field (amplitude at 0.3°)", MORE_POINTS,
             lambda at: (at.x**2 - at.y**2) / FIELD_SCALE**2,
         ),
-        _at(
+        Factor(
             "xy", FIELD, "as 2XY over the field (amplitude at 0.3°)", MORE_POINTS,
             lambda at: 2.0 * at.x * at.y / FIELD_SCALE**2,
         ),
-        _at(
+        Factor(
             "colour", WAVELENGTH, "growing with wavelength (per unit of λ/0.62 µm − 1)",
             "narrow bands, or another filter", lambda at: at.wavelength / REFERENCE_WAVELENGTH - 1.0,
         ),
-        _at(
+        Factor(
             "hours", EXPOSURE, "growing with time (per hour since the first exposure)",
             "the same exposures in another order, or once more hours later", lambda at: at.hours,
         ),
-        _at(
+        Factor(
             "hour angle", EXPOSURE, "growing with the hour angle (per hour)",
             "the same exposures at other hour angles, in another order", lambda at: at.hour_angle,
         ),
-        _at(
+        Factor(
             "kelvin", EXPOSURE, "growing with temperature (per kelvin above 10 °C)",
             "the same exposures at another temperature", lambda at: at.temperature - REFERENCE_TEMPERATURE,
         ),
-        _at(
+        Factor(
             # The detector multiplies with its own counts.
             "counts", COUNTS, "growing with the counts (at 10⁶ electrons)", "the same exposures at another flux",
             lambda at: 1.0,
         ),
-    )
-)  # fmt: skip
-"""Factors without a number of their own, by text."""
+    )  # fmt: skip
+    return {one.text: one for one in made}
 
-FORMS = (Ring, Harmonic, Span, Exposure, Gap)
-"""Factors with numbers or names in them."""
+
+PLAIN = _plain()
+"""Factors without a number of their own, by text."""
 
 
 @functools.cache
@@ -286,8 +160,7 @@ def factor(text: str) -> Factor:
     """The factor of a text. Raises ValueError, with the nearest ones, for what is none."""
     if text in PLAIN:
         return PLAIN[text]
-    first, *rest = text.split(" ")
-    for form in FORMS:
-        if (found := form.parsed(first, rest)) is not None:
-            return found
-    raise unknown_name("factor", text, (*PLAIN, *(form.form for form in FORMS)))
+    for pattern, make in FORMS.values():
+        if found := re.fullmatch(pattern, text):
+            return make(*found.groups())
+    raise unknown_name("factor", text, (*PLAIN, *FORMS))

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,11 +27,9 @@ from jaxtyping import Array, Float
 from walop_jax.model import legendre
 from walop_jax.model.cameras import ExposurePart, Mixing
 from walop_jax.model.effects.base import Context, Effect, Scalar
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import param, unknown_name
 from walop_jax.model.sources import ExposureArrays
-
-if TYPE_CHECKING:
-    from walop_jax.model.instrument import Instrument
 
 WIDTH = 0.003  # plausible size, in units of the response to unpolarised light
 SMOOTH, FINE, GRADIENT = 4, 8, 1  # degrees of the field polynomials

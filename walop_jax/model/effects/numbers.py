@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from walop_jax.model.effects.change import BAND, SKY, Kind, Term, add
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import unknown_name
-
-if TYPE_CHECKING:
-    from walop_jax.model.instrument import Instrument
 
 
 class Number(Kind):
@@ -51,38 +49,40 @@ class OfPolariser(Number):
     parameter: ClassVar[str] = "share"
 
 
-class Shift(Kind):
+class OfInstrument(Kind):
+    """A number of the instrument as a whole, at the only `place` that it has."""
+
+    place: ClassVar[str]
+    field: ClassVar[str]
+
+    @classmethod
+    def patch(cls, instrument: Instrument, terms: Sequence[Term]) -> Instrument:
+        """Add to the number."""
+        for change, size in terms:
+            if change.place != cls.place:
+                raise unknown_name(f"place of {change.kind}", change.place, (cls.place,))
+            instrument = instrument.changed("", **{cls.field: add(size)})
+        return instrument
+
+
+class Shift(OfInstrument):
     """The band displaced (µm): filters wider than `light.BROAD`."""
 
     names: ClassVar[tuple[str, ...]] = ("shift",)
     parameter: ClassVar[str] = "wavelength"
     test: ClassVar[str] = "narrow bands beside the broad one"
-
-    @classmethod
-    def patch(cls, instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-        """Displace broad bands."""
-        for change, size in terms:
-            if change.place != BAND:
-                raise unknown_name("place of a shift", change.place, (BAND,))
-            instrument = instrument.changed("", filter_shift=add(size))
-        return instrument
+    place: ClassVar[str] = BAND
+    field: ClassVar[str] = "filter_shift"
 
 
-class Rotator(Kind):
+class Rotator(OfInstrument):
     """True ROTATOR minus the header's (deg)."""
 
     names: ClassVar[tuple[str, ...]] = ("rotator",)
     parameter: ClassVar[str] = "angle"
     test: ClassVar[str] = "a polariser aligned in the laboratory: an independent zero of the angle"
-
-    @classmethod
-    def patch(cls, instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-        """Turn the sky against the instrument."""
-        for change, size in terms:
-            if change.place != SKY:
-                raise unknown_name("place of the rotator", change.place, (SKY,))
-            instrument = instrument.changed("", rotator_zero=add(size))
-        return instrument
+    place: ClassVar[str] = SKY
+    field: ClassVar[str] = "rotator_zero"
 
 
 NUMBERS = (*Angle.names, *Thickness.names, *Thermal.names)

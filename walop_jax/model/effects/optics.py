@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Hashable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -24,11 +24,9 @@ from walop_jax.model.effects.factors import PLAIN
 from walop_jax.model.elements import AddedPolarisation, AirGap
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.elements.polariser import Film
+from walop_jax.model.instrument import Instrument, NoSuchPlaceError
 from walop_jax.model.ray import Ray
 from walop_jax.model.sources import ExposureArrays
-
-if TYPE_CHECKING:
-    from walop_jax.model.instrument import Instrument
 
 SOURCE = "Lu & Chipman 1996, JOSA A 13, 1106"
 LARGEST_GAP = 60.0  # µm of air
@@ -215,8 +213,6 @@ class OfPolariser(Film):
 
 def element_at(instrument: Instrument, place: str) -> Element:
     """An element by the name that `inserted` takes. Raises `NoSuchPlaceError` where there is none."""
-    from walop_jax.model.instrument import NoSuchPlaceError
-
     arm, _, name = place.rpartition(".")
     trains = [one.train() for one in instrument.arms if one.name == arm] if arm else [instrument.train()]
     for element in (element for train in trains for element in train):

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 
 from walop_jax.model.effects.change import SKY, Change, Kind, Term
+from walop_jax.model.instrument import Instrument, NoSuchPlaceError
 from walop_jax.model.parameters import unknown_name
 from walop_jax.model.sources import Patches
-
-if TYPE_CHECKING:
-    from walop_jax.model.instrument import Instrument
 
 
 class Polarisation(Kind):
@@ -46,8 +44,6 @@ class Polarisation(Kind):
 
 
 def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-    from walop_jax.model.instrument import NoSuchPlaceError
-
     names = [name.replace(" ", "_") for name in instrument.standard.names]
     for change, size in terms:
         axis = change.kind.removeprefix("polarisation").strip()

@@ -22,8 +22,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.model.elements.base import Element
+from walop_jax.model.elements.spectral import Curve, check_curve, spline
 from walop_jax.model.parameters import number
-from walop_jax.model.spline import Curve, check_curve, spline
 
 Scalar = Float[Array, ""]
 

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from walop_jax.model import mueller
 from walop_jax.model.elements.base import Element
 from walop_jax.model.parameters import Component, number
-from walop_jax.model.sources.base import ExposureArrays
+from walop_jax.model.sources import ExposureArrays
 
 Scalar = Float[Array, ""]
 Angles = Float[Array, " e"]
