@@ -32,6 +32,7 @@ from scipy import stats
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.effect_columns import Probe, applicable, probes, showable
 from walop_jax.diagnosis.examination import ALARM
 from walop_jax.diagnosis.limits_found import PROBABILITY
 from walop_jax.diagnosis.mixups import with_exposures, with_places
@@ -48,14 +49,20 @@ from walop_jax.diagnosis.score import (
 from walop_jax.fit.refit import NEARLY
 from walop_jax.fit.verdict import Hidden
 from walop_jax.io.rounding import value_and_error
+from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects import EFFECTS
+from walop_jax.model.parameters import field_declarations
+from walop_jax.model.specification import effect_context
 
 MOST_HIDDEN = 12  # mistakes that a product keeps: what a star needs for each is a product of two vectors
 _SHOWN = 4  # alternatives that are told in words
 _ALIKE = 25.0  # in χ², within which conditions are told together
 _PRIOR_WIDTHS = 30.0  # by which a prior may be wrong at most
 MOST_OF_ELEMENT = 4  # numbers of an element whose priors may be wrong together
+_ASKED_OTHERWISE = ("pedestal", "nonlinearity", "standard_outlier")  # camera by camera, and as priors
+_PLACES = {"x", "gap"}  # shapes of which there are so many that an effect is as good as a pattern
 _PRECESSION = (
     46.124 / 3600.0,
     20.043 / 3600.0,
@@ -119,8 +126,8 @@ class Singles:
 
     @classmethod
     def of(cls, design: Design) -> Singles:
-        """Conditions that the set states, priors, and terms of a camera that have one amplitude."""
-        rivals = (*_conditions(design), *_priors(design), *_of_cameras(design))
+        """Conditions that the set states, priors, terms of a camera that have one amplitude, effects with a name."""
+        rivals = (*_conditions(design), *_priors(design), *_of_cameras(design), *_of_catalogue(design))
         names = [one.candidate.name for one in rivals]
         widths = [one.candidate.widths for one in rivals]
         columns = np.concatenate(
@@ -290,6 +297,39 @@ def _of_cameras(design: Design) -> Iterator[Single]:
         for other in range(measured.cameras):
             if other != k:
                 yield single(k, counts[..., other], 0.02, f"light of {names[other]} in {{}}", "of its counts")
+
+
+def _of_catalogue(design: Design) -> Iterator[Single]:
+    """Effects that the model has not; those with a place or a gap of their own are left to the patterns."""
+    fit = design.fit
+    template, calset = fit.model.template, fit.calset
+    context, known = effect_context(template, calset.exposures), (*fit.model.effect_names, *_ASKED_OTHERWISE)
+    kinds = [kind for kind in EFFECTS if kind.name not in known and not set(kind.shape) & _PLACES]
+    wanted = showable(calset, template, list(probes(applicable(kinds, context, template), context)))
+    columns = Columns(fit.likelihood, fit.values)
+    changes = [[one for member in p.group for one in member.first_order(template)] for p in wanted]
+    asked = [i for i, some in enumerate(changes) if all(columns.has(change) for change in some)]
+    found, first = columns.of([change for i in asked for change in changes[i]]), 0
+    for probe in (wanted[i] for i in asked):
+        rows = design.stacked([found[:, first : first + len(probe.widths)]])
+        first += len(probe.widths)
+        candidate = Candidate(probe.name, rows, probe.widths)
+        yield Single(
+            candidate, lambda score, probe=probe: _effect_in_words(probe, score, template.cameras.names)
+        )
+
+
+def _effect_in_words(probe: Probe, score: Score, cameras: Sequence[str]) -> str:
+    effect, declared = probe.effect.combine(probe.group, score.amplitudes), field_declarations(probe.effect)
+    if len(score.amplitudes) > MOST_OF_ELEMENT:
+        return f"{effect.name}, {len(score.amplitudes)} numbers"
+    choices = effect.choices()
+    texts = [f"{n} {cameras[value] if n == 'camera' else value}" for n, value in choices.items()]
+    sigmas = dict(zip(probe.parameters, np.sqrt(np.diag(score.covariance)), strict=True))
+    for name, sigma in sigmas.items():
+        value, error = value_and_error(float(getattr(effect, name)), float(sigma))
+        texts.append(f"{name} {value} ± {error} {declared[name].unit}".rstrip())
+    return f"{effect.name}, {', '.join(texts)}"
 
 
 def _in_words(stated: Stated, score: Score) -> str:
