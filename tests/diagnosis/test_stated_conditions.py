@@ -22,7 +22,7 @@ from walop_jax.diagnosis.mixups import with_places
 from walop_jax.diagnosis.stated_conditions import condition_scores, stated_conditions
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.refit import FitResult, refit
-from walop_jax.simulation.simulate import simulate
+from walop_jax.simulation.simulate import effect_from_text, simulate
 
 
 def moved(calset: CalibrationSet, x: np.ndarray, y: np.ndarray) -> CalibrationSet:
@@ -105,6 +105,25 @@ def test_a_number_that_is_wrong_is_told_with_its_size(change, what, size):
     value, error = re.search(r"([−\d.]+) ± ([\d.]+)", told).groups()  # type: ignore[union-attr]
     # A step of a quarter is not a linear one.
     assert float(value.replace("−", "-")) == pytest.approx(size, abs=4 * float(error) + 0.25 * abs(size))
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("hwp1_axis=0.01", "hwp1_axis, angle "),
+        ("camera_gain_drift=camera:2,rate:0.0016", "camera_gain_drift, camera O2, rate "),
+        ("nonlinearity=0/-0.0012/0/0", "a non-linearity of E1 of "),
+    ],
+)
+def test_an_effect_of_seven_standard_errors_is_told_whatever_patterns_say(text, told):
+    """Δχ² of 40 to 50 in one number: told with its size, to 4 standard errors, alone or beside what it is like."""
+    effect = effect_from_text(text, SMALL.context())
+    result = examined(refit(simulate(SMALL, seed=7, effects=(effect,)).calset))
+    assert not result.trusted
+    (said,) = [text for text in result.verdict.doubts if text.startswith("the residuals ask for ")]
+    value, error = re.search(re.escape(told) + r"([−\d.]+) ± ([\d.]+)", said).groups()  # type: ignore[union-attr]
+    size = float(re.findall(r"-?\d+\.\d+", text)[0])
+    assert float(value.replace("−", "-")) == pytest.approx(size, abs=4 * float(error))
 
 
 def test_scale_and_angle_are_sums_of_both_coordinates():

@@ -12,8 +12,8 @@ Groups      the squared residuals of each camera, kind, filter and exposure. Beh
             that follows from these; its p is that of a scaled χ² with these two moments.
 Components  the variance of what field points, exposures, states, standards, nights and kinds have in common beyond the
             model, finer than any pattern (`variance_components`).
-Conditions  the efficient score of every number that the set states of itself: field, filters, colours, sky; and of
-            every prior (`stated_conditions`).
+Conditions  the efficient score of every number that the set states of itself: field, filters, colours, sky; of every
+            prior, term of a camera and effect of the catalogue (`stated_conditions`).
 Repeats     the correlation of what is left of two exposures (`repeated_noise`).
 Errors      χ²/dof far below 1 says that N_ERR is not the error of N; a few per cent off is no matter of the model.
 
