@@ -308,7 +308,7 @@ def _of_catalogue(design: Design) -> Iterator[Single]:
     wanted = showable(calset, template, list(probes(applicable(kinds, context, template), context)))
     columns = Columns(fit.likelihood, fit.values)
     changes = [[one for member in p.group for one in member.first_order(template)] for p in wanted]
-    asked = [i for i, some in enumerate(changes) if all(columns.has(change) for change in some)]
+    asked = [i for i, some in enumerate(changes) if some and all(columns.has(change) for change in some)]
     found, first = columns.of([change for i in asked for change in changes[i]]), 0
     for probe in (wanted[i] for i in asked):
         rows = design.stacked([found[:, first : first + len(probe.widths)]])
