@@ -19,8 +19,7 @@ from walop_jax.calibration.certify import _physics
 from walop_jax.calibration.matrix import analysis_vectors, matrices
 from walop_jax.data import DataError
 from walop_jax.data.calset import empty_sources
-from walop_jax.data.catalogue import read_catalogue
-from walop_jax.data.field_points import field_points
+from walop_jax.data.catalogue import field_points, read_catalogue
 from walop_jax.data.records import Exposures, FilterCurve, Position, Site
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table

@@ -16,7 +16,7 @@ from zemax_exports import write_folder
 import walop_jax as walop
 from walop_jax.commands import COMMANDS
 from walop_jax.commands.command import COMMON, Argument
-from walop_jax.data.filters import DEFAULT_FILTER
+from walop_jax.data.settings import DEFAULT_FILTER
 from walop_jax.data.zemax import CAMERA_CONFIGURATIONS, RELATIVE_ERROR
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.fit import outliers

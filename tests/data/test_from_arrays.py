@@ -9,7 +9,7 @@ import pytest
 from astropy import units
 from small_run import SEED, SMALL
 
-from walop_jax.data.from_arrays import checked, from_arrays
+from walop_jax.data.calset import checked, from_arrays
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.io.errors import DataError

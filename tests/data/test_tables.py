@@ -8,7 +8,7 @@ from astropy import units
 from astropy.table import MaskedColumn, Table
 
 from walop_jax.data import DataError
-from walop_jax.data.field_points import field_points
+from walop_jax.data.catalogue import field_points
 from walop_jax.data.user_tables import read_input_table, write_output_table
 from walop_jax.model.instrument import nominal_instrument
 
@@ -61,9 +61,9 @@ def test_empty_cells_are_the_defaults(tmp_path):
         ("X,Y\n", "no rows"),
         ("X,x,Y\n0,1,0\n", "X: the column is there twice"),
         ("X,Y\n6,3\n12,-3\n", "arcmin or pixels"),
-        ("X,Y,TEFF\n0,0,5\n", "TEFF: is no temperature"),
+        ("X,Y,TEFF\n0,0,5\n", "TEFF: is not a temperature"),
         ("X,Y,CHWP_IN\n0,0,T\n", "CHWP_ANGLE: is not finite in row 0"),
-        ("X,Y,CHWP_IN\n0,0,perhaps\n", "CHWP_IN: perhaps is neither true nor false, in row 0"),
+        ("X,Y,CHWP_IN\n0,0,perhaps\n", "CHWP_IN: 'perhaps' is neither true nor false, in row 0"),
         ("X,Y,TEMP\n0,0,283\n", "kelvin"),
         ("X,Y,HA\n0,0,90\n", "degrees"),
         ("", "p.csv"),

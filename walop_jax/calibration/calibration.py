@@ -25,11 +25,15 @@ from walop_jax.calibration.matrix import (
     p_errors,
     sample_stars,
 )
-from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter, single_wavelength
 from walop_jax.data.frames import Grid
-from walop_jax.data.quantities import in_unit
 from walop_jax.data.records import CALIBRATION_PLATE, Exposures, FilterCurve, InputFile, Site, Sources
-from walop_jax.data.settings import Settings
+from walop_jax.data.settings import (
+    BUILTIN_FILTERS,
+    DEFAULT_FILTER,
+    Settings,
+    builtin_filter,
+    single_wavelength,
+)
 from walop_jax.fit.model_file import model_without_data, render, standard_names
 from walop_jax.fit.parameter_table import HEAD, parameter_notes, parameter_rows, parameter_table
 from walop_jax.fit.refit import FitResult

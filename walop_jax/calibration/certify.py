@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.data.filters import BUILTIN_FILTERS
+from walop_jax.data.settings import BUILTIN_FILTERS
 from walop_jax.fit.verdict import Quality
 
 MAP_TOLERANCE = 1e-7  # between maps in the file and maps of its parameters, on another machine

@@ -57,7 +57,7 @@ def compare(
     converge, and for a `calibration` or `truth` in memory together with `output`.
     """
     from walop_jax import Calibration
-    from walop_jax.data.field_points import true_matrices
+    from walop_jax.data.catalogue import true_matrices
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.refit import refit
     from walop_jax.io.plain_tables import write_columns

@@ -130,7 +130,7 @@ def set_of(data: Sets, instrument: Instrument | None = None) -> CalibrationSet:
     """A checked set: files are checked as they are read, tables in memory here."""
     from walop_jax import CalibrationSet
     from walop_jax.data import read_calibration_set
-    from walop_jax.data.from_arrays import checked
+    from walop_jax.data.calset import checked
     from walop_jax.data.records import KINDS
     from walop_jax.data.table_intensities import TableIntensities
 

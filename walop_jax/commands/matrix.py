@@ -58,7 +58,7 @@ def matrix(
     In Python: an astropy table, for `x`, `y` (degrees or quantities) or for the table `points`: a path, an astropy
     table, columns by name. `columns` are others of those above, such as teff=5000.
     """
-    from walop_jax.data.field_points import POINT_COLUMNS, field_points
+    from walop_jax.data.catalogue import POINT_COLUMNS, field_points
     from walop_jax.data.user_tables import table_format
     from walop_jax.fit.verdict import Quality
     from walop_jax.io.plain_tables import MatrixTable

@@ -66,7 +66,7 @@ def trace(
     names, for an unknown instrument, filter or moving element.
     """
     from walop_jax import Settings, Sightline
-    from walop_jax.data.filters import builtin_filter
+    from walop_jax.data.settings import builtin_filter
     from walop_jax.model.instrument import nominal_instrument
     from walop_jax.model.trace import trace as traced
 

@@ -5,7 +5,6 @@ gone afterwards: inside the package a number has the unit that the record's docs
 """
 
 from walop_jax.data.calset import empty_sources, read_calibration_set, with_builtins
-from walop_jax.data.filters import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter
 from walop_jax.data.frames import FrameIntensities, Grid
 from walop_jax.data.merge import JoinedIntensities, merge_calibration_sets
 from walop_jax.data.records import (
@@ -23,6 +22,7 @@ from walop_jax.data.records import (
     Sources,
 )
 from walop_jax.data.schema import CALVERS
+from walop_jax.data.settings import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter
 from walop_jax.data.table_intensities import TableIntensities, empty_block
 from walop_jax.data.write import write_calibration_set, write_frames
 from walop_jax.data.zemax import import_transmissions

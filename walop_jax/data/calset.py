@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +13,21 @@ import numpy as np
 
 from walop_jax.data import schema
 from walop_jax.data.checks import (
+    doubts_about,
     instrument_name,
     make_exposures,
     make_filters,
     make_points,
     make_sources,
+    oldest_version,
 )
 from walop_jax.data.compression import EXTENSION, read_compression, remark
-from walop_jax.data.filters import builtin_filter
 from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
 from walop_jax.data.merge import merge_calibration_sets
-from walop_jax.data.plausibility import doubts_about
 from walop_jax.data.records import (
     KINDS,
     CalibrationSet,
+    Compression,
     Exposures,
     FilterCurve,
     InputFile,
@@ -36,8 +37,10 @@ from walop_jax.data.records import (
     Sources,
 )
 from walop_jax.data.repeats import check_repeats
-from walop_jax.data.schema import CALVERS, Place, column_names, read_table, table_rules
+from walop_jax.data.schema import CALVERS, Place, column_names, in_unit, read_table, table_of, table_rules
+from walop_jax.data.settings import builtin_filter
 from walop_jax.data.table_intensities import TableIntensities, mask_repeats, table_intensities, usable
+from walop_jax.data.write import filter_columns, set_tables
 from walop_jax.io.errors import DataError, fail, nearest
 from walop_jax.io.fits_reading import UNREADABLE, OpenFile, one_line, open_fits
 
@@ -89,52 +92,82 @@ def _read_one(path: Path, kinds: Collection[str]) -> CalibrationSet:
     return dataclasses.replace(found, inputs=(InputFile(path, opened.sha256),))
 
 
-def set_from_hdus(opened: OpenFile, kinds: Collection[str] = ()) -> CalibrationSet:
-    """A calibration set from HDUs in memory, checked as a file is; `kinds` as for `read_calibration_set`."""
-    return _from_hdus(opened, (*KINDS, *kinds))
-
-
 def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
     path, remarks = opened.path, list(opened.remarks)
     primary = opened.hdus[0].header
     version, instrument, site = _header(primary, path)
-    tables, images = _extensions(opened, version, remarks)
-
-    def table(name: str) -> dict[str, Any]:
-        if name not in tables:
-            raise fail("the extension is missing", file=path, extension=name, advice="see the file format")
+    hdus, images = _extensions(opened, version, remarks)
+    if images and "INTENSITIES" in hdus:
+        raise fail("has frames and a table of intensities", file=path, advice="use one file for each")
+    if images and opened.compressed:
+        raise fail("frames are read in slabs", file=path, advice="unpack the file with gunzip")
+    tables = {}
+    for name in ("EXPOSURES", *(() if images else ("POINTS", "INTENSITIES")), "FILTERS", "SOURCES"):
         place = Place(path, name)
-        rules = table_rules(name, version, column_names(tables[name], place), place)
-        columns, more = read_table(tables[name], rules, place)
-        remarks.extend(more)
-        return columns
-
-    filters = make_filters(table("FILTERS"), Place(path, "FILTERS")) if "FILTERS" in tables else {}
-    place = Place(path, "EXPOSURES")
-    exposures = make_exposures(table("EXPOSURES"), filters, site, place, version=version, kinds=kinds)
-    remarks.extend(doubts_about(instrument, site, exposures, place))
-    sources = (
-        make_sources(table("SOURCES"), Place(path, "SOURCES")) if "SOURCES" in tables else empty_sources()
-    )
-    if images:
-        if "INTENSITIES" in tables:
-            raise fail("has frames and a table of intensities", file=path, advice="use one file for each")
-        if opened.compressed:
-            raise fail("frames are read in slabs", file=path, advice="unpack the file with gunzip")
-        intensities, points = _frames(images, exposures, instrument, version, path)
-    else:
-        points = make_points(table("POINTS"), instrument, Place(path, "POINTS"))
-        place = Place(path, "INTENSITIES")
-        intensities, more = table_intensities(table("INTENSITIES"), exposures, points, sources, place)
-        intensities, repeated = mask_repeats(intensities, exposures, path)
-        remarks.extend(more + repeated + _idle(intensities, exposures, path))
-    compression = None if EXTENSION not in tables else read_compression(tables[EXTENSION], path)
-    if compression is None:
-        remarks.extend(check_repeats(intensities, exposures, points, path))
-    found = CalibrationSet(
+        if name in hdus:
+            rules = table_rules(name, version, column_names(hdus[name], place), place)
+            tables[name], more = read_table(hdus[name], rules, place)
+            remarks += more
+        elif name not in ("FILTERS", "SOURCES"):
+            raise place.fail("the extension is missing", advice="see the file format")
+    return assembled(
+        tables,
+        path,
+        version=version,
         instrument=instrument,
         site=site,
         origin=str(primary.get("ORIGIN", "")).strip(),
+        kinds=kinds,
+        remarks=remarks,
+        images=images,
+        compression=None if EXTENSION not in hdus else read_compression(hdus[EXTENSION], path),
+    )
+
+
+def assembled(
+    tables: Mapping[str, dict[str, Any]],
+    path: Path,
+    *,
+    version: int,
+    instrument: str,
+    site: Site,
+    origin: str,
+    kinds: Collection[str] = KINDS,
+    remarks: Iterable[str] = (),
+    images: Mapping[str, Any] | None = None,
+    compression: Compression | None = None,
+) -> CalibrationSet:
+    """A checked calibration set from its tables, columns by name in kind and unit of the schema.
+
+    FILTERS and SOURCES may be missing; with `images` (HDUs of whole frames by name) POINTS and INTENSITIES are not
+    used. `path` is what errors and remarks call the set.
+
+    Raises `DataError` for whatever numbers cannot be meant.
+    """
+    remarks = list(remarks)
+    filters = make_filters(tables["FILTERS"], Place(path, "FILTERS")) if "FILTERS" in tables else {}
+    place = Place(path, "EXPOSURES")
+    exposures = make_exposures(tables["EXPOSURES"], filters, site, place, version=version, kinds=kinds)
+    remarks += doubts_about(instrument, site, exposures, place)
+    sources = empty_sources()
+    if "SOURCES" in tables:
+        sources = make_sources(tables["SOURCES"], Place(path, "SOURCES"))
+    if images:
+        intensities, points = _frames(images, exposures, instrument, version, path)
+    else:
+        points = make_points(tables["POINTS"], instrument, Place(path, "POINTS"))
+        place = Place(path, "INTENSITIES")
+        intensities, more = table_intensities(tables["INTENSITIES"], exposures, points, sources, place)
+        intensities, repeated = mask_repeats(intensities, exposures, path)
+        remarks += more + repeated + _idle(intensities, exposures, path)
+    if compression is None:
+        remarks += check_repeats(intensities, exposures, points, path)
+    else:
+        remarks.append(remark(compression, len(points)))
+    return CalibrationSet(
+        instrument=instrument,
+        site=site,
+        origin=origin,
         exposures=exposures,
         points=points,
         sources=sources,
@@ -143,7 +176,6 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
         remarks=tuple(remarks),
         compression=compression,
     )
-    return found if compression is None else dataclasses.replace(found, remarks=(*remarks, remark(found)))
 
 
 def _header(header: Any, path: Path) -> tuple[int, str, Site]:
@@ -210,7 +242,7 @@ def _idle(intensities: TableIntensities, exposures: Exposures, path: Path) -> li
 
 
 def _frames(
-    images: dict[str, Any], exposures: Exposures, instrument: str, version: int, path: Path
+    images: Mapping[str, Any], exposures: Exposures, instrument: str, version: int, path: Path
 ) -> tuple[Intensities, Points]:
     """Describe frames, and look at a few rows of pixels for what is wrong everywhere."""
     if np.any(bad := (exposures.kind == "standard") & ~exposures.clp_in):
@@ -248,3 +280,152 @@ def _frames(
     if lowest == highest and number > 1:
         raise place.fail(f"all counts are equal ({lowest:g})", f"N0…N{last}", "these are not measurements")
     return intensities, grid.points
+
+
+NAME = "arrays"
+"""What errors call the file that is none."""
+
+_SHOWN = 3
+_UNITS = {name: rule.unit for name, rule in schema.EXPOSURES.items()}
+
+
+def from_arrays(
+    counts: Any,
+    errors: Any,
+    x: Any,
+    y: Any,
+    angles: Any,
+    kinds: Any = "clp",
+    *,
+    instrument: str = "WALOP-SOUTH",
+    site: Site | None = None,
+    filters: Mapping[str, FilterCurve] | None = None,
+    sources: Mapping[str, Any] | None = None,
+    source: Any = None,
+    origin: str = "",
+    **exposures: Any,
+) -> CalibrationSet:
+    """A checked calibration set from arrays in memory.
+
+    `counts` and `errors` have the shape (point, exposure, camera), in electrons; counts that are NaN in all cameras
+    were not measured. `x`, `y` are the field points in degrees, `angles` those of the calibration polariser in every
+    exposure in degrees, NaN where it is out. `kinds` is the KIND of every exposure, or one for all.
+
+    Any other column of EXPOSURES goes by its name in small letters, one value or one for each exposure: `mjd`,
+    `filter`, `teff`, `temp`, `ha`, `ra`, `dec`, `rotator`, `chwp_in`, `chwp_angle`, … (docs: files). `sources` are
+    the columns of SOURCES, `source` (point, exposure) the SOURCE of every intensity, −1 for none; `filters` are
+    curves by name. Quantities are converted.
+
+    Raises `DataError`, naming column and row, for whatever a file would be refused for.
+    """
+    counts, errors = in_unit(counts, "electron", "counts"), in_unit(errors, "electron", "errors")
+    x, y, angles = (np.atleast_1d(in_unit(v, "deg", n)) for v, n in ((x, "x"), (y, "y"), (angles, "angles")))
+    if counts.ndim != 3 or counts.shape[:2] != (len(x), len(angles)) or len(x) != len(y):
+        raise fail(
+            f"has shape {counts.shape} for {len(x)} values of x, {len(y)} of y and {len(angles)} angles",
+            column="counts",
+            advice="its axes are (point, exposure, camera)",
+        )
+    if errors.shape != counts.shape:
+        raise fail(f"has shape {errors.shape}, counts {counts.shape}", column="errors", advice="one for each")
+    number, inside = len(angles), np.isfinite(angles)
+    point, exposure = np.nonzero(np.isfinite(counts).all(axis=2))
+    tables: dict[str, Mapping[str, Any]] = {
+        "EXPOSURES": {
+            "EXPOSURE": np.arange(number),
+            "KIND": np.broadcast_to(np.asarray(kinds), number),
+            "CLP_IN": inside,
+            "CLP_ANGLE": np.where(inside, angles, np.nan),
+        }
+        | {name.upper(): _column(name.upper(), values, number) for name, values in exposures.items()},
+        "POINTS": {"POINT": np.arange(len(x)), "X": x, "Y": y},
+        "INTENSITIES": {
+            "EXPOSURE": exposure,
+            "POINT": point,
+            "SOURCE": np.full(len(point), -1) if source is None else np.asarray(source)[point, exposure],
+            "N": counts[point, exposure],
+            "N_ERR": errors[point, exposure],
+        },
+    }
+    if sources is not None:
+        tables["SOURCES"] = _sources(sources)
+    if filters:
+        tables["FILTERS"] = filter_columns(filters)
+    found = _in_memory(
+        tables,
+        version=schema.CALVERS,
+        instrument=instrument_name(instrument, schema.CALVERS, Place(NAME, "PRIMARY")),
+        site=Site("", *np.full(3, np.nan)) if site is None else site,
+        origin=origin,
+    )
+    return dataclasses.replace(found, remarks=(*found.remarks, *_spoilt(counts)))
+
+
+def checked(calset: CalibrationSet, kinds: Collection[str] = ()) -> CalibrationSet:
+    """A set from memory behind the checks that files meet, and as they would leave it: unusable rows masked, and said.
+
+    `kinds` are kinds of exposures beyond those of the format. Raises `DataError` as `read_calibration_set` does.
+    """
+    version = oldest_version(calset.instrument, calset.exposures, calset.cameras)
+    found = _in_memory(
+        set_tables(calset),
+        version=version,
+        instrument=instrument_name(calset.instrument, version, Place(NAME, "PRIMARY")),
+        site=calset.site,
+        origin=calset.origin,
+        kinds=(*KINDS, *kinds),
+        compression=calset.compression,
+    )
+    before, after = calset.intensities, found.intensities
+    if isinstance(before, TableIntensities) and isinstance(after, TableIntensities):
+        # A file says why a row is not to be used, memory only that it is not.
+        return dataclasses.replace(found, intensities=after.using(after.used & before.used))
+    return found
+
+
+def _in_memory(tables: Mapping[str, Mapping[str, Any]], *, version: int, **said: Any) -> CalibrationSet:
+    """A checked set of columns in memory; `said` as for `assembled`."""
+    made = {}
+    for name, columns in tables.items():
+        place = Place(NAME, name)
+        made[name] = table_of(columns, table_rules(name, version, list(columns), place), place)
+    return assembled(made, Path(NAME), version=version, **said)
+
+
+def _spoilt(counts: np.ndarray) -> Iterator[str]:
+    """What is measured in some cameras only, by its place in the array."""
+    finite = np.isfinite(counts)
+    places = np.argwhere(finite.any(axis=2) & ~finite.all(axis=2))
+    if len(places):
+        shown = ", ".join(
+            f"counts[{p}, {e}] (camera {' and '.join(str(k) for k in np.flatnonzero(~finite[p, e]))})"
+            for p, e in places[:_SHOWN].tolist()
+        )
+        more = f" and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
+        yield f"{NAME}: not finite in {shown}{more}: not used in any camera"
+
+
+def _column(name: str, values: Any, number: int) -> np.ndarray:
+    unit = _UNITS.get(name, "deg" if name.endswith("_ANGLE") else "")
+    raw = np.asarray(getattr(values, "value", values))
+    plain = raw if raw.dtype.kind in "bSU" else in_unit(values, unit, name.lower())
+    try:
+        return np.broadcast_to(plain, number).copy()
+    except ValueError:
+        raise fail(
+            f"has shape {plain.shape} for {number} exposures",
+            column=name.lower(),
+            advice="one value for each",
+        ) from None
+
+
+def _sources(given: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The columns of SOURCES, numbered where they have no number."""
+    columns = {}
+    for name, values in given.items():
+        rule = schema.SOURCES.get(str(name).upper())
+        numbers = rule is not None and rule.kind == "float"
+        plain = in_unit(values, rule.unit, str(name)) if numbers else np.asarray(values)
+        columns[str(name).upper()] = np.atleast_1d(plain)
+    columns.setdefault("SOURCE", np.arange(max(map(len, columns.values()), default=0)))
+    return columns

@@ -1,4 +1,6 @@
-"""Science catalogues: one row per star and exposure, an intensity of every camera (docs: files).
+"""Tables that an instrument is asked about: field points, and catalogues of stars (docs: files).
+
+Catalogues have one row per star and exposure, an intensity of every camera:
 
 | column | unit | meaning |
 | --- | --- | --- |
@@ -16,18 +18,148 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection
+import os
+from collections.abc import Collection, Mapping, Sized
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data.field_points import FieldPoints, InstrumentOfTables, field_points
-from walop_jax.data.schema import Column, Place
-from walop_jax.data.user_tables import InputTable, numeric_column, vector_column
+from walop_jax.data.schema import EXPOSURES, Column, Place, check, finite
+from walop_jax.data.settings import TEMPERATURE, Settings
+from walop_jax.data.user_tables import InputTable, numeric_column, read_input_table, vector_column
 from walop_jax.io.errors import rows_text
 
-_ROTATOR, _TIME = Column("float", "deg", float("nan")), Column("float", "d", float("nan"))
 _NEGATIVE = 5.0  # sigma: what noise about a subtracted background may do, and no more
+_SINGLE = 1  # point: it may lie outside without a doubt about its unit
+_FINITE = finite("correct or remove these rows")
+
+
+def _also_finite(column: Column, missing: object) -> Column:
+    """A column of a calibration set in a table of field points, where a number is needed in every row."""
+    return dataclasses.replace(column, missing=missing, rules=(_FINITE, *column.rules))
+
+
+POINT_COLUMNS: Mapping[str, Column] = {
+    "X": Column("float", "deg", rules=(_FINITE,)),
+    "Y": Column("float", "deg", rules=(_FINITE,)),
+    "TEFF": EXPOSURES["TEFF"],
+    "FILTER": EXPOSURES["FILTER"],
+    "TEMP": _also_finite(EXPOSURES["TEMP"], TEMPERATURE),
+    "HA": _also_finite(EXPOSURES["HA"], 0.0),
+}
+
+
+@runtime_checkable
+class InstrumentOfTables(Protocol):
+    """What a table must know of the instrument that it is for; the field reaches to ±`field_limit` (deg)."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        ...
+
+    @property
+    def field_limit(self) -> float:
+        """Largest |X|, |Y| (deg)."""
+        ...
+
+    @property
+    def cameras(self) -> Sized:
+        """Its cameras."""
+        ...
+
+    @property
+    def arms(self) -> Sized:
+        """Its arms."""
+        ...
+
+    def moving(self) -> tuple[str, ...]:
+        """Column prefixes of its moving elements behind the polariser."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class FieldPoints:
+    """Where, and under which optical settings, an instrument matrix is asked for.
+
+    `x`, `y` in degrees; `outside` marks points beyond the field of the instrument.
+    """
+
+    x: Float[np.ndarray, " n"]
+    y: Float[np.ndarray, " n"]
+    settings: Settings
+    outside: Bool[np.ndarray, " n"]
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+
+def field_points(
+    source: InputTable, instrument: InstrumentOfTables, always_in: Collection[str] = ()
+) -> FieldPoints:
+    """The X, Y and optional settings of a table of field points of an instrument.
+
+    A moving element has the columns `<P>_ANGLE` and `<P>_IN`; without the latter it is in the beam where it has an
+    angle. The elements `always_in` (column prefixes) must have an angle. Single points outside the field are marked; if
+    most of them lie outside, the unit must be wrong.
+
+    Raises `DataError` naming file, column and row for anything that cannot be meant.
+    """
+    place = Place(source.path, "")
+    columns = {name: numeric_column(source, name, rule) for name, rule in POINT_COLUMNS.items()}
+    check(columns, POINT_COLUMNS, place)
+    x, y = columns["X"], columns["Y"]
+    positions = {}
+    for prefix in instrument.moving():
+        name = f"{prefix}_ANGLE"
+        if prefix in always_in and name not in source.names:
+            advice = f"add it: {prefix} was in the beam in all exposures of the calibration (NaN: it is out)"
+            raise place.fail("the column is missing", name, advice)
+        angle = numeric_column(source, name, EXPOSURES["CLP_ANGLE"])
+        inside = np.isfinite(angle)
+        if f"{prefix}_IN" in source.names:
+            inside = numeric_column(source, f"{prefix}_IN", EXPOSURES["CHWP_IN"])
+        advice = f"{prefix}_IN is true: give the angle"
+        place.refuse(inside & ~np.isfinite(angle), "is not finite", name, advice)
+        check({name: angle}, {name: EXPOSURES["CLP_ANGLE"]}, place)
+        positions[prefix] = np.where(inside, angle, np.nan)
+    limit = instrument.field_limit
+    outside = np.maximum(np.abs(x), np.abs(y)) > limit
+    if len(x) > _SINGLE and np.mean(outside) > 0.5:
+        raise place.fail(
+            f"most points lie outside ±{limit:g}° of {instrument.name}: {rows_text(np.flatnonzero(outside))}",
+            "X, Y",
+            "field coordinates are in degrees: are these arcmin or pixels?",
+        )
+    settings = Settings(
+        filter=columns["FILTER"],
+        teff=columns["TEFF"],
+        temperature=columns["TEMP"],
+        hour_angle=columns["HA"],
+        positions=positions,
+    )
+    return FieldPoints(x=x, y=y, settings=settings, outside=outside)
+
+
+def true_matrices(
+    path: str | os.PathLike[str], instrument: InstrumentOfTables
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
+    """X, Y (deg) and M21, M22, … of a table of true matrices, three for each arm.
+
+    Raises `DataError` for what is missing or not finite.
+    """
+    source = read_input_table(path)
+    points = field_points(source, instrument)
+    names = [f"M{arm + 2}{column}" for arm in range(len(instrument.arms)) for column in (1, 2, 3)]
+    matrix = np.stack([numeric_column(source, name, Column("float")) for name in names], axis=1)
+    Place(path, "").refuse(
+        ~np.isfinite(matrix), "not finite", f"{names[0]} … {names[-1]}", "remove these rows"
+    )
+    return points.x, points.y, matrix
+
+
+# ------------------------------------------------------------------------------------ stars
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,14 +201,10 @@ def read_catalogue(
     points, cameras = field_points(source, instrument, always_in), len(instrument.cameras)
     rule = Column("float", "electron", width=cameras, shape_advice=f"one row holds all {cameras} cameras")
     counts, sigma = (vector_column(source, name, rule) for name in ("N", "N_ERR"))
-    impossible = np.flatnonzero(np.any(np.isfinite(counts) & (sigma <= 0), axis=1))
-    if impossible.size:
-        what = f"is not above 0 in {rows_text(impossible)}"
-        raise place.fail(
-            what, "N_ERR", "standard errors in electrons; NaN for a camera that is not to be used"
-        )
+    advice = "standard errors in electrons; NaN for a camera that is not to be used"
+    place.refuse(np.isfinite(counts) & (sigma <= 0), "is not above 0", "N_ERR", advice)
     bad = _flagged(source, cameras, place) | (counts >= saturation) | (counts < -_NEGATIVE * sigma)
-    rotator = numeric_column(source, "ROTATOR", _ROTATOR)
+    rotator = numeric_column(source, "ROTATOR", EXPOSURES["ROTATOR"])
     star = _stars(source, points)
     on_sky = np.isfinite(rotator)
     most = np.zeros(star.max() + 1, bool)
@@ -92,7 +220,7 @@ def read_catalogue(
         spoilt=np.any(bad, axis=1),
         star=star,
         rotator=rotator,
-        time=numeric_column(source, "MJD", _TIME),
+        time=numeric_column(source, "MJD", EXPOSURES["MJD"]),
     )
 
 

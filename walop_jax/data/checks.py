@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
-from walop_jax.data.filters import BUILTIN_FILTERS
 from walop_jax.data.records import KINDS, Exposures, FilterCurve, Points, Site, Sources
-from walop_jax.data.schema import Place
+from walop_jax.data.schema import EXPOSURES, POINTS, SOURCES, Place, check
+from walop_jax.data.settings import BUILTIN_FILTERS
 from walop_jax.instruments.description import described, shipped
 from walop_jax.io.errors import nearest, rows_text
 
@@ -21,18 +21,6 @@ EPHEMERIS_MJD = (15020.0, 88069.0)
 """Where astropy's built-in ephemeris (ERFA `moon98`, the years 1900 to 2100) is meant to be used."""
 
 _WAVELENGTH = (0.2, 20.0)  # µm, from the ultraviolet to the thermal infrared
-
-
-def refuse(bad: np.ndarray, what: str, column: str, advice: str, place: Place) -> None:
-    """Raise `DataError` naming the rows where `bad` is set, if there are any."""
-    if np.any(bad):
-        raise place.fail(f"{what} in {rows_text(np.flatnonzero(bad))}", column, advice)
-
-
-def unique(ids: np.ndarray, column: str, place: Place) -> None:
-    """Raise `DataError` if an identifier is there twice."""
-    _, inverse, number = np.unique(ids, return_inverse=True, return_counts=True)
-    refuse(number[inverse] > 1, "the identifier is not unique", column, "number the rows", place)
 
 
 def field_limit(instrument: str) -> float:
@@ -67,17 +55,11 @@ def oldest_version(instrument: str, exposures: Exposures, cameras: int) -> int:
 
 def make_points(table: dict[str, Any], instrument: str, place: Place) -> Points:
     """Check the POINTS table (degrees) against the field of the instrument."""
-    unique(table["POINT"], "POINT", place)
+    check(table, POINTS, place)
     limit = field_limit(instrument)
+    advice = "field coordinates are in degrees: are these arcmin or pixels?"
     for name in ("X", "Y"):
-        refuse(~np.isfinite(table[name]), "is not finite", name, "remove these points", place)
-        refuse(
-            np.abs(table[name]) > limit,
-            f"lies outside ±{limit:g}° of {instrument}",
-            name,
-            "field coordinates are in degrees: are these arcmin or pixels?",
-            place,
-        )
+        place.refuse(np.abs(table[name]) > limit, f"lies outside ±{limit:g}° of {instrument}", name, advice)
     return Points(point=table["POINT"], x=table["X"], y=table["Y"])
 
 
@@ -123,22 +105,8 @@ def make_filters(table: dict[str, Any], place: Place) -> dict[str, FilterCurve]:
 
 def make_sources(table: dict[str, Any], place: Place) -> Sources:
     """Check the SOURCES table (fractions; kelvin)."""
-    unique(table["SOURCE"], "SOURCE", place)
-    refuse(table["SOURCE"] < 0, "is negative", "SOURCE", "−1 means no source; number from 0", place)
-    for name in ("Q", "U"):
-        refuse(~np.isfinite(table[name]), "is not finite", name, "remove the source", place)
-        refuse(np.abs(table[name]) > 1, "exceeds 1", name, "fractions are wanted: are these per cent?", place)
-    for name in ("Q_ERR", "U_ERR"):
-        refuse(
-            ~(table[name] > 0) | np.isinf(table[name]),
-            "is not a positive number",
-            name,
-            "it is the width of a prior: give the error of the catalogue",
-            place,
-        )
-    _temperature(table["TEFF"], place)
-    fields = ("SOURCE", "NAME", "Q", "U", "Q_ERR", "U_ERR", "TEFF")
-    return Sources(**{name.lower(): table[name] for name in fields})
+    check(table, SOURCES, place)
+    return Sources(**{name.lower(): table[name] for name in SOURCES})
 
 
 def make_exposures(
@@ -154,48 +122,38 @@ def make_exposures(
 
     `kinds` are those that KIND may have, None: any.
     """
-    unique(table["EXPOSURE"], "EXPOSURE", place)
     table["KIND"] = kind = np.char.lower(table["KIND"])
     if kinds is not None:
         _kinds(kind, kinds, version, place)
     known = {*filters, *BUILTIN_FILTERS}
     for name in np.unique(table["FILTER"]).tolist():
         if name not in known:
-            refuse(
-                table["FILTER"] == name,
-                f"{name!r} is neither a row of FILTERS nor built in,",
-                "FILTER",
-                nearest(name, known),
-                place,
-            )
+            what, advice = f"{name!r} is neither a row of FILTERS nor built in,", nearest(name, known)
+            place.refuse(table["FILTER"] == name, what, "FILTER", advice)
     clp_in = table["CLP_IN"]
-    refuse((kind == "clp") & ~clp_in, "is false", "CLP_IN", "KIND clp needs the polariser in", place)
+    place.refuse((kind == "clp") & ~clp_in, "is false", "CLP_IN", "KIND clp needs the polariser in")
     moving = [name.removesuffix("_IN") for name in table if name.endswith("_IN")]
     for prefix in moving:
         angle, inside = table[f"{prefix}_ANGLE"], table[f"{prefix}_IN"]
         advice = f"give the encoder reading, or set {prefix}_IN false"
-        refuse(inside & ~np.isfinite(angle), "is not finite", f"{prefix}_ANGLE", advice, place)
+        place.refuse(inside & ~np.isfinite(angle), "is not finite", f"{prefix}_ANGLE", advice)
         # Out of the beam an element has no angle, whatever the header remembers.
         table[f"{prefix}_ANGLE"] = np.where(inside, angle, np.nan)
     angles = np.unique(table["CLP_ANGLE"][clp_in])
     if like_radians(angles):
         what = f"all {len(angles)} different angles lie between {angles[0]:g} and {angles[-1]:g}"
         raise place.fail(what, "CLP_ANGLE", "angles are in degrees: are these radians?")
-    _temperature(table["TEFF"], place)
-    _ranges(table, [f"{prefix}_ANGLE" for prefix in moving], place)
+    check(table, {**EXPOSURES, **{f"{prefix}_ANGLE": EXPOSURES["CLP_ANGLE"] for prefix in moving}}, place)
 
     moon, standard = (kind == "moon") & ~clp_in, (kind == "standard") & ~clp_in
     for name in ("MJD", "RA", "DEC", "ROTATOR"):
         bad = moon & ~np.isfinite(table[name])
-        refuse(bad, "is not finite", name, "the Moon sky needs time and pointing", place)
-    refuse(
-        standard & ~np.isfinite(table["ROTATOR"]), "is not finite", "ROTATOR", "a standard needs it", place
-    )
+        place.refuse(bad, "is not finite", name, "the Moon sky needs time and pointing")
+    bad = standard & ~np.isfinite(table["ROTATOR"])
+    place.refuse(bad, "is not finite", "ROTATOR", "a standard needs it")
     low, high = EPHEMERIS_MJD
     bad = (moon & (table["MJD"] < low)) | (table["MJD"] > high)
-    refuse(bad, "is not in 1900 … 2100", "MJD", "is this a Julian Date? subtract 2400000.5", place)
-    bad = (table["EXPTIME"] < 0) | np.isinf(table["EXPTIME"])
-    refuse(bad, "is not a time", "EXPTIME", "seconds; NaN where it is not known", place)
+    place.refuse(bad, "is not in 1900 … 2100", "MJD", "is this a Julian Date? subtract 2400000.5")
     _site(site, place, needed=bool(np.any(moon)))
     return Exposures.from_columns(table)
 
@@ -204,30 +162,10 @@ def _kinds(kind: np.ndarray, kinds: Collection[str], version: int, place: Place)
     known = [name for name in kinds if version > 1 or name in _FIRST_KINDS]
     for name in np.unique(kind).tolist():
         if name not in kinds:
-            refuse(kind == name, f"{name!r} is not a kind,", "KIND", nearest(name, known), place)
+            place.refuse(kind == name, f"{name!r} is not a kind,", "KIND", nearest(name, known))
         if name not in known:
             what = f"{name!r} is a kind of CALVERS 2, this is {version},"
-            refuse(kind == name, what, "KIND", "set CALVERS = 2 in the primary header", place)
-
-
-def _temperature(teff: np.ndarray, place: Place) -> None:
-    bad = ~np.isnan(teff) & ~((teff >= 500) & (teff < 1e6))
-    refuse(bad, "is not a temperature of a source", "TEFF", "NaN means a flat photon spectrum", place)
-
-
-def _ranges(table: dict[str, Any], angles: list[str], place: Place) -> None:
-    """Refuse values that only another unit can explain; NaN passes, it has been dealt with."""
-    encoder = (36000.0, "encoder readings are in degrees: are these steps?")
-    limits = {
-        "DEC": (90.0, "declinations are in degrees"),
-        "RA": (360.0, "right ascensions are in degrees"),
-        "ROTATOR": (3600.0, "position angles are in degrees"),
-        **dict.fromkeys(angles, encoder),
-        "HA": (24.0, "hour angles are in hours: are these degrees?"),
-        "TEMP": (150.0, "temperatures are in degrees Celsius: are these kelvin?"),
-    }
-    for name, (limit, advice) in limits.items():
-        refuse(np.abs(table[name]) > limit, f"exceeds ±{limit:g}", name, advice, place)
+            place.refuse(kind == name, what, "KIND", "set CALVERS = 2 in the primary header")
 
 
 def _site(site: Site, place: Place, *, needed: bool) -> None:
@@ -255,3 +193,52 @@ def like_radians(angles: np.ndarray) -> bool:
     steps = distinct / 0.05
     off = np.mean(np.abs(steps - np.round(steps)) > 1e-3)
     return bool(distinct[-1] - distinct[0] > 0.5 * np.pi and off > 0.5)
+
+
+_NEAR = 0.05  # degrees between two statements of one site
+_LEVEL = 100.0  # metres
+_OLDEST = 48000.0  # MJD: 1990, before which no such camera was read out
+_CAMPAIGN = 400.0  # days
+
+
+def doubts_about(instrument: str, site: Site, exposures: Exposures, place: Place) -> Iterator[str]:
+    """Sentences on a site that is not that of a shipped instrument, and on dates that cannot be those of one campaign.
+
+    None of it forbids a fit: an instrument may have been moved, and MJD matters to few of its exposures.
+    """
+    if instrument in shipped():
+        yield from _about_site(instrument, site, place)
+    yield from _about_dates(exposures, place)
+
+
+def _about_site(instrument: str, site: Site, place: Place) -> Iterator[str]:
+    _, latitude, longitude, elevation, _ = described(instrument).place
+    for card, value, known, near, unit in (
+        ("SITELAT", site.latitude, latitude, _NEAR, "°"),
+        ("SITELONG", site.longitude, longitude, _NEAR, "°"),
+        ("SITEELEV", site.elevation, elevation, _LEVEL, " m"),
+    ):
+        away = abs(value - known)
+        if card == "SITELONG":
+            away = abs((away + 180.0) % 360.0 - 180.0)
+        if np.isfinite(away) and away > near:
+            yield (
+                f"{place.file} [PRIMARY] {card}: is {value:g}{unit}, {instrument} stands at {known:g}{unit}; "
+                "correct the card if the instrument has not been moved"
+            )
+
+
+def _about_dates(exposures: Exposures, place: Place) -> Iterator[str]:
+    where = f"{place.file} [EXPOSURES] MJD"
+    given = np.flatnonzero(np.isfinite(exposures.mjd))
+    if not len(given):
+        return
+    mjd = exposures.mjd[given]
+    if np.any(old := mjd < _OLDEST):
+        yield f"{where}: is before 1990 in {rows_text(given[old])}; write NaN where the time is not known"
+    middle = np.median(mjd)
+    if np.any(far := np.abs(mjd - middle) > _CAMPAIGN):
+        yield (
+            f"{where}: is more than {_CAMPAIGN:g} days from the median, {middle:.1f}, in {rows_text(given[far])}; "
+            "correct it, or calibrate the epochs one by one"
+        )

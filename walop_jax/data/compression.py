@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
-from walop_jax.data.records import CalibrationSet, Compression, InputFile
+from walop_jax.data.records import Compression, InputFile
 from walop_jax.data.schema import Place
 
 EXTENSION = "COMPRESSION"
@@ -75,11 +75,9 @@ def _asked(header: Any, name: str) -> float | None:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
-def remark(calset: CalibrationSet) -> str:
+def remark(found: Compression, points: int) -> str:
     """What to bear in mind with a set that stands for pixels."""
-    found = calset.compression
-    assert found is not None
     return (
-        f"{len(calset.points)} field points stand for {found.pixels:,} pixels, of which χ²/dof was "
+        f"{points} field points stand for {found.pixels:,} pixels, of which χ²/dof was "
         f"{found.chi2 / max(found.dof, 1):.5g}: what is smaller than a twentieth of the field is not seen here"
     )

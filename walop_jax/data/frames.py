@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -214,7 +215,7 @@ class FrameIntensities(Intensities):
 
 
 def frame_stack(
-    images: dict[str, Any], exposures: int, path: Path, cameras: int | None = None
+    images: Mapping[str, Any], exposures: int, path: Path, cameras: int | None = None
 ) -> tuple[Grid, FrameStack]:
     """Describe the image extensions of a file, `images` by name, without reading their pixels.
 

@@ -1,18 +1,20 @@
-"""The columns of the calibration tables, and the one way that a column becomes an array.
+"""The columns of all tables, what their values must be, and the one way in which they become arrays.
 
-Columns go by name (FITS names know no upper and lower case). A unit that can be converted is converted;
-a missing unit is that of the schema (docs: files); anything else is refused. What comes out is native-endian.
+Columns go by name, in upper or lower case. A unit that can be converted is converted; a missing unit is that of the
+column (docs: files); anything else is refused. What comes out is native-endian. FITS tables, tables of users and arrays
+in memory differ only in how their values are had.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Collection, Mapping
-from typing import Any, Literal
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from astropy import units
+from jaxtyping import Float
 
 from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, PREFIX
 from walop_jax.io.errors import fail, nearest, rows_text
@@ -23,13 +25,39 @@ CALVERS = 2
 """Newest version of the calibration set format; a set is written in the oldest version that can hold it."""
 
 
+class Rule(NamedTuple):
+    """What the values of a column must satisfy: where `broken` is true, what they are and what to do about it."""
+
+    broken: Callable[[np.ndarray], np.ndarray]
+    what: str
+    advice: str
+
+
+def finite(advice: str) -> Rule:
+    """No NaN, no infinity."""
+    return Rule(lambda values: ~np.isfinite(values), "is not finite", advice)
+
+
+def within(limit: float, advice: str, what: str = "") -> Rule:
+    """From −`limit` to `limit`; NaN passes."""
+    return Rule(lambda values: np.abs(values) > limit, what or f"exceeds ±{limit:g}", advice)
+
+
+def _not_alone(ids: np.ndarray) -> np.ndarray:
+    _, inverse, number = np.unique(ids, return_inverse=True, return_counts=True)
+    return number[inverse] > 1
+
+
+UNIQUE = Rule(_not_alone, "the identifier is not unique", "number the rows")
+
+
 @dataclasses.dataclass(frozen=True)
 class Column:
     """One column of a table: its kind, its unit in memory, and its value where the file lacks it.
 
     `missing` None means that the column is required; `width` is the number of values in a row, or None for
     as many as the file has. `shape_advice` says what a row should hold, `remarked` whether it is worth a remark
-    that the column is not there.
+    that the column is not there, `rules` what holds for its values in any table.
     """
 
     kind: Kind
@@ -38,31 +66,61 @@ class Column:
     width: int | None = 1
     shape_advice: str = "see the file format"
     remarked: bool = True
+    rules: tuple[Rule, ...] = ()
 
 
 _NAN = float("nan")
+_IDENTIFIER = Column("int", rules=(UNIQUE,))
+_TEFF = Column(
+    "float",
+    "K",
+    _NAN,
+    rules=(
+        Rule(
+            lambda teff: ~np.isnan(teff) & ~((teff >= 500) & (teff < 1e6)),
+            "is not a temperature of a source",
+            "kelvin are wanted; NaN means a flat photon spectrum, in text files so does an empty cell",
+        ),
+    ),
+)
+_ANGLE = Column(
+    "float", "deg", _NAN, rules=(within(36000.0, "encoder readings are in degrees: are these steps?"),)
+)
 EXPOSURES: Mapping[str, Column] = {
-    "EXPOSURE": Column("int"),
+    "EXPOSURE": _IDENTIFIER,
     "KIND": Column("str"),
     "MJD": Column("float", "d", _NAN),
-    "EXPTIME": Column("float", "s", _NAN),
+    "EXPTIME": Column(
+        "float",
+        "s",
+        _NAN,
+        rules=(
+            Rule(
+                lambda time: (time < 0) | np.isinf(time),
+                "is not a time",
+                "seconds; NaN where it is not known",
+            ),
+        ),
+    ),
     "FILTER": Column("str", missing="SDSS-r"),
     "CLP_IN": Column("bool"),
-    "CLP_ANGLE": Column("float", "deg", _NAN),
+    "CLP_ANGLE": _ANGLE,
     "CHWP_IN": Column("bool", missing=False),
-    "CHWP_ANGLE": Column("float", "deg", _NAN),
-    "TEMP": Column("float", "Celsius", _NAN),
-    "HA": Column("float", "h", _NAN),
-    "RA": Column("float", "deg", _NAN),
-    "DEC": Column("float", "deg", _NAN),
-    "ROTATOR": Column("float", "deg", _NAN),
-    "TEFF": Column("float", "K", _NAN),
+    "CHWP_ANGLE": _ANGLE,
+    "TEMP": Column(
+        "float",
+        "Celsius",
+        _NAN,
+        rules=(within(150.0, "temperatures are in degrees Celsius: are these kelvin?"),),
+    ),
+    "HA": Column("float", "h", _NAN, rules=(within(24.0, "hour angles are in hours: are these degrees?"),)),
+    "RA": Column("float", "deg", _NAN, rules=(within(360.0, "right ascensions are in degrees"),)),
+    "DEC": Column("float", "deg", _NAN, rules=(within(90.0, "declinations are in degrees"),)),
+    "ROTATOR": Column("float", "deg", _NAN, rules=(within(3600.0, "position angles are in degrees"),)),
+    "TEFF": _TEFF,
 }
-POINTS: Mapping[str, Column] = {
-    "POINT": Column("int"),
-    "X": Column("float", "deg"),
-    "Y": Column("float", "deg"),
-}
+_COORDINATE = Column("float", "deg", rules=(finite("remove these points"),))
+POINTS: Mapping[str, Column] = {"POINT": _IDENTIFIER, "X": _COORDINATE, "Y": _COORDINATE}
 _COUNTS = Column("float", "electron", width=4, shape_advice="one row holds the four cameras O1, E1, O2, E2")
 INTENSITIES: Mapping[str, Column] = {
     "EXPOSURE": Column("int"),
@@ -72,14 +130,37 @@ INTENSITIES: Mapping[str, Column] = {
     "N_ERR": _COUNTS,
     "FLAG": Column("int", missing=0),
 }
+_FRACTION = Column(
+    "float",
+    rules=(
+        finite("remove the source"),
+        within(1.0, "fractions are wanted: are these per cent?", "exceeds 1"),
+    ),
+)
+_ERROR = Column(
+    "float",
+    rules=(
+        Rule(
+            lambda error: ~(error > 0) | np.isinf(error),
+            "is not a positive number",
+            "it is the width of a prior: give the error of the catalogue",
+        ),
+    ),
+)
 SOURCES: Mapping[str, Column] = {
-    "SOURCE": Column("int"),
+    "SOURCE": Column(
+        "int",
+        rules=(
+            UNIQUE,
+            Rule(lambda number: number < 0, "is negative", "−1 means no source; number from 0"),
+        ),
+    ),
     "NAME": Column("str"),
-    "Q": Column("float"),
-    "U": Column("float"),
-    "Q_ERR": Column("float"),
-    "U_ERR": Column("float"),
-    "TEFF": Column("float", "K", _NAN),
+    "Q": _FRACTION,
+    "U": _FRACTION,
+    "Q_ERR": _ERROR,
+    "U_ERR": _ERROR,
+    "TEFF": _TEFF,
 }
 _PADDED = "use one length, padded with NaN"
 FILTERS: Mapping[str, Column] = {
@@ -95,9 +176,6 @@ TABLES: Mapping[str, Mapping[str, Column]] = {
     "FILTERS": FILTERS,
 }
 """The tables of a calibration set of version 1, in the order in which they are written."""
-_ANY_CAMERAS = dataclasses.replace(
-    _COUNTS, width=None, shape_advice="one row holds all cameras, the same number in every row"
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,6 +189,23 @@ class Place:
         """Build the error of something wrong in this table."""
         return fail(what, file=self.file, extension=self.extension, column=column, advice=advice)
 
+    def refuse(self, bad: np.ndarray, what: str, column: str, advice: str) -> None:
+        """Raise `DataError` naming the rows (first axis) where `bad` is set, if there are any."""
+        if np.any(bad):
+            rows = np.unique(np.nonzero(bad)[0])
+            raise self.fail(f"{what} in {rows_text(rows)}", column, advice)
+
+    def remark(self, what: str, column: str) -> str:
+        """A sentence about a column of this table."""
+        return f"{self.file} [{self.extension}] {column}: {what}"
+
+
+def check(table: Mapping[str, np.ndarray], columns: Mapping[str, Column], place: Place) -> None:
+    """Raise `DataError`, with column and rows, for values of a table that break a rule of their column."""
+    for name, column in columns.items():
+        for rule in column.rules:
+            place.refuse(rule.broken(table[name]), rule.what, name, rule.advice)
+
 
 def table_rules(name: str, version: int, columns: Collection[str], place: Place) -> Mapping[str, Column]:
     """The columns of a table of a calibration set of a version, where a file has `columns` (in capitals).
@@ -120,11 +215,11 @@ def table_rules(name: str, version: int, columns: Collection[str], place: Place)
     prefix that is none.
     """
     rules = TABLES[name]
-    if version == 1:
-        return rules
-    if name == "INTENSITIES":
-        return {**rules, "N": _ANY_CAMERAS, "N_ERR": _ANY_CAMERAS}
-    return {**rules, **_moving_columns(columns, place)} if name == "EXPOSURES" else rules
+    if version > 1 and name == "INTENSITIES":
+        advice = "one row holds all cameras, the same number in every row"
+        counts = dataclasses.replace(_COUNTS, width=None, shape_advice=advice)
+        return {**rules, "N": counts, "N_ERR": counts}
+    return {**rules, **_moving_columns(columns, place)} if version > 1 and name == "EXPOSURES" else rules
 
 
 def _moving_columns(columns: Collection[str], place: Place) -> dict[str, Column]:
@@ -133,10 +228,8 @@ def _moving_columns(columns: Collection[str], place: Place) -> dict[str, Column]
     for prefix in (POLARISER, CALIBRATION_PLATE):
         inside, angle = f"{prefix}_IN", f"{prefix}_ANGLE"
         absent = inside not in columns and angle not in columns
-        rules[inside] = Column("bool", missing=False if absent else None)
-        rules[angle] = Column("float", "deg", _NAN)
-        if absent:
-            rules |= {name: dataclasses.replace(rules[name], remarked=False) for name in (inside, angle)}
+        rules[inside] = Column("bool", missing=False if absent else None, remarked=not absent)
+        rules[angle] = dataclasses.replace(_ANGLE, remarked=not absent)
     for name in columns:
         prefix, mark, last = name.rpartition("_")
         if not mark or last not in ("IN", "ANGLE") or name in rules:
@@ -157,67 +250,113 @@ def _moving_columns(columns: Collection[str], place: Place) -> dict[str, Column]
                 f"{advice} ({nearest(angle, pairs)})" if pairs else advice,
             )
         rules[inside] = Column("bool", missing=True, remarked=False)
-        rules[angle] = Column("float", "deg")
+        rules[angle] = dataclasses.replace(_ANGLE, missing=None)
     return rules
+
+
+# ---------------------------------------------------------------------------------------- whole tables
 
 
 def column_names(hdu: Any, place: Place) -> list[str]:
     """Names of the columns of a FITS table in capitals; `DataError` if it is none or has a name twice."""
     if type(hdu).__name__ != "BinTableHDU":
         raise place.fail("is not a binary table", advice="write it as a FITS binary table")
-    names = [name.upper() for name in hdu.columns.names]
-    for name in names:
-        if names.count(name) > 1:
+    return distinct((name.upper() for name in hdu.columns.names), place)
+
+
+def distinct(names: Iterable[str], place: Place) -> list[str]:
+    """The names of columns; `DataError` if one is there twice."""
+    found = list(names)
+    for name in found:
+        if found.count(name) > 1:
             raise place.fail("the column is there twice", name, "remove or rename one of them")
-    return names
+    return found
 
 
-def read_table(hdu: Any, schema: Mapping[str, Column], place: Place) -> tuple[dict[str, Any], list[str]]:
-    """Turn a FITS table into arrays by column name, in the schema's units, and remarks on what was odd.
+def read_table(hdu: Any, columns: Mapping[str, Column], place: Place) -> tuple[dict[str, Any], list[str]]:
+    """Turn a FITS table into arrays by column name, in the units of `columns`, and remarks on what was odd.
 
     Raises `DataError` for a missing, duplicated or ill-typed column, a unit that cannot be converted, and a
     table without rows.
     """
     names = column_names(hdu, place)
-    for name, column in schema.items():
+    for name, column in columns.items():
         if column.missing is None and name not in names:
-            others = sorted(set(names) - set(schema))
+            others = sorted(set(names) - set(columns))
             advice = f"add it{' (' + nearest(name, others) + ')' if others else ''}"
             raise place.fail("the column is missing", name, advice)
     rows = int(hdu.header["NAXIS2"])
     if rows == 0:
         raise place.fail("has no rows", advice="a calibration set needs at least one")
-
     remarks = [
-        f"{place.file} [{place.extension}] {name}: unknown column, not used ({nearest(name, schema)})"
+        place.remark(f"unknown column, not used ({nearest(name, columns)})", name)
         for name in names
-        if name not in schema
+        if name not in columns
     ]
     table: dict[str, Any] = {}
-    for name, column in schema.items():
+    for name, column in columns.items():
         if name in names:
             index = names.index(name)
-            table[name] = _read_column(hdu, index, name, column, place)
-            if _is_converted(hdu.columns[index].unit, column):
-                where, unit = f"{place.file} [{place.extension}] {name}", hdu.columns[index].unit.strip()
-                remarks.append(f"{where}: is in {unit}, converted to {column.unit or 'a fraction'}")
+            unit = (hdu.columns[index].unit or "").strip()
+            table[name] = converted(_fits_values(hdu, index, name, column, place), unit, name, column, place)
+            if unit and column.kind == "float" and units.Unit(unit) != units.Unit(column.unit):
+                remarks.append(
+                    place.remark(f"is in {unit}, converted to {column.unit or 'a fraction'}", name)
+                )
         else:
             table[name] = np.full(rows, column.missing)
             if column.remarked:
-                where = f"{place.file} [{place.extension}] {name}"
-                remarks.append(f"{where}: no such column, {column.missing} taken")
+                remarks.append(place.remark(f"no such column, {column.missing} taken", name))
     return table, remarks
 
 
-def _read_column(hdu: Any, index: int, name: str, column: Column, place: Place) -> np.ndarray:
+def table_of(given: Mapping[str, Any], columns: Mapping[str, Column], place: Place) -> dict[str, np.ndarray]:
+    """A table in memory, its columns by name, as `read_table` would have it; what is absent takes its default.
+
+    Raises `DataError` for a column that is missing, ill-typed or of another shape than `columns` say, and for one that
+    `columns` do not have.
+    """
+    rows = max(len(values) for values in given.values())
+    table = {}
+    for name in given:
+        if name not in columns:
+            raise place.fail("there is no such column", name, nearest(name, columns))
+    for name, column in columns.items():
+        if name in given:
+            table[name] = converted(
+                _shaped(np.asarray(given[name]), name, column, place), "", name, column, place
+            )
+        elif column.missing is None:
+            raise place.fail("the column is missing", name, "add it")
+        else:
+            table[name] = np.full(rows, column.missing)
+    return table
+
+
+# ---------------------------------------------------------------------------------------- values of a column
+
+
+def _fits_values(hdu: Any, index: int, name: str, column: Column, place: Place) -> np.ndarray:
+    """The values of a column of a FITS table as they are stored, none of them undefined."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             values = np.asarray(hdu.data.field(index))
     except (ValueError, TypeError, OSError, UnicodeError, KeyError, IndexError, Warning) as error:
         raise place.fail(f"cannot be read: {error}", name, "write the column again") from error
-    if values.dtype == object or (column.width != 1 and values.ndim == 1):
-        values = _rectangular(values, name, column, place)
+    values = _shaped(values, name, column, place)
+    null = hdu.columns[index].null
+    if null not in (None, "") and np.issubdtype(values.dtype, np.integer):
+        place.refuse(values == int(null), "undefined (TNULL)", name, "fill or remove these rows")
+    return values
+
+
+def _shaped(values: np.ndarray, name: str, column: Column, place: Place) -> np.ndarray:
+    """The values with the axes of their column: rows, and values in a row unless that is one."""
+    if values.dtype == object:
+        raise place.fail("is an array of variable length", name, column.shape_advice)
+    if column.width is None and values.ndim == 1:
+        values = values[:, None]
     if column.width == 1 and values.ndim == 2 and values.shape[1] == 1:
         values = values[:, 0]
     if values.ndim != (1 if column.width == 1 else 2) or (
@@ -229,35 +368,22 @@ def _read_column(hdu: Any, index: int, name: str, column: Column, place: Place) 
             name,
             column.shape_advice,
         )
-    null = hdu.columns[index].null
-    if null not in (None, "") and np.issubdtype(values.dtype, np.integer) and np.any(values == int(null)):
-        raise place.fail(
-            f"undefined (TNULL) in {rows_text(np.unique(np.nonzero(values == int(null))[0]))}",
-            name,
-            "fill or remove these rows",
-        )
-    return _convert(values, hdu.columns[index].unit, name, column, place)
+    return values
 
 
-def _rectangular(values: np.ndarray, name: str, column: Column, place: Place) -> np.ndarray:
-    """Bring one value per row into a column of width one, refuse arrays whose length varies."""
-    if values.dtype == object:
-        raise place.fail("is an array of variable length", name, column.shape_advice)
-    return values[:, None] if column.width is None else values
+def converted(values: np.ndarray, unit: str, name: str, column: Column, place: Place) -> np.ndarray:
+    """The values of a column in the kind and unit that it has in memory; an empty `unit` is that of the column.
 
-
-def _convert(values: np.ndarray, unit: str | None, name: str, column: Column, place: Place) -> np.ndarray:
+    Raises `DataError` for names where numbers are needed and the reverse, for what is no whole number or no truth
+    value, and as `convert_unit` does.
+    """
     strings = values.dtype.kind in "SU"
     if column.kind == "str":
         if not strings:
             raise place.fail("holds numbers where names are needed", name, "write it as a string column")
         names = np.char.strip(values.astype(str))
-        if np.any(bad := [not (text.isascii() and text.isprintable()) for text in names.tolist()]):
-            raise place.fail(
-                f"holds a control character in {rows_text(np.flatnonzero(bad))}",
-                name,
-                "write printable ASCII",
-            )
+        bad = [not (text.isascii() and text.isprintable()) for text in names.tolist()]
+        place.refuse(np.array(bad), "holds a control character", name, "write printable ASCII")
         return names
     if strings:
         raise place.fail(
@@ -265,32 +391,37 @@ def _convert(values: np.ndarray, unit: str | None, name: str, column: Column, pl
             name,
             "write it as a numeric column",
         )
+    if values.dtype.kind not in ("fiu" if column.kind == "float" else "fiub"):
+        advice = "write it as a numeric column" if column.kind == "float" else "write integers"
+        raise place.fail(f"holds {values.dtype.name} values", name, advice)
     if column.kind == "float":
-        if values.dtype.kind not in "fiu":
-            raise place.fail(f"holds {values.dtype.name} values", name, "write it as a numeric column")
-        return _to_unit(values.astype(np.float64), unit, name, column, place)
+        values = values.astype(np.float64)
+        return convert_unit(values, unit, column.unit, name, place) if unit else values
+    if column.kind == "bool":
+        place.refuse((values != 0) & (values != 1), "is neither true nor false", name, "write T or F")
+        return values.astype(bool)
     # Whole numbers are compared as floats to find 3.5 and NaN; identifiers are far below 2**53.
-    if values.dtype.kind == "f" and np.any(bad := ~(np.abs(values) < 2.0**53) | (values != np.round(values))):
-        raise place.fail(f"is not a whole number in {rows_text(np.nonzero(bad)[0])}", name, "write integers")
-    if values.dtype.kind not in "fiub":
-        raise place.fail(f"holds {values.dtype.name} values", name, "write integers")
-    if column.kind == "int":
-        return values.astype(np.int64)
-    if np.any(bad := (values != 0) & (values != 1)):
-        raise place.fail(
-            f"is neither true nor false in {rows_text(np.nonzero(bad)[0])}", name, "write T or F"
-        )
-    return values.astype(bool)
+    if values.dtype.kind == "f":
+        bad = ~(np.abs(values) < 2.0**53) | (values != np.round(values))
+        place.refuse(bad, "is not a whole number", name, "write integers")
+    return values.astype(np.int64)
 
 
-def _to_unit(values: np.ndarray, unit: str | None, name: str, column: Column, place: Place) -> np.ndarray:
-    return values if not (unit or "").strip() else convert_unit(values, str(unit), column.unit, name, place)
+def in_unit(values: Any, unit: str, name: str) -> Float[np.ndarray, "*s"]:
+    """Numbers that callers bring along (lists, scalars, quantities, columns) as native float64 in `unit`.
 
-
-def _is_converted(unit: str | None, column: Column) -> bool:
-    """Whether numbers in a unit that can be read become others in that of the schema."""
-    given = (unit or "").strip()
-    return bool(given) and column.kind == "float" and units.Unit(given) != units.Unit(column.unit)
+    Numbers without a unit are taken to have it, masked ones are NaN. `name` is what errors call them. Raises
+    `DataError` for a unit that cannot be converted and for what is not a number.
+    """
+    place = Place("", "")
+    given = str(getattr(values, "unit", None) or "")
+    plain = getattr(values, "value", values) if given and not hasattr(values, "colnames") else values
+    try:
+        numbers = np.ma.filled(np.ma.asarray(plain, np.float64), np.nan)
+    except (TypeError, ValueError):
+        raise place.fail("is not made of numbers", name, f"give numbers in {unit or 'fractions'}") from None
+    flat = np.atleast_1d(numbers).astype(np.float64)
+    return (convert_unit(flat, given, unit, name, place) if given else flat).reshape(np.shape(numbers))
 
 
 def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: Place) -> np.ndarray:

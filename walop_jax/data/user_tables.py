@@ -14,15 +14,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from walop_jax.data.schema import Column, Place, convert_unit
+from walop_jax.data.schema import Column, Place, converted, distinct
 from walop_jax.io.errors import DataError, fail, rows_text
 from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits
 from walop_jax.io.plain_tables import table_format, write_table
 from walop_jax.io.text import check_input
 
-_TRUE, _FALSE = ("true", "t", "1", "yes"), ("false", "f", "0", "no", "")
+_TRUTH = dict.fromkeys(("true", "t", "1", "1.0", "yes"), 1.0) | dict.fromkeys(
+    ("false", "f", "0", "0.0", "no", ""), 0.0
+)
 
 _LISTED = 12  # columns, in a message
 
@@ -70,10 +72,7 @@ def read_input_table(path: str | os.PathLike[str]) -> InputTable:
         raise fail(what, file=path, advice="write it again") from error
     if len(table) == 0:
         raise fail("has no rows", file=path, advice="nothing to be done")
-    names = [str(name).upper() for name in table.colnames]
-    for name in names:
-        if names.count(name) > 1:
-            raise fail("the column is there twice", file=path, column=name, advice="rename one of them")
+    distinct((str(name).upper() for name in table.colnames), Place(path, ""))
     return InputTable(path, len(table), table)
 
 
@@ -112,16 +111,10 @@ def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
             raise place.fail("the column is missing", name, advice)
         return np.full(source.rows, rule.missing)
     column = source.table.columns[source.names.index(name)]
-    masked = np.asarray(getattr(column, "mask", np.zeros(source.rows, bool)))
     values = np.ma.getdata(np.ma.asarray(column))
     if values.ndim != 1:
         raise place.fail(f"has shape {values.shape[1:]} in a row, one value is needed", name, "split it")
-    if rule.kind == "str":
-        text = np.char.strip(values.astype(str))
-        return np.where(masked | (text == ""), str(rule.missing), text)
-    if rule.kind == "bool":
-        return _truth(values, masked, name, place)
-    return _numbers(values, masked, str(column.unit or ""), name, rule, place)
+    return _cells(column, name, rule, place)
 
 
 def _what_is_there(source: InputTable) -> str:
@@ -156,43 +149,40 @@ def vector_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
     if values.ndim != 2 or values.shape[1] != width:
         what = f"has shape {values.shape[1:] or '()'} in a row, {width} values are needed"
         raise place.fail(what, name, rule.shape_advice)
-    masked = np.broadcast_to(np.asarray(getattr(column, "mask", False)), values.shape).ravel()
-    return _numbers(values.ravel(), masked, str(column.unit or ""), name, rule, place).reshape(values.shape)
+    return _cells(column, name, rule, place)
 
 
-def _truth(values: np.ndarray, masked: np.ndarray, name: str, place: Place) -> Bool[np.ndarray, " n"]:
-    text = np.char.lower(np.char.strip(values.astype(str)))
-    true = np.isin(text, _TRUE) | np.isin(text, ["1.0"])
-    bad = ~(true | np.isin(text, _FALSE) | np.isin(text, ["0.0"]) | masked)
-    if np.any(bad):
-        rows = np.flatnonzero(bad)
-        what = f"{values[rows[0]]!s} is neither true nor false, in {rows_text(rows)}"
-        raise place.fail(what, name, "write T or F")
-    return true & ~masked
-
-
-def _numbers(
-    values: np.ndarray, masked: np.ndarray, unit: str, name: str, rule: Column, place: Place
-) -> Float[np.ndarray, " n"]:
+def _cells(column: Any, name: str, rule: Column, place: Place) -> np.ndarray:
+    """The values of a column as `rule` has them; a masked, empty or NaN cell is what it says of absent columns."""
+    values = np.ma.getdata(np.ma.asarray(column))
+    empty = np.broadcast_to(np.asarray(getattr(column, "mask", False)), values.shape)
+    if rule.kind == "str":
+        text = np.char.strip(values.astype(str))
+        return np.where(empty | (text == ""), str(rule.missing), text)
     if values.dtype.kind in "OSU":
-        numbers = np.full(len(values), np.nan)
-        for row, text in enumerate(values.astype(str).tolist()):
-            if masked[row] or not text.strip():
-                continue
-            try:
-                numbers[row] = float(text)
-            except ValueError:
-                raise place.fail(
-                    f"{text!r} is not a number, in {rows_text([row])}", name, "correct it or leave it empty"
-                ) from None
-    elif values.dtype.kind in "fiu":
-        numbers = values.astype(np.float64)
-    else:
-        raise place.fail(f"holds {values.dtype.name} values", name, "write it as a numeric column")
-    empty = masked | np.isnan(numbers)
-    if unit:
-        numbers = convert_unit(numbers, unit, rule.unit, name, place)
-    return np.where(empty, float("nan" if rule.missing is None else str(rule.missing)), numbers)
+        text = np.where(empty, "", np.char.strip(values.astype(str)))
+        values = _from_text(text, rule.kind == "bool", name, place)
+    if rule.kind == "bool":
+        return converted(np.where(empty, False, values), "", name, rule, place)
+    empty = empty | (values != values)
+    found = converted(values, str(column.unit or ""), name, rule, place)
+    return np.where(empty, np.nan if rule.missing is None else rule.missing, found)
+
+
+def _from_text(text: np.ndarray, truth: bool, name: str, place: Place) -> Float[np.ndarray, ...]:
+    """Numbers from the cells of a text, NaN where they are empty; of truth values 1 and 0."""
+    numbers = np.empty(text.shape)
+    for at, cell in np.ndenumerate(text):
+        try:
+            numbers[at] = _TRUTH[cell.lower()] if truth else float(cell or "nan")
+        except (KeyError, ValueError):
+            what, advice = ("neither true nor false", "write T or F") if truth else ("not a number", "")
+            raise place.fail(
+                f"{str(cell)!r} is {what}, in {rows_text(at[:1])}",
+                name,
+                advice or "correct it or leave it empty",
+            ) from None
+    return numbers
 
 
 def write_output_table(

@@ -36,18 +36,37 @@ def write_calibration_set(
     Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only,
     for fewer than two cameras, and if a name cannot be written in FITS (ASCII only).
     """
-    intensities = TableIntensities.of(calset.intensities, calset.points)
     with atomic_path(path, overwrite=overwrite) as temporary:
-        sign_and_write(_table_hdus(calset, intensities, path), temporary)
+        sign_and_write(_hdus(calset, set_tables(calset), path), temporary)
 
 
-def set_hdus(calset: CalibrationSet, path: object) -> list[Any]:
-    """The HDUs of a calibration set as tables; errors name `path`."""
-    return _table_hdus(calset, TableIntensities.of(calset.intensities, calset.points), path)
+def set_tables(calset: CalibrationSet) -> dict[str, dict[str, np.ndarray]]:
+    """The tables of a calibration set by name, columns by name; without those of the standards where there are none."""
+    points, sources = calset.points, calset.sources
+    intensities = TableIntensities.of(calset.intensities, points)
+    tables = {
+        "EXPOSURES": calset.exposures.columns(),
+        "POINTS": {"POINT": points.point, "X": points.x, "Y": points.y},
+        "INTENSITIES": {
+            "EXPOSURE": calset.exposures.exposure[intensities.exposure],
+            "POINT": points.point[intensities.point],
+            # The appended −1 is what a row without a source (−1, the last entry) becomes.
+            "SOURCE": np.append(sources.source, -1)[intensities.source],
+            "N": intensities.counts,
+            "N_ERR": intensities.sigma,
+            "FLAG": intensities.flag,
+        },
+    }
+    return tables | _optional_tables(calset)
 
 
-def _table_hdus(calset: CalibrationSet, intensities: TableIntensities, path: object) -> list[Any]:
-    return [*_head(calset, path), *_body(calset, intensities, path)]
+def _optional_tables(calset: CalibrationSet) -> dict[str, dict[str, np.ndarray]]:
+    tables = {}
+    if len(calset.sources):
+        tables["SOURCES"] = {name: getattr(calset.sources, name.lower()) for name in schema.SOURCES}
+    if calset.filters:
+        tables["FILTERS"] = filter_columns(calset.filters)
+    return tables
 
 
 def sign_and_write(hdus: list[Any], path: Path) -> None:
@@ -58,10 +77,9 @@ def sign_and_write(hdus: list[Any], path: Path) -> None:
     fits.HDUList(hdus).writeto(path, overwrite=True, output_verify="exception")
 
 
-def _head(calset: CalibrationSet, path: object) -> list[Any]:
+def _primary(calset: CalibrationSet, version: int, path: object) -> fits.PrimaryHDU:
     primary = fits.PrimaryHDU()
     site = calset.site
-    version = oldest_version(calset.instrument, calset.exposures, calset.cameras)
     instrument_name(calset.instrument, version, schema.Place(path, "PRIMARY"))
     if calset.cameras < 2:
         raise fail(f"{calset.cameras} camera", file=path, advice="a calibration set needs two at least")
@@ -80,7 +98,19 @@ def _head(calset: CalibrationSet, path: object) -> list[Any]:
         elif not np.isfinite(value):
             continue  # FITS headers know no NaN; a missing card is read as one
         primary.header[name] = (value, comment if not isinstance(value, str) else "")
-    return [primary, exposures_hdu(calset.exposures, version, path)]
+    return primary
+
+
+def _hdus(
+    calset: CalibrationSet, tables: Mapping[str, Mapping[str, np.ndarray]], path: object
+) -> list[fits.PrimaryHDU | fits.BinTableHDU]:
+    """The primary header of a set, some of its tables, and what it stands for."""
+    version = oldest_version(calset.instrument, calset.exposures, calset.cameras)
+    made = [_primary(calset, version, path)]
+    for name, columns in tables.items():
+        rules = schema.table_rules(name, version, list(columns), schema.Place(path, name))
+        made.append(table_hdu(name, columns, path, rules))
+    return made if calset.compression is None else [*made, compression_hdu(calset.compression)]
 
 
 def exposures_hdu(exposures: Exposures, version: int, path: object) -> fits.BinTableHDU:
@@ -88,33 +118,6 @@ def exposures_hdu(exposures: Exposures, version: int, path: object) -> fits.BinT
     columns = exposures.columns()
     rules = schema.table_rules("EXPOSURES", version, list(columns), schema.Place(path, "EXPOSURES"))
     return table_hdu("EXPOSURES", columns, path, rules)
-
-
-def _body(calset: CalibrationSet, intensities: TableIntensities, path: object) -> list[Any]:
-    points, sources = calset.points, calset.sources
-    hdus = [table_hdu("POINTS", {"POINT": points.point, "X": points.x, "Y": points.y}, path)]
-    rows = {
-        "EXPOSURE": calset.exposures.exposure[intensities.exposure],
-        "POINT": points.point[intensities.point],
-        # The appended −1 is what a row without a source (−1, the last entry) becomes.
-        "SOURCE": np.append(sources.source, -1)[intensities.source],
-        "N": intensities.counts,
-        "N_ERR": intensities.sigma,
-        "FLAG": intensities.flag,
-    }
-    return [*hdus, table_hdu("INTENSITIES", rows, path), *_optional(calset, path)]
-
-
-def _optional(calset: CalibrationSet, path: object) -> list[Any]:
-    hdus = []
-    if len(calset.sources):
-        columns = {name: getattr(calset.sources, name.lower()) for name in schema.SOURCES}
-        hdus.append(table_hdu("SOURCES", columns, path))
-    if calset.filters:
-        hdus.append(table_hdu("FILTERS", filter_columns(calset.filters), path))
-    if calset.compression is not None:
-        hdus.append(compression_hdu(calset.compression))
-    return hdus
 
 
 def filter_columns(filters: Mapping[str, FilterCurve]) -> dict[str, np.ndarray]:
@@ -191,7 +194,8 @@ def write_frames(
     counts, errors = count_names(calset.cameras), error_names(calset.cameras)
     kinds = dict.fromkeys((*counts, *errors), np.dtype(f">{dtype}")) | {"FLAG": np.dtype(">i2")}
     with atomic_path(path, overwrite=overwrite) as temporary:
-        sign_and_write([*_head(calset, path), *_optional(calset, path)], temporary)
+        tables = {"EXPOSURES": calset.exposures.columns()} | _optional_tables(calset)
+        sign_and_write(_hdus(calset, tables, path), temporary)
         cubes: dict[str, tuple[np.memmap[Any, Any], int]] = {}
         for name, kind in kinds.items():
             cubes[name] = _append_image(temporary, name, kind, shape, grid)

@@ -25,11 +25,8 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.data import schema
-from walop_jax.data.calset import empty_sources
-from walop_jax.data.checks import make_exposures, make_filters, make_points
+from walop_jax.data.calset import assembled
 from walop_jax.data.records import CalibrationSet, DataFlag, Site
-from walop_jax.data.schema import Place
-from walop_jax.data.table_intensities import table_intensities
 from walop_jax.data.zemax_text import HEADING, TransmissionExport, read_export
 from walop_jax.instruments.description import described, shipped
 from walop_jax.io.errors import fail, nearest
@@ -201,15 +198,9 @@ def _calibration_set(
 ) -> CalibrationSet:
     """Put the tables through the checks of any calibration set."""
     names = np.array([f"MONO-{1e4 * value:.0f}" for value in wavelength])
-    n, site = len(names), Site(*described(instrument).place[:4])
-    nothing = np.full(n, np.nan)
-    clp_in = np.isfinite(angle)
+    n, clp_in = len(names), np.isfinite(angle)
     curve, first = np.unique(names, return_index=True)
-    filters = make_filters(
-        {"FILTER": curve, "WAVELENGTH": wavelength[first][:, None], "THROUGHPUT": np.ones((len(curve), 1))},
-        Place(folder, "FILTERS"),
-    )
-    columns = dict.fromkeys(schema.EXPOSURES, nothing) | {
+    exposures = {name: np.full(n, column.missing) for name, column in schema.EXPOSURES.items()} | {
         "EXPOSURE": np.arange(n),
         "KIND": np.full(n, "flux"),
         "MJD": 60000.0 + 1e-3 * np.arange(n),
@@ -217,24 +208,25 @@ def _calibration_set(
         "FILTER": names,
         "CLP_IN": clp_in,
         "CLP_ANGLE": np.where(clp_in, angle, np.nan),
-        "CHWP_IN": np.zeros(n, dtype=bool),
         "TEMP": np.full(n, 20.0),
         "HA": np.zeros(n),
     }
-    exposures = make_exposures(columns, filters, site, Place(folder, "EXPOSURES"))
-    points = make_points(
-        {"POINT": np.arange(len(xy)), "X": xy[:, 0], "Y": xy[:, 1]}, instrument, Place(folder, "POINTS")
-    )
-    sources = empty_sources()
-    intensities, _ = table_intensities(rows, exposures, points, sources, Place(folder, "INTENSITIES"))
-    return CalibrationSet(
+    tables = {
+        "EXPOSURES": exposures,
+        "POINTS": {"POINT": np.arange(len(xy)), "X": xy[:, 0], "Y": xy[:, 1]},
+        "INTENSITIES": rows,
+        "FILTERS": {
+            "FILTER": curve,
+            "WAVELENGTH": wavelength[first][:, None],
+            "THROUGHPUT": np.ones((len(curve), 1)),
+        },
+    }
+    return assembled(
+        tables,
+        Path(folder),
+        version=1,
         instrument=instrument,
-        site=site,
+        site=Site(*described(instrument).place[:4]),
         origin="optical design program, polarization transmission",
-        exposures=exposures,
-        points=points,
-        sources=sources,
-        filters=filters,
-        intensities=intensities,
         remarks=remarks,
     )

@@ -31,9 +31,8 @@ from jaxtyping import Bool, Float, Int
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.data.filters import DEFAULT_FILTER
 from walop_jax.data.records import Block, CalibrationSet
-from walop_jax.data.settings import Settings
+from walop_jax.data.settings import DEFAULT_FILTER, Settings
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.refit import refit

@@ -19,7 +19,6 @@ from jaxtyping import Array, Float
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import analysis_vectors
-from walop_jax.data.filters import DEFAULT_FILTER
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.model import fold, light

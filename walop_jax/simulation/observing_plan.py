@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from walop_jax.data.filters import DEFAULT_FILTER, builtin_filter
 from walop_jax.data.records import Exposures, FilterCurve, Points, Position, Site
+from walop_jax.data.settings import DEFAULT_FILTER, builtin_filter
 from walop_jax.instruments.description import default_name, described, shipped
 from walop_jax.model.effects.base import Context
 from walop_jax.model.instrument import Instrument, as_designed, nominal_instrument
