@@ -46,6 +46,7 @@ from walop_jax.io.fits_reading import UNREADABLE, OpenFile, one_line, open_fits
 
 _IMAGE = re.compile(r"[NE](0|[1-9][0-9]{0,2})")  # of one camera: counts or errors
 _NO_SETS = (".csv", ".ecsv", ".txt", ".dat", ".vot", ".xml", ".json", ".toml", ".nc", ".npz", ".h5")
+_NAN = float("nan")
 _SAMPLE = 8  # image rows looked at when frames are opened; every block is checked again as it is read
 
 
@@ -355,7 +356,7 @@ def from_arrays(
         tables,
         version=schema.CALVERS,
         instrument=instrument_name(instrument, schema.CALVERS, Place(NAME, "PRIMARY")),
-        site=Site("", *np.full(3, np.nan)) if site is None else site,
+        site=Site("", _NAN, _NAN, _NAN) if site is None else site,
         origin=origin,
     )
     return dataclasses.replace(found, remarks=(*found.remarks, *_spoilt(counts)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 from jaxtyping import Int
@@ -100,45 +99,12 @@ def merge_calibration_sets(*sets: CalibrationSet) -> CalibrationSet:
     """
     first = sets[0]
     for other in sets[1:]:
-        if other.instrument != first.instrument:
-            raise _conflict(f"is {other.instrument}, {_name(first)} is {first.instrument}", other, "INSTRUME")
-        if other.cameras != first.cameras:
-            what = f"has {other.cameras} cameras, {_name(first)} has {first.cameras}"
-            raise _conflict(what, other, "N", "these are not sets of one instrument")
-        if not _same_site(first.site, other.site):
-            raise _conflict(
-                f"is another site than that of {_name(first)}", other, "SITELAT, SITELONG, SITEELEV"
-            )
+        _refuse_another_instrument(first, other)
     exposures, remarks = _join_exposures(sets)
     sources, source_rows = _join_sources(sets)
-    filters = _join_filters(sets)
-    offsets = np.cumsum([0, *(len(entry.exposures) for entry in sets)])
-
-    parts: list[tuple[Intensities, Points, np.ndarray]] = []
-    grids: dict[Grid, list[int]] = {}
-    tables: list[int] = []
-    for index, entry in enumerate(sets):
-        if isinstance(entry.intensities, FrameIntensities):
-            grids.setdefault(entry.intensities.grid, []).append(index)
-        elif isinstance(entry.intensities, TableIntensities):
-            tables.append(index)
-        else:
-            raise _conflict("has been merged before", entry, "", "merge all files at once")
-    for grid, members in grids.items():
-        frames = [
-            entry for index in members if isinstance(entry := sets[index].intensities, FrameIntensities)
-        ]
-        stacks = tuple(stack for entry in frames for stack in entry.stacks)
-        rows = np.concatenate([np.arange(offsets[index], offsets[index + 1]) for index in members])
-        parts.append((FrameIntensities(grid, stacks), grid.points, rows))
-    if tables:
-        table, points = _join_tables([sets[n] for n in tables], [source_rows[n] for n in tables])
-        rows = np.concatenate([np.arange(offsets[index], offsets[index + 1]) for index in tables])
-        # `table` counts the exposures of its own files; a whole of tables alone needs no joint.
-        parts.append((table, points, rows))
-
+    parts = _parts(sets, source_rows)
     names = ", ".join(str(entry_input.path) for entry in sets for entry_input in entry.inputs)
-    if len(parts) == 1:
+    if len(parts) == 1:  # a whole of tables alone, or of frames alone, needs no joint
         intensities, points = parts[0][:2]
         if isinstance(intensities, TableIntensities):
             intensities, repeated = mask_repeats(intensities, exposures, names)
@@ -154,11 +120,50 @@ def merge_calibration_sets(*sets: CalibrationSet) -> CalibrationSet:
         exposures=exposures,
         points=points,
         sources=sources,
-        filters=filters,
+        filters=_join_filters(sets),
         intensities=intensities,
         inputs=tuple(entry_input for entry in sets for entry_input in entry.inputs),
         remarks=tuple(dict.fromkeys([remark for entry in sets for remark in entry.remarks] + remarks)),
     )
+
+
+def _refuse_another_instrument(first: CalibrationSet, other: CalibrationSet) -> None:
+    if other.instrument != first.instrument:
+        raise _conflict(f"is {other.instrument}, {_name(first)} is {first.instrument}", other, "INSTRUME")
+    if other.cameras != first.cameras:
+        what = f"has {other.cameras} cameras, {_name(first)} has {first.cameras}"
+        raise _conflict(what, other, "N", "these are not sets of one instrument")
+    if not _same_site(first.site, other.site):
+        what = f"is another site than that of {_name(first)}"
+        raise _conflict(what, other, "SITELAT, SITELONG, SITEELEV")
+
+
+def _parts(
+    sets: tuple[CalibrationSet, ...], source_rows: list[np.ndarray]
+) -> list[tuple[Intensities, Points, np.ndarray]]:
+    """Intensities with their field points and rows of the joined exposures: frames of every grid, then all tables."""
+    ends = np.cumsum([len(entry.exposures) for entry in sets])
+    rows = np.split(np.arange(ends[-1]), ends[:-1])
+    grids: dict[Grid, list[int]] = {}
+    tables: list[int] = []
+    for number, entry in enumerate(sets):
+        if isinstance(entry.intensities, FrameIntensities):
+            grids.setdefault(entry.intensities.grid, []).append(number)
+        elif isinstance(entry.intensities, TableIntensities):
+            tables.append(number)
+        else:
+            raise _conflict("has been merged before", entry, "", "merge all files at once")
+    parts: list[tuple[Intensities, Points, np.ndarray]] = []
+    for grid, members in grids.items():
+        frames = [sets[n].intensities for n in members]
+        stacks = tuple(s for entry in frames if isinstance(entry, FrameIntensities) for s in entry.stacks)
+        parts.append(
+            (FrameIntensities(grid, stacks), grid.points, np.concatenate([rows[n] for n in members]))
+        )
+    if tables:
+        table, points = _join_tables([sets[n] for n in tables], [source_rows[n] for n in tables])
+        parts.append((table, points, np.concatenate([rows[n] for n in tables])))
+    return parts
 
 
 def _name(calset: CalibrationSet) -> str:
@@ -205,35 +210,29 @@ def _join_exposures(sets: tuple[CalibrationSet, ...]) -> tuple[Exposures, list[s
 def _join_sources(sets: tuple[CalibrationSet, ...]) -> tuple[Sources, list[np.ndarray]]:
     """Join the sources; return with them the row that each old row has become."""
     fields = [field.name for field in dataclasses.fields(Sources)]
-    rows: list[dict[str, Any]] = []
+    columns = {name: np.concatenate([getattr(entry.sources, name) for entry in sets]) for name in fields}
+    values = [columns[name] for name in ("q", "u", "q_err", "u_err", "teff")]
+    row_of: dict[str, int] = {}
+    kept: list[int] = []
     maps: list[np.ndarray] = []
+    number = 0  # of the row among those of all sets
     for entry in sets:
-        taken = {str(row["name"]): n for n, row in enumerate(rows) if row["name"]}
-        ids = {int(row["source"]) for row in rows}
-        becomes = np.empty(len(entry.sources), dtype=np.int64)
-        for n in range(len(entry.sources)):
-            row = {name: getattr(entry.sources, name)[n] for name in fields}
-            old = taken.get(str(row["name"]))
-            if old is not None:
-                values = ("q", "u", "q_err", "u_err", "teff")
-                if not all(np.array_equal(rows[old][name], row[name], equal_nan=True) for name in values):
-                    raise _conflict(
-                        f"{str(row['name'])!r} has other values than in an earlier file",
-                        entry,
-                        "SOURCES",
-                        "correct one of them, or give it another NAME",
-                    )
-                becomes[n] = old
-                continue
-            if int(row["source"]) in ids:
-                row["source"] = max(ids) + 1
-            ids.add(int(row["source"]))
-            becomes[n] = len(rows)
-            rows.append(row)
-        maps.append(becomes)
-    # A set without sources still has its typed empty columns.
-    dtypes = {name: np.concatenate([getattr(entry.sources, name) for entry in sets]).dtype for name in fields}
-    return Sources(**{n: np.array([row[n] for row in rows], dtype=dtypes[n]) for n in fields}), maps
+        earlier, becomes = dict(row_of), []
+        for name in entry.sources.name.tolist():
+            row = earlier.get(name, len(kept))
+            if row == len(kept):
+                kept.append(number)
+                if name:
+                    row_of.setdefault(name, row)
+            elif not all(np.array_equal(v[kept[row]], v[number], equal_nan=True) for v in values):
+                what = f"{name!r} has other values than in an earlier file"
+                raise _conflict(what, entry, "SOURCES", "correct one of them, or give it another NAME")
+            becomes.append(row)
+            number += 1
+        maps.append(np.array(becomes, dtype=np.int64))
+    rows = np.array(kept, dtype=np.int64)
+    joined = {name: column[rows] for name, column in columns.items()}
+    return Sources(**joined | {"source": _fresh(joined["source"])}), maps
 
 
 def _join_filters(sets: tuple[CalibrationSet, ...]) -> dict[str, FilterCurve]:
@@ -254,50 +253,41 @@ def _join_tables(
     sets: list[CalibrationSet], source_rows: list[np.ndarray]
 ) -> tuple[TableIntensities, Points]:
     """Join tables of intensities; identical coordinates are one field point."""
+    tables = [entry.intensities for entry in sets if isinstance(entry.intensities, TableIntensities)]
     points = [entry.points for entry in sets]
-    xy = np.concatenate([np.column_stack([entry.x, entry.y]) for entry in points]) + 0.0  # −0 is 0
-    places: dict[bytes, int] = {}
-    keep, row = [], np.empty(len(xy), dtype=np.int64)
-    owner = np.repeat(np.arange(len(points)), [len(entry) for entry in points])
-    seen: dict[tuple[bytes, int], int] = {}
-    for n, value in enumerate(xy):
-        key = value.tobytes()
-        # Two points of one file are never merged: both may have data in the same exposure.
-        if key not in places or (key, int(owner[n])) in seen:
-            places.setdefault(key, len(keep))
-            row[n] = len(keep)
-            keep.append(n)
-        else:
-            row[n] = places[key]
-        seen[key, int(owner[n])] = n
+    # Two points of one file are never merged: both may have data in the same exposure.
+    places = np.concatenate([np.column_stack([p.x, p.y, _earlier_ones(p)]) for p in points]) + 0.0  # −0 is 0
+    _, keep, place = np.unique(places, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(keep)  # as they appear
+    keep, row = keep[order], np.argsort(order)[place.reshape(-1)]
     ids = np.concatenate([entry.point for entry in points])[keep]
-    joined = Points(point=_fresh(ids), x=xy[keep, 0], y=xy[keep, 1])
-
-    columns: dict[str, list[np.ndarray]] = {name: [] for name in ("exposure", "point", "source")}
-    first_exposure = first_point = 0
-    tables: list[TableIntensities] = []
-    for entry, sources in zip(sets, source_rows, strict=True):
-        table = entry.intensities
-        assert isinstance(table, TableIntensities)
-        columns["exposure"].append(table.exposure + first_exposure)
-        columns["point"].append(row[first_point + table.point])
-        # The appended −1 is what a row without a source (−1, the last entry) becomes.
-        columns["source"].append(np.append(sources, -1)[table.source])
-        first_exposure += len(entry.exposures)
-        first_point += len(entry.points)
-        tables.append(table)
-    return (
-        TableIntensities(
-            first_exposure,
-            joined,
-            **{name: np.concatenate(parts) for name, parts in columns.items()},
-            **{
-                name: np.concatenate([getattr(table, name) for table in tables])
-                for name in ("counts", "sigma", "flag", "used")
-            },
-        ),
+    joined = Points(point=_fresh(ids), x=places[keep, 0], y=places[keep, 1])
+    first_exposure = np.cumsum([0, *(len(entry.exposures) for entry in sets)])
+    first_point = np.cumsum([0, *map(len, points)])
+    return TableIntensities(
+        int(first_exposure[-1]),
         joined,
-    )
+        exposure=np.concatenate([t.exposure + n for t, n in zip(tables, first_exposure, strict=False)]),
+        point=np.concatenate([row[n + t.point] for t, n in zip(tables, first_point, strict=False)]),
+        # The appended −1 is what a row without a source (−1, the last entry) becomes.
+        source=np.concatenate(
+            [np.append(rows, -1)[t.source] for t, rows in zip(tables, source_rows, strict=True)]
+        ),
+        **{
+            name: np.concatenate([getattr(table, name) for table in tables])
+            for name in ("counts", "sigma", "flag", "used")
+        },
+    ), joined
+
+
+def _earlier_ones(points: Points) -> Int[np.ndarray, " p"]:
+    """How many points ahead of each one lie at the same place."""
+    _, place = np.unique(np.column_stack([points.x, points.y]) + 0.0, axis=0, return_inverse=True)
+    place = place.reshape(-1)
+    order = np.argsort(place, kind="stable")
+    number = np.empty(len(place), np.int64)
+    number[order] = np.arange(len(place)) - np.searchsorted(place[order], place[order])
+    return number
 
 
 def _fresh(ids: np.ndarray) -> np.ndarray:
@@ -306,7 +296,7 @@ def _fresh(ids: np.ndarray) -> np.ndarray:
     sorted_ids = ids[order]
     repeated = np.sort(order[1:][sorted_ids[1:] == sorted_ids[:-1]])
     fresh = ids.copy()
-    fresh[repeated] = ids.max() + 1 + np.arange(len(repeated))
+    fresh[repeated] = ids.max(initial=-1) + 1 + np.arange(len(repeated))
     return fresh
 
 

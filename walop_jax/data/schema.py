@@ -79,7 +79,7 @@ _TEFF = Column(
         Rule(
             lambda teff: ~np.isnan(teff) & ~((teff >= 500) & (teff < 1e6)),
             "is not a temperature of a source",
-            "kelvin are wanted; NaN means a flat photon spectrum, in text files so does an empty cell",
+            "kelvin; NaN, in text an empty cell, means a flat photon spectrum",
         ),
     ),
 )
@@ -317,10 +317,14 @@ def table_of(given: Mapping[str, Any], columns: Mapping[str, Column], place: Pla
     `columns` do not have.
     """
     rows = max(len(values) for values in given.values())
+    if rows == 0:
+        raise place.fail("has no rows", advice="a calibration set needs at least one")
     table = {}
-    for name in given:
+    for name, values in given.items():
         if name not in columns:
             raise place.fail("there is no such column", name, nearest(name, columns))
+        if len(values) != rows:
+            raise place.fail(f"has {len(values)} values, another column {rows}", name, "one for each row")
     for name, column in columns.items():
         if name in given:
             table[name] = converted(
