@@ -6,6 +6,7 @@ import copy
 from pathlib import Path
 
 import numpy as np
+import pytest
 from astropy.io import fits
 
 NAN = float("nan")
@@ -127,6 +128,18 @@ class Handmade:
         path = self.folder / name
         fits.HDUList(self.hdus()).writeto(path, checksum=checksum, overwrite=True)
         return path
+
+    def refused(self, *fragments: str) -> None:
+        """Write it and have it read: the error names the file and `fragments`, in one line."""
+        from walop_jax.data import DataError, read_calibration_set  # behind the checks of shapes
+
+        path = self.write()
+        with pytest.raises(DataError) as caught:
+            read_calibration_set(path)
+        message = str(caught.value)
+        for fragment in (str(path), *fragments):
+            assert fragment in message
+        assert "\n" not in message
 
     def copy(self) -> Handmade:
         return copy.deepcopy(self)

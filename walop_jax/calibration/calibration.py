@@ -27,6 +27,7 @@ from walop_jax.calibration.matrix import (
 )
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import CALIBRATION_PLATE, Exposures, FilterCurve, InputFile, Site, Sources
+from walop_jax.data.schema import in_unit
 from walop_jax.data.settings import (
     BUILTIN_FILTERS,
     DEFAULT_FILTER,

@@ -20,7 +20,7 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import analysis_vectors
 from walop_jax.data.records import FilterCurve
-from walop_jax.data.settings import Settings
+from walop_jax.data.settings import DEFAULT_FILTER, Settings
 from walop_jax.model import fold, light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.elements import WavePlate
