@@ -121,7 +121,7 @@ ERRORS = (
             "likelihood/test_engine.py", "likelihood/test_priors.py", "likelihood/test_large.py"),
     # noise
     planted("simulation/simulate.py", "np.maximum(counts, 0.0) + self.read_noise**2",
-            "np.maximum(counts, 0.0) + self.read_noise", "likelihood/test_noise.py"),
+            "np.maximum(counts, 0.0) + self.read_noise", "simulation/test_noise.py"),
     # fit
     planted("fit/search.py", "start[likelihood.model.index(name)] += sign * one_wave",
             "start[likelihood.model.index(name)] += one_wave", "fit/test_search.py"),
@@ -144,6 +144,8 @@ ERRORS = (
             "posterior/test_surrogate.py"),
     planted("posterior/result.py", "steps <= LENGTHS * history[2]", "steps <= history[2]", _CHAINS),
     planted("posterior/result.py", "if not np.max(rhat) < LARGEST_RHAT", "if np.max(rhat) < 0", _CHAINS),
+    # nights
+    planted("nights/algebra.py", "border - gain @ last.left", "border + gain @ last.left", "nights/test_algebra.py"),
     # science
     planted("science/estimate.py", "np.where(used, sigma, 1.0) ** 2", "np.where(used, sigma, 1.0)",
             "science/test_estimate.py"),

@@ -79,7 +79,7 @@ _TEFF = Column(
         Rule(
             lambda teff: ~np.isnan(teff) & ~((teff >= 500) & (teff < 1e6)),
             "is not a temperature of a source",
-            "kelvin; NaN, in text an empty cell, means a flat photon spectrum",
+            "in kelvin; NaN means a flat photon spectrum, as an empty cell of a text does",
         ),
     ),
 )
