@@ -27,7 +27,7 @@ from walop_jax.commands.sample import sample as sample
 from walop_jax.commands.simulate import simulate as simulate
 from walop_jax.commands.trace import trace as trace
 from walop_jax.commands.watch import watch as watch
-from walop_jax.data.from_arrays import from_arrays as from_arrays
+from walop_jax.data.calset import from_arrays as from_arrays
 from walop_jax.data.records import CalibrationSet as CalibrationSet
 from walop_jax.data.settings import Settings as Settings
 from walop_jax.data.write import write_calibration_set as write_calibration_set
