@@ -25,7 +25,6 @@ jax.config.update("jax_enable_x64", True)  # the package itself never switches i
 jaxtyping.install_import_hook("walop_jax", "shapes.checked")
 from walop_jax.data import read_calibration_set  # noqa: E402
 from walop_jax.fit.refit import FitResult, refit  # noqa: E402
-from walop_jax.likelihood import limits  # noqa: E402
 
 LEAST_COMPILED = 0.1  # seconds: what compiles faster is not worth a file
 # Half the time; results differ by 10⁻¹³ of the counts. The second is newer than the oldest JAX that will do.
@@ -33,7 +32,6 @@ QUICK_COMPILATION = "--xla_backend_optimization_level=0"
 QUICK_OPTIMISATION = "jax_optimization_level"
 # Objects made before Python looks for garbage among the youngest: a program that is traced makes a million that stay.
 GARBAGE_AFTER = 50_000
-TOGETHER = 16  # field points: one program then serves sets of any size, which are small and many here
 SLOW = Path(__file__).parent / "slow_tests.txt"
 OPTIONS = {"long": "studies that take minutes", "benchmark": "timings"}
 
@@ -54,8 +52,6 @@ def pytest_configure(config: pytest.Config) -> None:
         if hasattr(jax.config, QUICK_OPTIMISATION):
             jax.config.update(QUICK_OPTIMISATION, "O0")
             os.environ[QUICK_OPTIMISATION.upper()] = "O0"
-        limits.POINTS_PER_CHUNK = limits.VECTOR_POINTS = limits.SOLVED_TOGETHER = TOGETHER
-        limits.MATRIX_POINTS = (TOGETHER, TOGETHER)
     cache = getattr(config, "cache", None)
     if cache is None:
         return

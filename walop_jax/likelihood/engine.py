@@ -234,7 +234,7 @@ def _normal_equations(
         return _block_equations(instrument, plan, part, nodes)
 
     points, block = data.x.shape[0], limits.JACOBIAN_BLOCK
-    if points <= limits.UNCUT or points % block:
+    if points <= block or points % block:
         return function(data)
     parts = jax.tree.map(lambda v: v.reshape(-1, block, *v.shape[1:]), data)
     blank = jax.tree.map(

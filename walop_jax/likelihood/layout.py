@@ -70,7 +70,7 @@ class Layout:
         points, exposures = len(calset.points), len(calset.exposures)
         many = points > limits.INTERPOLATE_ABOVE
         interpolated = many if interpolate is None else interpolate
-        usual = limits.LARGE_CHUNK if many else min(limits.POINTS_PER_CHUNK, _largest_chunk(model, exposures))
+        usual = limits.LARGE_CHUNK if many else limits.POINTS_PER_CHUNK
         chunk = min(points_per_chunk or usual, points)
         allowed = limits.MEMORY if memory is None else memory
         each = bytes_per_point(exposures, calset.cameras, mirrored=mirrored)
@@ -108,13 +108,6 @@ class Layout:
 def bytes_per_point(exposures: int, cameras: int = 4, *, mirrored: bool = False) -> int:
     """Size of the point data of one field point: per exposure counts and weights, sky, source and band."""
     return 8 * (2 + exposures * (2 * cameras + (4 if mirrored else 2) + 1 + 1))
-
-
-def _largest_chunk(model: Model, exposures: int) -> int:
-    """The largest multiple of four points whose Jacobian in local quantities stays small."""
-    cameras = len(model.template.cameras)
-    local = len(model.parameters) - len(model.template.throughput.coefficients.ravel()) + cameras
-    return max(1, limits.LARGEST_CHUNK // (cameras * exposures * local) * 4)
 
 
 def _rectangle(calset: CalibrationSet, *, mirrored: bool) -> Rectangle:

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 # ------------------------------------------------------------------------------------- chunks, slabs, memory
 
-POINTS_PER_CHUNK = 256
-"""Field points of a chunk whose optics are solved point by point: enough to keep a core busy."""
-LARGEST_CHUNK = 2_000_000
-"""Intensities × local quantities of a chunk: its Jacobian then takes 16 MB."""
+POINTS_PER_CHUNK = 16
+"""Field points of a chunk whose optics are solved point by point: what 144 of them need at a time leaves the cache of
+the processor and takes twice as long. One program serves sets of any size."""
 LARGE_CHUNK = 1024
 """Field points of a chunk whose optics are interpolated: each of them costs less, and the engine divides it further."""
 MEMORY = 2e9
@@ -26,8 +25,6 @@ SLABS = 16
 
 JACOBIAN_BLOCK = 64
 """Field points whose Jacobians are worked on together: these stay in the processor's cache."""
-UNCUT = 256
-"""Field points up to which a chunk is not cut into such blocks."""
 COLUMNS = 256
 """Columns of an image row that are worked on together: the sums of four cameras and 25 exposures take a megabyte."""
 RESPONSES_TOGETHER = 32
@@ -41,7 +38,7 @@ NODES_PER_SIDE = (12, 16, 18, 20, 24, 28, 32)
 """Numbers of nodes per side that are tried in turn: two more gain a factor of 30, beyond 32 the optics oscillate."""
 CHECKED_PLACES = 48
 """Places between the nodes at which the error is measured: within a factor of three of the largest anywhere."""
-SOLVED_TOGETHER = 64
+SOLVED_TOGETHER = 16
 """Places whose optics are solved together, so that they are compiled for one size only."""
 
 # ------------------------------------------------------------------------------------------------- large sets
@@ -91,8 +88,8 @@ MOST_CELLS = 128
 
 MATRIX_POINTS = (16, 256)
 """Field points whose instrument matrices are computed together, a few and many: compiled for these two sizes only."""
-VECTOR_POINTS = 100
-"""Field points whose analysis vectors are computed together: a quarter of a field table of 20 × 20."""
+VECTOR_POINTS = 16
+"""Field points whose analysis vectors are computed together: for one star as well as for a table of the field."""
 
 # ------------------------------------------------------------------------------------------------- diagnosis
 
