@@ -11,9 +11,11 @@ import pytest
 WRITERS = {
     "posterior": """
         import arviz
-        from walop_jax.posterior import files, write_posterior
-        files.inference_data = lambda sample: arviz.from_dict(posterior={"a": np.zeros((4, 20000)) + sample})
-        write = lambda path: write_posterior(path, 1.0, overwrite=True)
+        from walop_jax.posterior import write_posterior
+        class Sample:
+            def to_arviz(self):
+                return arviz.from_dict(posterior={"a": np.ones((4, 20000))})
+        write = lambda path: write_posterior(path, Sample(), overwrite=True)
     """,
     "checkpoint": """
         from walop_jax.posterior import Checkpoints

@@ -22,7 +22,6 @@ from walop_jax.posterior import (
     Options,
     Sampler,
     Stretch,
-    inference_data,
     make_sampler,
     read_draws,
     sample,
@@ -115,7 +114,7 @@ def test_a_sampler_of_ones_own_samples_the_surrogate(scene: Scene, tmp_path: Pat
     cut = sample(result, dataclasses.replace(short, parameters=None), folder=tmp_path / "chain")
     assert not cut.trusted
     assert cut.sampler == cut.document()["sampler"] == "metropolis"
-    assert inference_data(cut).posterior.attrs["sampler"] == "metropolis"
+    assert cut.to_arviz().posterior.attrs["sampler"] == "metropolis"
     assert cut.chains.shape[:3] == (2, 320, 1)
     with pytest.raises(DataError, match=r"other sampler \(metropolis \w+ → emcee"):
         sample(result, dataclasses.replace(short, sampler="emcee", parameters=None),

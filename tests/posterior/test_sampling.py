@@ -20,7 +20,6 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.posterior import (
     Options,
     PosteriorSample,
-    inference_data,
     read_draws,
     sample,
     sampling,
@@ -135,7 +134,7 @@ def test_posterior_file_table_and_report(posterior: PosteriorSample, tmp_path: P
     assert len(read_draws(tmp_path / "posterior.nc", posterior.names, posterior.fit)) == len(draws)
     with pytest.raises(DataError, match="is of another fit with the same parameters"):
         read_draws(tmp_path / "posterior.nc", posterior.names, posterior.fit[::-1])
-    data = inference_data(posterior)
+    data = posterior.to_arviz()
     assert data.posterior["half1.plate.quartz"].attrs["units"] == "um"
     assert data.posterior["half1.wedge"].shape == posterior.draws.shape[:2]
     assert data.posterior.attrs["converged"] == 1

@@ -77,43 +77,6 @@ def digest_of_fit(inputs: Sequence[InputFile], names: Sequence[str], values: np.
 # ------------------------------------------------------------------------------------------- posterior.nc
 
 
-def inference_data(sample: PosteriorSample) -> Any:
-    """ArviZ InferenceData: one variable per coefficient that varies, under its name, with its unit."""
-    varies = sample.varying
-    posterior = {sample.names[i]: sample.draws[:, :, i] for i in varies}
-    if sample.ln_f is not None:
-        posterior[INFLATION] = sample.ln_f
-    data = arviz().from_dict(posterior=posterior, sample_stats={"lp": sample.log_posterior})
-    for i in varies:
-        data.posterior[sample.names[i]].attrs["units"] = sample.units[i] or "1"
-    v = sample.convergence
-    for k, name in enumerate(v.names):
-        if name not in data.posterior:  # it never moved
-            continue
-        evidence = {"autocorrelation_steps": v.tau[k], "effective_samples": v.ess[k], "r_hat": v.rhat[k]}
-        data.posterior[name].attrs.update({key: float(value) for key, value in evidence.items()})
-        data.posterior[name].attrs["sampled_by"] = sample.sampler
-    data.posterior.attrs.update(
-        {
-            "sampler": sample.sampler,
-            "converged": int(v.converged),
-            "trusted": int(sample.trusted),
-            "verdict": v.message() if sample.of_trusted_fit else "the fit is not trusted",
-            "steps": v.steps,
-            "acceptance": sample.acceptance,
-            "fingerprint": json.dumps(sample.fingerprint),
-            "fit": sample.fit,
-            "fixed": json.dumps(
-                {n: float(sample.draws[0, 0, i]) for i, n in enumerate(sample.names) if i not in varies}
-            ),
-        }
-    )
-    if sample.accuracy is not None:
-        numbers = {"efficiency": sample.accuracy.efficiency, "spread": sample.accuracy.spread}
-        data.posterior.attrs.update({f"surrogate_{key}": value for key, value in numbers.items()})
-    return data
-
-
 def write_posterior(
     path: str | os.PathLike[str], sample: PosteriorSample, *, overwrite: bool = False
 ) -> None:
@@ -124,7 +87,7 @@ def write_posterior(
     import h5netcdf
     from xarray.backends import H5NetCDFStore
 
-    data = inference_data(sample)
+    data = sample.to_arviz()
 
     def fill(file: h5py.File) -> None:
         with warnings.catch_warnings(), h5netcdf.File(file, "a") as content:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 import math
 import warnings
 from collections.abc import Callable, Mapping
@@ -350,6 +351,42 @@ class PosteriorSample(Displayed):
     def to_table(self) -> Any:
         """The columns of `intervals` as an astropy table."""
         return astropy_table(self.intervals(), {"TRUSTED": self.trusted})
+
+    def to_arviz(self) -> Any:
+        """ArviZ InferenceData: one variable per coefficient that varies, under its name, with its unit."""
+        varies = self.varying
+        posterior = {self.names[i]: self.draws[:, :, i] for i in varies}
+        if self.ln_f is not None:
+            posterior[INFLATION] = self.ln_f
+        data = arviz().from_dict(posterior=posterior, sample_stats={"lp": self.log_posterior})
+        for i in varies:
+            data.posterior[self.names[i]].attrs["units"] = self.units[i] or "1"
+        v = self.convergence
+        for k, name in enumerate(v.names):
+            if name not in data.posterior:  # it never moved
+                continue
+            evidence = {"autocorrelation_steps": v.tau[k], "effective_samples": v.ess[k], "r_hat": v.rhat[k]}
+            data.posterior[name].attrs.update({key: float(value) for key, value in evidence.items()})
+            data.posterior[name].attrs["sampled_by"] = self.sampler
+        data.posterior.attrs.update(
+            {
+                "sampler": self.sampler,
+                "converged": int(v.converged),
+                "trusted": int(self.trusted),
+                "verdict": v.message() if self.of_trusted_fit else "the fit is not trusted",
+                "steps": v.steps,
+                "acceptance": self.acceptance,
+                "fingerprint": json.dumps(self.fingerprint),
+                "fit": self.fit,
+                "fixed": json.dumps(
+                    {n: float(self.draws[0, 0, i]) for i, n in enumerate(self.names) if i not in varies}
+                ),
+            }
+        )
+        if self.accuracy is not None:
+            numbers = {"efficiency": self.accuracy.efficiency, "spread": self.accuracy.spread}
+            data.posterior.attrs.update({f"surrogate_{key}": value for key, value in numbers.items()})
+        return data
 
     def display(self) -> Display:
         """The verdict on the chains and the sampled coefficients."""
