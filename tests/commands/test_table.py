@@ -30,7 +30,7 @@ FUNCTIONS = {name: getattr(walop, name.replace("-", "_")) for name in COMMANDS}
 PYTHON_ONLY = {
     "refit": {"folder"},
     "simulate": {"noiseless"},
-    "matrix": {"x", "y", "columns"},
+    "matrix": {"columns"},
     "compare": {"calibration"},
     "trace": {"positions"},
     "sample": {"parameters", "more"},

@@ -33,7 +33,7 @@ from walop_jax.model.effects.change import BAND, OPPOSITE, SKY
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.etalon import GAPS, QUARTER
 from walop_jax.model.effects.optics import Displacement
-from walop_jax.model.effects.sources import Polarisation
+from walop_jax.model.effects.sources import OfSource
 from walop_jax.model.elements import Polariser, PupilMapping, WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.responses import acts
@@ -307,7 +307,7 @@ def _of_field_and_band(instrument: Instrument, asked: _Asked) -> Iterator[tuple[
 
 
 def _of_sources(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
-    own = tuple(Sentence(kind, "of", SKY) for kind in Polarisation.names)
+    own = tuple(Sentence(kind, "of", SKY) for kind in OfSource.names)
     moon = np.flatnonzero((asked.exposures.kind == "moon") & ~asked.exposures.clp_in)
     if moon.size:
         yield own[2:]
@@ -317,7 +317,7 @@ def _of_sources(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentenc
         if len(each) > 1:
             yield tuple(itertools.chain(*each))
     for name in instrument.standard.names:
-        yield tuple(Sentence(kind, "of", name.replace(" ", "_")) for kind in Polarisation.names[:2])
+        yield tuple(Sentence(kind, "of", name.replace(" ", "_")) for kind in OfSource.names[:2])
 
 
 def _together(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:

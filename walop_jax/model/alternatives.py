@@ -18,14 +18,14 @@ from walop_jax.model import materials
 from walop_jax.model.elements import Analyser, Element, Layer, Polariser, WavePlate, Wedge
 from walop_jax.model.instrument import Arm, Instrument
 
-Change = Callable[[Instrument], Instrument]
-Named = tuple[str, Change]
+Rearrangement = Callable[[Instrument], Instrument]
+Named = tuple[str, Rearrangement]
 
 TURNS = (90.0, 180.0, 270.0)  # degrees
 JOINED = "; "
 
 
-def alternatives(instrument: Instrument) -> dict[str, Change]:
+def alternatives(instrument: Instrument) -> dict[str, Rearrangement]:
     """All changes of a description that an instrument has places for, by what they say."""
     return dict(
         itertools.chain(

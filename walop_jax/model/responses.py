@@ -41,7 +41,7 @@ from walop_jax.model.materials import REFERENCE_TEMPERATURE
 from walop_jax.model.parameters import shapes_of
 from walop_jax.model.plan import Plan
 from walop_jax.model.ray import CONDITIONS, Conditions, Ray
-from walop_jax.model.sources import ExposureArrays, MoonSky, Patches, Sight
+from walop_jax.model.sources import ExposureArrays, MoonPatches, MoonSky, Sight
 
 Scalar = Float[Array, ""]
 REFERENCE_WAVELENGTH = 0.62  # µm
@@ -550,7 +550,7 @@ def _lit(instrument: Instrument, own: dict[str, Scalar], count: int) -> Instrume
     instrument = instrument.changed("", rotator_zero=added("rotator"))
     for source in instrument.sources:
         if isinstance(source, MoonSky):
-            every = Patches(
+            every = MoonPatches(
                 jnp.full(count, own["sky q"]), jnp.full(count, own["sky u"]), positions=tuple(range(count))
             )
             instrument = instrument.changed(

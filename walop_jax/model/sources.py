@@ -105,17 +105,17 @@ def turned(qu: Float[Array, "e 2"], angle: Float[Array, " e"]) -> Float[Array, "
     return jnp.stack([qu[:, 0] * cos + qu[:, 1] * sin, qu[:, 1] * cos - qu[:, 0] * sin], axis=-1)
 
 
-class Patches(Component):
+class MoonPatches(Component):
     """What single Moon exposures, at some positions of the list, have beyond single scattering."""
 
     q: Float[Array, " m"]
     u: Float[Array, " m"]
     positions: tuple[int, ...] = eqx.field(static=True, default=())
 
-    def joined(self, other: Patches) -> Patches:
+    def joined(self, other: MoonPatches) -> MoonPatches:
         """These and others; what both have adds up."""
         q, u = jnp.concatenate([self.q, other.q]), jnp.concatenate([self.u, other.u])
-        return Patches(q, u, (*self.positions, *other.positions))
+        return MoonPatches(q, u, (*self.positions, *other.positions))
 
 
 class MoonSky(Source):
@@ -129,7 +129,7 @@ class MoonSky(Source):
         default=0.8,
     )
     missing: Scalar | None = number(unit="", about="degree taken away by multiple scattering", default=None)
-    patches: Patches | None = None
+    patches: MoonPatches | None = None
 
     name: ClassVar[str] = "sky"
     kind: ClassVar[str] = "moon"

@@ -73,7 +73,7 @@ class Pattern(Mixing):
         return vectors
 
 
-class Shares(ExposurePart):
+class FreeShares(ExposurePart):
     """Harmonics of the polariser angle and single exposures."""
 
     harmonics: Float[Array, "c h 2 g"]
@@ -170,5 +170,7 @@ class FreeForm(Effect):
         if self.vectors.size or self.fine.size:
             instrument = instrument.with_part("mixing", Pattern(self.vectors, self.fine))
         if self.harmonics.size or self.exposures.size:
-            instrument = instrument.with_part("exposures", Shares(self.harmonics, self.exposures, self.fine))
+            instrument = instrument.with_part(
+                "exposures", FreeShares(self.harmonics, self.exposures, self.fine)
+            )
         return instrument

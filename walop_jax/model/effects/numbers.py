@@ -75,7 +75,7 @@ class Shift(OfInstrument):
     field: ClassVar[str] = "filter_shift"
 
 
-class Rotator(OfInstrument):
+class RotatorZeroPoint(OfInstrument):
     """True ROTATOR minus the header's (deg)."""
 
     names: ClassVar[tuple[str, ...]] = ("rotator",)

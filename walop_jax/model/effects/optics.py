@@ -66,7 +66,7 @@ class Optical(Kind):
         changes, amplitudes = (tuple(column) for column in zip(*terms, strict=True))
         where, place, polariser = changes[0].where, changes[0].place, instrument.polariser
         if where == "of" and polariser is not None and place == polariser.name:
-            film = OfPolariser(amplitudes, changes)
+            film = PolariserFilm(amplitudes, changes)
             return instrument.changed(place, films=lambda films: (*films, film))
         own = Terms(name="described", amplitudes=amplitudes, changes=changes)
         if where != "of":
@@ -196,7 +196,7 @@ class Terms(Element):
         return matrix_of([(change, size * change.factor(at)) for change, size in terms], ray.x, ray.y)
 
 
-class OfPolariser(Film):
+class PolariserFilm(Film):
     """Changes of the polariser: what the light behind it meets when it is in."""
 
     amplitudes: tuple[Scalar, ...]

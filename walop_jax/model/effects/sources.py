@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from walop_jax.model.effects.change import SKY, Change, Kind, Term
 from walop_jax.model.instrument import Instrument, NoSuchPlaceError
 from walop_jax.model.parameters import unknown_name
-from walop_jax.model.sources import Patches
+from walop_jax.model.sources import MoonPatches
 
 
-class Polarisation(Kind):
+class OfSource(Kind):
     """Of a star: Q + a, or U, in the equatorial frame; of the Moon sky: its degree; q or u in one exposure."""
 
     names: ClassVar[tuple[str, ...]] = ("polarisation q", "polarisation u", "polarisation")
@@ -39,7 +39,7 @@ class Polarisation(Kind):
         for one, value in terms:
             at = positions.index(one.number)
             own[one.kind[-1]][at] = own[one.kind[-1]][at] + value
-        here = Patches(jnp.stack(own["q"]), jnp.stack(own["u"]), positions)
+        here = MoonPatches(jnp.stack(own["q"]), jnp.stack(own["u"]), positions)
         return instrument.changed("sky", patches=lambda there: here if there is None else there.joined(here))
 
 
