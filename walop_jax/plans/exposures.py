@@ -1,263 +1,251 @@
-"""Calibration exposures as candidates of a plan: the information of each, and what the plan is to know well.
-
-The exposures that could be taken are said by an observing plan (`ObservingPlan`): filters, settings of the calibration
-plate, Moon patches of a night, standard stars. The polariser may stand at any angle: its angles in the observing plan
-are ignored.
+"""The information that calibration exposures would bring, and the known parameters that a plan is judged by.
 
 Information  of an exposure e: J_eᵀ J_e, J_e the derivatives of its whitened residuals, fluxes eliminated, to the free
              parameters of the base model, from expected counts and the errors that they would have. No noise enters.
-Polariser    counts depend on the angle θ by cos 2θ and sin 2θ, their errors smoothly on the counts: a Fourier series in
-             2θ through `ANGLES` angles, whose truncation is measured at angles between them (`Candidates.truncation`).
-Target       error of p of stars with p ≤ 5 % behind the calibration alone, mean square over the stars, at a field point
-             and colour: δ(q, u) = −M⁻¹ (δm₁ + δM (q, u)) (`science.field_accuracy`), linear in the parameters. Where
-             |det M| < `LEAST_DETERMINANT` one exposure holds no u, and no plan of calibrations brings it back.
-Draws        of the instrument as built, from the priors of the model: the best plan depends on it.
-Limits       Exposures know of each other only by the parameters. Changes between exposures (slews, filters) cost time
-             when the plan is put in order, not here; the bound without them stays a bound.
+Polariser    Light is linear, so that counts and their derivatives are series of low degree in 2θ: they are computed at
+             `NODES` angles and known at all. The information, which divides by the variance of the counts, is a series
+             of high degree, cut where `ANGLES` angles end it; `Candidates.truncation` is what is lost, measured between.
+Draws        of the instrument as built, from the priors of the model or around a calibration: the best plan depends on it.
+Limits       Detectors are linear. Exposures know of each other only by the parameters. Changes between exposures
+             (slews, filters) cost time when the plan is put in order; the bound without them stays a bound.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
+import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
-from walop_jax.calibration.matrix import matrix_slopes
-from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet
-from walop_jax.data.settings import Settings
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.fit.model_file import base_model
+from walop_jax.likelihood import engine
+from walop_jax.likelihood.flux import Sharing, project_flux, sharing
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
+from walop_jax.likelihood.noise import PhotonNoise
+from walop_jax.model.compiled import compiled
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.plan import Plan
 from walop_jax.model.specification import Model
-from walop_jax.plans.families import Circle, Family, Listed
-from walop_jax.plans.optimal import Experiment
-from walop_jax.science.star_errors import sample_stars
+from walop_jax.plans.could import Choice, Could
+from walop_jax.plans.families import Circle, Family, Listed, harmonics
 from walop_jax.simulation.observing_plan import ObservingPlan
-from walop_jax.simulation.simulate import simulate, truth_values
+from walop_jax.simulation.simulate import draw_instrument, fluxes, simulate, truth_values
 
+NODES = 7  # angles of the polariser at which counts are computed: a series of degree 3 in 2θ, one more than it needs
 ANGLES = 361
-"""Polariser angles, over half a turn, of which the information is computed; between them it is a Fourier series in 2θ.
+"""Angles over half a turn through which the information is a Fourier series in 2θ.
 
 So many since errors vary quickly where a camera is dark: over some √(σ²/N) rad, N its counts in full light."""
+GRID, STAR_GRID = 6, 3
+"""Field points along each axis at which the information is computed, scaled to those of the plan."""
 DRAWS = 20
-LEAST_DETERMINANT = 0.1
-COLOURS = (float("nan"), 4000.0, 8000.0)
-"""Colour temperatures (K; NaN: flat photon spectrum) at which p is to be known."""
-TARGET_GRID = 9  # field points along each axis at which the error of p is asked
-OVERHEAD: Mapping[str, float] = {"clp": 20.0, "moon": 60.0, "standard": 90.0, "lamp": 15.0}
-"""Time (s) that an exposure of a KIND takes beside its EXPTIME: read-out, turning or pointing, settling."""
+_TOGETHER = 60  # angles, so that their derivatives stay small
 
 
 @dataclasses.dataclass(frozen=True)
 class Candidates:
     """Everything that could be observed, with the information that each exposure would bring.
 
-    `families` go by `labels`: a continuum of polariser angles (as 2θ, rad) for each setting, then the exposures of each
-    other KIND in the order of `plan`; `settings` are filter and positions of moving elements of the former. `slopes`
-    (draw, point, element, parameter) are the derivatives of the matrix at the target points, `forms`
-    (draw, point, 6, 6) the quadratic form that makes the mean square error of p of them, 0 where one exposure holds no
-    u. `truncation` is the largest error of the information between the angles that were computed, in units of the mean
-    diagonal of each parameter.
+    `families` go with `choices`, their information scaled to the field points of the plan. `values` (draw, parameter)
+    are all parameters of the instruments that were drawn, `prior` what is known of the free ones beforehand, `names`
+    of these. `truncation` is the largest error of the information between the angles that were computed, in units of
+    the mean diagonal of each parameter; `notes` say what had to be left out.
     """
 
-    plan: ObservingPlan
+    could: Could
     model: Model
+    choices: tuple[Choice, ...]
     families: tuple[Family, ...]
-    labels: tuple[str, ...]
-    settings: tuple[tuple[str, Mapping[str, float | None]], ...]
-    x: Float[np.ndarray, " p"]
-    y: Float[np.ndarray, " p"]
-    slopes: Float[np.ndarray, "r p 6 f"]
-    forms: Float[np.ndarray, "r p 6 6"]
+    values: Float[np.ndarray, "r n"]
+    names: tuple[str, ...]
     prior: Float[np.ndarray, "f f"]
     truncation: float
-
-    def experiment(
-        self,
-        minutes: float,
-        known: Float[np.ndarray, "f f"] | None = None,
-        targets: Float[np.ndarray, "r k f q"] | None = None,
-    ) -> Experiment:
-        """The problem of a budget in minutes; `known` is the information of what was measured before.
-
-        Default target: the mean square error of p (in %²) at every point and colour.
-        """
-        before = self.prior if known is None else known
-        draws = len(self.slopes)
-        return Experiment(
-            np.broadcast_to(before, (draws, *before.shape)).copy(),
-            self.p_targets() if targets is None else targets,
-            self.families,
-            60.0 * minutes,
-        )
-
-    def p_targets(self) -> Float[np.ndarray, "r k f 6"]:
-        """Linear functions of the parameters whose summed variance is the mean square error of p, in %²."""
-        value, vector = np.linalg.eigh(self.forms)
-        root = vector * np.sqrt(np.clip(value, 0.0, None))[..., None, :]
-        seen = self.forms.any(axis=(2, 3)).all(axis=0)
-        return 100.0 * np.einsum("rpif,rpij->rpfj", self.slopes, root)[:, seen]
-
-    def p_error(self, covariance: Float[np.ndarray, "r f f"]) -> Float[np.ndarray, "r p"]:
-        """Error of p (fraction) at the target points for covariances of the parameters; NaN where there is no u."""
-        c = np.einsum("rpif,rfg,rpjg->rpij", self.slopes, covariance, self.slopes, optimize=True)
-        square = np.einsum("rpij,rpij->rp", self.forms, c)
-        return np.sqrt(np.where(self.forms.any(axis=(2, 3)), square, np.nan))
+    notes: tuple[str, ...]
 
 
 def candidates(
-    plan: ObservingPlan,
+    could: Could,
     *,
     draws: int = DRAWS,
     seed: int = 0,
-    overhead: Mapping[str, float] = OVERHEAD,
-    colours: Sequence[float] = COLOURS,
+    around: Calibration | None = None,
     angles: int = ANGLES,
     progress: Callable[[str], None] | None = None,
 ) -> Candidates:
-    """The exposures that an observing plan allows, each with its information in `draws` draws of the instrument.
+    """The exposures that could be taken, each with its information in `draws` draws of the instrument.
 
-    `overhead` (s) by KIND is added to EXPTIME; `angles`, an odd number, are those of the polariser.
+    Instruments are drawn from the priors, or from the posterior of the calibration `around`; `angles`, an odd number,
+    are those of the polariser. Raises ValueError where nothing is left to be observed.
     """
     tell = progress or (lambda text: None)
-    sky = dataclasses.replace(plan, polariser_angles=(0.0,), plate=plan.plate[:1])
-    # The model of all exposures: no family by itself would free all parameters.
-    blank = simulate(sky, noiseless=True, steady=True).calset
-    model = base_model(blank, plan.design, throughput_degree=plan.throughput_degree)
-    families: list[Family] = []
-    labels, truncation = [], float("nan")
-    settings = []
-    for setting, there in _through_the_polariser(plan, angles):
-        label = ", ".join(
-            ["clp", setting[0], *(f"{p} {'out' if a is None else f'{a:g}°'}" for p, a in setting[1].items())]
-        )
-        settings.append(setting)
-        tell(f"information of {label}")
-        rows = np.flatnonzero(there.exposures().kind == "clp")
-        information = np.stack([_information(there, model, seed + draw, rows) for draw in range(draws)])
-        family = Circle.sampled(information, _cost(there, rows, overhead)[0])
-        families.append(family)
-        labels.append(label)
-        if len(families) == 1:
-            # Held against what it stands for, at angles between those of the series.
-            turned = tuple(np.array(there.polariser_angles) + 90.0 / angles)
-            between = dataclasses.replace(there, polariser_angles=turned)
-            truncation = _between(family, between, _information(between, model, seed, rows))
-    exposures = sky.exposures()
-    for kind in dict.fromkeys(k for k in exposures.kind.tolist() if k != "clp"):
-        tell(f"information of {kind} exposures")
-        rows = np.flatnonzero(exposures.kind == kind)
-        information = np.stack([_information(sky, model, seed + draw, rows) for draw in range(draws)])
-        families.append(Listed.of(information, _cost(sky, rows, overhead)))
-        labels.append(kind)
-    tell("what is wanted")
-    wanted = [_wanted(sky, model, _drawn(sky, model, seed + draw)[1], colours) for draw in range(draws)]
-    slopes, forms = (np.stack(part) for part in zip(*wanted, strict=True))
-    known = prior_rows(model).jacobian(model.selection())
-    x, y = _target_points(plan)
-    repeated = len(colours) * len(plan.filters)
-    return Candidates(
-        plan=sky,
-        model=model,
-        families=tuple(families),
-        labels=tuple(labels),
-        settings=tuple(settings),
-        x=np.tile(x, repeated),
-        y=np.tile(y, repeated),
-        slopes=slopes,
-        forms=forms,
-        prior=known.T @ known,
-        truncation=truncation,
-    )
-
-
-def _through_the_polariser(
-    plan: ObservingPlan, angles: int
-) -> Iterator[tuple[tuple[str, dict[str, float | None]], ObservingPlan]]:
-    """One plan for every filter and position of the moving elements, the polariser going through half a turn."""
-    turn = tuple((180.0 / angles * np.arange(angles)).tolist())
-    positions = {CALIBRATION_PLATE: plan.plate, **plan.moving}
-    for name in plan.filters:
-        for stops in itertools.product(*positions.values()):
-            yield (
-                (name, dict(zip(positions, stops, strict=True))),
-                dataclasses.replace(
-                    plan,
-                    polariser_angles=turn,
-                    filters=(name,),
-                    plate=stops[:1],
-                    moving={prefix: (a,) for prefix, a in zip(plan.moving, stops[1:], strict=True)},
-                    moon_patches=0,
-                    lamps=0,
-                ),
-            )
-
-
-def _cost(
-    plan: ObservingPlan, rows: Int[np.ndarray, " e"], overhead: Mapping[str, float]
-) -> Float[np.ndarray, " e"]:
-    """Time (s) of exposures, with what each takes beside."""
-    exposures = plan.exposures()
-    return exposures.exptime[rows] + np.array([overhead.get(str(k), 0.0) for k in exposures.kind[rows]])
-
-
-def _drawn(plan: ObservingPlan, model: Model, seed: int) -> tuple[CalibrationSet, Float[np.ndarray, " n"]]:
-    """The set that a plan gives without noise, and the true values of the model's parameters."""
-    calset, truth = simulate(plan, seed=seed, noiseless=True, steady=True)
-    there = truth_values(truth)
-    return calset, np.array([there[name] for name in model.names])
-
-
-def _information(
-    plan: ObservingPlan, model: Model, seed: int, chosen: Int[np.ndarray, " e"]
-) -> Float[np.ndarray, "e f f"]:
-    """J_eᵀ J_e of chosen exposures, in the instrument that a seed draws."""
-    calset, values = _drawn(plan, model, seed)
+    choices, notes = could.choices()
+    if not choices:
+        raise ValueError("; ".join(("nothing could be observed", *notes)))
+    few, stops = fewer_points(could.plan), []
+    turn = 180.0 / NODES * np.arange(NODES)
+    first = np.cumsum([0, *(NODES if c.kind == "clp" else len(c.stops) for c in choices)])
+    for choice in choices:
+        own = choice.stops * NODES if choice.kind == "clp" else choice.stops
+        stops += [
+            dataclasses.replace(s, polariser_angle=a) if choice.kind == "clp" else s
+            for s, a in zip(own, turn if choice.kind == "clp" else own, strict=True)
+        ]
+    plan = dataclasses.replace(few, stops=tuple(stops), patches=(), stars=())
+    tell("expected counts")
+    calset = simulate(plan, seed=seed, noiseless=True, steady=True).calset
+    model = base_model(calset, plan.design, throughput_degree=plan.throughput_degree)
+    values = drawn(model, draws, seed, around)
     likelihood = Likelihood.of(calset, model)
-    jacobian = likelihood.jacobian(values)
-    exposure = np.repeat(np.nonzero(likelihood.used)[1], likelihood.cameras)
-    parts = (jacobian[exposure == e] for e in chosen)
-    return np.stack([rows.T @ rows for rows in parts])
+    light, factor = _Light(plan, likelihood), _factor(could.plan, few)
+    responses = []
+    for number, one in enumerate(values):
+        tell(f"expected counts of instrument {number + 1} of {draws}")
+        responses.append(_responses(likelihood, one))
+    families, lost, turn = [], 0.0, np.arange(angles) / angles
+    for choice, start, stop in zip(choices, first[:-1], first[1:], strict=True):
+        tell(f"information of {choice.text()}")
+        rows = np.arange(start, stop)
+        polarised = choice.kind == "clp"
+        where = turn if polarised else None
+        information = np.stack([light.information(rows, *r, choice.seconds, where) for r in responses])
+        information *= 1.0 if choice.kind == "standard" else factor
+        cost = choice.seconds + could.costs.of(choice.kind)
+        families.append(Circle.sampled(information, cost) if polarised else Listed.of(information, cost))
+        if polarised:
+            between = (np.arange(0, angles, 6) + 0.5) / angles
+            exact = factor * light.information(rows, *responses[0], choice.seconds, between)
+            lost = max(lost, _overtone(responses[0][0][:, rows]), _apart(information[0], between, exact))
+    known = prior_rows(model).jacobian(model.selection())
+    names = tuple(model.names[i] for i in model.free)
+    return Candidates(could, model, choices, tuple(families), values, names, known.T @ known, lost, notes)
 
 
-def _target_points(plan: ObservingPlan) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    edge = np.linspace(-plan.field, plan.field, TARGET_GRID)
-    y, x = (a.ravel() for a in np.meshgrid(edge, edge, indexing="ij"))
-    return x, y
+def fewer_points(plan: ObservingPlan) -> ObservingPlan:
+    """The same over fewer field points, which are spread alike."""
+    return dataclasses.replace(
+        plan, grid=min(plan.grid, GRID), standard_grid=min(plan.standard_grid, STAR_GRID)
+        if not any(s.place for s in plan.stops) else plan.standard_grid
+    )  # fmt: skip
 
 
-def _wanted(
-    plan: ObservingPlan, model: Model, values: Float[np.ndarray, " n"], colours: Sequence[float]
-) -> tuple[Float[np.ndarray, "p 6 f"], Float[np.ndarray, "p 6 6"]]:
-    """Derivatives of the matrix, and the form of the error of p, at the target points in all filters and colours."""
-    instrument, select = model.instrument(values), model.selection()
-    x, y = _target_points(plan)
-    stars = sample_stars()
-    along = stars / np.hypot(*stars.T)[:, None]
-    light = np.concatenate([np.ones((len(stars), 1)), stars], axis=1)
-    slopes, forms = [], []
-    for name in plan.filters:
-        for teff in colours:
-            setting = dataclasses.replace(Settings.default(1, name), teff=np.array([teff]))
-            m, slope = matrix_slopes(instrument, setting, plan.curves(), x, y)
-            local = m[:, :, 1:]
-            determinant = np.linalg.det(local)
-            blind = np.abs(determinant) < LEAST_DETERMINANT
-            inverse = np.linalg.inv(np.where(blind[:, None, None], np.eye(2), local))
-            # δp of a star = −e · M⁻¹ δm s, linear in the six elements of δm.
-            form = np.einsum("nc,pcr,ns->pnrs", along, inverse, light).reshape(len(x), len(stars), 6)
-            square = np.einsum("pni,pnj->pij", form, form) / len(stars)
-            forms.append(np.where(blind[:, None, None], 0.0, square))
-            slopes.append(slope.reshape(len(x), 6, -1) @ select)
-    return np.concatenate(slopes), np.concatenate(forms)
+def _factor(plan: ObservingPlan, few: ObservingPlan) -> float:
+    def count(one: ObservingPlan) -> int:
+        return len(one.points()) - (one.standard_grid**2 if one.standards else 0)
+
+    return count(plan) / count(few)
 
 
-def _between(family: Circle, plan: ObservingPlan, information: Float[np.ndarray, "s f f"]) -> float:
-    """Largest error of a family's series at the angles of a plan, in units of the mean diagonal of each parameter."""
-    rows = family.coefficients(np.deg2rad(2.0 * np.array(plan.polariser_angles))[:, None])
-    made = np.einsum("sj,jab->sab", rows, family.basis[0], optimize=True)
-    size = np.sqrt(np.einsum("saa->a", information) / len(information))
+def drawn(model: Model, draws: int, seed: int, around: Calibration | None) -> Float[np.ndarray, "r n"]:
+    """Values of all parameters: from the priors, or from the posterior of a calibration as far as it has them."""
+    found = []
+    for draw in range(draws):
+        rng = np.random.default_rng([seed, draw])
+        there = truth_values(draw_instrument(model, rng))
+        values = np.array([there[name] for name in model.names])
+        if around is not None:
+            of = around.model
+            own = of.selection() @ rng.multivariate_normal(
+                np.zeros(len(of.free)), around.covariance[np.ix_(of.free, of.free)], method="eigh"
+            )
+            for i, name in enumerate(model.names):
+                if name in of.names:
+                    values[i] = around.values[of.index(name)] + own[of.index(name)]
+        found.append(values)
+    return np.stack(found)
+
+
+def _unit(instrument: Instrument, plan: Plan, point: engine.PointData) -> tuple[Array, Array]:
+    return engine.point_prediction(instrument, plan, point), engine.unit_slopes(instrument, plan, point)
+
+
+_unit_at = compiled(jax.vmap(_unit, (None, None, 0)), kept_as="unit_counts")
+
+
+def _responses(
+    likelihood: Likelihood, values: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "p e k"], Float[np.ndarray, "p e k f"]]:
+    """Counts for light of unit flux, and their derivatives to the free parameters."""
+    instrument, select = likelihood.model.instrument(values), likelihood.model.selection()
+    parts = [_unit_at(instrument, likelihood.plan, chunk) for chunk in likelihood.points]
+    unit, slopes = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
+    count = likelihood.layout.points
+    return unit[:count], slopes[:count] @ select
+
+
+class _Light:
+    """How much light there is: from counts of unit flux to information."""
+
+    def __init__(self, plan: ObservingPlan, likelihood: Likelihood) -> None:
+        self.flux, self.used, self.exptime = fluxes(plan, None), likelihood.used, plan.exposures().exptime
+        self.noise = PhotonNoise(plan.read_noise)
+        self.shared = Sharing(sharing(likelihood.model.template, likelihood.plan).cameras)
+
+    def information(
+        self,
+        rows: Int[np.ndarray, " e"],
+        unit: Float[np.ndarray, "p e k"],
+        slopes: Float[np.ndarray, "p e k f"],
+        seconds: float,
+        turn: Float[np.ndarray, " s"] | None = None,
+    ) -> Float[np.ndarray, "s f f"]:
+        """JᵀJ of the exposures `rows`; or, of `NODES` that differ in the polariser, at other shares of half a turn."""
+        if turn is None:
+            return np.concatenate([self._gram(r, unit[:, [r]], slopes[:, [r]], seconds) for r in rows])
+        order, nodes = NODES // 2, 2 * np.pi * np.arange(NODES) / NODES
+        weights = harmonics(2 * np.pi * turn, order) @ np.linalg.inv(harmonics(nodes, order))
+        parts = np.array_split(weights, max(len(weights) // _TOGETHER, 1))
+        u, du = unit[:, rows], slopes[:, rows]
+        return np.concatenate([self._gram(rows[0], _mixed(w, u), _mixed(w, du), seconds) for w in parts])
+
+    def _gram(
+        self, row: int, unit: Float[np.ndarray, "p s k"], slopes: Float[np.ndarray, "p s k f"], seconds: float
+    ) -> Float[np.ndarray, "s f f"]:
+        at = self.used[:, row]
+        unit, slopes = unit[at], slopes[at]
+        flux = (self.flux[at, row] * seconds / self.exptime[row])[:, None, None]
+        weight = 1.0 / self.noise.sigma(flux * unit)
+        columns = np.moveaxis(slopes * (flux * weight)[..., None], -1, 0)
+        projected = project_flux(columns, unit * weight, False, self.shared)
+        flat = projected.transpose(2, 0, 1, 3).reshape(unit.shape[1], len(projected), -1)
+        return flat @ flat.swapaxes(1, 2)
+
+
+def _mixed(weights: Float[np.ndarray, "s e"], values: Float[np.ndarray, "p e *_"]) -> Float[np.ndarray, "p s *_"]:
+    return np.tensordot(weights, values, (1, 1)).swapaxes(0, 1)
+
+
+def _overtone(unit: Float[np.ndarray, "p e k"]) -> float:
+    """The highest harmonic of the counts beside their mean: none where the series holds them."""
+    nodes = 2 * np.pi * np.arange(NODES) / NODES
+    series = np.linalg.solve(harmonics(nodes, NODES // 2), unit.swapaxes(0, 1).reshape(NODES, -1))
+    return float(np.abs(series[-2:]).max() / np.abs(series[0]).max())
+
+
+def _apart(
+    information: Float[np.ndarray, "s f f"], between: Float[np.ndarray, " b"], exact: Float[np.ndarray, "b f f"]
+) -> float:
+    """Largest error of the series at shares of half a turn, in units of the mean diagonal of each parameter."""
+    count = len(information)
+    series = np.linalg.solve(harmonics(2 * np.pi * np.arange(count) / count, count // 2), information.reshape(count, -1))
+    made = (harmonics(2 * np.pi * between, count // 2) @ series).reshape(exact.shape)
+    size = np.sqrt(np.einsum("saa->a", exact) / len(exact))
     size = np.where(size > 0, size, 1.0)
-    return float(np.max(np.abs(made - information) / (size[:, None] * size)))
+    return float(np.max(np.abs(made - exact) / (size[:, None] * size)))
+
+
+def information_of(known: Calibration, names: Sequence[str]) -> Float[np.ndarray, "f f"]:
+    """What a calibration says of parameters by name; nothing of those that it has not."""
+    both = [i for i, name in enumerate(names) if name in known.model.names]
+    there = [known.model.index(names[i]) for i in both]
+    covariance = known.covariance[np.ix_(there, there)]
+    size = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+    varied = size > 0
+    scaled = covariance[np.ix_(varied, varied)] / np.outer(size[varied], size[varied])
+    inverse = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) / np.outer(size[varied], size[varied])
+    at = np.array(both)[varied]
+    whole = np.zeros((len(names), len(names)))
+    whole[np.ix_(at, at)] = inverse
+    return whole

@@ -17,6 +17,7 @@ Matrices = Float[np.ndarray, "r j n n"]
 COMPRESSED = 1e-6
 """Share of any element, in units of its mean diagonal, that the basis of a `Circle` may leave out."""
 _GRID = 64  # points per period of the highest harmonic: the maximum is known to 1 / cos(π / 64), 0.12 %
+_SPANNING = 20_000  # elements of all matrices from which the basis of a circle is found
 _SPREAD = 16  # candidates of a family that a plan begins with
 
 
@@ -106,13 +107,18 @@ class Circle(Family):
         draws, samples, n, _ = information.shape
         size = np.sqrt(np.einsum("rsaa->ra", information) / samples)
         size = np.where(size > 0, size, 1.0)
-        scaled = np.moveaxis(information / (size[:, None, :, None] * size[:, None, None, :]), 1, 0)
-        flat = scaled.reshape(samples, -1)
-        value, vector = np.linalg.eigh(flat @ flat.T)
+        upper = np.triu_indices(n)
+        scale = size[:, upper[0]] * size[:, upper[1]]
+        flat = np.concatenate([m[:, *upper] / s for m, s in zip(information, scale, strict=True)], axis=1)
+        # Some thousand elements span what all of them do.
+        some = flat[:, :: max(flat.shape[1] // _SPANNING, 1)]
+        value, vector = np.linalg.eigh(some @ some.T * (flat.shape[1] / some.shape[1]))
         left = vector[:, value > (tolerance * samples) ** 2]
-        basis = (left.T @ flat).reshape(-1, draws, n, n) * size[:, :, None] * size[:, None, :]
+        packed = (left.T @ flat).reshape(-1, draws, len(upper[0])) * scale
+        basis = np.empty((draws, len(packed), n, n))
+        basis[..., upper[0], upper[1]] = basis[..., upper[1], upper[0]] = packed.swapaxes(0, 1)
         angle = 2 * np.pi * np.arange(samples) / samples
-        return cls(np.moveaxis(basis, 0, 1), np.linalg.solve(_harmonics(angle, samples // 2), left), cost)
+        return cls(basis, np.linalg.solve(harmonics(angle, samples // 2), left), cost)
 
     @property
     def order(self) -> int:
@@ -121,7 +127,7 @@ class Circle(Family):
 
     def coefficients(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, "s j"]:
         """Coefficients at these angles (rad)."""
-        return _harmonics(places[:, 0], self.order) @ self.mixing
+        return harmonics(places[:, 0], self.order) @ self.mixing
 
     def cost_at(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, " s"]:
         """The cost, which is the same everywhere."""
@@ -149,7 +155,7 @@ class Circle(Family):
         return 2 * np.pi * np.arange(count)[:, None] / count
 
 
-def _harmonics(angle: Float[np.ndarray, " s"], order: int) -> Float[np.ndarray, "s h"]:
+def harmonics(angle: Float[np.ndarray, " s"], order: int) -> Float[np.ndarray, "s h"]:
     """1, cos a, sin a, …, cos Ha, sin Ha at each angle."""
     turns = angle[:, None] * np.arange(1, order + 1)
     pairs = np.stack([np.cos(turns), np.sin(turns)], axis=2).reshape(len(angle), -1)

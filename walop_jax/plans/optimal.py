@@ -56,6 +56,8 @@ _HOPELESS = 1e3  # times the criterion of the best weights: some target is not d
 _EXCHANGES = 200
 _TRIED = 60  # exchanges, most promising first, of which the first that lowers the criterion is made
 _SHARPNESS = 20  # power of the variances by which targets share the slope of an exchange
+_BUDGETS = 8  # tried until a criterion is met
+_SMALL = 1e-3  # of the budget: what is known reaches the criterion already
 _PATIENCE = 4  # rounds without a better bound or value after which the search ends
 
 
@@ -113,11 +115,32 @@ class Experiment:
 
 
 @dataclasses.dataclass(frozen=True)
+class Bound:
+    """What no plan can undercut: f ≥ here² / (known + budget · ratio), in the symbols of the module.
+
+    `tops` are the candidates that promise most, as number of the family and place.
+    """
+
+    here: float
+    known: float
+    ratio: float
+    tops: tuple[tuple[int, Float[np.ndarray, " d"]], ...]
+
+    def value(self, budget: float) -> float:
+        """The least criterion of any plan of a budget."""
+        return self.here**2 / (self.known + budget * self.ratio)
+
+    def budget(self, value: float) -> float:
+        """The least budget of any plan that reaches a criterion."""
+        return max((self.here**2 / value - self.known) / self.ratio, 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
 class Allocation:
     """How often each candidate is done, the criterion, and the least that any plan of this budget can have.
 
     `family` (number of the family), `place` (its coordinates there) and `weight` are one for each candidate in it.
-    `bound` ≤ the criterion of every plan.
+    `bound` ≤ the criterion of every plan; `proof` says so for other budgets as well.
     """
 
     family: Int[np.ndarray, " s"]
@@ -125,6 +148,7 @@ class Allocation:
     weight: Float[np.ndarray, " s"]
     value: float
     bound: float
+    proof: Bound
     rounds: int
 
     @property
@@ -305,17 +329,19 @@ def optimise(
     chosen = [(number, place) for number, f in enumerate(problem.families) for place in f.spread()]
     some = _Some(problem, chosen)
     weight = np.full(len(chosen), problem.budget / some.costs.sum())
-    best_bound, plan, idle = 0.0, None, 0
+    best_bound, best, plan, idle = 0.0, None, None, 0
     for turn in range(1, _ROUNDS + 1):
         weight, shares = some.solve(weight, 0.5 * gap if turn > 1 else max(gap, 0.2))
         value = some.value(weight)
-        bound, tops = lower_bound(problem, some.covariance(weight), shares, most)
+        proof = lower_bound(problem, some.covariance(weight), shares, most)
+        bound = proof.value(problem.budget)
+        best = proof if best is None or bound > best_bound else best
         better = (
             plan is None or bound > best_bound * (1 + 1e-2 * gap) or value < plan.value * (1 - 1e-2 * gap)
         )
         idle = 0 if better else idle + 1
         best_bound = max(best_bound, bound)
-        plan = _plan(some, weight, value, best_bound, turn)
+        plan = _plan(some, weight, value, best_bound, best, turn)
         if progress is not None:
             progress(
                 f"round {turn}: criterion {value:.6g}, bound {best_bound:.6g}, gap {100 * plan.gap:.2g} %"
@@ -324,7 +350,7 @@ def optimise(
             break
         used = weight * some.costs > _LEAST_WEIGHT * problem.budget
         kept = [c for c, keep in zip(some.chosen, used, strict=True) if keep]
-        new = [top for top in tops if not any(_same(top, there) for there in kept)]
+        new = [top for top in proof.tops if not any(_same(top, there) for there in kept)]
         if not new and turn > 3:
             break
         share = 0.05 * problem.budget / max(len(new), 1)
@@ -339,7 +365,7 @@ def _same(one: tuple[int, Float[np.ndarray, " d"]], other: tuple[int, Float[np.n
 
 
 def _plan(
-    some: _Some, weight: Float[np.ndarray, " s"], value: float, bound: float, rounds: int
+    some: _Some, weight: Float[np.ndarray, " s"], value: float, bound: float, proof: Bound, rounds: int
 ) -> Allocation:
     used = np.flatnonzero(weight * some.costs > _LEAST_WEIGHT * some.experiment.budget)
     return Allocation(
@@ -348,6 +374,7 @@ def _plan(
         weight[used],
         value,
         bound,
+        proof,
         rounds,
     )
 
@@ -357,8 +384,8 @@ def lower_bound(
     covariance: Float[np.ndarray, "r n n"],
     shares: Float[np.ndarray, "r k"],
     most: int = 8,
-) -> tuple[float, list[tuple[int, Float[np.ndarray, " d"]]]]:
-    """The least criterion that any plan can have (see the module), and the candidates that promise most.
+) -> Bound:
+    """The least criterion that any plan can have (see the module).
 
     `covariance` is M(w)⁻¹ of a plan, `shares` multipliers π of the targets with sum 1 in each draw. Any of both gives a
     valid bound; those of the optimum give the largest.
@@ -373,7 +400,25 @@ def lower_bound(
         places, largest = family.best(gains, most)
         ratio = max(ratio, largest)
         tops += [(number, place) for place in places]
-    return here**2 / (known + experiment.budget * ratio), tops
+    return Bound(here, known, ratio, tuple(tops))
+
+
+def least_budget(
+    experiment: Experiment, value: float, *, gap: float = GAP, progress: Callable[[str], None] | None = None
+) -> tuple[Allocation, float]:
+    """The plan of the least budget that reaches a criterion, to `gap`, and a budget that none can reach it below.
+
+    The budget of the plan is Σ weight · cost. Raises as `optimise`.
+    """
+    budget, least = experiment.budget, 0.0
+    for _ in range(_BUDGETS):
+        plan = optimise(dataclasses.replace(experiment, budget=budget), gap=0.5 * gap, progress=progress)
+        least = max(least, plan.proof.budget(value))
+        if abs(plan.value / value - 1.0) <= 0.5 * gap or budget <= _SMALL * experiment.budget:
+            break
+        # What is known already bends the law 1 / budget: the bound says where it meets the value.
+        budget = max(plan.proof.budget(value) * plan.value / plan.bound, _SMALL * experiment.budget)
+    return plan, least
 
 
 def rounded(experiment: Experiment, plan: Allocation, *, most: int = 8) -> Allocation:
@@ -407,6 +452,7 @@ def rounded(experiment: Experiment, plan: Allocation, *, most: int = 8) -> Alloc
         count[used],
         some.value(count),
         plan.bound,
+        plan.proof,
         plan.rounds,
     )
 
@@ -436,8 +482,8 @@ def _exchanged(
     phi = some.variances(covariance)
     # The worst targets, smoothly: the slope of the maximum alone would forget the next one.
     shares = (phi / phi.max(axis=1, keepdims=True)) ** _SHARPNESS
-    _, tops = lower_bound(problem, covariance, shares / shares.sum(axis=1, keepdims=True), most)
-    new = [top for top in tops if not any(_same(top, there) for there in some.chosen)]
+    promising = lower_bound(problem, covariance, shares / shares.sum(axis=1, keepdims=True), most).tops
+    new = [top for top in promising if not any(_same(top, there) for there in some.chosen)]
     kept = np.flatnonzero(count)
     some = _Some(problem, [*(some.chosen[i] for i in kept), *new])
     count = np.concatenate([count[kept], np.zeros(len(new))])

@@ -1,38 +1,71 @@
-"""A plan of calibration exposures: which, how often, how well p will be known, and how far from the best plan that is.
+"""A plan of calibration exposures: which, how often, in what order, what it achieves, and how far from the best that is.
 
-The best weights and their proof are those of `optimal`, candidates and target those of `exposures`. Here they become
-whole exposures in an order with few changes, with the price of leaving each out and the error over the field before and
-after.
+The best weights and their proof are those of `optimal`, candidates those of `exposures`, what is asked that of
+`wanted`. Here they become whole exposures in an order with few changes, with the gain of each and the price of leaving
+it out.
+
+Order        Settings one after the other, the polariser turning one way in each, then the sky, the nearest pointing
+             next. Changes of filter, moving elements and pointing take time from the budget; whether a setting is worth
+             its change is tried. The bound knows of no changes, and holds for every order.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.data.user_tables import InputTable
 from walop_jax.io.display import Display, Displayed
-from walop_jax.plans.exposures import Candidates, candidates
-from walop_jax.plans.families import Listed
-from walop_jax.plans.optimal import GAP, Allocation, Experiment, optimise, rounded
+from walop_jax.io.rounding import rounded as digits
+from walop_jax.plans.could import Could
+from walop_jax.plans.exposures import DRAWS, Candidates, candidates, information_of
+from walop_jax.plans.optimal import (
+    GAP,
+    Allocation,
+    Experiment,
+    NotEstimableError,
+    least_budget,
+    optimise,
+    rounded,
+)
+from walop_jax.plans.wanted import WORST, FieldErrors, Wanted, field_errors, wanted
 from walop_jax.science.star_errors import GOAL
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, polariser_turn
 
-GRID = 6
-"""Field points along each axis at which the information of an exposure is computed, scaled to those of the plan."""
-_STANDARD_ANGLES, _STANDARD_PATCHES = 15, 8
+_TRIES = 6  # budgets, until the exposures and the changes between them fit into the time
+
+USUAL: Mapping[str, tuple[tuple[float, ...], bool, int]] = {
+    "even angles": (polariser_turn(15), False, 0),
+    "even angles and the Moon": (polariser_turn(15), False, 8),
+    "even angles at each setting": (polariser_turn(15), True, 0),
+    "balanced angles at each setting": ((0.0, 45.0, 90.0, 135.0), True, 0),
+}
+"""Usual plans: polariser angles (deg), at every setting or the first only, and number of Moon patches.
+
+The second is the procedure of Paper II; the last balances the Stokes parameters with the fewest states (Casini,
+Harrington & de Wijn 2026, arXiv:2602.13997). A full turn of the polariser says the same as half a turn."""
+
+
+class Line(NamedTuple):
+    """Exposures of a plan that are the same: number of the choice, place in it, how often."""
+
+    choice: int
+    place: float
+    times: int
 
 
 @dataclasses.dataclass(frozen=True)
 class PlannedExposure:
     """One line of a plan: what is set, how often it is exposed, the time (s) of all of it, and what it is worth.
 
-    `number` is that of the Moon patch or star, −1 through the polariser; `left_out` the factor by which the criterion
-    grows without this line.
+    `number` is that of the Moon patch or star, −1 through the polariser; `place` that of a star in its raster (None:
+    all). `exptime` (s) is of one exposure, `change` (s) the time until the first can begin. `left_out` is the factor by
+    which the criterion grows without this line, `one_more` the one by which it falls with another exposure.
     """
 
     kind: str
@@ -43,83 +76,122 @@ class PlannedExposure:
     times: int
     seconds: float
     left_out: float
+    one_more: float
+    exptime: float
+    change: float
+    place: int | None = None
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class ExposurePlan(Displayed):
     """The exposures of a budget, the proof, and the error of p over the field before and after.
 
-    `value` is the criterion of the exposures, `bound` the least that any plan of the same time can have, both as the
-    error of p (fraction) at the worst field point and colour, mean over draws; `before` and `after` (draw, point) are
-    errors of p (fraction) at `x`, `y` (deg), NaN where one exposure holds no u. `beside` are other plans of the same
-    time: their criterion, as the same error.
+    `value` is the criterion of the exposures, `bound` what no plan of the same time can undercut, both as `wanted` tells
+    them (% for errors of p). `needed` are the minutes in which the best plan reaches `goal`, and those in which none can.
+    `before` and `after` (draw, point) are errors of p (fraction) at `x`, `y` (deg), NaN where one exposure holds no u.
+    `beside` are other plans of the same time: their criterion, told likewise; `notes` what had to be left out.
     """
 
     minutes: float
     lines: tuple[PlannedExposure, ...]
+    wanted: Wanted
     value: float
     bound: float
     weights_gap: float
     truncation: float
+    goal: float | None
+    needed: tuple[float, float] | None
     x: Float[np.ndarray, " p"]
     y: Float[np.ndarray, " p"]
     before: Float[np.ndarray, "r p"]
     after: Float[np.ndarray, "r p"]
     beside: Mapping[str, float]
     observing_plan: ObservingPlan
+    notes: tuple[str, ...] = ()
 
     @property
     def gap(self) -> float:
         """Proven relative distance of the exposures' variance from the best: that of the criterion of `optimal`."""
-        return (self.value / self.bound) ** 2 - 1.0
+        return self.wanted.variance(self.value) / self.wanted.variance(self.bound) - 1.0
 
     @property
-    def share(self) -> float:
+    def share(self) -> float | None:
         """Share of the field points and colours, of those that hold u, at which the error of p is below 0.1 %."""
         seen = self.after[:, np.isfinite(self.after).all(axis=0)]
-        return float(np.mean(seen < GOAL))
+        return float(np.mean(seen < GOAL)) if seen.size else None
+
+    @property
+    def seconds(self) -> float:
+        """Time of all exposures and changes."""
+        return sum(line.seconds + line.change for line in self.lines)
 
     def document(self) -> dict[str, Any]:
         """The plan as plain data."""
-        middle = np.median(self.after, axis=0)
-        return {
+        found: dict[str, Any] = {
             "minutes": self.minutes,
+            "seconds": self.seconds,
             "exposures": [
                 dataclasses.asdict(line) | {"positions": dict(line.positions)} for line in self.lines
             ],
-            "p_error_worst": self.value,
-            "p_error_bound": self.bound,
+            "criterion": self.wanted.name,
+            "what": self.wanted.what,
+            "unit": self.wanted.unit,
+            "value": self.value,
+            "bound": self.bound,
             "gap": self.gap,
             "gap_of_weights": self.weights_gap,
             "truncation": self.truncation,
+            "goal": self.goal,
+            "minutes_to_goal": None
+            if self.needed is None
+            else dict(zip(("best", "least"), self.needed, strict=True)),
             "draws": len(self.after),
             "share_below_goal": self.share,
             "beside": dict(self.beside),
-            "field": {"x": self.x.tolist(), "y": self.y.tolist(), "p_error": middle.tolist()},
+            "notes": list(self.notes),
             "plan": self.observing_plan.document(),
         }
+        if self.wanted.name == WORST:
+            found |= {"p_error_worst": 0.01 * self.value, "p_error_bound": 0.01 * self.bound}
+        if len(self.x):
+            before, after = np.median(self.before, axis=0), np.median(self.after, axis=0)
+            found["field"] = {
+                "x": self.x.tolist(), "y": self.y.tolist(), "p_error": after.tolist(), "before": before.tolist()
+            }  # fmt: skip
+        return found
 
     def display(self) -> Display:
         """The exposures in order, and how good they are."""
-        middle = np.median(self.after, axis=0)
-        seen = np.isfinite(middle)
+        unit = f" {self.wanted.unit}" if self.wanted.unit else ""
+        better = "above" if self.wanted.inverse else "below"
         facts = {
-            "time": f"{sum(line.seconds for line in self.lines) / 60:.1f} of {self.minutes:g} min",
-            "error of p": f"{100 * self.value:.3g} % at the worst point, "
-            f"{100 * np.median(middle[seen]):.3g} % in the median",
-            "below 0.1 %": f"{100 * self.share:.0f} % of the field that holds u in one exposure",
-            "proof": f"no plan of this time is better than {100 * self.bound:.3g} % at the worst point",
+            "time": f"{self.seconds / 60:.1f} of {self.minutes:g} min",
+            self.wanted.what: f"{digits(self.value, '.3g')}{unit}",
+            "proof": f"no plan of this time gets {better} {digits(self.bound, '.3g')}{unit}",
         }
-        for name, error in self.beside.items():
-            facts[name] = f"{100 * error:.3g} %: {(error / self.value) ** 2:.2g} times the time for the same"
+        if self.share is not None:
+            middle = np.median(self.after[:, np.isfinite(self.after).all(axis=0)])
+            facts["over the field"] = (
+                f"error of p {100 * middle:.3g} % in the median, below 0.1 % in {100 * self.share:.0f} % of the field "
+                "that holds u in one exposure"
+            )
+        if self.needed is not None:
+            facts[f"{digits(self.goal, '.3g')}{unit} takes"] = (
+                f"{digits(self.needed[0], '.3g')} min, not counting changes; no plan needs less than "
+                f"{digits(self.needed[1], '.3g')} min"
+            )
+        own = self.wanted.variance(self.value)
+        for name, told in self.beside.items():
+            factor = self.wanted.variance(told) / own
+            facts[name] = f"{digits(told, '.3g')}{unit}; {factor:.2g} times the variance"
         rows = tuple(
             (
-                line.kind if line.number < 0 else f"{line.kind} {line.number}",
+                line.kind if line.number < 0 else f"{line.kind} {line.number}" + ("" if line.place is None else f" at {line.place}"),
                 line.filter,
                 ", ".join(f"{p} {_angle(a)}" for p, a in line.positions.items()),
                 _angle(line.polariser_angle if np.isfinite(line.polariser_angle) else None),
-                str(line.times),
-                f"{line.seconds:.0f}",
+                f"{line.times} × {line.exptime:g} s",
+                f"{line.seconds + line.change:.0f}",
                 f"{100 * (np.sqrt(line.left_out) - 1):+.2g} %",
             )
             for line in self.lines
@@ -127,8 +199,9 @@ class ExposurePlan(Displayed):
         return Display(
             title=f"Plan of {sum(line.times for line in self.lines)} exposures for {self.observing_plan.name}",
             facts=tuple(facts.items()),
-            head=("KIND", "FILTER", "POSITIONS", ">POLARISER", ">TIMES", ">TIME / s", ">WITHOUT IT"),
+            head=("KIND", "FILTER", "POSITIONS", ">POLARISER", ">EXPOSURES", ">TIME / s", ">WITHOUT IT"),
             rows=rows,
+            notes=self.notes,
         )
 
 
@@ -137,86 +210,244 @@ def _angle(angle: float | None) -> str:
 
 
 def plan_exposures(
-    could: ObservingPlan,
+    could: Could | ObservingPlan,
     minutes: float,
     *,
+    criterion: str | InputTable = WORST,
     known: Calibration | None = None,
-    draws: int = 20,
+    goal: float | None = None,
+    draws: int = DRAWS,
     seed: int = 0,
     gap: float = GAP,
     progress: Callable[[str], None] | None = None,
 ) -> ExposurePlan:
-    """The calibration exposures that make the error of p at the worst field point and colour smallest.
+    """The calibration exposures of `minutes` that make a criterion (`wanted`) best.
 
-    `could` says what could be observed (see `exposures`), `minutes` the time there is; `known` is a calibration that is
-    there already. Raises ValueError for a time that pays for nothing, NotEstimableError where nothing that could be
-    observed, or too little in that time, determines the matrix.
+    `known` is a calibration that is there already; `goal` a value of the criterion, as it is told, to which the time is
+    found. Raises ValueError for a time that pays for nothing, NotEstimableError where nothing that could be observed,
+    or too little in that time, determines what is asked.
     """
-    few = dataclasses.replace(could, grid=min(could.grid, GRID), standard_grid=min(could.standard_grid, 3))
-    found = candidates(few, draws=draws, seed=seed, progress=progress)
-    return plan_from(found, could, minutes, known=known, gap=gap, progress=progress)
+    found = candidates(Could.of(could), draws=draws, seed=seed, around=known, progress=progress)
+    if progress is not None:
+        progress("what is wanted")
+    field = None if len(found.model.template.arms) != 2 else field_errors(found)
+    if field is None and criterion in ("worst", "mean"):
+        field = field_errors(found)  # raises, with advice
+    return plan_from(
+        found, minutes, wanted(found, field, criterion), field,
+        known=None if known is None else information_of(known, found.names), goal=goal, gap=gap, progress=progress,
+    )  # fmt: skip
 
 
 def plan_from(
     found: Candidates,
-    could: ObservingPlan,
     minutes: float,
+    want: Wanted,
+    field: FieldErrors | None = None,
     *,
-    known: Calibration | None = None,
+    known: Float[np.ndarray, "f f"] | None = None,
+    goal: float | None = None,
     gap: float = GAP,
     progress: Callable[[str], None] | None = None,
 ) -> ExposurePlan:
-    """As `plan_exposures`, from candidates that are there; their field points may be fewer than those of `could`."""
+    """As `plan_exposures`, from candidates that are there; `known` is the information of what was measured before."""
     tell = progress or (lambda text: None)
-    few = found.plan
-    prior = found.prior if known is None else found.prior + _information_of(known, found)
-    factor = (len(could.points()) - _star_places(could)) / (len(few.points()) - _star_places(few))
-    experiment = _scaled(found.experiment(minutes, prior), factor, found)
+    if not minutes > 0:
+        raise ValueError(f"{minutes:g} minutes: nothing can be observed in no time")
     tell("looking for the best plan")
-    weights = optimise(experiment, gap=0.5 * gap, progress=tell)
-    best = rounded(experiment, weights)
-    return _finished(could, found, experiment, weights, best, minutes)
-
-
-def _star_places(plan: ObservingPlan) -> int:
-    return plan.standard_grid**2 if plan.standards else 0
-
-
-def _scaled(experiment: Experiment, factor: float, found: Candidates) -> Experiment:
-    """The information of as many field points as a plan has, from that of fewer that are spread alike."""
-    families = tuple(
-        family if label == "standard" else dataclasses.replace(family, basis=factor * family.basis)  # type: ignore[type-var]
-        for family, label in zip(experiment.families, found.labels, strict=True)
+    experiment = experiment_of(found, minutes, want, known)
+    try:
+        weights = optimise(experiment, gap=0.5 * gap, progress=tell)
+    except NotEstimableError as error:
+        missing = [k for k in ("moon", "standard") if not any(c.kind == k for c in found.choices)]
+        advice = f"; no {' or '.join(missing)} exposures could be taken" if missing else ""
+        raise NotEstimableError("; ".join((f"{error}{advice}", *found.notes))) from None
+    best, lines = _whole(found, experiment, weights)
+    needed = None
+    if goal is not None:
+        tell("how long the goal takes")
+        cheapest, least = least_budget(experiment, want.variance(goal), gap=gap)
+        needed = (_cost(experiment, cheapest) / 60.0, least / 60.0)
+    total = _total(experiment, best)
+    return ExposurePlan(
+        minutes=minutes,
+        lines=tuple(_described(found, experiment, lines, total)),
+        wanted=want,
+        value=want.told(best.value),
+        bound=want.told(weights.bound),
+        weights_gap=weights.gap,
+        truncation=found.truncation,
+        goal=goal,
+        needed=needed,
+        x=np.zeros(0) if field is None else field.x,
+        y=np.zeros(0) if field is None else field.y,
+        before=_errors(found, field, covariance(experiment.known)),
+        after=_errors(found, field, covariance(total)),
+        beside=dict(_beside(found, experiment, want)),
+        observing_plan=_as_observed(found, lines),
+        notes=found.notes,
     )
-    return dataclasses.replace(experiment, families=families)
 
 
-def _information_of(known: Calibration, found: Candidates) -> Float[np.ndarray, "f f"]:
-    """What a calibration says of the parameters that it shares with the candidates' model."""
-    names = [found.model.names[i] for i in found.model.free]
-    both = [i for i, name in enumerate(names) if name in known.model.names]
-    there = [known.model.index(names[i]) for i in both]
-    covariance = known.covariance[np.ix_(there, there)]
-    size = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-    varied = size > 0
-    scaled = covariance[np.ix_(varied, varied)] / np.outer(size[varied], size[varied])
-    inverse = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) / np.outer(size[varied], size[varied])
-    at = np.array(both)[varied]
-    whole = np.zeros((len(names), len(names)))
-    whole[np.ix_(at, at)] = inverse
-    return whole
+def experiment_of(
+    found: Candidates, minutes: float, want: Wanted, known: Float[np.ndarray, "f f"] | None = None
+) -> Experiment:
+    """The problem of a budget in minutes; `known` is added to what is known beforehand."""
+    before = found.prior if known is None else found.prior + known
+    draws = len(want.targets)
+    return Experiment(
+        np.broadcast_to(before, (draws, *before.shape)).copy(), want.targets, found.families, 60.0 * minutes
+    )
+
+
+def _errors(
+    found: Candidates, field: FieldErrors | None, covariances: Float[np.ndarray, "r f f"]
+) -> Float[np.ndarray, "r p"]:
+    return np.zeros((len(found.values), 0)) if field is None else field.error(covariances)
+
+
+def _cost(experiment: Experiment, plan: Allocation) -> float:
+    return sum(
+        w * float(experiment.families[f].cost_at(p[None])[0])
+        for f, p, w in zip(plan.family, plan.place, plan.weight, strict=True)
+    )
+
+
+# ------------------------------------------------------------------------------------------ whole, and in order
+
+
+def _whole(found: Candidates, experiment: Experiment, weights: Allocation) -> tuple[Allocation, list[Line]]:
+    """Whole exposures in order that fit into the time with their changes; settings that are not worth theirs left out."""
+    used = sorted({int(i) for i in weights.family})
+    settings = list(dict.fromkeys(found.choices[i].setting for i in used))
+    best = _within(found, experiment, weights, range(len(found.choices)))
+    for setting in settings if len(settings) > 1 else ():
+        kept = [i for i, choice in enumerate(found.choices) if choice.setting != setting]
+        try:
+            other = _within(found, experiment, weights, kept)
+        except ValueError:
+            continue
+        best = min(best, other, key=lambda one: one[0].value)
+    return best
+
+
+def _within(
+    found: Candidates, experiment: Experiment, weights: Allocation, kept: Any
+) -> tuple[Allocation, list[Line]]:
+    """Whole exposures of some choices, with their changes."""
+    kept, budget, changes = list(kept), experiment.budget, 0.0
+    at = [i for i, family in enumerate(weights.family) if family in kept]
+    if not at:
+        raise ValueError("none of the best exposures is left")
+    for _ in range(_TRIES):
+        left = budget - changes
+        if left <= 0:
+            raise ValueError(
+                f"{budget / 60:g} minutes: changes of filter, moving elements and pointing alone take "
+                f"{changes / 60:.1f}; give more time, or fewer filters and settings"
+            )
+        problem = dataclasses.replace(
+            experiment, families=tuple(experiment.families[i] for i in kept), budget=left
+        )
+        some = dataclasses.replace(
+            weights,
+            family=np.array([kept.index(weights.family[i]) for i in at]),
+            place=[weights.place[i] for i in at],
+            weight=weights.weight[at] * left / budget,
+        )
+        whole = rounded(problem, some)
+        whole = dataclasses.replace(whole, family=np.array([kept[i] for i in whole.family]))
+        lines = _ordered(found, whole)
+        between = sum(_changes(found, lines))
+        if _cost(experiment, whole) + between <= budget * (1 + 1e-9):
+            return whole, lines
+        changes = max(between, changes + 1.0)
+    raise ValueError(f"{budget / 60:g} minutes do not pay for the changes between exposures; give more time")
+
+
+def _ordered(found: Candidates, plan: Allocation) -> list[Line]:
+    """Indoors setting by setting, the polariser turning one way; then the sky, last setting first, the nearest next."""
+    lines = [
+        Line(int(f), float(p[0]), int(w))
+        for f, p, w in zip(plan.family, plan.place, plan.weight, strict=True)
+    ]
+    settings = list(dict.fromkeys(found.choices[i].setting for i in sorted({line.choice for line in lines})))
+
+    def key(line: Line) -> tuple[int, int, float]:
+        choice = found.choices[line.choice]
+        number = settings.index(choice.setting)
+        return (0, number, line.place) if choice.kind in ("clp", "lamp") else (1, -number, 0.0)
+
+    lines.sort(key=key)
+    done = [line for line in lines if key(line)[0] == 0]
+    sky = [line for line in lines if key(line)[0] == 1]
+    where = dict(zip(sky, _pointings(found, sky), strict=True))
+    while sky:
+        same = [line for line in sky if key(line) == key(sky[0])]
+        last = done[-1] if done and done[-1] in where else same[0]
+        after = min(same, key=lambda line: _distance(where[last], where[line]))
+        done.append(after)
+        sky.remove(after)
+    return done
+
+
+def _pointings(found: Candidates, lines: list[Line]) -> list[tuple[float, float]]:
+    """Right ascension and declination (deg)."""
+    stops = tuple(found.choices[line.choice].stop(line.place) for line in lines)
+    if not stops:
+        return []
+    exposures = dataclasses.replace(found.could.plan, stops=stops, patches=(), stars=()).exposures()
+    return list(zip(exposures.ra.tolist(), exposures.dec.tolist(), strict=True))
+
+
+def _distance(one: tuple[float, float], other: tuple[float, float]) -> float:
+    """Angle (deg) between directions (deg)."""
+    (a, d), (b, e) = np.deg2rad(one), np.deg2rad(other)
+    cosine = np.sin(d) * np.sin(e) + np.cos(d) * np.cos(e) * np.cos(a - b)
+    return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def _changes(found: Candidates, lines: list[Line]) -> Iterator[float]:
+    """Time (s) of what must be changed ahead of each line; what stands at the beginning is set up beforehand."""
+    costs = found.could.costs
+    last, there = None, None
+    for line in lines:
+        choice = found.choices[line.choice]
+        time = 0.0
+        if last is not None:
+            time += costs.filter * (choice.filter != last.filter)
+            time += costs.position * sum(choice.positions[p] != a for p, a in last.positions.items())
+        if choice.kind in ("moon", "standard"):
+            (here,) = _pointings(found, [line])
+            time += 0.0 if there is None else costs.slew * _distance(there, here)
+            there = here
+        last = choice
+        yield time
+
+
+def _as_observed(found: Candidates, lines: list[Line]) -> ObservingPlan:
+    stops: tuple[Stop, ...] = tuple(found.choices[line.choice].stop(line.place, line.times) for line in lines)
+    return dataclasses.replace(found.could.plan, stops=stops, patches=(), stars=())
+
+
+# -------------------------------------------------------------------------------------------------- what it is worth
 
 
 def _total(experiment: Experiment, plan: Allocation) -> Float[np.ndarray, "r n n"]:
     """M of a plan in every draw."""
     total = experiment.known.copy()
     for number, place, weight in zip(plan.family, plan.place, plan.weight, strict=True):
-        family = experiment.families[number]
-        total += weight * np.tensordot(family.basis, family.coefficients(place[None])[0], (1, 0))
+        total += weight * _of(experiment, int(number), float(place[0]))
     return total
 
 
-def _covariance(total: Float[np.ndarray, "r n n"]) -> Float[np.ndarray, "r n n"]:
+def _of(experiment: Experiment, number: int, place: float) -> Float[np.ndarray, "r n n"]:
+    """M of one exposure."""
+    family = experiment.families[number]
+    return np.tensordot(family.basis, family.coefficients(np.array([[place]]))[0], (1, 0))
+
+
+def covariance(total: Float[np.ndarray, "r n n"]) -> Float[np.ndarray, "r n n"]:
     """M⁻¹, scaled so that gauges drop out."""
     found = []
     for matrix in total:
@@ -226,106 +457,63 @@ def _covariance(total: Float[np.ndarray, "r n n"]) -> Float[np.ndarray, "r n n"]
     return np.stack(found)
 
 
-def _criterion(experiment: Experiment, total: Float[np.ndarray, "r n n"]) -> float:
+def criterion(experiment: Experiment, total: Float[np.ndarray, "r n n"]) -> float:
+    """f of the information of everything in every draw."""
     a = experiment.targets
-    c = _covariance(total)
+    c = covariance(total)
     return float(np.einsum("rknq,rnm,rkmq->rk", a, c, a, optimize=True).max(axis=1).mean())
 
 
-def _finished(
-    could: ObservingPlan,
-    found: Candidates,
-    experiment: Experiment,
-    weights: Allocation,
-    best: Allocation,
-    minutes: float,
-) -> ExposurePlan:
-    total = _total(experiment, best)
-    lines = tuple(_lines(could, found, experiment, best, total))
-    stops = tuple(
-        Stop(
-            line.polariser_angle,
-            line.filter,
-            line.positions.get("CHWP"),
-            {p: a for p, a in line.positions.items() if p != "CHWP"},
-            line.times,
-        )
-        for line in lines
-        if line.kind == "clp"
-    )
-    chosen = {
-        kind: tuple(line.number for line in lines if line.kind == kind for _ in range(line.times))
-        for kind in ("moon", "standard")
-    }
-    observing = dataclasses.replace(could, stops=stops, patches=chosen["moon"], stars=chosen["standard"])
-    return ExposurePlan(
-        minutes=minutes,
-        lines=lines,
-        value=0.01 * float(np.sqrt(best.value)),
-        bound=0.01 * float(np.sqrt(best.bound)),
-        weights_gap=weights.gap,
-        truncation=found.truncation,
-        x=found.x,
-        y=found.y,
-        before=found.p_error(_covariance(experiment.known)),
-        after=found.p_error(_covariance(total)),
-        beside=dict(_beside(found, experiment)),
-        observing_plan=observing,
-    )
-
-
-def _lines(
-    could: ObservingPlan,
-    found: Candidates,
-    experiment: Experiment,
-    best: Allocation,
-    total: Float[np.ndarray, "r n n"],
+def _described(
+    found: Candidates, experiment: Experiment, lines: list[Line], total: Float[np.ndarray, "r n n"]
 ) -> Iterator[PlannedExposure]:
-    """The exposures in order: setting by setting, the polariser turning one way, then the sky."""
-    here = _criterion(experiment, total)
-    settings = found.settings
-    order = sorted(range(len(best.family)), key=lambda i: (int(best.family[i]), float(best.place[i][0])))
-    for i in order:
-        family, place, times = experiment.families[best.family[i]], best.place[i], int(best.weight[i])
-        own = times * np.tensordot(family.basis, family.coefficients(place[None])[0], (1, 0))
-        seconds = times * float(family.cost_at(place[None])[0])
-        left_out = _criterion(experiment, total - own) / here
-        label = found.labels[best.family[i]]
-        if isinstance(family, Listed):
-            yield PlannedExposure(
-                label, could.filters[0], {}, float("nan"), round(float(place[0])), times, seconds, left_out
-            )
-        else:
-            filter_name, positions = settings[best.family[i]]
-            angle = float(np.rad2deg(place[0]) / 2)
-            yield PlannedExposure("clp", filter_name, positions, angle, -1, times, seconds, left_out)
+    here = criterion(experiment, total)
+    for line, change in zip(lines, _changes(found, lines), strict=True):
+        choice = found.choices[line.choice]
+        own = _of(experiment, line.choice, line.place)
+        stop = choice.stop(line.place)
+        each = float(experiment.families[line.choice].cost_at(np.array([[line.place]]))[0])
+        yield PlannedExposure(
+            kind=choice.kind,
+            filter=choice.filter,
+            positions=choice.positions,
+            polariser_angle=float("nan") if stop.polariser_angle is None else stop.polariser_angle,
+            number=stop.number if choice.kind in ("moon", "standard") else -1,
+            times=line.times,
+            seconds=line.times * each,
+            left_out=criterion(experiment, total - line.times * own) / here,
+            one_more=criterion(experiment, total + own) / here,
+            exptime=choice.seconds,
+            change=change,
+            place=stop.place,
+        )
 
 
-def _beside(found: Candidates, experiment: Experiment) -> Iterator[tuple[str, float]]:
-    """Plans of the same time that are usual: even angles with the Moon, over half a turn, with each plate setting."""
+def usual_plans(found: Candidates) -> Iterator[tuple[str, dict[tuple[int, float], float]]]:
+    """The plans of `USUAL` that the candidates hold, as weights of (choice, place)."""
+    polariser = {c.setting: i for i, c in reversed(list(enumerate(found.choices))) if c.kind == "clp"}
+    order = [i for i, c in enumerate(found.choices) if polariser.get(c.setting) == i]
+    moon = next((i for i, c in enumerate(found.choices) if c.kind == "moon"), None)
+    for name, (angles, each, patches) in USUAL.items():
+        if (each and len(order) < 2) or (patches and moon is None):
+            continue
+        weights = {(i, np.deg2rad(2 * a)): 1.0 for i in (order if each else order[:1]) for a in angles}
+        if patches and moon is not None:
+            there = len(found.choices[moon].stops)
+            weights |= {(moon, float(k)): patches / there for k in range(there)}
+        yield name, weights
 
-    def error(weight: Mapping[tuple[int, float], float]) -> float:
-        costs = {key: float(experiment.families[key[0]].cost_at(np.array([[key[1]]]))[0]) for key in weight}
-        share = experiment.budget / sum(w * costs[key] for key, w in weight.items())
-        plan = Allocation(
-            np.array([key[0] for key in weight]),
-            [np.array([key[1]]) for key in weight],
-            np.array([share * w for w in weight.values()]),
-            0.0, 1.0, 0,
-        )  # fmt: skip
-        return 0.01 * float(np.sqrt(_criterion(experiment, _total(experiment, plan))))
 
-    polariser = [i for i, label in enumerate(found.labels) if label.startswith("clp")]
-    sky = {
-        (i, float(k)): _STANDARD_PATCHES / experiment.families[i].spread().shape[0]
-        for i, label in enumerate(found.labels)
-        if label == "moon"
-        for k in range(len(experiment.families[i].spread()))
-    }
-    angles = [np.deg2rad(2 * a) for a in polariser_turn(_STANDARD_ANGLES)]
-    even = {(polariser[0], a): 1.0 for a in angles}
-    yield "even angles", error(even)
-    if sky:
-        yield "even angles and the Moon", error(even | sky)
-    if len(polariser) > 1:
-        yield "even angles at each setting", error({(i, a): 1.0 for i in polariser for a in angles})
+def information_of_weights(
+    experiment: Experiment, weights: Mapping[tuple[int, float], float]
+) -> tuple[Float[np.ndarray, "r n n"], float]:
+    """M of weights of (choice, place) without what is known, and their cost."""
+    whole = sum(w * _of(experiment, *key) for key, w in weights.items())
+    cost = sum(w * float(experiment.families[i].cost_at(np.array([[p]]))[0]) for (i, p), w in weights.items())
+    return np.asarray(whole), cost
+
+
+def _beside(found: Candidates, experiment: Experiment, want: Wanted) -> Iterator[tuple[str, float]]:
+    for name, weights in usual_plans(found):
+        whole, cost = information_of_weights(experiment, weights)
+        yield name, want.told(criterion(experiment, experiment.known + experiment.budget / cost * whole))

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from walop_jax.data.records import Exposures, FilterCurve, Points, Position, Site
 from walop_jax.data.settings import DEFAULT_FILTER, builtin_filter
@@ -25,6 +25,8 @@ NARROW_BANDS: Mapping[str, float] = {"NB-580": 0.580, "NB-660": 0.660}  # centre
 _SPACING = 0.004  # d between exposures
 _GOLDEN = 0.5 * (3.0 - np.sqrt(5.0))  # of a turn: spreads any number of angles evenly
 _STANDARD_EDGE = 0.232  # deg: 5 × 5 centres of boxes of 0.116°
+EXPOSED: Mapping[str, float] = {"clp": 30.0, "lamp": 30.0, "moon": 60.0, "standard": 60.0}
+"""The usual exposure time (s) of each kind, in which a camera sees `ObservingPlan.electrons`."""
 _MOON_ROTATOR, _STAR_ROTATOR = (0.0, 40.0, 90.0, 135.0), (0.0, 30.0, 75.0, 120.0)
 
 
@@ -35,16 +37,40 @@ def polariser_turn(count: int = 15, *, full_turn: bool = False) -> tuple[float, 
 
 @dataclasses.dataclass(frozen=True)
 class Stop:
-    """Exposures through the polariser at one angle (deg), `times` of them.
+    """One exposure, taken `times` times: through the polariser at an angle (deg), or of another `kind`.
 
-    `plate` is the angle of the calibration plate, `moving` those of further moving elements (deg, None: out).
+    `plate` is the angle of the calibration plate, `moving` those of further moving elements (deg, None: out);
+    `seconds` the exposure time (None: the usual one; electrons grow with it). `number`, from 0, is that of the Moon
+    patch or standard, `place` the place of a standard among those of the raster (None: all of them, one after the
+    other).
     """
 
-    polariser_angle: float
+    polariser_angle: float | None = None
     filter: str = DEFAULT_FILTER
     plate: float | None = None
     moving: Mapping[str, float | None] = dataclasses.field(default_factory=dict)
     times: int = 1
+    kind: str = "clp"
+    number: int = 0
+    place: int | None = None
+    seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in EXPOSED:
+            raise unknown_name("kind of a stop", self.kind, tuple(EXPOSED))
+        if (self.polariser_angle is None) == (self.kind == "clp"):
+            raise ValueError(
+                f"a stop of kind {self.kind} {'needs' if self.kind == 'clp' else 'has no'} polariser_angle"
+            )
+        if self.times < 1:
+            raise ValueError(f"a stop is taken {self.times} times; leave it out, or take it once")
+        if self.seconds is not None and not self.seconds > 0:
+            raise ValueError(f"an exposure of {self.seconds} s: give a time above 0, or leave it out")
+
+    def document(self) -> dict[str, Any]:
+        """The stop as plain data, with what is as usual left out from `kind` on."""
+        later = {"kind": "clp", "number": 0, "place": None, "seconds": None}
+        return {k: v for k, v in dataclasses.asdict(self).items() if k not in later or v != later[k]}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,8 +90,8 @@ class ObservingPlan:
     through its angles for every combination of them, and `lamps` exposures of KIND `lamp` without it follow each
     time.
 
-    A plan may also say each exposure: `stops` are those through the polariser, in place of all combinations; `patches`
-    and `stars` the numbers, from 0, of the Moon patches and standards that are taken, in order (None: each once).
+    A plan may also say each exposure: `stops` in place of all combinations, in order; `patches` and `stars` are the
+    numbers, from 0, of the Moon patches and standards that are taken after them (None: each once, unless stops say).
     """
 
     instrument: str | Instrument | None = None
@@ -119,8 +145,11 @@ class ObservingPlan:
             for prefix in stop.moving:
                 if prefix not in self.moving:
                     raise unknown_name("moving element of a stop", prefix, tuple(self.moving))
-            if stop.times < 1:
-                raise ValueError(f"a stop is taken {stop.times} times; leave it out, or take it once")
+            total = {"moon": self.moon_patches, "standard": self.standards}.get(stop.kind, 1)
+            if not 0 <= stop.number < total:
+                raise ValueError(f"a stop: there is no {stop.kind} {stop.number}; they go from 0 to {total - 1}")
+            if stop.place is not None and not 0 <= stop.place < self.standard_grid**2:
+                raise ValueError(f"a stop: places of standards go from 0 to {self.standard_grid**2 - 1}")
         for name, total in (("patches", self.moon_patches), ("stars", self.standards)):
             for number in getattr(self, name) or ():
                 if not 0 <= number < total:
@@ -158,7 +187,7 @@ class ObservingPlan:
         degree = self.design.throughput.degree if self.throughput_degree is None else self.throughput_degree
         fields |= {"instrument": self.name, "throughput_degree": degree, "moving": dict(self.moving)}
         # Named only where there are any: plans of other instruments read as they always did.
-        fields["stops"] = [dataclasses.asdict(stop) for stop in self.stops]
+        fields["stops"] = [stop.document() for stop in self.stops]
         later = {"moving": {}, "lamps": 0, "stops": [], "patches": None, "stars": None}
         return {key: value for key, value in fields.items() if key not in later or value != later[key]}
 
@@ -199,50 +228,62 @@ class ObservingPlan:
         """The filters with their curves."""
         return {name: filter_curve(name) for name in self.filters}
 
-    def _indoors(self) -> list[tuple[str, float | None, tuple[float | None, ...], float]]:
-        """Filter, calibration plate, further positions, polariser angle (NaN: out) of exposures indoors."""
-        if self.stops:
-            return [
-                (s.filter, s.plate, tuple(s.moving.get(prefix) for prefix in self.moving), s.polariser_angle)
-                for s in self.stops
-                for _ in range(s.times)
-            ]
-        further = list(itertools.product(*self.moving.values()))
-        angles = (*self.polariser_angles, *(NAN for _ in range(self.lamps)))
-        return [(f, p, m, a) for f in self.filters for p in self.plate for m in further for a in angles]
+    @functools.cached_property
+    def _taken(self) -> tuple[Stop, ...]:
+        """Every exposure, in the order in which they are taken."""
+        further = [dict(zip(self.moving, m, strict=True)) for m in itertools.product(*self.moving.values())]
+        angles = (*self.polariser_angles, *(None for _ in range(self.lamps)))
+        indoors = [dataclasses.replace(stop, times=1) for stop in self.stops for _ in range(stop.times)] or [
+            Stop(a, f, p, m, kind="lamp" if a is None else "clp")
+            for f in self.filters
+            for p in self.plate
+            for m in further
+            for a in angles
+        ]
+        # Where every exposure is said, those of the sky are taken with the plate at its first setting.
+        plates = self.plate[:1] if self.stops else self.plate
+        said = {stop.kind for stop in self.stops}
+        sky = [
+            Stop(None, self.filters[0], plates[i % len(plates)], further[0], kind=kind, number=number)
+            for kind, numbers, total in (
+                ("moon", self.patches, self.moon_patches),
+                ("standard", self.stars, self.standards),
+            )
+            for i, number in enumerate(
+                numbers if numbers is not None else () if kind in said else range(total)
+            )
+        ]
+        return (*indoors, *sky)
 
     def exposures(self) -> Exposures:
         """All exposures in the order in which they are taken."""
-        indoors = self._indoors()
-        patches, stars = self._patch_numbers, self._star_numbers
-        n_in, n_moon, n_star = len(indoors), len(patches), len(stars)
-        n = n_in + n_moon + n_star
-        # Where every exposure is said, those of the sky are taken with the plate at its first setting.
-        settings = 1 if self.stops else len(self.plate)
-        sky_plate = [self.plate[i % settings] for i in range(max(n_moon, n_star))]
-        plate = [p for _, p, _, _ in indoors] + sky_plate[:n_moon] + sky_plate[:n_star]
-        angle = np.array([a for _, _, _, a in indoors] + [NAN] * (n_moon + n_star), float)
-        mjd = self.start + _SPACING * (np.arange(n) - n_in)
-        moon, star = slice(n_in, n_in + n_moon), slice(n_in + n_moon, n)
+        taken = self._taken
+        n = len(taken)
+        kind = np.array([stop.kind for stop in taken])
+        number = np.array([stop.number for stop in taken])
+        moon, star = np.flatnonzero(kind == "moon"), np.flatnonzero(kind == "standard")
+        sky = np.append(moon, star)
+        angle = np.array([NAN if stop.polariser_angle is None else stop.polariser_angle for stop in taken])
+        plate = [stop.plate for stop in taken]
+        mjd = self.start + _SPACING * (np.arange(n) - (sky.min() if len(sky) else n))
         ra, dec, rotator = np.full((3, n), NAN)
-        if n_moon:
-            ra[moon], dec[moon] = self._patches(mjd[moon], patches)
-        rotator[moon] = [_MOON_ROTATOR[i % 4] for i in patches]
-        rotator[star] = [_STAR_ROTATOR[i % 4] for i in stars]
+        if len(moon):
+            ra[moon], dec[moon] = self._patches(mjd[moon], number[moon])
+        rotator[moon] = np.array(_MOON_ROTATOR)[number[moon] % 4]
+        rotator[star] = np.array(_STAR_ROTATOR)[number[star] % 4]
         # Pointings that the plan does not fix are spread over ±3 h, out of step with the polariser.
         ha = 6.0 * np.mod(np.arange(n) * _GOLDEN, 1.0) - 3.0
-        if n_moon or n_star:
+        if len(sky):
             sidereal = local_sidereal_time(mjd, self.site.longitude)
             ra[star] = np.mod(sidereal[star] - 15.0 * ha[star], 360.0)
             dec[star] = np.clip(self.site.latitude + 5.0, -85.0, 85.0)
             ha[moon] = (np.mod(sidereal[moon] - ra[moon] + 180.0, 360.0) - 180.0) / 15.0
-        kinds = ["clp" if np.isfinite(a) else "lamp" for a in angle[:n_in]]
         return Exposures(
             exposure=np.arange(n),
-            kind=np.array(kinds + ["moon"] * n_moon + ["standard"] * n_star),
+            kind=kind,
             mjd=mjd,
-            exptime=np.where(np.arange(n) < n_in, 30.0, 60.0),
-            filter=np.array([f for f, _, _, _ in indoors] + [self.filters[0]] * (n_moon + n_star)),
+            exptime=np.array([EXPOSED[s.kind] if s.seconds is None else s.seconds for s in taken]),
+            filter=np.array([stop.filter for stop in taken]),
             clp_in=np.isfinite(angle),
             clp_angle=angle,
             chwp_in=np.array([p is not None for p in plate], bool),
@@ -253,41 +294,31 @@ class ObservingPlan:
             dec=dec,
             rotator=rotator,
             teff=np.full(n, self.teff),
-            moving=self._positions(indoors, n),
+            moving={p: self._position([stop.moving.get(p) for stop in taken]) for p in self.moving},
         )
 
-    def _positions(self, indoors: list[Any], n: int) -> dict[str, Position]:
-        """Positions of the further moving elements; on the sky they stand at their first."""
-        found = {}
-        for k, (prefix, stops) in enumerate(self.moving.items()):
-            chosen = [m[k] for _, _, m, _ in indoors] + [stops[0]] * (n - len(indoors))
-            angle = np.array([NAN if a is None else a for a in chosen], float)
-            found[prefix] = Position(np.isfinite(angle), angle)
-        return found
-
-    @property
-    def _patch_numbers(self) -> tuple[int, ...]:
-        return tuple(range(self.moon_patches)) if self.patches is None else self.patches
-
-    @property
-    def _star_numbers(self) -> tuple[int, ...]:
-        return tuple(range(self.standards)) if self.stars is None else self.stars
+    @staticmethod
+    def _position(angles: list[float | None]) -> Position:
+        angle = np.array([NAN if a is None else a for a in angles], float)
+        return Position(np.isfinite(angle), angle)
 
     def _patches(
-        self, mjd: Float[np.ndarray, " m"], numbers: tuple[int, ...]
+        self, mjd: Float[np.ndarray, " m"], order: Int[np.ndarray, " m"]
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Field centres (deg) around the Moon: separations and position angles spread evenly."""
-        order, (near, far) = np.array(numbers), self.separations
+        near, far = self.separations
         separation = near + (far - near) * np.mod(0.5 + order * _GOLDEN, 1.0)
         return offset_direction(*moon_direction(mjd, self.site), 360.0 * _GOLDEN * order, separation)
 
     def layout(self) -> tuple[Bool[np.ndarray, "p e"], np.ndarray]:
         """Which (point, exposure) pairs are measured, and the row of the star in each (−1: none)."""
-        exposures, points = self.exposures(), self.points()
-        on_star = np.arange(len(points)) >= len(points) - (self.standard_grid**2 if self.standards else 0)
-        used = on_star[:, None] == (exposures.kind == "standard")
-        star = np.full(len(exposures), -1)
-        star[exposures.kind == "standard"] = self._star_numbers
+        taken, points = self._taken, self.points()
+        place = np.arange(len(points)) - (len(points) - (self.standard_grid**2 if self.standards else 0))
+        star = np.array([stop.number if stop.kind == "standard" else -1 for stop in taken])
+        used = (place[:, None] >= 0) == (star >= 0)
+        for e, stop in enumerate(taken):
+            if stop.place is not None and stop.kind == "standard":
+                used[:, e] &= place == stop.place
         return used, np.where(used, star, -1)
 
     def context(self) -> Context:

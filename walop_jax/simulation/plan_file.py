@@ -12,6 +12,11 @@ electrons = 5e5
 polariser_angle = 33.75
 plate = "out"
 times = 4
+seconds = 20                      # exposure time; electrons are those of the usual one
+
+[[stops]]
+kind = "moon"                     # or "standard", with place = 12 for one place of its raster; "lamp"
+number = 3
 """
 
 from __future__ import annotations
@@ -50,32 +55,39 @@ def read_plan(
     Raises `DataError` for a file that cannot be read, for names and values that a plan does not have.
     """
     with errors_naming(path):
-        content = parse_toml(read_text(path))
-        for name in content:
-            if name not in _KNOWN:
-                raise unknown_name("entry of a plan", name, _KNOWN)
-        own = content.pop("instrument", None)
-        if instrument is None and own is not None:
-            beside = Path(path).parent / str(own)
-            instrument = beside if beside.suffix == ".toml" else str(own)
-        full_turn, angles = content.pop(FULL_TURN, None), content.get("polariser_angles", _ANGLES)
-        if isinstance(angles, int):
-            content["polariser_angles"] = polariser_turn(angles, full_turn=bool(full_turn))
-        elif full_turn is not None:
-            raise ValueError(
-                f"{FULL_TURN} is of no use beside a list of angles; give their number, or leave it out"
-            )
-        stops = content.pop("stops", [])
-        values = {name: _value(value) for name, value in content.items()}
-        for stop in stops:
-            for name in stop:
-                if name not in _STOP:
-                    raise unknown_name("entry of a stop", name, _STOP)
-        try:
-            values["stops"] = tuple(Stop(**_value(stop)) for stop in stops)
-            return ObservingPlan(None if instrument is None else Instrument.read(instrument), **values)
-        except TypeError as error:  # text where a number belongs
-            raise fail(str(error), advice="see `walop-jax docs files` for a plan") from None
+        return plan_of(parse_toml(read_text(path)), Path(path).parent, instrument)
+
+
+def plan_of(
+    content: dict[str, Any], folder: Path, instrument: str | os.PathLike[str] | None = None
+) -> ObservingPlan:
+    """The plan of the entries of a file in `folder`; the rest as `read_plan`."""
+    content = dict(content)
+    for name in content:
+        if name not in _KNOWN:
+            raise unknown_name("entry of a plan", name, _KNOWN)
+    own = content.pop("instrument", None)
+    if instrument is None and own is not None:
+        beside = folder / str(own)
+        instrument = beside if beside.suffix == ".toml" else str(own)
+    full_turn, angles = content.pop(FULL_TURN, None), content.get("polariser_angles", _ANGLES)
+    if isinstance(angles, int):
+        content["polariser_angles"] = polariser_turn(angles, full_turn=bool(full_turn))
+    elif full_turn is not None:
+        raise ValueError(
+            f"{FULL_TURN} is of no use beside a list of angles; give their number, or leave it out"
+        )
+    stops = content.pop("stops", [])
+    values = {name: _value(value) for name, value in content.items()}
+    for stop in stops:
+        for name in stop:
+            if name not in _STOP:
+                raise unknown_name("entry of a stop", name, _STOP)
+    try:
+        values["stops"] = tuple(Stop(**_value(stop)) for stop in stops)
+        return ObservingPlan(None if instrument is None else Instrument.read(instrument), **values)
+    except TypeError as error:  # text where a number belongs
+        raise fail(str(error), advice="see `walop-jax docs files` for a plan") from None
 
 
 def _value(value: Any) -> Any:

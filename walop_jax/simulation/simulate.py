@@ -29,7 +29,7 @@ from walop_jax.model.parameters import field_declarations, leaves, unknown_name,
 from walop_jax.model.plan import with_median
 from walop_jax.model.sources import Standards
 from walop_jax.model.specification import Model, make_model, make_template, series_indices
-from walop_jax.simulation.observing_plan import ObservingPlan
+from walop_jax.simulation.observing_plan import EXPOSED, ObservingPlan
 
 Cube = Float[np.ndarray, "p e k"]
 
@@ -175,7 +175,7 @@ def simulate(
     active = in_order((*instrument.effects, *effects))
     truth = make_template(dataclasses.replace(instrument.with_source(standards), effects=active))
     blank = _without_light(plan, sources, seed, len(truth.cameras))
-    expected = _expected(blank, truth, _fluxes(plan, None if steady else sky))
+    expected = _expected(blank, truth, fluxes(plan, None if steady else sky))
     detector = PhotonNoise(plan.read_noise)
     if noiseless:
         counts, sigma = expected, detector.sigma(expected)
@@ -216,19 +216,22 @@ def _with_counts(plan: ObservingPlan, blank: CalibrationSet, counts: Cube, sigma
     return dataclasses.replace(blank, intensities=TableIntensities.dense(points, block))
 
 
-def _fluxes(plan: ObservingPlan, rng: np.random.Generator | None) -> Float[np.ndarray, "p e"]:
+def fluxes(plan: ObservingPlan, rng: np.random.Generator | None) -> Float[np.ndarray, "p e"]:
     """Flux of every (point, exposure): transparency, illumination of the field, brightness of the stars.
 
     A camera of throughput 0.5 sees a quarter of unpolarised light. Without `rng` all are at their means.
     """
     used, source = plan.layout()
+    exposures = plan.exposures()
+    usual = np.array([EXPOSED[str(kind)] for kind in exposures.kind])
+    electrons = plan.electrons * exposures.exptime / usual
     if rng is None:
         brightness = np.append(np.full(plan.standards, np.mean(TRANSPARENCY)), 1.0)
-        return 4.0 * plan.electrons * np.mean(TRANSPARENCY) * np.broadcast_to(brightness[source], used.shape)
+        return 4.0 * electrons * np.mean(TRANSPARENCY) * np.broadcast_to(brightness[source], used.shape)
     transparency = rng.uniform(*TRANSPARENCY, used.shape[1])
     illumination = rng.uniform(0.9, 1.1, used.shape[0])
     brightness = np.append(rng.uniform(*TRANSPARENCY, plan.standards), 1.0)  # the last entry: no star
-    return 4.0 * plan.electrons * illumination[:, None] * transparency * brightness[source]
+    return 4.0 * electrons * illumination[:, None] * transparency * brightness[source]
 
 
 def _expected(blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, "p e"]) -> Cube:

@@ -69,6 +69,13 @@ def moon_direction(
 
     Raises `DataError` for a time outside the ephemeris and for a site that is not finite.
     """
+    return body_direction("moon", mjd, site)
+
+
+def body_direction(
+    name: str, mjd: Float[np.ndarray, " e"], site: Site
+) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
+    """The same for any body of the ephemeris, by its name: "sun"."""
     mjd = np.asarray(mjd, dtype=np.float64)
     low, high = EPHEMERIS_MJD
     if not np.all((mjd >= low) & (mjd <= high)):
@@ -87,8 +94,21 @@ def moon_direction(
         from astropy.time import Time
 
         place = EarthLocation.from_geodetic(site.longitude, site.latitude, site.elevation)
-        moon: Any = get_body("moon", Time(mjd, format="mjd", scale="utc"), place, ephemeris="builtin")
-        return np.asarray(moon.ra.deg, dtype=np.float64), np.asarray(moon.dec.deg, dtype=np.float64)
+        body: Any = get_body(name, Time(mjd, format="mjd", scale="utc"), place, ephemeris="builtin")
+        return np.asarray(body.ra.deg, dtype=np.float64), np.asarray(body.dec.deg, dtype=np.float64)
+
+
+def altitude(
+    mjd: Float[np.ndarray, " e"], ra: Float[np.ndarray, " e"], dec: Float[np.ndarray, " e"], site: Site
+) -> Float[np.ndarray, " e"]:
+    """Return the altitude (deg) of directions (deg) at UTC days, without refraction, to the precession since 2000.
+
+    sin h = sin φ sin δ + cos φ cos δ cos H, H the hour angle (Meeus 1998, Astronomical Algorithms, equation 13.6).
+    """
+    hour = np.deg2rad(local_sidereal_time(mjd, site.longitude) - ra)
+    latitude, dec = np.deg2rad(site.latitude), np.deg2rad(dec)
+    sine = np.sin(latitude) * np.sin(dec) + np.cos(latitude) * np.cos(dec) * np.cos(hour)
+    return np.rad2deg(np.arcsin(np.clip(sine, -1.0, 1.0)))
 
 
 def offset_direction(

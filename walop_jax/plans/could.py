@@ -1,0 +1,205 @@
+"""What could be observed, and what it costs: filters, plates, exposure times, what is up, and the time beside exposing.
+
+    altitude = 20           # of the lowest pointing (deg)
+    places = true           # standards at single places of their raster
+    [seconds]               # exposure times to choose from, by kind
+    clp = [10, 30, 120]
+    [costs]                 # s beside exposing: read-out, turning or pointing, settling
+    clp = 20                # an exposure through the polariser, and likewise lamp, moon, standard
+    filter = 60             # a change of the filter
+    position = 30           # a moving element put in, taken out or turned
+    slew = 1                # for each degree between pointings
+
+Everything else in the file is an observing plan (`simulation.plan_file`), of which the polariser angles are ignored.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from walop_jax.data.records import CALIBRATION_PLATE
+from walop_jax.io.errors import errors_naming
+from walop_jax.io.text import parse_toml, read_text
+from walop_jax.model.parameters import unknown_name
+from walop_jax.simulation.observing_plan import EXPOSED, ObservingPlan, Stop
+from walop_jax.simulation.plan_file import is_plan, plan_of
+from walop_jax.sky.moon import altitude, body_direction
+
+DARK = -12.0  # altitude of the Sun (deg) below which the sky is dark enough for Moon and stars
+_FULL = 120.0  # distance of Moon and Sun (deg) from which the Moon is as good as full
+_SEARCHED, _STEP = 60.0, 1.0 / 24.0  # days in which a better time is looked for, and its steps
+
+
+@dataclasses.dataclass(frozen=True)
+class Costs:
+    """Time (s) beside exposing: of each exposure by its kind, and of changes between exposures (see the module)."""
+
+    clp: float = 20.0
+    lamp: float = 15.0
+    moon: float = 60.0
+    standard: float = 90.0
+    filter: float = 60.0
+    position: float = 30.0
+    slew: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, value in dataclasses.asdict(self).items():
+            if not (isinstance(value, int | float) and np.isfinite(value) and value >= 0):
+                raise ValueError(f"costs: {name} = {value}; give a time in seconds, 0 or more")
+
+    def of(self, kind: str) -> float:
+        """Time beside an exposure of a kind."""
+        return float(getattr(self, kind))
+
+
+class Choice(NamedTuple):
+    """Exposures that differ in one thing only: the angle of the polariser, or which of `stops` they are."""
+
+    kind: str
+    filter: str
+    positions: Mapping[str, float | None]
+    seconds: float
+    stops: tuple[Stop, ...]
+
+    @property
+    def setting(self) -> tuple[Any, ...]:
+        """What has to be changed for another choice."""
+        return (self.filter, *self.positions.values())
+
+    def stop(self, place: float, times: int = 1) -> Stop:
+        """The stop at the angle 2θ (rad) of the polariser, or of that number in the list."""
+        if self.kind != "clp":
+            return dataclasses.replace(self.stops[round(place)], times=times)
+        return dataclasses.replace(
+            self.stops[0], polariser_angle=round(float(np.rad2deg(place) / 2) % 180.0, 3), times=times
+        )
+
+    def text(self) -> str:
+        """In a few words."""
+        places = (f"{p} {'out' if a is None else f'{a:g}°'}" for p, a in self.positions.items())
+        return ", ".join([self.kind, self.filter, *places, f"{self.seconds:g} s"])
+
+
+@dataclasses.dataclass(frozen=True)
+class Could:
+    """Exposures that could be taken: those of an observing plan, at any angle of the polariser; costs and limits.
+
+    `seconds` are exposure times to choose from, by kind; pointings lower than `altitude` (deg) are left out; `places`
+    takes standards at single places of their raster, not at all of them for the cost of one. Raises ValueError for values that contradict each other.
+    """
+
+    plan: ObservingPlan
+    costs: Costs = Costs()
+    seconds: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
+    altitude: float = 20.0
+    places: bool = False
+
+    def __post_init__(self) -> None:
+        for kind, times in self.seconds.items():
+            if kind not in EXPOSED:
+                raise unknown_name("kind of exposure", kind, tuple(EXPOSED))
+            if not times or min(times) <= 0:
+                raise ValueError(f"seconds: {kind} = {list(times)}; give exposure times above 0")
+        if not -90.0 <= self.altitude < 90.0:
+            raise ValueError(f"altitude = {self.altitude}: give degrees above the horizon, below 90")
+
+    @classmethod
+    def of(cls, given: Could | ObservingPlan | str | os.PathLike[str]) -> Could:
+        """From a file, an observing plan, or the name or description of an instrument."""
+        if isinstance(given, Could):
+            return given
+        if isinstance(given, ObservingPlan):
+            return cls(given)
+        if not is_plan(given):
+            return cls(ObservingPlan(str(given)))
+        with errors_naming(given):
+            return cls.read(parse_toml(read_text(given)), Path(given).parent)
+
+    @classmethod
+    def read(cls, content: Mapping[str, Any], folder: Path) -> Could:
+        """From the entries of a file; raises ValueError for what is not known or not allowed."""
+        content, own = dict(content), {}
+        for name in ("altitude", "places"):
+            if name in content:
+                own[name] = content.pop(name)
+        costs = dict(content.pop("costs", {}))
+        for name in costs:
+            if name not in Costs.__dataclass_fields__:
+                raise unknown_name("cost", name, tuple(Costs.__dataclass_fields__))
+        seconds = {kind: tuple(np.atleast_1d(v).tolist()) for kind, v in content.pop("seconds", {}).items()}
+        return cls(plan_of(content, folder), Costs(**costs), seconds, **own)
+
+    def without_angles(self) -> ObservingPlan:
+        """The plan with as little of the polariser as may be."""
+        return dataclasses.replace(self.plan, polariser_angles=(0.0,), plate=self.plan.plate[:1])
+
+    def choices(self) -> tuple[tuple[Choice, ...], tuple[str, ...]]:
+        """All choices, and in words what had to be left out, with what would do."""
+        plan, notes = self.plan, []
+        up: dict[str, tuple[int, ...]] = {}
+        for kind, total in (("moon", plan.moon_patches), ("standard", plan.standards)):
+            up[kind], said = self._up(kind, total)
+            notes += said
+        found = []
+        positions = {CALIBRATION_PLATE: plan.plate, **plan.moving}
+        for name, stops in itertools.product(plan.filters, itertools.product(*positions.values())):
+            where = dict(zip(positions, stops, strict=True))
+            moving = {prefix: a for prefix, a in where.items() if prefix != CALIBRATION_PLATE}
+            for kind in EXPOSED:
+                for seconds in self.seconds.get(kind, (EXPOSED[kind],)):
+                    blank = Stop(
+                        0.0 if kind == "clp" else None, name, stops[0], moving, kind=kind, seconds=seconds
+                    )
+                    members = (
+                        (blank,)
+                        if kind == "clp" or (kind == "lamp" and plan.lamps)
+                        else tuple(self._members(blank, up.get(kind, ())))
+                    )
+                    if members:
+                        found.append(Choice(kind, name, where, seconds, members))
+        return tuple(found), tuple(notes)
+
+    def _members(self, blank: Stop, numbers: tuple[int, ...]) -> Iterator[Stop]:
+        single = self.places and blank.kind == "standard"
+        for number in numbers:
+            for place in range(self.plan.standard_grid**2) if single else (None,):
+                yield dataclasses.replace(blank, number=number, place=place)
+
+    def _up(self, kind: str, total: int) -> tuple[tuple[int, ...], list[str]]:
+        """Numbers of what is up in the dark, and what to say of the rest."""
+        if not total:
+            return (), []
+        plan = self.plan
+        e = dataclasses.replace(
+            plan,
+            stops=tuple(Stop(None, plan.filters[0], kind=kind, number=i) for i in range(total)),
+            patches=(),
+            stars=(),
+        ).exposures()
+        high = altitude(e.mjd, e.ra, e.dec, plan.site) >= self.altitude
+        dark = altitude(e.mjd, *body_direction("sun", e.mjd, plan.site), plan.site) < DARK
+        up = tuple(np.flatnonzero(high & dark).tolist())
+        if len(up) == total:
+            return up, []
+        what = "Moon patches" if kind == "moon" else "standards"
+        why = "it is not dark" if not dark.all() else f"they are below {self.altitude:g}°"
+        return up, [f"{total - len(up)} of {total} {what} are left out: {why}{self._better()}"]
+
+    def _better(self) -> str:
+        """The next time at which the Moon is full, high and the sky dark."""
+        mjd = self.plan.start + np.arange(0.0, _SEARCHED, _STEP)
+        site = self.plan.site
+        moon, sun = body_direction("moon", mjd, site), body_direction("sun", mjd, site)
+        (a, d), (b, c) = np.deg2rad(moon), np.deg2rad(sun)
+        apart = np.rad2deg(np.arccos(np.sin(d) * np.sin(c) + np.cos(d) * np.cos(c) * np.cos(a - b)))
+        high = altitude(mjd, *moon, site) >= self.altitude + self.plan.separations[1]
+        good = np.flatnonzero(high & (altitude(mjd, *sun, site) < DARK) & (apart > _FULL))
+        return f"; mjd = {mjd[good[0]]:.2f} would do" if len(good) else "; choose another night (mjd)"
+

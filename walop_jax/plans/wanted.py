@@ -1,0 +1,199 @@
+"""What a plan is to know well: linear functions of the parameters, by name.
+
+Error of p   of stars behind the calibration alone: δ(q, u) = −M⁻¹ (δm₁ + δM (q, u)), hence δp = −e · M⁻¹ δm s, linear in
+             the six elements of δm and so in the parameters (`science.field_accuracy`). Mean square over stars with
+             p ≤ 5 %, at points of the field, through every filter, for stars of some colours. Where |det M| is below
+             `LEAST_DETERMINANT` one exposure holds no u, and no plan of calibrations brings it back.
+Parameter    its variance, e.g. `collimator.curvature`.
+Stars        the error of p of the stars of a table.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from walop_jax.calibration.matrix import matrix_slopes
+from walop_jax.data.settings import Settings
+from walop_jax.data.user_tables import InputTable, numeric_column
+from walop_jax.data.schema import Column
+from walop_jax.model.parameters import unknown_name
+from walop_jax.plans.exposures import Candidates
+from walop_jax.science.star_errors import sample_stars
+from walop_jax.simulation.observing_plan import ObservingPlan
+
+WORST, MEAN, APART = "worst", "mean", "apart"
+LEAST_DETERMINANT = 0.1
+COLOURS = (float("nan"), 4000.0, 8000.0)
+"""Colour temperatures (K; NaN: flat photon spectrum) at which p is to be known."""
+TARGET_GRID = 9  # field points along each axis at which the error of p is asked
+
+
+@dataclasses.dataclass(frozen=True)
+class Wanted:
+    """Linear functions of the parameters, `targets` (draw, target, parameter, column), and what their variance says.
+
+    `unit` is that of the root of the largest variance, after `scale`; `what` says in words what it is. `inverse`: its
+    reciprocal is told, in standard deviations.
+    """
+
+    name: str
+    what: str
+    unit: str
+    targets: Float[np.ndarray, "r k f q"]
+    scale: float = 1.0
+    inverse: bool = False
+
+    def told(self, variance: float) -> float:
+        """The number that is told for a value of the criterion."""
+        root = self.scale * float(np.sqrt(variance))
+        return 1.0 / root if self.inverse else root
+
+    def variance(self, told: float) -> float:
+        """The value of the criterion for a number that is told."""
+        return float(((1.0 / told if self.inverse else told) / self.scale) ** 2)
+
+
+@dataclasses.dataclass(frozen=True)
+class FieldErrors:
+    """Points of the field, filters and colours at which p is to be known, and how it depends on the parameters.
+
+    `slopes` (draw, point, element, parameter) are the derivatives of the matrix, `forms` (draw, point, 6, 6) the
+    quadratic form that makes the mean square error of p of them, 0 where one exposure holds no u; `determinant`
+    (draw, point) is that of the matrix.
+    """
+
+    x: Float[np.ndarray, " p"]
+    y: Float[np.ndarray, " p"]
+    slopes: Float[np.ndarray, "r p 6 f"]
+    forms: Float[np.ndarray, "r p 6 6"]
+    determinant: Float[np.ndarray, "r p"]
+
+    @property
+    def seen(self) -> Bool[np.ndarray, " p"]:
+        """Where one exposure holds u in all draws."""
+        return self.forms.any(axis=(2, 3)).all(axis=0)
+
+    def targets(self) -> Float[np.ndarray, "r k f 6"]:
+        """Linear functions of the parameters whose summed variance is the mean square error of p, in %²."""
+        value, vector = np.linalg.eigh(self.forms)
+        root = vector * np.sqrt(np.clip(value, 0.0, None))[..., None, :]
+        return 100.0 * np.einsum("rpif,rpij->rpfj", self.slopes, root)[:, self.seen]
+
+    def error(self, covariance: Float[np.ndarray, "r f f"]) -> Float[np.ndarray, "r p"]:
+        """Error of p (fraction) for covariances of the parameters; NaN where there is no u."""
+        c = np.einsum("rpif,rfg,rpjg->rpij", self.slopes, covariance, self.slopes, optimize=True)
+        square = np.einsum("rpij,rpij->rp", self.forms, c)
+        return np.sqrt(np.where(self.forms.any(axis=(2, 3)), square, np.nan))
+
+
+def field_errors(
+    found: Candidates,
+    *,
+    colours: Sequence[float] = COLOURS,
+    points: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]] | None = None,
+    stars: Float[np.ndarray, "*p n 2"] | None = None,
+) -> FieldErrors:
+    """How p depends on the parameters, at a grid of points (or those given, deg).
+
+    `stars` (q, u) are those over which the square is averaged, at all points or at each: those with p ≤ 5 %.
+    """
+    plan = found.could.plan
+    x, y = _grid(plan) if points is None else points
+    light = sample_stars() if stars is None else stars
+    parts = [_at(found, values, x, y, light, colours) for values in found.values]
+    slopes, forms, determinant = (np.stack(part) for part in zip(*parts, strict=True))
+    repeated = len(colours) * len(plan.filters)
+    return FieldErrors(np.tile(x, repeated), np.tile(y, repeated), slopes, forms, determinant)
+
+
+def _grid(plan: ObservingPlan) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    edge = np.linspace(-plan.field, plan.field, TARGET_GRID)
+    y, x = (a.ravel() for a in np.meshgrid(edge, edge, indexing="ij"))
+    return x, y
+
+
+def _at(
+    found: Candidates,
+    values: Float[np.ndarray, " n"],
+    x: Float[np.ndarray, " p"],
+    y: Float[np.ndarray, " p"],
+    stars: Float[np.ndarray, "*p n 2"],
+    colours: Sequence[float],
+) -> tuple[Float[np.ndarray, "p 6 f"], Float[np.ndarray, "p 6 6"], Float[np.ndarray, " p"]]:
+    model, plan = found.model, found.could.plan
+    instrument, select = model.instrument(values), model.selection()
+    each = np.broadcast_to(stars, (len(x), *stars.shape[-2:]))
+    along = each / np.linalg.norm(each, axis=2, keepdims=True)
+    light = np.concatenate([np.ones((*each.shape[:2], 1)), each], axis=2)
+    slopes, forms, determinants = [], [], []
+    for name in plan.filters:
+        for teff in colours:
+            setting = dataclasses.replace(Settings.default(1, name), teff=np.array([teff]))
+            m, slope = matrix_slopes(instrument, setting, plan.curves(), x, y)
+            if m.shape[1] != 2:
+                raise ValueError(
+                    f"{plan.name} does not measure q and u in one exposure: the error of p depends on how stars are "
+                    "observed; plan for a parameter instead"
+                )
+            local = m[:, :, 1:]
+            determinant = np.linalg.det(local)
+            blind = np.abs(determinant) < LEAST_DETERMINANT
+            inverse = np.linalg.inv(np.where(blind[:, None, None], np.eye(2), local))
+            form = np.einsum("pnc,pcr,pns->pnrs", along, inverse, light).reshape(*each.shape[:2], 6)
+            square = np.einsum("pni,pnj->pij", form, form) / each.shape[1]
+            forms.append(np.where(blind[:, None, None], 0.0, square))
+            slopes.append(slope.reshape(len(x), 6, -1) @ select)
+            determinants.append(determinant)
+    return np.concatenate(slopes), np.concatenate(forms), np.concatenate(determinants)
+
+
+def wanted(found: Candidates, field: FieldErrors | None, criterion: str | InputTable) -> Wanted:
+    """A criterion by its name: `WORST`, `MEAN`, a parameter; or a table of stars (X, Y, Q, U; TEFF).
+
+    Raises ValueError for a name that is none of these, and where no star can be seen.
+    """
+    if isinstance(criterion, InputTable):
+        return _of_stars(found, criterion)
+    if criterion in (WORST, MEAN):
+        assert field is not None
+        targets = field.targets()
+        if criterion == WORST:
+            return Wanted(WORST, "error of p at the worst point and colour", "%", targets)
+        whole = np.einsum("rkfi,rkgi->rfg", targets, targets, optimize=True) / targets.shape[1]
+        return Wanted(MEAN, "error of p, rms over the field", "%", _root(whole)[:, None])
+    if criterion not in found.names:
+        raise unknown_name("criterion or parameter", criterion, (WORST, MEAN, *found.names))
+    unit = found.model.parameters[found.model.index(criterion)].unit
+    one = np.zeros((len(found.values), 1, len(found.names), 1))
+    one[:, 0, found.names.index(criterion)] = 1.0
+    return Wanted(criterion, f"error of {criterion}", unit, one)
+
+
+def _of_stars(found: Candidates, table: InputTable) -> Wanted:
+    rules: dict[str, Any] = {name: Column("float", unit) for name, unit in (("X", "deg"), ("Y", "deg"), ("Q", ""), ("U", ""))}
+    x, y, q, u = (numeric_column(table, name, rule) for name, rule in rules.items())
+    teff = numeric_column(table, "TEFF", Column("float", "K", missing=np.nan))
+    if np.any(np.hypot(q, u) == 0):
+        raise ValueError(f"{table.path}: a star with Q = U = 0 has no p; leave it out, or state what is expected of it")
+    parts = []
+    for colour in np.unique(teff):
+        here = np.flatnonzero((teff == colour) | (np.isnan(teff) & np.isnan(colour)))
+        stars = np.stack([q[here], u[here]], axis=1)[:, None]
+        at = field_errors(found, colours=(float(colour),), points=(x[here], y[here]), stars=stars)
+        parts.append(at.targets())
+    targets = np.concatenate(parts, axis=1)
+    if not targets.shape[1]:
+        raise ValueError(
+            f"{table.path}: no star lies where one exposure holds u; observe them at several angles of the rotator"
+        )
+    return Wanted("stars", f"error of p of the worst of {targets.shape[1]} stars", "%", targets)
+
+
+def _root(squares: Float[np.ndarray, "r f f"]) -> Float[np.ndarray, "r f f"]:
+    value, vector = np.linalg.eigh(squares)
+    return vector * np.sqrt(np.clip(value, 0.0, None))[:, None, :]
