@@ -9,6 +9,7 @@ from walop_jax.plans.families import Circle, Listed
 from walop_jax.plans.optimal import (
     Experiment,
     NotEstimableError,
+    least_budget,
     lower_bound,
     optimise,
     rounded,
@@ -65,6 +66,51 @@ def test_c_optimal_extrapolation():
     plan = optimise(experiment(regression(rows), wanted), gap=1e-4)
     assert plan.value == pytest.approx(4.0, rel=1e-4)
     assert weights_at(plan, GRID, 1.0) == pytest.approx(0.75, abs=5e-3)
+
+
+PARTIAL_CIRCLE = np.linspace(-np.pi / 2, np.pi / 2, 200)
+TWO = np.stack([a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21))], axis=1)
+DOSE = np.exp(-10 + 0.2 * np.arange(1, 151))
+PUBLISHED = {
+    "trigonometric": (
+        np.hstack([np.ones((200, 1)), *(f(k * PARTIAL_CIRCLE)[:, None] for k in (1, 2, 3) for f in (np.cos, np.sin))]),
+        3152.49145979,
+        1182.60662887,
+    ),
+    "cubic": (np.vander(np.linspace(0, 2, 101), 4), 256.070354482, 305.503237198),
+    "two factors": (
+        np.stack([np.ones(441), *TWO.T, *(TWO.T**2), TWO.prod(axis=1)], axis=1), 17.8921718391, 1690.65172159
+    ),
+    "dose": (np.sqrt(DOSE)[:, None] / (1 + DOSE)[:, None] * np.stack([np.ones(150), np.arange(1, 151)], axis=1),
+             227.768409005, 81.6616339845),
+}  # fmt: skip
+"""Models of the help pages of the R package OptimalDesign (od.AA, Fx_cube, od.MISOCP), and the optimal values of
+tr M⁻¹ and tr M⁻¹ ΣffT that its `od_REX` finds (version 1.0.1, efficiency 0.99999999, run with R 4.2.2)."""
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_designs_of_the_package_optimaldesign(name):
+    rows, a_optimal, i_optimal = PUBLISHED[name]
+    n = rows.shape[1]
+    factor = np.linalg.cholesky(rows.T @ rows)
+    for targets, expected in ((np.eye(n), a_optimal), (factor, i_optimal)):
+        plan = optimise(experiment(regression(rows), targets[None, None]), gap=2e-5)
+        assert plan.value == pytest.approx(expected, rel=1e-4)
+        assert plan.bound <= expected * (1 + 1e-8)
+
+
+def test_the_least_budget_of_a_criterion():
+    """Without what is known the criterion goes as 1 / budget: 8 for a budget of 1 is 2 for 4 (quadratic regression)."""
+    plan, least = least_budget(experiment(regression(QUADRATIC), np.eye(3)[None, None]), 2.0, gap=1e-3)
+    assert plan.weight.sum() == pytest.approx(4.0, rel=2e-3)
+    assert 4.0 * (1 - 2e-3) <= least <= 4.0 * (1 + 1e-6)
+    # One observation of each coefficient known beforehand is worth some of the budget, never more than it says.
+    known, less = least_budget(
+        experiment(regression(QUADRATIC), np.eye(3)[None, None], known=1.0), 2.0, gap=1e-3
+    )
+    assert known.weight.sum() < plan.weight.sum()
+    assert less <= known.weight.sum() * (1 + 1e-3)  # its criterion is that asked for to the gap
+    assert known.value == pytest.approx(2.0, rel=2e-3)
 
 
 def harmonics(angle: np.ndarray, degree: int) -> np.ndarray:
@@ -160,7 +206,7 @@ def test_no_plan_is_better_than_the_bound():
         covariance, phi = variances(weight)
         assert phi.max() >= plan.bound
         shares = rng.dirichlet(np.ones(len(phi)))
-        assert lower_bound(problem, covariance[None], shares[None])[0] <= plan.value
+        assert lower_bound(problem, covariance[None], shares[None]).value(problem.budget) <= plan.value
 
 
 def test_whole_numbers_are_within_three_per_cent_of_any_weights():

@@ -15,13 +15,32 @@ if TYPE_CHECKING:
 
 PLAN, RESULT = "plan.toml", "plan.json"
 
-Could = Annotated[
+What = Annotated[
     "ObservingPlan | PathLike",
-    Argument("What could be observed: a plan file, or an instrument by name.", "PLAN.toml|INSTRUMENT", Path),
+    Argument(
+        "What could be observed: a plan file, an instrument by name, or the RUN to add to.",
+        "PLAN.toml|INSTRUMENT|RUN",
+        Path,
+    ),
 ]
+More = Annotated[Any, Option("What could be observed, of a RUN or an instrument.", "PLAN.toml", Path)]
 After = Annotated[Any, Option("A calibration that is there already: plan what to add to it.", "RUN", Path)]
 Minutes = Annotated[
-    float, Option("Time for exposures, read-out and pointing, in minutes.", "MINUTES", float, least=0.0)
+    float,
+    Option("Time for exposures, read-out, pointing and changes, in minutes.", "MINUTES", float, least=0.0),
+]
+Criterion = Annotated[
+    Any,
+    Option(
+        "What is to be known best: worst (default: the largest error of p over field and colour), mean, a parameter, "
+        "or a table of stars (X, Y in degrees, Q, U).",
+        "NAME|TABLE",
+        str,
+    ),
+]
+Goal = Annotated[
+    "float | None",
+    Option("A value of the criterion, in % for errors of p: say how long it takes.", "VALUE", float),
 ]
 Draws = Annotated[
     int, Option("Instruments, drawn from the priors, that the plan is made for.", kind=int, least=1)
@@ -31,9 +50,12 @@ Draws = Annotated[
 @command(stages=("information", "searching"), writes=(PLAN, RESULT), random=True)
 def plan(
     job: Job,
-    could: Could,
+    could: What,
     *,
     minutes: Minutes = 30.0,
+    candidates: More = None,
+    criterion: Criterion = "worst",
+    goal: Goal = None,
     after: After = None,
     draws: Draws = 20,
     output: Folder = None,
@@ -41,28 +63,43 @@ def plan(
     """Plan the calibration exposures of a night: those that make the error of p smallest where it is largest.
 
     What could be observed is said by a plan file (see `walop-jax docs files`): filters, settings of the calibration
-    plate, Moon patches, standards. The polariser may stand at any angle. Printed are the exposures, the error of p that
-    they promise, and the least that any plan of the same time could reach, which is proven. RUN/plan.toml is the plan
-    for `simulate` and `limits`, RUN/plan.json holds all numbers.
+    plate, Moon patches, standards, exposure times, costs. The polariser may stand at any angle. Printed are the
+    exposures in order, the errors that they promise, and what no plan of the same time could undercut, which is proven.
+    RUN/plan.toml is the plan for `simulate` and `limits`, RUN/plan.json holds all numbers.
 
     In Python: the plan. Raises ValueError for a time that pays for nothing or determines nothing.
     """
-    from walop_jax import ObservingPlan
+    from walop_jax.data.user_tables import read_input_table
+    from walop_jax.plans.could import Could
     from walop_jax.plans.plan import plan_exposures
-    from walop_jax.simulation.plan_file import is_plan, plan_text, read_plan
+    from walop_jax.simulation.plan_file import plan_text
 
-    if isinstance(could, ObservingPlan):
-        wanted = could
-    elif is_plan(could):
-        wanted = read_plan(could)
-    else:
-        wanted = ObservingPlan(str(could))
+    if isinstance(could, str | Path) and Path(could).is_dir():
+        after, could = could, ""
+    known = None if after is None else calibration_of(after)
+    if candidates is not None:
+        could = candidates
+    elif could == "" and known is not None:
+        could = known.model.template.name
     if not minutes > 0:
         raise fail("nothing can be observed in no time", advice="give --minutes")
-    known = None if after is None else calibration_of(after)
+    wanted = (
+        read_input_table(criterion)
+        if Path(str(criterion)).suffix and Path(str(criterion)).exists()
+        else criterion
+    )
     job.tell("information of exposures", "information")
     with job.repeated() as say:
-        found = plan_exposures(wanted, minutes, known=known, draws=draws, seed=job.seed, progress=say)
+        found = plan_exposures(
+            Could.of(could),
+            minutes,
+            criterion=wanted,
+            known=known,
+            goal=goal,
+            draws=draws,
+            seed=job.seed,
+            progress=say,
+        )
 
     def files() -> Writers:
         return {PLAN: text_file(plan_text(found.observing_plan))}

@@ -92,7 +92,8 @@ class Could:
     """Exposures that could be taken: those of an observing plan, at any angle of the polariser; costs and limits.
 
     `seconds` are exposure times to choose from, by kind; pointings lower than `altitude` (deg) are left out; `places`
-    takes standards at single places of their raster, not at all of them for the cost of one. Raises ValueError for values that contradict each other.
+    takes standards at single places of their raster, not at all of them for the cost of one. Raises ValueError for
+    values that contradict each other.
     """
 
     plan: ObservingPlan
@@ -202,4 +203,3 @@ class Could:
         high = altitude(mjd, *moon, site) >= self.altitude + self.plan.separations[1]
         good = np.flatnonzero(high & (altitude(mjd, *sun, site) < DARK) & (apart > _FULL))
         return f"; mjd = {mjd[good[0]]:.2f} would do" if len(good) else "; choose another night (mjd)"
-

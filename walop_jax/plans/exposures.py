@@ -2,10 +2,10 @@
 
 Information  of an exposure e: J_eᵀ J_e, J_e the derivatives of its whitened residuals, fluxes eliminated, to the free
              parameters of the base model, from expected counts and the errors that they would have. No noise enters.
-Polariser    Light is linear, so that counts and their derivatives are series of low degree in 2θ: they are computed at
-             `NODES` angles and known at all. The information, which divides by the variance of the counts, is a series
-             of high degree, cut where `ANGLES` angles end it; `Candidates.truncation` is what is lost, measured between.
-Draws        of the instrument as built, from the priors of the model or around a calibration: the best plan depends on it.
+Polariser    Light is linear, so that counts and their derivatives are series of low degree in 2θ: they are computed
+             at `NODES` angles and known at all. The information, which divides by the variance of the counts, is a
+             series of high degree, cut where `ANGLES` angles end it; `Candidates.truncation` is what is lost.
+Draws        of the instrument as built, from the priors or around a calibration: the best plan depends on it.
 Limits       Detectors are linear. Exposures know of each other only by the parameters. Changes between exposures
              (slews, filters) cost time when the plan is put in order; the bound without them stays a bound.
 """
@@ -24,7 +24,6 @@ from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.flux import Sharing, project_flux, sharing
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
-from walop_jax.likelihood.noise import PhotonNoise
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
@@ -32,7 +31,7 @@ from walop_jax.model.specification import Model
 from walop_jax.plans.could import Choice, Could
 from walop_jax.plans.families import Circle, Family, Listed, harmonics
 from walop_jax.simulation.observing_plan import ObservingPlan
-from walop_jax.simulation.simulate import draw_instrument, fluxes, simulate, truth_values
+from walop_jax.simulation.simulate import PhotonNoise, draw_instrument, fluxes, simulate, truth_values
 
 NODES = 7  # angles of the polariser at which counts are computed: a series of degree 3 in 2θ, one more than it needs
 ANGLES = 361
@@ -185,20 +184,22 @@ class _Light:
 
     def information(
         self,
-        rows: Int[np.ndarray, " e"],
+        rows: Int[np.ndarray, " _"],
         unit: Float[np.ndarray, "p e k"],
         slopes: Float[np.ndarray, "p e k f"],
         seconds: float,
-        turn: Float[np.ndarray, " s"] | None = None,
+        turn: Float[np.ndarray, " _"] | None = None,
     ) -> Float[np.ndarray, "s f f"]:
         """JᵀJ of the exposures `rows`; or, of `NODES` that differ in the polariser, at other shares of half a turn."""
         if turn is None:
-            return np.concatenate([self._gram(r, unit[:, [r]], slopes[:, [r]], seconds) for r in rows])
+            return np.concatenate(
+                [self._gram(r, unit[:, [r]], slopes[:, [r]], seconds) for r in rows.tolist()]
+            )
         order, nodes = NODES // 2, 2 * np.pi * np.arange(NODES) / NODES
         weights = harmonics(2 * np.pi * turn, order) @ np.linalg.inv(harmonics(nodes, order))
         parts = np.array_split(weights, max(len(weights) // _TOGETHER, 1))
         u, du = unit[:, rows], slopes[:, rows]
-        return np.concatenate([self._gram(rows[0], _mixed(w, u), _mixed(w, du), seconds) for w in parts])
+        return np.concatenate([self._gram(int(rows[0]), _mixed(w, u), _mixed(w, du), seconds) for w in parts])
 
     def _gram(
         self, row: int, unit: Float[np.ndarray, "p s k"], slopes: Float[np.ndarray, "p s k f"], seconds: float
@@ -213,7 +214,9 @@ class _Light:
         return flat @ flat.swapaxes(1, 2)
 
 
-def _mixed(weights: Float[np.ndarray, "s e"], values: Float[np.ndarray, "p e *_"]) -> Float[np.ndarray, "p s *_"]:
+def _mixed(
+    weights: Float[np.ndarray, "s e"], values: Float[np.ndarray, "p e *k"]
+) -> Float[np.ndarray, "p s *k"]:
     return np.tensordot(weights, values, (1, 1)).swapaxes(0, 1)
 
 
@@ -225,11 +228,15 @@ def _overtone(unit: Float[np.ndarray, "p e k"]) -> float:
 
 
 def _apart(
-    information: Float[np.ndarray, "s f f"], between: Float[np.ndarray, " b"], exact: Float[np.ndarray, "b f f"]
+    information: Float[np.ndarray, "a f f"],
+    between: Float[np.ndarray, " b"],
+    exact: Float[np.ndarray, "b f f"],
 ) -> float:
     """Largest error of the series at shares of half a turn, in units of the mean diagonal of each parameter."""
     count = len(information)
-    series = np.linalg.solve(harmonics(2 * np.pi * np.arange(count) / count, count // 2), information.reshape(count, -1))
+    series = np.linalg.solve(
+        harmonics(2 * np.pi * np.arange(count) / count, count // 2), information.reshape(count, -1)
+    )
     made = (harmonics(2 * np.pi * between, count // 2) @ series).reshape(exact.shape)
     size = np.sqrt(np.einsum("saa->a", exact) / len(exact))
     size = np.where(size > 0, size, 1.0)

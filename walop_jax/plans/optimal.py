@@ -50,7 +50,8 @@ _NEWTON = 80  # steps for one set of candidates
 _SHARPER = 8.0  # by what the barrier falls between two Newton solutions
 _LEAST_WEIGHT = 1e-5  # share of the budget below which a candidate leaves
 _UNSEEN = 1e-13  # eigenvalue, of the scaled information of everything, below which a direction is not seen
-_NEAR = 0.5  # of the largest variance: targets below it wait until they are among the largest
+_MAIN = 1e-5  # of the largest eigenvalue: curvature below it is left out of a step
+_NEAR = 0.85  # of the largest variance: targets below it wait until they are among the largest
 _NOTHING = 1e-9  # of the information of everything
 _HOPELESS = 1e3  # times the criterion of the best weights: some target is not determined
 _EXCHANGES = 200
@@ -189,6 +190,15 @@ class _Some:
         summed = products.sum(axis=-2)
         return summed.reshape(*summed.shape[:-1], *self.per_target).sum(axis=-1)
 
+    def gains(self, y: Float[np.ndarray, "r n kq"]) -> Float[np.ndarray, "r s k"]:
+        """−∂φ/∂w: tr y_kᵀ M_s y_k of every target and candidate, y = M⁻¹ A."""
+        (k, q), (r, s, n, _) = self.per_target, self.matrices.shape
+        found = np.empty((r, s, k))
+        for one, matrices, into in zip(y, self.matrices, found, strict=True):
+            each = one.reshape(n, k, q).transpose(1, 0, 2)
+            into[:] = matrices.reshape(s, -1) @ (each @ each.swapaxes(1, 2)).reshape(k, -1).T
+        return found
+
     def value(self, weight: Float[np.ndarray, " s"]) -> float:
         """The criterion f(w)."""
         return float(self.variances(self.covariance(weight)).max(axis=1).mean())
@@ -213,6 +223,10 @@ class _Some:
                 whole[:, near] = shares
                 return weight, whole
 
+    def worst(self, phi: Float[np.ndarray, "r k"]) -> _Some:
+        """The same for the targets with the largest variances: whose value bounds that of all from below."""
+        return self._of_targets((phi >= _NEAR * phi.max(axis=1, keepdims=True)).any(axis=0))
+
     def _of_targets(self, near: Bool[np.ndarray, " k"]) -> _Some:
         """The same for some of the targets."""
         other = copy.copy(self)
@@ -232,7 +246,7 @@ class _Some:
         while True:
             weight, level = self._centred(weight, level, mu)
             least = min(least, 0.2 * gap * level.mean() / constraints)
-            if mu <= least:
+            if mu <= 1.1 * least:  # the level, and with it the least, still sinks a little in every solution
                 break
             mu = max(mu / _SHARPER, least)
         shares = 1.0 / np.maximum(level[:, None] - self.variances(self.covariance(weight)), 1e-300)
@@ -257,15 +271,14 @@ class _Some:
         for _ in range(_NEWTON):
             covariance = self.covariance(weight)
             y = covariance @ self.wide
-            slope = -np.stack(
-                [self._by_target(one * (m @ one)) for one, m in zip(y, self.matrices, strict=True)]
-            )
+            slope = -self.gains(y)
             slack = level[:, None] - self._by_target(self.wide * y)
             push = mu / slack
-            # Curvature of the φ: Σ_k push_k 2 tr(M_s P M_t Q), P = M⁻¹, Q = Σ_k push_k y_k y_kᵀ.
+            # Curvature of the φ: Σ_k push_k 2 tr(M_s P M_t Q), P = M⁻¹, Q = Σ_k push_k y_k y_kᵀ, of which the main
+            # part is enough to step by.
             pushed = y * np.repeat(push, self.per_target[1], axis=1)[:, None]
-            left, right = _root(covariance), _root(pushed @ np.swapaxes(y, 1, 2))
-            flat = np.moveaxis(left[:, None] @ self.matrices @ right[:, None], 1, 0).reshape(s, -1)
+            left, right = _root(covariance), _root(pushed @ np.swapaxes(y, 1, 2), _MAIN)
+            flat = np.moveaxis(left[:, None] @ (self.matrices @ right[:, None]), 1, 0).reshape(s, -1)
             hessian = np.zeros((s + r, s + r))
             gradient = np.zeros(s + r)
             gradient[:s] = np.einsum("rk,rsk->s", push, slope) - mu / weight
@@ -293,10 +306,11 @@ class _Some:
         return weight, level
 
 
-def _root(matrices: Float[np.ndarray, "r n n"]) -> Float[np.ndarray, "r n n"]:
-    """Symmetric square roots."""
+def _root(matrices: Float[np.ndarray, "r n n"], least: float = 0.0) -> Float[np.ndarray, "r n b"]:
+    """B with B Bᵀ the matrices, without eigenvalues below a share `least` of the largest."""
     value, vector = np.linalg.eigh(matrices)
-    return np.einsum("rab,rb,rcb->rac", vector, np.sqrt(np.clip(value, 0.0, None)), vector, optimize=True)
+    kept = int((value > least * value[:, -1:]).sum(axis=1).max())
+    return vector[:, :, -kept:] * np.sqrt(np.clip(value[:, None, -kept:], 0.0, None))
 
 
 def _on_the_budget(
@@ -329,9 +343,9 @@ def optimise(
     chosen = [(number, place) for number, f in enumerate(problem.families) for place in f.spread()]
     some = _Some(problem, chosen)
     weight = np.full(len(chosen), problem.budget / some.costs.sum())
-    best_bound, best, plan, idle = 0.0, None, None, 0
+    best_bound, best, plan, idle, accuracy = 0.0, None, None, 0, 0.2
     for turn in range(1, _ROUNDS + 1):
-        weight, shares = some.solve(weight, 0.5 * gap if turn > 1 else max(gap, 0.2))
+        weight, shares = some.solve(weight, accuracy)
         value = some.value(weight)
         proof = lower_bound(problem, some.covariance(weight), shares, most)
         bound = proof.value(problem.budget)
@@ -346,13 +360,16 @@ def optimise(
             progress(
                 f"round {turn}: criterion {value:.6g}, bound {best_bound:.6g}, gap {100 * plan.gap:.2g} %"
             )
-        if plan.gap <= gap or idle == _PATIENCE:
+        exact = accuracy <= 0.5 * gap
+        if plan.gap <= gap or (exact and idle >= _PATIENCE):
             break
         used = weight * some.costs > _LEAST_WEIGHT * problem.budget
         kept = [c for c, keep in zip(some.chosen, used, strict=True) if keep]
         new = [top for top in proof.tops if not any(_same(top, there) for there in kept)]
-        if not new and turn > 3:
+        if exact and not new and turn > 3:
             break
+        # Far from the end candidates matter, not their exact weights.
+        accuracy = 0.5 * gap if idle or not new else max(0.5 * gap, min(accuracy, 0.3 * plan.gap))
         share = 0.05 * problem.budget / max(len(new), 1)
         some = _Some(problem, [*kept, *new])
         weight = np.concatenate([0.95 * weight[used], share / some.costs[len(kept) :]])
@@ -457,6 +474,18 @@ def rounded(experiment: Experiment, plan: Allocation, *, most: int = 8) -> Alloc
     )
 
 
+def worth(
+    experiment: Experiment, plan: Allocation
+) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
+    """The criterion without each candidate of a plan, and with one more of it, over that of the plan."""
+    problem = experiment.reduced()
+    some = _Some(problem, list(zip(plan.family.tolist(), plan.place, strict=True)))
+    here, each = some.value(plan.weight), np.eye(len(plan.weight))
+    without = [some.value(plan.weight * (1.0 - one)) for one in each]
+    more = [some.value(plan.weight + one) for one in each]
+    return np.array(without) / here, np.array(more) / here
+
+
 def _filled(
     some: _Some, count: Float[np.ndarray, " s"], weight: Float[np.ndarray, " s"]
 ) -> Float[np.ndarray, " s"]:
@@ -468,8 +497,9 @@ def _filled(
             return count
         # A plan that is not whole yet may not determine everything: a thousandth of the weights stands in for the rest.
         base = count + 1e-3 * weight
-        here = some.value(base)
-        gain = [(here - some.value(base + (np.arange(len(count)) == i))) / some.costs[i] for i in can]
+        phi = some.variances(some.covariance(base))
+        here, near = float(phi.max(axis=1).mean()), some.worst(phi)
+        gain = [(here - near.value(base + (np.arange(len(count)) == i))) / some.costs[i] for i in can]
         count = count + (np.arange(len(count)) == can[int(np.argmax(gain))])
 
 
@@ -488,13 +518,9 @@ def _exchanged(
     some = _Some(problem, [*(some.chosen[i] for i in kept), *new])
     count = np.concatenate([count[kept], np.zeros(len(new))])
     y = covariance @ some.wide
-    weights = np.repeat(shares / shares.sum(axis=1, keepdims=True), some.per_target[1], axis=1)[:, None]
-    slope = np.array(
-        [
-            np.mean([np.sum(a * (m @ (a * w))) for a, m, w in zip(y, one, weights, strict=True)])
-            for one in np.swapaxes(some.matrices, 0, 1)
-        ]
-    )
+    weights = shares / shares.sum(axis=1, keepdims=True)
+    slope = np.einsum("rsk,rk->s", some.gains(y), weights) / len(y)
+    worst = some.worst(phi)
     left = problem.budget - some.costs @ count
     out, into = np.meshgrid(np.arange(len(kept)), np.arange(len(count)), indexing="ij")
     fits = (some.costs[into] - some.costs[out] <= left * (1 + 1e-9)) & (out != into)
@@ -506,6 +532,7 @@ def _exchanged(
         changed = count.copy()
         changed[i] -= 1
         changed[j] += 1
-        if some.value(changed) < here * (1 - 1e-9):
+        least = here * (1 - 1e-9)
+        if worst.value(changed) < least and some.value(changed) < least:
             return some, changed, True
     return some, count, False

@@ -1,4 +1,4 @@
-"""A plan of calibration exposures: which, how often, in what order, what it achieves, and how far from the best that is.
+"""A plan of calibration exposures: which, how often, in what order, what it achieves, how far from the best it is.
 
 The best weights and their proof are those of `optimal`, candidates those of `exposures`, what is asked that of
 `wanted`. Here they become whole exposures in an order with few changes, with the gain of each and the price of leaving
@@ -32,6 +32,7 @@ from walop_jax.plans.optimal import (
     least_budget,
     optimise,
     rounded,
+    worth,
 )
 from walop_jax.plans.wanted import WORST, FieldErrors, Wanted, field_errors, wanted
 from walop_jax.science.star_errors import GOAL
@@ -86,8 +87,9 @@ class PlannedExposure:
 class ExposurePlan(Displayed):
     """The exposures of a budget, the proof, and the error of p over the field before and after.
 
-    `value` is the criterion of the exposures, `bound` what no plan of the same time can undercut, both as `wanted` tells
-    them (% for errors of p). `needed` are the minutes in which the best plan reaches `goal`, and those in which none can.
+    `value` is the criterion of the exposures, `bound` what no plan of the same time can undercut, both as `wanted`
+    tells them (% for errors of p). `needed` are the minutes in which the best plan reaches `goal`, and those in which
+    none can.
     `before` and `after` (draw, point) are errors of p (fraction) at `x`, `y` (deg), NaN where one exposure holds no u.
     `beside` are other plans of the same time: their criterion, told likewise; `notes` what had to be left out.
     """
@@ -186,7 +188,9 @@ class ExposurePlan(Displayed):
             facts[name] = f"{digits(told, '.3g')}{unit}; {factor:.2g} times the variance"
         rows = tuple(
             (
-                line.kind if line.number < 0 else f"{line.kind} {line.number}" + ("" if line.place is None else f" at {line.place}"),
+                line.kind
+                if line.number < 0
+                else f"{line.kind} {line.number}" + ("" if line.place is None else f" at {line.place}"),
                 line.filter,
                 ", ".join(f"{p} {_angle(a)}" for p, a in line.positions.items()),
                 _angle(line.polariser_angle if np.isfinite(line.polariser_angle) else None),
@@ -271,7 +275,7 @@ def plan_from(
     total = _total(experiment, best)
     return ExposurePlan(
         minutes=minutes,
-        lines=tuple(_described(found, experiment, lines, total)),
+        lines=tuple(_described(found, experiment, lines, best)),
         wanted=want,
         value=want.told(best.value),
         bound=want.told(weights.bound),
@@ -317,7 +321,7 @@ def _cost(experiment: Experiment, plan: Allocation) -> float:
 
 
 def _whole(found: Candidates, experiment: Experiment, weights: Allocation) -> tuple[Allocation, list[Line]]:
-    """Whole exposures in order that fit into the time with their changes; settings that are not worth theirs left out."""
+    """Whole exposures in order, within the time with their changes, without settings that are not worth theirs."""
     used = sorted({int(i) for i in weights.family})
     settings = list(dict.fromkeys(found.choices[i].setting for i in used))
     best = _within(found, experiment, weights, range(len(found.choices)))
@@ -465,12 +469,12 @@ def criterion(experiment: Experiment, total: Float[np.ndarray, "r n n"]) -> floa
 
 
 def _described(
-    found: Candidates, experiment: Experiment, lines: list[Line], total: Float[np.ndarray, "r n n"]
+    found: Candidates, experiment: Experiment, lines: list[Line], best: Allocation
 ) -> Iterator[PlannedExposure]:
-    here = criterion(experiment, total)
+    keys = [(int(f), float(p[0])) for f, p in zip(best.family, best.place, strict=True)]
+    without, more = worth(experiment, best)
     for line, change in zip(lines, _changes(found, lines), strict=True):
-        choice = found.choices[line.choice]
-        own = _of(experiment, line.choice, line.place)
+        choice, i = found.choices[line.choice], keys.index((line.choice, line.place))
         stop = choice.stop(line.place)
         each = float(experiment.families[line.choice].cost_at(np.array([[line.place]]))[0])
         yield PlannedExposure(
@@ -481,8 +485,8 @@ def _described(
             number=stop.number if choice.kind in ("moon", "standard") else -1,
             times=line.times,
             seconds=line.times * each,
-            left_out=criterion(experiment, total - line.times * own) / here,
-            one_more=criterion(experiment, total + own) / here,
+            left_out=float(without[i]),
+            one_more=float(more[i]),
             exptime=choice.seconds,
             change=change,
             place=stop.place,

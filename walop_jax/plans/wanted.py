@@ -1,7 +1,7 @@
 """What a plan is to know well: linear functions of the parameters, by name.
 
-Error of p   of stars behind the calibration alone: δ(q, u) = −M⁻¹ (δm₁ + δM (q, u)), hence δp = −e · M⁻¹ δm s, linear in
-             the six elements of δm and so in the parameters (`science.field_accuracy`). Mean square over stars with
+Error of p   of stars behind the calibration alone: δ(q, u) = −M⁻¹ (δm₁ + δM (q, u)), hence δp = −e · M⁻¹ δm s, linear
+             in the six elements of δm and so in the parameters (`science.field_accuracy`). Mean square over stars with
              p ≤ 5 %, at points of the field, through every filter, for stars of some colours. Where |det M| is below
              `LEAST_DETERMINANT` one exposure holds no u, and no plan of calibrations brings it back.
 Parameter    its variance, e.g. `collimator.curvature`.
@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.calibration.matrix import matrix_slopes
+from walop_jax.data.schema import Column
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import InputTable, numeric_column
-from walop_jax.data.schema import Column
 from walop_jax.model.parameters import unknown_name
 from walop_jax.plans.exposures import Candidates
 from walop_jax.science.star_errors import sample_stars
@@ -96,7 +96,7 @@ def field_errors(
     *,
     colours: Sequence[float] = COLOURS,
     points: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]] | None = None,
-    stars: Float[np.ndarray, "*p n 2"] | None = None,
+    stars: Float[np.ndarray, "*b m 2"] | None = None,
 ) -> FieldErrors:
     """How p depends on the parameters, at a grid of points (or those given, deg).
 
@@ -122,9 +122,9 @@ def _at(
     values: Float[np.ndarray, " n"],
     x: Float[np.ndarray, " p"],
     y: Float[np.ndarray, " p"],
-    stars: Float[np.ndarray, "*p n 2"],
+    stars: Float[np.ndarray, "*b m 2"],
     colours: Sequence[float],
-) -> tuple[Float[np.ndarray, "p 6 f"], Float[np.ndarray, "p 6 6"], Float[np.ndarray, " p"]]:
+) -> tuple[Float[np.ndarray, "t 6 f"], Float[np.ndarray, "t 6 6"], Float[np.ndarray, " t"]]:
     model, plan = found.model, found.could.plan
     instrument, select = model.instrument(values), model.selection()
     each = np.broadcast_to(stars, (len(x), *stars.shape[-2:]))
@@ -175,11 +175,15 @@ def wanted(found: Candidates, field: FieldErrors | None, criterion: str | InputT
 
 
 def _of_stars(found: Candidates, table: InputTable) -> Wanted:
-    rules: dict[str, Any] = {name: Column("float", unit) for name, unit in (("X", "deg"), ("Y", "deg"), ("Q", ""), ("U", ""))}
+    rules: dict[str, Any] = {
+        name: Column("float", unit) for name, unit in (("X", "deg"), ("Y", "deg"), ("Q", ""), ("U", ""))
+    }
     x, y, q, u = (numeric_column(table, name, rule) for name, rule in rules.items())
     teff = numeric_column(table, "TEFF", Column("float", "K", missing=np.nan))
     if np.any(np.hypot(q, u) == 0):
-        raise ValueError(f"{table.path}: a star with Q = U = 0 has no p; leave it out, or state what is expected of it")
+        raise ValueError(
+            f"{table.path}: a star with Q = U = 0 has no p; leave it out, or state what is expected of it"
+        )
     parts = []
     for colour in np.unique(teff):
         here = np.flatnonzero((teff == colour) | (np.isnan(teff) & np.isnan(colour)))

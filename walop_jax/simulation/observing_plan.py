@@ -147,7 +147,9 @@ class ObservingPlan:
                     raise unknown_name("moving element of a stop", prefix, tuple(self.moving))
             total = {"moon": self.moon_patches, "standard": self.standards}.get(stop.kind, 1)
             if not 0 <= stop.number < total:
-                raise ValueError(f"a stop: there is no {stop.kind} {stop.number}; they go from 0 to {total - 1}")
+                raise ValueError(
+                    f"a stop: there is no {stop.kind} {stop.number}; they go from 0 to {total - 1}"
+                )
             if stop.place is not None and not 0 <= stop.place < self.standard_grid**2:
                 raise ValueError(f"a stop: places of standards go from 0 to {self.standard_grid**2 - 1}")
         for name, total in (("patches", self.moon_patches), ("stars", self.standards)):
