@@ -47,8 +47,8 @@ def from_elsewhere(calset, rng):
 
 MISTAKES = [
     with_cameras_exchanged,
-    with_random_intensities,
-    with_scrambled_angles,
+    pytest.param(with_random_intensities, marks=pytest.mark.long),
+    pytest.param(with_scrambled_angles, marks=pytest.mark.long),
     pytest.param(from_elsewhere, marks=pytest.mark.long),
 ]
 
