@@ -21,13 +21,16 @@ TOPICS = (
     "adding-a-command",
     "adding-an-effect",
     "adding-an-instrument",
+    "coming-from",
     "conventions",
     "effects",
     "files",
+    "large-sets",
     "model",
     "organisation",
     "recipes",
     "sources",
+    "validation",
     "vocabulary",
 )
 every_page = pytest.mark.parametrize("topic", TOPICS)

@@ -9,11 +9,13 @@ from walop_jax.commands.clip import clip as clip
 from walop_jax.commands.compare import compare as compare
 from walop_jax.commands.compress import compress as compress
 from walop_jax.commands.conformance import conformance as conformance
+from walop_jax.commands.demo import demo as demo
 from walop_jax.commands.diagnose import diagnose as diagnose
 from walop_jax.commands.docs import docs as docs
 from walop_jax.commands.epoch import epoch as epoch
 from walop_jax.commands.import_zemax import import_zemax as import_zemax
 from walop_jax.commands.inputs import read as read
+from walop_jax.commands.inputs import save as save
 from walop_jax.commands.inspect import inspect as inspect
 from walop_jax.commands.instrument import instrument as instrument
 from walop_jax.commands.limits import limits as limits

@@ -175,7 +175,13 @@ CASES = {
     "conformance": Case(lambda g: ("--make", g.pack), lambda g, **k: walop.conformance(make=g.pack, **k)),
     "docs": Case(lambda g: ("files",), lambda g, **k: walop.docs("files", **k)),
 }
-ELSEWHERE = {"compress", "clip", "sample", "plan"}  # frames; fit/test_outliers; test_sample; tests/plans
+ELSEWHERE = {
+    "demo",
+    "compress",
+    "clip",
+    "sample",
+    "plan",
+}  # frames; fit/test_outliers; test_sample; tests/plans
 CHEAP = [name for name, case in CASES.items() if not case.long]
 WRITING = [name for name in CHEAP if CASES[name].output]
 TABLE = [pytest.param(name, marks=[pytest.mark.long] if CASES[name].long else []) for name in CASES]

@@ -9,6 +9,7 @@ import dataclasses
 import datetime
 import functools
 import hashlib
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,12 +37,12 @@ from walop_jax.data.settings import (
     single_wavelength,
 )
 from walop_jax.fit.model_file import model_without_data, render, standard_names
-from walop_jax.fit.parameter_table import HEAD, parameter_notes, parameter_rows, parameter_table
+from walop_jax.fit.parameter_table import HEAD, Estimate, parameter_notes, parameter_rows, parameter_table
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import STATED, Hidden, Quality, Verdict
 from walop_jax.instruments.description import parsed
 from walop_jax.io.code import software_versions
-from walop_jax.io.display import Display, Displayed
+from walop_jax.io.display import Display, Result
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.text import in_ascii
 from walop_jax.model import carried
@@ -87,7 +88,7 @@ class ListedModel(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Calibration(Displayed):
+class Calibration(Result):
     """An instrument as fitted: model, values and covariance of all parameters, and where they come from.
 
     `field` is (smallest x, largest x, smallest y, largest y) in degrees of the points that were used. `residuals` is
@@ -248,6 +249,18 @@ class Calibration(Displayed):
         where = "" if self.path is None else f"{self.path}: "
         why = "; ".join(self.verdict.warnings) or "see WARNINGS"
         return (f"{where}this calibration is not trusted: {why}",)
+
+    @staticmethod
+    def read(path: str | os.PathLike[str]) -> Calibration:
+        """The calibration of a product, or of the folder of a run. Raises `DataError` for what cannot be read."""
+        from walop_jax.calibration.product import read_calibration
+
+        return read_calibration(path)
+
+    def __getitem__(self, name: str) -> Estimate:
+        """A parameter by name: value, standard error and unit; ValueError with the nearest names if there is none."""
+        at = self.model.index(name)
+        return Estimate(float(self.values[at]), float(self.sigma[at]), self.model.parameters[at].unit)
 
     def to_table(self) -> Any:
         """All parameters as an astropy table: value, error, unit, start, prior, and whether it was free."""

@@ -10,6 +10,7 @@ import os
 import sys
 
 COMMANDS = {
+    "demo": "Fit the small calibration set that comes with the package, and write the page about it.",
     "inspect": "Say what is in calibration sets and what is wrong with them.",
     "simulate": "Make a calibration set of an instrument whose as-built values are drawn from their priors.",
     "refit": "Fit all field points of calibration sets jointly.",

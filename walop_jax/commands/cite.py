@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.inputs import Effects, PathLike, catalogue_of
+from walop_jax.commands.inputs import Effects, PathLike, calibration_of, catalogue_of
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
+    from walop_jax import Calibration, FitResult, Run
     from walop_jax.model.references import Reference
 
 RUN = Argument("Run, or its calibration.fits; default: the base model.", "[RUN]", Path)
@@ -18,14 +20,14 @@ RUN = Argument("Run, or its calibration.fits; default: the base model.", "[RUN]"
 @command()
 def cite(
     job: Job,
-    run: Annotated[PathLike | None, RUN] = None,
+    run: Annotated[Calibration | FitResult | Run | PathLike | None, RUN] = None,
     *,
     bibtex: Annotated[bool, Option("As BibTeX entries.")] = False,
     effects: Effects = None,
 ) -> Outcome[tuple[Reference, ...]]:
     """List the sources of the physics in a fitted model, effects included."""
     from walop_jax import __version__
-    from walop_jax.calibration import product_path, read_calibration
+    from walop_jax.calibration import product_path
     from walop_jax.fit import minimise
     from walop_jax.fit.model_file import model_without_data
     from walop_jax.model.instrument import nominal_instrument
@@ -35,9 +37,9 @@ def cite(
     if run is None:
         model = model_without_data(nominal_instrument())
     else:
-        path = product_path(run)
+        path = product_path(run) if isinstance(run, str | os.PathLike) else None
         with errors_naming(path):
-            model = read_calibration(path, catalogue_of(effects)).model
+            model = calibration_of(run if path is None else path, catalogue_of(effects)).model
     found = (*references(model), Reference("fit", minimise.SOURCE))
     lines = [f"{entry.what}: {entry.source}" for entry in found]
     return Outcome(

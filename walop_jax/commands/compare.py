@@ -101,6 +101,7 @@ def compare(
         lambda: f"{found.display().text()}\n{output}",
         files,
         saved_as=DOCUMENT,
+        trusted=trusted,
         warnings=(
             *(() if trusted else (f"the joint fit: {text}" for text in warnings)),
             *left_out_sentences(lost),

@@ -65,7 +65,7 @@ def pages() -> dict[str, str]:
     from importlib.resources import files
 
     folder = files("walop_jax") / "docs"
-    found = (entry for entry in folder.iterdir() if entry.name.endswith(".md"))
+    found = (entry for entry in folder.iterdir() if entry.name.endswith(".md") and entry.name != "index.md")
     texts = {entry.name.removesuffix(".md"): entry.read_text(encoding="utf-8") for entry in found}
     return dict(sorted(texts.items()))
 

@@ -190,6 +190,31 @@ def calibration_of(given: Product, effects: Effects = None) -> Calibration:
     return read_calibration(folder_of(given), catalogue_of(effects))
 
 
+def save(
+    result: FitResult | Calibration | Run, folder: str | os.PathLike[str], *, overwrite: bool = False
+) -> None:
+    """Write a fit as the folder of a run: calibration.fits and summary.json; of a calibration the first alone.
+
+    Raises `DataError` where they exist already and `overwrite` is False.
+    """
+    from walop_jax import Calibration, FitResult, Run
+    from walop_jax.calibration import PRODUCT, SUMMARY, summary, write_calibration
+    from walop_jax.io.errors import fail
+    from walop_jax.io.folder import output_folder
+    from walop_jax.io.text import json_text
+
+    held = result.calibration if isinstance(result, Run) else result
+    if held is None:
+        raise fail("holds no calibration", file=getattr(result, "folder", ""), advice="give a fit")
+    product = Calibration.from_fit(held) if isinstance(held, FitResult) else held
+    names = (PRODUCT, SUMMARY) if isinstance(held, FitResult) else (PRODUCT,)
+    with output_folder(folder, names, overwrite=overwrite) as out, out.filled() as there:
+        write_calibration(there / PRODUCT, product)
+        if isinstance(held, FitResult):
+            content = summary(held, seconds=held.seconds)
+            (there / SUMMARY).write_text(json_text(content), encoding="utf-8")
+
+
 def folder_of(run: Run | PathLike) -> Path:
     """The folder of a run, or whatever else a path names."""
     from walop_jax import Run

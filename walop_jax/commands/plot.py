@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.inputs import Effects, PathLike, catalogue_of, folder_of
+from walop_jax.commands.inputs import Effects, PathLike, catalogue_of
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
-    from walop_jax import Run
+    from walop_jax import Calibration, FitResult, Run
 
 FORMATS = (".pdf", ".png", ".svg", ".eps", ".jpg")
 RUN = Argument("Folder of results; none: list the figures.", "[RUN]", Path)
@@ -23,7 +24,7 @@ PARAMETERS = Option("Coefficients of a corner or trace plot, by name.", "A,B,…
 @command(writes=())
 def plot(
     job: Job,
-    run: Annotated[PathLike | Run | None, RUN] = None,
+    run: Annotated[FitResult | Calibration | Run | PathLike | None, RUN] = None,
     name: Annotated[str | None, NAME] = None,
     *,
     output: Annotated[PathLike | None, FILE] = None,
@@ -37,9 +38,11 @@ def plot(
     Without a name the figures are listed: accuracy of p over the field, maps of the matrix and of the retardance of the
     half-wave plates, camera transmissions, corner plots, and others. The format follows the name of the file.
 
-    In Python: the matplotlib figure, written if `output` is given; without a name, what each figure shows, by name.
+    In Python: the matplotlib figure, of a run or of a fit or calibration in memory, written if `output` is given;
+    without a name, what each figure shows, by name.
     Raises `DataError`, with the nearest names, for a figure that does not exist and for what the run lacks.
     """
+    from walop_jax import Run
     from walop_jax.io.atomic import check_output
     from walop_jax.reports.named import FIGURES, Source, draw
     from walop_jax.reports.posterior_figures import save_figure
@@ -55,15 +58,18 @@ def plot(
         if path.suffix.lower() not in FORMATS:
             raise fail("is no picture that can be written", file=path, advice=f"use {', '.join(FORMATS)}")
         check_output(path, overwrite=job.overwrite)
-    folder = folder_of(run)
-    if not folder.is_dir():
+    catalogue = catalogue_of(effects)
+    held = Run(Path(run), catalogue) if isinstance(run, str | os.PathLike) else run
+    if isinstance(held, Run) and not held.folder.is_dir():
         raise fail(
-            "is not the folder of a run", file=folder, advice="give the RUN of walop-jax refit or diagnose"
+            "is not the folder of a run",
+            file=held.folder,
+            advice="give the RUN of walop-jax refit or diagnose",
         )
     if isinstance(parameters, str):
         parameters = [part.strip() for part in parameters.split(",") if part.strip()]
     job.tell(f"drawing {name}")
-    figure = draw(name, Source(folder, catalogue_of(effects), tuple(parameters or ()), (x, y)))
+    figure = draw(name, Source.of(held, parameters=tuple(parameters or ()), place=(x, y)))
     if path is not None:
         save_figure(path, figure, overwrite=job.overwrite)
     return Outcome(figure, lambda: {"figure": name, "output": str(path)}, lambda: str(path))

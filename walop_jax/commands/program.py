@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib
 import inspect
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -40,6 +42,22 @@ EXIT_CODES = (
     "Exit codes: 0 done; 1 not done, or a check that does not hold, with one line on stderr; 2 wrong usage; 3 done, "
     "but the result is not to be trusted; 130 interrupted."
 )
+NEXT = {
+    "inspect": ("walop-jax refit {data} -o RUN",),
+    "simulate": ("walop-jax refit {output} -o RUN",),
+    "compress": ("walop-jax refit {output} -o RUN",),
+    "clip": ("walop-jax refit {output} -o RUN",),
+    "import_zemax": ("walop-jax refit {output} -o RUN",),
+    "sample": ("walop-jax report {fit}",),
+    "limits": ("walop-jax report {output}", "walop-jax plan"),
+    "compare": ("walop-jax report {output}",),
+    "epoch": ("walop-jax report {output}",),
+    "apply": ("walop-jax watch {calibration} {output}, with the nights to come",),
+    "report": ("open the page in a browser",),
+    "certify": ("walop-jax apply {calibration} STARS.fits -o OUT.fits",),
+}
+"""What one might type after a command, where the command itself does not say; names are those of its arguments."""
+
 QUIET = Option("Print nothing but warnings and errors.", short="-q", kind=bool)
 JSON = Option("Machine-readable result to stdout, nothing else.", kind=bool)
 
@@ -203,7 +221,18 @@ def _run(command: Command[Any], given: dict[str, Any]) -> None:
     with progress(quiet or json, command.stages) as tell:
         found = command.run(Job(progress=tell, typed=True, **common), given)
     if not found.silent:
-        _show(found, quiet, json)
+        _show(dataclasses.replace(found, next=found.next or _next_steps(command, given)), quiet, json)
+
+
+def _next_steps(command: Command[Any], given: dict[str, Any]) -> tuple[str, ...]:
+    """The lines of `NEXT` for what was given; those that need an output which was not written are left out."""
+    words = {
+        name: " ".join(map(str, value)) if isinstance(value, list) else str(value)
+        for name, value in given.items()
+        if value is not None
+    }
+    lines = NEXT.get(command.name, ())
+    return tuple(line.format_map(words) for line in lines if set(re.findall(r"{(\w+)}", line)) <= set(words))
 
 
 def _show(found: Outcome[Any], quiet: bool, json: bool) -> None:
@@ -217,7 +246,8 @@ def _show(found: Outcome[Any], quiet: bool, json: bool) -> None:
     elif not quiet and (text := found.shown()):
         _print(text, found.markdown)
         if found.next and not found.failure:
-            typer.echo(f"Done in {seconds_since_start():.0f} s. Next: {' or '.join(found.next)}")
+            # On stderr: what is on stdout may be redirected into a file.
+            typer.echo(f"Done in {seconds_since_start():.0f} s. Next: {' or '.join(found.next)}", err=True)
     if found.failure:
         sys.stdout.flush()
         complain(found.failure)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.inputs import Effects, PathLike, catalogue_of, folder_of
+from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
+from walop_jax.commands.inputs import Effects, PathLike, catalogue_of, folder_of, save
 from walop_jax.io.display import Display, Displayed
 
 if TYPE_CHECKING:
-    from walop_jax import Run
+    from walop_jax import FitResult, Run
 
 PAGE = "report.html"
 GENERATOR = '<meta name="generator" content="walop-jax'
@@ -39,7 +40,7 @@ class Page(Displayed):
 @command(stages=("reading", "drawing"), writes=())
 def report(
     job: Job,
-    run: Annotated[PathLike | Run, RUN],
+    run: Annotated[FitResult | Run | PathLike, RUN],
     output: Annotated[PathLike | None, FILE] = None,
     *,
     effects: Effects = None,
@@ -53,13 +54,20 @@ def report(
     well; compare, epoch and limits have pages of their own. A page that exists is made anew; another file of that
     name is left alone unless --overwrite is given.
 
-    In Python: a `Page`.
+    In Python: a `Page`; of a fit in memory, which needs an `output`.
     """
+    from walop_jax import FitResult, Run
     from walop_jax.io.atomic import atomic_path, check_output
     from walop_jax.io.text import printable
     from walop_jax.reports.page import kind_of_run, render, render_other
     from walop_jax.reports.run import read_run
 
+    if isinstance(run, FitResult):
+        if output is None:
+            raise UsageError("say where the page of a fit in memory is to be written", "output")
+        with tempfile.TemporaryDirectory() as temporary:
+            save(run, Path(temporary) / "fit")
+            return report.command.body(job, Path(temporary) / "fit", output, effects=effects)
     folder = folder_of(run)
     target = folder / PAGE if output is None else Path(output)
     job.begin("reading")

@@ -33,6 +33,13 @@ AT = Option(
 TEFF = Option("Colour temperature (K); without it, a flat spectrum.", kind=float)
 
 
+class Traced(tuple["Stage", ...]):
+    """The stages of a sightline; prints as the table of the command."""
+
+    def __repr__(self) -> str:
+        return "\n".join(table(self))
+
+
 def _numbers_first(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
     """Numbers by their position are x, y, q and u; other keywords are elements, by the prefix of their columns."""
     if args and isinstance(args[0], numbers.Real):
@@ -56,7 +63,7 @@ def trace(
     teff: Annotated[float | None, TEFF] = None,
     filter: Annotated[str, Option("Filter of the calibration, or SDSS-r.")] = "SDSS-r",
     **positions: float,
-) -> Outcome[tuple[Stage, ...]]:
+) -> Outcome[Traced]:
     """Follow the light of one source through the instrument.
 
     Every line is the light at one place: Stokes vectors averaged over the band, then the cameras. The
@@ -88,7 +95,7 @@ def trace(
         stages = traced(held.model.instrument(held.values), held.filter_curve(filter), line)
         warnings = (*held.warnings, *left_out_sentences(lost, held.path))
     return Outcome(
-        stages,
+        Traced(stages),
         lambda: {
             "stages": [
                 {

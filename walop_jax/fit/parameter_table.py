@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,19 @@ Columns = dict[str, tuple[np.ndarray, str, str]]
 
 PRIOR_ONLY = 0.99  # of the prior width: an error above it owes nothing to the data
 HEAD = ("parameter", ">value", ">error", "unit", ">start", "prior", "")
+
+
+class Estimate(NamedTuple):
+    """A number with its standard error and unit; prints as 15.649 ± 0.004 deg."""
+
+    value: float
+    sigma: float
+    unit: str
+
+    def __str__(self) -> str:
+        return f"{with_error(self.value, self.sigma)} {self.unit}".rstrip()
+
+    __repr__ = __str__
 
 
 def unconstrained(model: Model, sigma: Vector) -> tuple[str, ...]:
@@ -59,7 +72,8 @@ def parameter_rows(model: Model, values: Vector, sigma: Vector) -> tuple[tuple[s
         start = "" if same else with_minus_sign(f"{p.start + 0.0:.6g}")
         texts = value_and_error(float(value), float(s))
         rows.append((p.name, *texts, p.unit, start, prior, _state(p, idle)))
-    return tuple(rows)
+    # Standards last: they are no part of the instrument.
+    return tuple(sorted(rows, key=lambda row: row[0].startswith("standard.")))
 
 
 def parameter_notes(model: Model, sigma: Vector) -> tuple[str, ...]:

@@ -16,12 +16,12 @@ from jaxtyping import Float
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.minimise import Minimum
 from walop_jax.fit.model_file import base_model, render
-from walop_jax.fit.parameter_table import HEAD, parameter_notes, parameter_rows, parameter_table
+from walop_jax.fit.parameter_table import HEAD, Estimate, parameter_notes, parameter_rows, parameter_table
 from walop_jax.fit.robust import robust_errors
 from walop_jax.fit.search import find_minimum, free_scales
 from walop_jax.fit.verdict import NO_STRUCTURE, STATED, Doubt, Hidden, Quality, Structure, Verdict
 from walop_jax.io.code import software_versions
-from walop_jax.io.display import Display, Displayed
+from walop_jax.io.display import Display, Result
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.likelihood import Likelihood, Posterior
 from walop_jax.likelihood.runner import Journal, Processes, Progress, Runner, fingerprint
@@ -41,7 +41,7 @@ ILL_CONDITIONED = (
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class FitResult(Displayed):
+class FitResult(Result):
     """A fit, the likelihood that it maximises, and the verdict on it.
 
     `values` and `covariance` are of all parameters in tree order, frozen ones with zero variance. `verdict` is None
@@ -188,6 +188,10 @@ class FitResult(Displayed):
         return tuple(
             doubt.sentence for doubt in _against(self, (), examined=False, noiseless=False) if doubt.sentence
         )
+
+    def __getitem__(self, name: str) -> Estimate:
+        """A parameter by name: value, standard error and unit; ValueError with the nearest names if there is none."""
+        return Estimate(*self.value(name), self.model[name].unit)
 
     def value(self, name: str) -> tuple[float, float]:
         """Value and standard error of a parameter."""

@@ -5,7 +5,13 @@ from __future__ import annotations
 import abc
 import dataclasses
 import html
+import importlib
+import os
 from collections.abc import Iterator
+from typing import Any
+
+MOST_LINES = 25
+"""Of what a result shows of itself unasked."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +46,15 @@ class Display:
                 )
                 yield ("  " + "  ".join(cells)).rstrip()
         yield from (f"  {note}" for note in self.notes)
+
+    def shortened(self, most: int) -> Display:
+        """The same in at most `most` lines: rows of the table go, and it is said how many."""
+        room = most - 3 - len(self.facts) - len(self.notes)
+        if len(self.rows) <= room + 1:
+            return self
+        rows = self.rows[: max(room, 1)]
+        note = f"… and {len(self.rows) - len(rows)} more rows"
+        return dataclasses.replace(self, rows=rows, notes=(note, *self.notes))
 
     def html(self) -> str:
         """HTML that takes its colours from the page that it stands in."""
@@ -83,7 +98,27 @@ class Displayed(abc.ABC):
         """What to show."""
 
     def __repr__(self) -> str:
-        return self.display().text()
+        return self.display().shortened(MOST_LINES).text()
 
     def _repr_html_(self) -> str:
-        return self.display().html()
+        return self.display().shortened(MOST_LINES).html()
+
+    def summary(self) -> str:
+        """Everything that there is to show, as text."""
+        return self.display().text()
+
+
+class Result(Displayed):
+    """Something with a calibration in it: what can be done with it is asked of the public functions."""
+
+    def plot(self, name: str = "matrix", **options: Any) -> Any:
+        """One of its figures by name; `walop_jax.plot()` lists them, and `options` are its."""
+        return importlib.import_module("walop_jax").plot(self, name, **options)
+
+    def report(self, output: str | os.PathLike[str], **options: Any) -> Any:
+        """Write the page about it."""
+        return importlib.import_module("walop_jax").report(self, output, **options)
+
+    def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write it as the folder of a run, which every command reads."""
+        importlib.import_module("walop_jax").save(self, folder, overwrite=overwrite)

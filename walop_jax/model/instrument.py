@@ -108,6 +108,14 @@ class Instrument(Component):
     raster: tuple[str, float] = eqx.field(static=True, default=("square", 0.0))
     description: str = eqx.field(static=True, default="", repr=False)
 
+    def __repr__(self) -> str:
+        arms = "; ".join(f"{arm.name}: {' > '.join(arm.path)}" for arm in self.arms)
+        effects = f"; effects: {', '.join(effect.name for effect in self.effects)}" if self.effects else ""
+        return (
+            f"Instrument {self.name}, cameras {', '.join(self.cameras.names)}\n"
+            f"  light path  {' > '.join(self.path)}\n  arms        {arms}{effects}"
+        )
+
     @classmethod
     def read(cls, source: str | os.PathLike[str], **options: Any) -> Instrument:
         """The instrument of a description file, or a shipped one by name; options as for `build`.

@@ -26,7 +26,7 @@ THROUGHPUT = "throughput"
 """The part of an instrument that is a smooth map: its terms mean nothing one by one."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Model:
     """An instrument with what may vary in it. Immutable: every change returns a new model.
 
@@ -37,6 +37,10 @@ class Model:
     template: Instrument
     parameters: tuple[Parameter, ...]
     catalogue: tuple[type[Effect], ...] = EFFECTS
+
+    def __repr__(self) -> str:
+        effects = ", ".join(self.effect_names) or "none beyond the base model"
+        return f"Model of {self.name}: {len(self.parameters)} parameters, {len(self.free)} free; effects: {effects}"
 
     def __post_init__(self) -> None:
         names = self.names

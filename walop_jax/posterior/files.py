@@ -38,8 +38,9 @@ from walop_jax.fit.model_file import model_for
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.verdict import STATED
 from walop_jax.io.atomic import atomic_path
-from walop_jax.io.display import Display, Displayed
+from walop_jax.io.display import Display, Result
 from walop_jax.io.errors import fail
+from walop_jax.io.rounding import two_digits
 from walop_jax.io.text import read_json
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
@@ -303,7 +304,7 @@ SAME_FIT = 0.05  # standard errors
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Run(Displayed):
+class Run(Result):
     """The folder of a run; everything in it is read when it is asked for. None stands for what is not there.
 
     `catalogue` are the effects that its model may have.
@@ -311,6 +312,9 @@ class Run(Displayed):
 
     folder: Path
     catalogue: Sequence[type[Effect]] = EFFECTS
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "folder", Path(self.folder))
 
     def __contains__(self, name: str) -> bool:
         return (self.folder / name).exists()
@@ -363,11 +367,16 @@ class Run(Displayed):
         return calset
 
     def _located(self, path: Path) -> Path:
-        for folder in (Path(), self.folder, self.folder.parent):
-            if (folder / path).exists():
-                return folder / path
-        what = "the data of this run are not there any more"
-        raise fail(what, file=path, advice="put them back, or refit")
+        beside = self.folder.resolve()
+        for folder in (Path(), beside, *beside.parents):
+            for there in (folder / path, folder / path.name):
+                if there.exists():
+                    return there
+        raise fail(
+            f"cannot be found, neither from {Path.cwd()} nor beside {self.folder}",
+            file=path,
+            advice="copy it into the folder of the run, or run the command where the fit was made",
+        )
 
     def fit(self, model_text: str | None = None) -> FitResult:
         """The fit of the run, made once more from where it ended; `model_text` is the model file of the fit.
@@ -415,6 +424,12 @@ class Run(Displayed):
         files = {"calibration": PRODUCT, "posterior": POSTERIOR}
         held = [name for name, file in files.items() if file in self]
         facts = [("holds", ", ".join([*held, *found]) or "nothing")]
+        known = found.get("summary", {}).get("accuracy_of_p")
+        if known and found["summary"].get("trusted"):
+            share = f"below 0.1 % over {100 * known['share_below_goal']:.0f} % of it"
+            facts.append(
+                ("p of a star", f"{two_digits(100 * known['median'])} % (median of the field), {share}")
+            )
         if "diagnosis" in found:
             facts.append(("verdict", str(found["diagnosis"].get("verdict"))))
         inner = Display("") if self.calibration is None else self.calibration.display()

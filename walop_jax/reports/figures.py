@@ -21,7 +21,7 @@ from walop_jax.calibration.maps import MatrixMaps, ResidualMap
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
-from walop_jax.io.rounding import two_digits
+from walop_jax.io.rounding import two_digits, with_minus_sign
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.reports.style import (
     AFTER,
@@ -57,15 +57,18 @@ def matrix_figure(calibration: Calibration, settings: Settings | None = None) ->
 
 
 def residual_figure(result: FitResult, before: Float[np.ndarray, " n"] | None = None) -> Figure:
-    """Residuals of every field point before and after a fit; a histogram of the latter.
-
-    `before` is a full vector of parameter values (default: the start values of the model).
-    """
-    likelihood = result.likelihood
+    """`residuals_figure` of a fit in memory; `before` defaults to the start values of its model."""
     start = result.model.start if before is None else before
+    return residuals_figure(result.likelihood, result.values, start)
+
+
+def residuals_figure(
+    likelihood: Likelihood, values: Float[np.ndarray, " n"], before: Float[np.ndarray, " n"]
+) -> Figure:
+    """Residuals of every field point before and after a fit, full vectors of parameters; a histogram of the latter."""
     figure = empty_figure(9.6, 3.2)
     left, middle, right = figure.subplots(1, 3)
-    maps = [point_residuals(likelihood, values) for values in (start, result.values)]
+    maps = [point_residuals(likelihood, one) for one in (before, values)]
     norm = LogNorm(0.7, max(2.0, float(np.nanmax(maps[0]))))
     field_axes(left, "before the fit")
     field_axes(middle, "after the fit")
@@ -74,7 +77,7 @@ def residual_figure(result: FitResult, before: Float[np.ndarray, " n"] | None = 
     bar.set_label("rms residual (σ)", fontsize=8)
     bar.ax.tick_params(labelsize=7)
     middle.set_ylabel("")
-    _histogram(right, likelihood, result.values)
+    _histogram(right, likelihood, values)
     return figure
 
 
@@ -192,7 +195,7 @@ def modulation_figure(calset: CalibrationSet, points: Sequence[int]) -> Figure:
         for k, point in enumerate(points):
             rows = shown[block.used[point, shown]]
             first, second = block.counts[point, rows, pair], block.counts[point, rows, pair + 1]
-            where = f"({block.x[point]:+.2f}°, {block.y[point]:+.2f}°)"
+            where = with_minus_sign(f"({block.x[point]:+.2f}°, {block.y[point]:+.2f}°)")
             axis.plot(
                 e.clp_angle[rows], (first - second) / (first + second), "os^Dv"[k % 5], ms=4, label=where
             )

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,9 @@ from matplotlib.figure import Figure
 
 from walop_jax.calibration import PRODUCT, Calibration, MatrixMaps
 from walop_jax.diagnosis.limits_found import DetectionLimits
+from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import fail, nearest
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.posterior import Run
 from walop_jax.posterior.files import LIMITS, POSTERIOR
 from walop_jax.reports import diagnosis_figures, figures, paper_figures, posterior_figures
@@ -28,6 +32,31 @@ class Source(Run):
 
     parameters: tuple[str, ...] = ()
     place: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def of(cls, given: FitResult | Calibration | Run, **options: Any) -> Source:
+        """What a fit or a calibration in memory holds, or the folder of a run."""
+        if isinstance(given, Run):
+            return cls(given.folder, given.catalogue, **options)
+        held = Calibration.from_fit(given) if isinstance(given, FitResult) else given
+        made = cls(Path("in memory"), **options)
+        vars(made).update(product=held, calibration=held, documents={}, posterior=None)
+        if isinstance(given, FitResult):
+            vars(made).update(calset=given.calset, likelihood=given.likelihood)
+        return made
+
+    def wanted(self, name: str, advice: str) -> Path:
+        """As for any run; what is held in memory has no file."""
+        return (
+            self.folder / name
+            if name == PRODUCT and "product" in vars(self)
+            else super().wanted(name, advice)
+        )
+
+    @functools.cached_property
+    def likelihood(self) -> Likelihood:
+        """The likelihood of the data of the run under its model."""
+        return Likelihood.of(self.calset, self.rebuilt.model)
 
     @property
     def maps(self) -> MatrixMaps:
@@ -60,6 +89,13 @@ def _accuracy(source: Source) -> Figure:
         advice = "plot matrix-errors"
         raise fail("has a single arm: one exposure holds no p", file=source.folder, advice=advice)
     return figures.accuracy_figure(found)
+
+
+def _residuals(source: Source) -> Figure:
+    c = source.rebuilt
+    if source.likelihood.layout.large:
+        raise fail("was fitted to whole frames", file=source.folder, advice="plot residual-map")
+    return figures.residuals_figure(source.likelihood, c.values, c.model.start)
 
 
 def _residual_map(source: Source) -> Figure:
@@ -166,6 +202,7 @@ FIGURES: Mapping[str, NamedFigure] = {
         ),
         ("separation", "which effects look alike", lambda s: diagnosis_figures.separation_figure(s.limits)),
         ("residual-map", "what the smooth model leaves, of whole frames", _residual_map),
+        ("residuals", "residuals of every field point before and after the fit, and all of them", _residuals),
         ("corner", "posterior of coefficients in pairs", _corner),
         ("trace", "chains of the posterior", _trace),
     )

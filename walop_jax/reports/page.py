@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import io
 import math
 import re
@@ -29,6 +30,7 @@ from walop_jax.io.rounding import (
 )
 from walop_jax.io.text import read_json
 from walop_jax.reports import diagnosis_figures, figures
+from walop_jax.reports.named import Source, draw
 from walop_jax.reports.posterior_figures import MOST_IN_CORNER, informed
 from walop_jax.reports.run import COMPARISON, EPOCH, LIMITS, SUMMARY, RunContents, read_limits
 from walop_jax.reports.wording import (
@@ -234,6 +236,9 @@ def _figures(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, str]
         made["errors"] = figures.matrix_errors_figure(run.product.maps)
         if run.product.residuals is not None:
             made["residual_map"] = figures.residual_map_figure(run.product.residuals)
+    if run.diagnosis is None and run.product is not None:
+        with contextlib.suppress(ValueError, OSError):  # data that are not there: the page says so
+            made["fit_residuals"] = draw("residuals", Source(run.folder))
     if run.figure_data is not None:
         data = run.figure_data
         whole = data.comparisons[0]
@@ -284,6 +289,7 @@ def limits_in_words(found: DetectionLimits | None) -> dict[str, Any] | None:
         "level": f"{level[:1].upper()}{level[1:]}." if level else "",
         "rows": [dict(zip(names, row, strict=True)) for row in found.display().rows],
         "untestable": found.untestable,
+        "median": None if found.worst is None else 100 * float(np.nanmedian(found.protection)),
     }
 
 

@@ -6,6 +6,7 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 
+import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
@@ -149,5 +150,7 @@ def save_figure(
     path: str | os.PathLike[str], figure: Figure, *, overwrite: bool = False, dpi: int = 200
 ) -> None:
     """Write a figure (format by the name); it appears whole or not at all."""
-    with atomic_path(path, overwrite=overwrite) as temporary:
+    # TrueType: journals refuse the Type 3 fonts that matplotlib writes by itself.
+    fonts = {"pdf.fonttype": 42, "ps.fonttype": 42}
+    with atomic_path(path, overwrite=overwrite) as temporary, matplotlib.rc_context(fonts):
         figure.savefig(temporary, dpi=dpi, bbox_inches="tight")

@@ -85,9 +85,7 @@ def read_run(run: Run | Path) -> RunContents:
     product = optional(PRODUCT, lambda path: read_calibration(path, rebuild=False), lost)
     diagnosis = _document(folder / DIAGNOSIS, DIAGNOSIS_KEYS) if DIAGNOSIS in run else None
     figure_data = None
-    if diagnosis is None:
-        missing.append("This run is a refit: maps of the residuals come with walop-jax diagnose.")
-    else:
+    if diagnosis is not None:
         figure_data = optional(
             FIGURE_DATA, read_figure_data, "no maps of the residuals, no curves, no ladder of χ²"
         )

@@ -73,7 +73,7 @@ class Stop:
         return {k: v for k, v in dataclasses.asdict(self).items() if k not in later or v != later[k]}
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class ObservingPlan:
     """A calibration run: where, when, through what.
 
@@ -117,6 +117,14 @@ class ObservingPlan:
     stops: tuple[Stop, ...] = ()
     patches: tuple[int, ...] | None = None
     stars: tuple[int, ...] | None = None
+
+    def __repr__(self) -> str:
+        said = (
+            f"{field.name}={getattr(self, field.name)!r}"
+            for field in dataclasses.fields(self)
+            if field.name != "instrument" and getattr(self, field.name) != field.default
+        )
+        return f"ObservingPlan({', '.join([repr(self.name), *said])})"
 
     def __post_init__(self) -> None:
         if isinstance(self.instrument, str):

@@ -48,6 +48,9 @@ class Simulated(NamedTuple):
     calset: CalibrationSet
     truth: Instrument
 
+    def __repr__(self) -> str:
+        return f"{self.calset!r}\ntruth: {self.truth!r}"
+
 
 def truth_values(truth: Instrument) -> dict[str, float]:
     """The true value of every parameter by name; the names are those of a fit."""
