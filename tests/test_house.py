@@ -49,7 +49,8 @@ MACHINE = re.compile(r"""/(?:home|root|work|tmp|Users|opt|mnt|data)/|[A-Z]:\\\\|
 
 
 def files() -> list[Path]:
-    return sorted(PACKAGE.rglob("*.py"))
+    """All but the configuration of the site, which only Sphinx reads."""
+    return sorted(set(PACKAGE.rglob("*.py")) - {PACKAGE / "docs" / "conf.py"})
 
 
 def room_of(module: str) -> str | None:
