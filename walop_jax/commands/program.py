@@ -150,8 +150,8 @@ def _command(name: str) -> Any:
     word = name.replace("-", "_")
     command: Command[Any] = getattr(importlib.import_module(f"walop_jax.commands.{word}"), word).command
     alone = typer.Typer(add_completion=False, rich_markup_mode=None)
-    described = {"help": _paragraphs(command.body), "short_help": COMMANDS[name]}
-    alone.command(name, context_settings=HELP, **described)(_function(command))
+    page, line = _paragraphs(command.body), COMMANDS[name]
+    alone.command(name, context_settings=HELP, help=page, short_help=line)(_function(command))
     return typer.main.get_command(alone)
 
 

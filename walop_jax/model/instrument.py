@@ -100,7 +100,7 @@ class Instrument(Component):
     throughput: Throughput
     cameras: Cameras
     path: tuple[str, ...] = eqx.field(static=True)
-    effects: tuple[Patch, ...] = ()
+    effects: tuple[Any, ...] = ()  # patches: `effects.base.Effect`
     rotator_zero: Scalar | None = number(unit="deg", about="true ROTATOR minus the header's", default=None)
     filter_shift: Scalar | None = number(unit="um", about="displacement of broad bands", default=None)
     field_limit: float = eqx.field(static=True, default=90.0)

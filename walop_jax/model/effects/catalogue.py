@@ -37,7 +37,7 @@ import sys
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.resources import files
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self, TypeGuard
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -444,7 +444,7 @@ PARTS: Mapping[str, str] = {
 """Parts of the page of effects, by the effect that each begins with."""
 
 
-def is_own(effect: Effect) -> bool:
+def is_own(effect: Effect) -> TypeGuard[Entry]:
     """Whether an effect is an entry that does not come with the package."""
     return isinstance(effect, Entry) and type(effect) not in EFFECTS
 
