@@ -24,7 +24,7 @@ from walop_jax.data.settings import Settings
 from walop_jax.likelihood import limits, linear
 from walop_jax.likelihood.runner import usual_threads
 from walop_jax.model import light
-from walop_jax.model.compiled import compiled
+from walop_jax.model.compiled import array, compiled
 from walop_jax.model.effects.base import Effect, with_amplitudes
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import with_values
@@ -122,7 +122,7 @@ def matrices(
     """
     size = 3 * len(instrument.arms)
     values, errors = np.empty((len(x), size)), np.empty((len(x), size, size))
-    cov = jnp.asarray(covariance)
+    cov = array(covariance)
     columns = (x, y, np.nan_to_num(settings.teff), settings.temperature, settings.hour_angle)
     for layout, rows in settings.layouts():
         plan = plan_for_settings(instrument, layout, filters)
@@ -165,7 +165,7 @@ def in_chunks(
         slices = [column[start : start + size] for column in columns]
         missing = size - len(slices[0])
         # Padding with the last row keeps the arithmetic as tame as that of the data.
-        result = function(*(jnp.asarray(np.pad(part, (0, missing), mode="edge")) for part in slices))
+        result = function(*(array(np.pad(part, (0, missing), mode="edge")) for part in slices))
         return [np.asarray(part)[: size - missing] for part in result]
 
     # The first slice compiles; a slice keeps one core busy.

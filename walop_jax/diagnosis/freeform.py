@@ -24,7 +24,6 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.polynomial.legendre import legvander
@@ -186,10 +185,8 @@ def strata(measured: Measured) -> Iterator[Stratum]:
     further = [(f" {prefix}", prefix) for prefix in measured.likelihood.plan.moving if prefix in e.moving]
     turning = [("θ", POLARISER), *further]
 
-    smooth = np.asarray(legendre.basis(jnp.asarray(points.x), jnp.asarray(points.y), SMOOTH))
-    fine = np.asarray(legendre.basis(jnp.asarray(points.x), jnp.asarray(points.y), FINE))[
-        :, smooth.shape[1] :
-    ]
+    smooth = legendre.basis(points.x, points.y, SMOOTH)
+    fine = legendre.basis(points.x, points.y, FINE)[:, smooth.shape[1] :]
     square = points.x**2 + points.y**2
     rings = legvander(2.0 * square / max(float(square.max()), 1e-300) - 1.0, RINGS[-1])[:, RINGS]
     stokes = measured.likelihood.stokes(measured.values)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -57,7 +56,7 @@ def _harmonics(
 
 def _field_words(design: Design, field: Float[np.ndarray, " p"]) -> str:
     points = design.fit.calset.points
-    basis = np.asarray(legendre.basis(jnp.asarray(points.x), jnp.asarray(points.y), 4))
+    basis = legendre.basis(points.x, points.y, 4)
     degree = np.array([i + j for i, j in legendre.terms(4)])
     if len(field) <= len(degree):
         return "too few points to tell"

@@ -261,7 +261,7 @@ class Columns:
         if not every:
             return {}
         padded = np.pad(np.array(every), (0, -len(every) % (8 * GAPS_TOGETHER)), mode="edge")
-        left = np.asarray(_visible(self.instrument, self.fringe_plan, jnp.asarray(padded)))
+        left = np.asarray(_visible(self.instrument, self.fringe_plan, padded))
         return {gap: bool(value > LEAST_SURVIVING) for gap, value in zip(every, left, strict=False)}
 
     @functools.cached_property
@@ -375,9 +375,7 @@ class _Block:
         sites = [np.stack([one, -one], 1)[:, : self.sites] for one in (x, y)]
         padded = np.pad(np.array(every), (0, -len(every) % GAPS_TOGETHER), mode="edge")
         parts = [
-            np.asarray(
-                _fringes_at(self.of.instrument, self.of.fringe_plan, jnp.asarray(some), *sites, once=True)
-            )
+            np.asarray(_fringes_at(self.of.instrument, self.of.fringe_plan, some, *sites, once=True))
             for some in np.split(padded, len(padded) // GAPS_TOGETHER)
         ]
         whole = np.concatenate(parts, axis=3)

@@ -318,7 +318,7 @@ class Likelihood:
             sums = np.zeros(sum(math.prod(shape) for shape in shapes))
             for chunk in chunks:
                 sums += np.concatenate([sums[:0], *(np.ravel(array) for array in function(chunk))])
-            used = np.concatenate([np.asarray(chunk.weight[..., 0]) > 0 for chunk in chunks])
+            used = np.concatenate([np.asarray(chunk.weight)[..., 0] > 0 for chunk in chunks])
             x, y = (np.concatenate([np.asarray(getattr(chunk, name)) for chunk in chunks]) for name in "xy")
             extent = np.stack([-x, x, -y, y])[:, used.any(axis=1)].max(axis=1, initial=-np.inf)
             return SlabSums(np.concatenate([sums, used.sum(axis=0)]), extent)
@@ -342,7 +342,7 @@ class Likelihood:
     @cached_property
     def used(self) -> Bool[np.ndarray, "p e"]:
         """True where the intensities of a (point, exposure) are used."""
-        return np.concatenate([np.asarray(chunk.weight[..., 0]) > 0 for chunk in self.points])[
+        return np.concatenate([np.asarray(chunk.weight)[..., 0] > 0 for chunk in self.points])[
             : self.layout.points
         ]
 
@@ -394,6 +394,6 @@ class Likelihood:
 
 def used_rows(columns: Array | np.ndarray, chunk: engine.PointData) -> Float[np.ndarray, "d n"]:
     """The rows of a chunk that are used."""
-    used = np.asarray(chunk.weight[..., 0] > 0)
+    used = np.asarray(chunk.weight)[..., 0] > 0
     cube = np.asarray(columns).reshape(*used.shape, chunk.weight.shape[-1], -1)
     return cube[used].reshape(-1, cube.shape[-1])

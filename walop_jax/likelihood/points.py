@@ -12,13 +12,13 @@ import functools
 from collections.abc import Iterator
 from functools import cached_property
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from walop_jax.data.records import Block, CalibrationSet, Exposures, Site
 from walop_jax.likelihood.engine import PointData
 from walop_jax.likelihood.layout import Layout
+from walop_jax.model.compiled import array
 from walop_jax.model.plan import Plan
 from walop_jax.sky.moon import moon_direction, rayleigh_sky
 
@@ -52,14 +52,14 @@ class PointReader:
         weight = np.where(block.used[:, :, None], 1.0 / np.where(sigma > 0, sigma, 1.0), 0.0)
         opposite = self.sky_polarisation(-block.x, -block.y) if self.mirrored else None
         return PointData(
-            x=jnp.asarray(block.x),
-            y=jnp.asarray(block.y),
-            counts=jnp.asarray(np.where(block.used[:, :, None], block.counts, 0.0)),
-            weight=jnp.asarray(weight),
-            sky=jnp.asarray(self.sky_polarisation(block.x, block.y)),
-            source=jnp.asarray(block.source),
-            band=jnp.asarray(band),
-            opposite_sky=None if opposite is None else jnp.asarray(opposite),
+            x=array(block.x),
+            y=array(block.y),
+            counts=array(np.where(block.used[:, :, None], block.counts, 0.0)),
+            weight=array(weight),
+            sky=array(self.sky_polarisation(block.x, block.y)),
+            source=array(block.source),
+            band=array(band),
+            opposite_sky=None if opposite is None else array(opposite),
         )
 
     @cached_property

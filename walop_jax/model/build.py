@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from walop_jax.data.records import POLARISER, PREFIX
@@ -14,6 +13,7 @@ from walop_jax.instruments.description import Description, Reader, Table, is_nam
 from walop_jax.io.errors import nearest
 from walop_jax.model import legendre
 from walop_jax.model.cameras import Cameras, Throughput
+from walop_jax.model.compiled import array
 from walop_jax.model.elements import ELEMENTS, Analyser, Element, Layer, Polariser, WavePlate
 from walop_jax.model.parameters import Component, Parameter, is_row, numbers_of, unknown_name
 
@@ -48,7 +48,7 @@ def parts(description: Description, elements: Sequence[type[Element]] = ()) -> P
     coefficients[:, 0] = description.level
     series = Throughput(
         degree=description.degree,
-        coefficients=jnp.asarray(coefficients),
+        coefficients=array(coefficients),
         scale=description.field_scale,
         declared=Parameter("", "", SERIES, FREE, scale=description.scale, loose=description.loose),
     )

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
+import numpy as np
 
 from walop_jax.model import kept_programs
 
@@ -63,6 +64,11 @@ def compiled(
         return run(*args)
 
     return call
+
+
+def array(values: Any, kind: Any = None) -> jax.Array:
+    """Known numbers as an array of JAX, for use outside of programs: `jnp.asarray` compiles one for each shape."""
+    return values if isinstance(values, jax.Array) else jax.device_put(np.asarray(values, kind))
 
 
 def forget_programs() -> None:

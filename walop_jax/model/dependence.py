@@ -86,9 +86,13 @@ def _follow(structure: Any, shapes: Shapes) -> tuple[Needs, tuple[bool, ...]]:
 
 
 def changed_elements(bare: Instrument, effect: Effect) -> tuple[Element, ...]:
-    """The elements behind the polariser that an effect puts into an instrument or changes."""
+    """The elements behind the polariser that an effect puts into an instrument or changes, with shapes for numbers."""
     before = {id(element) for element in _behind_polariser(bare)}
-    return tuple(element for element in _behind_polariser(effect.patch(bare)) if id(element) not in before)
+
+    def changed(effect: Effect) -> list[Element]:
+        return [element for element in _behind_polariser(effect.patch(bare)) if id(element) not in before]
+
+    return tuple(jax.eval_shape(changed, effect))
 
 
 def _behind_polariser(instrument: Instrument) -> Iterator[Element]:

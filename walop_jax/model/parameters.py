@@ -22,6 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from walop_jax.model.compiled import array
+
 PARAMETER = "walop_jax.parameter"
 NUMBER = "walop_jax.number"
 SEVERAL = "walop_jax.several"
@@ -221,7 +223,7 @@ def values_of(component: Component) -> Vector:
     tracer: Any = jax.core.Tracer  # pyright: ignore[reportAttributeAccessIssue]
     if not any(isinstance(array, tracer) for array in chosen):
         # By numpy: operations of JAX outside of a program are each compiled as one of their own.
-        return jnp.asarray(np.concatenate([np.zeros(0), *map(np.ravel, chosen)]))
+        return array(np.concatenate([np.zeros(0), *map(np.ravel, chosen)]))
     return jnp.concatenate([jnp.ravel(array) for array in chosen])
 
 
@@ -249,7 +251,7 @@ def with_values(component: AnyComponent) -> Callable[[Vector | np.ndarray], AnyC
     def replaced(values: Vector | np.ndarray) -> AnyComponent:
         filled, split = list(arrays), np.split if isinstance(values, np.ndarray) else jnp.split
         for i, part, shape in zip(places, split(values, ends), shapes, strict=True) if places else ():
-            filled[i] = jnp.asarray(part.reshape(shape))
+            filled[i] = array(part.reshape(shape))
         return jax.tree_util.tree_unflatten(structure, filled)
 
     return replaced

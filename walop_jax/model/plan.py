@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.data.records import Exposures
+from walop_jax.model.compiled import array
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.ray import Conditions
 from walop_jax.model.sources import ExposureArrays
@@ -65,23 +66,23 @@ def exposure_arrays(
     if unknown:
         raise ValueError(f"KIND {unknown[0]!r}: the instrument has no such source; it has {', '.join(known)}")
     return ExposureArrays(
-        kind=jnp.asarray([known.index(kind) for kind in exposures.kind], int),
-        clp_in=jnp.asarray(exposures.clp_in),
-        clp_angle=jnp.asarray(np.deg2rad(np.where(exposures.clp_in, exposures.clp_angle, 0.0))),
-        flux_known=jnp.asarray(np.isin(exposures.kind, list(flux_known))),
-        rotator=jnp.asarray(np.deg2rad(np.nan_to_num(exposures.rotator))),
-        hours=jnp.asarray(hours_of(exposures)),
-        temperature=jnp.asarray(exposures.temp),
-        hour_angle=jnp.asarray(np.nan_to_num(exposures.ha)),
+        kind=array([known.index(kind) for kind in exposures.kind], int),
+        clp_in=array(exposures.clp_in),
+        clp_angle=array(np.deg2rad(np.where(exposures.clp_in, exposures.clp_angle, 0.0))),
+        flux_known=array(np.isin(exposures.kind, list(flux_known))),
+        rotator=array(np.deg2rad(np.nan_to_num(exposures.rotator))),
+        hours=array(hours_of(exposures)),
+        temperature=array(exposures.temp),
+        hour_angle=array(np.nan_to_num(exposures.ha)),
         kinds=known,
     )
 
 
 def blank_exposures(instrument: Instrument, count: int) -> ExposureArrays:
     """Exposures of which nothing is said but that they are there."""
-    zero, off = jnp.zeros(count), jnp.zeros(count, bool)
+    zero, off = array(np.zeros(count)), array(np.zeros(count, bool))
     return ExposureArrays(
-        kind=jnp.zeros(count, int), clp_in=off, clp_angle=zero, flux_known=off, rotator=zero, hours=zero,
+        kind=array(np.zeros(count, int)), clp_in=off, clp_angle=zero, flux_known=off, rotator=zero, hours=zero,
         temperature=zero, hour_angle=zero, kinds=instrument.kinds,
     )  # fmt: skip
 
@@ -122,5 +123,5 @@ def with_numbers(
 def with_median(plan: Plan, median: Float[np.ndarray, "e k"]) -> Plan:
     """The plan with the median counts of every exposure and camera, which some detectors need."""
     return eqx.tree_at(
-        lambda p: p.exposures.median_counts, plan, jnp.asarray(median), is_leaf=lambda leaf: leaf is None
+        lambda p: p.exposures.median_counts, plan, array(median), is_leaf=lambda leaf: leaf is None
     )

@@ -7,12 +7,12 @@ import functools
 from collections.abc import Callable, Mapping
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.data.records import Exposures, FilterCurve, Sources
 from walop_jax.data.settings import Settings
+from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan, blank_exposures, exposure_arrays, hours_of
@@ -71,7 +71,7 @@ def _without_shares(exposures: ExposureArrays, settings: Settings) -> ExposureAr
     _, number = np.unique(group, return_inverse=True)
     return dataclasses.replace(
         exposures,
-        flux_known=jnp.zeros(len(known), bool),
+        flux_known=array(np.zeros(len(known), bool)),
         shared=jax.nn.one_hot(number, number.max() + 1, dtype=float) if known.any() else None,
     )
 
@@ -135,7 +135,7 @@ def _plan(
 
     def per_node(of_group: list[float]) -> Float[Array, " n"]:
         counts = [len(rules[name][0]) for name, _ in groups]
-        return jnp.asarray(np.repeat(np.asarray(of_group, float), counts))
+        return array(np.repeat(np.asarray(of_group, float), counts))
 
     laid = []
     found = [key[0] for key in bands]
@@ -143,13 +143,13 @@ def _plan(
         state = tuple(None if np.isinf(angle) else float(angle) for angle in value)
         laid.append((state, found.index(value), len(found) - found[::-1].index(value)))
     return Plan(
-        wavelength=jnp.asarray(np.concatenate([rules[name][0] for name, _ in groups])),
+        wavelength=array(np.concatenate([rules[name][0] for name, _ in groups])),
         conditions=Conditions(
             band_width=per_node([width[name] for name, _ in groups]),
             planned={name: per_node([moment[i] for _, moment in groups]) for i, name in enumerate(names)},
         ),
-        node_weight=jnp.asarray(weight),
-        teff=jnp.asarray([key[3] for key in bands]),
+        node_weight=array(weight),
+        teff=array([key[3] for key in bands], float),
         exposures=exposures,
         band_of=band_of(np.array([index[key] for key in keys], int)),
         settings=tuple(laid),

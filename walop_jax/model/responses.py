@@ -35,6 +35,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.model import fold, light
+from walop_jax.model.compiled import array
 from walop_jax.model.elements import Element, PupilMapping, WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.materials import REFERENCE_TEMPERATURE
@@ -110,7 +111,7 @@ def acts(element: Element) -> bool:
 
 @functools.lru_cache(maxsize=1024)
 def _acts(structure: Any, shapes: Any) -> bool:
-    one, zero = jnp.ones(1), jnp.zeros(())
+    one, zero = array(np.ones(1)), array(np.zeros(()))
 
     def run(*arrays: Array) -> Any:
         element = jax.tree_util.tree_unflatten(structure, arrays)
