@@ -425,8 +425,10 @@ def _sources(given: Mapping[str, Any]) -> dict[str, np.ndarray]:
     columns = {}
     for name, values in given.items():
         rule = schema.SOURCES.get(str(name).upper())
-        numbers = rule is not None and rule.kind == "float"
-        plain = in_unit(values, rule.unit, str(name)) if numbers else np.asarray(values)
+        if rule is not None and rule.kind == "float":
+            plain = in_unit(values, rule.unit, str(name))
+        else:
+            plain = np.asarray(values)
         columns[str(name).upper()] = np.atleast_1d(plain)
     columns.setdefault("SOURCE", np.arange(max(map(len, columns.values()), default=0)))
     return columns

@@ -166,7 +166,7 @@ def _cells(column: Any, name: str, rule: Column, place: Place) -> np.ndarray:
         return converted(np.where(empty, False, values), "", name, rule, place)
     empty = empty | (values != values)
     found = converted(values, str(column.unit or ""), name, rule, place)
-    return np.where(empty, np.nan if rule.missing is None else rule.missing, found)
+    return np.where(empty, float("nan" if rule.missing is None else str(rule.missing)), found)
 
 
 def _from_text(text: np.ndarray, truth: bool, name: str, place: Place) -> Float[np.ndarray, ...]:

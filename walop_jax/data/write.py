@@ -101,12 +101,10 @@ def _primary(calset: CalibrationSet, version: int, path: object) -> fits.Primary
     return primary
 
 
-def _hdus(
-    calset: CalibrationSet, tables: Mapping[str, Mapping[str, np.ndarray]], path: object
-) -> list[fits.PrimaryHDU | fits.BinTableHDU]:
+def _hdus(calset: CalibrationSet, tables: Mapping[str, Mapping[str, np.ndarray]], path: object) -> list[Any]:
     """The primary header of a set, some of its tables, and what it stands for."""
     version = oldest_version(calset.instrument, calset.exposures, calset.cameras)
-    made = [_primary(calset, version, path)]
+    made: list[Any] = [_primary(calset, version, path)]
     for name, columns in tables.items():
         rules = schema.table_rules(name, version, list(columns), schema.Place(path, name))
         made.append(table_hdu(name, columns, path, rules))
