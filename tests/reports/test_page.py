@@ -54,7 +54,8 @@ def test_every_section_is_there(diagnosed, refitted):
         "Inputs and versions",
     ]
     page = Page(refitted)
-    assert page.headings == ["The data", *both, "What this page lacks"]
+    assert page.headings == ["The data", "Residuals before and after the fit", *both]
+    assert "The data of this run cannot be found" in page.text
     assert len(page.images) == 2
     page = Page(diagnosed)
     assert [heading for heading in page.headings if heading in both] == both
