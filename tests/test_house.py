@@ -33,6 +33,7 @@ ROOMS = (
 )
 OWNERS = {
     "astropy": {"io", "data", "sky", "calibration", "diagnosis", "nights"},
+    "optimistix": {"fit"},
     "emcee": {"posterior"},
     "arviz": {"posterior"},
     "matplotlib": {"reports"},
@@ -43,7 +44,7 @@ OWNERS = {
     "tomlkit": {"simulation", "model", "fit"},
 }
 # Imported by nobody: tools of the tests, and what there is no need of.
-STRANGERS = {"pandas", "elli", "beartype", "hypothesis", "pytest", "optimistix", "oracle", "tests"}
+STRANGERS = {"pandas", "elli", "beartype", "hypothesis", "pytest", "oracle", "tests"}
 LONGEST = 600  # a question, not a goal: split by idea, never by length
 MACHINE = re.compile(r"""/(?:home|root|work|tmp|Users|opt|mnt|data)/|[A-Z]:\\\\|\.\./shared|file://""")
 

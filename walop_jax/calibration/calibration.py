@@ -37,7 +37,13 @@ from walop_jax.data.settings import (
     single_wavelength,
 )
 from walop_jax.fit.model_file import model_without_data, render, standard_names
-from walop_jax.fit.parameter_table import HEAD, Estimate, parameter_notes, parameter_rows, parameter_table
+from walop_jax.fit.parameter_table import (
+    HEAD,
+    ParameterValue,
+    parameter_notes,
+    parameter_rows,
+    parameter_table,
+)
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import STATED, Hidden, Quality, Verdict
 from walop_jax.instruments.description import parsed
@@ -257,10 +263,10 @@ class Calibration(Result):
 
         return read_calibration(path)
 
-    def __getitem__(self, name: str) -> Estimate:
+    def __getitem__(self, name: str) -> ParameterValue:
         """A parameter by name: value, standard error and unit; ValueError with the nearest names if there is none."""
         at = self.model.index(name)
-        return Estimate(float(self.values[at]), float(self.sigma[at]), self.model.parameters[at].unit)
+        return ParameterValue(float(self.values[at]), float(self.sigma[at]), self.model.parameters[at].unit)
 
     def to_table(self) -> Any:
         """All parameters as an astropy table: value, error, unit, start, prior, and whether it was free."""

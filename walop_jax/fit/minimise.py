@@ -1,10 +1,10 @@
 """Levenberg–Marquardt on normal equations: one minimiser for ten intensities or 10⁹.
 
-A pass over the data hands over χ², Jᵀr and JᵀJ, so that residuals are neither seen nor stored here.
+A pass over the data hands over χ², Jᵀr and JᵀJ, so that residuals are neither seen nor stored here. The search runs on
+the host, since a pass may read files, in parameters scaled to their prior width.
 
-Step        δ = −(JᵀJ + λ)⁻¹ Jᵀr in parameters scaled to their prior width. λ falls by `WIDER` after a step that was
-            predicted well, and rises by `NARROWER` after one that was not, which is taken back. A start that may be far
-            away begins with λ = 1; one near the minimum with λ = 0, the Newton step, until a step leads upwards.
+Step        δ = −(JᵀJ + λ)⁻¹ Jᵀr, λ following optimistix' classical trust region from `damping` on. A start that may be
+            far away takes λ = 1; one near the minimum λ = 0, the Newton step, until a step leads upwards.
 Stop        The scaled gradient d = ‖(JᵀJ)^(−½) Jᵀr‖ < `tolerance`: the distance to the minimum in standard errors.
             Without `look_at_end` a Newton step is not looked at if d²/d₋₁, which steps that close in at a constant rate
             leave, is that small (d₋₁: the distance at the place before). A model that is far from the data
@@ -18,16 +18,23 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
 import numpy as np
-from jaxtyping import Float
-from scipy import linalg
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from walop_jax.model.compiled import compiled
 
 SOURCE = "Moré 1978, Lecture Notes in Mathematics 630, 105; Conn, Gould & Toint 2000, Trust Region Methods"
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
+RESULTS = optx.RESULTS
 
 MAXIMUM_STEPS = 200
 """Along a curved valley that only a prior closes (throughput and flux) there may be more than a hundred."""
@@ -37,11 +44,10 @@ PATIENCE, LEAST_GAIN = 6, 1e-3
 # Sums of many terms are good to some 10⁻¹⁵ of the largest eigenvalue: the smallest is then known to ten per cent.
 LARGEST_CONDITION = 1e14
 ROUNDING = 1e-12  # of an objective: near the end two of them differ by less
-SMALLEST_REGION = 1e-14  # 1/λ
-WIDER, NARROWER = 3.5, 0.25  # factors on 1/λ
-# Shares of the predicted reduction: below the first a step is taken back, above the second λ falls. With 0.99 a problem
-# that is a little curved keeps its λ and with it a slow end: directions that the data hardly see then take forty steps.
-TAKEN, WELL_PREDICTED = 0.01, 0.75
+SMALLEST_STEP = 1e-14  # of the trust region
+# Share of the predicted reduction above which λ falls. With 0.99 a problem that is a little curved keeps its λ and with
+# it a slow end: directions that the data hardly see then take forty steps.
+WELL_PREDICTED = 0.75
 
 
 @runtime_checkable
@@ -68,22 +74,41 @@ class Expansion(Protocol):
 class Minimum:
     """Where the search ended: `x` in the units it was given, the expansion there and the gates.
 
-    `converged` says whether the minimum was reached and is well conditioned, `message` how the search ended. `steps`
-    counts the places looked at, `history` holds their objectives.
+    `steps` counts the places looked at, `history` holds their objectives; `result` is a member of
+    `optimistix.RESULTS`, and `message` says it in words.
     """
 
     x: Vector
     expansion: Expansion
-    converged: bool
+    result: optx.RESULTS
     message: str
+    steps: int
     scaled_gradient: float
     condition: float
     history: tuple[float, ...]
 
     @property
-    def steps(self) -> int:
-        """Number of places looked at."""
-        return len(self.history)
+    def converged(self) -> bool:
+        """Whether the minimum was reached and is well conditioned."""
+        return bool(self.result == RESULTS.successful)
+
+
+class _Information(NamedTuple):
+    """An expansion in scaled parameters, as compiled code takes it."""
+
+    objective: Any
+    gradient: Any
+    matrix: Any
+
+    @classmethod
+    def of(cls, given: Expansion, scale: Vector) -> _Information:
+        objective = given.objective if np.isfinite(given.objective) else np.inf
+        return cls(objective, given.gradient * scale, given.matrix * np.outer(scale, scale))
+
+    def of_function(self) -> Any:
+        """The same as optimistix takes it, whose objective is half of the sum of squares."""
+        operator = lx.MatrixLinearOperator(self.matrix, lx.positive_semidefinite_tag)
+        return optx.FunctionInfo.EvalGradHessian(0.5 * self.objective, self.gradient, operator)
 
 
 def minimise(
@@ -104,79 +129,80 @@ def minimise(
     hopelessly far from the data there. No more than `maximum_steps` places are looked at, the start among them;
     `progress(step, expansion)` is told the best one after each. Without `look_at_end` the last step may be taken
     unseen: `scaled_gradient` is then the one to be expected, and the expansion that of the place before. Never raises
-    for a numerical outcome: the gates and `message` say what happened.
+    for a numerical outcome: the gates, `result` and `message` say what happened.
     """
-    x = np.asarray(start, float)
-    here = evaluate(x)
-    history, best = [here.objective], [here.objective]
-    before, (distance, condition) = np.inf, distance_to_minimum(here, scale)
-    region, taken = 1.0 / damping if damping > 0 else np.inf, True
-    message, converged = "", False
-    while True:
+    x = trial = np.asarray(start, float)
+    region = _REGION.init(jnp.zeros(len(x)), None)  # pyright: ignore[reportArgumentType]
+    region = eqx.tree_at(lambda s: s.step_size, region, jnp.asarray(1.0 / damping if damping > 0 else np.inf))
+    here, near, history, best = None, None, [], []
+    distance, before, condition = np.inf, np.inf, np.inf
+    result, why = RESULTS.nonlinear_max_steps_reached, ""
+    while len(history) < maximum_steps:
+        found = evaluate(trial)
+        history.append(found.objective)
+        there = _Information.of(found, scale)
+        if here is None or near is None:
+            here, near = found, there
+            if not np.isfinite(found.objective):
+                result = RESULTS.nonfinite
+                break
+        size, accept, region, step = _next(len(history) == 1, x / scale, trial / scale, near, there, region)
+        if bool(accept):
+            x, here, near, before = trial, found, there, distance
+            distance, condition = distance_to_minimum(there)
+        best.append(here.objective)
         if progress is not None:
             progress(len(history), here)
-        step, region = _step(here, scale, region)
         hopeless = far_off(here)
-        left = distance**2 / before if taken and not look_at_end and np.isinf(region) else np.inf
+        left = distance * distance / before if bool(accept) and not look_at_end and np.isinf(size) else 0.0
         rough = hopeless and distance < ROUGH and distance * CLOSING_IN > before
-        if not np.isfinite(history[0]):
-            message = "the model is not finite at the start values"
-        elif distance < tolerance or 0.0 < left < tolerance or rough:
+        if distance < tolerance or 0.0 < left < tolerance or rough:
             if distance >= tolerance and 0.0 < left < tolerance:
-                x, distance = x + step, left
-            converged = condition <= LARGEST_CONDITION
-            message = (
-                f"converged: scaled gradient {distance:.1e}"
-                if converged
-                else f"parameters cannot be told apart: condition number {condition:.1e}"
+                x, distance = x + scale * np.asarray(step), left
+            result = RESULTS.conlim if condition > LARGEST_CONDITION else RESULTS.successful
+            break
+        if hopeless and len(best) > PATIENCE and best[-1] > (1.0 - LEAST_GAIN) * best[-1 - PATIENCE]:
+            result, why = (
+                RESULTS.stagnation,
+                f"{PATIENCE} more steps lowered χ² by less than {LEAST_GAIN:.1%}",
             )
-        elif hopeless and len(best) > PATIENCE and best[-1] > (1.0 - LEAST_GAIN) * best[-1 - PATIENCE]:
-            gain = f"{PATIENCE} more steps lowered χ² by less than {LEAST_GAIN:.1%}"
-            message = f"{gain}, scaled gradient {distance:.1e}"
-        elif region < SMALLEST_REGION:
-            message = f"no step lowers χ² any more, scaled gradient {distance:.1e}"
-        elif len(history) >= maximum_steps:
-            message = f"not converged after {len(history)} steps, scaled gradient {distance:.1e}"
-        if message:
-            return Minimum(x, here, converged, message, distance, condition, tuple(history))
-        there = evaluate(x + step)
-        history.append(there.objective)
-        gained = 0.5 * (there.objective - here.objective) if np.isfinite(there.objective) else np.inf
-        predicted = step @ (here.gradient + 0.5 * here.matrix @ step)
-        wanted = gained <= TAKEN * predicted
-        if not wanted:
-            region *= NARROWER
-        elif gained < WELL_PREDICTED * predicted < 0.0:
-            region *= WIDER
-        taken = wanted or gained <= 0.5 * ROUNDING * abs(here.objective)
-        if taken:
-            x, here, before = x + step, there, distance
-            distance, condition = distance_to_minimum(here, scale)
-        elif np.isinf(region):
-            region = 1.0
-        best.append(here.objective)
+            break
+        if float(size) < SMALLEST_STEP:
+            result, why = RESULTS.stagnation, "no step lowers χ² any more"
+            break
+        trial = x + scale * np.asarray(step)
+    assert here is not None
+    return Minimum(
+        x=x,
+        expansion=here,
+        result=result,  # pyright: ignore[reportArgumentType]
+        message=_in_words(result, why, len(history), distance, condition),  # pyright: ignore[reportArgumentType]
+        steps=len(history),
+        scaled_gradient=distance,
+        condition=condition,
+        history=tuple(history),
+    )
 
 
-def _step(here: Expansion, scale: Vector, region: float) -> tuple[Vector, float]:
-    """The damped Newton step, and the 1/λ with which the matrix is positive definite."""
-    matrix, gradient = here.matrix * np.outer(scale, scale), here.gradient * scale
-    while region >= SMALLEST_REGION and np.isfinite(matrix).all() and np.isfinite(gradient).all():
-        try:
-            factor = linalg.cho_factor(matrix + np.eye(len(matrix)) / region, lower=True)
-            return -scale * linalg.cho_solve(factor, gradient), region
-        except linalg.LinAlgError:
-            region = NARROWER * region if np.isfinite(region) else 1.0
-    return np.zeros(len(scale)), 0.0
+def _in_words(result: optx.RESULTS, why: str, steps: int, distance: float, condition: float) -> str:
+    if bool(result == RESULTS.successful):
+        return f"converged: scaled gradient {distance:.1e}"
+    if bool(result == RESULTS.conlim):
+        return f"parameters cannot be told apart: condition number {condition:.1e}"
+    if bool(result == RESULTS.stagnation):
+        return f"{why}, scaled gradient {distance:.1e}"
+    if bool(result == RESULTS.nonfinite):
+        return "the model is not finite at the start values"
+    return f"not converged after {steps} steps, scaled gradient {distance:.1e}"
 
 
-def distance_to_minimum(expansion: Expansion, scale: Vector | float = 1.0) -> tuple[float, float]:
-    """‖(JᵀJ)^(−½) Jᵀr‖ in parameters in units of `scale`, and the condition number of JᵀJ with a diagonal of ones.
+def distance_to_minimum(expansion: Expansion) -> tuple[float, float]:
+    """‖(JᵀJ)^(−½) Jᵀr‖ in scaled parameters, and the condition number of JᵀJ with a diagonal of ones.
 
     How well each parameter is known by itself is no matter of telling them apart: the best scaling is by that, up to
     the number of parameters (van der Sluis 1969, Numerische Mathematik 14, 14).
     """
-    gradient = expansion.gradient * scale
-    matrix = expansion.matrix * np.outer(scale, scale)
+    matrix, gradient = expansion.matrix, expansion.gradient
     if not (np.isfinite(matrix).all() and np.isfinite(gradient).all()):
         return np.inf, np.inf
     # In units of what each is known to: in others a parameter that the data hardly see would fall below the rounding.
@@ -190,3 +216,24 @@ def distance_to_minimum(expansion: Expansion, scale: Vector | float = 1.0) -> tu
     positive = value > value[-1] * 1e-15
     along = vector.T @ (gradient[seen] / unit)
     return float(np.sqrt(np.sum(along[positive] ** 2 / value[positive]))), condition
+
+
+_REGION = optx.ClassicalTrustRegion(high_cutoff=WELL_PREDICTED)
+
+
+def _after(
+    first: Any, y: Any, trial: Any, here: _Information, there: _Information, region: Any
+) -> tuple[Array, Array, Any, Array]:
+    """Size of the trust region, whether the trial is accepted, the state of the region, and the next step."""
+    size, accept, _, region = _REGION.step(first, y, trial, here.of_function(), there.of_function(), region)
+    accept = accept | (there.objective - here.objective <= ROUNDING * jnp.abs(here.objective))
+    # From no damping at all the first retreat is to λ = 1.
+    size = jnp.where(accept | jnp.isfinite(size), size, 1.0)
+    best = jax.tree.map(lambda new, old: jnp.where(accept, new, old), there, here).of_function()
+    descent = optx.DampedNewtonDescent(linear_solver=lx.Cholesky())
+    step = descent.step(size, descent.query(best.grad, best, descent.init(best.grad, best)))[0]
+    return size, accept, eqx.tree_at(lambda s: s.step_size, region, size), step
+
+
+# Compiled as a whole: operation by operation it would cost a tenth of a second at the first step.
+_next = compiled(_after, kept_as="step")

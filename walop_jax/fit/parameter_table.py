@@ -19,7 +19,7 @@ PRIOR_ONLY = 0.99  # of the prior width: an error above it owes nothing to the d
 HEAD = ("parameter", ">value", ">error", "unit", ">start", "prior", "")
 
 
-class Estimate(NamedTuple):
+class ParameterValue(NamedTuple):
     """A number with its standard error and unit; prints as 15.649 ± 0.004 deg."""
 
     value: float

@@ -16,7 +16,13 @@ from jaxtyping import Float
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.minimise import Minimum
 from walop_jax.fit.model_file import base_model, render
-from walop_jax.fit.parameter_table import HEAD, Estimate, parameter_notes, parameter_rows, parameter_table
+from walop_jax.fit.parameter_table import (
+    HEAD,
+    ParameterValue,
+    parameter_notes,
+    parameter_rows,
+    parameter_table,
+)
 from walop_jax.fit.robust import robust_errors
 from walop_jax.fit.search import find_minimum, free_scales
 from walop_jax.fit.verdict import NO_STRUCTURE, STATED, Doubt, Hidden, Quality, Structure, Verdict
@@ -189,9 +195,9 @@ class FitResult(Result):
             doubt.sentence for doubt in _against(self, (), examined=False, noiseless=False) if doubt.sentence
         )
 
-    def __getitem__(self, name: str) -> Estimate:
+    def __getitem__(self, name: str) -> ParameterValue:
         """A parameter by name: value, standard error and unit; ValueError with the nearest names if there is none."""
-        return Estimate(*self.value(name), self.model[name].unit)
+        return ParameterValue(*self.value(name), self.model[name].unit)
 
     def value(self, name: str) -> tuple[float, float]:
         """Value and standard error of a parameter."""

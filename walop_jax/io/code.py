@@ -41,7 +41,7 @@ def classes_of(path: str | os.PathLike[str], base: type[T], advice: str) -> dict
     }
 
 
-SOFTWARE = ("walop-jax", "jax", "jaxlib", "equinox", "numpy", "scipy", "astropy")
+SOFTWARE = ("walop-jax", "jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy", "scipy", "astropy")
 
 
 def versions_of(names: Iterable[str]) -> dict[str, str]:

@@ -59,7 +59,7 @@ class Costs:
         return float(getattr(self, kind))
 
 
-class Choice(NamedTuple):
+class CandidateExposure(NamedTuple):
     """Exposures that differ in one thing only: the angle of the polariser, or which of `stops` they are."""
 
     kind: str
@@ -141,7 +141,7 @@ class Could:
         """The plan with as little of the polariser as may be."""
         return dataclasses.replace(self.plan, polariser_angles=(0.0,), plate=self.plan.plate[:1])
 
-    def choices(self) -> tuple[tuple[Choice, ...], tuple[str, ...]]:
+    def choices(self) -> tuple[tuple[CandidateExposure, ...], tuple[str, ...]]:
         """All choices, and in words what had to be left out, with what would do."""
         plan, notes = self.plan, []
         up: dict[str, tuple[int, ...]] = {}
@@ -164,7 +164,7 @@ class Could:
                         else tuple(self._members(blank, up.get(kind, ())))
                     )
                     if members:
-                        found.append(Choice(kind, name, where, seconds, members))
+                        found.append(CandidateExposure(kind, name, where, seconds, members))
         return tuple(found), tuple(notes)
 
     def _members(self, blank: Stop, numbers: tuple[int, ...]) -> Iterator[Stop]:

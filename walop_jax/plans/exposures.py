@@ -28,7 +28,7 @@ from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 from walop_jax.model.specification import Model
-from walop_jax.plans.could import Choice, Could
+from walop_jax.plans.could import CandidateExposure, Could
 from walop_jax.plans.families import Circle, Family, Listed, harmonics
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import PhotonNoise, draw_instrument, fluxes, simulate, truth_values
@@ -56,7 +56,7 @@ class Candidates:
 
     could: Could
     model: Model
-    choices: tuple[Choice, ...]
+    choices: tuple[CandidateExposure, ...]
     families: tuple[Family, ...]
     values: Float[np.ndarray, "r n"]
     names: tuple[str, ...]
