@@ -15,7 +15,6 @@ from walop_jax.commands.docs import docs as docs
 from walop_jax.commands.epoch import epoch as epoch
 from walop_jax.commands.import_zemax import import_zemax as import_zemax
 from walop_jax.commands.inputs import read as read
-from walop_jax.commands.inputs import save as save
 from walop_jax.commands.inspect import inspect as inspect
 from walop_jax.commands.instrument import instrument as instrument
 from walop_jax.commands.limits import limits as limits
