@@ -23,8 +23,8 @@ def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
 
 
 def test_commands_exist():
-    named = set(re.findall(r"^walop-jax ([a-z-]+)", TEXT, re.MULTILINE))
-    assert named
+    named = set(re.findall(r"(?:^|`|&& )walop-jax ([a-z][a-z-]+)", TEXT, re.MULTILINE))
+    assert len(named) > 5
     assert named <= set(COMMANDS)
 
 
