@@ -14,6 +14,7 @@ from astropy.table import Table
 
 import walop_jax.calibration.product
 from walop_jax.calibration import read_calibration
+from walop_jax.calibration.matrix import p_errors, sample_stars
 from walop_jax.data.settings import Settings
 from walop_jax.fit import search
 
@@ -56,8 +57,11 @@ def test_refit_says_what_it_found(call, calset_file, tmp_path):
     shown = call("refit", calset_file, "-o", tmp_path / "run")
     assert "half2.plate.mgf2" in shown.stdout
     assert "χ²/dof" in shown.stdout
-    assert all(len(line) < 100 for line in shown.stdout.splitlines())
-    assert "walop-jax" not in shown.stderr  # neither an error nor a warning
+    lines = shown.stdout.replace(str(tmp_path), "").splitlines()  # a path is as long as the caller's
+    assert [line for line in lines if len(line) >= 100] == []
+    assert "walop-jax:" not in shown.stderr  # neither an error nor a warning
+    assert shown.stderr.count("walop-jax") == 2  # what to do next
+    assert f"Next: walop-jax report {tmp_path / 'run'} or walop-jax apply" in shown.stderr
     told = call("refit", calset_file, "-o", tmp_path / "run", "--json", "--overwrite")
     summary = json.loads(told.stdout)
     assert summary == json.loads((tmp_path / "run" / "summary.json").read_text())
@@ -192,7 +196,7 @@ def test_matrix_adds_columns(call, run, tmp_path, suffix):
     table = Table.read(output)
     assert table.colnames[:6] == ["ID", "X", "Y", "TEFF", "CHWP_IN", "CHWP_ANGLE"]
     names = ["M21", "M22", "M23", "M31", "M32", "M33"]
-    assert table.colnames[6:] == [*names, *(f"{name}_ERR" for name in names), "FLAG"]
+    assert table.colnames[6:] == [*names, *(f"{name}_ERR" for name in names), "P_ERR", "FLAG"]
     calibration = read_calibration(run / "calibration.fits", rebuild=False).rebuilt()
     settings = dataclasses.replace(
         Settings.default(20).at(CHWP=np.where(np.arange(20) % 3 == 0, 45.0, np.nan)),
@@ -202,6 +206,7 @@ def test_matrix_adds_columns(call, run, tmp_path, suffix):
     for k, name in enumerate(names):
         np.testing.assert_allclose(table[name], values[:, k], rtol=0, atol=1e-12)
         np.testing.assert_allclose(table[f"{name}_ERR"], np.sqrt(covariance[:, k, k]), rtol=1e-9)
+    np.testing.assert_allclose(table["P_ERR"], p_errors(values, covariance, sample_stars()), rtol=1e-9)
 
 
 def test_matrix_marks_what_is_outside(call, run, tmp_path):
