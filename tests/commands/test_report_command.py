@@ -34,7 +34,10 @@ def test_page_goes_where_it_is_asked_to(call, tmp_path):
     told = json.loads(call("report", folder, "-o", tmp_path / "page.html", "--json").stdout)
     assert told["page"] == str(tmp_path / "page.html")
     assert told["bytes"] == (tmp_path / "page.html").stat().st_size
-    assert "walop-jax diagnose" in told["missing"][0]
+    residuals, accuracy = told["missing"]
+    assert residuals.startswith("Residuals are not drawn: night.fits")
+    assert "copy it into the folder of the run" in residuals
+    assert "accuracy of p over the field is not known" in accuracy
     assert not (folder / "report.html").exists()
 
 

@@ -285,6 +285,11 @@ def command(
     return lambda body: Command(body, stages, writes, random, jax, given).function
 
 
+def command_of(function: Callable[..., T]) -> Command[T]:
+    """The command that a Python function belongs to."""
+    return vars(function)["command"]
+
+
 # --------------------------------------------------------------------------------------------- the compiled programs
 
 

@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Job, Option, Outcome, command
+from walop_jax.commands.command import Job, Option, Outcome, command, command_of
 from walop_jax.commands.inputs import PathLike
 from walop_jax.io.errors import fail
 
@@ -32,12 +32,12 @@ def demo(job: Job, *, output: Annotated[PathLike, FOLDER] = "walop-jax-demo") ->
     folder.mkdir(parents=True, exist_ok=True)
     calset, run = folder / SET, folder / "RUN"
     shutil.copyfile(_shipped(), calset)
-    found = refit.command.run(job, {"data": [calset], "output": run})
-    page = report.command.run(job, {"run": run})
+    found = command_of(refit).run(job, {"data": [calset], "output": run})
+    page = command_of(report).run(job, {"run": run})
     return Outcome(
         found.value,
         lambda: {"run": str(run), "page": str(page.value.path), "summary": found.content},
-        lambda: f"{found.text()}\nThe page about it: {page.value.path}",
+        lambda: f"{found.shown()}\nThe page about it: {page.value.path}",
         warnings=found.warnings,
         trusted=found.trusted,
         next=(

@@ -26,6 +26,7 @@ from walop_jax.commands.command import (
     Option,
     Outcome,
     UsageError,
+    command_of,
     switch_on_jax,
 )
 from walop_jax.io.progress import interrupts_answered
@@ -148,7 +149,7 @@ def _parameter(name: str, option: Option, default: Any, hidden: bool = False) ->
 def _command(name: str) -> Any:
     """A command as typer makes it."""
     word = name.replace("-", "_")
-    command: Command[Any] = getattr(importlib.import_module(f"walop_jax.commands.{word}"), word).command
+    command: Command[Any] = command_of(getattr(importlib.import_module(f"walop_jax.commands.{word}"), word))
     alone = typer.Typer(add_completion=False, rich_markup_mode=None)
     page, line = _paragraphs(command.body), COMMANDS[name]
     alone.command(name, context_settings=HELP, help=page, short_help=line)(_function(command))

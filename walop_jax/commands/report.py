@@ -7,12 +7,13 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
+from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command, command_of
 from walop_jax.commands.inputs import Effects, PathLike, catalogue_of, folder_of, save
 from walop_jax.io.display import Display, Displayed
 
 if TYPE_CHECKING:
     from walop_jax import FitResult, Run
+    from walop_jax.reports.run import RunContents
 
 PAGE = "report.html"
 GENERATOR = '<meta name="generator" content="walop-jax'
@@ -67,7 +68,7 @@ def report(
             raise UsageError("say where the page of a fit in memory is to be written", "output")
         with tempfile.TemporaryDirectory() as temporary:
             save(run, Path(temporary) / "fit")
-            return report.command.body(job, Path(temporary) / "fit", output, effects=effects)
+            return command_of(report).body(job, Path(temporary) / "fit", output, effects=effects)
     folder = folder_of(run)
     target = folder / PAGE if output is None else Path(output)
     job.begin("reading")
@@ -82,7 +83,7 @@ def report(
         job.tell("working out the accuracy of p")
         accuracy, lacking = _accuracy(found)
         job.tell("drawing", "drawing")
-        missing = (*found.missing, *lacking)
+        missing = (*found.missing, *_residuals(found), *lacking)
         text = render(dataclasses.replace(found, missing=missing), accuracy)
     text = printable(text)
     with atomic_path(target, overwrite=overwrite) as temporary:
@@ -98,6 +99,19 @@ def _is_page(path: Path) -> bool:
             return GENERATOR in stream.read(1000)
     except (OSError, UnicodeDecodeError):
         return False
+
+
+def _residuals(run: RunContents) -> tuple[str, ...]:
+    """Why the page of a fit shows no residuals, in words; nothing where it does."""
+    from walop_jax import Run
+
+    if run.product is None or run.diagnosis is not None:
+        return ()
+    try:
+        Run(run.folder).calset  # noqa: B018
+    except (ValueError, OSError) as error:
+        return (f"Residuals are not drawn: {error}.",)
+    return ()
 
 
 def _accuracy(run: Any) -> tuple[Any, tuple[str, ...]]:

@@ -212,8 +212,9 @@ class FitResult(Result):
     def notes(self) -> tuple[str, ...]:
         """What its table leaves out, what the data do not constrain, and which mistakes they would not show."""
         notes = parameter_notes(self.model, self.sigma)
-        told = self.answer is not None or self.hidden is None or not len(self.hidden)
-        return notes if told else (*notes, self.hidden.in_words())
+        if self.answer is not None or self.hidden is None or not len(self.hidden):
+            return notes
+        return (*notes, self.hidden.in_words())
 
     def display(self) -> Display:
         """The verdict and the parameters."""

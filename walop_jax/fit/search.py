@@ -129,12 +129,14 @@ def find_minimum(
         every = strips_of(likelihood) // limits.FIRST_STRIPS
         passes = [("fit of some image rows", _unkept(likelihood), every, 1.0)] if every > 1 else []
         passes.append(("fit of all pixels", likelihood, 1, LARGE_TOLERANCE))
+    found: Found | None = None
     for label, whole, every, tolerance in passes:
         expand = None if every is None else functools.partial(_of_pixels, whole, every)
         found = _search(
             whole, label, values, scale, None, expand, tolerance=tolerance, damping=0.0, look_at_end=False
         )
         values = found.values
+    assert found is not None  # there is a pass over everything
     return dataclasses.replace(found, starts=starts)
 
 

@@ -215,7 +215,9 @@ class UndeterminedError(ValueError):
 
 def _factored(matrix: Matrix, parameters: Int[np.ndarray, " k"], unit: int | None) -> tuple[Matrix, bool]:
     """The Cholesky factor; `UndeterminedError` names the first parameter that has nothing left."""
-    factor, failed = linalg.lapack.dpotrf(matrix, lower=1, clean=1)
+    factor, failed = linalg.lapack.dpotrf(  # pyright: ignore[reportAttributeAccessIssue]
+        matrix, lower=1, clean=1
+    )
     if failed:
         raise UndeterminedError(int(parameters[failed - 1]), unit)
     small = np.diag(factor) ** 2 < 1e-14 * np.maximum(np.diag(matrix), 1e-300)

@@ -341,7 +341,7 @@ def together(nights: Sequence[Night]) -> Together:
         slope = night.matrix @ moved
         chi2[u] = night.chi2 + 2.0 * night.gradient @ moved + moved @ slope
         gradient[u, at] = night.gradient + slope
-        matrix[np.ix_([u], at, at)] = night.matrix
+        matrix[u][np.ix_(at, at)] = night.matrix
     mean, width = np.zeros(n), np.full(n, np.inf)
     for k, p in enumerate(known.values()):
         if p.name in of_model and (p.prior is not None or p.loose is not None):

@@ -109,14 +109,17 @@ def candidates(
         rows = np.arange(start, stop)
         polarised = choice.kind == "clp"
         where = turn if polarised else None
-        information = np.stack([light.information(rows, *r, choice.seconds, where) for r in responses])
+        information = np.stack(
+            [light.information(rows, unit, slopes, choice.seconds, where) for unit, slopes in responses]
+        )
         information *= 1.0 if choice.kind == "standard" else factor
         cost = choice.seconds + could.costs.of(choice.kind)
         families.append(Circle.sampled(information, cost) if polarised else Listed.of(information, cost))
         if polarised:
+            unit, slopes = responses[0]
             between = (np.arange(0, angles, 6) + 0.5) / angles
-            exact = factor * light.information(rows, *responses[0], choice.seconds, between)
-            lost = max(lost, _overtone(responses[0][0][:, rows]), _apart(information[0], between, exact))
+            exact = factor * light.information(rows, unit, slopes, choice.seconds, between)
+            lost = max(lost, _overtone(unit[:, rows]), _apart(information[0], between, exact))
     known = prior_rows(model).jacobian(model.selection())
     names = tuple(model.names[i] for i in model.free)
     return Candidates(could, model, choices, tuple(families), values, names, known.T @ known, lost, notes)

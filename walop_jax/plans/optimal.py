@@ -427,14 +427,20 @@ def least_budget(
 
     The budget of the plan is Σ weight · cost. Raises as `optimise`.
     """
-    budget, least = experiment.budget, 0.0
-    for _ in range(_BUDGETS):
-        plan = optimise(dataclasses.replace(experiment, budget=budget), gap=0.5 * gap, progress=progress)
-        least = max(least, plan.proof.budget(value))
+
+    def best(budget: float) -> Allocation:
+        return optimise(dataclasses.replace(experiment, budget=budget), gap=0.5 * gap, progress=progress)
+
+    budget = experiment.budget
+    plan = best(budget)
+    least = plan.proof.budget(value)
+    for _ in range(_BUDGETS - 1):
         if abs(plan.value / value - 1.0) <= 0.5 * gap or budget <= _SMALL * experiment.budget:
             break
         # What is known already bends the law 1 / budget: the bound says where it meets the value.
         budget = max(plan.proof.budget(value) * plan.value / plan.bound, _SMALL * experiment.budget)
+        plan = best(budget)
+        least = max(least, plan.proof.budget(value))
     return plan, least
 
 

@@ -76,7 +76,7 @@ class FieldErrors:
     @property
     def seen(self) -> Bool[np.ndarray, " p"]:
         """Where one exposure holds u in all draws."""
-        return self.forms.any(axis=(2, 3)).all(axis=0)
+        return np.asarray(self.forms.any(axis=(2, 3)).all(axis=0))
 
     def targets(self) -> Float[np.ndarray, "r k f 6"]:
         """Linear functions of the parameters whose summed variance is the mean square error of p, in %²."""

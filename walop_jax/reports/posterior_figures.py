@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -151,6 +152,6 @@ def save_figure(
 ) -> None:
     """Write a figure (format by the name); it appears whole or not at all."""
     # TrueType: journals refuse the Type 3 fonts that matplotlib writes by itself.
-    fonts = {"pdf.fonttype": 42, "ps.fonttype": 42}
+    fonts: dict[Any, int] = {"pdf.fonttype": 42, "ps.fonttype": 42}
     with atomic_path(path, overwrite=overwrite) as temporary, matplotlib.rc_context(fonts):
         figure.savefig(temporary, dpi=dpi, bbox_inches="tight")
