@@ -27,6 +27,7 @@ TOPICS = (
     "files",
     "large-sets",
     "model",
+    "nights",
     "organisation",
     "recipes",
     "sources",

@@ -169,20 +169,6 @@ def test_scores_of_changes_equal_a_fit_with_one_column_more(name, spanning):
                 assert score[c, j] / e.scale[j] == pytest.approx(column @ residual, rel=1e-6, abs=1e-6)
 
 
-@pytest.mark.parametrize("name", ["night", "walk", "trends"])
-def test_a_few_changes_together(name):
-    found, *_ = solved(name)
-    scan = changes.scan(found)
-    first, last, parameter = np.array([3, 5, 2]), np.array([9, 9, 3]), np.array([5, 5, 1])
-    score, information = changes.changes_together(found, first, last, parameter)
-    assert score == pytest.approx([scan[0][3, 5], scan[0][5, 5], scan[2][2, 1]], rel=1e-7, abs=1e-7)
-    assert np.diag(information) == pytest.approx([scan[1][3, 5], scan[1][5, 5], scan[3][2, 1]], rel=1e-6)
-    assert np.linalg.eigvalsh(information).min() > 0
-    # A step less a later one is a change between them: its variance is that of the difference.
-    between = changes.changes_together(found, np.array([3]), np.array([5]), np.array([5]))[1][0, 0]
-    assert information[0, 0] + information[1, 1] - 2 * information[0, 1] == pytest.approx(between, rel=1e-6)
-
-
 def test_a_walk_is_a_gaussian_process():
     """One parameter, one datum a night: kriging with the kernel w² + r² (min(t, t') − t₀)."""
     rng = np.random.default_rng(3)

@@ -50,13 +50,6 @@ class Equations:
     def __len__(self) -> int:
         return len(self.mjd)
 
-    def only(self, keep: Bool[np.ndarray, " u"]) -> Equations:
-        """The equations of some units."""
-        parts = {
-            name: getattr(self, name)[keep] for name in ("mjd", "night", "file", "chi2", "gradient", "matrix")
-        }
-        return dataclasses.replace(self, **parts)
-
 
 class Global(NamedTuple):
     """An unknown of all nights: the parameter that it belongs to, its function of time, its prior (mean, precision)."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy import linalg
 
 from walop_jax.nights.algebra import Solution
@@ -97,40 +97,3 @@ def scan(of: Solution) -> Scan:
         found[0][c], found[2][c] = score, alone
     found[1][0] = 0.0  # from the first night on is no change
     return found
-
-
-def changes_together(
-    of: Solution, first: Int[np.ndarray, " v"], last: Int[np.ndarray, " v"], parameter: Int[np.ndarray, " v"]
-) -> tuple[Vector, Matrix]:
-    """Scores of a few changes, each of a parameter in the cells from `first` up to `last`, and their information.
-
-    A dense elimination, for few changes: cells one by one, forwards.
-    """
-    system, e = of.system, of.system.equations
-    count = len(parameter)
-    own, cross, score = np.zeros((count, count)), np.zeros((len(system.at), count)), np.zeros(count)
-    taken, border_taken = np.zeros((count, count)), np.zeros((len(system.at), count))
-    moved = np.zeros((0, count))
-    for c, cell in enumerate(system.cells):
-        active = ((first <= c) & (c < last)).astype(float)
-        local = np.zeros((len(cell.parameter), count))
-        for v, unit in enumerate(cell.units):
-            some = e.matrix[unit][:, parameter] * active
-            own += some[parameter] * active[:, None]
-            cross += system.basis[unit][:, None] * some[system.at]
-            local += cell.covers[:, v : v + 1] * some[cell.parameter]
-            score -= of.slopes[unit][parameter] * active
-        entry = of.cells[c]
-        if len(cell.parameter):
-            if c and entry.before.any():
-                gain = linalg.cho_solve(of.cells[c - 1].factor, entry.before.T, check_finite=False).T
-                local = local - gain @ moved
-            solved = linalg.cho_solve(entry.factor, local, check_finite=False)
-            taken += local.T @ solved
-            border_taken += entry.left.T @ solved
-        moved = local
-    information = own - taken
-    if len(system.at):
-        lower = linalg.solve_triangular(of.factor[0], cross - border_taken, lower=True, check_finite=False)
-        information = information - lower.T @ lower
-    return score, information

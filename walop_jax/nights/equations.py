@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,8 +22,7 @@ from jaxtyping import Bool, Float, Int
 
 from walop_jax.data.records import CalibrationSet, Exposures, Site
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.model_file import SKY_AND_STARS, header_of, model_like
-from walop_jax.fit.refit import FitResult
+from walop_jax.fit.model_file import SKY_AND_STARS, header_of
 from walop_jax.io.errors import DataError, fail
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.columns import Columns
@@ -269,21 +268,6 @@ def data_hash(calset: CalibrationSet) -> str:
     return together if len(calset.inputs) == 1 else hashlib.sha256(together.encode()).hexdigest()
 
 
-def nights_like(
-    calset: CalibrationSet,
-    old: Model,
-    values: Mapping[str, float],
-    catalogue: Sequence[type[Effect]] = EFFECTS,
-) -> list[Night]:
-    """The nights of a set under the model of an earlier fit, linearised at the values of that: no fit is needed."""
-    return night_equations(calset, model_like(calset, old), values, catalogue)
-
-
-def nights_of_fit(result: FitResult, catalogue: Sequence[type[Effect]] = EFFECTS) -> list[Night]:
-    """The nights of a fitted set, linearised at the fit."""
-    return night_equations(result.calset, result.model, result.values, catalogue)
-
-
 # -------------------------------------------------------------------------------------------------------- together
 
 
@@ -316,7 +300,7 @@ class Together:
 def together(nights: Sequence[Night]) -> Together:
     """Nights in the order of time, in the parameters of all. Raises `DataError` as `check_together` does."""
     if not nights:
-        raise fail("no night was given", advice="make them with walop-jax nights, or refit --nights")
+        raise fail("no night was given", advice="give fits, sets or files of nights")
     ordered = tuple(sorted(nights, key=lambda night: (night.mjd, night.sha256)))
     check_together(ordered)
     known: dict[str, Parameter] = {}
@@ -375,7 +359,7 @@ def check_together(nights: Sequence[Night]) -> None:
     first = nights[0]
     advice = {
         "instrument": "stack the instruments apart",
-        "model": "linearise all nights with one model (walop-jax nights --like RUN)",
+        "model": "linearise all nights with one model (like=)",
     }
     for name, remedy in advice.items():
         for night in nights:
@@ -392,7 +376,3 @@ def check_together(nights: Sequence[Night]) -> None:
                 where = f"{what} are in {seen[key].source} and {night.source}"
                 raise fail(f"the night of MJD {night.number} is there twice: {where}", advice="leave one out")
             seen[key] = night
-
-
-Again = Callable[[Night, Mapping[str, float]], Night | None]
-"""Linearises a night again at other values; None where its data cannot be had."""

@@ -63,15 +63,6 @@ class Form(NamedTuple):
         turn = 2.0 * np.pi * mjd / YEAR
         return np.cos(turn) if self.kind == "cosine" else np.sin(turn)
 
-    @property
-    def words(self) -> str:
-        """The function in a few words."""
-        if self.kind != "window":
-            return {"linear": "per year"}.get(self.kind, f"annual {self.kind}")
-        if math.isinf(self.start):
-            return "" if math.isinf(self.stop) else f"before {self.stop:g}"
-        return f"from {self.start:.2f}" + ("" if math.isinf(self.stop) else f" to {self.stop:.2f}")
-
 
 ALWAYS = Form("window")
 
@@ -139,17 +130,6 @@ class Law:
             yield Form("linear", middle), False
         if "annual" in self.per:
             yield from ((Form(kind), False) for kind in ("cosine", "sine"))
-
-    def with_step(self, date: float) -> Law:
-        """The law with a step more; with intervals an edge more."""
-        per = self.per if {"interval", "step"} & set(self.per) else (*self.per, "step")
-        return dataclasses.replace(self, per=per, at=tuple(sorted({*self.at, date})))
-
-    def with_bad(self, start: float, stop: float) -> Law:
-        """The law with a time more at which the value differs."""
-        return dataclasses.replace(
-            self, per=tuple(dict.fromkeys((*self.per, "bad"))), bad=tuple(sorted({*self.bad, (start, stop)}))
-        )
 
     def document(self) -> dict[str, Any]:
         """The entry of a model file, as plain data."""

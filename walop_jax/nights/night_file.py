@@ -22,7 +22,7 @@ from walop_jax.data.schema import Column, Place, read_table
 from walop_jax.data.write import sign_and_write, table_hdu
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import DataError, fail
-from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits, primary_keywords
+from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits
 from walop_jax.io.text import in_ascii
 from walop_jax.model.parameters import Parameter
 from walop_jax.nights.equations import Night
@@ -30,7 +30,7 @@ from walop_jax.nights.equations import Night
 NIGHTVER = 1
 NIGHTS = "nights.fits"
 _NAN = float("nan")
-_AGAIN = "make the nights again: walop-jax nights"
+_AGAIN = "make the nights again and write them anew"
 _PARAMETERS = {
     "NAME": Column("str"),
     "UNIT": Column("str"),
@@ -99,11 +99,6 @@ def write_nights(path: str | os.PathLike[str], nights: Sequence[Night], *, overw
 
 def _texts(values: Iterable[str]) -> np.ndarray:
     return np.array([in_ascii(str(value)) for value in values], dtype=np.str_)
-
-
-def is_night_file(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is one of nights, by its header."""
-    return "NIGHTVER" in primary_keywords(path)
 
 
 def read_nights(path: str | os.PathLike[str]) -> list[Night]:
@@ -190,5 +185,5 @@ def nights_in(place: str | os.PathLike[str]) -> list[Night]:
         return read_nights(path)
     files = [path / NIGHTS] if (path / NIGHTS).exists() else sorted(path.glob("night*.fits"))
     if not files:
-        raise fail("holds no nights", file=place, advice="make them: walop-jax nights, or refit --nights")
+        raise fail("holds no nights", file=place, advice="write some there with write_nights")
     return [night for file in files for night in read_nights(file)]
