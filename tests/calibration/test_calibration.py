@@ -15,6 +15,7 @@ from small_run import WITH_PLATE, small_fit_with_plate
 from walop_jax.calibration import Calibration, read_calibration, write_calibration
 from walop_jax.data import DataError
 from walop_jax.data.settings import Settings
+from walop_jax.fit.minimise import RESULTS
 from walop_jax.fit.model_file import model_for, model_without_data, render
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.likelihood import Likelihood
@@ -250,7 +251,7 @@ def test_models_without_data():
 
 def test_quality_bits_follow_the_fit(result):
     assert result.judged().verdict.quality == 0
-    minimum = dataclasses.replace(result.minimum, converged=False, condition=1e11)
+    minimum = dataclasses.replace(result.minimum, result=RESULTS.stagnation, condition=1e11)
     posterior = dataclasses.replace(result.posterior, data=10.0 * result.dof)
     values = result.values.copy()
     index = result.model.index("pupil.magnification")

@@ -20,7 +20,8 @@ def test_a_set_that_can_be_inspected(call, folder, tmp_path):
     result = call("import-zemax", folder, "-o", output)
     assert result.exit_code == 0, result.output
     assert "WALOP-NORTH, 2 wavelengths, 12 exposures of 3 points, 36 rows to use" in result.stdout
-    assert result.stderr == ""
+    assert "warning" not in result.stderr
+    assert f"Next: walop-jax refit {output} -o RUN" in result.stderr
     shown = call("inspect", output)
     assert shown.exit_code == 0, shown.output
     assert "MONO-6600" in shown.stdout

@@ -226,8 +226,9 @@ def fluxes(plan: ObservingPlan, rng: np.random.Generator | None) -> Float[np.nda
     """
     used, source = plan.layout()
     exposures = plan.exposures()
-    usual = np.array([EXPOSED[str(kind)] for kind in exposures.kind])
-    electrons = plan.electrons * exposures.exptime / usual
+    # A kind of a user's own has no usual time: each of its exposures sees the electrons of the plan.
+    usual = [EXPOSED.get(str(kind), t) for kind, t in zip(exposures.kind, exposures.exptime, strict=True)]
+    electrons = plan.electrons * exposures.exptime / np.array(usual)
     if rng is None:
         brightness = np.append(np.full(plan.standards, np.mean(TRANSPARENCY)), 1.0)
         return 4.0 * electrons * np.mean(TRANSPARENCY) * np.broadcast_to(brightness[source], used.shape)
