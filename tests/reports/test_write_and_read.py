@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import handmade_run
-import numpy as np
 import pytest
+from same_record import assert_same
 
 from walop_jax.calibration import read_calibration, write_calibration
 from walop_jax.diagnosis.figure_file import read_figure_data, write_figure_data
@@ -29,23 +29,6 @@ RECORDS: Mapping[str, tuple[Any, Callable[[Path, Any], None], Callable[[Path], A
         lambda path: DetectionLimits.from_document(read_json(path)),
     ),
 }
-
-
-def assert_same(one: Any, other: Any, where: str) -> None:
-    """Records are equal; arrays bit for bit, NaN is NaN."""
-    if dataclasses.is_dataclass(one):
-        for field in dataclasses.fields(one):
-            assert_same(getattr(one, field.name), getattr(other, field.name), f"{where}.{field.name}")
-    elif isinstance(one, Mapping):
-        assert list(one) == list(other), where
-        for name in one:
-            assert_same(one[name], other[name], f"{where}[{name}]")
-    elif isinstance(one, tuple):
-        assert len(one) == len(other), where
-        for number, pair in enumerate(zip(one, other, strict=True)):
-            assert_same(*pair, f"{where}[{number}]")
-    else:
-        np.testing.assert_equal(other, one, err_msg=where)
 
 
 @pytest.mark.parametrize("name", RECORDS)
