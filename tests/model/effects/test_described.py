@@ -302,7 +302,7 @@ def test_what_cannot_be_carried_over_is_said():
         ("polarisation q of green_star", "nearest: polarisation q of"),
         ("polarisation of blue_star", "unknown description 'polarisation of blue_star'"),
         ("fringes of half1.plate", "of which gap"),
-        ("shift of filter", "unknown place of a shift 'filter'"),
+        ("shift of filter", "unknown place of shift 'filter'"),
     ],
 )
 def test_what_is_no_sentence_is_an_error(text, message):
