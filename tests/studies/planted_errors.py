@@ -172,7 +172,8 @@ ERRORS = (
     planted("paper/polynomial.py", "(s * (1 - t), 0, 1), ((1 - s) * t, 1, 0)",
             "(s * (1 - t), 1, 0), ((1 - s) * t, 0, 1)", "paper/test_polynomial.py"),
     # plans
-    planted("plans/optimal.py", "return self.here**2 / (self.known", "return self.here**2 / (0.0 * self.known", "plans/test_optimal.py"),
+    planted("plans/optimal.py", "return self.here**2 / (self.known", "return self.here**2 / (0.0 * self.known",
+            "plans/test_optimal.py"),
     planted("plans/families.py", "- 1j * series[2::2]", "+ 1j * series[2::2]", "plans/test_optimal.py"),
     # commands
     planted("commands/refit.py", "            if result.converged:", "            if True:",
