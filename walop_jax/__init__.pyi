@@ -46,7 +46,6 @@ from walop_jax.model.parameters import param as param
 from walop_jax.model.specification import Model as Model
 from walop_jax.model.specification import with_effects as with_effects
 from walop_jax.model.trace import Sightline as Sightline
-from walop_jax.nights.survey import stack as stack
 from walop_jax.posterior import Options as Options
 from walop_jax.posterior.files import Run as Run
 from walop_jax.simulation.observing_plan import ObservingPlan as ObservingPlan

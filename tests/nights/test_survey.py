@@ -18,6 +18,7 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, make_model, with_effects
 from walop_jax.nights import night_file
+from walop_jax.nights.survey import stack
 from walop_jax.simulation.simulate import simulate
 
 TURN = 0.1  # deg, of the axis of a half-wave plate, between the third night and the fourth
@@ -50,7 +51,7 @@ def single(sets):
 
 @pytest.fixture(scope="module")
 def quiet(sets, single):
-    return walop.stack([single, *sets[1:3]])
+    return stack([single, *sets[1:3]])
 
 
 def test_a_stack_is_the_joint_fit(sets, quiet):
@@ -71,7 +72,7 @@ def test_nights_that_share_nothing_are_single_fits(sets, single):
     """Every parameter with a value of its own in every night: the fit of that night; χ² and degrees of freedom add."""
     other = fitted(sets[1])
     laws = {single.model.names[i]: {"per": "night"} for i in single.model.free}
-    survey = walop.stack([other, single], laws)
+    survey = stack([other, single], laws)
     for k, alone in enumerate((single, other)):
         product = survey.at(SMALL.start + 7.0 * k)
         assert np.all(np.abs(product.values - alone.values) <= 1e-3 * alone.sigma)
@@ -83,19 +84,19 @@ def test_nights_that_share_nothing_are_single_fits(sets, single):
 def test_a_step_of_what_the_model_lacks(sets, single):
     """The planted turn, under a law of its date; 0 before; without the law the stack is not trusted."""
     date = SMALL.start + 17.5
-    survey = walop.stack([single, *sets[1:]], {"hwp1_axis.angle": {"per": "step", "at": date}})
+    survey = stack([single, *sets[1:]], {"hwp1_axis.angle": {"per": "step", "at": date}})
     before, after = (survey.at(date + days)["hwp1_axis.angle"] for days in (-1.0, 1.0))
     assert (before.value, before.sigma) == (0.0, 0.0)
     assert 0.0 < after.sigma < TURN / 10.0
     assert abs(after.value - TURN) < 4.0 * after.sigma
     assert survey.trusted
-    assert not walop.stack([single, *sets[1:]]).trusted
+    assert not stack([single, *sets[1:]]).trusted
 
 
 def test_a_walk_knows_less_after_the_last_night(quiet):
     """Variance grows by rate² Δt; a parameter that may walk is known less well than one that all nights share."""
     name, rate = "half1.plate.mgf2", 1e-2
-    survey = walop.stack(quiet.data.nights, {name: {"per": "walk", "rate": rate}})
+    survey = stack(quiet.data.nights, {name: {"per": "walk", "rate": rate}})
     k, last = survey.data.names.index(name), survey.data.nights[-1].mjd
     ((value, at_last), (later, after)) = (survey.values_at(last + days) for days in (0.0, 0.4))
     assert value[k] == later[k]
@@ -115,7 +116,7 @@ def test_tracks_and_tables(quiet):
     # A night that alone were free to differ: the law of a bad night gives the same change and error.
     night = quiet.data.nights[1]
     law = {"per": ["shared", "bad"], "bad": [[night.mjd - 1.0, night.mjd + 1.0]]}
-    other = walop.stack(quiet.data.nights, {name: law})
+    other = stack(quiet.data.nights, {name: law})
     k = other.data.names.index(name)
     change = np.diff([other.values_at(night.mjd + days)[0][k] for days in (-7.0, 0.0)])[0]
     assert rows["DEVIATION"][1] == pytest.approx(change, abs=1e-6 * rows["DEVIATION_ERR"][1])
@@ -129,16 +130,16 @@ def test_kept_nights_are_stacked(quiet, sets, single, tmp_path):
     """Files of nights that were linearised where all of them end: the same values, and no more is promised."""
     for k, night in enumerate(quiet.data.nights):
         night_file.write_nights(tmp_path / f"night{k}.fits", [night])
-    kept = walop.stack([tmp_path], like=single)
+    kept = stack([tmp_path], like=single)
     assert kept.values_at(SMALL.start)[0] == pytest.approx(
         quiet.values_at(SMALL.start)[0], rel=1e-9, abs=1e-12
     )
     assert kept.at(SMALL.start).values == pytest.approx(quiet.at(SMALL.start).values, rel=1e-9, abs=1e-12)
     assert any("stay as they were linearised" in text for text in kept.verdict.warnings)
     with pytest.raises(DataError, match="no calibration is known"):
-        walop.stack([tmp_path]).at(SMALL.start)
+        stack([tmp_path]).at(SMALL.start)
     with pytest.raises(DataError, match="nothing says at which values"):
-        walop.stack([sets[0]])
+        stack([sets[0]])
 
 
 def test_outside_the_nights_only_by_force(quiet):
@@ -153,23 +154,23 @@ def test_outside_the_nights_only_by_force(quiet):
 def test_bad_input(quiet, single):
     one, two, three = quiet.data.nights
     with pytest.raises(DataError, match=r"there is twice|is there twice"):
-        walop.stack([one, one])
+        stack([one, one])
     with pytest.raises(DataError, match="other filters"):
-        walop.stack([one, dataclasses.replace(two, filters=("other",))])
+        stack([one, dataclasses.replace(two, filters=("other",))])
     late = dataclasses.replace(three, number=three.number + 400, begin=three.begin + 400, end=three.end + 400)
-    survey = walop.stack([one, two, dataclasses.replace(late, mjd=three.mjd + 400)], like=single)
+    survey = stack([one, two, dataclasses.replace(late, mjd=three.mjd + 400)], like=single)
     assert any("no night from MJD" in text for text in survey.verdict.warnings)
     with pytest.raises(ValueError, match="did you mean"):
-        walop.stack([one, two], {"half1.plate.mgf": {"per": "night"}})
+        stack([one, two], {"half1.plate.mgf": {"per": "night"}})
     shape = next(name for name in one.names if "#" in name)
     with pytest.raises(DataError, match="is one shape of its effect"):
-        walop.stack([one, two, three], {shape: {"per": "linear"}}, like=single).at(one.mjd)
+        stack([one, two, three], {shape: {"per": "linear"}}, like=single).at(one.mjd)
     deaf = dataclasses.replace(two, matrix=np.zeros_like(two.matrix), gradient=np.zeros_like(two.gradient))
     free = next(p.name for p in one.parameters if p.prior is None and p.loose is None)
     with pytest.raises(DataError, match=r"says nothing of .*, which has a value of its own there"):
-        walop.stack([one, deaf, three], {free: {"per": "night"}})
+        stack([one, deaf, three], {free: {"per": "night"}})
     with pytest.raises(DataError, match="do not explain its scatter"):
-        walop.stack([dataclasses.replace(single, errors_from="residuals")])
+        stack([dataclasses.replace(single, errors_from="residuals")])
 
 
 def test_the_page_runs_as_it_stands(sets, tmp_path, monkeypatch, capsys):
