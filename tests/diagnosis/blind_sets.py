@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.effect_columns import Probe, effect_candidates, probes
+from walop_jax.diagnosis.effect_columns import Probe, all_candidates, probes
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.policy import POLICY
@@ -69,7 +69,7 @@ class Hiding:
             tuple(_jittered(member, rng) for member in probe.group) if len(probe.group) == 1 else probe.group
         )
         probe = Probe(probe.name, probe.effect, group)
-        candidate = effect_candidates(self.fit.calset, self.fit.model, self.fit.values, [probe])[probe.name]
+        candidate = all_candidates(self.fit.likelihood, self.fit.values, [probe], ())[0][probe.name]
         columns = self.design.stacked([candidate.columns])
         step = rng.standard_normal(len(probe.widths)) * probe.widths
         step = np.where(probe.one_sided, np.abs(step), step)

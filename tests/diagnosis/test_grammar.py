@@ -10,7 +10,7 @@ from own_instrument import OWN
 
 from walop_jax.data.records import Position
 from walop_jax.diagnosis import grammar
-from walop_jax.diagnosis.effect_columns import all_candidates, applicable, effect_candidates, probes
+from walop_jax.diagnosis.effect_columns import all_candidates, applicable, probes
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.instruments.description import parsed
@@ -69,7 +69,7 @@ def test_names_are_sentences(laid, said):
     single = {}
     for name, columns in said.items():
         single |= dict(zip(name.split("; "), columns.T, strict=True))
-    theirs = effect_candidates(laid.calset, laid.model, laid.values, wanted)
+    theirs = all_candidates(laid.likelihood, laid.values, wanted, ())[0]
     assert {p.effect.name for p in wanted if p.name not in theirs} == {"etalon"}, (
         "wide gaps, blurred by the bands"
     )

@@ -61,15 +61,3 @@ def test_field_point_leaves_in_the_direction_worked_out_by_hand(arguments, tange
     kx, ky, kz = optics.pupil_direction(*(jnp.asarray(v) for v in arguments))
     np.testing.assert_allclose([kx / kz, ky / kz], tangents, atol=1e-10)
     assert float(kx**2 + ky**2 + kz**2) == pytest.approx(1.0, abs=1e-15)
-
-
-@pytest.mark.parametrize("direction", DIRECTIONS)
-def test_carried_axes_are_those_of_the_smallest_rotation(direction):
-    """Rodrigues' rotation from z to k about z × k, applied to the axes."""
-    k = np.array([*direction, np.sqrt(1 - np.sum(np.square(direction)))])
-    v = np.cross([0.0, 0.0, 1.0], k)
-    cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    rotation = np.eye(3) + cross + cross @ cross / (1 + k[2])
-    np.testing.assert_allclose(rotation @ [0, 0, 1], k, atol=1e-15)
-    found = optics.carried_axes(tuple(jnp.asarray(c) for c in k))
-    np.testing.assert_allclose(found, [rotation[:, 0], rotation[:, 1]], atol=1e-15)

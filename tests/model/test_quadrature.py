@@ -39,13 +39,17 @@ CURVES = {
 }
 
 
+def gauss_rule(node, weight, count):
+    return next(quadrature.gauss_rules(node, weight, range(count, count + 1)))
+
+
 @pytest.mark.parametrize("count", [1, 2, 5, 12])
 def test_gauss_rule_is_exact_for_polynomials(count):
     """Degree 2n − 1, on a lopsided discrete measure; degree 2n is not."""
     rng = np.random.default_rng(1)
     node, weight = np.sort(rng.uniform(0.5, 0.7, 60)), rng.uniform(0.1, 1.0, 60)
     weight /= weight.sum()
-    found, found_weight = quadrature.gauss_rule(node, weight, count)
+    found, found_weight = gauss_rule(node, weight, count)
     assert found_weight.min() > 0
     t, found_t = (node - 0.6) / 0.1, (found - 0.6) / 0.1
     for degree in range(2 * count):
@@ -57,7 +61,7 @@ def test_gauss_rule_of_the_uniform_measure_is_gauss_legendre():
     """The three-point rule typed: ± √(3/5), weights 5/18, 4/9, 5/18."""
     edges = np.linspace(-1, 1, 200001)
     middle = 0.5 * (edges[1:] + edges[:-1])
-    node, weight = quadrature.gauss_rule(middle, np.full(middle.size, 1 / middle.size), 3)
+    node, weight = gauss_rule(middle, np.full(middle.size, 1 / middle.size), 3)
     np.testing.assert_allclose(node, [-0.7745966692, 0, 0.7745966692], atol=1e-9)
     np.testing.assert_allclose(weight, [5 / 18, 4 / 9, 5 / 18], atol=1e-9)
 
@@ -124,7 +128,7 @@ def test_band_rule_is_not_wasteful():
     count = len(quadrature.band_rule(*curve)[0])
     error = {}
     for n in range(20, count + 1):
-        found = forward.analysis_vectors(params, *CENTRE_TO_CORNERS, *quadrature.gauss_rule(*measure, n))
+        found = forward.analysis_vectors(params, *CENTRE_TO_CORNERS, *gauss_rule(*measure, n))
         error[n] = np.abs(found - full).max() / full[:, :, 0].max()
     fewest = 1 + max(n for n, e in error.items() if e > 1e-6)
     assert fewest <= count <= 1.25 * fewest

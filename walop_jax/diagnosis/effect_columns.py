@@ -22,7 +22,6 @@ from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations
 from walop_jax.model.ray import CONDITIONS
-from walop_jax.model.specification import Model
 
 DEFAULT_WIDTH = 1.0
 FEWEST_POINTS = 9  # in which a pattern over the field is looked for, or what refers to their median
@@ -98,13 +97,6 @@ def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Pr
         if probe.effect not in shown:
             shown[probe.effect] = _can_show(calset, instrument, probe.group[0])
     return [probe for probe in wanted if shown[probe.effect]]
-
-
-def effect_candidates(
-    calset: CalibrationSet, model: Model, values: Vector, wanted: Sequence[Probe]
-) -> dict[str, Candidate]:
-    """Columns of all probes at the fit `values` of `model`, by probe name; without those that the bands blur away."""
-    return all_candidates(Likelihood.of(calset, model), values, wanted, ())[0]
 
 
 def all_candidates(

@@ -62,8 +62,7 @@ class Score:
     """The efficient score of one candidate.
 
     `statistic` T and `rank`; `p_value` local; `amplitudes` one step from zero with `covariance`; `log_bayes` the
-    Laplace evidence against the base for the prior widths; `surviving` the largest share of a column's square that
-    the base does not absorb; `testable` False when nothing survives.
+    Laplace evidence against the base for the prior widths; `testable` False when the base absorbs all of it.
     """
 
     name: str
@@ -74,7 +73,6 @@ class Score:
     amplitudes: Vector
     covariance: Float[np.ndarray, "k k"]
     log_bayes: float
-    surviving: float
     testable: bool
 
 
@@ -331,15 +329,12 @@ class Scorer:
         z = w.T @ np.where(alive, scores[at], 0.0)
         statistic, rank = float(z @ z) / noise**2, w.shape[1]
         log_p = float(stats.chi2.logsf(statistic, rank)) if rank else 0.0
-        after = np.clip(np.diag(self.space.gram)[at], 0.0, None)
-        before = self.space.before[at]
-        share = np.where(before > 0, after / np.where(before > 0, before, 1.0), 0.0)
         gram = np.where(np.outer(alive, alive), self.space.gram[at, at], 0.0)
         return Score(
             name=name, statistic=statistic, rank=rank, p_value=float(np.exp(log_p)), log_p=log_p,
             amplitudes=-w @ z, covariance=w @ w.T * noise**2,
             log_bayes=log_bayes(gram / noise**2, np.where(alive, scores[at], 0.0) / noise**2, self.space.widths[at]),
-            surviving=float(share.max(initial=0.0)), testable=rank > 0,
+            testable=rank > 0,
         )  # fmt: skip
 
     def _global_p(self, scores: Sequence[Score]) -> tuple[float, float]:

@@ -54,7 +54,6 @@ from walop_jax.model.effects import Context, Described, Effect, FreeForm, OtherD
 from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import Model, effect_context
 
-MINUTES = POLICY.minutes
 _SMALL = 200  # field points up to which programs of earlier models may stay: half a gigabyte
 
 

@@ -100,11 +100,6 @@ class FitResult(Result):
         return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
 
     @property
-    def n_priors(self) -> int:
-        """Number of free parameters that are known beforehand."""
-        return sum(1 for i in self.model.free if self.model.parameters[i].prior is not None)
-
-    @property
     def excess(self) -> float:
         """(χ² − dof) / √(2 dof): how many standard deviations χ² lies above its expectation."""
         return (self.chi2 - self.dof) / np.sqrt(2.0 * max(self.dof, 1))

@@ -19,7 +19,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -150,8 +149,3 @@ class Cameras(Component):
         for a, b in self.pairs:
             other[a], other[b] = b, a
         return tuple(other)
-
-
-def per_camera(count: int, value: float = 0.0) -> Float[Array, " k"]:
-    """One value for each camera."""
-    return jnp.full(count, value)

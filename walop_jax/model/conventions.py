@@ -10,7 +10,7 @@ Matrix      one row for each arm, the normalised difference of its two cameras, 
             q_m = (N0 − N1)/(N0 + N1) = m21 + m22 q + m23 u and u_m = (N2 − N3)/(N2 + N3) = m31 + m32 q + m33 u,
             m being ratios of band-integrated linear coefficients.
 Oblique     The Stokes parameters of a ray of direction k refer to the ICS axes carried from (0, 0, 1) to k by
-            the smallest rotation (`optics.carried_axes`).
+            the smallest rotation (`optics.transport_rotation`).
 """
 
 REFERENCE_WAVELENGTH = 0.62  # µm: where dispersions, colours and fringes are counted from
@@ -22,6 +22,4 @@ def matrix_elements(arms: int) -> tuple[str, ...]:
     return tuple(f"m{row}{column}" for row in range(2, 2 + arms) for column in (1, 2, 3))
 
 
-MATRIX_ELEMENTS = matrix_elements(2)
-CAMERA_NAMES = ("O1", "E1", "O2", "E2")
 EXTINCTION = 2e-5  # of the calibration polariser of WALOP, unwanted over wanted transmission

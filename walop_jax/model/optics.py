@@ -59,12 +59,3 @@ def wedge_rotation(direction: tuple[Real, Real, Real], angle: Real, index: Real)
     sx, sy = behind_wedge(direction, angle, index)
     gx, gy = sx / index, sy / index
     return transport_rotation(direction, (gx, gy, jnp.sqrt(1.0 - gx**2 - gy**2)))
-
-
-def carried_axes(direction: tuple[Real, Real, Real]) -> tuple[Float[Array, "... 3"], Float[Array, "... 3"]]:
-    """The ICS axes carried from (0, 0, 1) to `direction` by the smallest rotation."""
-    kx, ky, kz = direction
-    g = 1.0 / (1.0 + kz)
-    first = jnp.stack([1.0 - g * kx**2, -g * kx * ky, -kx], axis=-1)
-    second = jnp.stack([-g * kx * ky, 1.0 - g * ky**2, -ky], axis=-1)
-    return first, second

@@ -70,11 +70,6 @@ def gauss_rules(node: Vector, weight: Vector, counts: range) -> Iterator[Rule]:
         yield centre + half * value, columns[0] ** 2
 
 
-def gauss_rule(node: Vector, weight: Vector, count: int) -> Rule:
-    """Gauss rule with `count` nodes for a discrete measure whose weights sum to 1."""
-    return next(gauss_rules(node, weight, range(count, count + 1))) if count < len(node) else (node, weight)
-
-
 def _fringe_error(
     node: Vector,
     weight: Vector,

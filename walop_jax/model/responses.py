@@ -46,7 +46,6 @@ from walop_jax.model.sources import ExposureArrays, MoonPatches, MoonSky, Sight
 
 Scalar = Float[Array, ""]
 REFERENCE_WAVELENGTH = 0.62  # µm
-MOMENTS = 2  # 1 and colour
 LAYER_NUMBERS = ("thickness", "axis", "cut")
 
 

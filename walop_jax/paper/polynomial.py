@@ -33,12 +33,8 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import Block, CalibrationSet
 from walop_jax.data.settings import DEFAULT_FILTER, Settings
-from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.diagnosis.trust import examined
-from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model.conventions import EXTINCTION
-from walop_jax.model.specification import Model
 from walop_jax.science.estimate import estimate
 from walop_jax.science.star_errors import QuPairs, sample_stars, transmitted
 from walop_jax.sky.moon import moon_sky
@@ -295,34 +291,6 @@ def _smooth_fit(
         float(left @ left / max(len(left) - 3, 1)),
         sky.mean(axis=0),
     )
-
-
-def down_weighted(calset: CalibrationSet, patches: Patches) -> CalibrationSet:
-    """The set with the errors of every Moon exposure divided by the square root of its weight."""
-    block = calset.intensities.block(0, len(calset.points))
-    sigma = block.sigma.copy()
-    sigma[:, patches.exposure] /= np.sqrt(patches.weight)[:, None]
-    changed = Block(block.x, block.y, block.counts, sigma, block.used, block.source)
-    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, changed))
-
-
-def reweighted_calibration(
-    calset: CalibrationSet, model: Model, rounds: int = 6
-) -> tuple[Calibration, Patches]:
-    """Fit, judge the patches, weigh them down, fit again, until the weights settle (iterative reweighting).
-
-    A bad patch spoils the calibration that it is judged with, and with it the look of good ones; a few rounds
-    tell them apart. Weights are always of the errors as given.
-    """
-    current, weight = calset, np.ones(0)
-    while True:
-        calibration = Calibration.from_fit(examined(refit(current, model)))
-        patches = judge_patches(calset, calibration)
-        rounds -= 1
-        if rounds < 1 or (weight.size and np.allclose(patches.weight, weight, rtol=0.05)):
-            return calibration, patches
-        weight = patches.weight
-        current = down_weighted(calset, patches)
 
 
 # ----------------------------------------------------------------------------------- the scheme of the paper

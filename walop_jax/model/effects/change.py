@@ -144,11 +144,6 @@ class Change:
         return found[0]
 
     @property
-    def field_factors(self) -> tuple[str, ...]:
-        """Factors that depend on the field point alone."""
-        return tuple(f.text for f in self.grows_with if f.depends_on == FIELD)
-
-    @property
     def exposure_factors(self) -> tuple[str, ...]:
         """Factors that depend on the exposure."""
         return tuple(f.text for f in self.grows_with if f.depends_on not in (FIELD, WAVELENGTH))
