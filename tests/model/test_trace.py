@@ -17,7 +17,7 @@ from walop_jax.model.effects import effect_by_name
 from walop_jax.model.effects.base import Context
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.planning import plan_for
-from walop_jax.model.trace import STOKES, Sightline, Stage, trace
+from walop_jax.model.trace import STOKES, LightStage, Sightline, trace
 
 
 def setting(plate: float | None, teff: float = np.nan) -> Settings:
@@ -63,7 +63,7 @@ def counts_of(instrument, sightline: Sightline) -> np.ndarray:
     )
 
 
-def named(stages: tuple[Stage, ...], name: str) -> np.ndarray:
+def named(stages: tuple[LightStage, ...], name: str) -> np.ndarray:
     return next(stage.value for stage in stages if stage.name == name)
 
 

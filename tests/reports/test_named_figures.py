@@ -16,7 +16,7 @@ from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model import mueller
 from walop_jax.paper.wavelength import plate_retardances, retardance
-from walop_jax.reports.named import FIGURES, Source, draw
+from walop_jax.reports.named import FIGURES, FigureSource, draw
 from walop_jax.reports.posterior_figures import informed
 from walop_jax.reports.style import element_kind
 from walop_jax.simulation.simulate import simulate
@@ -25,12 +25,12 @@ WITHOUT = ("corner", "trace", "residual-map", "protection", "separation")  # wha
 
 
 @pytest.fixture(scope="module")
-def source(tmp_path_factory) -> Source:
+def source(tmp_path_factory) -> FigureSource:
     folder = tmp_path_factory.mktemp("run")
     write_calibration_set(folder / "set.fits", simulate(SMALL, seed=SEED).calset)
     calibration = Calibration.from_fit(refit(read_calibration_set(folder / "set.fits")).judged())
     write_calibration(folder / "calibration.fits", calibration)
-    return Source(folder)
+    return FigureSource(folder)
 
 
 @pytest.mark.parametrize("name", [name for name in FIGURES if name not in WITHOUT])
@@ -118,7 +118,7 @@ def test_coefficients_that_are_only_prior_are_not_shown():
 
 @pytest.mark.parametrize("name", ["protection", "separation"])
 def test_figures_of_limits(tmp_path, name):
-    figure = draw(name, Source(handmade_run.make_limits(tmp_path)))
+    figure = draw(name, FigureSource(handmade_run.make_limits(tmp_path)))
     assert figure.axes[0].has_data()
 
 

@@ -44,7 +44,7 @@ def plot(
     """
     from walop_jax import Run
     from walop_jax.io.atomic import check_output
-    from walop_jax.reports.named import FIGURES, Source, draw
+    from walop_jax.reports.named import FIGURES, FigureSource, draw
     from walop_jax.reports.posterior_figures import save_figure
 
     if run is None or name is None:
@@ -69,7 +69,7 @@ def plot(
     if isinstance(parameters, str):
         parameters = [part.strip() for part in parameters.split(",") if part.strip()]
     job.tell(f"drawing {name}")
-    figure = draw(name, Source.of(held, parameters=tuple(parameters or ()), place=(x, y)))
+    figure = draw(name, FigureSource.of(held, parameters=tuple(parameters or ()), place=(x, y)))
     if path is not None:
         save_figure(path, figure, overwrite=job.overwrite)
     return Outcome(figure, lambda: {"figure": name, "output": str(path)}, lambda: str(path))

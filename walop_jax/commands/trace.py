@@ -21,7 +21,7 @@ from walop_jax.commands.inputs import (
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Run
-    from walop_jax.model.trace import Stage
+    from walop_jax.model.trace import LightStage
 
 PRODUCT = Argument("An instrument as fitted; without it, as designed.", "[RUN/calibration.fits]", Path)
 ANGLE = Option("Polariser in, with its axis here (deg).", kind=float)
@@ -33,7 +33,7 @@ AT = Option(
 TEFF = Option("Colour temperature (K); without it, a flat spectrum.", kind=float)
 
 
-class Traced(tuple["Stage", ...]):
+class Traced(tuple["LightStage", ...]):
     """The stages of a sightline; prints as the table of the command."""
 
     def __repr__(self) -> str:
@@ -128,7 +128,7 @@ def _angles(at: Mapping[str, float] | Sequence[str] | None) -> dict[str, float]:
     return found
 
 
-def table(stages: Sequence[Stage]) -> list[str]:
+def table(stages: Sequence[LightStage]) -> list[str]:
     """The stages as lines of text; column names appear where they change."""
     width = max(len(f"{stage.name} {row}") for stage in stages for row in stage.rows)
     lines: list[str] = []

@@ -42,7 +42,7 @@ from walop_jax.diagnosis.repeated_noise import repeated_noise
 from walop_jax.diagnosis.score import Projector, ScoreTable, local_p
 from walop_jax.diagnosis.stated_conditions import Singles, hidden_mistakes, stated_conditions
 from walop_jax.diagnosis.variance_components import (
-    Component,
+    VarianceComponent,
     found_components,
     in_words,
     structure_of,
@@ -113,7 +113,7 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
     return dataclasses.replace(found, hidden=hidden_mistakes(design, singles))
 
 
-def _of_pixels(result: FitResult) -> list[Component]:
+def _of_pixels(result: FitResult) -> list[VarianceComponent]:
     """What single pixels of whole frames have in common between exposures, of a sample of them."""
     if not isinstance(result.posterior, PixelPosterior):
         return []

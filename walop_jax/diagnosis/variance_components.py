@@ -64,7 +64,7 @@ class Grouping(NamedTuple):
     structure: str = ""
 
 
-class Component(NamedTuple):
+class VarianceComponent(NamedTuple):
     """What one grouping holds: T in standard deviations of noise, its p, and the size τ with its standard error."""
 
     grouping: Grouping
@@ -74,7 +74,7 @@ class Component(NamedTuple):
     error: float
 
 
-def variance_components(design: Design, *, pixels: bool = False) -> list[Component]:
+def variance_components(design: Design, *, pixels: bool = False) -> list[VarianceComponent]:
     """Every grouping that the data have, asked by itself; of single `pixels` those of field points alone."""
     residual = design.projector(design.residual)
     square = float(residual @ residual)
@@ -82,13 +82,13 @@ def variance_components(design: Design, *, pixels: bool = False) -> list[Compone
     return [one[0].answered(one[1][:, 0], square) for one in ready if one is not None and square > 0]
 
 
-def found_components(components: list[Component]) -> list[Component]:
+def found_components(components: list[VarianceComponent]) -> list[VarianceComponent]:
     """Those that noise does not make, the clearest first, after one correction for all that were asked."""
     limit = local_p(ALARM, len(components))
     return sorted((c for c in components if c.p_value < limit), key=lambda c: c.p_value)
 
 
-def in_words(found: list[Component]) -> Iterator[str]:
+def in_words(found: list[VarianceComponent]) -> Iterator[str]:
     """One sentence on what was found; a grouping that is asked as well often answers to the same structure."""
     if not found:
         return
@@ -100,7 +100,7 @@ def in_words(found: list[Component]) -> Iterator[str]:
     )
 
 
-def structure_of(found: list[Component]) -> Structure:
+def structure_of(found: list[VarianceComponent]) -> Structure:
     """What field points differ by, of the components that were found."""
 
     def size(name: str) -> float:
@@ -109,7 +109,9 @@ def structure_of(found: list[Component]) -> Structure:
     return Structure(size("gain"), size("response"))
 
 
-def with_structure(result: FitResult, design: Design, found: list[Component], points: int) -> FitResult:
+def with_structure(
+    result: FitResult, design: Design, found: list[VarianceComponent], points: int
+) -> FitResult:
     """The fit with what the structure of field points does to its parameters added to their covariance.
 
     With J = QR the parameters take up R⁻¹QᵀA of the amplitudes, so that τ² R⁻¹BBᵀR⁻ᵀ is added. `design` may be of a
@@ -193,14 +195,16 @@ class Question(NamedTuple):
     error: float
     skew: float
 
-    def answered(self, pull: Float[np.ndarray, " a"], square: float) -> Component:
+    def answered(self, pull: Float[np.ndarray, " a"], square: float) -> VarianceComponent:
         """The component, from Aᵀr and r·r."""
         noise = square / self.free
         deviate = 0.5 * self.error * (float(np.sum(pull**2)) / noise - self.share * self.free)
         error = noise * self.error  # of τ²
         size = float(np.sqrt(max(deviate * error, 0.0)))
         p_value = _tail(deviate, self.skew)
-        return Component(self.grouping, deviate, p_value, size, 0.5 * error / max(size, np.sqrt(error)))
+        return VarianceComponent(
+            self.grouping, deviate, p_value, size, 0.5 * error / max(size, np.sqrt(error))
+        )
 
 
 def asked(

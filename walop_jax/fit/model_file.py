@@ -52,7 +52,7 @@ PARAMETER_KEYS = ("start", "prior", "free", "tie", "unit", "scale", "about")
 
 
 @dataclasses.dataclass(frozen=True)
-class Header:
+class ModelTable:
     """The [model] table: what decides which parameters there are. None: as in the base model.
 
     `choices` are those of effects, `entries` those of effects that do not come with the package.
@@ -66,11 +66,11 @@ class Header:
     entries: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
-def header_of(model: Model) -> Header:
+def header_of(model: Model) -> ModelTable:
     """What decides which parameters a model has."""
     instrument = model.template
     choices = {effect.name: effect.choices() for effect in model.effects}
-    return Header(
+    return ModelTable(
         instrument=model.name,
         plates=instrument.plates,
         throughput_degree=instrument.throughput.degree,
@@ -115,7 +115,7 @@ def render(model: Model) -> str:
     return tomlkit.dumps(document)
 
 
-def parse(text: str, build: Callable[[Header], Model]) -> Model:
+def parse(text: str, build: Callable[[ModelTable], Model]) -> Model:
     """The model that a TOML text describes; `build` makes the base model for its [model] table.
 
     Raises ValueError naming the table and key that is wrong, and what to write instead.
@@ -143,7 +143,7 @@ def parse(text: str, build: Callable[[Header], Model]) -> Model:
     return dataclasses.replace(model, parameters=changed)
 
 
-def _header(table: Mapping[str, Any], choices: Mapping[str, Any], entries: Mapping[str, Any]) -> Header:
+def _header(table: Mapping[str, Any], choices: Mapping[str, Any], entries: Mapping[str, Any]) -> ModelTable:
     for key in table:
         if key not in MODEL_KEYS:
             raise unknown_name("key of [model]", key, MODEL_KEYS)
@@ -158,7 +158,7 @@ def _header(table: Mapping[str, Any], choices: Mapping[str, Any], entries: Mappi
             raise unknown_name("effect (it has choices but is not in the list of [model])", name, effects)
         if not isinstance(values, Mapping):
             raise ValueError(f"[effects] {name} = {values!r} must be a table, [effects.{name}]")
-    return Header(table.get("instrument"), table.get("plates"), degree, tuple(effects), choices, entries)
+    return ModelTable(table.get("instrument"), table.get("plates"), degree, tuple(effects), choices, entries)
 
 
 def _number(name: str, key: str, value: Any) -> float:
@@ -313,7 +313,7 @@ def model_for(
     Raises ValueError for anything in the text that does not exist or does not fit the data.
     """
 
-    def build(header: Header) -> Model:
+    def build(header: ModelTable) -> Model:
         model = base_model(
             calset, instrument, plates=header.plates, throughput_degree=header.throughput_degree
         )
@@ -360,7 +360,7 @@ def model_without_data(
     """
     design = nominal_instrument(instrument) if isinstance(instrument, str) else as_designed(instrument)
 
-    def build(header: Header) -> Model:
+    def build(header: ModelTable) -> Model:
         nominal = adapted(
             design, standards=standards, plates=header.plates, throughput_degree=header.throughput_degree
         )
@@ -372,14 +372,14 @@ def model_without_data(
     return parse(text, build)
 
 
-def known_to(header: Header, catalogue: Catalogue) -> tuple[type[Effect], ...]:
+def known_to(header: ModelTable, catalogue: Catalogue) -> tuple[type[Effect], ...]:
     """A catalogue with the entries that a model file brings along; those of the catalogue stay."""
     names = {effect.name for effect in catalogue}
     own = {name: table for name, table in header.entries.items() if name not in names}
     return (*catalogue, *entries(own, OWN_ENTRIES))
 
 
-def _with_effects(model: Model, header: Header, context: Context) -> Model:
+def _with_effects(model: Model, header: ModelTable, context: Context) -> Model:
     effects: list[Any] = []
     for name in header.effects:
         choices: Mapping[str, Any] = header.choices.get(name, {})

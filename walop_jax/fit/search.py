@@ -36,7 +36,7 @@ LARGE_TOLERANCE = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
-class Found:
+class FoundMinimum:
     """A minimum, the values of all parameters there, and from how many places it was sought."""
 
     minimum: Minimum
@@ -79,7 +79,7 @@ def _search(
     expand: Expand | None = None,
     maximum_steps: int = MAXIMUM_STEPS,
     **how: Any,
-) -> Found:
+) -> FoundMinimum:
     """The minimum from a full vector of start values; `near` is an expansion at similar ones, if there is any.
 
     `expand` takes the place of `Likelihood.expand`; `how` goes to `minimise`.
@@ -107,12 +107,12 @@ def _search(
         progress=tell,
         **how,
     )
-    return Found(minimum, full(minimum.x))
+    return FoundMinimum(minimum, full(minimum.x))
 
 
 def find_minimum(
     likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
-) -> Found:
+) -> FoundMinimum:
     """The minimum of a set from start values that may be far away; of a large one, from that of a sample of it.
 
     Of whole frames some strips of image rows come between the sample and all pixels. `noise_scale` and `worth` are
@@ -129,7 +129,7 @@ def find_minimum(
         every = strips_of(likelihood) // limits.FIRST_STRIPS
         passes = [("fit of some image rows", _unkept(likelihood), every, 1.0)] if every > 1 else []
         passes.append(("fit of all pixels", likelihood, 1, LARGE_TOLERANCE))
-    found: Found | None = None
+    found: FoundMinimum | None = None
     for label, whole, every, tolerance in passes:
         expand = None if every is None else functools.partial(_of_pixels, whole, every)
         found = _search(
@@ -177,7 +177,7 @@ def _of_sample(
 
 def _from_afar(
     likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
-) -> Found:
+) -> FoundMinimum:
     """The minimum from start values that may be far away, the errors of the data scaled if need be."""
     check_identifiable(likelihood)
     given = noise_scale or 1.0
@@ -190,11 +190,11 @@ def _from_afar(
     return _far_off(likelihood, found)
 
 
-def _far_off(likelihood: Likelihood, found: Found) -> Found:
+def _far_off(likelihood: Likelihood, found: FoundMinimum) -> FoundMinimum:
     """The best place for a model that is far from the data: errors scaled to what it leaves, other orders tried."""
     left, starts = most_passes(likelihood.model) - found.minimum.steps, 1
 
-    def search(label: str, values: Vector, scale: float, most: int) -> Found:
+    def search(label: str, values: Vector, scale: float, most: int) -> FoundMinimum:
         nonlocal left
         more = _search(
             likelihood, label, values, scale, found.posterior, maximum_steps=max(1, min(most, left))
@@ -202,7 +202,7 @@ def _far_off(likelihood: Likelihood, found: Found) -> Found:
         left -= more.minimum.steps
         return more
 
-    def rescaled(found: Found) -> Found:
+    def rescaled(found: FoundMinimum) -> FoundMinimum:
         for _ in range(MAXIMUM_RESCALINGS):
             scale = float(np.sqrt(found.misfit)) if found.misfit > FAR_OFF else 1.0
             if left <= 0 or abs(scale / found.posterior.noise_scale - 1.0) < 0.1:

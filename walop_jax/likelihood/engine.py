@@ -161,7 +161,7 @@ def point_residuals(
 
 def _linear_unit_counts(
     instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None
-) -> linear.Linear:
+) -> linear.LocalDerivatives:
     """Counts of one point for light of unit flux, and their derivatives with respect to its local quantities."""
     to_instrument = with_values(instrument)
 

@@ -29,7 +29,7 @@ Quantity = Callable[[Array, Vector, Array], Array]
 """What is computed from the rows, all parameters and the local throughputs."""
 
 
-class Linear(NamedTuple):
+class LocalDerivatives(NamedTuple):
     """A quantity and its derivatives: leading axes are the plain parameters and the local throughputs, flattened."""
 
     value: Float[Array, ...]
@@ -72,7 +72,7 @@ def linearised(
     rows: Float[Array, ...],
     slopes: Float[Array, "o ..."],
     local: Float[Array, ...],
-) -> Linear:
+) -> LocalDerivatives:
     """A quantity of a field point and its derivatives at the values of an instrument.
 
     `rows` are band rows, of one site or more, and `slopes` their derivatives with respect to the optical parameters;
@@ -86,7 +86,7 @@ def linearised(
     rows_of = jnp.zeros((values.size, *rows.shape)).at[optical].set(slopes)[plain]
     each = jnp.eye(values.size)[plain]
     each_local = jnp.eye(local.size).reshape(-1, *local.shape)
-    return Linear(
+    return LocalDerivatives(
         value,
         jax.vmap(lambda dr, dv: push(dr, dv, no_local))(rows_of, each),
         jax.vmap(lambda dt: push(no_rows, no_values, dt))(each_local),

@@ -30,7 +30,7 @@ from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.numbers import NUMBERS
 from walop_jax.model.elements import Element, WavePlate
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.responses import GENERATORS, LIGHT, Place
+from walop_jax.model.responses import GENERATORS, LIGHT, TrainPlace
 
 
 class NoColumnError(ValueError):
@@ -81,7 +81,7 @@ class Resolver:
     thermal: tuple[Any, ...]  # factors of thermal changes
 
     @functools.cached_property
-    def _places(self) -> Mapping[Place, int]:
+    def _places(self) -> Mapping[TrainPlace, int]:
         return responses.places(self.instrument)
 
     @functools.cached_property
@@ -118,12 +118,12 @@ class Resolver:
         elements = [element.name for element in self._trains[number + 1]]
         if number >= 0 and name == self.instrument.arms[number].analyser.name:
             at = len(elements)
-            return self._places[Place(number, at + (where != "ahead of"))]
+            return self._places[TrainPlace(number, at + (where != "ahead of"))]
         if place == self._polariser and where == "behind":
-            return self._places[Place(-1, 0)]
+            return self._places[TrainPlace(-1, 0)]
         if name not in elements or (arm and number < 0):
             raise NoColumnError(f"{where} {place}")
-        return self._places[Place(number, elements.index(name) + (where != "ahead of"))]
+        return self._places[TrainPlace(number, elements.index(name) + (where != "ahead of"))]
 
     def _plate(self, place: str) -> tuple[int, WavePlate, str]:
         """Number of the plate that a place is of or in, the plate, and the name of the layer."""

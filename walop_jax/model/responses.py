@@ -69,7 +69,7 @@ GENERATORS = _generators()
 # --------------------------------------------------------------------------------------------- places of the train
 
 
-class Place(NamedTuple):
+class TrainPlace(NamedTuple):
     """A place between two elements: in the common train (arm −1) or in an arm, behind so many of its elements.
 
     Counted from the polariser.
@@ -86,20 +86,20 @@ def trains(instrument: Instrument) -> tuple[tuple[Element, ...], tuple[tuple[Ele
     return elements[start:], tuple(tuple(arm.train()) for arm in instrument.arms)
 
 
-def places(instrument: Instrument) -> dict[Place, int]:
+def places(instrument: Instrument) -> dict[TrainPlace, int]:
     """Every place of an instrument (`patched`) and the number of its responses: equal where nothing acts in between."""
     common, arms = trains(instrument)
-    found, number = {Place(-1, 0): 0}, 0
+    found, number = {TrainPlace(-1, 0): 0}, 0
     for i, element in enumerate(common, start=1):
         number += acts(element)
-        found[Place(-1, i)] = number
+        found[TrainPlace(-1, i)] = number
     last = number
     for a, arm in enumerate(arms):
         last += len(arms) > 1
-        found[Place(a, 0)] = last if len(arms) > 1 else number
+        found[TrainPlace(a, 0)] = last if len(arms) > 1 else number
         for i, element in enumerate(arm, start=1):
             last += acts(element)
-            found[Place(a, i)] = last
+            found[TrainPlace(a, i)] = last
     return found
 
 

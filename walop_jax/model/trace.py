@@ -33,7 +33,7 @@ STOKES = ("I", "Q", "U", "V")
 
 
 @dataclasses.dataclass(frozen=True)
-class Stage:
+class LightStage:
     """The light at one place: rows of `value` are one beam or the arms, columns Stokes or cameras."""
 
     name: str
@@ -66,7 +66,7 @@ class Sightline:
             raise ValueError(f"a sightline has one setting, not {len(self.setting)}")
 
 
-def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> tuple[Stage, ...]:
+def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> tuple[LightStage, ...]:
     """Every stage from the source to the counts of the cameras, through a filter of this curve."""
     instrument = _with_source(instrument.patched(), sightline)
     plan = plan_for_settings(instrument, sightline.setting, {str(sightline.setting.filter[0]): curve})
@@ -109,7 +109,7 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
         beams = beams.at[cameras].set(seen)
     names = tuple(arm.name for arm in instrument.arms)
     stages.append(
-        Stage("arms", "ahead of the analysers", names, STOKES, np.asarray(weight @ jnp.stack(ahead)))
+        LightStage("arms", "ahead of the analysers", names, STOKES, np.asarray(weight @ jnp.stack(ahead)))
     )
     stages.append(_cameras(instrument, "analysers", "share of the light in each beam of its arm", beams))
 
@@ -181,9 +181,9 @@ def _with_source(instrument: Instrument, sightline: Sightline) -> Instrument:
     return instrument.with_source(Standards(q=q, u=u, names=(*stars.names, "traced")))
 
 
-def _one(name: str, about: str, beam: Float[Array, " 4"]) -> Stage:
-    return Stage(name, about.splitlines()[0].rstrip("."), ("",), STOKES, np.asarray(beam)[None])
+def _one(name: str, about: str, beam: Float[Array, " 4"]) -> LightStage:
+    return LightStage(name, about.splitlines()[0].rstrip("."), ("",), STOKES, np.asarray(beam)[None])
 
 
-def _cameras(instrument: Instrument, name: str, about: str, beams: Float[Array, " k"]) -> Stage:
-    return Stage(name, about, ("",), instrument.cameras.names, np.asarray(beams)[None])
+def _cameras(instrument: Instrument, name: str, about: str, beams: Float[Array, " k"]) -> LightStage:
+    return LightStage(name, about, ("",), instrument.cameras.names, np.asarray(beams)[None])

@@ -24,7 +24,7 @@ from walop_jax.science.field_accuracy import field_accuracy
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Source(Run):
+class FigureSource(Run):
     """The run that a figure is drawn from; what it needs and is not there is a `DataError`.
 
     `parameters` are coefficients that were asked for by name; `place` (deg) is a field point.
@@ -34,7 +34,7 @@ class Source(Run):
     place: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def of(cls, given: FitResult | Calibration | Run, **options: Any) -> Source:
+    def of(cls, given: FitResult | Calibration | Run, **options: Any) -> FigureSource:
         """What a fit or a calibration in memory holds, or the folder of a run."""
         if isinstance(given, Run):
             return cls(given.folder, given.catalogue, **options)
@@ -83,7 +83,7 @@ class Source(Run):
         return read_limits(self.wanted(LIMITS, "run walop-jax limits -o RUN first"))
 
 
-def _accuracy(source: Source) -> Figure:
+def _accuracy(source: FigureSource) -> Figure:
     found = field_accuracy(source.rebuilt)
     if found is None:
         advice = "plot matrix-errors"
@@ -91,21 +91,21 @@ def _accuracy(source: Source) -> Figure:
     return figures.accuracy_figure(found)
 
 
-def _residuals(source: Source) -> Figure:
+def _residuals(source: FigureSource) -> Figure:
     c = source.rebuilt
     if source.likelihood.layout.large:
         raise fail("was fitted to whole frames", file=source.folder, advice="plot residual-map")
     return figures.residuals_figure(source.likelihood, c.values, c.model.start)
 
 
-def _residual_map(source: Source) -> Figure:
+def _residual_map(source: FigureSource) -> Figure:
     if source.stored.residuals is None:
         advice = "it comes with sets of whole frames"
         raise fail("holds no map of residuals", file=source.folder, advice=advice)
     return figures.residual_map_figure(source.stored.residuals)
 
 
-def _draws(source: Source) -> tuple[dict[str, Any], dict[str, str], tuple[str, ...]]:
+def _draws(source: FigureSource) -> tuple[dict[str, Any], dict[str, str], tuple[str, ...]]:
     """Draws (chain, draw) and units by name, and the names that are shown."""
     if source.posterior is None:
         raise fail("has no posterior", file=source.folder, advice="run walop-jax sample first")
@@ -121,7 +121,7 @@ def _draws(source: Source) -> tuple[dict[str, Any], dict[str, str], tuple[str, .
     return held, units, source.parameters or tuple(sampled)
 
 
-def _corner(source: Source) -> Figure:
+def _corner(source: FigureSource) -> Figure:
     held, units, shown = _draws(source)
     if not source.parameters:
         spread = {name: float(held[name].std()) for name in shown}
@@ -131,7 +131,7 @@ def _corner(source: Source) -> Figure:
     return posterior_figures.corner_figure(draws, shown, [units[name] for name in shown])
 
 
-def _trace(source: Source) -> Figure:
+def _trace(source: FigureSource) -> Figure:
     held, units, shown = _draws(source)
     chains = np.stack([held[name][:, :, None] for name in shown], axis=-1)
     return posterior_figures.trace_figure(
@@ -139,7 +139,7 @@ def _trace(source: Source) -> Figure:
     )
 
 
-def _modulation(source: Source) -> Figure:
+def _modulation(source: FigureSource) -> Figure:
     exposures, points = source.calset.exposures, source.calset.points
     behind = np.flatnonzero(exposures.clp_in & ~exposures.chwp_in)
     seen = source.calset.intensities.block(0, len(points)).used[:, behind].any(axis=1)
@@ -149,11 +149,11 @@ def _modulation(source: Source) -> Figure:
     return figures.modulation_figure(source.calset, [int(np.argmin(np.where(seen, away, np.inf)))])
 
 
-def _coefficients(source: Source) -> Figure:
+def _coefficients(source: FigureSource) -> Figure:
     return paper_figures.coefficients_figure(source.calset, source.maps.filter)
 
 
-def _transmission(source: Source) -> Figure:
+def _transmission(source: FigureSource) -> Figure:
     return paper_figures.transmission_figure(source.calset, source.maps.filter, source.place)
 
 
@@ -162,7 +162,7 @@ class NamedFigure:
     """A figure with what it shows in a few words."""
 
     about: str
-    draw: Callable[[Source], Figure]
+    draw: Callable[[FigureSource], Figure]
 
 
 FIGURES: Mapping[str, NamedFigure] = {
@@ -210,7 +210,7 @@ FIGURES: Mapping[str, NamedFigure] = {
 """In the order of the list that is printed."""
 
 
-def draw(name: str, source: Source) -> Figure:
+def draw(name: str, source: FigureSource) -> Figure:
     """The figure of a name; `DataError` with the nearest names if there is none, or if the run lacks what it needs."""
     if name not in FIGURES:
         raise fail(f"there is no figure {name!r}", advice=nearest(name, FIGURES))

@@ -30,7 +30,7 @@ from walop_jax.io.rounding import (
 )
 from walop_jax.io.text import read_json
 from walop_jax.reports import diagnosis_figures, figures
-from walop_jax.reports.named import Source, draw
+from walop_jax.reports.named import FigureSource, draw
 from walop_jax.reports.posterior_figures import MOST_IN_CORNER, informed
 from walop_jax.reports.run import COMPARISON, EPOCH, LIMITS, SUMMARY, RunContents, read_limits
 from walop_jax.reports.wording import (
@@ -238,7 +238,7 @@ def _figures(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, str]
             made["residual_map"] = figures.residual_map_figure(run.product.residuals)
     if run.diagnosis is None and run.product is not None:
         with contextlib.suppress(ValueError, OSError):  # data that are not there: the page says so
-            made["fit_residuals"] = draw("residuals", Source(run.folder))
+            made["fit_residuals"] = draw("residuals", FigureSource(run.folder))
     if run.figure_data is not None:
         data = run.figure_data
         whole = data.comparisons[0]

@@ -53,7 +53,7 @@ _SEEN = 2.33  # one-sided 99 %
 CAMERA_KINDS = ("gain", "x", "y", "time", "flux", "light")
 
 
-class Question(NamedTuple):
+class ChangeQuestion(NamedTuple):
     """One thing that may have changed: a camera, in one of `CAMERA_KINDS`, or a parameter of the optics."""
 
     kind: str
@@ -84,21 +84,21 @@ class Question(NamedTuple):
         return f"{self.name} {more} by {with_error(100 * amount, 100 * error)} %{where}"
 
 
-class Found(NamedTuple):
+class FoundChange(NamedTuple):
     """A change that was found: what, by how much, standard error, and its significance (standard errors)."""
 
-    question: Question
+    question: ChangeQuestion
     size: float
     error: float
     sigma: float
 
 
 @dataclasses.dataclass(frozen=True)
-class Change:
+class InstrumentChange:
     """A change of the instrument since it was calibrated: the simplest description, and all as good (it included)."""
 
-    best: Found
-    alike: tuple[Found, ...]
+    best: FoundChange
+    alike: tuple[FoundChange, ...]
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -116,7 +116,7 @@ class Change:
         more = f", and {len(others) - 4} more" if len(others) > 4 else ""
         return f"{text}. These rows cannot tell it from {', '.join(others[:4])}{more}"
 
-    def _words(self, found: Found) -> str:
+    def _words(self, found: FoundChange) -> str:
         return found.question.words(found.size, found.error)
 
 
@@ -141,15 +141,15 @@ class CatalogueCheck(Displayed):
     rows: float | None
     rows_p: float
     scale: tuple[float, float]
-    tests: tuple[Found, ...]
-    changes: tuple[Change, ...]
+    tests: tuple[FoundChange, ...]
+    changes: tuple[InstrumentChange, ...]
     smallest: float
     edge: float = 1.0
     times: tuple[float, float] = (0.0, 0.0)
 
     def growth(
         self,
-        question: Question,
+        question: ChangeQuestion,
         x: Float[np.ndarray, " r"],
         y: Float[np.ndarray, " r"],
         time: Float[np.ndarray, " r"],
@@ -203,7 +203,7 @@ class CatalogueCheck(Displayed):
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
 
-        def entry(found: Found) -> dict[str, Any]:
+        def entry(found: FoundChange) -> dict[str, Any]:
             q = found.question
             return {"kind": q.kind, "name": q.name, "unit": q.unit} | {
                 k: float(getattr(found, k)) for k in ("size", "error", "sigma")
@@ -327,13 +327,14 @@ class _Search:
         self.kinds = kinds
         units = {"flux": "per 1e6 electron", "light": "electron"}
         self.questions = [
-            Question(kind, name, units.get(kind, ""), camera=k)
+            ChangeQuestion(kind, name, units.get(kind, ""), camera=k)
             for kind in kinds
             for k, name in enumerate(cameras)
         ]
         plain = stars.plain.shape[-1]
         self.questions += [
-            Question("optics", name, unit, parameter=p) for p, (name, unit) in enumerate(parameters[:plain])
+            ChangeQuestion("optics", name, unit, parameter=p)
+            for p, (name, unit) in enumerate(parameters[:plain])
         ]
         # Columns: those of the cameras, all parameters, two of the colours; from them questions and nuisances are made.
         count, shown = len(kinds) * len(cameras), len(root)
@@ -432,7 +433,7 @@ class _Search:
     def _alarm(self) -> float:
         return ALARM / (self.asked + 2)
 
-    def _suspicious(self, look: _Look, tests: list[Found]) -> bool:
+    def _suspicious(self, look: _Look, tests: list[FoundChange]) -> bool:
         """Whether anything comes near an alarm."""
         near = 100.0 * self._alarm
         rows = 1.0 if look.rows is None else _chance_beside(look.rows, look.noise)
@@ -456,19 +457,23 @@ class _Search:
 
     def _beside(
         self, matrix: Float[np.ndarray, "c c"], score: Float[np.ndarray, " c"], chosen: list[int]
-    ) -> list[Found]:
+    ) -> list[FoundChange]:
         """Every question, alone beside `chosen`, which have no answer here."""
         free = [n for n in range(self.asked) if n not in chosen]
         order = [*free, *chosen, *range(self.asked, len(score))]
         left, along = eliminated(matrix[np.ix_(order, order)], score[order], len(free))
-        found = [Found(question, 0.0, np.inf, 0.0) for question in self.questions]
+        found = [FoundChange(question, 0.0, np.inf, 0.0) for question in self.questions]
         for n, information, slope in zip(free, np.diag(left), along, strict=True):
             if information > 1e-9 * matrix[n, n]:
                 error = float(information**-0.5)
-                found[n] = Found(self.questions[n], float(slope * error**2), error, float(slope * error))
+                found[n] = FoundChange(
+                    self.questions[n], float(slope * error**2), error, float(slope * error)
+                )
         return found
 
-    def _change(self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int], asked: int) -> Change:
+    def _change(
+        self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int], asked: int
+    ) -> InstrumentChange:
         """What was found, and what describes the same residuals as well."""
         away = np.zeros_like(sizes)
         away[asked] = sizes[asked]
@@ -478,9 +483,9 @@ class _Search:
         alike = [found for found in each if found.sigma**2 > best.sigma**2 - RIVAL]
         # A gain is the simplest of what describes the stars alike.
         ranked = sorted(alike, key=lambda found: (found.question.kind != "gain", -abs(found.sigma)))
-        return Change(ranked[0], tuple(ranked))
+        return InstrumentChange(ranked[0], tuple(ranked))
 
-    def _smallest(self, tests: list[Found]) -> float:
+    def _smallest(self, tests: list[FoundChange]) -> float:
         """The gain change of one camera that raises the alarm in 99 % of cases."""
         errors = [t.error for t in tests if t.question.kind == "gain" and np.isfinite(t.error)]
         return (threshold(self._alarm) + _SEEN) * min(errors) if errors else np.nan
