@@ -14,7 +14,7 @@ from walop_jax.calibration import Calibration, ListedModel, MatrixMaps, write_ca
 from walop_jax.data import empty_sources
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import InputFile, Points, Site
-from walop_jax.diagnosis.figure_file import (
+from walop_jax.diagnosis.figure_data import (
     DiagnosisFigureData,
     ExposureLabels,
     Ladder,

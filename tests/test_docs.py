@@ -218,12 +218,12 @@ def test_keys_of_the_summary():
 
 def test_keys_of_the_diagnosis():
     names = keys_written("walop_jax.diagnosis.findings", "document", "_step")
-    names |= keys_written("walop_jax.diagnosis.location", "describe")
+    names |= keys_written("walop_jax.diagnosis.findings", "describe")
     assert unexplained(names, section("files", "diagnosis.json")) == []
 
 
 def test_tables_of_the_diagnosis():
-    from walop_jax.diagnosis.figure_file import _TABLES
+    from walop_jax.diagnosis.figure_data import _TABLES
 
     told = {row[0]: row[1] for row in rows(section("files", "diagnosis.fits"))}
     assert set(told) == set(_TABLES)

@@ -52,7 +52,7 @@ def test_print_command_and_page_say_the_same(found: Diagnosis, call, calset_file
     monkeypatch.setattr("walop_jax.diagnosis.workflow.diagnose", lambda *args, **how: found)
     monkeypatch.setattr("walop_jax.diagnosis.figure_data.figure_data", lambda found: None)
     monkeypatch.setattr(
-        "walop_jax.diagnosis.figure_file.write_figure_data", lambda path, data: path.write_bytes(b"")
+        "walop_jax.diagnosis.figure_data.write_figure_data", lambda path, data: path.write_bytes(b"")
     )
     run = handmade_run.make_refit(tmp_path / "run")
     (run / "diagnosis.json").write_text(json.dumps(document(dataclasses.replace(found))))

@@ -45,7 +45,7 @@ def test_a_diagnosis(call, spoilt_file: Path, tmp_path: Path, monkeypatch):
     assert read_calibration(tmp_path / "caller" / "calibration.fits", rebuild=False).verdict.trusted
 
     monkeypatch.setattr("walop_jax.diagnosis.workflow.diagnose", lambda *args, **more: found)
-    monkeypatch.setattr("walop_jax.diagnosis.figure_file.write_figure_data", fail)
+    monkeypatch.setattr("walop_jax.diagnosis.figure_data.write_figure_data", fail)
     with pytest.raises(DataError, match="what was there is untouched"):
         walop.diagnose(spoilt_file, output=tmp_path / "other")
     assert not (tmp_path / "other").exists()

@@ -24,14 +24,13 @@ from pathlib import Path
 import numpy as np
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import grammar
-from walop_jax.diagnosis.effect_columns import Probe, probes
+from walop_jax.diagnosis import candidates
+from walop_jax.diagnosis.candidates import Probe, probes
+from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Measured
 from walop_jax.diagnosis.examination import Evidence, Ranked, examine
-from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, Measured
-from walop_jax.diagnosis.naming import Trial
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.score import Scorer, separations, whitening
-from walop_jax.diagnosis.search import Linear, joined, search
+from walop_jax.diagnosis.search import Linear, Trial, joined, search
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
@@ -171,7 +170,7 @@ class Blind:
         self.rng = np.random.default_rng(seed)
         wanted = list(probes(EFFECTS, effect_context(model.template, calset.exposures)))
         self.context, self.template = effect_context(model.template, calset.exposures), model.template
-        every = grammar.sentences(model.template, calset.exposures, len(calset.points))
+        every = candidates.sentences(model.template, calset.exposures, len(calset.points))
         examination = examine(result, wanted, self.rng, None, every)
         self.sentences = examination.sentences
         self.probes = list(examination.probes)
@@ -187,7 +186,7 @@ class Blind:
             text: column
             for probe in self.sentences
             for text, column in zip(
-                grammar.said_by(probe), examination.said[probe.name].columns.T, strict=True
+                candidates.said_by(probe), examination.said[probe.name].columns.T, strict=True
             )
         }
         for name, shape in outside(examination.design.measured, single):
@@ -277,7 +276,7 @@ class Blind:
         catalogue = [effect for effect in EFFECTS if effect.name not in removed]
         every = self.sentences, catalogue, self.context, self.template
         names = [p for p in self.probes if p.effect.name not in removed]
-        said, parts = grammar.uncovered(*every), grammar.parts(*every)
+        said, parts = candidates.uncovered(*every), candidates.parts(*every)
         asked = [*(p.name for p in (*names, *said)), *(p.name for p, _ in parts), *self.patterns]
         space = self._behind_nuisance.subset(asked)
         scorer = Scorer(space, np.random.default_rng(7), 0 if removed else DRAWS)

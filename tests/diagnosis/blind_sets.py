@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from walop_jax.diagnosis.candidates import Probe, all_candidates, probes
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.effect_columns import Probe, all_candidates, probes
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.policy import POLICY

@@ -12,12 +12,12 @@ from score_draws import alarms, noise_scores
 from small_run import SEED, SMALL, small_fit
 
 from walop_jax.calibration.maps import SMALLEST_DETERMINANT
+from walop_jax.diagnosis.candidates import probes
 from walop_jax.diagnosis.detection_limits import (
     PROBABILITY,
     DetectionLimits,
     detection_limits,
 )
-from walop_jax.diagnosis.effect_columns import probes
 from walop_jax.diagnosis.examination import ALARM, Examination, examine
 from walop_jax.diagnosis.score import Scorer
 from walop_jax.fit.refit import FitResult, refit

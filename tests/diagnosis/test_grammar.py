@@ -9,8 +9,8 @@ import scenes
 from own_instrument import OWN
 
 from walop_jax.data.records import Position
-from walop_jax.diagnosis import grammar
-from walop_jax.diagnosis.effect_columns import all_candidates, applicable, probes
+from walop_jax.diagnosis import candidates
+from walop_jax.diagnosis.candidates import all_candidates, applicable, probes
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.instruments.description import parsed
@@ -51,7 +51,7 @@ def laid():
 @pytest.fixture(scope="module")
 def said(laid, request):
     """Columns of some listed groups; of all that there are where there is time."""
-    found = grammar.sentences(laid.model.template, laid.calset.exposures, len(laid.calset.points))
+    found = candidates.sentences(laid.model.template, laid.calset.exposures, len(laid.calset.points))
     if not request.config.getoption("--long"):
         found = [probe for probe in found if probe.name in QUICK]
         assert len(found) == len(QUICK)
@@ -89,8 +89,8 @@ def test_names_are_sentences(laid, said):
 def test_sentences_that_have_a_name_are_left_to_it(laid):
     template = laid.model.template
     context = effect_context(template, laid.calset.exposures)
-    every = grammar.sentences(template, laid.calset.exposures, len(laid.calset.points))
-    left = {p.name for p in grammar.uncovered(every, EFFECTS, context, template)}
+    every = candidates.sentences(template, laid.calset.exposures, len(laid.calset.points))
+    left = {p.name for p in candidates.uncovered(every, EFFECTS, context, template)}
     gone = {p.name for p in every} - left
     assert "turn of polariser" in gone
     assert "retardance q behind collimator; retardance u behind collimator" in gone
@@ -103,15 +103,16 @@ def test_parts_of_effects_stand_for_them(laid):
     """One Moon patch of all, the light in one camera of four: no sentences of their own, but no longer than one."""
     template = laid.model.template
     context = effect_context(template, laid.calset.exposures)
-    every = grammar.sentences(template, laid.calset.exposures, len(laid.calset.points))
+    every = candidates.sentences(template, laid.calset.exposures, len(laid.calset.points))
     found = {
-        p.name: {e.name for e in effects} for p, effects in grammar.parts(every, EFFECTS, context, template)
+        p.name: {e.name for e in effects}
+        for p, effects in candidates.parts(every, EFFECTS, context, template)
     }
     assert found["light in O1"] == {"pedestal"}
     patches = [name for name in found if name.startswith("polarisation q of sky * exposure")]
     assert len(patches) == 4
     assert all(found[name] == {"moon_patch"} for name in patches)
-    left = {p.name for p in grammar.uncovered(every, EFFECTS, context, template)}
+    left = {p.name for p in candidates.uncovered(every, EFFECTS, context, template)}
     assert not left & set(found)
     assert "turn of polariser" not in found, "this is clp_zero as a whole"
 
@@ -124,7 +125,7 @@ def test_grammar_of_another_instrument():
     instrument = build(parsed(OWN, "own.toml"))
     window = Position(np.ones(5, bool), np.array([0.0, 10.0, 20.0, 40.0, 80.0]))
     exposures = dataclasses.replace(builders.exposures(*turns), moving={"WIN": window})
-    said = {p.name for p in grammar.sentences(instrument, exposures, 25)}
+    said = {p.name for p in candidates.sentences(instrument, exposures, 25)}
     assert "retardance q behind window; retardance u behind window" in said
     assert "depolarisation of window * cos 2 WIN; depolarisation of window * sin 2 WIN" in said
     assert "axis of main.plate.second" in said

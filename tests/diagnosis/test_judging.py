@@ -9,12 +9,11 @@ from matrix_at import matrix_at
 from scenes import PLAN
 from scipy import integrate, stats
 
-from walop_jax.diagnosis import naming
-from walop_jax.diagnosis.change_of_stokes import largest_change
-from walop_jax.diagnosis.design import Design
+from walop_jax.calibration.matrix import largest_change
+from walop_jax.diagnosis import search
+from walop_jax.diagnosis.design import Design, Measured, strata
 from walop_jax.diagnosis.examination import upper_limit
 from walop_jax.diagnosis.findings import Diagnosis
-from walop_jax.diagnosis.freeform import Measured, strata
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_file import base_model
@@ -41,9 +40,9 @@ def leaking():
 def test_density_at_neutral_is_the_evidence_of_two_fits(leaking):
     """Savage–Dickey against Laplace evidence of the models with and without: both Gaussian, so alike."""
     _, context, base, extended = leaking
-    by_fits = naming.log_evidence_ratio(base, extended)
+    by_fits = search.log_evidence_ratio(base, extended)
     assert by_fits > 5.0
-    assert naming.evidence_of_presence(extended, "camera_leakage", context) == pytest.approx(by_fits, abs=0.5)
+    assert search.evidence_of_presence(extended, "camera_leakage", context) == pytest.approx(by_fits, abs=0.5)
 
 
 def test_signature_is_what_taking_the_effect_away_does(leaking):
@@ -54,13 +53,13 @@ def test_signature_is_what_taking_the_effect_away_does(leaking):
     kept = [extended.model.index(name) for name in base.model.names]
     column = own_columns(bare, extended.values[kept], probe)[:, 0]
     share, _ = extended.value("camera_leakage.share")
-    found = naming.signature(extended, "camera_leakage", context)
+    found = search.signature(extended, "camera_leakage", context)
     np.testing.assert_allclose(found, -column * share, atol=2e-2 * np.abs(found).max())
 
 
 def test_taking_it_out_again_gives_the_fit_without(leaking):
     _, _, base, extended = leaking
-    again = naming.refit_without(extended, "camera_leakage")
+    again = search.refit_without(extended, "camera_leakage")
     assert again.model.names == base.model.names
     assert again.chi2 == pytest.approx(base.chi2, abs=1e-3)
 
@@ -72,11 +71,11 @@ def test_a_prior_is_widened_only_where_the_data_refute_it(leaking):
     for away, expected in ((3.9, width), (-3.9, width), (12.0, 12.0 * width), (-12.0, 12.0 * width)):
         values = extended.values.copy()
         values[at] = mean + away * width
-        wide = naming.with_refuted_priors_widened(model, values, "camera_leakage")
+        wide = search.with_refuted_priors_widened(model, values, "camera_leakage")
         assert wide["camera_leakage.share"].prior == (mean, pytest.approx(expected))
         assert wide.change("camera_leakage.share", prior=(mean, width)) == model
         widened = dataclasses.replace(extended.likelihood, model=wide)
-        beyond = naming.beyond_prior(
+        beyond = search.beyond_prior(
             dataclasses.replace(extended, likelihood=widened, values=values), "camera_leakage"
         )
         assert beyond == ({"share": pytest.approx(12.0)} if abs(away) > 4.0 else {})
@@ -205,7 +204,7 @@ def slips():
 def test_patterns_that_hold_at_no_other_setting_do_not_predict_it(slips):
     """Errors of single settings are smooth over the field: they predict parts of it that they have not seen."""
     assert slips.fit.chi2 > 1.5 * slips.fit.dof
-    assert not naming.predicts_unseen(slips, vectors(slips), POLICY.useful)
+    assert not search.predicts_unseen(slips, vectors(slips), POLICY.useful)
 
 
 def gains(seed=3):
@@ -228,11 +227,11 @@ def test_a_term_is_useful_where_the_matrix_is_closer_to_the_truth_with_it(hidden
     assert off[1] < 0.5 * off[0] if hidden == "gains" else off[1] > 1.5 * off[0]
     design = Design.of(before)
     columns = [design.measured.candidate(one) for one in strata(design.measured) if one.block == "exposures"]
-    assert naming.predicts_unseen(design, columns, POLICY.useful) == (hidden == "gains")
+    assert search.predicts_unseen(design, columns, POLICY.useful) == (hidden == "gains")
 
 
 def test_patterns_of_the_optics_predict_settings_that_they_have_not_seen():
     hidden = Described.saying(["retardance u behind half1.plate * xy"], [0.02])
     calset = simulate(PLAN, seed=1, effects=[hidden]).calset
     optics = Design.of(fit(Likelihood.of(calset, base_model(calset))))
-    assert naming.predicts_unseen(optics, vectors(optics), POLICY.useful)
+    assert search.predicts_unseen(optics, vectors(optics), POLICY.useful)

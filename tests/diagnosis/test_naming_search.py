@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from walop_jax.diagnosis.effect_columns import Probe
+from walop_jax.diagnosis.candidates import Probe
 from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace

@@ -10,15 +10,14 @@ import pytest
 from scipy import stats
 from small_run import SEED, SMALL, small_fit
 
-from walop_jax.calibration.matrix import change_of_qu, matrix_slopes
+from walop_jax.calibration.matrix import change_of_qu, first_setting, matrix_slopes
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import stated_conditions as conditions
-from walop_jax.diagnosis.change_of_stokes import first_setting
+from walop_jax.diagnosis.alternatives import with_places
 from walop_jax.diagnosis.condition_limits import condition_limits
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.limits_found import PROBABILITY
-from walop_jax.diagnosis.mixups import with_places
 from walop_jax.diagnosis.stated_conditions import condition_scores, stated_conditions
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.refit import FitResult, refit

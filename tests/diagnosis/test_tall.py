@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from walop_jax.diagnosis import tall
+from walop_jax.diagnosis import score
 from walop_jax.likelihood import limits
 
 
@@ -13,13 +13,13 @@ def test_pieces_make_the_whole(order, count, monkeypatch):
     monkeypatch.setattr(limits, "COLUMNS_TOGETHER", 7)
     monkeypatch.setattr(limits, "PROJECTED_COLUMNS", 7)
     columns = np.asarray(np.random.default_rng(count).standard_normal((50, count)), order=order)
-    found = tall.gram(columns)
+    found = score.gram(columns)
     np.testing.assert_allclose(found, columns.T @ columns, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(found, found.T)
-    monkeypatch.setattr(tall, "cores", lambda: 1)
-    np.testing.assert_array_equal(tall.gram(columns), found)
+    monkeypatch.setattr(score, "cores", lambda: 1)
+    np.testing.assert_array_equal(score.gram(columns), found)
     changed = columns.copy(order="K")
-    tall.change_in_place(lambda some: 2.0 * some, changed)
+    score.change_in_place(lambda some: 2.0 * some, changed)
     np.testing.assert_array_equal(changed, 2.0 * columns)
 
 
@@ -27,7 +27,7 @@ def test_pieces_make_the_whole(order, count, monkeypatch):
 def test_columns_that_are_not_exact_take_part_in_single_precision(exact, monkeypatch):
     monkeypatch.setattr(limits, "COLUMNS_TOGETHER", 7)
     columns = np.random.default_rng(4).standard_normal((50, 30)) * 10.0 ** np.linspace(-3, 5, 30)
-    found, whole, length = tall.gram(columns, exact), columns.T @ columns, np.linalg.norm(columns, axis=0)
+    found, whole, length = score.gram(columns, exact), columns.T @ columns, np.linalg.norm(columns, axis=0)
     off = np.abs(found - whole) / np.outer(length, length)
     assert np.max(off[:exact, :exact], initial=0.0) < 1e-14
     assert np.max(off) < 1e-6
@@ -39,4 +39,4 @@ def test_an_error_in_a_piece_is_an_error():
         raise ValueError("not these")
 
     with pytest.raises(ValueError, match="not these"):
-        tall.change_in_place(refuse, np.ones((3, 2)))
+        score.change_in_place(refuse, np.ones((3, 2)))

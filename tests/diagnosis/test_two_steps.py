@@ -7,7 +7,7 @@ holds, less a constant: the numbers are those of plain geometry.
 import numpy as np
 import pytest
 
-from walop_jax.diagnosis.effect_columns import Probe
+from walop_jax.diagnosis.candidates import Probe
 from walop_jax.diagnosis.examination import Ranked, name_first
 from walop_jax.diagnosis.score import Score
 from walop_jax.model.effects import Described, effect_by_name

@@ -11,8 +11,8 @@ from scenes import PLAN
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data import read_calibration_set
+from walop_jax.diagnosis.candidates import probes
 from walop_jax.diagnosis.design import Design, exposure_folds, field_folds, held_out
-from walop_jax.diagnosis.effect_columns import probes
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import document
 from walop_jax.diagnosis.workflow import diagnose

@@ -11,8 +11,12 @@ from astropy.io import fits
 from builders import exposures
 
 from walop_jax.data import DataError
-from walop_jax.diagnosis.figure_data import best_combination, compare_residuals
-from walop_jax.diagnosis.figure_file import read_figure_data, write_figure_data
+from walop_jax.diagnosis.figure_data import (
+    best_combination,
+    compare_residuals,
+    read_figure_data,
+    write_figure_data,
+)
 
 ANGLES = 22.5 * np.arange(16)
 SEQUENCE = exposures(

@@ -32,12 +32,12 @@ from score_draws import alarms, noise_scores  # noqa: E402
 from walop_jax.calibration.matrix import change_of_qu  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
 from walop_jax.diagnosis import grammar  # noqa: E402
+from walop_jax.diagnosis.candidates import Probe, probes  # noqa: E402
 from walop_jax.diagnosis.detection_limits import (  # noqa: E402
     PROBABILITY,
     _columns,
     detection_limits,
 )
-from walop_jax.diagnosis.effect_columns import Probe, probes  # noqa: E402
 from walop_jax.diagnosis.examination import Examination, examine  # noqa: E402
 from walop_jax.diagnosis.policy import POLICY  # noqa: E402
 from walop_jax.diagnosis.score import separations  # noqa: E402

@@ -3,6 +3,9 @@
 Elements     three for each arm, m21, m22, m23, m31, … of `light.instrument_matrix`: band integrated, with throughput.
 Covariance   C_m = J C_θ Jᵀ with the exact J; the throughput series enters through its local values.
 Derivatives  to all parameters, and to the amplitudes of effects that are not there yet.
+
+Impact       m = m₀ + A s with s = (q, u), so a star that is calibrated with (m₀, A) while (m₀ + δm₀, A + δA) is true
+comes out wrong by A⁻¹ (δm₀ + δA s), at most |A⁻¹ δm₀| + p ‖A⁻¹ δA‖.
 """
 
 from __future__ import annotations
@@ -19,8 +22,9 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from walop_jax.calibration.maps import SMALLEST_DETERMINANT
-from walop_jax.data.records import FilterCurve
+from walop_jax.data.records import CalibrationSet, FilterCurve
 from walop_jax.data.settings import Settings
+from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import limits, linear
 from walop_jax.likelihood.runner import usual_threads
 from walop_jax.model import light
@@ -270,3 +274,28 @@ _all_slopes = compiled(jax.vmap(point_matrix, in_axes=(None, None, 0, 0)), kept_
 _effect_slopes = compiled(
     jax.vmap(_point_effect_slopes, in_axes=(None, None, None, 0, 0)), kept_as="effect_slopes"
 )
+
+
+# ----------------------------------------------------------------------------------------- at the field points of a fit
+
+
+def first_setting(calset: CalibrationSet, instrument: Instrument) -> Settings:
+    """Filter and positions of the first exposure of a set, all else as by default."""
+    first = Settings.of(calset.exposures[:1], instrument.patched().moving())
+    return Settings.default(1, str(first.filter[0])).at(**first.positions)
+
+
+def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p a 3"]:
+    """Instrument matrix at the field points of a fit, in the filter and plate setting of its first exposure."""
+    instrument, calset = result.model.instrument(result.values), result.calset
+    plan = plan_for_settings(instrument, first_setting(calset, instrument), calset.filters)
+    vectors = sky_vectors(instrument, plan, calset.points.x, calset.points.y)[:, 0]
+    return light.instrument_matrix(vectors, instrument.cameras.pairs)
+
+
+def largest_change(
+    assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
+) -> float:
+    """Largest of `change_of_qu` over the field; NaN when no point holds both q and u."""
+    found = change_of_qu(assumed, true, p)
+    return float(np.nanmax(found)) if np.isfinite(found).any() else float("nan")

@@ -47,8 +47,7 @@ def diagnose(
     """
     from walop_jax import Calibration
     from walop_jax.calibration import PRODUCT, SUMMARY, summary, write_calibration
-    from walop_jax.diagnosis.figure_data import figure_data
-    from walop_jax.diagnosis.figure_file import FIGURE_DATA, write_figure_data
+    from walop_jax.diagnosis.figure_data import FIGURE_DATA, figure_data, write_figure_data
     from walop_jax.diagnosis.findings import DIAGNOSIS, document
     from walop_jax.diagnosis.workflow import diagnose as diagnosis_of
     from walop_jax.fit.misfit import describe

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from walop_jax.calibration.matrix import change_of_qu, matrix_slopes
-from walop_jax.diagnosis.change_of_stokes import first_setting
+from walop_jax.calibration.matrix import change_of_qu, first_setting, matrix_slopes
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM
 from walop_jax.diagnosis.limits_found import PROBABILITY, ConditionLimit, over_field

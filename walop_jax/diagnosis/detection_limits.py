@@ -30,11 +30,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-from walop_jax.calibration.matrix import change_of_qu, effect_slopes, matrix_slopes
-from walop_jax.diagnosis.change_of_stokes import first_setting
+from walop_jax.calibration.matrix import change_of_qu, effect_slopes, first_setting, matrix_slopes
+from walop_jax.diagnosis.candidates import Probe, applicable
+from walop_jax.diagnosis.candidates import probes as all_probes
 from walop_jax.diagnosis.condition_limits import condition_limits
-from walop_jax.diagnosis.effect_columns import Probe, applicable
-from walop_jax.diagnosis.effect_columns import probes as all_probes
 from walop_jax.diagnosis.examination import Examination, examine, most_points
 from walop_jax.diagnosis.limits_found import PROBABILITY, DetectionLimit, DetectionLimits, over_field
 from walop_jax.diagnosis.policy import POLICY

@@ -24,11 +24,9 @@ from jaxtyping import Float
 from scipy import stats
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import grammar
-from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.effect_columns import Probe, all_candidates
+from walop_jax.diagnosis.candidates import Probe, all_candidates, said_by
+from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Design, number_of_columns, strata
 from walop_jax.diagnosis.findings import Alike, Limit
-from walop_jax.diagnosis.freeform import SINGLE_EXPOSURES, number_of_columns, strata
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.score import (
     Candidate,
@@ -169,7 +167,7 @@ class Evidence:
 
     `scorer` holds the space of all candidates behind the nuisance that single exposures may have, `scores` are C̃ᵀr and
     `square` r·r there. `probes` are effects, `sentences` what else can be said, `parts` sentences that are told as the
-    effects that hold them (`grammar.parts`), `patterns` the names of patterns without a name. `chi2` and `dof` are
+    effects that hold them (`candidates.parts`), `patterns` the names of patterns without a name. `chi2` and `dof` are
     those of the fit, `scale` the factor on the errors with which it was made.
     """
 
@@ -345,7 +343,7 @@ class Evidence:
         length, limit = len(item.score.amplitudes), self.policy.separation * self.floor
         alike = {p.name for p in self.sentences if len(p.widths) <= length and apart[p.name] < limit}
         others = [r for r in self.told if r.log_bayes > least or r.probe.name in alike]
-        others = [r for r in others if not set(own) & set(grammar.said_by(r.probe))]
+        others = [r for r in others if not set(own) & set(said_by(r.probe))]
         return tuple(r.probe.name for r in others[: self.policy.most_classes])
 
     def held_in_part(self, item: Ranked) -> tuple[str, ...]:
@@ -469,7 +467,7 @@ def examine(
     parts: Parts = (),
     policy: Policy = POLICY,
 ) -> Examination:
-    """Score effects that a model has not, sentences, `parts` of effects (`grammar.parts`) and patterns against a fit.
+    """Score effects that a model has not, sentences, `parts` (`candidates.parts`) and patterns against a fit.
 
     `earlier` is of a smaller model; its columns serve again where the light has hardly changed.
     """

@@ -16,20 +16,25 @@ Global p     Under the base model the scores of all candidates together are N(0,
              1/√k; measured between 0.3 % and 40 % of the draws it is the same to a tenth).
 Sources      Rao 1948; Bera & Bilias 2001, J. Stat. Plan. Inference 97, 9 (score tests); Gross & Vitells 2010,
              Eur. Phys. J. C 70, 525 (trial factors).
-"""
+
+Products of matrices with hundreds of columns and 10⁴ to 10⁶ rows are taken piece by piece on all cores. The command
+line keeps numpy to one thread, as its matrices are small everywhere else. The pieces do not depend on the number of
+cores, and so neither do the results."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import linalg, optimize, stats
 
-from walop_jax.diagnosis.tall import change_in_place, gram
 from walop_jax.likelihood import limits
+from walop_jax.likelihood.runner import cores
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
@@ -389,3 +394,40 @@ def separations(space: ScoreSpace, scores: Vector, square: float) -> dict[str, f
         z = space.whitened[name].T @ scores[at]
         found[name] = float(np.sqrt(max(square - float(z @ z), 0.0)))
     return found
+
+
+# ------------------------------------------------------------------------------------------- products of large matrices
+
+
+def gram(columns: Float[np.ndarray, "d n"], exact: int | None = None) -> Float[np.ndarray, "n n"]:
+    """CᵀC; in single precision where a column beyond the first `exact` takes part, if that is said."""
+    count = columns.shape[1]
+    single = columns if exact is None or exact >= count else columns.astype(np.float32)
+    found = np.empty((count, count))
+    starts = {*range(0, count, limits.COLUMNS_TOGETHER), count, min(exact or 0, count)}
+    pieces = [slice(first, stop) for first, stop in itertools.pairwise(sorted(starts))]
+
+    def product(pair: tuple[slice, slice]) -> None:
+        one, other = pair
+        source = columns if exact is None or other.stop <= exact else single
+        found[one, other] = source[:, one].T @ source[:, other]
+        found[other, one] = found[one, other].T
+
+    _on_all_cores(product, [(one, other) for i, one in enumerate(pieces) for other in pieces[i:]])
+    return found
+
+
+def change_in_place(function: Callable[[Matrix], Matrix], columns: Float[np.ndarray, "d n"]) -> None:
+    """Replace columns by what a function of some of them gives."""
+
+    def change(first: int) -> None:
+        some = columns[:, first : first + limits.PROJECTED_COLUMNS]
+        some[:] = function(some)
+
+    _on_all_cores(change, range(0, columns.shape[1], limits.PROJECTED_COLUMNS))
+
+
+def _on_all_cores(work: Callable[..., None], pieces: Iterable[object]) -> None:
+    with ThreadPoolExecutor(cores()) as pool:
+        for _ in pool.map(work, pieces):
+            pass

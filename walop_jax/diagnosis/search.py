@@ -1,14 +1,18 @@
-"""The search for what is missing: names by evidence, one after the other, the same rules for every judge.
+"""Exact fits of what a diagnosis tries, adds and drops, and the search for what is missing.
 
-A *judge* says what an addition is worth. `Linear` takes its linear step (a Schur complement of the score space): no
-model is computed, and the blind study (`tests/diagnosis/blind.py`) runs thousands of scenes through the rules below.
-`workflow.Refit` fits it, but only what may be added:
+Evidence       Laplace: ln B = ½ (O_base − O_g) − ½ (ln det H_g − ln det H_base) − Σ ln w, with O the objective (χ² of
+               data and priors), H half its Hessian and w the prior widths of the added parameters.
+
+Names are added by evidence, one after the other, by the same rules for every judge. A *judge* says what an addition is
+worth. `Linear` takes its linear step (a Schur complement of the score space): no model is computed, and the blind study
+(`tests/diagnosis/blind.py`) runs thousands of scenes through the rules below. `workflow.Refit` fits it, but only what
+may be added:
 
 1. Candidates are ordered by their linear evidence. What linear algebra finds not worth telling is not tried.
 2. The best is fitted. If it leaves nothing but noise, no rival can be better. If its evidence differs from that of its
    linear step by more than `Policy.linear_good`, rivals that lie within twice the difference are fitted as well.
 3. Where the model is far off and no name explains half of that, or none is found, what cannot be differentiated
-   competes with the names: structural effects and other descriptions of the instrument (`choices`).
+   competes with the names: structural effects and other descriptions of the instrument (`alternatives`).
 4. What data that took no part in the fit confirm joins the model (`adopted`), and what is left is scored again.
 """
 
@@ -19,12 +23,348 @@ from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
+from jaxtyping import Float, Int
 
+from walop_jax.calibration.matrix import instrument_matrices, largest_change
+from walop_jax.diagnosis.candidates import said_by
+from walop_jax.diagnosis.design import Design, held_out
 from walop_jax.diagnosis.examination import Evidence, Ranked, explains, leaders
-from walop_jax.diagnosis.naming import Trial, in_words
+from walop_jax.diagnosis.findings import Step
 from walop_jax.diagnosis.policy import Policy
-from walop_jax.diagnosis.score import Scorer
-from walop_jax.model.effects import Described
+from walop_jax.diagnosis.score import Candidate, Scorer
+from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
+from walop_jax.fit.robust import field_cells, states
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects import Context, Described, Effect
+from walop_jax.model.parameters import leaves, values_of
+from walop_jax.model.specification import Model, with_effects
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """An addition to a model that was tried: its evidence (ln B), and what it leaves, χ² and whether that is noise.
+
+    `item` is its linear step, `linear` the evidence of that (NaN where there was none). `fit` is None until it has been
+    fitted. `alternatives` are other shapes of the effect that do as well, in words. `rivals` are effects of nearly its
+    evidence, or of which a part would do, `nameless` sentences that are not improbable beside it.
+    """
+
+    effect: type[Effect]
+    evidence: float
+    left: float
+    noise: bool
+    item: Ranked | None = None
+    linear: float = float("nan")
+    fit: FitResult | None = None
+    alternatives: tuple[str, ...] = ()
+    rivals: tuple[str, ...] = ()
+    nameless: tuple[str, ...] = ()
+
+    @classmethod
+    def of_fit(cls, effect: type[Effect], fit: FitResult, evidence: float) -> Trial:
+        """A trial without a linear step."""
+        return cls(effect, evidence, fit.chi2, fit.explains_data, fit=fit)
+
+    @property
+    def instance(self) -> Effect:
+        """The effect at its fitted values, in standard form."""
+        assert self.fit is not None
+        return self.fit.model.instrument(self.fit.values).effect(self.effect.name).standard_form()
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The sentences that it is, where it has no name."""
+        if self.effect is not Described:
+            return ()
+        if self.fit is None:
+            return () if self.item is None else said_by(self.item.probe)
+        return self.instance.sentences  # type: ignore[attr-defined]
+
+
+def _log_determinant(result: FitResult) -> float:
+    return float(np.linalg.slogdet(result.posterior.matrix)[1])
+
+
+def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
+    """Laplace evidence of an extended fit against the base (parameters without a prior carry no Occam factor)."""
+    known = set(base.model.names)
+    widths = [
+        p.prior[1] if p.prior is not None else (p.loose or p.scale)
+        for p in extended.model.parameters
+        if p.name not in known and p.free and p.tie is None
+    ]
+    gain = 0.5 * (base.posterior.objective - extended.posterior.objective)
+    occam = 0.5 * (_log_determinant(extended) - _log_determinant(base))
+    return gain - occam - float(np.sum(np.log(widths)))
+
+
+def try_effect(base: FitResult, instance: Effect, context: Context, prior_shapes: int = 1) -> Trial:
+    """Add an effect at the given values to the fitted model and fit everything again."""
+    return try_model(
+        base, type(instance), with_effects(base.model, [instance], context), base.values, prior_shapes
+    )
+
+
+def try_sentences(base: FitResult, said: Described, context: Context, count: int) -> Trial:
+    """Add sentences to the fitted model, beside those that it has, and fit again; they are among `count` of them."""
+    model = base.model
+    if Described.name in model.effect_names:
+        earlier = model.instrument(base.values).effect(Described.name)
+        assert isinstance(earlier, Described)
+        said, model = earlier.joined(said), model_without(model, Described.name)
+    return try_model(base, Described, with_effects(model, [said], context), base.values, count)
+
+
+def try_model(
+    base: FitResult, effect: type[Effect], model: Model, values: Float[np.ndarray, " n"], prior_shapes: int
+) -> Trial:
+    """Fit a model with an effect, from values of the parameters of the base and its own start values of others."""
+    start = dict(zip(base.model.names, values, strict=True))
+    likelihood = Likelihood.of(base.calset, model)
+    result = fit(
+        likelihood,
+        start=np.array([start.get(p.name, p.start) for p in model.parameters]),
+        noise_scale=base.noise_scale,
+        worth=base.posterior.objective,
+    )
+    bayes = log_evidence_ratio(base, result) - (float(np.log(prior_shapes)) if prior_shapes > 1 else 0.0)
+    return Trial.of_fit(effect, result, bayes)
+
+
+def try_shapes(base: FitResult, item: Ranked, context: Context, shapes: int, policy: Policy) -> Trial:
+    """Refit an effect from the amplitudes of its linear steps at the shapes that may be best, and keep the best."""
+    places = ((item.probe, item.score), *item.others)
+    trials = [
+        try_effect(base, item.effect.combine(probe.group, score.amplitudes), context, shapes)
+        for probe, score in places
+    ]
+    best = max(trials, key=lambda t: t.evidence if _converged(t) else -np.inf)
+    alike = [t for t in trials if _converged(t) and t.evidence > best.evidence - policy.even_odds]
+    told = dict.fromkeys(in_words(t.instance) for t in alike if _differ(t, best, policy.separation))
+    return dataclasses.replace(best, alternatives=tuple(told))
+
+
+def _converged(trial: Trial) -> bool:
+    return trial.fit is not None and trial.fit.converged
+
+
+def _differ(one: Trial, other: Trial, separation: float) -> bool:
+    assert one.fit is not None
+    assert other.fit is not None
+    if one.instance.choices() != other.instance.choices():
+        return True
+    at = one.fit.model.positions(one.effect.name)
+    sigma = np.maximum(one.fit.sigma[at], other.fit.sigma[at])
+    away = np.asarray(values_of(one.instance)) - np.asarray(values_of(other.instance))
+    return bool(np.any(np.abs(away) > separation * np.where(sigma > 0, sigma, np.inf)))
+
+
+def in_words(effect: Effect) -> str:
+    """Choices and values of an effect, e.g. "camera = 2, depth = 0.006"."""
+    values = {
+        leaf.name: f"{v:.4g}" for leaf, v in zip(leaves(effect), np.asarray(values_of(effect)), strict=True)
+    }
+    return ", ".join(f"{name} = {value}" for name, value in (spoken_choices(effect) | values).items())
+
+
+def spoken_choices(effect: Effect) -> dict[str, Any]:
+    """Discrete choices that mean something to a reader: a camera, a crystal, a star."""
+    return {name: value for name, value in effect.choices().items() if isinstance(value, int | str)}
+
+
+def amplitude_positions(model: Model, name: str) -> list[int]:
+    """Positions of the free amplitudes of an active effect that have a prior."""
+    effect = model.template.effect(name)
+    at = [model.index(f"{name}.{label}") for f in effect.amplitudes() for label in effect.labels(f)]
+    return [i for i in at if model.parameters[i].free and model.parameters[i].prior is not None]
+
+
+def with_refuted_priors_widened(model: Model, values: Float[np.ndarray, " n"], name: str) -> Model:
+    """The model in which amplitudes of an effect that lie far outside of their priors lie one width from the mean.
+
+    A prior says how large such an effect usually is. One that the data refute would go on pulling at the value and
+    count the square of its distance as a misfit, of data that are explained to within the noise.
+    """
+    for i in amplitude_positions(model, name):
+        mean, width = model.parameters[i].prior  # type: ignore[misc]
+        away = abs(float(values[i]) - mean)
+        if away > PRIOR_EDGE * width:
+            model = model.change(model.names[i], prior=(mean, away))
+    return model
+
+
+def beyond_prior(result: FitResult, name: str) -> dict[str, float]:
+    """Amplitudes of an effect that lie beyond the prior of their declaration, widened or not, in its widths."""
+    effect = result.model.template.effect(name)
+    declared = {f"{name}.{leaf.name}": leaf.width for leaf in leaves(effect)}
+    found = {}
+    for i in amplitude_positions(result.model, name):
+        p = result.model.parameters[i]
+        widths = abs(float(result.values[i]) - p.prior[0]) / (declared[p.name] or np.inf)  # type: ignore[index]
+        if widths > PRIOR_EDGE:
+            found[p.name.removeprefix(f"{name}.")] = widths
+    return found
+
+
+def evidence_of_presence(result: FitResult, name: str, context: Context) -> float:
+    """ln B of a fitted model against the one without an effect: the density that prior and posterior have at neutral.
+
+    The Savage–Dickey ratio of nested models, Gaussian (Dickey 1971, Ann. Math. Stat. 42, 204). Infinite for an
+    effect without parameters.
+    """
+    effect = result.model.template.effect(name)
+    at = amplitude_positions(result.model, name)
+    if not at:
+        return float("inf")
+    neutral = dict(
+        zip(
+            (f"{name}.{leaf.name}" for leaf in leaves(effect)),
+            np.asarray(values_of(effect.at_neutral(context))),
+            strict=True,
+        )
+    )
+    away = result.values[at] - np.array([neutral[result.model.parameters[i].name] for i in at])
+    width = np.array([result.model.parameters[i].prior[1] for i in at])  # type: ignore[index]
+    covariance = result.covariance[np.ix_(at, at)] / np.outer(width, width)
+    away = away / width
+    return float(0.5 * away @ np.linalg.solve(covariance, away) + 0.5 * np.linalg.slogdet(covariance)[1])
+
+
+def model_without(model: Model, name: str) -> Model:
+    """The model with one effect taken out."""
+    rest = tuple(effect for effect in model.template.effects if effect.name != name)
+    own = model.positions(name)
+    parameters = tuple(p for i, p in enumerate(model.parameters) if i not in own)
+    template = dataclasses.replace(model.template, effects=rest)
+    return dataclasses.replace(model, template=template, parameters=parameters)
+
+
+def refit_without(result: FitResult, name: str) -> FitResult:
+    """Take an effect out of a fitted model and fit again, with errors scaled only if what is left needs it."""
+    model = model_without(result.model, name)
+    start = dict(zip(result.model.names, result.values, strict=True))
+    return fit(Likelihood.of(result.calset, model), start=np.array([start[n] for n in model.names]))
+
+
+def signature(result: FitResult, name: str, context: Context) -> Float[np.ndarray, " _"]:
+    """What an active effect does to the residuals (data rows): theirs without it, minus theirs with it."""
+    effect = result.model.template.effect(name)
+    if type(effect).is_structural():
+        model = model_without(result.model, name)
+        kept = [result.model.index(n) for n in model.names]
+        bare = Likelihood.of(result.calset, model).residuals(result.values[kept])[1]
+    else:
+        values = result.values.copy()
+        values[result.model.positions(name)] = np.asarray(values_of(effect.at_neutral(context)))
+        bare = result.likelihood.residuals(values)[1]
+    change = bare - result.likelihood.residuals(result.values)[1]
+    return change[result.likelihood.used].reshape(-1) / result.noise_scale
+
+
+# ------------------------------------------------------------------------------- what an effect does, by two fits
+
+
+def before_and_after(name: str, before: Design, after: Design) -> dict[str, Any]:
+    """The fields of a `Step` that compare the fits without and with an effect."""
+    effect = after.fit.model.instrument(after.fit.values).effect(name)
+    # An effect with a number for every exposure, or for one of them, cannot predict exposures that it has not seen.
+    many = any(np.size(getattr(effect, f)) > 4 for f in effect.amplitudes())
+    many |= isinstance(effect, Described) and any("exposure" in text for text in effect.sentences)
+    scheme = "field blocks" if many else "exposures"
+    old, new = (instrument_matrices(design.fit) for design in (before, after))
+    return {
+        "chi2_before": before.fit.chi2,
+        "chi2_after": after.fit.chi2,
+        "heldout_before": held_out(before, scheme),
+        "heldout_after": held_out(after, scheme),
+        "change_of_qu": largest_change(old, new),
+        "residual_before": before.measured.residual,
+        "residual_after": after.measured.residual,
+    }
+
+
+def refitted_in_order(steps: Sequence[Step], start: Design, end: Design) -> list[Step]:
+    """The steps as they lead, one after the other, from one fit to another that has no effects beside theirs.
+
+    The models between the two are fitted again; what belongs to the discovery of an effect stays.
+    """
+    fits = [end.fit] if steps else []
+    for step in reversed(steps[1:]):
+        fits.append(refit_without(fits[-1], step.effect))
+    compared, before = [], start
+    for step, result in zip(steps, reversed(fits), strict=True):
+        after = end if result is end.fit else Design.of(result)
+        compared.append(dataclasses.replace(step, **before_and_after(step.effect, before, after)))
+        before = after
+    return compared
+
+
+def predicts_unseen(
+    design: Design, terms: Sequence[Candidate], least: float, *, of_states: bool = True
+) -> bool:
+    """Whether terms without a name predict states and parts of the field that they have not seen.
+
+    One Gauss–Newton step of everything, with and without the terms, from all data but those of a unit gives the
+    density of that unit, ln p = −½ (dᵀΣ⁻¹d + ln det Σ), Σ = s² (1 + A H⁻¹ Aᵀ): it is broad where the step leaves it
+    open, and s² is the χ²/dof that a model leaves, 1 or more. Units are states (exposures that differ in nothing but
+    the filter; not where the terms are about single ones), and the cells of the field. The mean gain must exceed
+    `least` times its standard error over the units, for both: a term that only follows what each setting of an element
+    does by itself predicts the field, and no other setting. Nor must it bend the rest of the model: the mean of dᵀd
+    over the states must not grow, where a density may become more probable by being broader alone.
+
+    Symbols     d prediction error of the unit, A its rows of the Jacobian, H normal matrix of all others and priors
+    """
+    widths = np.concatenate([one.widths for one in terms])
+    own = design.stacked([one.columns for one in terms])
+    prior = np.zeros((len(widths), design.jacobian.shape[1]))
+    rows = np.vstack([np.hstack([design.jacobian, own]), np.hstack([prior, np.diag(1.0 / widths)])])
+    residual = np.append(design.residual, np.zeros(len(widths)))
+    calset = design.fit.calset
+    units = {"cells": field_cells(calset)[design.point]}
+    if of_states:
+        units["states"] = states(calset)[design.exposure]
+    for kind, unit in units.items():
+        before = _predictions(design.jacobian, design.residual, unit, design.projector.free)
+        after = _predictions(rows, residual, unit, design.projector.free)
+        gain, closer = (after - before).T
+        if len(gain) < 2 or gain.mean() < least * gain.std(ddof=1) / np.sqrt(len(gain)):
+            return False
+        if kind == "states" and closer.mean() > 0.0:
+            return False
+    return True
+
+
+def _predictions(
+    rows: Float[np.ndarray, "r n"],
+    residual: Float[np.ndarray, " r"],
+    unit: Int[np.ndarray, " d"],
+    free: int,
+) -> Float[np.ndarray, "u 2"]:
+    """ln p of the data rows of each unit as all the others predict them, and the square of how far they are off.
+
+    Rows beyond those of `unit` are priors.
+    """
+    norm = np.linalg.norm(rows, axis=0)
+    scaled = rows / np.where(norm > 0, norm, 1.0)
+    ridge = 1e-12 * np.eye(len(norm))
+    gram, along = scaled.T @ scaled + ridge, scaled.T @ residual
+    step = np.linalg.solve(gram, along)
+    scale = max(1.0, float(residual @ residual - along @ step) / max(free, 1))
+    whole = np.linalg.slogdet(gram)[1]
+    found = []
+    for one in np.unique(unit):
+        a, r = scaled[: len(unit)][unit == one], residual[: len(unit)][unit == one]
+        rest = gram - a.T @ a
+        d = r - a @ np.linalg.solve(rest, along - a.T @ r)
+        pull = a.T @ d
+        square = d @ d - pull @ np.linalg.solve(gram, pull)
+        spread = whole - np.linalg.slogdet(rest)[1]
+        density = -0.5 * (square / scale + spread + len(r) * free / len(unit) * np.log(scale))
+        found.append((density, float(d @ d)))
+    return np.array(found)
+
+
+# ----------------------------------------------------------------------------------------------------------- the search
 
 State = TypeVar("State", bound=Evidence)
 

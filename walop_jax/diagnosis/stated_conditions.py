@@ -31,11 +31,11 @@ from jaxtyping import Float
 from scipy import stats
 
 from walop_jax.data.records import CalibrationSet
+from walop_jax.diagnosis.alternatives import with_exposures, with_places
+from walop_jax.diagnosis.candidates import Probe, applicable, probes, showable
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.effect_columns import Probe, applicable, probes, showable
 from walop_jax.diagnosis.examination import ALARM
 from walop_jax.diagnosis.limits_found import PROBABILITY
-from walop_jax.diagnosis.mixups import with_exposures, with_places
 from walop_jax.diagnosis.score import (
     Candidate,
     Score,

@@ -3,7 +3,7 @@
 χ² of everything hides what is small beside all the noise, or what is made up for elsewhere. Here the residuals
 are asked in smaller questions, each with a known answer under the model that was fitted:
 
-Patterns    the efficient score of every free-form pattern (`freeform`) with one global p for all of them: structure
+Patterns    the efficient score of every free-form pattern (`design`) with one global p for all of them: structure
             over the field, angle, time, flux, kinds, filters and single exposures that noise does not make.
 Groups      the squared residuals of each camera, kind, filter and exposure. Behind the fluxes and parameters that
             were fitted, r has the covariance P = 1 − Σ w wᵀ − QQᵀ, so that
@@ -34,10 +34,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import stats
 
-from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.alternatives import refuse_mixups
+from walop_jax.diagnosis.design import Design, pattern_scores
 from walop_jax.diagnosis.examination import ALARM
-from walop_jax.diagnosis.mixups import refuse_mixups
-from walop_jax.diagnosis.pattern_scores import pattern_scores
 from walop_jax.diagnosis.repeated_noise import repeated_noise
 from walop_jax.diagnosis.score import Projector, ScoreTable, local_p
 from walop_jax.diagnosis.stated_conditions import Singles, hidden_mistakes, stated_conditions
@@ -70,11 +69,12 @@ Cube = Float[np.ndarray, "p e k"]
 def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> FitResult:
     """The fit with the verdict on it: what its residuals say against it, beside χ², priors and convergence.
 
-    A fit that explains nothing is held against other readings of its data first (`mixups`), unless these were tried
-    already (`as_written`), and against stated errors that are too small. `seed` is that of the Monte Carlo p. Of a set
-    with more than `limits.TRUST_ROWS` (exposure, point) pairs, points spread over the field are looked at. A χ² that is
-    a few per cent too large while nothing else is wrong is put down to the stated errors, and the standard errors are
-    made from the residuals. Raises `DataError` with the remedy for data that another reading explains.
+    A fit that explains nothing is held against other readings of its data first (`alternatives`), unless these were
+    tried already (`as_written`), and against stated errors that are too small. `seed` is that of the Monte Carlo p.
+    Of a set with more than `limits.TRUST_ROWS` (exposure, point) pairs, points spread over the field are looked at.
+    A χ² that is a few per cent too large while nothing else is wrong is put down to the stated errors, and the
+    standard errors are made from the residuals. Raises `DataError` with the remedy for data that another reading
+    explains.
     """
     result = with_pixels(result)
     if not result.converged:

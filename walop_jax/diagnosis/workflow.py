@@ -1,7 +1,7 @@
 """The workflow: alarm, name, addition, until the data are explained or what is left has no name.
 
-1. Fit the model. 2. Score every effect of the catalogue, every sentence (`grammar`) and every pattern of the free-form
-basis; global p by Monte Carlo. 3. Below `Policy.alarm`: add names one after the other (`search`), each fitted together
+1. Fit the model. 2. Score every effect of the catalogue, every sentence (`candidates`) and every pattern without a
+name; global p by Monte Carlo. 3. Below `Policy.alarm`: add names one after the other (`search`), each fitted together
 with everything before it is added. 4. Drop names that are not needed beside the others. 5. Names that leave a poor fit
 nearly as poor are told as parts of what is missing, and taken out again. 6. What no name explains is described, and the
 verdict is `unexplained`; a free-form term for it stays in the model where it predicts settings and parts of the field
@@ -20,13 +20,13 @@ from typing import Any
 
 import numpy as np
 
+from walop_jax.calibration.matrix import instrument_matrices, largest_change
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import grammar, location, naming
-from walop_jax.diagnosis.change_of_stokes import instrument_matrices, largest_change
-from walop_jax.diagnosis.choices import Choices
-from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.effect_columns import Probe, applicable
-from walop_jax.diagnosis.effect_columns import probes as all_probes
+from walop_jax.diagnosis import candidates
+from walop_jax.diagnosis.alternatives import Choices, mixups_of, refusal
+from walop_jax.diagnosis.candidates import Probe, applicable
+from walop_jax.diagnosis.candidates import probes as all_probes
+from walop_jax.diagnosis.design import Design, strata
 from walop_jax.diagnosis.examination import (
     Examination,
     Ranked,
@@ -34,12 +34,25 @@ from walop_jax.diagnosis.examination import (
     most_points,
     shortest,
 )
-from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexplained, told
-from walop_jax.diagnosis.freeform import strata
-from walop_jax.diagnosis.mixups import mixups_of, refusal
-from walop_jax.diagnosis.naming import Trial, before_and_after, predicts_unseen, refitted_in_order
+from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexplained, describe, told
 from walop_jax.diagnosis.policy import POLICY, Policy
-from walop_jax.diagnosis.search import Linear, search
+from walop_jax.diagnosis.search import (
+    Linear,
+    Trial,
+    before_and_after,
+    beyond_prior,
+    evidence_of_presence,
+    predicts_unseen,
+    refit_without,
+    refitted_in_order,
+    search,
+    signature,
+    spoken_choices,
+    try_effect,
+    try_sentences,
+    try_shapes,
+    with_refuted_priors_widened,
+)
 from walop_jax.diagnosis.stated_conditions import rival_conditions
 from walop_jax.diagnosis.trust import examined, pixel_structure
 from walop_jax.fit.model_file import base_model
@@ -76,7 +89,7 @@ def diagnose(
     (default: those of the policy);
     what is left then has no name, and `Diagnosis.caution` says so. Both fits are examined. Other readings of the data
     are not tried where the caller has done that already (`as_written`). Raises what `fit` raises, and `DataError` for
-    data that another reading explains (`mixups`).
+    data that another reading explains (`alternatives`).
     """
     began = time.perf_counter()
     tell = progress or (lambda text: None)
@@ -85,7 +98,7 @@ def diagnose(
     catalogue = model.catalogue if catalogue is None else catalogue
     calset = in_field_points(calset, model, tell, pixel_structure)
     context = effect_context(model.template, calset.exposures)
-    every = grammar.sentences(model.template, calset.exposures, len(calset.points))
+    every = candidates.sentences(model.template, calset.exposures, len(calset.points))
     amplitudes = sum(len(probe.widths) for probe in (*all_probes(tuple(catalogue), context), *every))
     some = thinned(calset, most_points(calset, model.template, amplitudes), neighbours=1)
     if len(some.points) < len(calset.points):
@@ -151,7 +164,7 @@ def _promise(choice: Choice) -> tuple[float, float]:
 class Refit(Linear):
     """The judge that fits: the current fit of a diagnosis, and the steps so far.
 
-    `wanted` are the probes of `catalogue`, `sentences` and `parts` what else can be said (`grammar`). `choices` are
+    `wanted` are the probes of `catalogue`, `sentences` and `parts` what else can be said (`candidates`). `choices` are
     other descriptions that were tried, `said` the groups of sentences that were added. `ended` says that there was no
     time for something.
     """
@@ -195,8 +208,8 @@ class Refit(Linear):
             context=context,
             catalogue=fitting,
             wanted=list(all_probes(fitting, context)),
-            sentences=grammar.uncovered(*every),
-            parts=grammar.parts(*every),
+            sentences=candidates.uncovered(*every),
+            parts=candidates.parts(*every),
             rng=rng,
             tell=tell,
             policy=policy,
@@ -232,17 +245,17 @@ class Refit(Linear):
             if not self._hopeful(state, item):
                 return None
             said = shortest(item, self.policy.most_together)
-            found = naming.try_sentences(self.fit, said, self.context, len(state.sentences))
+            found = try_sentences(self.fit, said, self.context, len(state.sentences))
         else:
             shapes = sum(probe.effect is item.effect for probe in state.probes)
-            found = naming.try_shapes(self.fit, item, self.context, shapes, self.policy)
+            found = try_shapes(self.fit, item, self.context, shapes, self.policy)
         if found.fit is None or not found.fit.converged:
             return None
         return dataclasses.replace(found, item=item, linear=trial.linear)
 
     def _hopeful(self, state: Examination, item: Ranked) -> bool:
         """Whether a sentence predicts what it has not seen, by its linear step: nobody has a name for it to believe."""
-        single = any("exposure" in text for text in grammar.said_by(item.probe))
+        single = any("exposure" in text for text in candidates.said_by(item.probe))
         columns = [state.said[item.probe.name]]
         return predicts_unseen(state.design, columns, self.policy.hopeful, of_states=not single)
 
@@ -251,7 +264,7 @@ class Refit(Linear):
         for effect in self.catalogue if state.poor else ():
             if effect.is_structural() and effect.name not in self.fit.model.effect_names and self.time_left():
                 self.tell(f"trying {effect.name}")
-                yield naming.try_effect(self.fit, effect.neutral(self.context), self.context)
+                yield try_effect(self.fit, effect.neutral(self.context), self.context)
         choices = Choices(
             self.fit, self.context, self.policy, self.time_left, self.tell, all_of_them=state.poor
         )
@@ -321,7 +334,7 @@ class Refit(Linear):
             result = fit(result.likelihood, start=result.values)
         model = result.model
         for step in self.steps:
-            model = naming.with_refuted_priors_widened(model, result.values, step.effect)
+            model = with_refuted_priors_widened(model, result.values, step.effect)
         if model is not result.model:
             result = fit(Likelihood.of(self.calset, model), start=result.values)
         self.fit = result
@@ -365,15 +378,13 @@ class Refit(Linear):
             if not dropped:
                 return self.examined(state), nameless
             # Those names only stood in for what has none: what is it without them?
-            self._go_on_with(naming.refit_without(self.fit, FreeForm.name))
+            self._go_on_with(refit_without(self.fit, FreeForm.name))
 
     def _drop_what_is_not_needed(self) -> bool:
         """Take out, one by one, names that the final model does not need; whether there were any."""
         dropped = False
         while self.steps and len(self.fit.model.template.effects) > 1:
-            worth = {
-                s.effect: naming.evidence_of_presence(self.fit, s.effect, self.context) for s in self.steps
-            }
+            worth = {s.effect: evidence_of_presence(self.fit, s.effect, self.context) for s in self.steps}
             least = min(worth, key=lambda name: worth[name])
             if worth[least] >= self.policy.least_evidence:
                 break
@@ -384,7 +395,7 @@ class Refit(Linear):
 
     def _without(self, name: str) -> None:
         self.steps = [s for s in self.steps if s.effect != name]
-        self._go_on_with(naming.refit_without(self.fit, name))
+        self._go_on_with(refit_without(self.fit, name))
 
     def _parts(self, first: Examination) -> tuple[str, ...]:
         """Take out names that leave a poor fit nearly as poor: in words what each of them would explain.
@@ -429,7 +440,7 @@ class Refit(Linear):
     def _with_free_form(self, state: Examination, found: Unexplained, blocks: tuple[str, ...]) -> Unexplained:
         """Add a free-form term for patterns without a name, so that the calibration improves all the same."""
         term = FreeForm.of(self.context, blocks=blocks)
-        trial = naming.try_effect(self.fit, term, self.context)
+        trial = try_effect(self.fit, term, self.context)
         if trial.fit is None or not trial.fit.converged:
             return found
         before = self.fit
@@ -441,7 +452,7 @@ class Refit(Linear):
 
     def finished(self, step: Step, state: Examination) -> Step:
         """The step with final parameters, what cannot be told from it, and where it sits."""
-        change = naming.signature(self.fit, step.effect, self.context)
+        change = signature(self.fit, step.effect, self.context)
         separation = state.separation(step.effect, change)
         close = {name for name, s in separation.items() if s < self.policy.separation} | set(step.equivalent)
         close -= {other.effect for other in self.steps}
@@ -456,13 +467,13 @@ class Refit(Linear):
             step,
             parameters=parameters,
             told=told(self.fit) if step.effect == Described.name else (),
-            far=naming.beyond_prior(self.fit, step.effect),
-            choices=naming.spoken_choices(effect),
+            far=beyond_prior(self.fit, step.effect),
+            choices=spoken_choices(effect),
             robust_ratio=state.design.robust_ratio(step.effect),
             equivalent=tuple(sorted(close, key=lambda name: (separation.get(name, np.inf), name))),
             separation=separation,
             separated_by=effect.separated_by if close or step.nameless else "",
-            where=location.describe(state.design, change),
+            where=describe(state.design, change),
         )
 
 
@@ -478,7 +489,7 @@ def unexplained(state: Examination, patterns: tuple[tuple[str, float], ...]) -> 
         text = f"patterns without a name: {'; '.join(f'{name} (p = {p:.1g})' for name, p in patterns)}"
     else:
         text = "something is missing, no single pattern is significant by itself"
-    where = location.describe(state.design, state.design.residual)
+    where = describe(state.design, state.design.residual)
     text += f". Residuals sit in: cameras {where['camera']}; kinds {where['kind']}; field {where['field']}"
     return Unexplained(state.table.p_global, text, patterns)
 

@@ -20,7 +20,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator, NullLocator
 
 from walop_jax.data.records import Points
-from walop_jax.diagnosis.figure_file import ExposureLabels, Ladder, PointMap, ResidualComparison, Shares
+from walop_jax.diagnosis.figure_data import ExposureLabels, Ladder, PointMap, ResidualComparison, Shares
 from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.reports.style import (

@@ -11,8 +11,7 @@ import numpy as np
 
 from walop_jax.calibration import PRODUCT, SUMMARY, Calibration, read_calibration
 from walop_jax.data.user_tables import read_input_table
-from walop_jax.diagnosis.figure_data import UNNAMED
-from walop_jax.diagnosis.figure_file import FIGURE_DATA, DiagnosisFigureData, read_figure_data
+from walop_jax.diagnosis.figure_data import FIGURE_DATA, UNNAMED, DiagnosisFigureData, read_figure_data
 from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.text import read_json

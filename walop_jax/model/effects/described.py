@@ -1,7 +1,7 @@
 """What is missing and has no name: changes (`change`), each with an amplitude; several of them are one effect.
 
-Not in the catalogue: `diagnose` tries all changes that an instrument and its exposures allow (`diagnosis/grammar.py`)
-beside the names, and adds one where it explains the data better than any name.
+Not in the catalogue: `diagnose` tries all changes that an instrument and its exposures allow
+(`diagnosis/candidates.py`) beside the names, and adds one where it explains the data better than any name.
 
 Equation    that of each change: `optics`, `numbers`, `cameras`, `sources`
 Source      Lu & Chipman 1996, JOSA A 13, 1106: every Mueller matrix near the identity is a product of these

@@ -1,4 +1,10 @@
-"""All that an instrument may lack, in sentences: kind × place × dependence, from its own train and its exposures.
+"""All that could be missing, effects and sentences, and what each would do to the residuals.
+
+The columns of the score test come from the responses of the light path (`likelihood.columns`), but those of effects of
+a user's own, which are differentiated themselves. Structural effects have no amplitude: they can only be tried
+(`search.try_effect`).
+
+Sentences say all that an instrument may lack: kind × place × dependence, from its own train and its exposures.
 
 A *group* of sentences is one candidate of the score test: a linear retarder has two axes, a harmonic a cosine and a
 sine, a gradient two directions. Groups are short: at most two things are free beside the kind.
@@ -23,11 +29,15 @@ import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from jaxtyping import Bool, Float
 
-from walop_jax.data.records import Exposures
-from walop_jax.diagnosis.effect_columns import FEWEST_POINTS, Probe
-from walop_jax.diagnosis.freeform import RINGS
+from walop_jax.data.records import CalibrationSet, Exposures
+from walop_jax.diagnosis.design import RINGS
+from walop_jax.diagnosis.score import Candidate
 from walop_jax.likelihood import limits
+from walop_jax.likelihood.columns import Change, Columns, own_columns
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.dependence import changed_elements, conditions_asked_by
 from walop_jax.model.effects import Context, Described, Effect
 from walop_jax.model.effects.change import BAND, OPPOSITE, SKY
 from walop_jax.model.effects.change import Change as Sentence
@@ -36,7 +46,131 @@ from walop_jax.model.effects.optics import Displacement
 from walop_jax.model.effects.sources import OfSource
 from walop_jax.model.elements import Polariser, PupilMapping, WavePlate
 from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import field_declarations
+from walop_jax.model.ray import CONDITIONS
 from walop_jax.model.responses import acts
+
+DEFAULT_WIDTH = 1.0
+FEWEST_POINTS = 9  # in which a pattern over the field is looked for, or what refers to their median
+
+Vector = Float[np.ndarray, " _"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Probe:
+    """One group of probes of an effect: the place in its shape space from which a linear step is taken."""
+
+    name: str
+    effect: type[Effect]
+    group: tuple[Effect, ...]
+
+    def _fields(self) -> Iterator[str]:
+        """The parameter that each amplitude belongs to, member by member."""
+        for member in self.group:
+            for name in self.effect.amplitudes():
+                yield from [name] * np.size(getattr(member, name))
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that the amplitudes belong to, one for each."""
+        return tuple(self._fields())
+
+    @property
+    def widths(self) -> Vector:
+        """Prior widths of the amplitudes, member by member."""
+        declared = field_declarations(self.effect)
+        return np.array([declared[name].width or DEFAULT_WIDTH for name in self._fields()])
+
+    @property
+    def one_sided(self) -> Bool[np.ndarray, " _"]:
+        """Which amplitudes physics keeps above neutral, member by member."""
+        return np.array([name in self.effect.one_sided for name in self._fields()], bool)
+
+
+def applicable(
+    catalogue: Sequence[type[Effect]], context: Context, instrument: Instrument
+) -> tuple[type[Effect], ...]:
+    """The effects of a catalogue that have what they act on in an instrument."""
+    return tuple(kind for kind in catalogue if kind.neutral(context).fits(instrument))
+
+
+def probes(catalogue: Sequence[type[Effect]], context: Context) -> Iterator[Probe]:
+    """Every group of probes of every effect that has an amplitude in this context."""
+    for effect in catalogue:
+        if effect.is_structural():
+            continue
+        groups = effect.probes(context)
+        for number, group in enumerate(groups):
+            probe = Probe(effect.name if len(groups) == 1 else f"{effect.name}#{number}", effect, group)
+            if len(probe.widths):
+                yield probe
+
+
+def _can_show(calset: CalibrationSet, instrument: Instrument, effect: Effect) -> bool:
+    """Whether a set has what an effect acts on: several field points, or the conditions that its elements ask for."""
+    if effect.over_field and len(calset.points) < FEWEST_POINTS:
+        return False
+    bare = dataclasses.replace(instrument, effects=())
+    changed = changed_elements(bare, effect)
+    asked = frozenset(name for element in changed for name in conditions_asked_by(element))
+    stated = {name: getattr(calset.exposures, column.lower()) for name, column in CONDITIONS.items()}
+    return all(np.isfinite(stated[name]).any() for name in asked if name in stated)
+
+
+def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Probe]) -> list[Probe]:
+    """The probes of effects that a set can show; shapes of one effect need the same."""
+    shown: dict[type[Effect], bool] = {}
+    for probe in wanted:
+        if probe.effect not in shown:
+            shown[probe.effect] = _can_show(calset, instrument, probe.group[0])
+    return [probe for probe in wanted if shown[probe.effect]]
+
+
+def all_candidates(
+    likelihood: Likelihood, values: Vector, effects: Sequence[Probe], sentences: Sequence[Probe]
+) -> tuple[dict[str, Candidate], dict[str, Candidate]]:
+    """Columns of effects and of sentences at the fit `values` of a model, by name.
+
+    Without effects that the set cannot show, and without fringes that the bands blur away.
+    """
+    calset, template = likelihood.calset, likelihood.model.template
+    shown = showable(calset, template, effects)
+    columns = Columns(likelihood, values)
+    changes: dict[int, list[Change]] = {}
+    for number, probe in enumerate([*shown, *sentences]):
+        each = [member.first_order(template) for member in probe.group]
+        if all(one and all(columns.has(change) for change in one) for one in each):
+            changes[number] = [change for one in each for change in one]
+    gaps = [sentence.gap for some in changes.values() for change in some for sentence in _fringes(change)]
+    survives = columns.survives(gaps)
+    blurred = {
+        number
+        for number, some in changes.items()
+        if not all(survives[sentence.gap] for change in some for sentence in _fringes(change))
+    }
+    kept = {number: some for number, some in changes.items() if number not in blurred}
+    found = columns.of([change for some in kept.values() for change in some])
+    named: dict[str, Candidate] = {}
+    said: dict[str, Candidate] = {}
+    first = 0
+    for number, probe in enumerate([*shown, *sentences]):
+        if number in kept:
+            own = found[:, first : first + len(probe.widths)]
+            first += len(probe.widths)
+        elif number in blurred:
+            continue
+        else:
+            own = own_columns(likelihood, values, probe.group)
+        into = named if number < len(shown) else said
+        into[probe.name] = Candidate(probe.name, own, probe.widths)
+    return named, said
+
+
+def _fringes(change: Change) -> Iterator[Sentence]:
+    return (sentence for _, sentence in change if sentence.kind == "fringes")
+
+
+# -------------------------------------------------------------------------------------------------------- all sentences
 
 LINEAR = ("diattenuation", "retardance")
 ALONE = ("diattenuation v", "retardance v", "depolarisation")
@@ -281,10 +415,10 @@ def _of_plates(instrument: Instrument, exposures: Exposures, asked: _Asked) -> I
             yield (Sentence("cut", "of", layer),)
     if warm and asked.kelvin:
         yield tuple(warm)
-    yield from _fringes([sentence.place for sentence in warm])
+    yield from _fringes_ahead([sentence.place for sentence in warm])
 
 
-def _fringes(plates: Sequence[str]) -> Iterator[tuple[Sentence, ...]]:
+def _fringes_ahead(plates: Sequence[str]) -> Iterator[tuple[Sentence, ...]]:
     """Cosine and sine of the fringes of an air gap ahead of one plate, and of the same gap ahead of all of them."""
     for gap in GAPS if plates else ():
         pairs = [
