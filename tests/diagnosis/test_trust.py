@@ -13,7 +13,7 @@ from scipy import stats
 from small_run import SMALL
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.data.records import Block, CalibrationSet
+from walop_jax.data.records import Block, CalibrationSet, Compression
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.trust import examined, group_scores
@@ -183,6 +183,23 @@ def test_errors_a_few_per_cent_off_are_no_matter_of_the_model():
     assert "% too small" in found.warnings[0]
     ratio = np.median(found.sigma[found.sigma > 0] / clean.sigma[clean.sigma > 0])
     assert 1.0 < ratio < 1.5
+
+
+@pytest.mark.parametrize(("ratio", "gain"), [(1.0, 2e-4), (1.04, 2e-4), (1.4, 8e-4)])
+def test_a_set_that_stands_for_pixels_says_what_these_hold(calset, clean, ratio, gain):
+    """A wave of a few pixels is in none of its field points: χ² of the pixels and their structure are all there is."""
+    dof = 330_000
+    names = [p.name for p in clean.model.parameters]
+    values = dict(zip(names, clean.values.tolist(), strict=True))
+    record = Compression(10_000, ratio * dof, dof, values, (), gain=gain, response=0.0)
+    found = refit(dataclasses.replace(calset, compression=record))
+    assert (found.chi2, found.dof) == (pytest.approx(ratio * dof, abs=clean.chi2), dof)
+    assert not found.trusted
+    told = f"residuals of the same pixel agreed between exposures when the pixels were summed: structure of {gain:.2g}"
+    assert any(text.startswith(told) for text in found.verdict.doubts)
+    assert found.verdict.structure.gain == pytest.approx(gain)
+    made = Calibration.from_fit(found).matrix(np.array([0.1]), np.array([0.1]))[1]
+    assert np.sqrt(made[0, 0, 0]) > 0.6 * gain  # (N₁ − N₂)/(N₁ + N₂) of gains that differ by √2 of it
 
 
 def test_squares_of_groups_follow_their_distribution(south_set, south_fit):

@@ -40,8 +40,8 @@ from walop_jax.data.records import Block, CalibrationSet, Intensities
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.fit.stand_in import compressed
 from walop_jax.likelihood import engine
+from walop_jax.likelihood.compressed import compressed
 from walop_jax.likelihood.frames import PixelPosterior, frame_sums
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.points import StreamedPoints

@@ -47,7 +47,8 @@ def compress(
     from walop_jax.data.write import write_calibration_set
     from walop_jax.diagnosis.trust import pixel_structure
     from walop_jax.fit.refit import refit
-    from walop_jax.fit.stand_in import compressed, with_pixel_structure
+    from walop_jax.fit.stand_in import with_pixel_structure
+    from walop_jax.likelihood.compressed import compressed
     from walop_jax.likelihood.frames import PixelPosterior
 
     job.begin("reading")

@@ -81,36 +81,39 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
         if not as_written and result.chi2 > FAR_OFF * max(result.dof, 1):
             refuse_mixups(result)
         return result.judged()
-    if not (result.explains_data or result.nearly_explains_data):
-        if not as_written:
-            refuse_mixups(result)
-        doubts = tuple(_errors_too_small(result, seed)) or tuple(
-            stated_conditions(Design.of(_looked_at(result)))
-        )
-        return result.judged(doubts)
+    near = result.explains_data or result.nearly_explains_data
+    if not (near or as_written):
+        refuse_mixups(result)
     whole = on_field_points(result)
+    if not near and (scaled := tuple(_errors_too_small(result, seed))):
+        return result.judged(scaled)
     design = Design.of(sampled(whole, _most(whole)))
     if result.errors_too_large and _hold_no_noise(design):
         return result.judged(noiseless=True)
-    table, singles = pattern_scores(design, seed), Singles.of(design)
     pixels = _of_pixels(result)
-    components = found_components([*variance_components(design), *pixels])
-    doubts = (
-        *stated_conditions(design, singles),
-        *_patterns(table),
-        *in_words(components),
-        *_groups(design),
-        *repeated_noise(design),
-        *_summed_pixels(result),
-        *_far_from_pixels(result),
-    )
+    components = found_components([*pixels, *variance_components(design)])
+    hidden = None
+    if near:
+        table, singles = pattern_scores(design, seed), Singles.of(design)
+        hidden = hidden_mistakes(design, singles)
+        doubts = (
+            *stated_conditions(design, singles),
+            *_patterns(table),
+            *in_words(components),
+            *_groups(design),
+            *repeated_noise(design),
+        )
+    else:  # anything may be in such residuals; what single places of the field share sits on stars as well
+        components = [one for one in components if one.grouping.structure]
+        doubts = (*stated_conditions(design), *in_words(components))
+    doubts = (*doubts, *_summed_pixels(result), *_far_from_pixels(result))
     structure = structure_of(components)
     found = with_honest_errors(result)
     if structure:
         of_points = [one for one in components if not any(one is other for other in pixels)]
         found = with_structure(found, design, of_points, len(whole.calset.points))
     found = found.judged(doubts, structure=_with_summed_pixels(result, structure))
-    return dataclasses.replace(found, hidden=hidden_mistakes(design, singles))
+    return dataclasses.replace(found, hidden=hidden)
 
 
 def _of_pixels(result: FitResult) -> list[VarianceComponent]:
@@ -151,11 +154,6 @@ def pixel_structure(result: FitResult) -> Structure:
     return structure_of(found_components(_of_pixels(result)))
 
 
-def _looked_at(result: FitResult) -> FitResult:
-    whole = on_field_points(result)
-    return sampled(whole, _most(whole))
-
-
 def _most(result: FitResult) -> int:
     """Field points that are looked at."""
     return max(1, limits.TRUST_ROWS // max(len(result.calset.exposures), 1))
@@ -165,8 +163,11 @@ def _errors_too_small(result: FitResult, seed: int) -> Iterator[str]:
     """Whether residuals far larger than the stated errors are nothing but noise."""
     factor = float(np.sqrt(result.chi2 / max(result.dof, 1)))
     scaled = fit(result.likelihood, start=result.values, noise_scale=factor)
-    design = Design.of(_looked_at(scaled))
-    if pattern_scores(design, seed).p_global >= ALARM and not list(_groups(design)):
+    whole = on_field_points(scaled)
+    design = Design.of(sampled(whole, _most(whole)))
+    rough = found_components([*variance_components(design), *_of_pixels(scaled)])
+    rough = rough or any(_summed_pixels(result))
+    if pattern_scores(design, seed).p_global >= ALARM and not (rough or any(_groups(design))):
         yield (
             f"N_ERR is {factor:.3g} times too small: with errors as large the residuals hold nothing but noise; check "
             "the gain and the unit of N_ERR"

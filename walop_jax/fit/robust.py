@@ -23,6 +23,8 @@ from jaxtyping import Float, Int
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.likelihood import engine, limits
+from walop_jax.likelihood.compressed import compressed
+from walop_jax.likelihood.frames import PixelPosterior
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood, Posterior
 
@@ -43,7 +45,8 @@ class RobustErrors(NamedTuple):
 def robust_errors(likelihood: Likelihood, values: Vector, posterior: Posterior) -> RobustErrors:
     """Errors from the residuals at a minimum; `posterior` is the expansion there, `values` a full vector.
 
-    Of a large set the blocks are those of a sample of its points, as if the others had residuals like them.
+    Of whole frames the blocks are those of the field points that stand for all pixels; of another large set those of
+    a sample of its points, as if the others had residuals like them.
     """
     rows = likelihood.priors
     model, scale = likelihood.model, posterior.noise_scale
@@ -56,6 +59,8 @@ def robust_errors(likelihood: Likelihood, values: Vector, posterior: Posterior) 
     independent = (posterior.matrix - prior) * square / scale**2 + prior
     covariance = bread @ (independent * np.outer(unit, unit)) @ bread
     ways = []
+    if isinstance(posterior, PixelPosterior):
+        likelihood = Likelihood.of(compressed(posterior), model, interpolate=False)
     for name, gradients in _gradients(likelihood, values):
         count = len(gradients)
         if count < FEWEST_BLOCKS:
