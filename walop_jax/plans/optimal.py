@@ -39,7 +39,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import linalg
 
 from walop_jax.plans.families import Family
@@ -51,6 +51,8 @@ _SHARPER = 8.0  # by what the barrier falls between two Newton solutions
 _LEAST_WEIGHT = 1e-5  # share of the budget below which a candidate leaves
 _UNSEEN = 1e-13  # eigenvalue, of the scaled information of everything, below which a direction is not seen
 _MAIN = 1e-5  # of the largest eigenvalue: curvature below it is left out of a step
+_ROUGH, _EXACT = 0.1, 1e-4  # of μ: Newton's decrement at which a centre is left, and at which it is found
+_BENT = 5  # draws whose curvature stands for that of all
 _NEAR = 0.85  # of the largest variance: targets below it wait until they are among the largest
 _NOTHING = 1e-9  # of the information of everything
 _HOPELESS = 1e3  # times the criterion of the best weights: some target is not determined
@@ -166,19 +168,19 @@ class _Some:
         matrices, costs = [], []
         for number, place in self.chosen:
             family, at = experiment.families[number], np.atleast_2d(place)
-            matrices.append(np.einsum("j,rjab->rab", family.coefficients(at)[0], family.basis, optimize=True))
+            r, j, n, _ = family.basis.shape
+            matrices.append((family.coefficients(at) @ family.basis.reshape(r, j, -1)).reshape(r, n, n))
             costs.append(float(family.cost_at(at)[0]))
         self.matrices = np.stack(matrices, axis=1)  # (r, s, n, n)
         self.costs = np.array(costs)
-        r, k, n, q = experiment.targets.shape
-        self.wide = np.moveaxis(experiment.targets, 2, 1).reshape(
-            r, n, k * q
-        )  # A of all targets side by side
+        _, k, _, q = experiment.targets.shape
+        self.wide = _side_by_side(experiment.targets)
         self.per_target = (k, q)
 
     def covariance(self, weight: Float[np.ndarray, " s"]) -> Float[np.ndarray, "r n n"]:
         """M(w)⁻¹ of every draw."""
-        there = self.experiment.known + np.tensordot(weight, self.matrices, (0, 1))
+        r, s, n, _ = self.matrices.shape
+        there = self.experiment.known + (weight @ self.matrices.reshape(r, s, -1)).reshape(r, n, n)
         return np.linalg.inv(0.5 * (there + np.swapaxes(there, 1, 2)))
 
     def variances(self, covariance: Float[np.ndarray, "r n n"]) -> Float[np.ndarray, "r k"]:
@@ -213,40 +215,43 @@ class _Some:
         weight = np.maximum(weight, 1e-3 * self.experiment.budget / self.costs.sum())
         weight *= self.experiment.budget / (self.costs @ weight)
         phi = self.variances(self.covariance(weight))
-        near = np.zeros(phi.shape[1], bool)
+        seen = np.zeros(phi.shape)
         while True:
-            near |= (phi >= _NEAR * phi.max(axis=1, keepdims=True)).any(axis=0)
+            seen = np.maximum(seen, phi / phi.max(axis=1, keepdims=True))
+            near = _nearest(seen)
             weight, shares = self._of_targets(near)._solved(weight, gap)
             phi = self.variances(self.covariance(weight))
-            if np.all(phi[:, ~near] <= (1.0 + 0.1 * gap) * phi[:, near].max(axis=1, keepdims=True)):
+            top = np.take_along_axis(phi, near, axis=1).max(axis=1)
+            if np.all(phi.max(axis=1) <= (1.0 + 0.1 * gap) * top):
                 whole = np.zeros(phi.shape)
-                whole[:, near] = shares
+                np.put_along_axis(whole, near, shares, axis=1)
                 return weight, whole
 
     def worst(self, phi: Float[np.ndarray, "r k"]) -> _Some:
         """The same for the targets with the largest variances: whose value bounds that of all from below."""
-        return self._of_targets((phi >= _NEAR * phi.max(axis=1, keepdims=True)).any(axis=0))
+        return self._of_targets(_nearest(phi / phi.max(axis=1, keepdims=True)))
 
-    def _of_targets(self, near: Bool[np.ndarray, " k"]) -> _Some:
-        """The same for some of the targets."""
+    def _of_targets(self, near: Int[np.ndarray, "r l"]) -> _Some:
+        """The same for some of the targets of each draw."""
         other = copy.copy(self)
         r, _, n, q = self.experiment.targets.shape
-        other.wide = self.wide.reshape(r, n, -1, q)[:, :, near].reshape(r, n, -1)
-        other.per_target = (int(near.sum()), q)
+        some = np.take_along_axis(self.wide.reshape(r, n, -1, q), near[:, None, :, None], axis=2)
+        other.wide = some.reshape(r, n, -1)
+        other.per_target = (near.shape[1], q)
         return other
 
     def _solved(
         self, weight: Float[np.ndarray, " s"], gap: float
     ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "r k"]]:
         phi = self.variances(self.covariance(weight))
-        level = phi.max(axis=1) * 1.05
         constraints = phi.size + len(weight)
-        mu = level.mean() / constraints
+        mu = phi.max(axis=1).mean() / constraints
+        level = phi.max(axis=1) + len(phi) * mu
         least = 0.2 * gap * level.mean() / constraints
         while True:
-            weight, level = self._centred(weight, level, mu)
-            least = min(least, 0.2 * gap * level.mean() / constraints)
-            if mu <= 1.1 * least:  # the level, and with it the least, still sinks a little in every solution
+            last = mu <= 1.1 * least
+            weight, level = self._centred(weight, level, mu, _EXACT if last else _ROUGH)
+            if last:
                 break
             mu = max(mu / _SHARPER, least)
         shares = 1.0 / np.maximum(level[:, None] - self.variances(self.covariance(weight)), 1e-300)
@@ -264,26 +269,29 @@ class _Some:
         return float(level.mean() - mu * (np.log(slack).sum() + np.log(weight).sum()))
 
     def _centred(
-        self, weight: Float[np.ndarray, " s"], level: Float[np.ndarray, " r"], mu: float
+        self, weight: Float[np.ndarray, " s"], level: Float[np.ndarray, " r"], mu: float, enough: float
     ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " r"]]:
-        """Newton's method for one μ."""
+        """Newton's method for one μ, until its decrement is `enough` of μ."""
         s, r = len(weight), len(level)
+        some = slice(None, None, -(-r // _BENT))
         for _ in range(_NEWTON):
             covariance = self.covariance(weight)
             y = covariance @ self.wide
             slope = -self.gains(y)
             slack = level[:, None] - self._by_target(self.wide * y)
             push = mu / slack
-            # Curvature of the φ: Σ_k push_k 2 tr(M_s P M_t Q), P = M⁻¹, Q = Σ_k push_k y_k y_kᵀ, of which the main
-            # part is enough to step by.
-            pushed = y * np.repeat(push, self.per_target[1], axis=1)[:, None]
-            left, right = _root(covariance), _root(pushed @ np.swapaxes(y, 1, 2), _MAIN)
-            flat = np.moveaxis(left[:, None] @ (self.matrices @ right[:, None]), 1, 0).reshape(s, -1)
+            # Curvature of the φ: Σ_k push_k 2 tr(M_s P M_t Q), P = M⁻¹, Q = Σ_k push_k y_k y_kᵀ. Its main part in some
+            # of the draws, which are much alike, is enough to step by.
+            pushed = y[some] * np.repeat(push[some], self.per_target[1], axis=1)[:, None]
+            left = np.linalg.cholesky(covariance[some]).swapaxes(1, 2)
+            right = _root(pushed @ np.swapaxes(y[some], 1, 2), _MAIN)
+            flat = np.moveaxis(left[:, None] @ (self.matrices[some] @ right[:, None]), 1, 0).reshape(s, -1)
+            alike = push.sum() / push[some].sum()
             hessian = np.zeros((s + r, s + r))
             gradient = np.zeros(s + r)
             gradient[:s] = np.einsum("rk,rsk->s", push, slope) - mu / weight
             gradient[s:] = 1.0 / r - push.sum(axis=1)
-            hessian[:s, :s] = 2.0 * flat @ flat.T + np.diag(mu / weight**2)
+            hessian[:s, :s] = 2.0 * alike * flat @ flat.T + np.diag(mu / weight**2)
             stiff = mu / slack**2
             hessian[:s, :s] += np.einsum("rsk,rtk->st", slope * stiff[:, None], slope, optimize=True)
             hessian[:s, s:] = -np.einsum("rk,rsk->sr", stiff, slope)
@@ -301,9 +309,21 @@ class _Some:
             else:
                 break
             weight, level = new
-            if decrement < 1e-3 * mu * (s + r):
+            if decrement < enough * mu:
                 break
         return weight, level
+
+
+def _side_by_side(targets: Float[np.ndarray, "r k n q"]) -> Float[np.ndarray, "r n kq"]:
+    """A of all targets in one matrix."""
+    r, _, n, _ = targets.shape
+    return np.moveaxis(targets, 2, 1).reshape(r, n, -1)
+
+
+def _nearest(relative: Float[np.ndarray, "r k"]) -> Int[np.ndarray, "r l"]:
+    """Numbers of the targets that come near the largest, as many in each draw."""
+    most = int((relative >= _NEAR).sum(axis=1).max())
+    return np.argsort(-relative, axis=1)[:, :most]
 
 
 def _root(matrices: Float[np.ndarray, "r n n"], least: float = 0.0) -> Float[np.ndarray, "r n b"]:
@@ -407,13 +427,16 @@ def lower_bound(
     `covariance` is M(w)⁻¹ of a plan, `shares` multipliers π of the targets with sum 1 in each draw. Any of both gives a
     valid bound; those of the optimum give the largest.
     """
-    y = np.einsum("rnm,rkmq->rknq", covariance, experiment.targets, optimize=True)
-    g = np.einsum("rk,rknq,rkmq->rnm", shares, y, y, optimize=True)
-    here = float(np.einsum("rk,rknq,rknq->r", shares, experiment.targets, y, optimize=True).mean())
-    known = float(np.einsum("rnm,rnm->r", g, experiment.known).mean())
+    wide = _side_by_side(experiment.targets)
+    y = covariance @ wide
+    shared = y * np.repeat(shares, experiment.targets.shape[3], axis=1)[:, None]
+    g = shared @ y.swapaxes(1, 2)
+    here = float((shared * wide).sum(axis=(1, 2)).mean())
+    known = float((g * experiment.known).sum(axis=(1, 2)).mean())
     tops, ratio = [], 0.0
     for number, family in enumerate(experiment.families):
-        gains = np.einsum("rnm,rjnm->rj", g, family.basis, optimize=True).mean(axis=0)
+        flat = family.basis.reshape(len(g), family.basis.shape[1], -1)
+        gains = (flat @ g.reshape(len(g), -1, 1)).mean(axis=(0, 2))
         places, largest = family.best(gains, most)
         ratio = max(ratio, largest)
         tops += [(number, place) for place in places]
