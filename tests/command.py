@@ -25,11 +25,12 @@ def no_cache():
 @pytest.fixture(scope="session")
 def call() -> Call:
     """Run a command in this process; exceptions that are no exit code count as test failures."""
+    return run_program
 
-    def run(*args: object) -> Any:
-        result = CliRunner().invoke(app, [str(arg) for arg in args])
-        if result.exception is not None and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        return result
 
-    return run
+def run_program(*args: object) -> Any:
+    """What `call` calls."""
+    result = CliRunner().invoke(app, [str(arg) for arg in args])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result

@@ -26,6 +26,7 @@ from walop_jax.commands.refit import refit as refit
 from walop_jax.commands.report import report as report
 from walop_jax.commands.sample import sample as sample
 from walop_jax.commands.simulate import simulate as simulate
+from walop_jax.commands.stack import stack as stack
 from walop_jax.commands.trace import trace as trace
 from walop_jax.commands.watch import watch as watch
 from walop_jax.data.calset import from_arrays as from_arrays
@@ -41,11 +42,9 @@ from walop_jax.model.effects import Effect as Effect
 from walop_jax.model.effects import effect_by_name as effect_by_name
 from walop_jax.model.effects.base import Scalar as Scalar
 from walop_jax.model.instrument import Instrument as Instrument
-from walop_jax.model.instrument import nominal_instrument as nominal_instrument
 from walop_jax.model.parameters import param as param
 from walop_jax.model.specification import Model as Model
 from walop_jax.model.specification import with_effects as with_effects
-from walop_jax.model.trace import Sightline as Sightline
 from walop_jax.posterior import Options as Options
 from walop_jax.posterior.files import Run as Run
 from walop_jax.simulation.observing_plan import ObservingPlan as ObservingPlan

@@ -181,7 +181,8 @@ ELSEWHERE = {
     "clip",
     "sample",
     "plan",
-}  # frames; fit/test_outliers; test_sample; tests/plans
+    "stack",
+}  # frames; fit/test_outliers; test_sample; tests/plans; tests/nights
 CHEAP = [name for name, case in CASES.items() if not case.long]
 WRITING = [name for name in CHEAP if CASES[name].output]
 TABLE = [pytest.param(name, marks=[pytest.mark.long] if CASES[name].long else []) for name in CASES]

@@ -8,8 +8,8 @@ import itertools
 import numpy as np
 import pytest
 
+from walop_jax.model.laws import Law
 from walop_jax.nights import algebra, changes
-from walop_jax.nights.laws import Law
 
 N = 6  # parameters, the last one a candidate
 LAWS = {
@@ -167,6 +167,25 @@ def test_scores_of_changes_equal_a_fit_with_one_column_more(name, spanning):
                     continue
                 assert information[c, j] / e.scale[j] ** 2 == pytest.approx(wanted, rel=1e-5)
                 assert score[c, j] / e.scale[j] == pytest.approx(column @ residual, rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["night", "file", "walk", "trends"])
+def test_a_few_changes_together(name):
+    """Steps, one night and a drift, against a fit with all of these columns more."""
+    found, _, jacobian, data, covariance, pull, rows = solved(name)
+    e = found.system.equations
+    weights = np.stack([e.night >= 3, e.night >= 5, e.night == 2, e.mjd - e.mjd.mean()], axis=1).astype(float)
+    parameter = np.array([5, 5, 1, 3])
+    score, information = changes.weighted(found, weights, parameter)
+    residual = data - jacobian @ (covariance @ (jacobian.T @ data + pull))
+    columns = np.einsum("udi,ui->udi", rows[:, :, parameter], weights).reshape(-1, 4)
+    wanted = columns.T @ (np.eye(len(data)) - jacobian @ covariance @ jacobian.T) @ columns
+    scale = e.scale[parameter]
+    seen = np.diag(wanted) > 1e-6 * np.sum(columns**2, axis=0)
+    assert score / scale == pytest.approx(columns.T @ residual, rel=1e-6, abs=1e-5)
+    assert (information / np.outer(scale, scale))[np.ix_(seen, seen)] == pytest.approx(
+        wanted[np.ix_(seen, seen)], rel=1e-5, abs=1e-5 * np.diag(wanted).max()
+    )
 
 
 def test_a_walk_is_a_gaussian_process():

@@ -2,7 +2,8 @@
 
 import pytest
 
-from walop_jax.nights.laws import Law, laws_of, resolved
+from walop_jax.fit.model_file import model_without_data, render
+from walop_jax.model.laws import Law, laws_of, resolved
 
 
 def test_laws_are_read_written_and_resolved():
@@ -40,3 +41,16 @@ def test_wrong_laws_are_errors(table, words):
 def test_a_law_of_nothing_is_an_error():
     with pytest.raises(ValueError, match=r"half2.plate.axes.*did you mean"):
         resolved({"half2.plate.axes": Law()}, ["half2.plate.axis"], [])
+
+
+def test_a_model_file_keeps_laws():
+    text = (
+        "[law.'half2.plate.axis']\nper = 'night'\n\n[law.'clp_zero.angle']\nper = ['night']\nspread = 0.05\n"
+    )
+    model = model_without_data("WALOP-SOUTH", text.replace("half2.plate.axis", "half2.wedge"))
+    wanted = {"half2.wedge": {"per": ["night"]}, "clp_zero.angle": {"per": ["night"], "spread": 0.05}}
+    assert model.laws == model_without_data("WALOP-SOUTH", render(model)).laws == wanted
+    with pytest.raises(ValueError, match=r"parameter of \[law\].*half2.wegde"):
+        model_without_data("WALOP-SOUTH", text.replace("half2.plate.axis", "half2.wegde"))
+    with pytest.raises(ValueError, match="needs rate"):
+        model_without_data("WALOP-SOUTH", "[law.'half2.wedge']\nper = 'walk'\n")

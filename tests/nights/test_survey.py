@@ -1,24 +1,27 @@
 """Stacks of nights against one joint fit, against fits of single nights, and against a known truth; bad input."""
 
 import dataclasses
+import json
 import re
 import textwrap
 
 import numpy as np
 import pytest
 from astropy.table import Table
+from command import run_program
 from small_run import SMALL
 
 import walop_jax as walop
 from walop_jax.data.merge import merge_calibration_sets
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.model_file import base_model, model_for
 from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, make_model, with_effects
-from walop_jax.nights import night_file
-from walop_jax.nights.survey import stack
+from walop_jax.nights import night_file, stacking
+from walop_jax.nights.equations import night_equations
+from walop_jax.nights.stacking import stack
 from walop_jax.simulation.simulate import simulate
 
 TURN = 0.1  # deg, of the axis of a half-wave plate, between the third night and the fourth
@@ -90,7 +93,31 @@ def test_a_step_of_what_the_model_lacks(sets, single):
     assert 0.0 < after.sigma < TURN / 10.0
     assert abs(after.value - TURN) < 4.0 * after.sigma
     assert survey.trusted
-    assert not stack([single, *sets[1:]]).trusted
+    assert survey.breaks == ()
+
+
+def test_a_break_is_found_and_named(sets, single):
+    """The planted turn, without a law of it: its date, its size, its name or its class; then it is a law."""
+    assert not stack([single, *sets[1:]], find=False).trusted
+    survey = stack([single, *sets[1:]])
+    (one,) = survey.breaks
+    assert (one.kind, one.before, one.after) == (
+        "step",
+        survey.data.nights[2].end,
+        survey.data.nights[3].begin,
+    )
+    assert "hwp1_axis.angle" in (one.name, *one.alike)
+    assert survey.trusted
+    assert one.p_value < 1e-6
+    assert survey.changing[one.name].at == (one.date,)
+    # Half-way between the nights it may have happened or not: half of it, and as uncertain as that.
+    k = survey.data.names.index(one.name)
+    (early, _), (middle, known), (late, _) = (
+        survey.values_at(mjd) for mjd in (one.before, one.date, one.after)
+    )
+    assert middle[k] == pytest.approx(0.5 * (early[k] + late[k]), abs=1e-6 * abs(one.size))
+    assert known[k, k] >= 0.25 * one.size**2
+    assert survey.validity[0][1] == survey.validity[1][0] == one.date
 
 
 def test_a_walk_knows_less_after_the_last_night(quiet):
@@ -123,7 +150,6 @@ def test_tracks_and_tables(quiet):
     assert np.sum(nights["CHI2"]) == pytest.approx(quiet.solution.chi2)
     assert np.all(np.abs(quiet.excess) < 5.0)
     assert "Survey of WALOP-SOUTH: trusted" in repr(quiet)
-    assert name in quiet.summary()
 
 
 def test_kept_nights_are_stacked(quiet, sets, single, tmp_path):
@@ -146,9 +172,9 @@ def test_outside_the_nights_only_by_force(quiet):
     start, stop = quiet.span
     assert quiet.at(start).verdict.trusted
     for mjd in (start - 0.01, stop):
-        with pytest.raises(DataError, match="outside the nights"):
+        with pytest.raises(DataError, match="outside the validity"):
             quiet.at(mjd)
-        assert any("outside the nights" in text for text in quiet.at(mjd, force=True).verdict.warnings)
+        assert any("outside the validity" in text for text in quiet.at(mjd, force=True).verdict.warnings)
 
 
 def test_bad_input(quiet, single):
@@ -171,6 +197,75 @@ def test_bad_input(quiet, single):
         stack([one, deaf, three], {free: {"per": "night"}})
     with pytest.raises(DataError, match="do not explain its scatter"):
         stack([dataclasses.replace(single, errors_from="residuals")])
+
+
+@pytest.fixture(scope="module")
+def kept(sets, single, tmp_path_factory):
+    """A run of the first night, the sets of the first three, and their survey, made by the program."""
+    folder = tmp_path_factory.mktemp("nights")
+    for k, calset in enumerate(sets[:3]):
+        walop.write_calibration_set(folder / f"night{k}.fits", calset)
+    calset, run = walop.read(folder / "night0.fits"), folder / "RUN"
+    law = "[law.'throughput.n1.p00']\nper = 'walk'\nrate = 1e-4\n"
+    fit(Likelihood.of(calset, model_for(calset, law))).judged().save(run)
+    stopped, made = folder / "SURVEY", []
+
+    def interrupted(*args, **more):
+        made.append(len(made))
+        if len(made) == 2:
+            raise KeyboardInterrupt
+        return night_equations(*args, **more)
+
+    words = [run, folder / "night2.fits", folder / "night1.fits", "-o", stopped]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stacking, "night_equations", interrupted)
+        assert run_program("stack", *words).exit_code == 130
+        assert [entry.name for entry in stopped.iterdir()] == ["partial"]
+        # The first night is kept: the other two are made, then all three again at the common solution, twice.
+        made[:] = [0, 1]
+        assert run_program("stack", *words, "--quiet").exit_code == 0
+    assert len(made) - 2 == 2 + 3 + 3
+    return folder
+
+
+def test_the_program_stacks_what_python_does(kept, sets, single):
+    """Resumed, from a run and two sets in another order, with the law of the model file."""
+    survey = stacking.read_survey(kept / "SURVEY")
+    laws = {"throughput.n1.p00": {"per": "walk", "rate": 1e-4}}
+    other = stack([single, *sets[1:3]], laws)
+    assert survey.changing == other.changing
+    for mjd in (SMALL.start, SMALL.start + 10.0):
+        one, two = survey.at(mjd), other.at(mjd)
+        assert np.all(np.abs(one.values - two.values) <= 1e-3 * two.sigma)
+        assert np.sqrt(np.diag(one.covariance)) == pytest.approx(two.sigma, rel=1e-3)
+    assert not (kept / "SURVEY" / "partial").exists()
+    assert walop.read(kept / "SURVEY" / "calibration.fits").verdict.trusted
+    found = json.loads((kept / "SURVEY" / "survey.json").read_text())
+    assert (found["nights"], found["trusted"], found["laws"]) == (
+        3,
+        True,
+        {k: {**v, "per": ["walk"]} for k, v in laws.items()},
+    )
+
+
+def test_stars_get_the_calibration_of_their_moment(kept, tmp_path):
+    """`apply` of a survey: what `at` gives; outside and without a time an error, by force with a flag."""
+    survey = stacking.read_survey(kept / "SURVEY")
+    counts = np.array([[2.1e5, 1.9e5, 2e5, 2e5], [1.9e5, 2.1e5, 2e5, 2.1e5]])
+    stars = {"X": [0.1, 0.2], "Y": [0.0, 0.1], "N": counts, "N_ERR": np.sqrt(counts)}
+    start, stop = survey.span
+    for mjd in (start, SMALL.start + 3.0, np.nextafter(stop, 0.0)):
+        found = walop.apply(kept / "SURVEY", stars | {"MJD": [mjd, mjd]})
+        assert found["Q"] == pytest.approx(np.asarray(walop.apply(survey.at(mjd), stars)["Q"]), abs=1e-12)
+        assert not np.any(found["FLAG"] & 2048)
+    for mjd in (start - 1e-6, stop):
+        with pytest.raises(DataError, match="outside the validity"):
+            walop.apply(kept / "SURVEY", stars | {"MJD": [mjd, mjd]})
+        assert np.all(walop.apply(kept / "SURVEY", stars | {"MJD": [mjd, mjd]}, force=True)["FLAG"] & 2048)
+    with pytest.raises(DataError, match=r"MJD.*is not given"):
+        walop.apply(kept / "SURVEY", stars)
+    with pytest.raises(DataError, match=r"spans 2.0 days"):
+        walop.apply(kept / "SURVEY", stars | {"MJD": [start + 1.0, start + 3.0]})
 
 
 def test_the_page_runs_as_it_stands(sets, tmp_path, monkeypatch, capsys):

@@ -28,6 +28,7 @@ COMMANDS = {
     "certify": "Check a calibration product from its checksums to its physics.",
     "epoch": "Fit new calibration sets and compare with an old calibration.",
     "watch": "Say when a calibration ceased to hold, from the stars of many nights.",
+    "stack": "Fit many nights at once, each parameter under a law that says how it may change.",
     "model": "Write the base model as a file.",
     "instrument": "Print and check an instrument.",
     "import-zemax": "Make a calibration set (KIND flux) of the transmissions that an optical design program gives.",

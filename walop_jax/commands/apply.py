@@ -13,6 +13,8 @@ from walop_jax.commands.inputs import (
     Product,
     TableFile,
     calibration_of,
+    catalogue_of,
+    folder_of,
     table_of,
     table_outcome,
 )
@@ -50,11 +52,14 @@ def apply(
     saturated counts, 2048 used with --force, 16384 no result, 131072 intensities that disagree with the
     calibration by more than noise and half a per cent; bits of the calibration itself are added to all rows.
 
+    Of a SURVEY (walop-jax stack) the calibration at the MJD of the stars is taken: those of one night in a catalogue.
+
     In Python: an astropy table; `catalogue` is a path, an astropy table, or columns by name.
     """
     from walop_jax.data.catalogue import read_catalogue
     from walop_jax.data.user_tables import table_format
     from walop_jax.fit.verdict import Quality
+    from walop_jax.nights.stacking import calibration_of_stars, is_survey, read_survey
     from walop_jax.posterior import with_moments
     from walop_jax.science.apply import apply as apply_to_rows
     from walop_jax.science.polarisation import ESTIMATORS
@@ -67,8 +72,12 @@ def apply(
     if output is not None:
         table_format(output)
     job.begin("reading")
-    held = calibration_of(calibration, effects)
     table = table_of(catalogue, {})
+    if is_survey(calibration):
+        survey = read_survey(folder_of(calibration), catalogue_of(effects))
+        held = calibration_of_stars(survey, table, force=force)
+    else:
+        held = calibration_of(calibration, effects)
     limit = math.inf if saturation is None else saturation
     rows = read_catalogue(table, held.model.template.patched(), limit, always_in=held.always_in)
     job.tell("tabulating the analysis vectors", "tabulating")

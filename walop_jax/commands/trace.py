@@ -72,9 +72,10 @@ def trace(
     In Python: the stages. Angles of moving elements are keywords, chwp=45, or `at`. Raises ValueError, with the nearest
     names, for an unknown instrument, filter or moving element.
     """
-    from walop_jax import Settings, Sightline
+    from walop_jax import Settings
     from walop_jax.data.settings import builtin_filter
     from walop_jax.model.instrument import nominal_instrument
+    from walop_jax.model.trace import Sightline
     from walop_jax.model.trace import trace as traced
 
     there = {name.upper(): value for name, value in positions.items()} | _angles(at)

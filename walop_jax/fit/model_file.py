@@ -18,6 +18,9 @@
     free = true
     tie = "half1.plate.mgf2"    # optional: takes the value of another parameter
 
+    [law."half2.wedge"]    # how it may change from night to night (docs nights); kept for walop-jax stack
+    per = "night"
+
 What it does not mention stays as in the base model. Names that do not exist are errors that list the nearest ones.
 
 The scale of the throughput is a gauge unless a flux is known: the constant of camera N0 is held then. Where every arm
@@ -27,8 +30,10 @@ has a flux of its own, the whole series of its first camera is.
 from __future__ import annotations
 
 import dataclasses
+import fnmatch
 import json
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -42,11 +47,12 @@ from walop_jax.likelihood import limits
 from walop_jax.model.effects import EFFECTS, Context, Effect, effect_by_name
 from walop_jax.model.effects.catalogue import entries, is_own
 from walop_jax.model.instrument import Instrument, adapted, as_designed, nominal_instrument
+from walop_jax.model.laws import laws_of
 from walop_jax.model.parameters import Parameter, unknown_name
 from walop_jax.model.sources import MoonSky, Standards
 from walop_jax.model.specification import THROUGHPUT, Model, effect_context, make_model, with_effects
 
-TABLES = ("model", "effects", "catalogue", "parameters")
+TABLES = ("model", "effects", "catalogue", "parameters", "law")
 MODEL_KEYS = ("instrument", "plates", "throughput_degree", "effects")
 PARAMETER_KEYS = ("start", "prior", "free", "tie", "unit", "scale", "about")
 
@@ -112,6 +118,8 @@ def render(model: Model) -> str:
         entry["scale"] = p.scale
         parameters[p.name] = entry
     document["parameters"] = parameters
+    if model.laws:
+        document["law"] = dict(model.laws)
     return tomlkit.dumps(document)
 
 
@@ -140,7 +148,12 @@ def parse(text: str, build: Callable[[ModelTable], Model]) -> Model:
             raise ValueError(f'[parameters."{name}"] must be a table; names with dots stand in quotes')
         changes[name] = _changes(parameter, entry)
     changed = tuple(dataclasses.replace(p, **changes.get(p.name, {})) for p in model.parameters)
-    return dataclasses.replace(model, parameters=changed)
+    laws = {name: law.document() for name, law in laws_of(content.get("law", {})).items()}
+    parts = [kind.name for kind in model.catalogue]
+    for name in laws:
+        if not fnmatch.filter(model.names, name) and re.split("[.#]", name)[0] not in parts:
+            raise unknown_name("parameter of [law]", name, model.names)
+    return dataclasses.replace(model, parameters=changed, laws=laws)
 
 
 def _header(table: Mapping[str, Any], choices: Mapping[str, Any], entries: Mapping[str, Any]) -> ModelTable:
@@ -341,7 +354,7 @@ def model_like(calset: CalibrationSet, old: Model) -> Model:
         else p
         for p in model.parameters
     )
-    return dataclasses.replace(model, parameters=parameters)
+    return dataclasses.replace(model, parameters=parameters, laws=old.laws)
 
 
 def model_without_data(

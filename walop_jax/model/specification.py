@@ -30,13 +30,15 @@ THROUGHPUT = "throughput"
 class Model:
     """An instrument with what may vary in it. Immutable: every change returns a new model.
 
-    `catalogue` are the effects that it may be given by name.
+    `catalogue` are the effects that it may be given by name, `laws` how parameters may change from night to night: the
+    [law] tables of a model file (`model.laws`), which a fit of one set does not need.
     """
 
     name: str
     template: Instrument
     parameters: tuple[Parameter, ...]
     catalogue: tuple[type[Effect], ...] = EFFECTS
+    laws: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def __repr__(self) -> str:
         effects = ", ".join(self.effect_names) or "none beyond the base model"

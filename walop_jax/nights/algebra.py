@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import linalg
 
-from walop_jax.nights.laws import Form, Law
+from walop_jax.model.laws import Form, Law
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
@@ -49,6 +49,11 @@ class Equations:
 
     def __len__(self) -> int:
         return len(self.mjd)
+
+    def only(self, keep: Bool[np.ndarray, " u"]) -> Equations:
+        """The equations of some units."""
+        names = ("mjd", "night", "file", "chi2", "gradient", "matrix")
+        return dataclasses.replace(self, **{name: getattr(self, name)[keep] for name in names})
 
 
 class Global(NamedTuple):

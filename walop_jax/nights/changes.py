@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy import linalg
 
 from walop_jax.nights.algebra import Solution
@@ -97,3 +97,42 @@ def scan(of: Solution) -> Scan:
         found[0][c], found[2][c] = score, alone
     found[1][0] = 0.0  # from the first night on is no change
     return found
+
+
+def weighted(
+    of: Solution, weights: Float[np.ndarray, "u v"], parameter: Int[np.ndarray, " v"]
+) -> tuple[Vector, Matrix]:
+    """Scores of changes of any course, and their information: `weights` are its values in every unit.
+
+    The information is that of all of them together, off the diagonal what two have in common.
+    """
+    system, e = of.system, of.system.equations
+    count, globals_ = len(parameter), len(system.at)
+    own, cross = np.zeros((count, count)), np.zeros((globals_, count))
+    taken, border_taken = np.zeros((count, count)), np.zeros((globals_, count))
+    moved = np.zeros((0, count))
+    for c, cell in enumerate(system.cells):
+        local = np.zeros((len(cell.parameter), count))
+        for v, unit in enumerate(cell.units):
+            if weights[unit].any():
+                some = e.matrix[unit][:, parameter] * weights[unit]
+                own += some[parameter] * weights[unit][:, None]
+                cross += system.basis[unit][:, None] * some[system.at]
+                local += cell.covers[:, v : v + 1] * some[cell.parameter]
+        entry = of.cells[c]
+        if len(cell.parameter):
+            if c and entry.before.any():
+                gain = linalg.cho_solve(of.cells[c - 1].factor, entry.before.T, check_finite=False).T
+                local = local - gain @ moved
+            solved = linalg.cho_solve(entry.factor, local, check_finite=False)
+            taken += local.T @ solved
+            border_taken += entry.left.T @ solved
+        moved = local
+    information = own - taken
+    if globals_:
+        lower = linalg.solve_triangular(of.factor[0], cross - border_taken, lower=True, check_finite=False)
+        information = information - lower.T @ lower
+    gone = np.diag(information) <= NOTHING * np.maximum(np.diag(own), 1e-300)
+    information[gone] = 0.0
+    information[:, gone] = 0.0
+    return -np.sum(of.slopes[:, parameter] * weights, axis=0), information

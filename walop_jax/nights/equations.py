@@ -146,11 +146,13 @@ def split(calset: CalibrationSet) -> Iterator[tuple[int, CalibrationSet]]:
 # ------------------------------------------------------------------------------------------------------ candidates
 
 Change = tuple[tuple[float, Any], ...]
+Candidates = dict[str, tuple[Parameter, Change]]
+"""Amplitudes beyond a model by name, each with the change that it is to first order."""
 
 
 def candidates_of(
     model: Model, exposures: Exposures, catalogue: Sequence[type[Effect]] = EFFECTS
-) -> dict[str, tuple[Parameter, Change]]:
+) -> Candidates:
     """Amplitudes of the effects that a model lacks, by name, each with the change that it is to first order."""
     context, found = effect_context(model.template, exposures), {}
     for kind in catalogue:
@@ -212,13 +214,12 @@ def night_equations(
     calset: CalibrationSet,
     model: Model,
     values: Vector | Mapping[str, float],
-    catalogue: Sequence[type[Effect]] = EFFECTS,
-    *,
-    candidates: bool = True,
+    changes: Candidates | None = None,
 ) -> list[Night]:
     """The nights of a set, linearised at values of the parameters: a full vector, or by name (others: start values).
 
-    Of sets too large for a table of derivatives no candidates are kept. Raises `DataError` as `split` does.
+    `changes` are the candidates (None: `candidates_of` each night). Of sets too large for a table of derivatives none
+    are kept. Raises `DataError` as `split` does.
     """
     if isinstance(values, Mapping):
         values = np.array([values.get(p.name, p.start) for p in model.parameters])
@@ -226,14 +227,14 @@ def night_equations(
     found = []
     for number, some in split(calset):
         likelihood = Likelihood.of(some, model)
-        changes = candidates_of(model, some.exposures, catalogue) if candidates else {}
         if likelihood.layout.large:
             terms, _ = likelihood.data_terms(values)
             select = model.selection()
             chi2, gradient, matrix = terms.data, select.T @ terms.gradient, select.T @ terms.matrix @ select
-            changes, census = {}, terms.census
+            known, census = {}, terms.census
         else:
-            chi2, gradient, matrix = with_candidates(likelihood, values, [c for _, c in changes.values()])
+            known = candidates_of(model, some.exposures, model.catalogue) if changes is None else changes
+            chi2, gradient, matrix = with_candidates(likelihood, values, [c for _, c in known.values()])
             census = likelihood.census
         e = some.exposures
         found.append(
@@ -250,9 +251,9 @@ def night_equations(
                 n_data=census.n_data,
                 dof=round(float(census.rows @ likelihood.data_per_row)),
                 chi2=chi2,
-                parameters=(*(model.parameters[i] for i in model.free), *(p for p, _ in changes.values())),
-                candidates=len(changes),
-                reference=np.concatenate([values[model.free], np.zeros(len(changes))]),
+                parameters=(*(model.parameters[i] for i in model.free), *(p for p, _ in known.values())),
+                candidates=len(known),
+                reference=np.concatenate([values[model.free], np.zeros(len(known))]),
                 gradient=gradient,
                 matrix=matrix,
             )
@@ -290,6 +291,25 @@ class Together:
     def names(self) -> tuple[str, ...]:
         """Names of the parameters, candidates last."""
         return tuple(p.name for p in self.parameters)
+
+    def aligned(self) -> list[Night]:
+        """The nights in the parameters of all, about the common origin: what a file of nights can hold together."""
+        e, up = self.equations, 1.0 / self.equations.scale
+        return [
+            dataclasses.replace(
+                night, chi2=float(e.chi2[u]), parameters=self.parameters, candidates=self.candidates,
+                reference=self.origin, gradient=e.gradient[u] * up, matrix=e.matrix[u] * np.outer(up, up),
+            )
+            for u, night in enumerate(self.nights)
+        ]  # fmt: skip
+
+    @property
+    def reference(self) -> Float[np.ndarray, "u n"]:
+        """The values that every night was linearised at; the origin for what a night does not know."""
+        found = np.tile(self.origin, (len(self.nights), 1))
+        for u, night in enumerate(self.nights):
+            found[u, [self.names.index(name) for name in night.names]] = night.reference
+        return found
 
     @property
     def has_value(self) -> Bool[np.ndarray, " n"]:

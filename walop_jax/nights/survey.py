@@ -1,13 +1,18 @@
-"""Nights of one instrument, stacked under laws of time: the calibration at any moment between them.
+"""A survey: nights of one instrument, stacked under laws of time; the calibration at any moment, and until when.
 
-The calibration of a moment is the instrument with the parameters that the laws give for it, and their joint covariance.
-It is given from half a day before the first exposure to half a day after the last; beyond that nothing vouches for it.
+The calibration of a moment is the instrument with the parameters that the laws give for it and their joint covariance.
+It is valid from half a day before the first exposure until walks and drifts have grown the error of p (of stars with
+p ≤ 5 %, from the calibration alone) to half of the goal, 0.05 %, in 5 % of the field; at the latest after as long again
+as the nights span, as nothing vouches for more, and not before half a day after the last exposure. Validity is
+half-open, and parted, without gaps, where something breaks. Between the last exposure before a break that was found and
+the first after it, it may have happened at any time: the calibration takes a share of it there, and its variance.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -17,21 +22,22 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.matrix import matrix_slopes, p_forms, sample_stars
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.model_file import model_like
 from walop_jax.fit.refit import FitResult
-from walop_jax.fit.verdict import NO_STRUCTURE, STATED, Doubt, Quality, Verdict
+from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Displayed
-from walop_jax.io.errors import DataError, fail
+from walop_jax.io.errors import fail
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.rounding import value_and_error
+from walop_jax.io.rounding import two_digits, value_and_error
 from walop_jax.model.effects import Effect
+from walop_jax.model.laws import Law
 from walop_jax.model.specification import effect_context, with_effects
-from walop_jax.nights.algebra import Solution, System, UndeterminedError, solve
+from walop_jax.nights.algebra import Solution
+from walop_jax.nights.breaks import Break, part_of
 from walop_jax.nights.changes import scan
-from walop_jax.nights.equations import Night, Together, night_equations, night_numbers, together
-from walop_jax.nights.laws import Law, laws_of, resolved
-from walop_jax.nights.night_file import nights_in
+from walop_jax.nights.equations import Night, Together, night_numbers
+from walop_jax.science.star_errors import GOAL
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "n n"]
@@ -41,6 +47,9 @@ Again = Callable[[Mapping[str, float]], Night]
 """Linearises a night at other values."""
 
 HALF_A_DAY = 0.5
+SHARE = 0.95  # of the field that must know p to half of the goal
+GRID = 13  # points along each axis of the field at which that is asked
+STARS = 20
 SUSPECT = 5.0  # excess of χ² of a night over its expectation, in its own standard deviations
 LONG = 60.0  # days without a night that are worth a remark
 SETTLED = 1e-3  # standard errors that parameters may still move when nights are linearised again
@@ -51,9 +60,10 @@ ROUNDS = 6
 class Survey(Displayed):
     """Nights under laws: `at(mjd)` is the calibration of a moment, `tracks` every parameter against time.
 
-    `laws` are those of every parameter and candidate (None: absent); `like` is a calibration of the same model, from
-    which field, filters, site and parameters that are held are taken (None: there is no calibration of a moment);
-    `doubts` are what speaks against it beside χ².
+    `laws` are those of every parameter and candidate (None: absent), `breaks` what was found and made a law. `like` is
+    a calibration of the same model, from which field, filters, site and parameters that are held are taken (None:
+    there is no calibration of a moment); `doubts` are what speaks against it beside χ²; `events` what users have
+    written down (MJD, words).
     """
 
     data: Together
@@ -61,6 +71,8 @@ class Survey(Displayed):
     solution: Solution
     like: Calibration | None = None
     doubts: tuple[Doubt, ...] = ()
+    breaks: tuple[Break, ...] = ()
+    events: tuple[tuple[float, str], ...] = ()
 
     # ----------------------------------------------------------------------------------------------- how good
 
@@ -121,9 +133,76 @@ class Survey(Displayed):
 
     @property
     def span(self) -> tuple[float, float]:
-        """From and up to, not including, which moment (MJD, UTC) it gives a calibration."""
-        nights = self.data.nights
-        return min(n.begin for n in nights) - HALF_A_DAY, max(n.end for n in nights) + HALF_A_DAY
+        """Beginning and end of the validity (MJD), half-open."""
+        return min(night.begin for night in self.data.nights) - HALF_A_DAY, self.until
+
+    @functools.cached_property
+    def until(self) -> float:
+        """The end of the validity (MJD): see the head of this file."""
+        begin, end = min(night.begin for night in self.data.nights), self.last
+        most = end + max(end - begin, HALF_A_DAY)
+        if self._slopes is None or self.error_of_p(most) <= GOAL / 2:
+            return most
+        low, high = end, most
+        while high - low > 0.01:
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self.error_of_p(middle) <= GOAL / 2 else (low, middle)
+        return max(low, end + HALF_A_DAY)
+
+    def error_of_p(self, mjd: float) -> float:
+        """Error of p (a fraction) that 95 % of the field stays below at a moment, by the calibration alone."""
+        assert self._slopes is not None
+        form = self._slopes
+        variance = np.mean((form @ self._product(mjd).covariance * form).sum(axis=-1), axis=1)
+        return float(np.sqrt(np.quantile(variance, SHARE)))
+
+    @functools.cached_property
+    def _slopes(self) -> Float[np.ndarray, "p n k"] | None:
+        """Derivatives of p to the parameters, at points of the field, for some stars; None where p is not measured."""
+        if self.like is None or len(self.like.model.template.arms) != 2:
+            return None
+        product = self._product(self.last)
+        low_x, high_x, low_y, high_y = product.field
+        grid = np.meshgrid(np.linspace(low_x, high_x, GRID), np.linspace(low_y, high_y, GRID))
+        x, y = (part.ravel() for part in grid)
+        name = str(np.unique(product.exposures.filter)[0])
+        instrument, curves = product.model.instrument(product.values), {name: product.filter_curve(name)}
+        matrix, slopes = matrix_slopes(instrument, product.usual_settings(1, name), curves, x, y)
+        return p_forms(matrix.reshape(len(x), 6), sample_stars(STARS)) @ slopes.reshape(len(x), 6, -1)
+
+    @property
+    def last(self) -> float:
+        """The last exposure (MJD)."""
+        return max(night.end for night in self.data.nights)
+
+    @property
+    def changing(self) -> dict[str, Law]:
+        """The laws other than that of a parameter that all nights share."""
+        known = zip(self.data.names, self.laws, strict=True)
+        return {name: law for name, law in known if law is not None and law.per != ("shared",)}
+
+    @property
+    def edges(self) -> tuple[float, ...]:
+        """Moments (MJD) at which a parameter changes at once."""
+        dates = ((*law.at, *itertools.chain(*law.bad)) for law in self.changing.values())
+        return tuple(sorted(set(itertools.chain(*dates))))
+
+    @property
+    def validity(self) -> tuple[tuple[float, float], ...]:
+        """Stretches of time (MJD), half-open and without gaps, in which nothing changes at once."""
+        start, stop = self.span
+        edges = [start, *(edge for edge in self.edges if start < edge < stop), stop]
+        return tuple(itertools.pairwise(edges))
+
+    @property
+    def reference(self) -> Calibration:
+        """The calibration about which nights are linearised, with the laws in its model. `DataError` without one."""
+        if self.like is None:
+            what = "no calibration is known for the model of these nights"
+            raise fail(what, advice="give one: --like RUN (like= in Python)")
+        laws = {name: law.document() for name, law in self.changing.items()}
+        like = dataclasses.replace(self.like, hidden=None, residuals=None, draws=None)
+        return dataclasses.replace(like, fitted=dataclasses.replace(like.model, laws=laws))
 
     def values_at(self, mjd: float) -> tuple[Vector, Matrix]:
         """All parameters and candidates (`data.names`) at a moment (MJD, UTC), and their covariance."""
@@ -134,7 +213,13 @@ class Survey(Displayed):
             number = next((n.number for n in nights if n.begin <= mjd <= n.end), -1)
         known = sorted({n.number for n in nights})
         value, covariance = self.solution.predict(mjd, known.index(number) if number in known else None)
-        return self.data.origin + value * scale, covariance * np.outer(scale, scale)
+        value, covariance = self.data.origin + value * scale, covariance * np.outer(scale, scale)
+        for one in self.breaks:
+            if one.kind == "step" and one.before < mjd < one.after:
+                i, share = self.data.names.index(one.name), (mjd - one.before) / (one.after - one.before)
+                value[i] += one.size * (share - (mjd >= one.date))
+                covariance[i, i] += (one.size**2 + one.error**2) * share * (1.0 - share)
+        return value, covariance
 
     def at(self, mjd: float, *, force: bool = False) -> Calibration:
         """The calibration of a moment (MJD, UTC).
@@ -143,10 +228,18 @@ class Survey(Displayed):
         """
         (start, stop), against = self.span, self.verdict.against
         if not start <= mjd < stop:
-            what = f"MJD {mjd:.3f} is outside the nights of the survey, {start:.3f} to {stop:.3f}"
+            what = f"MJD {mjd:.3f} is outside the validity of the survey, {start:.3f} to {stop:.3f}"
             if not force:
-                raise fail(what, advice="calibrate a night nearer to it, or give force=True")
+                raise fail(
+                    what, advice="calibrate a night nearer to it, or give --force (force=True in Python)"
+                )
             against = (*against, Doubt(Quality.VALIDITY_FORCED, what, blocking=False))
+        return dataclasses.replace(
+            self._product(mjd), verdict=dataclasses.replace(self.verdict, against=against)
+        )
+
+    def _product(self, mjd: float) -> Calibration:
+        """The calibration of a moment, whether it is valid or not."""
         full, (value, covariance), names = self._full, self.values_at(mjd), self.data.names
         model = full.model
         there = [k for k, name in enumerate(names) if name in model.names and self.laws[k] is not None]
@@ -160,18 +253,14 @@ class Survey(Displayed):
             full,
             values=np.where(inside, select @ value[there], full.values),
             covariance=select @ covariance[np.ix_(there, there)] @ select.T,
-            verdict=dataclasses.replace(self.verdict, against=against),
             origin=f"{len(self.data.nights)} nights, stacked, at MJD {mjd:.5f}",
             inputs=(),
         )
 
     @functools.cached_property
     def _full(self) -> Calibration:
-        """`like` with the effects that laws have added to its model, at neutral."""
-        like = self.like
-        if like is None:
-            raise fail("no calibration is known for the model of these nights", advice="give one: like=")
-        like = dataclasses.replace(like, hidden=None, residuals=None, draws=None)
+        """The calibration with the effects that laws have added to its model, at neutral."""
+        like = self.reference
         model = like.model
         context = effect_context(model.template, like.exposures)
         candidates = [
@@ -180,7 +269,7 @@ class Survey(Displayed):
         ]  # fmt: skip
         for p in candidates:
             # Names of parts, not `Parameter.part`, which files of nights do not hold.
-            part = p.name.split(".")[0]
+            part = part_of(p.name)
             kind: type[Effect] | None = next((one for one in model.catalogue if one.name == part), None)
             if kind is not None and part not in model.effect_names:
                 model = with_effects(model, [kind.neutral(context)], context)
@@ -244,165 +333,71 @@ class Survey(Displayed):
             "SOURCE": (np.array([n.source for n in nights]), "", "files"),
         })  # fmt: skip
 
+    def document(self) -> dict[str, Any]:
+        """Everything but tracks as plain data."""
+        verdict, (start, stop) = self.verdict, self.span
+        value, covariance = self.values_at(self.last)
+        error = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+        return {
+            "trusted": verdict.trusted, "quality": int(verdict.quality), "chi2": verdict.chi2, "dof": verdict.dof,
+            "n_data": verdict.n_data, "nights": len({night.number for night in self.data.nights}),
+            "first": min(night.begin for night in self.data.nights), "last": self.last,
+            "valid_from": start, "valid_until": stop, "validity": self.validity,
+            "error_of_p": None if self._slopes is None else self.error_of_p(self.last),
+            "breaks": [dataclasses.asdict(one) | {"date": one.date} for one in self.breaks],
+            "events": [{"mjd": mjd, "what": what} for mjd, what in self.events],
+            "suspect_nights": [self.data.nights[u].number for u in np.flatnonzero(self.excess > SUSPECT)],
+            "laws": {name: law.document() for name, law in self.changing.items()},
+            "parameters": {
+                p.name: {"value": float(value[k]), "sigma": float(error[k]), "unit": p.unit}
+                for k, p in enumerate(self.data.parameters) if self.laws[k] is not None
+            },
+            "warnings": list(verdict.warnings),
+        }  # fmt: skip
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """What to do, in sentences, the most urgent first."""
+        found = (
+            [] if self.trusted else ["Look at the nights that scatter too much: walop-jax diagnose NIGHT."]
+        )
+        for one in self.breaks:
+            if one.alike:
+                more = (
+                    "no more nights like these would tell" if math.isinf(one.nights_needed)
+                    else f"or {one.nights_needed:.0f} more nights like these"
+                )  # fmt: skip
+                names = ", ".join(one.alike[:3]) + (" …" if len(one.alike) > 3 else "")
+                how = "; ".join((*one.separated_by, more))
+                found.append(
+                    f"MJD {one.night}: {one.name} cannot be told from {names}. To separate them: {how}."
+                )
+        return (*found, f"Calibrate again before MJD {self.until:.1f}.")
+
     def display(self) -> Display:
-        """The verdict, and the parameters in the last night."""
-        verdict, (start, stop), data = self.verdict, self.span, self.data
+        """How good it is tonight, what has changed since when, and what to do."""
+        verdict, (start, stop), nights = self.verdict, self.span, self.data.nights
         facts = {
             "χ²/dof": f"{verdict.chi2:.1f} / {verdict.dof} = {verdict.chi2 / max(verdict.dof, 1):.4g}",
-            "nights": str(len({night.number for night in data.nights})),
-            "from": f"MJD {start:.2f}",
-            "until": f"MJD {stop:.2f}",
+            "nights": f"{len({night.number for night in nights})}, MJD {start + HALF_A_DAY:.2f} to {self.last:.2f}",
+            "valid": f"from MJD {start:.2f} until {stop:.2f}",
         }
-        scale = data.equations.scale
-        last = zip(
-            data.origin + self.solution.values[-1] * scale, self.solution.errors()[-1] * scale, strict=True
-        )
+        if self._slopes is not None:
+            error = two_digits(100.0 * self.error_of_p(self.last))
+            facts["p of a star"] = f"{error} % or better in 95 % of the field on the last night"
+        if not self.breaks:
+            facts["changes"] = "none found beyond the laws"
         rows = tuple(
-            (p.name, " ± ".join(value_and_error(value, error)), p.unit, " ".join(law.per))
-            for p, law, (value, error) in zip(data.parameters, self.laws, last, strict=True) if law is not None
+            (
+                one.kind, one.name, " ± ".join(value_and_error(one.size, one.error)), one.unit, str(one.night),
+                f"{one.z:+.1f}", ", ".join(one.alike[:3]),
+            )
+            for one in self.breaks
         )  # fmt: skip
-        title = f"Survey of {data.nights[0].instrument}: {verdict.words}"
         return Display(
-            title, tuple(facts.items()), ("parameter", "last night", "unit", "law"), rows, verdict.warnings
+            f"Survey of {nights[0].instrument}: {verdict.words}",
+            tuple(facts.items()),
+            ("change", "of", ">size", "unit", ">first night", ">z", "or as well"),
+            rows,
+            tuple(dict.fromkeys((*verdict.warnings, *self.advice))),
         )
-
-
-# ------------------------------------------------------------------------------------------------------- stacking
-
-
-def stack(
-    nights: Sequence[Given],
-    laws: Mapping[str, Law | Mapping[str, Any]] | None = None,
-    *,
-    like: Calibration | FitResult | None = None,
-) -> Survey:
-    """Fit all nights together under laws of time, from their normal equations.
-
-    Nights are fits, calibration sets (linearised at the values of `like`, no fit is needed), or what was kept of them
-    (`nights.night_file`, in memory or by path). `laws` are as the [law] tables of `nights.laws`; a parameter without
-    one is shared by all nights. `like` is a calibration of their model, by default that of the first fit. Fits and sets
-    are linearised again at the common solution until it stays where it is; kept nights cannot be.
-
-    Raises `DataError` for nights that do not belong together, that do not determine a parameter under its law, and for
-    nights without a filter in common; ValueError for laws that are wrong, or of what does not exist.
-    """
-    like = next((one for one in nights if isinstance(one, FitResult)), None) if like is None else like
-    shared = Calibration.from_fit(like) if isinstance(like, FitResult) else like and like.rebuilt()
-    made: list[Night] = []
-    again: dict[tuple[str, int], Again] = {}
-    doubts: list[Doubt] = []
-    for one in nights:
-        found, anew = _nights_of(one, shared)
-        made += found
-        again |= anew
-        if isinstance(one, FitResult) and one.errors_from != STATED:
-            raise fail(
-                f"the errors of {one.calset.origin} do not explain its scatter, and nights are weighed by them",
-                advice="correct N_ERR, or leave the night out",
-            )
-        if isinstance(one, FitResult) and not one.trusted:
-            what = f"the fit of {one.calset.origin} is not trusted"
-            doubts.append(Doubt(one.checked_verdict().quality, what))
-    data = together(made)
-    doubts += _about_time(data.nights)
-    cut = len(data.names) - data.candidates
-    tables = {name: law if isinstance(law, Mapping) else law.document() for name, law in (laws or {}).items()}
-    chosen = resolved(laws_of(tables), data.names[:cut], data.names[cut:])
-    _check_filters(data, chosen)
-    try:
-        data, solution, settled = _settled(data, chosen, again)
-    except UndeterminedError as error:
-        raise _undetermined(data, error) from None
-    if not settled:
-        what = f"the solution has not settled after {ROUNDS} linearisations: the nights are too different"
-        doubts.append(Doubt(Quality.NOT_CONVERGED, what))
-    if kept := sum((night.sha256, night.number) not in again for night in data.nights):
-        what = f"{kept} of {len(data.nights)} nights stay as they were linearised: their data are not at hand"
-        doubts.append(Doubt(Quality(0), what, blocking=False))
-    return Survey(data, chosen, solution, shared, tuple(doubts))
-
-
-def _nights_of(one: Given, like: Calibration | None) -> tuple[list[Night], dict[tuple[str, int], Again]]:
-    """The nights of what was given, and for each, by data and night, how it is linearised again."""
-    if isinstance(one, Night):
-        return [one], {}
-    if isinstance(one, FitResult):
-        calset, model = one.calset, one.model
-        found = night_equations(calset, model, one.values)
-    elif isinstance(one, CalibrationSet):
-        if like is None:
-            raise fail(f"{one.origin} is a set, and nothing says at which values", advice="give like=, a fit")
-        values = dict(zip(like.model.names, like.values.tolist(), strict=True))
-        calset, model = one, model_like(one, like.model)
-        found = night_equations(calset, model, values)
-    else:
-        return nights_in(one), {}
-
-    def anew(number: int) -> Again:
-        def run(at: Mapping[str, float]) -> Night:
-            return next(night for night in night_equations(calset, model, at) if night.number == number)
-
-        return run
-
-    return found, {(night.sha256, night.number): anew(night.number) for night in found}
-
-
-def _settled(
-    data: Together, laws: Sequence[Law | None], again: Mapping[tuple[str, int], Again]
-) -> tuple[Together, Solution, bool]:
-    """Linearise nights at the common solution until it stays where it is; whether it does."""
-    before: Float[np.ndarray, "u n"] | None = None
-    for _ in range(ROUNDS):
-        solution = solve(System.of(data.equations, laws, data.mean, data.width, data.has_value))
-        scale = data.equations.scale
-        values = data.origin + solution.values * scale
-        sigma = np.maximum(solution.errors() * scale, 1e-12 * scale)
-        if not again or (before is not None and np.max(np.abs(values - before) / sigma) < SETTLED):
-            return data, solution, True
-        # Candidates have no place in the model: their part stays first-order, at 0.
-        data = together([
-            again[key](dict(zip(data.names, values[u].tolist(), strict=True)))
-            if (key := (night.sha256, night.number)) in again else night
-            for u, night in enumerate(data.nights)
-        ])  # fmt: skip
-        before = values
-    return data, solve(System.of(data.equations, laws, data.mean, data.width, data.has_value)), False
-
-
-def _undetermined(data: Together, error: UndeterminedError) -> DataError:
-    name = data.names[error.parameter]
-    if error.unit is None:
-        return fail(
-            f"the nights do not determine {name} under its law", advice="give it a prior, or another law"
-        )
-    number = data.nights[error.unit].number
-    return fail(
-        f"the night of MJD {number} says nothing of {name}, which has a value of its own there",
-        advice="give its law a spread, or let it be shared",
-    )
-
-
-def _about_time(nights: Sequence[Night]) -> list[Doubt]:
-    found, reached = [], math.inf
-    for begin, end in sorted((night.begin, night.end) for night in nights):
-        if begin - reached > LONG:
-            what = f"no night from MJD {reached:.1f} to {begin:.1f}: what holds there rests on the laws alone"
-            found.append(Doubt(Quality(0), what, blocking=False))
-        reached = end if math.isinf(reached) else max(reached, end)
-    return found
-
-
-def _check_filters(data: Together, laws: Sequence[Law | None]) -> None:
-    first = data.nights[0]
-    free = {
-        law.base
-        for law, p in zip(laws, data.parameters, strict=True)
-        if law and p.name.startswith("throughput.")
-    }
-    for night in data.nights[1:]:
-        if not set(night.filters) & set(first.filters) and not free & {"night", "file"}:
-            raise fail(
-                f"nights in other filters with the same throughputs: {', '.join(first.filters)} (MJD {first.number}) "
-                f"and {', '.join(night.filters)} (MJD {night.number})",
-                advice='stack them apart, or give [law."throughput.*"] per = "night"',
-            )

@@ -12,7 +12,7 @@
 
 In a model file, for a parameter or, with * and ?, for a group of them:
 
-    [law."half2.plate.axis"]
+    [law."half2.wedge"]
     per = "night"
 
     [law."throughput.n?.p00"]
@@ -130,6 +130,22 @@ class Law:
             yield Form("linear", middle), False
         if "annual" in self.per:
             yield from ((Form(kind), False) for kind in ("cosine", "sine"))
+
+    def adding(self, word: str, *dates: float) -> Law:
+        """The law with a drift, a step or a bad night more; a step is an edge more where intervals hold."""
+        word = "interval" if word == "step" and "interval" in self.per else word
+        at, bad = self.at, self.bad
+        if word in ("step", "interval"):
+            at = tuple(sorted({*at, *dates}))
+        elif word == "bad":
+            bad = tuple(sorted({*bad, (dates[0], dates[1])}))
+        return dataclasses.replace(self, per=tuple(dict.fromkeys((*self.per, word))), at=at, bad=bad)
+
+    def seen_at(self, mjd: Any) -> Law:
+        """The law without bad nights that none of some times (MJD) lies in."""
+        bad = tuple((start, stop) for start, stop in self.bad if np.any((mjd >= start) & (mjd < stop)))
+        per = self.per if bad or not self.bad else tuple(word for word in self.per if word != "bad")
+        return dataclasses.replace(self, per=per, bad=bad)
 
     def document(self) -> dict[str, Any]:
         """The entry of a model file, as plain data."""

@@ -1,0 +1,77 @@
+"""`walop-jax stack`: many nights of one instrument under laws of time, and what has changed between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from walop_jax.commands.command import Argument, Job, Option, Outcome, command
+from walop_jax.commands.inputs import Effects, Product, calibration_of, catalogue_of
+
+if TYPE_CHECKING:
+    from walop_jax.nights.survey import Survey
+
+NIGHTS = Argument("Calibration sets, folders of refit, or a SURVEY.", "NIGHT...", list[Path])
+LAWS = Option("Model file with [law] tables (default: that of the first fit).", "MODEL.toml", Path)
+LIKE = Option("Fit with the model of all nights (default: the first RUN or SURVEY given).", "RUN", Path)
+EVENTS = Option("Table of what was done to the instrument: MJD, WHAT.", "TABLE", Path)
+KNOWN = Option("Do not look for breaks.")
+SURVEY = Option("Folder of the survey.", "SURVEY", Path, "-o", required=True)
+
+
+@command(stages=("reading", "stacking"), writes=())
+def stack(
+    job: Job,
+    nights: Annotated[Any, NIGHTS],
+    laws: Annotated[Any, LAWS] = None,
+    *,
+    like: Annotated[Product | None, LIKE] = None,
+    events: Annotated[Any, EVENTS] = None,
+    no_breaks: Annotated[bool, KNOWN] = False,
+    output: Annotated[Any, SURVEY] = None,
+    effects: Effects = None,
+) -> Outcome[Survey]:
+    """Fit many nights at once, each parameter under a law that says how it may change.
+
+    Breaks of any parameter, or of an effect that the model lacks, are looked for, named and dated, and become laws.
+    Laws stand in the [law] tables of a model file: a value for each night or file, a random walk, intervals, steps,
+    drifts, annual terms; what has none is shared by all nights (walop-jax docs nights). A night is linearised at the
+    values of a fit, and again at the common solution; its normal equations are kept, so that it need not be read again.
+
+    SURVEY holds the nights (nights.fits), every parameter against time (tracks.fits), the calibration of the last
+    night (calibration.fits), that about which nights are linearised, with the laws (reference.fits), and survey.json.
+    Nights that are made stay in SURVEY/partial until the end: the same command resumes an interrupted stack.
+    walop-jax apply SURVEY takes the calibration of the MJD of its stars. Exit code 3 if the laws do not explain the
+    nights.
+
+    In Python: a `Survey`; nights may be fits and sets in memory, `laws` a mapping of names to [law] tables.
+    """
+    from walop_jax.calibration import PARTIAL
+    from walop_jax.nights.stacking import FILES, writers
+    from walop_jax.nights.stacking import stack as stacked
+
+    several = isinstance(nights, Sequence) and not isinstance(nights, str)
+    with job.reserved(output, FILES) as job:
+        job.begin("reading")
+        survey = stacked(
+            list(nights) if several else [nights],
+            laws,
+            like=None if like is None else calibration_of(like, effects),
+            find=not no_breaks,
+            events=events,
+            partial=None if output is None else Path(output) / PARTIAL,
+            tell=lambda text: job.tell(text, "stacking"),
+            catalogue=catalogue_of(effects),
+        )
+        found = Outcome(
+            survey,
+            files=lambda: writers(survey),
+            saved_as=FILES[-1],
+            next=(f"walop-jax apply {output} STARS.fits -o OUT.fits",) if survey.trusted else (),
+            warnings=survey.verdict.warnings,
+            trusted=survey.trusted,
+        )
+        if job.folder is not None:
+            found.save(job.folder, drop=(PARTIAL,))
+        return found

@@ -1,0 +1,317 @@
+"""Breaks: what has changed, when, by how much, and what else it may be. Asked of a stack, not of its data.
+
+A change of any parameter or candidate is a step at the boundary of two nights, one bad night, or a drift. Its z and
+size come from `changes`, with everything else fitted anew: what a random walk may do by itself is no break. The largest
+|z| of all is one if chance makes one as large in less than `CHANCE` of series:
+
+    P(max |z| ≥ u)  ≤  Σ P(|z_i| ≥ u)  −  Σ_(i,k) P(|z_i| ≥ u, |z_k| ≥ u)
+
+over any forest of pairs (Hunter 1976; Worsley 1982, Biometrika 69, 297). Steps of one parameter at neighbouring
+boundaries are pairs, and each bad night with a step beside it: a step less the next one is the night between, and
+the informations give the correlations, ρ = (I_b + I_(b+1) − I_night)/2√(I_b I_(b+1)). z is normal, as the equations are
+linear. Then the break becomes a law, and the search goes on. Its date is that of the largest z² of its parameter; dates
+within `DATES` of that may be it as well. Others whose z² stays within `RIVAL` look alike.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy import special
+
+from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.laws import YEAR, Law
+from walop_jax.nights import changes
+from walop_jax.nights.algebra import Solution, System, UndeterminedError, solve
+from walop_jax.nights.equations import Together
+
+CHANCE = 0.01  # of any break in a series that has none
+RIVAL = 2.0 * math.log(1000.0)  # z² behind the best at which another name is improbable
+DATES = 9.0  # z² behind the best within which a date may be it: 99.7 %
+SURE = 5.0  # standard errors that keep one name from another
+MOST = 40  # breaks that are looked for
+ROUNDS = 3  # in which all are named again
+KINDS = ("step", "bad night", "drift")
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
+_FARTHEST = 40.0  # of the tail in units of 1/u, beyond which nothing is left of it
+
+
+@dataclasses.dataclass(frozen=True)
+class Break:
+    """A change that was found, in the unit of its parameter; a drift per year.
+
+    `night` is the first night that it holds for (MJD of the evening), `nights` the first and last that this may be.
+    `before` and `after` are the last exposure before the change and the first after it (MJD), NaN for a drift; of a bad
+    night they lie half-way to the nights beside it. `p_value` is corrected for all that was tried. `alike` are names
+    that explain the same as well, `separated_by` observations that would tell, `nights_needed` how many more nights
+    like these would (0: they are told, inf: none would). `held_out` is the gain in χ² on every other night by the size
+    that the rest give: more than 0 if it is real.
+    """
+
+    kind: str
+    name: str
+    unit: str
+    size: float
+    error: float
+    z: float
+    p_value: float
+    night: int
+    nights: tuple[int, int]
+    before: float
+    after: float
+    alike: tuple[str, ...] = ()
+    separated_by: tuple[str, ...] = ()
+    nights_needed: float = 0.0
+    held_out: float = math.nan
+
+    @property
+    def date(self) -> float:
+        """The moment (MJD) from which a step holds: half-way between the exposures beside it."""
+        return 0.5 * (self.before + self.after)
+
+    @classmethod
+    def read(cls, entry: Mapping[str, Any]) -> Break:
+        """A break as a document holds it."""
+        known = {field.name: entry[field.name] for field in dataclasses.fields(cls)}
+        for name, value in known.items():
+            if value is None:
+                known[name] = math.inf if name == "nights_needed" else math.nan
+            elif isinstance(value, list):
+                known[name] = tuple(value)
+        return cls(**known)
+
+    def law(self, law: Law | None) -> Law:
+        """A law with the break; None is that of a candidate, which is 0 without it."""
+        if self.kind == "drift":
+            # A candidate that drifts has a value as well.
+            return (law or Law()).adding("linear")
+        law = law or Law(())
+        return (
+            law.adding("step", self.date)
+            if self.kind == "step"
+            else law.adding("bad", self.before, self.after)
+        )
+
+
+def both_beyond(u: float, rho: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    """P(|z₁| ≥ u, |z₂| ≥ u) of two normal deviates of unit variance with correlation ρ, by quadrature."""
+    rho = np.clip(np.abs(rho), 0.0, 1.0 - 1e-12)
+    share = 0.5 * (_NODES + 1.0)
+    x = u + _FARTHEST / u * share**3
+    weight = 0.5 * _WEIGHTS * 3.0 * share**2 * _FARTHEST / u * np.exp(-0.5 * x**2) / math.sqrt(2.0 * math.pi)
+    spread = np.sqrt(1.0 - rho**2)[:, None]
+    inside = special.ndtr((u - rho[:, None] * x) / spread) - special.ndtr((-u - rho[:, None] * x) / spread)
+    return np.clip(2.0 * (1.0 - inside) @ weight, 0.0, None)
+
+
+class Tried(NamedTuple):
+    """All changes of a solution: score and information by kind, cell and parameter (drifts have one cell)."""
+
+    score: tuple[Float[np.ndarray, "_ n"], ...]
+    information: tuple[Float[np.ndarray, "_ n"], ...]
+
+    @classmethod
+    def of(cls, solution: Solution) -> Tried:
+        """Scores of all changes."""
+        scan, e = changes.scan(solution), solution.system.equations
+        n = len(solution.system.laws)
+        course = np.repeat(((e.mjd - e.mjd.mean()) / YEAR)[:, None], n, axis=1)
+        score, information = changes.weighted(solution, course, np.arange(n))
+        return cls(
+            (scan.step_score, scan.once_score, score[None]),
+            (scan.step_information, scan.once_information, np.diag(information)[None]),
+        )
+
+    def z(self, kind: int) -> Float[np.ndarray, "_ n"]:
+        """Changes of a kind in their standard errors; 0 where the laws take them up."""
+        known = self.information[kind]
+        return np.where(known > 0, self.score[kind] / np.sqrt(np.where(known > 0, known, 1.0)), 0.0)
+
+    def chance(self, u: float) -> float:
+        """The bound on the probability of a |z| of u or more anywhere, if nothing has changed."""
+        step, once, _ = self.information
+        single = 2.0 * float(special.ndtr(-u))
+        total = single * sum(int((known > 0).sum()) for known in self.information)
+        if u < 3.0:
+            return 1.0
+        after = np.vstack([step[1:], np.zeros_like(step[:1])])
+
+        def correlation(one: Any, other: Any, rest: Any) -> Any:
+            product = one * other
+            found = (one + other - rest) / (2.0 * np.sqrt(np.where(product > 0, product, 1.0)))
+            return np.where(product > 0, np.abs(found), 0.0)
+
+        beside = np.maximum(correlation(step, once, after), correlation(after, once, step))
+        rho = np.concatenate([correlation(step, after, once).ravel(), beside.ravel()])
+        rho = np.minimum(rho[rho > 0.5], 1.0)
+        return float(min(1.0, max(total - both_beyond(u, rho).sum(), single)))
+
+    def alarm(self) -> float:
+        """The |z| from which a change is a break."""
+        low, high = 3.0, 12.0
+        while high - low > 1e-3:
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if self.chance(middle) < CHANCE else (middle, high)
+        return high
+
+    def largest(self) -> tuple[int, int, int]:
+        """Kind, cell and parameter of the largest |z|."""
+        every = [np.abs(self.z(kind)) for kind in range(len(KINDS))]
+        kind = int(np.argmax([z.max() for z in every]))
+        cell, parameter = np.unravel_index(every[kind].argmax(), every[kind].shape)
+        return kind, int(cell), int(parameter)
+
+
+def solved(data: Together, laws: Sequence[Law | None]) -> Solution:
+    """The solution of nights under laws. Raises `UndeterminedError` where there is none."""
+    return solve(System.of(data.equations, laws, data.mean, data.width, data.has_value))
+
+
+def find(
+    data: Together, laws: Sequence[Law | None], catalogue: Sequence[type[Effect]] = EFFECTS
+) -> tuple[tuple[Break, ...], tuple[Law | None, ...], Solution]:
+    """The breaks of a series, the laws with them, and the solution under these."""
+    found: list[Break] = []
+    while True:
+        solution = solved(data, with_breaks(data, laws, found))
+        one = _largest(data, solution, CHANCE, catalogue)
+        if one is None or len(found) == MOST:
+            break
+        found.append(one)
+    # The first were named while the others were not known: each is named again beside all others.
+    for _ in range(ROUNDS if len(found) > 1 else 0):
+        before = [(one.kind, one.name, one.night) for one in found]
+        for k in range(len(found)):
+            rest = with_breaks(data, laws, found[:k] + found[k + 1 :])
+            found[k] = _largest(data, solved(data, rest), 1.1, catalogue) or found[k]
+        if [(one.kind, one.name, one.night) for one in found] == before:
+            break
+    for k, one in enumerate(found):
+        known = with_breaks(data, laws, found[:k] + found[k + 1 :])
+        found[k] = dataclasses.replace(one, held_out=_held_out(data, known, one))
+    chosen = with_breaks(data, laws, found)
+    return tuple(sorted(found, key=lambda one: one.night)), chosen, solved(data, chosen)
+
+
+def at_solution(data: Together, solution: Solution, one: Break) -> Break:
+    """A break with the size that a solution under its law gives it."""
+    system, i = solution.system, data.names.index(one.name)
+    start = one.date if one.kind == "step" else one.before
+    for g, entry in enumerate(system.globals):
+        known = entry.form.kind == "linear" if one.kind == "drift" else entry.form.start == start
+        if entry.parameter == i and known:
+            scale = float(data.equations.scale[i])
+            error = scale * math.sqrt(solution.covariance[g, g])
+            return dataclasses.replace(one, size=scale * float(solution.shared[g]), error=error)
+    return one
+
+
+def with_breaks(data: Together, laws: Sequence[Law | None], found: Sequence[Break]) -> tuple[Law | None, ...]:
+    """Laws with breaks."""
+    changed = list(laws)
+    for one in found:
+        i = data.names.index(one.name)
+        changed[i] = one.law(changed[i])
+    return tuple(changed)
+
+
+def _largest(
+    data: Together, solution: Solution, chance: float, catalogue: Sequence[type[Effect]]
+) -> Break | None:
+    """The change that stands out most; None where chance does as well."""
+    tried = Tried.of(solution)
+    kind, cell, i = at = tried.largest()
+    z, scale = tried.z(kind), float(data.equations.scale[i])
+    p_value = tried.chance(abs(float(z[cell, i])))
+    if p_value >= chance:
+        return None
+    best, p = float(z[cell, i] ** 2), data.parameters[i]
+    first, span, before, after = _dates(data, solution, kind, cell, z[:, i] ** 2 > best - DATES)
+    near = (z if kind == 2 else z[max(cell - 1, 0) : cell + 2]) ** 2
+    rivals = [int(j) for j in np.argsort(-near.max(axis=0)) if j != i and near[:, j].max() > best - RIVAL]
+    members = {part_of(data.names[j]) for j in (i, *rivals)}
+    said = [effect.separated_by for effect in catalogue if effect.name in members and effect.separated_by]
+    information = float(tried.information[kind][cell, i])
+    return Break(
+        kind=KINDS[kind],
+        name=p.name,
+        unit=f"{p.unit}/yr".lstrip("/") if kind == 2 else p.unit,
+        size=float(tried.score[kind][cell, i]) / information * scale,
+        error=scale / math.sqrt(information),
+        z=float(z[cell, i]),
+        p_value=p_value,
+        night=first,
+        nights=span,
+        before=before,
+        after=after,
+        alike=tuple(data.names[j] for j in rivals),
+        separated_by=tuple(dict.fromkeys(said)) if rivals else (),
+        nights_needed=_nights_needed(solution, at, rivals, best) if rivals else 0.0,
+    )
+
+
+def part_of(name: str) -> str:
+    """The part or effect that a parameter or candidate belongs to."""
+    return name.split(".")[0].split("#")[0]
+
+
+def _dates(
+    data: Together, solution: Solution, kind: int, cell: int, may: np.ndarray
+) -> tuple[int, tuple[int, int], float, float]:
+    """The first night of a change, the first and last that this may be, and the moments before and after it."""
+    cells, nights = solution.system.cells, data.nights
+    numbers = [nights[entry.units[0]].number for entry in cells]
+    if kind == 2:
+        return numbers[0], (numbers[0], numbers[-1]), math.nan, math.nan
+    begin = [min(nights[u].begin for u in entry.units) for entry in cells]
+    end = [max(nights[u].end for u in entry.units) for entry in cells]
+    before, after = end[cell - 1] if cell else begin[cell] - 1.0, begin[cell]
+    if kind == 1:
+        later = begin[cell + 1] if cell + 1 < len(cells) else end[cell] + 1.0
+        before, after = 0.5 * (before + after), 0.5 * (end[cell] + later)
+    some = np.flatnonzero(may)
+    return numbers[cell], (numbers[some[0]], numbers[some[-1]]), before, after
+
+
+def _nights_needed(solution: Solution, at: tuple[int, int, int], rivals: Sequence[int], best: float) -> float:
+    """Nights like those that the change holds for, until the nearest rival is `SURE` standard errors away."""
+    (kind, cell, i), cells, e = at, solution.system.cells, solution.system.equations
+    course = np.zeros(len(e))
+    for entry in cells[cell:] if kind == 0 else cells[cell : cell + 1]:
+        course[entry.units] = 1.0
+    if kind == 2:
+        course = (e.mjd - e.mjd.mean()) / YEAR
+    parameter = np.array([i, *rivals])
+    _, known = changes.weighted(solution, np.repeat(course[:, None], len(parameter), axis=1), parameter)
+    own = np.maximum(np.diag(known)[1:], 1e-300)
+    least = float(np.min(best * (1.0 - known[0, 1:] ** 2 / (known[0, 0] * own))))
+    held = len(cells) - cell if kind == 0 else 1 if kind == 1 else len(cells)
+    return math.inf if least < 1e-6 * best else float(max(0, math.ceil(held * (SURE**2 / least - 1.0))))
+
+
+def _held_out(data: Together, laws: Sequence[Law | None], one: Break) -> float:
+    """Gain in χ² of every other night by the size that the others give; NaN where that cannot be asked."""
+    i, halves = data.names.index(one.name), []
+    for odd in (0, 1):
+        keep = data.equations.night % 2 == odd
+        some, number = data.equations.only(keep), np.array([night.number for night in data.nights])[keep]
+        course = (some.mjd - data.equations.mjd.mean()) / YEAR
+        if one.kind != "drift":
+            course = (number >= one.night if one.kind == "step" else number == one.night).astype(float)
+        there = [None if law is None else law.seen_at(some.mjd) for law in laws]
+        try:
+            solution = solve(System.of(some, there, data.mean, data.width, data.has_value))
+        except UndeterminedError:
+            return math.nan
+        score, known = changes.weighted(solution, course[:, None], np.array([i]))
+        halves.append((float(score[0]), float(known[0, 0])))
+    (score, known), (other, information) = halves
+    if not known > 0 or not information > 0:
+        return math.nan
+    size = score / known
+    return 2.0 * size * other - size**2 * information

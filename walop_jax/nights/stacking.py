@@ -1,0 +1,364 @@
+"""From what users have to a survey: nights are made of fits, runs and sets, stacked, and kept in a folder.
+
+The folder of a survey:
+
+    nights.fits        the normal equations of all nights (`night_file`)
+    reference.fits     the calibration about which they are linearised; its model file holds the laws
+    calibration.fits   the calibration of the last exposure
+    tracks.fits        every parameter in every night
+    survey.json        what was found
+    partial            nights that are made, until all are
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from walop_jax.calibration import PRODUCT, read_calibration, write_calibration
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.data import read_calibration_set
+from walop_jax.data.records import CalibrationSet
+from walop_jax.data.schema import EXPOSURES, Column, Place
+from walop_jax.data.user_tables import InputTable, in_memory, numeric_column, read_input_table
+from walop_jax.fit.model_file import model_like
+from walop_jax.fit.refit import FitResult
+from walop_jax.fit.verdict import STATED, Doubt, Quality
+from walop_jax.io.errors import DataError, fail
+from walop_jax.io.fits_reading import primary_keywords
+from walop_jax.io.text import check_input, parse_toml, read_json, read_text
+from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.laws import Law, laws_of, resolved
+from walop_jax.model.specification import Model
+from walop_jax.nights.algebra import Solution, UndeterminedError
+from walop_jax.nights.breaks import Break, at_solution, solved
+from walop_jax.nights.breaks import find as breaks_of
+from walop_jax.nights.equations import (
+    Candidates,
+    Night,
+    Together,
+    candidates_of,
+    data_hash,
+    model_hash,
+    night_equations,
+    together,
+)
+from walop_jax.nights.night_file import NIGHTS, nights_in, read_nights, write_nights
+from walop_jax.nights.survey import Survey
+from walop_jax.posterior.files import Run
+
+Given = FitResult | CalibrationSet | Night | Run | str | os.PathLike[str]
+"""What nights are made of: a fit, a set, a night, or a path: of a set, of a RUN, of a SURVEY or of its nights."""
+
+LONG = 60.0  # days without a night that are worth a remark
+FAR = 0.02  # standard errors from the solution beyond which a night is linearised again
+ROUNDS = 6
+REFERENCE = "reference.fits"
+FILES = (NIGHTS, REFERENCE, PRODUCT, "tracks.fits", "survey.json")
+"""The files of a survey."""
+
+
+class _Data(NamedTuple):
+    """Data that nights can be made of at any values: reader, hash, and model (None: that of `like`)."""
+
+    read: Callable[[], CalibrationSet]
+    sha256: str
+    model: Model | None = None
+
+
+class _Opened(NamedTuple):
+    """What was given: nights, or data that they can be made of, with what comes with them."""
+
+    nights: list[Night]
+    data: _Data | None = None
+    fit: Calibration | FitResult | None = None
+    breaks: tuple[Break, ...] = ()
+    events: tuple[tuple[float, str], ...] = ()
+
+
+@dataclasses.dataclass
+class _Maker:
+    """Makes nights of data, and keeps them in a folder, if there is one: what is there already is not made again."""
+
+    like: Calibration | None
+    folder: Path | None
+    candidates: dict[tuple[str, ...], Candidates] = dataclasses.field(default_factory=dict)
+
+    def nights(self, data: _Data, values: Mapping[str, float] | None = None) -> list[Night]:
+        """The nights of data, linearised at `values` by name; None: as they are kept, or at those of `like`."""
+        like, place = self.like, None
+        if like is None:
+            raise fail(
+                f"{data.read().origin} is a set, and nothing says at which values to linearise it",
+                advice="give --like RUN, a fit of the same model (like= in Python)",
+            )
+        if self.folder is not None:
+            named = f"{data.sha256} {model_hash(data.model or like.model)}"
+            place = self.folder / f"night-{hashlib.sha256(named.encode()).hexdigest()[:16]}.fits"
+            if values is None and place.exists():
+                return read_nights(place)
+        calset = data.read()
+        model = data.model or model_like(calset, like.model)
+        if values is None:
+            values = dict(zip(like.model.names, like.values.tolist(), strict=True))
+        # Candidates depend on cameras, standards and the effects of the model alone: listing them takes a while.
+        key = (*model.names, *model.effect_names)
+        if key not in self.candidates:
+            self.candidates[key] = candidates_of(model, calset.exposures, model.catalogue)
+        found = night_equations(calset, model, values, self.candidates[key])
+        if place is not None:
+            place.parent.mkdir(parents=True, exist_ok=True)
+            write_nights(place, found, overwrite=True)
+        return found
+
+
+def stack(
+    nights: Sequence[Given],
+    laws: Mapping[str, Law | Mapping[str, Any]] | str | os.PathLike[str] | None = None,
+    *,
+    like: Calibration | FitResult | None = None,
+    find: bool = True,
+    events: Any = None,
+    partial: Path | None = None,
+    tell: Callable[[str], None] = lambda text: None,
+    catalogue: Sequence[type[Effect]] = EFFECTS,
+) -> Survey:
+    """Fit all nights together under laws of time, from their normal equations.
+
+    Nights are fits, calibration sets (linearised at the values of `like`, no fit is needed), or what was kept of them.
+    `laws` are as the [law] tables of `model.laws`, or a file with them, by default those of the model of `like`; a
+    parameter without one is shared by all nights. `like` is a calibration of their model, by default the first that is
+    given. Sets and fits are linearised again at the common solution until none is far from it; kept nights cannot be.
+    With `find` breaks are looked for in three nights and more, and become laws. `events` is a table of what was done to
+    the instrument (MJD, WHAT); `partial` is a folder that nights are kept in while others are made.
+
+    Raises `DataError` for nights that do not belong together, that do not determine a parameter under its law, and for
+    nights without a filter in common; ValueError for laws that are wrong, or of what does not exist.
+    """
+    opened = [_opened(one, catalogue) for one in nights]
+    fits = [one for one in (like, *(some.fit for some in opened)) if one is not None]
+    held = (
+        Calibration.from_fit(fits[0])
+        if fits and isinstance(fits[0], FitResult)
+        else fits[0]
+        if fits
+        else None
+    )
+    maker = _Maker(None if held is None else held.rebuilt(), partial)
+    made: list[Night] = []
+    at_hand: dict[tuple[str, int], _Data] = {}
+    for k, one in enumerate(opened):
+        some = one.nights
+        if one.data is not None:
+            tell(f"{k + 1} of {len(opened)}")
+            some = maker.nights(one.data)
+            at_hand |= {(night.sha256, night.number): one.data for night in some}
+        made += some
+    data = together(made)
+    doubts = [*_about_fits(fits), *_about_time(data.nights)]
+    if isinstance(laws, str | os.PathLike):
+        laws = parse_toml(read_text(laws)).get("law", {})
+    elif laws is None:
+        laws = maker.like.model.laws if maker.like else {}
+    chosen = laws_of_all(data, laws)
+    _check_filters(data, chosen)
+    breaks = [one for some in opened for one in some.breaks]
+    try:
+        data, solution, settled = _settled(data, chosen, at_hand, maker)
+        if find and len({night.number for night in data.nights}) > 2:
+            found, chosen, solution = breaks_of(data, chosen, catalogue)
+            breaks += found
+            if found:
+                data, solution, settled = _settled(data, chosen, at_hand, maker)
+    except UndeterminedError as error:
+        raise _undetermined(data, error) from None
+    if not settled:
+        what = f"the solution has not settled after {ROUNDS} linearisations: the nights are too different"
+        doubts.append(Doubt(Quality.NOT_CONVERGED, what))
+    if kept := sum((night.sha256, night.number) not in at_hand for night in data.nights):
+        what = f"{kept} of {len(data.nights)} nights stay as they were linearised: their data are not at hand"
+        doubts.append(Doubt(Quality(0), what, blocking=False))
+    happened = {event for some in opened for event in some.events} | set(
+        () if events is None else events_of(events)
+    )
+    breaks = sorted((at_solution(data, solution, one) for one in breaks), key=lambda one: one.night)
+    return Survey(data, chosen, solution, maker.like, tuple(doubts), tuple(breaks), tuple(sorted(happened)))
+
+
+def events_of(table: Any) -> list[tuple[float, str]]:
+    """Events of a table with the columns MJD and WHAT, or of its file. Raises `DataError` where one is missing."""
+    read = read_input_table(table) if isinstance(table, str | os.PathLike) else in_memory(table)
+    mjd = numeric_column(read, "MJD", Column("float", "d"))
+    if "WHAT" not in read.names:
+        raise fail(
+            "the column is missing", file=read.path, column="WHAT", advice="say what was done, in words"
+        )
+    words = read.table.columns[read.names.index("WHAT")]
+    return list(zip(mjd.tolist(), map(str, words), strict=True))
+
+
+def laws_of_all(data: Together, laws: Mapping[str, Law | Mapping[str, Any]]) -> tuple[Law | None, ...]:
+    """A law for every parameter and candidate of nights (None: absent). ValueError for what is wrong in `laws`."""
+    tables = {name: law.document() if isinstance(law, Law) else law for name, law in laws.items()}
+    cut = len(data.names) - data.candidates
+    return resolved(laws_of(tables), data.names[:cut], data.names[cut:])
+
+
+def writers(survey: Survey) -> dict[str, Callable[[Path], object]]:
+    """What writes the files of a survey, but for its document."""
+    last, reference = survey.at(survey.last), dataclasses.replace(survey.reference, path=None)
+    return {
+        NIGHTS: lambda path: write_nights(path, survey.data.aligned()),
+        REFERENCE: lambda path: write_calibration(path, reference),
+        PRODUCT: lambda path: write_calibration(path, last),
+        FILES[3]: lambda path: survey.tracks.write(path, format="fits"),
+    }
+
+
+def read_survey(folder: str | os.PathLike[str], catalogue: Sequence[type[Effect]] = EFFECTS) -> Survey:
+    """The survey of a folder, solved again. Raises `DataError` for a folder that is none."""
+    return stack([folder], find=False, catalogue=catalogue)
+
+
+def is_survey(given: Any) -> bool:
+    """Whether something is the path of a survey."""
+    return isinstance(given, str | os.PathLike) and (Path(given) / FILES[-1]).exists()
+
+
+def calibration_of_stars(survey: Survey, stars: InputTable, *, force: bool = False) -> Calibration:
+    """The calibration for stars of one day (MJD, UTC).
+
+    Raises `DataError` for stars without a time, of more than a day, on both sides of a change, and, unless `force` is
+    given, outside the validity.
+    """
+    place, mjd = Place(stars.path, ""), numeric_column(stars, "MJD", EXPOSURES["MJD"])
+    advice = "add the times (UTC) of the exposures, or give one calibration.fits for all"
+    place.refuse(~np.isfinite(mjd), "is not given, and a survey changes with time", "MJD", advice)
+    low, high = float(mjd.min()), float(mjd.max())
+    advice = "give a catalogue for every night"
+    if high - low > 1.0:
+        raise place.fail(f"spans {high - low:.1f} days", "MJD", advice)
+    if changed := [edge for edge in survey.edges if low < edge <= high]:
+        raise place.fail(f"the instrument changed between the stars, at {changed[0]:.3f}", "MJD", advice)
+    for moment in (low, high):
+        survey.at(moment, force=force)
+    return survey.at(0.5 * (low + high), force=force)
+
+
+def _opened(one: Given, catalogue: Sequence[type[Effect]]) -> _Opened:
+    """What nights can be made of, or are, with the fit, breaks and events that come with them."""
+    if isinstance(one, Night):
+        return _Opened([one])
+    if isinstance(one, FitResult):
+        return _Opened([], _Data(lambda: one.calset, data_hash(one.calset), one.model), one)
+    if isinstance(one, CalibrationSet):
+        return _Opened([], _Data(lambda: one, data_hash(one)))
+    path = one.folder if isinstance(one, Run) else Path(one)
+    if path.is_dir() and (not (path / PRODUCT).exists() or (path / NIGHTS).exists()):
+        fit = read_calibration(path / REFERENCE, catalogue) if (path / REFERENCE).exists() else None
+        said = read_json(path / FILES[-1]) if is_survey(path) else {"breaks": [], "events": []}
+        return _Opened(
+            nights_in(path),
+            fit=fit,
+            breaks=tuple(Break.read(entry) for entry in said["breaks"]),
+            events=tuple((float(entry["mjd"]), str(entry["what"])) for entry in said["events"]),
+        )
+    keywords = () if path.is_dir() else primary_keywords(path)
+    if "NIGHTVER" in keywords:
+        return _Opened(read_nights(path))
+    if path.is_dir() or "PRODVERS" in keywords:
+        run = one if isinstance(one, Run) else Run(path if path.is_dir() else path.parent, catalogue)
+        return _Opened([], _Data(lambda: run.calset, data_hash(run.calset)), run.calibration)
+    with check_input(path).open("rb") as raw:
+        return _Opened(
+            [], _Data(lambda: read_calibration_set(path), hashlib.file_digest(raw, "sha256").hexdigest())
+        )
+
+
+def _settled(
+    data: Together, laws: Sequence[Law | None], at_hand: Mapping[tuple[str, int], _Data], maker: _Maker
+) -> tuple[Together, Solution, bool]:
+    """Linearise nights at the common solution until none is far from it; whether none is."""
+    for _ in range(ROUNDS):
+        solution = solved(data, laws)
+        scale = data.equations.scale
+        values = data.origin + solution.values * scale
+        sigma = np.maximum(solution.errors() * scale, 1e-12 * scale)
+        # Candidates have no place in the model: their part stays first-order, at 0.
+        far = np.abs(values - data.reference) > FAR * sigma
+        again = [
+            u for u in np.flatnonzero(far[:, data.has_value].any(axis=1))
+            if (data.nights[u].sha256, data.nights[u].number) in at_hand
+        ]  # fmt: skip
+        if not again:
+            return data, solution, True
+        nights = list(data.nights)
+        for u in again:
+            night = nights[u]
+            made = maker.nights(
+                at_hand[night.sha256, night.number], dict(zip(data.names, values[u].tolist(), strict=True))
+            )
+            nights[u] = next(one for one in made if one.number == night.number)
+        data = together(nights)
+    return data, solved(data, laws), False
+
+
+def _about_fits(fits: Sequence[Calibration | FitResult]) -> list[Doubt]:
+    doubts = []
+    for one in fits:
+        verdict = one.verdict if isinstance(one, Calibration) else one.checked_verdict()
+        where = one.calset.origin if isinstance(one, FitResult) else one.origin
+        if (one.errors_from if isinstance(one, FitResult) else verdict.errors_from) != STATED:
+            raise fail(
+                f"the errors of {where} do not explain its scatter, and nights are weighed by them",
+                advice="correct N_ERR, or leave the night out",
+            )
+        if not verdict.trusted:
+            doubts.append(Doubt(verdict.quality, f"the fit of {where} is not trusted"))
+    return doubts
+
+
+def _undetermined(data: Together, error: UndeterminedError) -> DataError:
+    name = data.names[error.parameter]
+    if error.unit is None:
+        return fail(
+            f"the nights do not determine {name} under its law", advice="give it a prior, or another law"
+        )
+    number = data.nights[error.unit].number
+    return fail(
+        f"the night of MJD {number} says nothing of {name}, which has a value of its own there",
+        advice="give its law a spread, or let it be shared",
+    )
+
+
+def _about_time(nights: Sequence[Night]) -> list[Doubt]:
+    found, reached = [], math.inf
+    for begin, end in sorted((night.begin, night.end) for night in nights):
+        if begin - reached > LONG:
+            what = f"no night from MJD {reached:.1f} to {begin:.1f}: what holds there rests on the laws alone"
+            found.append(Doubt(Quality(0), what, blocking=False))
+        reached = end if math.isinf(reached) else max(reached, end)
+    return found
+
+
+def _check_filters(data: Together, laws: Sequence[Law | None]) -> None:
+    first = data.nights[0]
+    free = {
+        law.base
+        for law, p in zip(laws, data.parameters, strict=True)
+        if law and p.name.startswith("throughput.")
+    }
+    for night in data.nights[1:]:
+        if not set(night.filters) & set(first.filters) and not free & {"night", "file"}:
+            raise fail(
+                f"nights in other filters with the same throughputs: {', '.join(first.filters)} (MJD {first.number}) "
+                f"and {', '.join(night.filters)} (MJD {night.number})",
+                advice='stack them apart, or give [law."throughput.*"] per = "night"',
+            )
