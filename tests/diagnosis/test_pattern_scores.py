@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_run import small_fit_with_plate
 
-from walop_jax.diagnosis.design import Design, strata
+from walop_jax.diagnosis.design import Design, _from_columns, _from_rows, strata
 from walop_jax.likelihood.flux import Sharing
 
 
@@ -34,8 +34,8 @@ def test_rows_are_columns(scale, apart):
         for a, (k, pattern) in enumerate(zip(stratum.camera, stratum.patterns, strict=True)):
             exact = design.measured.column(pattern[..., None] * one[k])
             np.testing.assert_allclose(columns[:, a], exact, rtol=0, atol=1e-12 * np.abs(exact).max())
-    one, scores, square = design._from_rows(design, found)
-    other, expected, total = design._from_columns(design, found)
+    one, scores, square = _from_rows(design, found)
+    other, expected, total = _from_columns(design, found)
     assert (one.names, one.sizes, one.free) == (other.names, other.sizes, other.free)
     assert square == pytest.approx(total, rel=1e-12)
     np.testing.assert_allclose(one.before, other.before, rtol=1e-9)
