@@ -7,22 +7,16 @@ import html
 import json
 
 import handmade_run
-import numpy as np
 import pytest
 from small_run import small_fit
 
-from walop_jax.diagnosis.design import HeldOut
-from walop_jax.diagnosis.findings import Alike, Diagnosis, Step, Told, Unexplained, document
+from walop_jax.diagnosis.findings import Diagnosis, Step, Unexplained, document
+from walop_jax.model.effects.change import Change
 
 
 @pytest.fixture(scope="module")
 def found() -> Diagnosis:
     fit = small_fit().judged()
-    held = HeldOut("exposures", np.ones(2), np.ones(2, int))
-    told = Told(
-        "turn of polariser * x", "turn", "of polariser", ("grows with x",), 0.1, 0.01, "deg",
-        "the polariser is turned, more towards +X", "turn the polariser by half a turn",
-    )  # fmt: skip
     step = Step(
         effect="described",
         parameters={"turn": (0.1, 0.01, "deg")},
@@ -31,20 +25,21 @@ def found() -> Diagnosis:
         log_bayes=40.0,
         chi2_before=2000.0,
         chi2_after=1000.0,
-        heldout_before=held,
-        heldout_after=held,
+        heldout_scheme="exposures",
+        heldout_before=1.0,
+        heldout_after=1.0,
         change_of_qu=0.01,
         equivalent=("clp_zero",),
         separated_by="a polarised standard",
         where={"kind": "clp 100%"},
-        told=(told,),
+        told=((Change.parsed("turn of polariser * x"), 0.1, 0.01),),
         nameless=("a step of the polariser in exposure 4",),
         alternatives=("camera = 2",),
     )
     left = Unexplained(1e-5, "patterns over the field are left", (), ("gain",), 1000.0, 900.0)
     return Diagnosis(
         "effect_found", (step,), (), (), ("etalon",), left, 1e-9, 0.5, fit, fit, 1.0, 29,
-        classes=(Alike("hwp1_axis", ("hwp2_axis",), "stars in the other half"),),
+        classes=({"effect": "hwp1_axis", "equivalent": ["hwp2_axis"], "separated_by": "stars in the other half"},),
     )  # fmt: skip
 
 
@@ -60,7 +55,7 @@ def test_print_command_and_page_say_the_same(found: Diagnosis, call, calset_file
     call("report", run)
     page = html.unescape((run / "report.html").read_text())
     for text in (
-        "the polariser is turned, more towards +X: turn the polariser by half a turn",
+        "turn of polariser: 0.100 ± 0.010 deg, growing with X (amplitude at 0.3°)",
         "these data cannot tell it from clp_zero, a step of the polariser in exposure 4",
         "to tell them apart: a polarised standard",
         "equally consistent with camera = 2",

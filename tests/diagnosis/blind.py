@@ -30,7 +30,7 @@ from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Measured
 from walop_jax.diagnosis.examination import Evidence, Ranked, examine
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.score import Scorer, separations, whitening
-from walop_jax.diagnosis.search import Linear, Trial, joined, search
+from walop_jax.diagnosis.search import Linear, Trial, search
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
@@ -336,7 +336,7 @@ class Cached(Linear):
         item = trial.item
         assert item is not None
         self.added = (*self.added, item.probe.name)
-        after = joined(state, item, self.scorers.get(self.added))
+        after = state.joined(item, self.scorers.get(self.added))
         if len(self.scorers) > KEPT:
             self.scorers.clear()
         self.scorers[self.added] = after.scorer

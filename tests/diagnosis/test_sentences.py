@@ -58,12 +58,11 @@ def test_a_film_whose_axis_turns_over_the_field():
     result = found([Described.saying(["turn of polariser * x"], [0.05])])
     assert result.verdict == "effect_found"
     assert [step.effect for step in result.steps] == ["described"]
-    (told,) = result.steps[0].told
-    assert (told.kind, told.place) == ("turn", "of polariser")
-    assert told.sentence == "turn of polariser * x"
-    assert told.value == pytest.approx(0.05, abs=4 * told.sigma)
-    assert told.unit == "deg"
-    assert told.tested_by
+    ((change, value, sigma),) = result.steps[0].told
+    assert (change.kind, change.where, change.place) == ("turn", "of", "polariser")
+    assert change.text == "turn of polariser * x"
+    assert value == pytest.approx(0.05, abs=4 * sigma)
+    assert change.tested_by
 
 
 @pytest.mark.long
@@ -71,7 +70,9 @@ def test_an_encoder_error_twice_per_turn():
     """Its mimic to first order is polarisation of the telescope: told apart, or told as a class."""
     result = found([Described.saying(["turn of polariser * sin 2 CLP"], [0.08])])
     step = result.steps[0]
-    said = {told.sentence for told in step.told} | {t for text in step.nameless for t in text.split("; ")}
+    said = {change.text for change, _, _ in step.told} | {
+        t for text in step.nameless for t in text.split("; ")
+    }
     assert "turn of polariser * sin 2 CLP" in said
     assert result.verdict == "effect_found"
 
@@ -81,7 +82,7 @@ def test_halves_that_are_vignetted_differently():
     result = found([Vignetting()])
     names = {step.effect for step in result.steps}
     assert names <= {"described"}
-    places = {told.place for step in result.steps for told in step.told}
+    places = {f"{change.where} {change.place}" for step in result.steps for change, _, _ in step.told}
     assert result.verdict == "unexplained" or places == {"of half1"} or places == {"of half2"}
 
 

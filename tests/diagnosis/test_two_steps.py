@@ -4,6 +4,8 @@ Columns are unit vectors and prior widths large, so that the evidence of a direc
 holds, less a constant: the numbers are those of plain geometry.
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -36,20 +38,20 @@ class Geometry:
                     continue
                 d = d / np.linalg.norm(d)
             square, one = float(d @ r) ** 2, np.ones(1)
-            score = Score(name, square, 1, 0.0, 0.0, one, np.eye(1), 0.0, 1.0, True)
+            score = Score(name, square, 1, 0.0, 0.0, one, np.eye(1), 0.0, True)
             found.append(Ranked(KINDS[name], Probe(name, KINDS[name], ()), score, 0.5 * square - PRICE))
         return sorted(found, key=lambda item: -item.log_bayes)
 
-    def behind(self, item: Ranked) -> tuple[list[Ranked], list[Ranked], float]:
+    def joined(self, item: Ranked) -> SimpleNamespace:
         d = self.directions[item.probe.name]
         left = self.residual - d * (d @ self.residual)
-        p = 0.5 if left @ left < LEAST else 1e-6
-        return self.ranked(("a", "b"), d), self.ranked(("sentence",), d), p
+        names, told = self.ranked(("a", "b"), d), self.ranked(("sentence",), d)
+        return SimpleNamespace(ranked=names, told=told, alarm=left @ left >= LEAST)
 
     def name_first(self) -> bool:
         names, sentence = self.ranked(("a", "b")), self.ranked(("sentence",))[0]
         assert sentence.log_bayes > names[0].log_bayes
-        return name_first(names, sentence, self.behind)
+        return name_first(names, sentence, self.joined)
 
 
 @pytest.mark.parametrize("share", [0.5, 1.0])
@@ -65,5 +67,5 @@ def test_a_sentence_that_holds_all_comes_before_two_names():
 def test_a_name_that_suffices_comes_before_a_sentence_that_does_not():
     geometry = Geometry(A + B, 10.0 * A)
     names, sentence = geometry.ranked(("a", "b")), geometry.ranked(("sentence",))[0]
-    assert name_first(names, sentence, geometry.behind)
-    assert not name_first([], sentence, geometry.behind)
+    assert name_first(names, sentence, geometry.joined)
+    assert not name_first([], sentence, geometry.joined)

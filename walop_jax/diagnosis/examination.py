@@ -18,6 +18,7 @@ import itertools
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -26,7 +27,6 @@ from scipy import stats
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.candidates import Probe, all_candidates, said_by
 from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Design, number_of_columns, strata
-from walop_jax.diagnosis.findings import Alike, Limit
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.score import (
     Candidate,
@@ -125,17 +125,13 @@ def shortest(item: Ranked, most: int = POLICY.most_together) -> Described:
     return Described.combine([item.probe.group[i] for i in best], amplitudes)
 
 
-Behind = tuple[Sequence[Ranked], Sequence[Ranked], float]
-"""Names and sentences in order of evidence, and the global p of what is left, once one of them is in the model."""
-
-
 def name_first(
     names: Sequence[Ranked],
     sentence: Ranked,
-    behind: Callable[[Ranked], Behind],
+    joined: Callable[[Ranked], Evidence],
     policy: Policy = POLICY,
 ) -> bool:
-    """Whether significant `names` come before a more probable sentence.
+    """Whether significant `names` come before a more probable sentence; `joined` is `Evidence.joined`.
 
     They do where the best of them leaves nothing significant and the sentence does, or where two of them are more
     probable than the sentence with whatever is best behind it.
@@ -147,13 +143,13 @@ def name_first(
 
     if not names:
         return False
-    left_names, left_sentences, p_sentence = behind(sentence)
-    least = worth(sentence, [*left_names[:1], *left_sentences[:1]], len(left_names))
+    left = joined(sentence)
+    least = worth(sentence, [*left.ranked[:1], *left.told[:1]], len(left.ranked))
     for name in leaders(names, policy):
-        left_names, _, p_name = behind(name)
-        if name is names[0] and p_sentence < policy.alarm <= p_name:
+        behind = joined(name)
+        if name is names[0] and left.alarm and not behind.alarm:
             return True
-        if worth(name, left_names[:1], len(left_names)) > least:
+        if worth(name, behind.ranked[:1], len(behind.ranked)) > least:
             return True
     return False
 
@@ -295,21 +291,31 @@ class Evidence:
         probes = [probe for probe in self.probes if probe.effect is effect]
         return self.stands(probes, evidence) if probes or effect is Described else True
 
-    def behind(self, item: Ranked) -> Behind:
-        """What is left to be told when one candidate has joined the base, by a linear step."""
+    def joined(self, item: Ranked, scorer: Scorer | None = None) -> Evidence:
+        """The evidence once a candidate has joined the base, by a linear step."""
         space, reduce = self.space.with_base([item.probe.name])
-        scorer = Scorer(space, np.random.default_rng(0), draws=0)
-        table = scorer.after(self.table, reduce(self.scores, self.square)[0])
-        probes = [probe for probe in self.probes if probe.effect is not item.effect]
-        said = [probe for probe in self.sentences if probe is not item.probe]
-        return rank(table, probes, self.policy), rank_sentences(table, said), table.p_global
+        scores, square = reduce(self.scores, self.square)
+        scorer = scorer or Scorer(space, np.random.default_rng(0), draws=0)
+        effect = item.effect
+        return dataclasses.replace(
+            self,
+            scorer=scorer,
+            scores=scores,
+            square=square,
+            table=scorer.after(self.table, scores),
+            probes=[p for p in self.probes if p.effect is not effect or effect is Described],
+            sentences=[probe for probe in self.sentences if probe is not item.probe],
+            parts=[(probe, {one for one in effects if one is not effect}) for probe, effects in self.parts],
+            chi2=self.chi2 - item.score.statistic * (self.table.noise_scale * self.scale) ** 2,
+            dof=self.dof - item.score.rank,
+        )
 
     def sentences_before_names(self) -> list[Ranked]:
         """Sentences that are more probable than every name; none where names suffice and they do not."""
         names, found = self.significant, self.significant_sentences
         if names:
             found = [item for item in found if item.log_bayes > names[0].log_bayes]
-        return [] if found and name_first(names, found[0], self.behind, self.policy) else found
+        return [] if found and name_first(names, found[0], self.joined, self.policy) else found
 
     # ------------------------------------------------------------------------------- what cannot be told apart
 
@@ -361,19 +367,20 @@ class Evidence:
             )
         )
 
-    def classes(self) -> Iterator[Alike]:
-        """Which other effects could follow what each significant one would explain, by linear steps."""
+    def classes(self) -> Iterator[dict[str, Any]]:
+        """Which other effects could follow what each significant one would explain, by linear steps: rows of a file."""
         for item in self.significant[: self.policy.most_classes]:
             if close := self.close(item):
-                yield Alike(item.effect.name, close, item.effect.separated_by)
+                effect = item.effect
+                yield {"effect": effect.name, "equivalent": close, "separated_by": effect.separated_by}
 
     def summary(self) -> tuple[tuple[str, float, float], ...]:
         """Effects with score and corrected p, most significant first."""
         rows = [(r.effect.name, r.score.statistic, self.table.corrected(r.score)) for r in self.ranked]
         return tuple(sorted(rows, key=lambda row: row[2]))
 
-    def limits(self) -> Iterator[Limit]:
-        """What each effect with a single amplitude stays below."""
+    def limits(self) -> Iterator[dict[str, Any]]:
+        """What each effect with a single amplitude stays below: rows of a file."""
         for item in self.ranked:
             names = item.effect.amplitudes()
             if len(item.score.amplitudes) != 1 or sum(p.effect is item.effect for p in self.probes) > 1:
@@ -382,7 +389,10 @@ class Evidence:
             unit = field_declarations(item.effect)[names[0]].unit
             one_sided = names[0] in item.effect.one_sided
             below = upper_limit(value, sigma, one_sided=one_sided, probability=self.policy.limit)
-            yield Limit(item.effect.name, names[0], unit, value, sigma, below)
+            yield {
+                "effect": item.effect.name, "parameter": names[0], "unit": unit,
+                "value": value, "sigma": sigma, "below_95": below,
+            }  # fmt: skip
 
 
 def explains(chi2: float, dof: float) -> bool:

@@ -19,7 +19,7 @@ gives them, one value for each camera, in the order of SHARES. NaN where there a
 combination, BEFORE and AFTER, have standard deviation 1 (where the flux is free √(1 − 1/K) with K cameras, 0.87 of
 four) if there is noise alone.
 
-Combination  r_pk = Σ_e w_e r_pek / (Σ_e w_e² over the used ones)^½ keeps unit noise. The weights w are those of what
+_Combination  r_pk = Σ_e w_e r_pek / (Σ_e w_e² over the used ones)^½ keeps unit noise. The weights w are those of what
              can be said in words (a harmonic of the polariser angle at its best phase, the mean of a kind of
              exposures, a trend with time) that holds most of the power of the disagreement; if all of them hold less
              than `WORDS_FROM` of what the best weights do (principal component over the exposures), the latter.
@@ -307,7 +307,7 @@ UNNAMED = FreeForm.name  # the effect that stands for patterns without a name
 
 
 @dataclasses.dataclass(frozen=True)
-class Combination:
+class _Combination:
     """Weights of the exposures (norm 1), what they are in words, and the harmonic of the polariser angle or −1."""
 
     words: str
@@ -386,21 +386,21 @@ def compare_residuals(
     )
 
 
-def best_combination(cube: Cube, used: Used, exposures: Exposures) -> Combination:
+def best_combination(cube: Cube, used: Used, exposures: Exposures) -> _Combination:
     """The combination of the exposures in which a pattern (σ) shows best, in words wherever that is possible."""
 
-    def power(combination: Combination) -> float:
+    def power(combination: _Combination) -> float:
         return float(np.nansum(combination.of(cube, used) ** 2))
 
     flat = np.moveaxis(cube, 1, -1).reshape(-1, cube.shape[1])
     principal = np.linalg.eigh(flat.T @ flat)[1][:, -1]
     principal = principal * (np.sign(principal[np.abs(principal).argmax()]) or 1.0)
-    free = Combination("the combination of all exposures that shows it best", principal)
+    free = _Combination("the combination of all exposures that shows it best", principal)
     named = max(_in_words(cube, used, exposures), key=power, default=free)
     return named if power(named) >= WORDS_FROM * power(free) else free
 
 
-def _in_words(cube: Cube, used: Used, exposures: Exposures) -> Iterator[Combination]:
+def _in_words(cube: Cube, used: Used, exposures: Exposures) -> Iterator[_Combination]:
     measured = used.any(axis=0)
     through = exposures.clp_in & measured
     angle = np.deg2rad(np.where(through, exposures.clp_angle, 0.0))
@@ -410,13 +410,13 @@ def _in_words(cube: Cube, used: Used, exposures: Exposures) -> Iterator[Combinat
         weight = waves[0] * np.cos(phase) + waves[1] * np.sin(phase)
         if np.linalg.norm(weight) > 1e-6:
             words = f"cos({harmonic} theta - {np.rad2deg(phase) % 360:.0f} deg), theta the polariser angle"
-            yield Combination(words, weight / np.linalg.norm(weight), harmonic)
+            yield _Combination(words, weight / np.linalg.norm(weight), harmonic)
     for kind in np.unique(exposures.kind[measured]):
         weight = ((exposures.kind == kind) & measured).astype(float)
-        yield Combination(f"mean of the {kind} exposures", weight / np.linalg.norm(weight))
+        yield _Combination(f"mean of the {kind} exposures", weight / np.linalg.norm(weight))
     hours = np.where(measured, exposures.mjd - exposures.mjd[measured].mean(), 0.0)
     if np.all(np.isfinite(hours)) and np.any(hours):
-        yield Combination("trend with time", hours / np.linalg.norm(hours))
+        yield _Combination("trend with time", hours / np.linalg.norm(hours))
 
 
 def _best_phase(cube: Cube, waves: list[Weight]) -> float:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.diagnosis.design import Design, HeldOut
+from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.display import Display, Displayed
@@ -18,6 +18,7 @@ from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.rounding import value_and_error
 from walop_jax.model import legendre
 from walop_jax.model.effects import Described
+from walop_jax.model.effects.change import Change
 from walop_jax.model.parameters import field_declarations
 
 HARMONICS = (0, 1, 2, 3, 4)
@@ -118,21 +119,6 @@ def _no_cube() -> Cube:
 
 
 @dataclasses.dataclass(frozen=True)
-class Told:
-    """A sentence that was found: kind, place, what it grows with, its amplitude, and what would test it."""
-
-    sentence: str
-    kind: str
-    place: str
-    dependence: tuple[str, ...]
-    value: float
-    sigma: float
-    unit: str
-    words: str
-    tested_by: str
-
-
-@dataclasses.dataclass(frozen=True)
 class Step:
     """One effect that was found, added and confirmed; `parameters` hold (value, sigma, unit).
 
@@ -145,7 +131,8 @@ class Step:
     `separation` how far (σ) each rival stays from it. `residual_before` and `residual_after` are the residuals
     (data − model, in standard deviations as given; point, exposure, camera) without and with the effect at the time it
     was added; where another name has been dropped since, they and χ² are of fits without that name. `told` are the
-    sentences of an effect without a name (`described`), `nameless` those that are not improbable beside what was found.
+    sentences of an effect without a name (`described`) with amplitude and error, `nameless` those that are not
+    improbable beside what was found.
     """
 
     effect: str
@@ -155,8 +142,9 @@ class Step:
     log_bayes: float
     chi2_before: float
     chi2_after: float
-    heldout_before: HeldOut
-    heldout_after: HeldOut
+    heldout_scheme: str
+    heldout_before: float
+    heldout_after: float
     change_of_qu: float = float("nan")
     robust_ratio: float = float("nan")
     far: dict[str, float] = dataclasses.field(default_factory=dict)
@@ -166,7 +154,7 @@ class Step:
     separation: dict[str, float] = dataclasses.field(default_factory=dict)
     separated_by: str = ""
     where: dict[str, Any] = dataclasses.field(default_factory=dict)
-    told: tuple[Told, ...] = ()
+    told: tuple[tuple[Change, float, float], ...] = ()
     nameless: tuple[str, ...] = ()
     residual_before: Cube = dataclasses.field(default_factory=_no_cube)
     residual_after: Cube = dataclasses.field(default_factory=_no_cube)
@@ -174,24 +162,12 @@ class Step:
     @property
     def confirmed(self) -> bool:
         """Whether data that took no part in the fit agree better with the effect than without."""
-        return self.heldout_after.mean < self.heldout_before.mean
+        return self.heldout_after < self.heldout_before
 
     @property
     def negligible(self) -> bool:
         """Whether the effect hardly matters for calibrated q and u."""
         return self.change_of_qu < POLICY.negligible
-
-
-@dataclasses.dataclass(frozen=True)
-class Limit:
-    """Amplitude of an effect that was not found, one linear step, and the size it stays below with 95 % probability."""
-
-    effect: str
-    parameter: str
-    unit: str
-    value: float
-    sigma: float
-    below: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -226,18 +202,6 @@ class Choice:
     better_by: float = float("nan")
 
 
-@dataclasses.dataclass(frozen=True)
-class Alike:
-    """A significant effect of the first examination, and those that can follow what it would explain, to within 3 σ.
-
-    `separated_by` is the observation that would tell them apart.
-    """
-
-    effect: str
-    equivalent: tuple[str, ...]
-    separated_by: str
-
-
 @dataclasses.dataclass(frozen=True, repr=False)
 class Diagnosis(Displayed):
     """What is missing from a model, according to one calibration set.
@@ -246,14 +210,14 @@ class Diagnosis(Displayed):
     `after` that of the extended one; `remaining_p` is the significance of what is left at the end. `choices` are other
     descriptions of the instrument that were tried, the best first; none where nothing, or only a name, was missing.
     `noise_scale` is the scatter of what no candidate explains over what N_ERR says, `noise_p` the chance that noise of
-    the stated size scatters as much. `classes` are significant effects that these data cannot tell from others, whether
-    they were added or not.
+    the stated size scatters as much. `classes` are significant effects of the first examination with those that
+    these data cannot tell from them, `limits` what effects that were not found stay below: rows of `diagnosis.json`.
     """
 
     verdict: Outcome
     steps: tuple[Step, ...]
     candidates: tuple[tuple[str, float, float], ...]
-    limits: tuple[Limit, ...]
+    limits: tuple[Mapping[str, Any], ...]
     untestable: tuple[str, ...]
     unexplained: Unexplained | None
     p_value: float
@@ -265,7 +229,7 @@ class Diagnosis(Displayed):
     noise_scale: float = float("nan")
     noise_p: float = float("nan")
     choices: tuple[Choice, ...] = ()
-    classes: tuple[Alike, ...] = ()
+    classes: tuple[Mapping[str, Any], ...] = ()
     policy: Policy = POLICY
     ended: bool = False
 
@@ -342,32 +306,34 @@ class Diagnosis(Displayed):
 # --------------------------------------------------------------------------------- sentences, told to people
 
 
-def told(result: FitResult) -> tuple[Told, ...]:
-    """The sentences of a fitted model, with their amplitudes."""
+def told(result: FitResult) -> tuple[tuple[Change, float, float], ...]:
+    """The sentences of a fitted model, each with its amplitude and standard error."""
     if Described.name not in result.model.effect_names:
         return ()
     effect = result.model.instrument(result.values).effect(Described.name)
     assert isinstance(effect, Described)
-    found = []
-    for sentence, amplitude in effect.terms():
-        sigma = float(result.sigma[result.model.index(f"{Described.name}.{sentence.label}")])
-        unit = field_declarations(Described)[sentence.parameter].unit
-        value, error = value_and_error(float(amplitude), sigma)
-        kind, *dependence = sentence.in_words().split(", ")
-        found.append(
-            Told(
-                sentence=sentence.text,
-                kind=sentence.kind,
-                place=f"{sentence.where} {sentence.place}",
-                dependence=tuple(dependence),
-                value=float(amplitude),
-                sigma=sigma,
-                unit=unit,
-                words=f"{kind}: {value} ± {error}{' ' if unit else ''}{unit}{''.join(f', {d}' for d in dependence)}",
-                tested_by=sentence.tested_by,
-            )
-        )
-    return tuple(found)
+    index = result.model.index
+    return tuple(
+        (change, float(amplitude), float(result.sigma[index(f"{Described.name}.{change.label}")]))
+        for change, amplitude in effect.terms()
+    )
+
+
+def _sentence(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
+    unit = field_declarations(Described)[change.parameter].unit
+    value, error = value_and_error(amplitude, sigma)
+    kind, *dependence = change.in_words().split(", ")
+    return {
+        "sentence": change.text,
+        "kind": change.kind,
+        "place": f"{change.where} {change.place}",
+        "dependence": dependence,
+        "value": amplitude,
+        "sigma": sigma,
+        "unit": unit,
+        "words": f"{kind}: {value} ± {error}{' ' if unit else ''}{unit}{''.join(f', {d}' for d in dependence)}",
+        "tested_by": change.tested_by,
+    }
 
 
 # ------------------------------------------------------------------------------------------ as plain data
@@ -379,39 +345,21 @@ def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
+_AS_THEY_ARE = (
+    "effect", "score", "p_value", "chi2_before", "chi2_after", "heldout_before", "heldout_after", "heldout_scheme",
+    "alternatives", "equivalent", "nameless", "separated_by", "where", "confirmed", "log_bayes", "negligible",
+)  # fmt: skip
+
+
 def _step(step: Step) -> dict[str, Any]:
-    return {
-        "effect": step.effect,
-        "parameters": {
-            name: {"value": value, "sigma": 0.0, "unit": ""} for name, value in step.choices.items()
-        }
-        | {
-            name: {"value": value, "sigma": sigma, "unit": unit}
-            for name, (value, sigma, unit) in step.parameters.items()
-        },
-        "alternatives": list(step.alternatives),
-        "score": step.score,
-        "p_value": step.p_value,
-        "chi2_before": step.chi2_before,
-        "chi2_after": step.chi2_after,
-        "heldout_before": step.heldout_before.mean,
-        "heldout_after": step.heldout_after.mean,
-        "sentences": [dataclasses.asdict(told) for told in step.told],
-        "equivalent": list(step.equivalent),
-        "nameless": list(step.nameless),
-        "separated_by": step.separated_by,
-        "where": step.where,
-        "heldout_scheme": step.heldout_before.scheme,
-        "confirmed": step.confirmed,
-        "log_bayes": step.log_bayes,
+    entries = {name: (value, 0.0, "") for name, value in step.choices.items()} | step.parameters
+    near = sorted(step.separation.items(), key=lambda s: s[1])
+    return {name: getattr(step, name) for name in _AS_THEY_ARE} | {
+        "parameters": {n: {"value": v, "sigma": s, "unit": unit} for n, (v, s, unit) in entries.items()},
+        "sentences": [_sentence(*one) for one in step.told],
         "change_of_qu": _number(step.change_of_qu),
-        "negligible": step.negligible,
         "robust_error_ratio": _number(step.robust_ratio),
-        "separation_sigma": {
-            name: value
-            for name, value in sorted(step.separation.items(), key=lambda s: s[1])
-            if math.isfinite(value)
-        },
+        "separation_sigma": {name: value for name, value in near if math.isfinite(value)},
     }
 
 
@@ -497,23 +445,13 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         "remaining_p_value": diagnosis.remaining_p,
         "noise_scale": _number(diagnosis.noise_scale),
         "noise_p_value": _number(diagnosis.noise_p),
-        "limits": [
-            {
-                "effect": limit.effect,
-                "parameter": limit.parameter,
-                "unit": limit.unit,
-                "value": limit.value,
-                "sigma": limit.sigma,
-                "below_95": limit.below,
-            }
-            for limit in diagnosis.limits
-        ],
+        "limits": diagnosis.limits,
         "choices": [
             {"change": choice.change, "left": choice.left, "better_by": _number(choice.better_by)}
             for choice in diagnosis.choices
         ],
-        "classes": [dataclasses.asdict(alike) for alike in diagnosis.classes],
-        "cannot_be_tested": list(diagnosis.untestable),
+        "classes": diagnosis.classes,
+        "cannot_be_tested": diagnosis.untestable,
         "chi2_per_dof_before": diagnosis.before.chi2 / max(diagnosis.before.dof, 1),
         "chi2_per_dof_after": diagnosis.after.chi2 / max(diagnosis.after.dof, 1),
         "caution": diagnosis.caution,

@@ -31,7 +31,7 @@ from walop_jax.diagnosis.design import Design, held_out
 from walop_jax.diagnosis.examination import Evidence, Ranked, explains, leaders
 from walop_jax.diagnosis.findings import Step
 from walop_jax.diagnosis.policy import Policy
-from walop_jax.diagnosis.score import Candidate, Scorer
+from walop_jax.diagnosis.score import Candidate
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
 from walop_jax.fit.robust import field_cells, states
 from walop_jax.likelihood.likelihood import Likelihood
@@ -275,6 +275,7 @@ def before_and_after(name: str, before: Design, after: Design) -> dict[str, Any]
     return {
         "chi2_before": before.fit.chi2,
         "chi2_after": after.fit.chi2,
+        "heldout_scheme": scheme,
         "heldout_before": held_out(before, scheme),
         "heldout_after": held_out(after, scheme),
         "change_of_qu": largest_change(old, new),
@@ -395,7 +396,7 @@ class Linear:
     def adopted(self, state: Any, trial: Trial) -> Any:
         """The evidence of what is left once a trial has joined the model."""
         assert trial.item is not None
-        return joined(state, trial.item)
+        return state.joined(trial.item)
 
 
 def search(state: State, judge: Linear, policy: Policy) -> Iterator[tuple[Trial, State, State]]:
@@ -500,28 +501,4 @@ def _with_rivals(state: Evidence, trial: Trial, tried: Sequence[Trial], policy: 
     rivals += () if item is None else state.held_in_part(item)
     return dataclasses.replace(
         trial, alternatives=tuple(shapes), rivals=tuple(dict.fromkeys(rivals)), nameless=nameless
-    )
-
-
-def joined(state: Evidence, item: Ranked, scorer: Scorer | None = None) -> Evidence:
-    """The evidence once a candidate has joined the base, by a linear step."""
-    space, reduce = state.space.with_base([item.probe.name])
-    scores, square = reduce(state.scores, state.square)
-    scorer = scorer or Scorer(space, np.random.default_rng(0), draws=0)
-    return dataclasses.replace(
-        state,
-        scorer=scorer,
-        scores=scores,
-        square=square,
-        table=scorer.after(state.table, scores),
-        probes=[
-            probe for probe in state.probes if probe.effect is not item.effect or probe.effect is Described
-        ],
-        sentences=[probe for probe in state.sentences if probe is not item.probe],
-        parts=[
-            (probe, {effect for effect in effects if effect is not item.effect})
-            for probe, effects in state.parts
-        ],
-        chi2=state.chi2 - item.score.statistic * (state.table.noise_scale * state.scale) ** 2,
-        dof=state.dof - item.score.rank,
     )

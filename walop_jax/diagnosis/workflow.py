@@ -291,7 +291,7 @@ class Refit(Linear):
         """Whether data that took no part in the fit agree better with the effect than without."""
         assert trial.fit is not None
         self._compared = before_and_after(trial.effect.name, state.design, Design.of(trial.fit))
-        return self._compared["heldout_after"].mean < self._compared["heldout_before"].mean
+        return self._compared["heldout_after"] < self._compared["heldout_before"]
 
     def adopted(self, state: Examination, trial: Trial) -> Examination:
         """Go on with the model of a trial, everything fitted again where priors or errors were in its way."""
