@@ -9,8 +9,7 @@ import pytest
 from frame_run import frame_run
 
 from walop_jax.calibration import residual_map
-from walop_jax.calibration.maps import residual_names
-from walop_jax.calibration.matrix import analysis_vectors
+from walop_jax.calibration.matrix import analysis_vectors, residual_names
 from walop_jax.calibration.residual_map import cell_of, cells_for, residual_map_at
 from walop_jax.data.records import Block
 from walop_jax.data.settings import Settings

@@ -16,7 +16,7 @@ import pytest
 from astropy.io import fits
 
 from walop_jax.calibration import read_calibration, write_calibration
-from walop_jax.calibration.maps import residual_names
+from walop_jax.calibration.matrix import residual_names
 from walop_jax.data import Grid, write_frames
 from walop_jax.likelihood import limits
 from walop_jax.reports import figures

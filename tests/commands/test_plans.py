@@ -10,7 +10,7 @@ from walop_jax.diagnosis.detection_limits import detection_limits
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model.effects import effect_by_name
-from walop_jax.simulation.plan_file import read_plan
+from walop_jax.simulation.observing_plan import read_plan
 from walop_jax.simulation.simulate import simulate
 
 # As many exposures and points as `small_run.SMALL`: compiled for one, compiled for both.

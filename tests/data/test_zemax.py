@@ -13,8 +13,7 @@ from zemax_exports import FIELDS, STATES, export_text, transmission, write_folde
 
 from walop_jax.data import DataError, read_calibration_set, write_calibration_set
 from walop_jax.data.inspection import inspect
-from walop_jax.data.zemax import import_transmissions
-from walop_jax.data.zemax_text import read_export
+from walop_jax.data.zemax import import_transmissions, read_export
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from matrix_at import matrix_at
 from score_draws import alarms, noise_scores
 from small_run import SEED, SMALL, small_fit
 
-from walop_jax.calibration.maps import SMALLEST_DETERMINANT
+from walop_jax.calibration.matrix import SMALLEST_DETERMINANT
 from walop_jax.diagnosis.candidates import probes
 from walop_jax.diagnosis.detection_limits import (
     PROBABILITY,

@@ -10,7 +10,7 @@ from small_run import small_fit
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.io.display import Display
-from walop_jax.io.rounding import value_and_error
+from walop_jax.io.text import value_and_error
 
 SHOWN = Display(
     "A <title>", (("a", "1"), ("long", "2 & 3")), ("name", ">n"), (("x", "10"), ("yy", "5")), ("note",)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from walop_jax.io.rounding import probability, two_digits_range, with_error
+from walop_jax.io.text import probability, two_digits_range, with_error
 
 
 @pytest.mark.parametrize(

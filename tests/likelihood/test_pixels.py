@@ -18,8 +18,9 @@ from walop_jax.data import (
     write_calibration_set,
     write_frames,
 )
+from walop_jax.data.frames import RowReader, float64
 from walop_jax.data.merge import without_frames
-from walop_jax.data.raw_rows import RowReader, float64
+from walop_jax.data.frames import RowReader, float64
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.trust import examined, pixel_structure
 from walop_jax.fit.model_file import base_model

@@ -15,9 +15,8 @@ from walop_jax.data.records import Intensities
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.layout import bytes_per_point, thinned
+from walop_jax.likelihood.layout import PointReader, PointsInMemory, StreamedPoints, bytes_per_point, thinned
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.points import PointReader, PointsInMemory, StreamedPoints
 from walop_jax.simulation.simulate import simulate
 from walop_jax.sky.moon import moon_sky
 

@@ -43,8 +43,8 @@ from walop_jax.fit.refit import fit
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.compressed import compressed
 from walop_jax.likelihood.frames import PixelPosterior, frame_sums
+from walop_jax.likelihood.layout import StreamedPoints
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.points import StreamedPoints
 from walop_jax.model.light import instrument_matrix
 from walop_jax.model.parameters import values_of
 from walop_jax.model.planning import plan_for_settings

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import walop_jax
-from walop_jax.model import kept_programs
+from walop_jax.model import compiled as kept
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects import Context, Described, Effect
 from walop_jax.model.effects.base import Scalar
@@ -23,9 +23,9 @@ from walop_jax.model.parameters import param
 def programs(tmp_path, monkeypatch) -> Path:
     """A cache folder in which programs are kept."""
     before = jax.config.jax_compilation_cache_dir
-    (tmp_path / kept_programs.FOLDER).mkdir()
+    (tmp_path / kept.FOLDER).mkdir()
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    yield tmp_path / kept_programs.FOLDER
+    yield tmp_path / kept.FOLDER
     jax.config.update("jax_compilation_cache_dir", before)
 
 
@@ -120,21 +120,21 @@ def test_answers_are_kept_like_programs(programs):
         asked.append(1)
         return frozenset({"tilt"}), (True, False)
 
-    first = kept_programs.answer("what", structure, ((2,), (3,)), find)
-    assert kept_programs.answer("what", structure, ((2,), (3,)), find) == first == find()
+    first = kept.answer("what", structure, ((2,), (3,)), find)
+    assert kept.answer("what", structure, ((2,), (3,)), find) == first == find()
     assert len(asked) == 2
-    kept_programs.answer("what", structure, ((2,), (4,)), find)
-    kept_programs.answer("what", jax.tree.structure([1, 2]), ((2,), (3,)), find)
+    kept.answer("what", structure, ((2,), (4,)), find)
+    kept.answer("what", jax.tree.structure([1, 2]), ((2,), (3,)), find)
     assert len(asked) == 4
 
 
 def test_source_that_was_changed_since_is_not_trusted(programs, monkeypatch):
-    monkeypatch.setattr(kept_programs, "_STARTED", 0.0)
-    kept_programs._source.cache_clear()
+    monkeypatch.setattr(kept, "_STARTED", 0.0)
+    kept._source.cache_clear()
     compiled(double, kept_as="double")(1.0)
     assert not list(programs.iterdir())
     monkeypatch.undo()
-    kept_programs._source.cache_clear()
+    kept._source.cache_clear()
 
 
 def test_without_the_folder_nothing_is_kept(tmp_path):
@@ -142,7 +142,7 @@ def test_without_the_folder_nothing_is_kept(tmp_path):
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     compiled(double, kept_as="double")(1.0)
     jax.config.update("jax_compilation_cache_dir", before)
-    assert not list(tmp_path.rglob(kept_programs.FOLDER))
+    assert not list(tmp_path.rglob(kept.FOLDER))
 
 
 def test_every_program_has_a_name_of_its_own():

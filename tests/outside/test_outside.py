@@ -16,8 +16,9 @@ from outside.twilight import Twilight
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
-from walop_jax.model import light, materials, optics, plates
+from walop_jax.model import light, materials, plates
 from walop_jax.model.effects import EFFECTS
+from walop_jax.model.elements import geometry
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.planning import plan_for
 from walop_jax.model.specification import effect_context, with_effects
@@ -92,7 +93,9 @@ def test_other_arms_are_the_product_of_their_plates():
     """The first arm multiplied out by hand, at one wavelength: haze, plate ahead of the wedge, wedge, second plate."""
     lam, x, y = 0.61, 0.1, -0.15
     instrument = other_arms().changed("collimator", diattenuation=0.0)
-    kx, ky, kz = optics.pupil_direction(jnp.asarray(x), jnp.asarray(y), jnp.asarray(15.63), jnp.asarray(0.02))
+    kx, ky, kz = geometry.pupil_direction(
+        jnp.asarray(x), jnp.asarray(y), jnp.asarray(15.63), jnp.asarray(0.02)
+    )
 
     def stack(kx, ky, *layers):
         made = []
@@ -110,7 +113,7 @@ def test_other_arms_are_the_product_of_their_plates():
 
     first = stack(kx, ky, ("mgf2", 1900.0, 100.0), ("quartz", 2350.0, 10.0))
     glass = materials.BK7.refractive_index(jnp.asarray(lam))
-    behind = optics.behind_wedge((kx, ky, kz), jnp.asarray(-0.23), glass)
+    behind = geometry.behind_wedge((kx, ky, kz), jnp.asarray(-0.23), glass)
     second = stack(*behind, ("quartz", 51.3, 30.0))
     kept = 1.0 - 0.01 * (0.62 / lam) ** 4
     whole = second @ first @ np.diag([1.0, kept, kept, 1.0])

@@ -18,8 +18,7 @@ from walop_jax.plans.plan import plan_from
 from walop_jax.plans.wanted import FieldErrors, field_errors, wanted
 from walop_jax.science.field_accuracy import p_errors
 from walop_jax.science.star_errors import sample_stars
-from walop_jax.simulation.observing_plan import ObservingPlan, Stop
-from walop_jax.simulation.plan_file import plan_text, read_plan
+from walop_jax.simulation.observing_plan import ObservingPlan, Stop, plan_text, read_plan
 from walop_jax.simulation.simulate import simulate
 
 ANGLES = 181

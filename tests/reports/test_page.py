@@ -12,7 +12,7 @@ from html_page import Page
 
 from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import write_columns
-from walop_jax.io.rounding import probability, value_and_error, with_error
+from walop_jax.io.text import probability, value_and_error, with_error
 from walop_jax.reports.page import render
 from walop_jax.reports.run import read_run
 from walop_jax.reports.wording import effect_in_words, verdict_of_diagnosis

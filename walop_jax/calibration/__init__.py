@@ -1,7 +1,7 @@
 """Calibrations: what a fit has learnt of an instrument, its files, and its matrix anywhere in the field."""
 
 from walop_jax.calibration.calibration import Calibration, ListedModel
-from walop_jax.calibration.maps import (
+from walop_jax.calibration.matrix import (
     SMALLEST_DETERMINANT,
     MatrixMaps,
     ResidualMap,

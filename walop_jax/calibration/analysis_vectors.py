@@ -6,8 +6,8 @@ The vectors of one optical setting (filter, moving elements, temperature, hour a
 field points and colours and interpolated between them; every table is checked against vectors computed where it has
 no node (`model/field_table.py`). A setting has one table, whatever the catalogue that asks for it.
 
-The derivatives have the structure of the fit (`likelihood/linear.py`): plain parameters act directly, the throughput
-series only through its local values.
+The derivatives have the structure of the fit (`likelihood/field_table.py`): plain parameters act directly, the
+throughput series only through its local values.
 """
 
 from __future__ import annotations
@@ -24,8 +24,17 @@ from jaxtyping import Array, Float, Int
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import in_chunks, sky_vectors
 from walop_jax.data.settings import Settings
-from walop_jax.likelihood import limits, linear
-from walop_jax.likelihood.field_table import FieldTable, accurate_table, held_out
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.field_table import (
+    FieldTable,
+    accurate_table,
+    held_out,
+    linearised,
+    plain_positions,
+    rows_and_slopes,
+    series_positions,
+    through_series,
+)
 from walop_jax.model import chebyshev, light
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import compiled
@@ -81,8 +90,8 @@ def _derivatives(
         there = to_instrument(all_values)
         return (light.camera_vectors(there, rows, local, x, y) @ light.telescope(there, x, y))[..., :3]
 
-    rows, slopes = linear.rows_and_slopes(instrument, plan, x, y)
-    found = linear.linearised(instrument, vectors, rows, slopes, light.throughput_at(instrument, x, y))
+    rows, slopes = rows_and_slopes(instrument, plan, x, y)
+    found = linearised(instrument, vectors, rows, slopes, light.throughput_at(instrument, x, y))
     return jnp.concatenate([found.plain, found.local])
 
 
@@ -111,7 +120,7 @@ class AnalysisVectors:
         self.half_width = min(self.instrument.field_limit, reach)
         self.cameras = len(self.instrument.cameras)
         self._tables: dict[tuple[object, ...], _Tables] = {}
-        series, plain = linear.series_positions(self.instrument), linear.plain_positions(self.instrument)
+        series, plain = series_positions(self.instrument), plain_positions(self.instrument)
         self._uncertain: Int[np.ndarray, " o"] = np.flatnonzero(np.diag(calibration.covariance)[plain] > 0)
         self.parameters: Int[np.ndarray, " n"] = np.concatenate([plain[self._uncertain], series])
         value, vector = np.linalg.eigh(calibration.covariance[np.ix_(self.parameters, self.parameters)])
@@ -180,7 +189,7 @@ class AnalysisVectors:
         y: Float[np.ndarray, " p"],
     ) -> Float[np.ndarray, "p 2 n"]:
         """Derivatives to `parameters`: those to the local throughputs are spread over the series."""
-        spread = linear.through_series(throughput[:, :, None], self.basis(x, y)[:, None, None])
+        spread = through_series(throughput[:, :, None], self.basis(x, y)[:, None, None])
         return np.concatenate([plain, spread], axis=-1)
 
     def basis(self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p t"]:
@@ -240,7 +249,7 @@ class AnalysisVectors:
 
     def _derivative_table(self, setting: Settings) -> FieldTable:
         plan, bands = self._plan(setting, [np.nan, *colour_nodes(DERIVATIVE_COLOURS).tolist()])
-        plain = linear.plain_positions(self.instrument).size
+        plain = plain_positions(self.instrument).size
         wanted = np.concatenate([self._uncertain, plain + np.arange(self.cameras)])
 
         def exact(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p f"]:

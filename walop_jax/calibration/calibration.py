@@ -17,11 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.calibration.maps import MatrixMaps, ResidualMap, matrix_names
 from walop_jax.calibration.matrix import (
+    MatrixMaps,
+    ResidualMap,
     change_of_qu,
     matrices,
     matrix_draws,
+    matrix_names,
     matrix_slopes,
     p_errors,
     sample_stars,

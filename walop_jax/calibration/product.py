@@ -36,7 +36,7 @@ import numpy as np
 from astropy.io import fits
 
 from walop_jax.calibration.calibration import Calibration, ListedModel
-from walop_jax.calibration.maps import MatrixMaps, ResidualMap, matrix_names, residual_names
+from walop_jax.calibration.matrix import MatrixMaps, ResidualMap, matrix_names, residual_names
 from walop_jax.data import schema
 from walop_jax.data.calset import empty_sources
 from walop_jax.data.checks import instrument_name, make_exposures, make_filters, make_sources, oldest_version

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from walop_jax.calibration.maps import ResidualMap, residual_names
+from walop_jax.calibration.matrix import ResidualMap, residual_names
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import CALIBRATION_PLATE
 from walop_jax.data.settings import Settings

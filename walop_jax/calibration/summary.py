@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from walop_jax.calibration.maps import ResidualMap
+from walop_jax.calibration.matrix import ResidualMap
 from walop_jax.fit.misfit import Misfit
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.code import software_versions

@@ -314,13 +314,13 @@ def switch_on_jax() -> None:
     """Import JAX with float64 and with the cache of compiled code, which makes later runs start fast."""
     import jax
 
-    from walop_jax.model import kept_programs
+    from walop_jax.model import compiled
 
     jax.config.update("jax_enable_x64", True)
     folder = cache_folder()
     if folder is not None:
         with contextlib.suppress(OSError):
-            (folder / kept_programs.FOLDER).mkdir(exist_ok=True)
+            (folder / compiled.FOLDER).mkdir(exist_ok=True)
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

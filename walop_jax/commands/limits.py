@@ -59,7 +59,7 @@ def limits(
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.refit import refit
     from walop_jax.reports.diagnosis_figures import protection_figure, separation_figure
-    from walop_jax.simulation.plan_file import is_plan, read_plan
+    from walop_jax.simulation.observing_plan import is_plan, read_plan
     from walop_jax.simulation.simulate import as_planned
 
     job.begin("reading")

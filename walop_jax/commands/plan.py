@@ -72,7 +72,7 @@ def plan(
     from walop_jax.data.user_tables import read_input_table
     from walop_jax.plans.could import Could
     from walop_jax.plans.plan import plan_exposures
-    from walop_jax.simulation.plan_file import plan_text
+    from walop_jax.simulation.observing_plan import plan_text
 
     if isinstance(could, str | Path) and Path(could).is_dir():
         after, could = could, ""

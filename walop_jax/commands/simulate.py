@@ -86,7 +86,7 @@ def simulate(
     from walop_jax import Instrument
     from walop_jax.data.write import write_calibration_set
     from walop_jax.io.atomic import atomic_path, check_output
-    from walop_jax.simulation.plan_file import read_plan
+    from walop_jax.simulation.observing_plan import read_plan
     from walop_jax.simulation.simulate import effect_from_text
     from walop_jax.simulation.simulate import simulate as simulated
 

@@ -21,7 +21,6 @@ from walop_jax.data.checks import (
     make_sources,
     oldest_version,
 )
-from walop_jax.data.compression import EXTENSION, read_compression, remark
 from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
 from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.records import (
@@ -40,7 +39,7 @@ from walop_jax.data.repeats import check_repeats
 from walop_jax.data.schema import CALVERS, Place, column_names, in_unit, read_table, table_of, table_rules
 from walop_jax.data.settings import builtin_filter
 from walop_jax.data.table_intensities import TableIntensities, mask_repeats, table_intensities, usable
-from walop_jax.data.write import filter_columns, set_tables
+from walop_jax.data.write import EXTENSION, filter_columns, read_compression, remark, set_tables
 from walop_jax.io.errors import DataError, fail, nearest
 from walop_jax.io.fits_reading import UNREADABLE, OpenFile, one_line, open_fits
 

@@ -15,7 +15,7 @@ from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.rounding import value_and_error
+from walop_jax.io.text import value_and_error
 from walop_jax.model import legendre
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.change import Change

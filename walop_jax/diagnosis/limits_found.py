@@ -12,7 +12,7 @@ from jaxtyping import Float
 from walop_jax.diagnosis.examination import ALARM
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.rounding import two_digits, two_digits_range, with_minus_sign
+from walop_jax.io.text import two_digits, two_digits_range, with_minus_sign
 
 PROBABILITY = 0.99
 

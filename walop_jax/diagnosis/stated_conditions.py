@@ -48,7 +48,7 @@ from walop_jax.diagnosis.score import (
 )
 from walop_jax.fit.refit import NEARLY
 from walop_jax.fit.verdict import Hidden
-from walop_jax.io.rounding import value_and_error
+from walop_jax.io.text import value_and_error
 from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood

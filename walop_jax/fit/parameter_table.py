@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.rounding import value_and_error, with_error, with_minus_sign
+from walop_jax.io.text import value_and_error, with_error, with_minus_sign
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.specification import THROUGHPUT, Model
 

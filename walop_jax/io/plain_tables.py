@@ -16,7 +16,7 @@ from astropy.table import Table
 
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail
-from walop_jax.io.rounding import two_digits, with_error, with_minus_sign
+from walop_jax.io.text import two_digits, with_error, with_minus_sign
 
 FORMATS = {
     ".fits": "fits",

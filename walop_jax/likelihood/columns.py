@@ -28,10 +28,9 @@ from jaxtyping import Array, Float
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.engine import PointData, best_flux, point_prediction, real_counts
 from walop_jax.likelihood.flux import Sharing, project_flux, sharing
-from walop_jax.likelihood.layout import median_counts
+from walop_jax.likelihood.layout import PointReader, median_counts
 from walop_jax.likelihood.likelihood import Likelihood, used_rows
 from walop_jax.likelihood.pieces import NoColumnError, Piece, Resolver
-from walop_jax.likelihood.points import PointReader
 from walop_jax.model import light, responses
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects.base import Effect, with_amplitudes

@@ -24,10 +24,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from walop_jax.likelihood import limits, linear
-from walop_jax.likelihood.field_table import FieldTable
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.field_table import (
+    FieldTable,
+    LocalDerivatives,
+    linearised,
+    plain_positions,
+    rows_and_slopes,
+    series_positions,
+    to_all,
+)
 from walop_jax.likelihood.flux import eliminate_flux, project_flux, sharing
-from walop_jax.likelihood.linear import rows_and_slopes
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
@@ -161,7 +168,7 @@ def point_residuals(
 
 def _linear_unit_counts(
     instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None
-) -> linear.LocalDerivatives:
+) -> LocalDerivatives:
     """Counts of one point for light of unit flux, and their derivatives with respect to its local quantities."""
     to_instrument = with_values(instrument)
 
@@ -171,14 +178,14 @@ def _linear_unit_counts(
         return _unit_counts(to_instrument(all_values), plan, rows, local, point)
 
     rows, slopes = _rows_and_slopes_at(instrument, plan, point, nodes)
-    return linear.linearised(instrument, unit_counts, rows, slopes, _throughput_at(instrument, point))
+    return linearised(instrument, unit_counts, rows, slopes, _throughput_at(instrument, point))
 
 
 def unit_slopes(instrument: Instrument, plan: Plan, point: PointData) -> Float[Array, "e k n"]:
     """Derivatives of the counts of one point for light of unit flux with respect to all parameters."""
     found = _linear_unit_counts(instrument, plan, point, None)
     basis = instrument.throughput.basis(*field_sites(instrument, point))
-    return linear.to_all(instrument, found.plain, found.local, basis)
+    return to_all(instrument, found.plain, found.local, basis)
 
 
 def _point_jacobian(
@@ -201,7 +208,7 @@ def _point_jacobian(
         counts, push_detector = jax.linearize(
             lambda v, n: light.detected(to_instrument(v), plan.exposures, n), values, counts
         )
-        each = jnp.eye(values.size)[linear.plain_positions(instrument)]
+        each = jnp.eye(values.size)[plain_positions(instrument)]
         all_values = jnp.concatenate([each, jnp.zeros((throughput.size, values.size))])
         d_counts = jax.vmap(push_detector)(all_values, d_counts)
         along = push_detector(jnp.zeros_like(values), unit)
@@ -247,7 +254,7 @@ def _normal_equations(
 
 def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None) -> Normal:
     size, series, plain = (
-        values_of(instrument).size, linear.series_positions(instrument), linear.plain_positions(instrument),
+        values_of(instrument).size, series_positions(instrument), plain_positions(instrument),
     )  # fmt: skip
     chi2, gradient, gram = jax.vmap(_point_normal, in_axes=(None, None, 0, None))(
         instrument, plan, data, nodes
@@ -289,8 +296,8 @@ def _linearised_residuals(
     """All residuals and their derivatives with respect to all parameters: for tables, not for whole frames."""
     residual, local = jax.vmap(_point_jacobian, in_axes=(None, None, 0))(instrument, plan, data)
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
-    count = linear.plain_positions(instrument).size
-    slope = jax.vmap(lambda columns, at: linear.to_all(instrument, columns[:count], columns[count:], at))(
+    count = plain_positions(instrument).size
+    slope = jax.vmap(lambda columns, at: to_all(instrument, columns[:count], columns[count:], at))(
         local, basis
     )
     return residual, slope

@@ -37,16 +37,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from walop_jax.data.frames import FrameIntensities, Grid
+from walop_jax.data.frames import FrameIntensities, Grid, RawRows, RowReader, float64
 from walop_jax.data.merge import frames_among, without_frames
-from walop_jax.data.raw_rows import RawRows, RowReader, float64
 from walop_jax.data.records import Block
 from walop_jax.data.table_intensities import NEGATIVE
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.field_table import TOLERANCE, FieldTable, accurate_table, in_batches
 from walop_jax.likelihood.flux import sharing
+from walop_jax.likelihood.layout import PointReader
 from walop_jax.likelihood.likelihood import Census, DataTerms, Likelihood, OpticsUsed, Posterior
-from walop_jax.likelihood.points import PointReader
 from walop_jax.likelihood.runner import SlabSums
 from walop_jax.model import chebyshev, light
 from walop_jax.model.chebyshev import Rectangle

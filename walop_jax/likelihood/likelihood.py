@@ -14,8 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from walop_jax.data.records import CalibrationSet
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.field_table import FieldTable, accurate_nodes
-from walop_jax.likelihood.layout import Layout
-from walop_jax.likelihood.points import MeasuredPoints, measured_points
+from walop_jax.likelihood.layout import Layout, MeasuredPoints, measured_points
 from walop_jax.likelihood.runner import Runner, SlabSums
 from walop_jax.model.compiled import require_double_precision
 from walop_jax.model.dependence import optical_indices
@@ -153,7 +152,7 @@ class Likelihood:
     """The joint likelihood of one calibration set under one model.
 
     Field points are handled in chunks of equal size, so that a set larger than memory goes through the same code
-    (`likelihood/points.py`), several of them at a time (`likelihood/runner.py`). Where `layout` says so, `expand`
+    (`likelihood/layout.py`), several of them at a time (`likelihood/runner.py`). Where `layout` says so, `expand`
     and `residuals` solve the optics on Chebyshev nodes only (`likelihood/field_table.py`). Immutable: what a pass
     finds out beside its sums comes back with them (`Posterior`).
     """

@@ -1,4 +1,13 @@
-"""Compilation with the options that this code needs.
+"""Compilation with the options that this code needs, and traced programs kept on disk.
+
+JAX keeps compiled code between processes, under the text of the program; but to have the text Python must trace the
+optics with all their derivatives, which takes longer than most fits. So the text (StableHLO, `jax.export`) is kept as
+well, under what it depends on: the name of the function, the structure of its arguments with everything in it that is
+not a number (elements, effects, choices), shapes and types, the source of this package and the versions of what traces
+it. Whatever else an argument holds (a class of a user, a closure) is not kept, and neither is what cannot be exported.
+
+Programs are kept where JAX's cache folder has a folder `programs`, which the command line makes; like compiled code
+they are code: the folder must be the user's own. A file that is damaged is made again.
 
 On CPU the fusion emitters of XLA compute shared sub-expressions over and over when a derivative of the plates is
 compiled (measured with jax 0.10.2: 35 s and 9.6 s a call instead of 3 s and 0.08 s), so they are switched off
@@ -11,13 +20,163 @@ import contextlib
 import ctypes
 import functools
 import gc
-from collections.abc import Callable
+import hashlib
+import importlib.metadata
+import io
+import os
+import pickle
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
+from jax import export
 
-from walop_jax.model import kept_programs
+FOLDER = "programs"
+_DIGEST = hashlib.sha256().digest_size
+_PACKAGES = ("jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy")
+_KNOWN = ("walop_jax", "builtins", "types", "functools", "operator", "_operator", *_PACKAGES)
+_MOST = 500  # programs that are kept, those used last
+_STARTED = time.time()
+"""A source file that is younger is not the code that runs."""
+
+
+class _NotKept(Exception):
+    """A program that depends on more than its key could say."""
+
+
+def folder() -> Path | None:
+    """Where programs are kept; None where they are not."""
+    cache = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    here = Path(cache) / FOLDER if cache else None
+    return here if here is not None and here.is_dir() else None
+
+
+def program(
+    here: Path, name: str, function: Callable[..., Any], args: tuple[Any, ...], options: dict[str, Any] | None
+) -> Callable[..., Any] | None:
+    """What runs `function` on arguments like these: a kept program, or one that is kept from now on.
+
+    None where it cannot be kept.
+    """
+    leaves, tree = jax.tree.flatten(args)
+    try:
+        key = _key(name, tree.unflatten(range(tree.num_leaves)), [kind(leaf) for leaf in leaves])
+        kept = _read(here / key)
+        if kept is None:
+            kept = _traced(function, tree, leaves)
+            _write(here / key, kept)
+        exported, structure = export.deserialize(kept[0]), kept[1]
+    except Exception:  # whatever stands in the way: the call itself shows it, if it matters
+        return None
+    run, shape = jax.jit(exported.call, compiler_options=options), jax.tree.structure(structure)
+    return lambda *args: shape.unflatten(run(*jax.tree.leaves(args)))
+
+
+def answer(name: str, tree: Any, kinds: Sequence[Any], find: Callable[[], Any]) -> Any:
+    """What `find` finds, which depends on nothing but a structure and the kinds of its numbers: kept like a program."""
+    here = folder()
+    if here is None:
+        return find()
+    try:
+        path = here / _key(name, tree.unflatten(range(tree.num_leaves)), kinds)
+        kept = _read(path)
+    except Exception:  # as above
+        return find()
+    if kept is None:
+        kept = find()
+        _write(path, kept)
+    return kept
+
+
+def kind(leaf: Any) -> tuple[Any, ...]:
+    """What a program depends on of a number."""
+    seen = jax.typeof(leaf)
+    return seen.shape, str(seen.dtype), bool(seen.weak_type)
+
+
+def _traced(function: Callable[..., Any], tree: Any, leaves: Sequence[Any]) -> tuple[bytearray, Any]:
+    """The program as bytes, and the structure of its results."""
+    shapes: list[Any] = []
+
+    def flat(*leaves: Any) -> list[Any]:
+        found, shape = jax.tree.flatten(function(*tree.unflatten(leaves)))
+        shapes.append(shape)
+        return found
+
+    exported = export.export(jax.jit(flat))(*leaves)
+    return exported.serialize(), shapes[-1].unflatten(range(shapes[-1].num_leaves))
+
+
+def _key(name: str, structure: Any, kinds: Sequence[Any]) -> str:
+    text = io.BytesIO()
+    _Exact(text).dump(structure)
+    flags = os.environ.get("XLA_FLAGS", "")
+    double = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    said = repr((name, kinds, jax.default_backend(), double, flags))
+    return hashlib.sha256(_source() + said.encode() + text.getvalue()).hexdigest()
+
+
+class _Exact(pickle.Pickler):
+    """Equal bytes for equal structures, of classes and functions of this package and its libraries alone."""
+
+    def __init__(self, file: io.BytesIO) -> None:
+        super().__init__(file, protocol=5)
+        self.fast = True  # without references to what came before: these go by identity
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, type) or callable(obj):
+            module = (getattr(obj, "__module__", None) or "").partition(".")[0]
+            if module not in _KNOWN:
+                raise _NotKept(module)
+        return NotImplemented
+
+
+@functools.cache
+def _source() -> bytes:
+    """Digest of the source of this package and the versions of what traces it. Raises `_NotKept`."""
+    root = Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256(sys.version.encode())
+    for package in _PACKAGES:
+        digest.update(f"{package} {importlib.metadata.version(package)}".encode())
+    for path in sorted((*root.rglob("*.py"), *root.rglob("effects/*.toml"))):
+        if path.stat().st_mtime > _STARTED:
+            raise _NotKept(str(path))
+        digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
+    return digest.digest()
+
+
+def _read(path: Path) -> Any:
+    """What is kept under a name; None where there is nothing, or a damaged file."""
+    with contextlib.suppress(OSError):
+        content = path.read_bytes()
+        if hashlib.sha256(content[_DIGEST:]).digest() == content[:_DIGEST]:
+            os.utime(path)
+            return pickle.loads(content[_DIGEST:])
+    return None
+
+
+def _write(path: Path, found: Any) -> None:
+    """Keep something, in one step, and no more than there is room for; quietly not where the disk does not take it."""
+    content = pickle.dumps(found, protocol=5)
+    with contextlib.suppress(OSError):
+        handle, name = tempfile.mkstemp(dir=path.parent)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(hashlib.sha256(content).digest() + content)
+            os.replace(name, path)
+        except OSError:
+            os.unlink(name)
+            raise
+        for old in sorted(path.parent.iterdir(), key=lambda path: path.stat().st_mtime)[:-_MOST]:
+            old.unlink()
+
+
+# ---------------------------------------------------------------------------------------------------------- compilation
 
 Result = TypeVar("Result")
 _kept: list[dict[Any, Any]] = []  # programs that came from disk, of every compiled function
@@ -30,7 +189,7 @@ def compiled(
 
     A call with `once=True` compiles without optimisation: sooner ready, slower to run. `fuse` leaves the fusion
     emitters on, for a function without derivatives of the plates. `kept_as` is the name under which the traced program
-    is kept between processes (`kept_programs`), for a function that depends on nothing but its arguments.
+    is kept between processes (`program`), for a function that depends on nothing but its arguments.
     """
 
     def options(once: bool) -> dict[str, Any] | None:
@@ -49,13 +208,13 @@ def compiled(
 
     def kept(args: tuple[Any, ...], once: bool) -> Any:
         """The program for arguments like these, from disk where it is there; None where none is kept."""
-        here = kept_programs.folder()
+        here = folder()
         if here is None:
             return None
         leaves, tree = jax.tree.flatten(args)
-        at = tree, tuple(kept_programs.kind(leaf) for leaf in leaves), once
+        at = tree, tuple(kind(leaf) for leaf in leaves), once
         if at not in programs:
-            programs[at] = kept_programs.program(here, kept_as, function, args, options(once))
+            programs[at] = program(here, kept_as, function, args, options(once))
         return programs[at]
 
     @functools.wraps(function)

@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from walop_jax.model import kept_programs, light
+from walop_jax.model import light
+from walop_jax.model.compiled import answer
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.elements.base import Element
 from walop_jax.model.instrument import Instrument
@@ -47,7 +48,7 @@ def optical_indices(instrument: Instrument) -> tuple[int, ...]:
 @functools.lru_cache(maxsize=256)
 def _followed(structure: Any, shapes: Shapes) -> tuple[Needs, tuple[bool, ...]]:
     """What the light path asks for, and which arrays of the instrument reach the rows of its bands: in one go."""
-    return kept_programs.answer("light_path", structure, shapes, lambda: _follow(structure, shapes))
+    return answer("light_path", structure, shapes, lambda: _follow(structure, shapes))
 
 
 def _follow(structure: Any, shapes: Shapes) -> tuple[Needs, tuple[bool, ...]]:

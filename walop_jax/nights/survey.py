@@ -29,7 +29,7 @@ from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import fail
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.rounding import two_digits, value_and_error
+from walop_jax.io.text import two_digits, value_and_error
 from walop_jax.model.effects import Effect
 from walop_jax.model.laws import Law
 from walop_jax.model.specification import effect_context, with_effects

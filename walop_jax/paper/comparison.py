@@ -22,12 +22,12 @@ from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.maps import SMALLEST_DETERMINANT
+from walop_jax.calibration.matrix import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import DEFAULT_FILTER, Settings
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError
-from walop_jax.io.rounding import two_digits
+from walop_jax.io.text import two_digits
 from walop_jax.paper.polynomial import (
     PaperCalibration,
     fit_paper,

@@ -28,8 +28,7 @@ from walop_jax.data.records import CALIBRATION_PLATE
 from walop_jax.io.errors import errors_naming
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.model.parameters import unknown_name
-from walop_jax.simulation.observing_plan import EXPOSED, ObservingPlan, Stop
-from walop_jax.simulation.plan_file import is_plan, plan_of
+from walop_jax.simulation.observing_plan import EXPOSED, ObservingPlan, Stop, is_plan, plan_of
 from walop_jax.sky.moon import altitude, body_direction
 
 DARK = -12.0  # altitude of the Sun (deg) below which the sky is dark enough for Moon and stars

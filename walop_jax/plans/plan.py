@@ -21,7 +21,7 @@ from jaxtyping import Float
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.user_tables import InputTable
 from walop_jax.io.display import Display, Displayed
-from walop_jax.io.rounding import rounded as digits
+from walop_jax.io.text import rounded as digits
 from walop_jax.plans.could import Could
 from walop_jax.plans.exposures import DRAWS, Candidates, candidates, information_of
 from walop_jax.plans.optimal import (

@@ -40,8 +40,7 @@ from walop_jax.fit.verdict import STATED
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.display import Display, Result
 from walop_jax.io.errors import fail
-from walop_jax.io.rounding import two_digits
-from walop_jax.io.text import read_json
+from walop_jax.io.text import read_json, two_digits
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Effect

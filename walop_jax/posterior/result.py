@@ -27,7 +27,7 @@ from jaxtyping import Float
 from walop_jax.fit.verdict import STATED
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.rounding import value_and_error
+from walop_jax.io.text import value_and_error
 from walop_jax.posterior.samplers import Sampler, make_sampler
 from walop_jax.posterior.surrogate import Accuracy
 from walop_jax.posterior.target import INFLATION, LARGEST_SAMPLED

@@ -17,11 +17,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.maps import MatrixMaps, ResidualMap
+from walop_jax.calibration.matrix import MatrixMaps, ResidualMap
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
-from walop_jax.io.rounding import two_digits, with_minus_sign
+from walop_jax.io.text import two_digits, with_minus_sign
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.reports.style import (
     AFTER,

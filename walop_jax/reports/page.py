@@ -20,15 +20,15 @@ from walop_jax.diagnosis.findings import sentences
 from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import fail
-from walop_jax.io.rounding import (
+from walop_jax.io.text import (
     probability,
+    read_json,
     rounded,
     two_digits,
     value_and_error,
     with_error,
     with_minus_sign,
 )
-from walop_jax.io.text import read_json
 from walop_jax.reports import diagnosis_figures, figures
 from walop_jax.reports.named import FigureSource, draw
 from walop_jax.reports.posterior_figures import MOST_IN_CORNER, informed

@@ -15,7 +15,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.io.errors import DataError
-from walop_jax.io.rounding import with_minus_sign
+from walop_jax.io.text import with_minus_sign
 from walop_jax.paper.comparison import Comparison
 from walop_jax.paper.polynomial import fit_paper, fit_transmissions, polariser_states
 from walop_jax.paper.wavelength import plate_names, plate_retardances

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter, ScalarFormatter
 
-from walop_jax.calibration.maps import SMALLEST_DETERMINANT
-from walop_jax.io.rounding import with_minus_sign
+from walop_jax.calibration.matrix import SMALLEST_DETERMINANT
+from walop_jax.io.text import with_minus_sign
 
 FONT = 9
 SMALL = 7

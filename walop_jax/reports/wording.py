@@ -17,7 +17,7 @@ from jaxtyping import Float
 from walop_jax.calibration import Calibration
 from walop_jax.diagnosis.figure_data import UNNAMED
 from walop_jax.fit.parameter_table import PRIOR_ONLY
-from walop_jax.io.rounding import RAISED, probability, rounded, value_and_error, with_error, with_minus_sign
+from walop_jax.io.text import RAISED, probability, rounded, value_and_error, with_error, with_minus_sign
 from walop_jax.model.effects import EFFECTS
 from walop_jax.reports.posterior_figures import LABELS
 

@@ -25,7 +25,7 @@ from scipy import special
 
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.rounding import with_error, with_minus_sign
+from walop_jax.io.text import with_error, with_minus_sign
 from walop_jax.science.star_residuals import (
     CROWDED,
     NO_NOISE,

@@ -28,14 +28,14 @@ from scipy import special
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.maps import SMALLEST_DETERMINANT
+from walop_jax.calibration.matrix import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_file import SKY_AND_STARS, model_like
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.rounding import probability, two_digits, value_and_error, with_minus_sign
+from walop_jax.io.text import probability, two_digits, value_and_error, with_minus_sign
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.conventions import matrix_elements
 from walop_jax.model.specification import Model

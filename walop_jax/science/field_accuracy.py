@@ -18,7 +18,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import matrix_slopes, p_errors, p_forms, sample_stars
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
-from walop_jax.io.rounding import two_digits
+from walop_jax.io.text import two_digits
 from walop_jax.science.star_errors import GOAL
 
 SIZE = 31  # points along each axis of the map

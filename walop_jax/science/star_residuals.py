@@ -27,8 +27,8 @@ from jaxtyping import Bool, Float, Int
 from scipy import special
 
 from walop_jax.likelihood import limits
+from walop_jax.likelihood.field_table import through_series
 from walop_jax.likelihood.flux import Sharing, project_flux
-from walop_jax.likelihood.linear import through_series
 
 TRIMMED = 1e-3
 CROWDED = 1.5

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.rounding import two_digits, with_error, with_minus_sign
+from walop_jax.io.text import two_digits, with_error, with_minus_sign
 from walop_jax.science.catalogue_check import NOISE_MATTERS
 
 _DATE = 1e3  # times above are dates, not numbers of groups

@@ -23,7 +23,7 @@ from walop_jax.model.effects.change import AtPoint, Change, Kind, Scalar, Term, 
 from walop_jax.model.effects.factors import PLAIN
 from walop_jax.model.elements import AddedPolarisation, AirGap
 from walop_jax.model.elements.base import Element, Mueller
-from walop_jax.model.elements.polariser import Film
+from walop_jax.model.elements.simple import Film
 from walop_jax.model.instrument import Instrument, NoSuchPlaceError
 from walop_jax.model.ray import Ray
 from walop_jax.model.sources import ExposureArrays

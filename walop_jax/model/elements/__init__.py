@@ -1,11 +1,18 @@
 """The elements of a train: one class each, and `ELEMENTS`, the kinds that a description file may name."""
 
-from walop_jax.model.elements.analyser import Analyser
 from walop_jax.model.elements.base import Element
-from walop_jax.model.elements.collimator import Collimator, RadialRetarder
 from walop_jax.model.elements.geometry import FieldShift, PupilMapping, Wedge
-from walop_jax.model.elements.polariser import Polariser
-from walop_jax.model.elements.simple import AddedPolarisation, Depolariser, Diattenuator, Retarder, Rotator
+from walop_jax.model.elements.simple import (
+    AddedPolarisation,
+    Analyser,
+    Collimator,
+    Depolariser,
+    Diattenuator,
+    Polariser,
+    RadialRetarder,
+    Retarder,
+    Rotator,
+)
 from walop_jax.model.elements.spectral import FieldDiattenuator, SpectralElement
 from walop_jax.model.elements.wave_plate import AirGap, Layer, WavePlate
 

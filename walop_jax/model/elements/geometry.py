@@ -1,4 +1,19 @@
-"""Elements that change where a ray goes: the mapping from field to pupil, wedges, flexure (equations: `optics`)."""
+"""Elements that change where a ray goes: the mapping from field to pupil, wedges, flexure.
+
+Pupil       (X, Y) leaves the collimator along (tan M X′, tan M (1 + a) Y′, 1), X′ = X (1 + κ r²): M magnification,
+            κ distortion [deg⁻²], r² = X² + Y² [deg²], a aspect.
+Wedge       exact refraction at a front face with normal n = (sin w, 0, cos w) and a rear face normal to z:
+            in the glass k_g = k + (√(N² − 1 + (k·n)²) − k·n) n; behind the rear face the transverse part of k_g
+            stays. N index of the glass, w wedge angle [rad]. No loss.
+Rotation    at a face the plane of vibration follows the ray by the smallest rotation that takes the old direction to
+            the new one. Carried axes (from z to k by the smallest rotation) do not: directions a, b and z span a
+            spherical triangle, and light that goes from a to b turns by its signed area against the carried axes,
+            tan(Ω/2) = z·(a × b) / (1 + a·b + a·z + b·z). Faces normal to z add nothing.
+Source      vector form of Snell's law, Born & Wolf 1.5.1; mapping: Paper II, appendix B; rotation: Chipman, Lam &
+            Young 2018, Polarized Light and Optical Systems, ch. 17 (parallel transport); Van Oosterom & Strackee
+            1983, IEEE Trans. Biomed. Eng. 30, 125 (area).
+Limits      w = 0 leaves the direction as it is; X = Y = 0 goes along z.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +24,53 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.io.errors import nearest
-from walop_jax.model import materials, mueller, optics
+from walop_jax.model import materials, mueller
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.parameters import number
 from walop_jax.model.ray import Ray
+
+Real = Float[Array, "..."]
+
+
+def pupil_direction(
+    x: Real, y: Real, magnification: Real, distortion: Real, aspect: Real | float = 0.0
+) -> tuple[Real, Real, Real]:
+    """Unit direction behind the collimator of the field point x, y (degrees)."""
+    stretch = magnification * (1.0 + distortion * (x**2 + y**2)) * (jnp.pi / 180.0)
+    tx, ty = jnp.tan(stretch * x), jnp.tan(stretch * (1.0 + aspect) * y)
+    norm = 1.0 / jnp.sqrt(1.0 + tx**2 + ty**2)
+    return tx * norm, ty * norm, norm
+
+
+def rotated(kx: Real, ky: Real, angle: Real) -> tuple[Real, Real]:
+    """A transverse direction turned by `angle` (deg) from +X toward +Y."""
+    c, s = jnp.cos(jnp.deg2rad(angle)), jnp.sin(jnp.deg2rad(angle))
+    return c * kx - s * ky, s * kx + c * ky
+
+
+def behind_wedge(direction: tuple[Real, Real, Real], angle: Real, index: Real) -> tuple[Real, Real]:
+    """Transverse direction (sx, sy) behind a wedge of `angle` (rad) and refractive `index`."""
+    kx, ky, kz = direction
+    nx, nz = jnp.sin(angle), jnp.cos(angle)
+    incidence = kx * nx + kz * nz
+    bend = jnp.sqrt(index**2 - 1.0 + incidence**2) - incidence
+    return kx + bend * nx, ky + jnp.zeros_like(bend)
+
+
+def transport_rotation(before: tuple[Real, Real, Real], after: tuple[Real, Real, Real]) -> Real:
+    """Angle (rad, from the first carried axis to the second) by which light turns on the way between two directions."""
+    (ax, ay, az), (bx, by, bz) = before, after
+    return 2.0 * jnp.arctan2(ax * by - ay * bx, 1.0 + ax * bx + ay * by + az * bz + az + bz)
+
+
+def wedge_rotation(direction: tuple[Real, Real, Real], angle: Real, index: Real) -> Real:
+    """Angle (rad) by which the front face of a wedge turns light against the carried axes; the rear face adds none."""
+    sx, sy = behind_wedge(direction, angle, index)
+    gx, gy = sx / index, sy / index
+    return transport_rotation(direction, (gx, gy, jnp.sqrt(1.0 - gx**2 - gy**2)))
+
+
+# --------------------------------------------------------------------------------------------------------- the elements
 
 Scalar = Float[Array, ""]
 FRAMES = ("kept", "turned")
@@ -32,7 +90,7 @@ class PupilMapping(Element):
 
     def ray(self, ray: Ray) -> Ray:
         """The collimated ray."""
-        kx, ky, _ = optics.pupil_direction(
+        kx, ky, _ = pupil_direction(
             ray.x, ray.y, self.magnification, self.distortion, 0.0 if self.aspect is None else self.aspect
         )
         return ray.toward(kx, ky)
@@ -42,7 +100,7 @@ class Wedge(Element):
     """A glass wedge: exact refraction, no loss.
 
     `frame` says what becomes of the plane of vibration: `kept` in the carried axes of the rays (no rotation), or
-    `turned` with the ray at each face, as it is for light (see `optics.wedge_rotation`). `sense` −1: the other
+    `turned` with the ray at each face, as it is for light (see `wedge_rotation`). `sense` −1: the other
     way round. It bends light along +X, or along `azimuth` from +X toward +Y.
     """
 
@@ -69,14 +127,14 @@ class Wedge(Element):
 
     def ray(self, ray: Ray) -> Ray:
         """The ray behind the wedge."""
-        behind = optics.behind_wedge(self.direction(ray), self.turn, self.index(ray))
-        return ray.toward(*(behind if self.azimuth is None else optics.rotated(*behind, self.azimuth)))
+        behind = behind_wedge(self.direction(ray), self.turn, self.index(ray))
+        return ray.toward(*(behind if self.azimuth is None else rotated(*behind, self.azimuth)))
 
     def direction(self, ray: Ray) -> tuple[Float[Array, ...], Float[Array, ...], Float[Array, ...]]:
         """The direction of a ray with +X where the wedge bends light to."""
         if self.azimuth is None:
             return ray.kx, ray.ky, ray.kz
-        return *optics.rotated(ray.kx, ray.ky, -self.azimuth), ray.kz
+        return *rotated(ray.kx, ray.ky, -self.azimuth), ray.kz
 
     @property
     def turn(self) -> Scalar:
@@ -91,7 +149,7 @@ class Wedge(Element):
         """Rotation of the plane of vibration against the carried axes; None where it is kept."""
         if self.frame == "kept":
             return None
-        return mueller.rotation(-optics.wedge_rotation(self.direction(ray), self.turn, self.index(ray)))
+        return mueller.rotation(-wedge_rotation(self.direction(ray), self.turn, self.index(ray)))
 
 
 class FieldShift(Element):

@@ -1,21 +1,61 @@
-"""Elements that are one Mueller matrix: retarder, rotator, diattenuator, depolariser, polarisation of a telescope.
+"""Elements with a formula each: simple ones, the calibration polariser, lenses, analysers.
+
+Elements that are one Mueller matrix: retarder, rotator, diattenuator, depolariser, polarisation of a telescope.
 
 Sources     retarder: Paper II of WALOP-South, appendix B; diattenuator: Lu & Chipman 1996, JOSA A 13, 1106, eq. 18;
             depolariser: ibid., eq. 32, diagonal.
 Limits      all are the identity at their neutral numbers.
+
+The calibration polariser: light behind it forgets its past.
+
+Equation    light behind it (1, c cos 2θ, c sin 2θ, v), c = (1 − ε)/(1 + ε), per unit of transmitted light
+            θ = reading + zero
+Symbols     θ transmission axis in the instrument frame; ε extinction ratio, unwanted over wanted transmission;
+            v circular polarisation behind it; reading: encoder [deg]
+Source      Malus' law for a polariser of finite extinction: Goldstein 2003, Polarized Light, ch. 9.
+Limits      ε = 0 is the ideal polariser. What it does to the flux of polarised light is part of the unknown flux.
+
+Lenses that polarise weakly: diattenuation and retardance growing with the square of the field radius.
+
+Equation    diattenuation (q, u) = c r² (cos 2φ, sin 2φ) + (c_q, c_u)
+            retardance Δ = 2π (delta + slope u + bend u²) (r/0.3°)², fast axis radial, u = λ − 0.62 µm (coatings)
+Symbols     r, φ polar coordinates of the field point [deg]; c [deg⁻²]; delta in waves at 0.3°
+Source      Fresnel transmission of curved surfaces and stress of mounted lenses, both ∝ r²: Paper II of WALOP-South
+            (Maharana et al. 2022); Selbing 2010, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146.
+Limits      nothing on the axis but (c_q, c_u). Written with (1 − cos Δ)/Δ² and sin Δ/Δ, both smooth at the centre of
+            the field, Δ(cos 2φ, sin 2φ) being k (x² − y², 2xy).
+
+Analysers: where an arm ends and the beams of its cameras begin.
+
+Equation    beams of an arm ½ (1, ±η cos 2α, ±η sin 2α, 0), first camera +, with η ± ξ in the place of η
+            with a dispersion κ the first camera sees the band at λ (1 + κ), the second at λ (1 − κ), to first order:
+            M → M ± κ λ ∂M/∂λ, M the train ahead of the analyser
+            with balance g and loss l, curves over wavelength taken at the mean wavelength of a band, the beams of η = 1
+            are ½ (1 ± g) (1, ±(1 − l) cos 2α, ±(1 − l) sin 2α, 0): what differs from band to band
+Symbols     η efficiency, near 1, ξ half its difference between the beams; α axis of the first beam, from +X toward +Y;
+            κ half the relative difference of the wavelengths of the two beams
+Source      Wollaston prism as a pair of crossed analysers: Goldstein 2003, Polarized Light, ch. 9.
+Limits      no balance, no loss: as if g = l = 0
+            η = 1, α = 0 are ideal analysers along +X and +Y; κ = 0: both see the filter as it is.
 """
 
 from __future__ import annotations
 
+import abc
+from collections.abc import Sequence
 from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.model import mueller
+from walop_jax.model.conventions import FIELD_SCALE, REFERENCE_WAVELENGTH
 from walop_jax.model.elements.base import Element, Mueller
-from walop_jax.model.parameters import number
+from walop_jax.model.elements.spectral import Curve, check_curve, spline
+from walop_jax.model.parameters import Component, number
 from walop_jax.model.ray import Ray
+from walop_jax.model.sources import ExposureArrays
 
 Scalar = Float[Array, ""]
 
@@ -104,3 +144,159 @@ class AddedPolarisation(Element):
         """[[1, 0], [(q, u, 0)ᵀ, 1]]: not a physical Mueller matrix beyond first order in q and u."""
         del ray
         return jnp.eye(4).at[1, 0].add(self.q).at[2, 0].add(self.u)
+
+
+# -------------------------------------------------------------------------------------------- the calibration polariser
+
+Angles = Float[Array, " e"]
+
+
+class Film(Component):
+    """What light meets directly behind the polariser, at its angle and only when it is in."""
+
+    @abc.abstractmethod
+    def through(
+        self, light: Float[Array, "e 4"], exposures: ExposureArrays, x: Scalar, y: Scalar
+    ) -> Float[Array, "e 4"]:
+        """Stokes vectors behind it at a field point, one per exposure."""
+
+
+class Polariser(Element):
+    """A polariser whose axis is read from an encoder."""
+
+    extinction: Scalar = number(unit="", about="ε, unwanted over wanted transmission")
+    zero: Scalar | None = number(unit="deg", about="added to the encoder reading", default=None)
+    ellipticity: Scalar | None = number(unit="", about="circular polarisation behind it", default=None)
+    films: tuple[Film, ...] = ()
+
+    kind: ClassVar[str] = "polariser"
+    reference: ClassVar[str] = "Goldstein 2003, Polarized Light, ch. 9"
+
+    def axis_of(self, reading: Angles) -> Angles:
+        """Transmission axis (rad) from the encoder reading (rad)."""
+        return reading if self.zero is None else reading + jnp.deg2rad(self.zero)
+
+    def light(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e 4"]:
+        """Stokes vectors behind it at a field point, per unit of transmitted light, one per exposure."""
+        behind = mueller.polarised(self.axis_of(exposures.clp_angle), self.extinction)
+        if self.ellipticity is not None:
+            behind = behind.at[:, 3].add(self.ellipticity)
+        for film in self.films:
+            behind = film.through(behind, exposures, x, y)
+        return behind
+
+
+# --------------------------------------------------------------------------------------------------------------- lenses
+
+PAPER_II = "Maharana et al. 2022, Paper II"
+
+
+class Collimator(Element):
+    """Weak linear diattenuation: a radial part and a constant one."""
+
+    diattenuation: Scalar = number(unit="deg-2", about="c, radial diattenuation of curved lenses")
+    q: Scalar = number(unit="", about="c_q, constant part")
+    u: Scalar = number(unit="", about="c_u, constant part")
+
+    kind: ClassVar[str] = "collimator"
+    reference: ClassVar[str] = PAPER_II
+
+    def mueller(self, ray: Ray) -> Mueller:
+        """A non-depolarising diattenuator."""
+        q = self.diattenuation * (ray.x**2 - ray.y**2) + self.q
+        u = self.diattenuation * 2.0 * ray.x * ray.y + self.u
+        return mueller.diattenuator(q, u)
+
+
+class RadialRetarder(Element):
+    """Retardance with a radial fast axis, growing with the square of the field radius."""
+
+    delta: Scalar = number(unit="wave", about="retardance at 0.3° (and 0.62 µm)")
+    slope: Scalar | None = number(unit="wave/um", about="change of it with wavelength", default=None)
+    bend: Scalar | None = number(unit="wave/um2", about="the same, per square of λ − 0.62 µm", default=None)
+
+    kind: ClassVar[str] = "radial_retarder"
+    reference: ClassVar[str] = "Selbing 2010, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146"
+
+    def mueller(self, ray: Ray) -> Mueller:
+        """A linear retarder, smooth at the centre of the field."""
+        x, y, delta = ray.x, ray.y, self.delta
+        if self.slope is not None:
+            delta = delta + self.slope * (ray.wavelength - REFERENCE_WAVELENGTH)
+        if self.bend is not None:
+            delta = delta + self.bend * (ray.wavelength - REFERENCE_WAVELENGTH) ** 2
+        k = 2.0 * jnp.pi * delta / FIELD_SCALE**2
+        return mueller.general_retarder(k * (x**2 - y**2), k * 2.0 * x * y, jnp.zeros_like(k * x))
+
+
+# ------------------------------------------------------------------------------------------------------------ analysers
+
+
+class Analyser(Element):
+    """A polarising beam splitter: two beams, one for each of its cameras.
+
+    What depends on the light ahead of it (`seen`) and what does not (`shares`) are kept apart: only the first
+    enters the band integral.
+    """
+
+    efficiency: Scalar = number(unit="", about="η of the analysers ½(1, ±η, 0, 0)", default=1.0)
+    contrast: Scalar | None = number(
+        unit="", about="ξ, half the difference of the efficiencies", default=None
+    )
+    angle: Scalar | None = number(unit="deg", about="rotation of the analysers", default=None)
+    dispersion: Scalar | None = number(
+        unit="", about="κ, first beam at λ (1 + κ), second at λ (1 − κ)", default=None
+    )
+    balance: Curve | None = number(
+        unit="", about="half the relative difference of the beams at `balance_at`", default=None, several=True
+    )
+    loss: Curve | None = number(
+        unit="", about="share of the polarisation lost at `loss_at`", default=None, several=True
+    )
+    balance_at: tuple[float, ...] = eqx.field(static=True, default=())
+    loss_at: tuple[float, ...] = eqx.field(static=True, default=())
+    cameras: tuple[str, ...] = eqx.field(static=True, default=())
+
+    kind: ClassVar[str] = "analyser"
+    reference: ClassVar[str] = "Goldstein 2003, Polarized Light, ch. 9"
+
+    rows: ClassVar[int] = 2
+
+    def seen(self, mueller: Float[Array, "*n 4 4"]) -> Float[Array, "*n 2 4"]:
+        """Rows of the Mueller matrix ahead of it that the beams are made of: S0 and what is analysed."""
+        analysed = mueller[..., 1, :]
+        if self.angle is not None:
+            twice = 2.0 * jnp.deg2rad(self.angle)
+            analysed = jnp.cos(twice) * mueller[..., 1, :] + jnp.sin(twice) * mueller[..., 2, :]
+        return jnp.stack([mueller[..., 0, :], analysed], axis=-2)
+
+    def __check_init__(self) -> None:
+        check_curve("balance", self.balance, self.balance_at)
+        check_curve("loss", self.loss, self.loss_at)
+
+    def labels(self, field: str) -> Sequence[str]:
+        """Values of a curve are numbered from 1, by wavelength."""
+        knots = {"balance": self.balance_at, "loss": self.loss_at}.get(field)
+        return (field,) if knots is None else tuple(f"{field}{i + 1}" for i in range(len(knots)))
+
+    def in_band(self, rows: Float[Array, "b r 4"], wavelength: Float[Array, " b"]) -> Float[Array, "b r 4"]:
+        """Band-integrated rows of `seen` (or of their slopes) with balance and loss, at mean wavelengths (µm)."""
+        whole, analysed = rows[:, 0], rows[:, 1]
+        if self.loss is not None:
+            analysed = (1.0 - spline(self.loss_at, self.loss, wavelength))[:, None] * analysed
+        if self.balance is not None:
+            g = spline(self.balance_at, self.balance, wavelength)[:, None]
+            whole, analysed = whole + g * analysed, analysed + g * whole
+        return jnp.stack([whole, analysed], axis=1)
+
+    def shares(self) -> Float[Array, "k 2"]:
+        """What each beam takes of `seen`."""
+        half = 0.5 * jnp.ones_like(self.efficiency)
+        extra = jnp.zeros_like(half) if self.contrast is None else 0.5 * self.contrast
+        along = 0.5 * self.efficiency
+        return jnp.stack([jnp.stack([half, along + extra]), jnp.stack([half, extra - along])])
+
+    def shares_of_slopes(self) -> Float[Array, "k 2"]:
+        """What each beam takes of λ ∂/∂λ of `seen`."""
+        kappa = jnp.zeros_like(self.efficiency) if self.dispersion is None else self.dispersion
+        return self.shares() * jnp.stack([kappa, -kappa])[:, None]
