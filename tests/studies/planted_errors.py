@@ -166,7 +166,7 @@ ERRORS = (
     planted("diagnosis/variance_components.py", "first = whole - np.trace(m)", "first = whole",
             "diagnosis/test_variance_components.py"),
     planted("fit/verdict.py", "return not any(doubt.blocking", "return any(doubt.blocking", "diagnosis/test_trust.py"),
-    planted("diagnosis/mixups.py", "sign * a + offset", "sign * a - offset", "diagnosis/test_mixups.py"),
+    planted("diagnosis/alternatives.py", "sign * a + offset", "sign * a - offset", "diagnosis/test_mixups.py"),
     # paper
     planted("paper/polynomial.py", "- self.delta[:, None]", "+ self.delta[:, None]", "paper/test_polynomial.py"),
     planted("paper/polynomial.py", "(s * (1 - t), 0, 1), ((1 - s) * t, 1, 0)",
