@@ -20,7 +20,6 @@ from walop_jax.data import (
 )
 from walop_jax.data.frames import RowReader, float64
 from walop_jax.data.merge import without_frames
-from walop_jax.data.frames import RowReader, float64
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.trust import examined, pixel_structure
 from walop_jax.fit.model_file import base_model

@@ -31,7 +31,7 @@ from score_draws import alarms, noise_scores  # noqa: E402
 
 from walop_jax.calibration.matrix import change_of_qu  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
-from walop_jax.diagnosis import grammar  # noqa: E402
+from walop_jax.diagnosis import candidates  # noqa: E402
 from walop_jax.diagnosis.candidates import Probe, probes  # noqa: E402
 from walop_jax.diagnosis.detection_limits import (  # noqa: E402
     PROBABILITY,
@@ -76,8 +76,8 @@ def scores(result: FitResult, draws: int, named: int) -> dict[str, dict[str, flo
     template, calset = result.model.template, result.calset
     context = effect_context(template, calset.exposures)
     every = list(probes(EFFECTS, context))
-    said = grammar.sentences(template, calset.exposures, len(calset.points))
-    said = grammar.uncovered(said, EFFECTS, context, template)
+    said = candidates.sentences(template, calset.exposures, len(calset.points))
+    said = candidates.uncovered(said, EFFECTS, context, template)
     names = examine(result, every, np.random.default_rng(0))
     whole = examine(result, every, np.random.default_rng(0), None, said)
     p = float(np.exp(names.scorer.threshold(POLICY.alarm)))
