@@ -1,0 +1,361 @@
+"""Studies of many nights: what is found in a series, and whether what is said of it holds. The truth is sealed.
+
+    python tests/studies/nights.py quiet [--count 100]       false breaks in series of 1000 nights in which things walk
+    python tests/studies/nights.py series [--count 300]      one step or bad night each: found, dated, named
+    python tests/studies/nights.py smallest [--count 40]     the smallest step, beside ruptures and a person's rule
+    python tests/studies/nights.py stars [--count 40]        coverage over a year and of the forecast; other habits
+
+Series are linear: gradients with their noise, made from the matrices of six simulated nights of 144 points (NIGHTS,
+made when it is not there). So a series costs no optics, and what is shown is the statistics, not the linearisation.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import resource
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import numpy as np  # noqa: E402
+
+from walop_jax.calibration.calibration import Calibration  # noqa: E402
+from walop_jax.fit.model_file import base_model  # noqa: E402
+from walop_jax.fit.refit import fit  # noqa: E402
+from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
+from walop_jax.model.laws import YEAR, Law  # noqa: E402
+from walop_jax.nights import breaks, changes  # noqa: E402
+from walop_jax.nights.equations import Night, Together, night_equations, together  # noqa: E402
+from walop_jax.nights.night_file import read_nights, write_nights  # noqa: E402
+from walop_jax.nights.stacking import laws_of_all, stack  # noqa: E402
+from walop_jax.nights.survey import Survey  # noqa: E402
+from walop_jax.simulation.observing_plan import ObservingPlan  # noqa: E402
+from walop_jax.simulation.simulate import simulate, truth_values  # noqa: E402
+
+NIGHTS = Path(tempfile.gettempdir()) / "walop-nights-of-the-study.fits"
+RATE = 1e-4  # of throughputs, per √day
+LAWS = {"throughput.n?.p00": Law(("walk",), rate=RATE)}
+START = 61000.85
+CHANGING = (
+    "half1.plate.mgf2", "half2.plate.quartz", "half2.wedge", "half1.wedge", "collimator.q", "collimator.u",
+    "collimator.diattenuation", "throughput.n2.p10", "throughput.n3.p01",
+)  # fmt: skip
+"""Parameters that change in the series of `smallest` and `stars`."""
+
+
+def cpu() -> float:
+    """CPU seconds of this process."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def first_night():
+    """A night of 144 points and its truth."""
+    return simulate(ObservingPlan(), seed=1)
+
+
+@functools.cache
+def few() -> list[Night]:
+    """Six nights over six months, linearised where they truly are."""
+    if not NIGHTS.exists():
+        first, found = first_night(), []
+        for k in range(6):
+            plan = dataclasses.replace(ObservingPlan(), mjd=ObservingPlan().start + 30.0 * k)
+            calset = simulate(plan, seed=1 + k, instrument=first.truth, catalogue_seed=1).calset
+            found += night_equations(calset, base_model(calset), truth_values(first.truth))
+        write_nights(NIGHTS, found)
+    return read_nights(NIGHTS)
+
+
+@functools.cache
+def roots() -> list[np.ndarray]:
+    """R of every night with R Rᵀ its matrix."""
+    pairs = [np.linalg.eigh(night.matrix) for night in few()]
+    return [vector * np.sqrt(np.clip(value, 0.0, None)) for value, vector in pairs]
+
+
+def days_of(nights: int, rng: np.random.Generator) -> np.ndarray:
+    """Days of nights, 1.5 apart in the mean."""
+    return np.cumsum(1 + rng.poisson(0.5, nights)).astype(float)
+
+
+def walked(days: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """True values (night, parameter) from the reference: throughputs walk."""
+    names = few()[0].names
+    truth = np.zeros((len(days), len(names)))
+    for camera in (1, 2, 3):
+        steps = RATE * np.sqrt(np.diff(days, prepend=days[0])) * rng.normal(size=len(days))
+        truth[:, names.index(f"throughput.n{camera}.p00")] = np.cumsum(steps)
+    return truth
+
+
+def nights_at(truth: np.ndarray, days: np.ndarray, rng: np.random.Generator) -> list[Night]:
+    """Nights whose parameters lie at `truth` from the reference."""
+    found = []
+    for u, (away, day) in enumerate(zip(truth, days, strict=True)):
+        k, mjd = u % len(few()), START + float(day)
+        night, noise = few()[k], roots()[k] @ rng.normal(size=truth.shape[1])
+        pull = night.matrix @ away
+        chi2 = rng.chisquare(night.dof) + away @ pull - 2.0 * away @ noise
+        found.append(
+            dataclasses.replace(
+                night, number=int(mjd), begin=mjd - 0.05, end=mjd + 0.05, mjd=mjd, sha256=f"{u:064d}",
+                reference=few()[0].reference, gradient=noise - pull, chi2=float(chi2), source=f"night {u}",
+            )
+        )  # fmt: skip
+    return found
+
+
+def quiet(count: int, nights: int = 1000) -> None:
+    """False breaks, with the bound on their chance at the largest |z|; it is exact where the numbers are uniform."""
+    chances, began = [], cpu()
+    for k in range(count):
+        rng = np.random.default_rng(10_000 + k)
+        days = days_of(nights, rng)
+        data = together(nights_at(walked(days, rng), days, rng))
+        tried = breaks.Tried.of(breaks.solved(data, laws_of_all(data, LAWS)))
+        kind, cell, i = tried.largest()
+        chances.append(tried.chance(abs(float(tried.z(kind)[cell, i]))))
+        if k == 0:
+            print(f"alarm at |z| = {tried.alarm():.2f}; one series {cpu() - began:.1f} s of CPU", flush=True)
+    alarms = int(np.sum(np.array(chances) < breaks.CHANCE))
+    share = ", ".join(f"{np.mean(np.array(chances) < p):.3f} below {p}" for p in (0.05, 0.2, 0.5))
+    print(f"quiet: {alarms} of {count} series of {nights} nights with a false break; bounds: {share}")
+
+
+def information(data: Together, laws: Sequence[Law | None], i: int, first: int, last: int) -> float:
+    """Information on a change of a parameter from one night up to another."""
+    weights = np.zeros((len(data.nights), 1))
+    weights[first:last] = 1.0
+    known = changes.weighted(breaks.solved(data, laws), weights, np.array([i]))[1][0, 0]
+    return float(known / data.equations.scale[i] ** 2)
+
+
+def sealed(count: int, nights: int = 200) -> None:
+    """One change a series, of any parameter, effect or walk that the laws let be seen, of 5 to 15 standard errors."""
+    tally, began, alarm, clear = np.zeros((3, 7), int), cpu(), 0.0, np.zeros(2, int)
+    bands = ("5 to 7", "7 to 8", "8 to 15")
+    for k in range(count):
+        rng = np.random.default_rng(20_000 + k)
+        days, names = days_of(nights, rng), few()[0].names
+        truth, bad = walked(days, rng), bool(rng.random() < 0.3)
+        first = int(rng.integers(nights // 10, nights - nights // 10))
+        last = first + 1 if bad else nights
+        plain = together(nights_at(truth, days, rng))
+        laws = laws_of_all(plain, LAWS)
+        alarm = alarm or breaks.Tried.of(breaks.solved(plain, laws)).alarm()
+        known = 0.0
+        while not known > 0.0:
+            name = str(rng.choice(names))
+            known = information(plain, laws, names.index(name), first, last)
+        expected = float(rng.uniform(5.0, 15.0))
+        truth[first:last, names.index(name)] += rng.choice([-1.0, 1.0]) * expected / np.sqrt(known)
+        found, _, _ = breaks.find(together(nights_at(truth, days, rng)), laws)
+        band = 0 if expected < 7.0 else 1 if expected < 8.0 else 2
+        number = np.array([int(START + day) for day in days])
+        at = [int(np.searchsorted(number, one.night)) for one in found]
+        near = [
+            (one, abs(night - first)) for one, night in zip(found, at, strict=True)
+            if one.kind != "drift" and (abs(night - first) < 20 or name in (one.name, *one.alike))
+        ]  # fmt: skip
+        tally[band, 0] += 1
+        tally[band, 6] += len(found) - min(len(near), 1)
+        if near:
+            best, off = max(near, key=lambda pair: abs(pair[0].z))
+            right, inside = (
+                name in (best.name, *best.alike),
+                best.nights[0] <= number[first] <= best.nights[1],
+            )
+            tally[band, 1:6] += (1, off <= 1, inside, right, 1 + len(best.alike))
+            # What one night alone sees of the change, in its errors: no method dates less to a night.
+            held = 1 if bad else first * (nights - first) / nights
+            if band == 2 and expected / np.sqrt(held) > 2.5:
+                clear += (1, off <= 1)
+            if band == 2 and not (inside and right):
+                print(
+                    "  off:",
+                    name,
+                    "bad" if bad else "step",
+                    f"{expected:.1f}",
+                    first,
+                    best.name,
+                    off,
+                    f"{best.z:.1f}",
+                )
+    print(f"sealed: alarm {alarm:.2f}, {cpu() - began:.0f} s of CPU")
+    for label, row in zip(bands, tally.tolist(), strict=True):
+        total, seen, dated, inside, named, size, more = row
+        print(f"  expected z {label}: {total} series, found {seen}, date ±1 {dated}, within its nights {inside}, named "
+              f"{named} (class of {size / max(seen, 1):.1f} names), breaks that are none {more}")  # fmt: skip
+    print(f"  of 2.5 errors of a night and more: {clear[0]}, date ±1 {clear[1]}")
+
+
+def alone(night: Night) -> tuple[np.ndarray, np.ndarray]:
+    """Values and errors of the parameters of the model that one night gives, priors laid on."""
+    data = together([night])
+    solution = breaks.solved(data, laws_of_all(data, {}))
+    cut = len(data.names) - data.candidates
+    scale = data.equations.scale
+    return (solution.values[0] * scale)[:cut], (solution.errors()[0] * scale)[:cut]
+
+
+def smallest(count: int, nights: int = 200) -> None:
+    """Steps in the middle, each method at 1 % false alarms a series; the size found in half of the cases."""
+    try:
+        import ruptures
+    except ImportError:
+        ruptures = None
+        print("ruptures is not there (pip install ruptures): left out")
+    names = [name for name in CHANGING if name in few()[0].names]
+    rng = np.random.default_rng(30_000)
+
+    def tracks(truth: np.ndarray, days: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[Night]]:
+        made = nights_at(truth, days, rng)
+        every = [alone(night) for night in made]
+        return np.array([v for v, _ in every]), np.array([e for _, e in every]), made
+
+    def gain(values: np.ndarray) -> float:
+        """Of a track in its errors: what the best single step of ruptures gains in the sum of squares."""
+        cost = ruptures.costs.CostL2().fit(values[:, None])
+        where = ruptures.Dynp(custom_cost=cost, min_size=1, jump=1).fit(values[:, None]).predict(1)[0]
+        return cost.error(0, len(values)) - cost.error(0, where) - cost.error(where, len(values))
+
+    quiet_gains, jumps = [], []
+    for _ in range(count):
+        days = days_of(nights, rng)
+        values, errors, _ = tracks(walked(days, rng), days)
+        z = values / errors
+        jumps.append(np.mean(np.abs(np.diff(z, axis=0)) > 3.0 * np.sqrt(2.0), axis=0).max())
+        if ruptures is not None:
+            quiet_gains += [gain(z[:, few()[0].names.index(name)]) for name in names]
+    # 1 % a series over all parameters, as ours: the tail of a gain is that of χ².
+    single = np.sort(quiet_gains)[::-1] if quiet_gains else np.array([np.nan])
+    level = float(single[0]) if len(single) else np.nan
+    print(f"smallest: largest gain of ruptures in {len(single)} quiet tracks {level:.1f}; the 3 sigma rule has a false "
+          f"alarm in {100 * np.mean(np.array(jumps) > 0):.0f} % of quiet series")  # fmt: skip
+    middle = nights // 2
+    for name in names:
+        days = days_of(nights, rng)
+        truth = walked(days, rng)
+        i = few()[0].names.index(name)
+        plain = together(nights_at(truth, days, rng))
+        laws = laws_of_all(plain, LAWS)
+        one = 1.0 / np.sqrt(information(plain, laws, i, middle, nights))
+        alarm = breaks.Tried.of(breaks.solved(plain, laws)).alarm()
+        sigma = float(np.median(tracks(truth[:6], days[:6])[1][:, i]))
+        ours, person = alarm * one, 3.0 * np.sqrt(2.0) * sigma
+        found, theirs = [], np.nan
+        if ruptures is not None:
+            for size in np.geomspace(0.2, 3.0, 10) * sigma:
+                values = truth[:, i] + np.where(np.arange(nights) >= middle, size, 0.0)
+                hits = [gain(values / sigma + rng.normal(size=nights)) > level for _ in range(10)]
+                found.append((size, np.mean(hits)))
+            theirs = next((size for size, share in found if share >= 0.5), np.nan)
+        print(f"  {name}: ours {ours:.3g}, ruptures {theirs:.3g} ({ours / theirs:.2f}), 3 sigma between neighbours "
+              f"{person:.3g} ({ours / person:.2f})", flush=True)  # fmt: skip
+
+
+def like() -> Calibration:
+    """A calibration of the instrument of the series."""
+    calset = first_night().calset
+    return Calibration.from_fit(fit(Likelihood.of(calset, base_model(calset))).judged())
+
+
+def stars(count: int, nights: int = 243) -> None:
+    """A year with four breaks, two drifts and three bad nights: stars through it, and until the forecast ends."""
+    held, inside, beyond = like(), [], []
+    habits: dict[str, list[np.ndarray]] = {"ours": [], "average of all nights": [], "latest night": []}
+    names = few()[0].names
+    for k in range(count):
+        rng = np.random.default_rng(40_000 + k)
+        days = days_of(nights, rng)
+        later = days[-1] + np.cumsum(1.0 + np.arange(40) / 4.0)
+        truth = walked(np.concatenate([days, later]), rng)
+        moments = np.concatenate([days, later])
+        sigma = alone(few()[0])[1]
+        for j, name in enumerate(rng.permutation(CHANGING)):
+            i, at = names.index(str(name)), int(rng.integers(20, nights - 20))
+            size = rng.choice([-1.0, 1.0]) * rng.uniform(1.0, 3.0) * sigma[i]
+            if j < 4:
+                truth[at:, i] += size
+            elif j < 6:
+                truth[:, i] += size * (moments - moments[0]) / YEAR
+            else:
+                truth[at, i] += 5.0 * size
+        made = nights_at(truth[:nights], days, rng)
+        survey = stack(made, LAWS, like=held)
+        plain = stack(made, {}, like=held, find=False)
+        form = slopes_of(survey, names)
+        reference = dict(zip(names, few()[0].reference, strict=True))
+        rows = []
+        for u in range(10, nights, 3):
+            true = truth[u] - truth[0] * 0.0
+            error, z = off(survey, START + days[u], form, names, reference, true)
+            inside.append(z)
+            average, _ = off(plain, START + days[u], form, names, reference, true)
+            last = np.zeros(len(names))
+            last[: len(sigma)] = alone(made[u - 1])[0]
+            latest = np.sqrt(np.mean((form @ (last - true)) ** 2))
+            rows.append((days[u], error, average, latest))
+        for u in np.flatnonzero(START + later < survey.until):
+            beyond.append(off(survey, START + later[u], form, names, reference, truth[nights + u])[1])
+        for habit, column in zip(habits, np.array(rows).T[1:], strict=True):
+            month = np.minimum((np.array(rows)[:, 0] / 30.44).astype(int), 11)
+            habits[habit].append(np.array([np.sqrt(np.mean(column[month == m] ** 2)) for m in range(12)]))
+    for label, some in (("stars of a year", inside), ("later, up to the end of validity", beyond)):
+        z = np.abs(np.concatenate([one.ravel() for one in some])) if some else np.array([np.nan])
+        print(
+            f"stars: {label}: {100 * np.mean(z < 1):.1f} % within 1 σ, {100 * np.mean(z < 1.96):.1f} % within 1.96 σ"
+        )
+    for habit, rows in habits.items():
+        months = np.sqrt(np.nanmean(np.array(rows) ** 2, axis=0))
+        print(f"  error of p (%) by month, {habit}: {' '.join(f'{100 * one:.3f}' for one in months)}")
+
+
+def slopes_of(survey: Survey, names: Sequence[str]) -> np.ndarray:
+    """Derivatives of p (points × stars) to the parameters of the nights, along which stars are wrong."""
+    slopes, known = survey._slopes, survey._full.model.names
+    assert slopes is not None
+    found = np.zeros((slopes.shape[0] * slopes.shape[1], len(names)))
+    for k, name in enumerate(names):
+        if name in known:
+            found[:, k] = slopes[:, :, known.index(name)].ravel()
+    return found[::37]
+
+
+def off(survey, mjd, form, names, reference, true) -> tuple[float, np.ndarray]:
+    """Rms error of p at a moment, and every error of p over its standard error."""
+    value, covariance = survey.values_at(mjd)
+    order = [survey.data.names.index(name) for name in names]
+    away = value[order] - np.array([reference[name] for name in names]) - true
+    error = form @ away
+    sigma = np.sqrt(np.einsum("sn,nm,sm->s", form, covariance[np.ix_(order, order)], form, optimize=True))
+    return float(np.sqrt(np.mean(error**2))), error / sigma
+
+
+STUDIES = {"quiet": (quiet, 100), "series": (sealed, 300), "smallest": (smallest, 40), "stars": (stars, 40)}
+
+
+def main() -> None:
+    """Run one study, or all."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("study", choices=[*STUDIES, "all"])
+    parser.add_argument("--count", type=int)
+    given = parser.parse_args()
+    for name, (study, count) in STUDIES.items():
+        if given.study in (name, "all"):
+            study(given.count or count)
+
+
+if __name__ == "__main__":
+    main()
