@@ -7,6 +7,7 @@ import json
 import handmade_run
 import numpy as np
 import pytest
+from astropy.table import Table
 from html_page import Page
 
 from walop_jax.io.errors import DataError
@@ -55,6 +56,82 @@ def test_an_epoch_whose_own_fit_is_not_trusted_says_so(tmp_path):
     assert "120 % at most" in text
     assert "χ²/dof = 5.99" in text
     assert "cannot tell it from pedestal" in text
+
+
+def test_page_of_a_survey(tmp_path):
+    """How good tonight, what has changed and what was done in the order of time, each night with its own trust."""
+    found = {
+        "kind": "step",
+        "name": "half1.wedge",
+        "unit": "rad",
+        "size": -0.00123,
+        "error": 0.00004,
+        "z": -30.8,
+        "night": 61012,
+        "nights": [61011, 61013],
+        "before": 61011.9,
+        "after": 61012.9,
+        "alike": ["hwp1_axis.angle"],
+    }
+    nights = [
+        {
+            "night": 61010 + k,
+            "mjd": 61010.9 + k,
+            "chi2": 900.0 + 300 * (k == 3),
+            "dof": 900,
+            "excess": 7.1 * (k == 3),
+        }
+        for k in range(4)
+    ]
+    document = {
+        "trusted": True,
+        "nights": 4,
+        "first": 61010.85,
+        "last": 61013.95,
+        "valid_until": 61017.5,
+        "error_of_p": 0.000234,
+        "breaks": [found],
+        "events": [{"mjd": 61012.4, "what": "HWP1 remounted"}],
+        "laws": {"half1.wedge": {"per": ["step"]}},
+        "by_night": nights,
+        "advice": ["Calibrate again before MJD 61017.5."],
+        "warnings": [],
+    }
+    columns = {
+        "MJD": [n["mjd"] for n in nights],
+        "VALUE": [0.1] * 4,
+        "ERROR": [0.01] * 4,
+        "DEVIATION": [0.0] * 4,
+        "DEVIATION_ERR": [0.02] * 4,
+        "NAME": ["half1.wedge"] * 4,
+        "UNIT": ["rad"] * 4,
+    }
+    (tmp_path / "survey.json").write_text(json.dumps(document))
+    assert kind_of_run(tmp_path) == "survey"
+    text, missing = render_other(tmp_path, "survey")
+    assert ("tracks.fits" in missing[0], len(Page(text).images)) == (True, 1)
+    Table(columns).write(tmp_path / "tracks.fits")
+    page = Page(render_other(tmp_path, "survey")[0])
+    assert len(page.images) == 2
+    assert "p of a star is known to 0.023 % or better in 95 % of the field" in page.text
+    assert "Calibrate again before MJD 61017.5." in page.text
+    wanted = [
+        "61012 (61011 … 61013)",
+        "step",
+        "half1.wedge",
+        "−0.001230",
+        "0.000040",
+        "rad",
+        "−30.8",
+        "hwp1_axis.angle",
+    ]
+    assert page.row("61012 (61011 … 61013)") == wanted
+    assert page.row("61013") == ["61013", "1.333", "+7.1", "not trusted"]
+    assert page.text.index("HWP1 remounted") > page.text.index("61011 … 61013")
+    (tmp_path / "survey.json").write_text(
+        json.dumps(document | {"trusted": False, "warnings": ["χ²/dof = 3"]})
+    )
+    assert "Not trusted: the laws do not explain the nights" in render_other(tmp_path, "survey")[0]
 
 
 def test_limits_come_back_from_their_file(tmp_path):

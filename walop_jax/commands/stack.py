@@ -64,11 +64,12 @@ def stack(
             tell=lambda text: job.tell(text, "stacking"),
             catalogue=catalogue_of(effects),
         )
+        stars = (f"walop-jax apply {output} STARS.fits -o OUT.fits",) if survey.trusted else ()
         found = Outcome(
             survey,
             files=lambda: writers(survey),
             saved_as=FILES[-1],
-            next=(f"walop-jax apply {output} STARS.fits -o OUT.fits",) if survey.trusted else (),
+            next=(f"walop-jax report {output}", *stars),
             warnings=survey.verdict.warnings,
             trusted=survey.trusted,
         )

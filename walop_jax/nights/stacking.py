@@ -61,7 +61,8 @@ LONG = 60.0  # days without a night that are worth a remark
 FAR = 0.02  # standard errors from the solution beyond which a night is linearised again
 ROUNDS = 6
 REFERENCE = "reference.fits"
-FILES = (NIGHTS, REFERENCE, PRODUCT, "tracks.fits", "survey.json")
+TRACKS, SURVEY = "tracks.fits", "survey.json"
+FILES = (NIGHTS, REFERENCE, PRODUCT, TRACKS, SURVEY)
 """The files of a survey."""
 
 
@@ -218,7 +219,7 @@ def writers(survey: Survey) -> dict[str, Callable[[Path], object]]:
         NIGHTS: lambda path: write_nights(path, survey.data.aligned()),
         REFERENCE: lambda path: write_calibration(path, reference),
         PRODUCT: lambda path: write_calibration(path, last),
-        FILES[3]: lambda path: survey.tracks.write(path, format="fits"),
+        TRACKS: lambda path: survey.tracks.write(path, format="fits"),
     }
 
 
@@ -229,7 +230,7 @@ def read_survey(folder: str | os.PathLike[str], catalogue: Sequence[type[Effect]
 
 def is_survey(given: Any) -> bool:
     """Whether something is the path of a survey."""
-    return isinstance(given, str | os.PathLike) and (Path(given) / FILES[-1]).exists()
+    return isinstance(given, str | os.PathLike) and (Path(given) / SURVEY).exists()
 
 
 def calibration_of_stars(survey: Survey, stars: InputTable, *, force: bool = False) -> Calibration:
@@ -263,7 +264,7 @@ def _opened(one: Given, catalogue: Sequence[type[Effect]]) -> _Opened:
     path = one.folder if isinstance(one, Run) else Path(one)
     if path.is_dir() and (not (path / PRODUCT).exists() or (path / NIGHTS).exists()):
         fit = read_calibration(path / REFERENCE, catalogue) if (path / REFERENCE).exists() else None
-        said = read_json(path / FILES[-1]) if is_survey(path) else {"breaks": [], "events": []}
+        said = read_json(path / SURVEY) if is_survey(path) else {"breaks": [], "events": []}
         return _Opened(
             nights_in(path),
             fit=fit,

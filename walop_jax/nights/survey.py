@@ -346,7 +346,11 @@ class Survey(Displayed):
             "error_of_p": None if self._slopes is None else self.error_of_p(self.last),
             "breaks": [dataclasses.asdict(one) | {"date": one.date} for one in self.breaks],
             "events": [{"mjd": mjd, "what": what} for mjd, what in self.events],
-            "suspect_nights": [self.data.nights[u].number for u in np.flatnonzero(self.excess > SUSPECT)],
+            "by_night": [
+                {"night": one.number, "mjd": one.mjd, "chi2": float(chi2), "dof": one.dof, "excess": float(excess)}
+                for one, chi2, excess in zip(self.data.nights, self.solution.unit_chi2, self.excess, strict=True)
+            ],
+            "advice": self.advice,
             "laws": {name: law.document() for name, law in self.changing.items()},
             "parameters": {
                 p.name: {"value": float(value[k]), "sigma": float(error[k]), "unit": p.unit}

@@ -16,10 +16,11 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.findings import sentences
 from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.fit.verdict import Quality
-from walop_jax.io.errors import fail
+from walop_jax.io.errors import DataError, fail
 from walop_jax.io.text import (
     probability,
     read_json,
@@ -29,7 +30,8 @@ from walop_jax.io.text import (
     with_error,
     with_minus_sign,
 )
-from walop_jax.reports import diagnosis_figures, figures
+from walop_jax.nights.stacking import SURVEY, TRACKS
+from walop_jax.reports import diagnosis_figures, figures, survey_figures
 from walop_jax.reports.named import FigureSource, draw
 from walop_jax.reports.posterior_figures import MOST_IN_CORNER, informed
 from walop_jax.reports.run import COMPARISON, EPOCH, LIMITS, SUMMARY, RunContents, read_limits
@@ -294,11 +296,12 @@ def limits_in_words(found: DetectionLimits | None) -> dict[str, Any] | None:
 
 
 SHOWN = 24  # parameters that have moved
-KINDS = {"comparison": COMPARISON, "epoch": EPOCH, "limits": LIMITS}
+KINDS = {"comparison": COMPARISON, "epoch": EPOCH, "limits": LIMITS, "survey": SURVEY}
 NEEDED = {
     "comparison": ("on_grid", "between"),
     "epoch": ("fits", "moved", "star_errors"),
     "limits": ("probability",),
+    "survey": ("breaks", "events", "by_night", "advice"),
 }
 PICTURES = {
     "comparison_histogram.png": "Errors of q, u and p over the field, on the grid points and between them.",
@@ -334,9 +337,14 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
     for key in NEEDED[kind]:
         if key not in document:
             raise fail(f"has no {key!r}", file=path, advice="run the command that made it again")
-    words, pictures, missing = None, list[Picture](), ()
+    words, pictures, missing, rows = None, list[Picture](), (), []
     if kind == "comparison":
         pictures, missing = _of_comparison(folder)
+    elif kind == "survey":
+        rows = sorted(
+            [*document["breaks"], *document["events"]], key=lambda row: row.get("mjd", row.get("night"))
+        )
+        pictures, missing = _of_survey(folder, document)
     elif kind == "limits":
         found = read_limits(path)
         words = limits_in_words(found)
@@ -347,9 +355,27 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
         ]
     text = environment().get_template(f"{kind}.html").render(
         document=document, name=folder.resolve().name, versions={}, pictures=pictures, missing=missing,
-        shown=SHOWN, percent=two_digits, words=words,
+        shown=SHOWN, percent=two_digits, words=words, rows=rows,
     )  # fmt: skip
     return text, missing
+
+
+def _of_survey(folder: Path, document: Mapping[str, Any]) -> tuple[list[Picture], tuple[str, ...]]:
+    """Parameters against time, if they are there, and χ² of every night."""
+    found, missing = [], ()
+    try:
+        tracks = read_input_table(folder / TRACKS).table
+        drawn = survey_figures.tracks_figure(tracks, document)
+    except DataError as error:
+        drawn, missing = None, (f"Parameters against time are not drawn: {error}.",)
+    if drawn is not None:
+        caption = (
+            "Parameters that change: value under the law and its error (band), what each night would have by itself "
+            "(dots), breaks (dashed) and what was done (dotted)."
+        )
+        found.append((embedded(drawn), "Parameters against time", caption))
+    caption = "χ² of every night against its expectation, in standard deviations; the band is ±2."
+    return [*found, (embedded(survey_figures.nights_figure(document)), "χ² night by night", caption)], missing
 
 
 def _of_comparison(folder: Path) -> tuple[list[Picture], tuple[str, ...]]:

@@ -1,0 +1,68 @@
+"""Figures of a survey: parameters against time with what was found and what was done, and χ² night by night."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from walop_jax.reports.style import AFTER, BEFORE, FONT, QUIET, SMALL, empty_figure
+
+MOST = 8  # parameters in a figure
+
+
+def tracks_figure(tracks: Any, document: Mapping[str, Any]) -> Figure | None:
+    """Parameters whose law lets them change, against time; None where there is none.
+
+    The band is the value under the law with its error, dots what each night would have by itself; dashed lines are
+    breaks of that parameter, dotted ones the events that the user wrote down.
+    """
+    found = document["breaks"]
+    laws = [name for name in document["laws"] if name not in {one["name"] for one in found}]
+    names = [*dict.fromkeys(one["name"] for one in found), *laws][:MOST]
+    if not names:
+        return None
+    figure = empty_figure(6.4, 0.9 + 1.25 * len(names))
+    axes = np.ravel(figure.subplots(len(names), 1, sharex=True, squeeze=False))
+    for axis, name in zip(axes, names, strict=True):
+        rows = tracks[np.asarray(tracks["NAME"]).astype(str) == name]
+        mjd, value, error, alone, alone_error = (
+            np.asarray(rows[key], float) for key in ("MJD", "VALUE", "ERROR", "DEVIATION", "DEVIATION_ERR")
+        )
+        axis.fill_between(mjd, value - error, value + error, color=QUIET, lw=0)
+        axis.plot(mjd, value, color=AFTER, lw=1.0)
+        axis.errorbar(mjd, value + alone, alone_error, fmt="o", ms=2, lw=0.6, color=AFTER, alpha=0.6)
+        for one in found:
+            if one["name"] == name and one["kind"] != "drift":
+                axis.axvline(
+                    one["after"] if one["kind"] == "step" else one["before"], color=BEFORE, lw=0.9, ls="--"
+                )
+        _events(axis, document["events"])
+        unit = str(rows["UNIT"][0]) if len(rows) else ""
+        axis.set_ylabel(f"{name}\n{f'({unit})' if unit else ''}".strip(), fontsize=SMALL)
+        axis.tick_params(labelsize=SMALL)
+    axes[-1].set_xlabel("MJD", fontsize=FONT)
+    return figure
+
+
+def nights_figure(document: Mapping[str, Any]) -> Figure:
+    """How far χ² of every night lies from its expectation, in standard deviations."""
+    nights: Sequence[Mapping[str, Any]] = document["by_night"]
+    excess = np.array([night["excess"] for night in nights], float)
+    mjd = np.array([night["mjd"] for night in nights], float)
+    figure = empty_figure(6.4, 2.0)
+    axis = figure.subplots()
+    axis.axhspan(-2.0, 2.0, color=QUIET, lw=0)
+    axis.scatter(mjd, excess, s=6, color=np.where(excess > 5.0, BEFORE, AFTER).tolist())
+    _events(axis, document["events"])
+    axis.set_ylabel("(χ² − dof)/σ", fontsize=FONT)
+    axis.set_xlabel("MJD", fontsize=FONT)
+    axis.tick_params(labelsize=SMALL)
+    return figure
+
+
+def _events(axis: Any, events: Sequence[Mapping[str, Any]]) -> None:
+    for event in events:
+        axis.axvline(event["mjd"], color="0.4", lw=0.8, ls=":")
