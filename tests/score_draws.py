@@ -17,7 +17,7 @@ def noise_scores(space: ScoreSpace, rng: np.random.Generator, draws: int) -> np.
 
 def alarms(space: ScoreSpace, scores: np.ndarray, threshold: float) -> float:
     """Share of draws (rows) in which some candidate undercuts the threshold (ln p)."""
-    alive, smallest = space.alive(), np.zeros(len(scores))
+    alive, smallest = space.alive, np.zeros(len(scores))
     for at in space.places().values():
         chosen = np.arange(at.start, at.stop)[alive[at]]
         if len(chosen):

@@ -29,7 +29,7 @@ from walop_jax.diagnosis.candidates import Probe, probes
 from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Measured
 from walop_jax.diagnosis.examination import Evidence, Ranked, examine
 from walop_jax.diagnosis.policy import POLICY
-from walop_jax.diagnosis.score import Scorer, separations, whitening
+from walop_jax.diagnosis.score import ScoreSpace, separations, whitening
 from walop_jax.diagnosis.search import Linear, Trial, search
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
@@ -41,7 +41,7 @@ SEPARABLE = 5.0  # σ between the truth and its nearest rival above which a name
 CONFOUNDED = 2.0  # below which a class is asked for
 PLAUSIBLE = 5.0  # prior widths that a hidden amplitude may have
 DRAWS = 3000
-KEPT = 150  # scorers
+KEPT = 150  # spaces
 WITHOUT_ENTRY = 6  # scenes of one kind and ratio
 
 
@@ -199,7 +199,7 @@ class Blind:
             [SINGLE_EXPOSURES], examination.common_mode
         )
         self.evidence: Evidence = examination
-        self._scorers: dict[tuple[str, ...], Scorer] = {}
+        self._spaces: dict[tuple[str, ...], ScoreSpace] = {}
         self.free = examination.space.free
         self.visible = sorted({p.effect.name for p in self.probes if examination.table[p.name].testable})
         self._testable = {p.name for p in self.probes if examination.table[p.name].testable}
@@ -221,7 +221,7 @@ class Blind:
         shapes = [p for p in self.probes if p.effect.name == name and p.name in self._testable]
         for _ in range(100):
             probe = shapes[self.rng.integers(len(shapes))]
-            at, alive = self.places[probe.name], self.space.alive()[self.places[probe.name]]
+            at, alive = self.places[probe.name], self.space.alive[self.places[probe.name]]
             gram = self.space.gram[at, at]
             step = self.rng.standard_normal(len(alive)) * self.space.widths[at] * alive
             step *= ratio / np.sqrt(step @ gram @ step)
@@ -279,9 +279,10 @@ class Blind:
         said, parts = candidates.uncovered(*every), candidates.parts(*every)
         asked = [*(p.name for p in (*names, *said)), *(p.name for p, _ in parts), *self.patterns]
         space = self._behind_nuisance.subset(asked)
-        scorer = Scorer(space, np.random.default_rng(7), 0 if removed else DRAWS)
+        if not removed:
+            self._smallest = space.smallest_p(np.random.default_rng(7), DRAWS)
         return dataclasses.replace(
-            self.evidence, scorer=scorer, probes=names, sentences=said, parts=parts, patterns=self.patterns
+            self.evidence, space=space, probes=names, sentences=said, parts=parts, patterns=self.patterns
         )
 
     def _evidence(self, scene: Scene) -> Evidence:
@@ -290,10 +291,12 @@ class Blind:
             self._root @ scene.coordinates, float(scene.coordinates @ scene.coordinates) + scene.rest
         )
         whole, start = self._start(()), self._start(scene.removed)
-        table = whole.scorer(scores[self._behind_nuisance.chosen(whole.space.names)], square)
+        table = whole.space.table(
+            scores[self._behind_nuisance.chosen(whole.space.names)], square, self._smallest
+        )
         scores = scores[self._behind_nuisance.chosen(start.space.names)]
         if scene.removed:
-            table = start.scorer.after(table, scores)
+            table = start.space.table_after(table, scores)
         return dataclasses.replace(
             start, scores=scores, square=square, table=table, chi2=square, dof=start.space.free
         )
@@ -305,7 +308,7 @@ class Blind:
         classes: list[frozenset[str]] = []
         last = self._evidence(scene)
         first: Ranked | None = None
-        for trial, before, left in search(last, Cached(self._scorers, scene.removed), POLICY):
+        for trial, before, left in search(last, Cached(self._spaces, scene.removed), POLICY):
             last, item = left, trial.item
             assert item is not None
             first, name = first or item, item.effect.name
@@ -326,20 +329,20 @@ class Blind:
 
 
 class Cached(Linear):
-    """Steps of scenes are alike: their scorers are kept."""
+    """Steps of scenes are alike: their spaces are kept."""
 
-    def __init__(self, scorers: dict[tuple[str, ...], Scorer], removed: tuple[str, ...]) -> None:
-        self.scorers, self.added = scorers, removed
+    def __init__(self, spaces: dict[tuple[str, ...], ScoreSpace], removed: tuple[str, ...]) -> None:
+        self.spaces, self.added = spaces, removed
 
     def adopted(self, state: Evidence, trial: Trial) -> Evidence:
-        """As `Linear`, with the scorer of another scene where it went the same way."""
+        """As `Linear`, with the space of another scene where it went the same way."""
         item = trial.item
         assert item is not None
         self.added = (*self.added, item.probe.name)
-        after = state.joined(item, self.scorers.get(self.added))
-        if len(self.scorers) > KEPT:
-            self.scorers.clear()
-        self.scorers[self.added] = after.scorer
+        after = state.joined(item, self.spaces.get(self.added))
+        if len(self.spaces) > KEPT:
+            self.spaces.clear()
+        self.spaces[self.added] = after.space
         return after
 
 

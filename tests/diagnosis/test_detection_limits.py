@@ -19,7 +19,7 @@ from walop_jax.diagnosis.detection_limits import (
     detection_limits,
 )
 from walop_jax.diagnosis.examination import ALARM, Examination, examine
-from walop_jax.diagnosis.score import Scorer
+from walop_jax.diagnosis.score import effective_trials, local_p
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.instrument import Instrument
@@ -61,9 +61,9 @@ def test_every_effect_has_a_limit_or_is_named_as_beyond_these_data(found):
 
 def test_the_alarm_is_raised_with_the_stated_probability(found, examination):
     """Scores drawn with each effect at its limit: 99 % of the draws raise the alarm, at 90 % of it clearly fewer."""
-    space = examination.scorer.space
-    scorer = Scorer(space, np.random.default_rng(2))
-    threshold = scorer.threshold(ALARM)
+    space = examination.space
+    trials = effective_trials(space.smallest_p(np.random.default_rng(2)))
+    threshold = np.log(local_p(ALARM, trials))
     places, draws = space.places(), 2000
     noise = noise_scores(space, np.random.default_rng(3), draws)
     checked = 0

@@ -8,7 +8,7 @@ import pytest
 from walop_jax.diagnosis.candidates import Probe
 from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.policy import POLICY
-from walop_jax.diagnosis.score import Projector, Scorer, ScoreSpace
+from walop_jax.diagnosis.score import Projector, ScoreSpace
 from walop_jax.diagnosis.search import Linear, search
 from walop_jax.model.effects import Context, effect_by_name
 
@@ -28,14 +28,13 @@ def evidence(amplitudes, seed=1):
     residual = projector(residual)
     columns = np.asfortranarray(columns)
     space = ScoreSpace.projected(projector, [*NAMES, PATTERN], [np.full(1, 10.0)] * 4, columns)
-    scorer = Scorer(space, np.random.default_rng(0))
     scores, square = columns.T @ residual, float(residual @ residual)
     kinds = [effect_by_name(name) for name in NAMES]
     return Evidence(
-        scorer=scorer,
+        space=space,
         scores=scores,
         square=square,
-        table=scorer(scores, square),
+        table=space.table(scores, square, space.smallest_p(np.random.default_rng(0))),
         probes=[Probe(k.name, k, (dataclasses.replace(k.neutral(Context())),)) for k in kinds],
         sentences=(),
         parts=(),

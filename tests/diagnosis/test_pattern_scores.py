@@ -42,4 +42,4 @@ def test_rows_are_columns(scale, apart):
     size = np.sqrt(other.before)
     np.testing.assert_allclose(one.gram / np.outer(size, size), other.gram / np.outer(size, size), atol=1e-12)
     np.testing.assert_allclose(scores / size, expected / size, rtol=0, atol=1e-10 * np.sqrt(total))
-    np.testing.assert_array_equal(one.alive(), other.alive())
+    np.testing.assert_array_equal(one.alive, other.alive)

@@ -7,7 +7,6 @@ from scipy import stats
 from walop_jax.diagnosis.score import (
     Candidate,
     Projector,
-    Scorer,
     ScoreSpace,
     corrected_p,
     separations,
@@ -23,11 +22,12 @@ class Scoring:
         self.projector = projector
         self.columns = np.column_stack([c.columns for c in candidates])
         names, widths = [c.name for c in candidates], [c.widths for c in candidates]
-        self.scorer = Scorer(ScoreSpace.projected(projector, names, widths, self.columns), rng)
+        self.space = ScoreSpace.projected(projector, names, widths, self.columns)
+        self.smallest = self.space.smallest_p(rng)
 
     def __call__(self, residual):
         r = self.projector(residual)
-        return self.scorer(self.columns.T @ r, r @ r)
+        return self.space.table(self.columns.T @ r, r @ r, self.smallest)
 
 
 @pytest.fixture(scope="module")
@@ -129,11 +129,11 @@ def test_a_candidate_that_joins_the_base_is_as_if_it_had_always_been_there(desig
     joined = Projector(np.column_stack([base, columns["two"]]))
     left = [Candidate(name, columns[name], np.ones(columns[name].shape[1])) for name in ("one", "three")]
     direct = Scoring(joined, left, np.random.default_rng(0))(r)
-    space, reduce = scoring.scorer.space.with_base(["two"])
+    space, reduce = scoring.space.with_base(["two"])
     projected = scoring.projector(r)
     s, square = reduce(scoring.columns.T @ projected, projected @ projected)
     keep = space.chosen(["one", "three"])
-    table = Scorer(space.subset(["one", "three"]), np.random.default_rng(0))(s[keep], square)
+    table = space.subset(["one", "three"]).table(s[keep], square)
     assert space.free == joined.free
     for name in ("one", "three"):
         assert table[name].statistic == pytest.approx(direct[name].statistic, rel=1e-8)
@@ -146,7 +146,7 @@ def test_a_nuisance_of_known_width_is_the_covariance_it_adds(design):
     base, columns, scoring = design
     r = np.random.default_rng(9).standard_normal(ROWS)
     width = 0.03
-    space, reduce = scoring.scorer.space.with_base(["three"], np.full(3, width))
+    space, reduce = scoring.space.with_base(["three"], np.full(3, width))
     projected = scoring.projector(r)
     s, square = reduce(scoring.columns.T @ projected, projected @ projected)
     q = np.linalg.svd(base, full_matrices=True)[0][:, FREE:]
@@ -162,7 +162,7 @@ def test_a_nuisance_of_known_width_is_the_covariance_it_adds(design):
 def test_separation_is_the_distance_to_the_closest_change_a_rival_can_make(design):
     base, columns, scoring = design
     change = scoring.projector(columns["two"] @ np.array([2.0, 1.0]))
-    found = separations(scoring.scorer.space, scoring.columns.T @ change, change @ change)
+    found = separations(scoring.space, scoring.columns.T @ change, change @ change)
     for name, c in columns.items():
         rest = refitted(columns["two"] @ np.array([2.0, 1.0]), np.column_stack([base, c]))
         assert found[name] == pytest.approx(np.sqrt(rest), abs=1e-5)

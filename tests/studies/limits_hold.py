@@ -57,7 +57,7 @@ BELOW = 0.98
 
 def one_shape_each(examination: Examination) -> Iterator[Probe]:
     """A probe of every effect that the data can show."""
-    alive, places, seen = examination.space.alive(), examination.space.places(), set()
+    alive, places, seen = examination.space.alive, examination.space.places(), set()
     for probe in examination.probes:
         if probe.effect.name not in seen and alive[places[probe.name]].any():
             seen.add(probe.effect.name)
@@ -80,9 +80,9 @@ def scores(result: FitResult, draws: int, named: int) -> dict[str, dict[str, flo
     said = candidates.uncovered(said, EFFECTS, context, template)
     names = examine(result, every, np.random.default_rng(0))
     whole = examine(result, every, np.random.default_rng(0), None, said)
-    p = float(np.exp(names.scorer.threshold(POLICY.alarm)))
+    p = names.table.local(POLICY.alarm)
     space, full, rng = whole.space, whole.bare, np.random.default_rng(1)
-    noise, threshold = noise_scores(space, rng, draws), whole.scorer.threshold(POLICY.alarm)
+    noise, threshold = noise_scores(space, rng, draws), np.log(whole.table.local(POLICY.alarm))
     noise_in_full = noise_scores(full, rng, named)
     places = full.places()
     found: dict[str, dict[str, float]] = {}
@@ -124,7 +124,7 @@ def sets(seed: int, most: int) -> Iterator[tuple[str, float]]:
     calset = reference.calset
     every = list(probes(EFFECTS, effect_context(reference.model.template, calset.exposures)))
     names = examine(reference, every, np.random.default_rng(0))
-    p = float(np.exp(names.scorer.threshold(POLICY.alarm)))
+    p = names.table.local(POLICY.alarm)
     without = refit(simulate(PLAN, seed=seed, instrument=truth).calset)
     start = matrices_of(without.model.instrument(without.values), calset)
     bare = matrices_of(truth, calset)

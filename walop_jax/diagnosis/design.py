@@ -43,7 +43,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.polynomial.legendre import legvander
 
 from walop_jax.data.records import POLARISER, CalibrationSet, Exposures
-from walop_jax.diagnosis.score import Candidate, Projector, Scorer, ScoreSpace, ScoreTable, gram, whitening
+from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, gram, whitening
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.robust import states
 from walop_jax.likelihood import limits
@@ -442,7 +442,7 @@ def pattern_scores(design: Design, seed: int = 0) -> ScoreTable:
     found = list(strata(design.measured))
     alone = design.measured.shared.exposures is None
     space, scores, square = (_from_rows if alone else _from_columns)(design, found)
-    return Scorer(space, np.random.default_rng(seed))(scores, square)
+    return space.table(scores, square, space.smallest_p(np.random.default_rng(seed)))
 
 
 def _from_columns(design: Design, found: list[Stratum]) -> tuple[ScoreSpace, Vector, float]:

@@ -74,7 +74,7 @@ def detection_limits(
     )
     tell(Stage("differentiating every effect", "differentiating"))
     examination = examine(result, wanted, np.random.default_rng(seed))
-    p = float(np.exp(examination.scorer.threshold(POLICY.alarm)))
+    p = examination.table.local(POLICY.alarm)
     tell(Stage("comparing the effects", "comparing"))
     rivals = examination.bare.subset([probe.name for probe in examination.probes])
     columns = [c for probe in examination.probes for c in _columns(examination, rivals, probe, p)]
@@ -97,8 +97,8 @@ class _Column:
 
 def _columns(examination: Examination, rivals: ScoreSpace, probe: Probe, p: float) -> list[_Column]:
     """The amplitudes of a probe; `rivals` is the space of all effects, without what single exposures may have."""
-    space = examination.scorer.space
-    at, alive, rank = space.places()[probe.name], space.alive(), space.whitened[probe.name].shape[1]
+    space = examination.space
+    at, alive, rank = space.places()[probe.name], space.alive, space.whitened[probe.name].shape[1]
     first, found = rivals.places()[probe.name].start, []
     for number, place in enumerate(range(at.start, at.stop)):
         if not alive[place]:

@@ -32,7 +32,6 @@ from walop_jax.diagnosis.score import (
     Candidate,
     Projector,
     Score,
-    Scorer,
     ScoreSpace,
     ScoreTable,
     corrected_p,
@@ -161,13 +160,13 @@ def name_first(
 class Evidence:
     """What every candidate would explain of one set of residuals, beyond what the base parameters do.
 
-    `scorer` holds the space of all candidates behind the nuisance that single exposures may have, `scores` are C̃ᵀr and
+    `space` is that of all candidates behind the nuisance that single exposures may have, `scores` are C̃ᵀr and
     `square` r·r there. `probes` are effects, `sentences` what else can be said, `parts` sentences that are told as the
     effects that hold them (`candidates.parts`), `patterns` the names of patterns without a name. `chi2` and `dof` are
     those of the fit, `scale` the factor on the errors with which it was made.
     """
 
-    scorer: Scorer
+    space: ScoreSpace
     scores: Vector
     square: float
     table: ScoreTable
@@ -179,11 +178,6 @@ class Evidence:
     dof: int
     scale: float = 1.0
     policy: Policy = POLICY
-
-    @property
-    def space(self) -> ScoreSpace:
-        """The space that was scored."""
-        return self.scorer.space
 
     @cached_property
     def ranked(self) -> list[Ranked]:
@@ -256,7 +250,7 @@ class Evidence:
             names.remove(best.name)
             space, reduce = space.with_base([best.name])
             scores, square = reduce(scores, square)
-            table = Scorer(space, np.random.default_rng(0), draws=0).after(self.table, scores)
+            table = space.table_after(self.table, scores)
         return needed, table
 
     def patterns_needed(self) -> list[tuple[str, float]]:
@@ -291,18 +285,18 @@ class Evidence:
         probes = [probe for probe in self.probes if probe.effect is effect]
         return self.stands(probes, evidence) if probes or effect is Described else True
 
-    def joined(self, item: Ranked, scorer: Scorer | None = None) -> Evidence:
-        """The evidence once a candidate has joined the base, by a linear step."""
+    def joined(self, item: Ranked, known: ScoreSpace | None = None) -> Evidence:
+        """The evidence once a candidate has joined the base, by a linear step; `known` is the space of that."""
         space, reduce = self.space.with_base([item.probe.name])
         scores, square = reduce(self.scores, self.square)
-        scorer = scorer or Scorer(space, np.random.default_rng(0), draws=0)
+        space = known or space
         effect = item.effect
         return dataclasses.replace(
             self,
-            scorer=scorer,
+            space=space,
             scores=scores,
             square=square,
-            table=scorer.after(self.table, scores),
+            table=space.table_after(self.table, scores),
             probes=[p for p in self.probes if p.effect is not effect or effect is Described],
             sentences=[probe for probe in self.sentences if probe is not item.probe],
             parts=[(probe, {one for one in effects if one is not effect}) for probe, effects in self.parts],
@@ -518,12 +512,11 @@ def examine(
         common_mode = _common_mode(bare, design, policy.common_mode)
         space, reduce = bare.with_base([SINGLE_EXPOSURES], common_mode)
         scores, square = reduce(scores, square)
-    scorer = Scorer(space, rng)
     return Examination(
-        scorer=scorer,
+        space=space,
         scores=scores,
         square=square,
-        table=scorer(scores, square),
+        table=space.table(scores, square, space.smallest_p(rng)),
         probes=probes,
         sentences=sentences,
         parts=known,

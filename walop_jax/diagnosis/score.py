@@ -123,6 +123,10 @@ class ScoreTable:
         """p of a candidate corrected for the number of candidates tried."""
         return corrected_p(score.log_p, self.trials)
 
+    def local(self, p: float) -> float:
+        """The local p that the smallest of all candidates undercuts with probability `p` under the base."""
+        return local_p(p, self.trials)
+
 
 def corrected_p(log_p: float, trials: float) -> float:
     """Šidák correction 1 − (1 − p)^n, from ln p."""
@@ -133,6 +137,15 @@ def corrected_p(log_p: float, trials: float) -> float:
 def local_p(p: float, trials: float) -> float:
     """The local p of one of so many candidates that `corrected_p` makes `p`."""
     return float(-np.expm1(np.log1p(-p) / max(trials, 1)))
+
+
+def effective_trials(smallest: Vector) -> float:
+    """Effective number of independent candidates, from draws of ln of the smallest p."""
+    count = int(TAIL * len(smallest))
+    if not count:
+        return 1.0
+    t = -np.log1p(-np.exp(np.minimum(np.sort(smallest), -1e-12)))
+    return max(1.0, count / float(t[:count].sum() + (len(t) - count) * t[count - 1]))
 
 
 @functools.cache
@@ -159,6 +172,7 @@ class ScoreSpace:
     """The Gram matrix of all candidates behind the projection: all that the scores need of a design.
 
     `before` are the squares of the columns ahead of any projection; `free` the degrees of freedom of the residuals.
+    Nothing here depends on the residuals, so that many data sets of the same design can be scored in turn.
     """
 
     names: tuple[str, ...]
@@ -216,6 +230,7 @@ class ScoreSpace:
             self.gram[np.ix_(keep, keep)], self.free,
         )  # fmt: skip
 
+    @functools.cached_property
     def alive(self) -> Bool[np.ndarray, " _"]:
         """Amplitudes of which the base leaves something and that would stand out at a plausible size."""
         after = np.clip(np.diag(self.gram), 0.0, None)
@@ -225,7 +240,7 @@ class ScoreSpace:
     @functools.cached_property
     def whitened(self) -> Mapping[str, Matrix]:
         """By candidate its `whitening`, with no part in it of amplitudes that are not alive."""
-        alive, found = self.alive(), {}
+        alive, found = self.alive, {}
         for name, at in self.places().items():
             mask = alive[at]
             found[name] = whitening(np.where(np.outer(mask, mask), self.gram[at, at], 0.0))
@@ -236,7 +251,7 @@ class ScoreSpace:
 
         With `widths`, one for each of their amplitudes, these are nuisances that are known that well beforehand.
         """
-        place, alive = self.chosen(names), self.alive()
+        place, alive = self.chosen(names), self.alive
         inverse = np.zeros(len(place)) if widths is None else np.asarray(widths, float) ** -2
         place, inverse = place[alive[place]], inverse[alive[place]]
         w = whitening(self.gram[np.ix_(place, place)] + np.diag(inverse))
@@ -248,6 +263,66 @@ class ScoreSpace:
 
         free = self.free - (w.shape[1] if widths is None else 0)
         return dataclasses.replace(self, gram=self.gram - along @ along.T, free=free), reduce
+
+    # ------------------------------------------------------------------------------------------ scores
+
+    @functools.cached_property
+    def _root(self) -> _Root:
+        alive = self.alive
+        return _Root(np.where(np.outer(alive, alive), self.gram, 0.0))
+
+    def table_after(self, earlier: ScoreTable, scores: Vector) -> ScoreTable:
+        """The table of a space that is part of an earlier one, with the noise and the number of trials found there."""
+        noise, trials = earlier.noise_scale, earlier.trials
+        table = tuple(self._score(name, at, scores, noise) for name, at in self.places().items())
+        found = min((score.log_p for score in table if score.testable), default=0.0)
+        return ScoreTable(table, noise, corrected_p(found, trials), trials)
+
+    def table(self, scores: Vector, square: float, smallest: Vector | None = None) -> ScoreTable:
+        """The table from s = C̃ᵀr and r·r, both behind the projection; `smallest` are draws of `smallest_p`."""
+        rest = max(square - self._root.explained(scores), 0.0)
+        left = self.free - self._root.rank
+        if left < LEAST_REST * self.free:  # candidates that could explain anything say nothing of the noise
+            rest, left = square, self.free
+        noise = float(np.sqrt(rest / max(left, 1))) or 1.0
+        table = tuple(self._score(name, at, scores, noise) for name, at in self.places().items())
+        if smallest is None or not len(smallest):
+            return ScoreTable(table, noise, 1.0, 1.0)
+        found = min((score.log_p for score in table if score.testable), default=0.0)
+        trials, below = effective_trials(smallest), int(np.sum(smallest <= found))
+        often = below >= TAIL * len(smallest)
+        p = (1 + below) / (1 + len(smallest)) if often else corrected_p(found, trials)
+        return ScoreTable(table, noise, p, trials)
+
+    def _score(self, name: str, at: slice, scores: Vector, noise: float) -> Score:
+        w, alive = self.whitened[name], self.alive[at]
+        z = w.T @ np.where(alive, scores[at], 0.0)
+        statistic, rank = float(z @ z) / noise**2, w.shape[1]
+        log_p = float(stats.chi2.logsf(statistic, rank)) if rank else 0.0
+        gram = np.where(np.outer(alive, alive), self.gram[at, at], 0.0)
+        return Score(
+            name=name, statistic=statistic, rank=rank, p_value=float(np.exp(log_p)), log_p=log_p,
+            amplitudes=-w @ z, covariance=w @ w.T * noise**2,
+            log_bayes=log_bayes(gram / noise**2, np.where(alive, scores[at], 0.0) / noise**2, self.widths[at]),
+            testable=rank > 0,
+        )  # fmt: skip
+
+    def smallest_p(self, rng: np.random.Generator, draws: int = limits.NULL_DRAWS) -> Vector:
+        """ln of the smallest p among all candidates, drawn under the base."""
+        if not self._root.rank:
+            return np.zeros(0)
+        # Scores s = L n have covariance G for unit normals n. Seven digits are plenty for what is only counted.
+        root = self._root.whole
+        places = self.places()
+        maps = [root[places[name]].T @ w for name, w in self.whitened.items() if w.shape[1]]
+        normal = rng.standard_normal((draws, root.shape[1]), dtype=np.float32)
+        squares = (normal @ np.concatenate(maps, axis=1).astype(np.float32)) ** 2
+        smallest, first = np.zeros(draws), 0
+        for rank in (m.shape[1] for m in maps):
+            statistic = squares[:, first : first + rank].sum(axis=1)
+            np.minimum(smallest, _log_survival(statistic, rank), out=smallest)
+            first += rank
+        return smallest
 
 
 class _Root:
@@ -279,94 +354,6 @@ class _Root:
             return 0.0
         part = linalg.solve_triangular(self.whole[self._chosen], scores[self._chosen], lower=True)
         return float(part @ part)
-
-
-class Scorer:
-    """Candidates made ready for one design, with the distribution of the smallest p under the base.
-
-    Nothing here depends on the residuals, so that many data sets of the same design can be scored in turn.
-    """
-
-    def __init__(self, space: ScoreSpace, rng: np.random.Generator, draws: int = limits.NULL_DRAWS) -> None:
-        self.space = space
-        self._alive = space.alive()
-        self._whitening = space.whitened
-        self._smallest = self._smallest_p(rng, draws) if draws else np.zeros(0)
-
-    @functools.cached_property
-    def _root(self) -> _Root:
-        return _Root(np.where(np.outer(self._alive, self._alive), self.space.gram, 0.0))
-
-    def after(self, earlier: ScoreTable, scores: Vector) -> ScoreTable:
-        """The table of a space that is part of an earlier one, with the noise and the number of trials found there."""
-        noise, trials = earlier.noise_scale, earlier.trials
-        table = tuple(self._score(name, at, scores, noise) for name, at in self.space.places().items())
-        found = min((score.log_p for score in table if score.testable), default=0.0)
-        return ScoreTable(table, noise, corrected_p(found, trials), trials)
-
-    def threshold(self, p: float) -> float:
-        """ln of the local p that the smallest of all candidates undercuts with probability `p` under the base."""
-        return float(np.log(local_p(p, self.trials)))
-
-    @functools.cached_property
-    def trials(self) -> float:
-        """Effective number of independent candidates: 1 without draws."""
-        count = int(TAIL * len(self._smallest))
-        if not count:
-            return 1.0
-        t = -np.log1p(-np.exp(np.minimum(np.sort(self._smallest), -1e-12)))
-        return max(1.0, count / float(t[:count].sum() + (len(t) - count) * t[count - 1]))
-
-    def __call__(self, scores: Vector, square: float) -> ScoreTable:
-        """The table from s = C̃ᵀr and r·r, both behind the projection."""
-        rest = max(square - self._root.explained(scores), 0.0)
-        left = self.space.free - self._root.rank
-        if (
-            left < LEAST_REST * self.space.free
-        ):  # candidates that could explain anything say nothing of the noise
-            rest, left = square, self.space.free
-        noise = float(np.sqrt(rest / max(left, 1))) or 1.0
-        table = tuple(self._score(name, at, scores, noise) for name, at in self.space.places().items())
-        return ScoreTable(table, noise, *self._global_p(table))
-
-    def _score(self, name: str, at: slice, scores: Vector, noise: float) -> Score:
-        w, alive = self._whitening[name], self._alive[at]
-        z = w.T @ np.where(alive, scores[at], 0.0)
-        statistic, rank = float(z @ z) / noise**2, w.shape[1]
-        log_p = float(stats.chi2.logsf(statistic, rank)) if rank else 0.0
-        gram = np.where(np.outer(alive, alive), self.space.gram[at, at], 0.0)
-        return Score(
-            name=name, statistic=statistic, rank=rank, p_value=float(np.exp(log_p)), log_p=log_p,
-            amplitudes=-w @ z, covariance=w @ w.T * noise**2,
-            log_bayes=log_bayes(gram / noise**2, np.where(alive, scores[at], 0.0) / noise**2, self.space.widths[at]),
-            testable=rank > 0,
-        )  # fmt: skip
-
-    def _global_p(self, scores: Sequence[Score]) -> tuple[float, float]:
-        found = min((score.log_p for score in scores if score.testable), default=0.0)
-        if not len(self._smallest):
-            return 1.0, 1.0
-        below = int(np.sum(self._smallest <= found))
-        if below >= TAIL * len(self._smallest):
-            return (1 + below) / (1 + len(self._smallest)), self.trials
-        return corrected_p(found, self.trials), self.trials
-
-    def _smallest_p(self, rng: np.random.Generator, draws: int) -> Vector:
-        """ln of the smallest p among all candidates, drawn under the base."""
-        if not self._root.rank:
-            return np.zeros(0)
-        # Scores s = L n have covariance G for unit normals n. Seven digits are plenty for what is only counted.
-        root = self._root.whole
-        places = self.space.places()
-        maps = [root[places[name]].T @ w for name, w in self._whitening.items() if w.shape[1]]
-        normal = rng.standard_normal((draws, root.shape[1]), dtype=np.float32)
-        squares = (normal @ np.concatenate(maps, axis=1).astype(np.float32)) ** 2
-        smallest, first = np.zeros(draws), 0
-        for rank in (m.shape[1] for m in maps):
-            statistic = squares[:, first : first + rank].sum(axis=1)
-            np.minimum(smallest, _log_survival(statistic, rank), out=smallest)
-            first += rank
-        return smallest
 
 
 def log_bayes(gram: Matrix, scores: Vector, widths: Vector) -> float:

@@ -39,7 +39,6 @@ from walop_jax.diagnosis.limits_found import PROBABILITY
 from walop_jax.diagnosis.score import (
     Candidate,
     Score,
-    Scorer,
     ScoreSpace,
     ScoreTable,
     corrected_p,
@@ -372,7 +371,7 @@ def _table(
     """Scores of columns, which are projected in place, and what is left of their squares."""
     space = ScoreSpace.projected(design.projector, names, widths, columns)
     residual = design.projector(design.residual)
-    table = Scorer(space, np.random.default_rng(), draws=0)(columns.T @ residual, float(residual @ residual))
+    table = space.table(columns.T @ residual, float(residual @ residual))
     return table, np.diag(space.gram)
 
 
