@@ -16,10 +16,7 @@ from walop_jax.data.frames import Grid
 from walop_jax.data.records import InputFile, Points, Site
 from walop_jax.diagnosis.figure_data import (
     DiagnosisFigureData,
-    ExposureLabels,
-    Ladder,
     ResidualComparison,
-    Shares,
     write_figure_data,
 )
 from walop_jax.diagnosis.limits_found import DetectionLimit, DetectionLimits
@@ -137,21 +134,24 @@ def comparison(effect: str, size: float = 6.0) -> ResidualComparison:
 def figure_data(effects: tuple[str, ...] = ("clp_wobble",)) -> DiagnosisFigureData:
     return DiagnosisFigureData(
         points=Points(np.arange(9), X, Y),
-        exposures=ExposureLabels(
-            np.arange(8), np.array(["clp"] * 8), 61043.0 + 0.01 * np.arange(8), 22.5 * np.arange(8)
-        ),
-        ladder=Ladder(
-            np.array(["starting model", *effects]),
-            np.linspace(1950.25, 1234.5, len(effects) + 1),
-            np.full(len(effects) + 1, 1200),
-        ),
-        shares=Shares(
-            np.array(["camera"] * 4 + ["exposure"] * 8),
-            np.array(["O1", "E1", "O2", "E2", *(str(i) for i in range(8))]),
-            np.full(12, 100.0),
-            np.linspace(100.0, 300.0, 12),
-            np.full(12, 100.0),
-        ),
+        exposures={
+            "EXPOSURE": np.arange(8),
+            "KIND": np.array(["clp"] * 8),
+            "MJD": 61043.0 + 0.01 * np.arange(8),
+            "CLP_ANGLE": 22.5 * np.arange(8),
+        },
+        ladder={
+            "MODEL": np.array(["starting model", *effects]),
+            "CHI2": np.linspace(1950.25, 1234.5, len(effects) + 1),
+            "DOF": np.full(len(effects) + 1, 1200),
+        },
+        shares={
+            "GROUP": np.array(["camera"] * 4 + ["exposure"] * 8),
+            "MEMBER": np.array(["O1", "E1", "O2", "E2", *(str(i) for i in range(8))]),
+            "EXPECTED": np.full(12, 100.0),
+            "BEFORE": np.linspace(100.0, 300.0, 12),
+            "AFTER": np.full(12, 100.0),
+        },
         comparisons=(comparison(""), *(comparison(effect) for effect in effects)),
     )
 

@@ -42,8 +42,8 @@ def lead_from_the_first_fit_to_the_last(found):
         assert one.heldout_after == next_one.heldout_before
         np.testing.assert_array_equal(one.residual_after, next_one.residual_before)
     ladder = figure_data(found).ladder
-    assert list(ladder.model) == ["starting model", *(step.effect for step in found.steps)]
-    assert (ladder.dof[0], ladder.dof[-1]) == (found.before.dof, found.after.dof)
+    assert list(ladder["MODEL"]) == ["starting model", *(step.effect for step in found.steps)]
+    assert (ladder["DOF"][0], ladder["DOF"][-1]) == (found.before.dof, found.after.dof)
     return True
 
 
@@ -141,4 +141,4 @@ def test_what_has_no_name_is_told_without_a_name_that_could_stand_in_for_it():
     assert found.unexplained.chi2_before == pytest.approx(found.before.chi2, rel=1e-9)
     assert found.unexplained.chi2_after == found.after.chi2
     assert found.unexplained.p_value == pytest.approx(found.p_value, rel=0.5)
-    assert list(figure_data(found).ladder.model) == ["starting model", "free_form"]
+    assert list(figure_data(found).ladder["MODEL"]) == ["starting model", "free_form"]

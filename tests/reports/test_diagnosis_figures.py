@@ -48,7 +48,7 @@ def test_points_without_data_are_left_out():
 )
 def test_signature_lies_beside_the_data(harmonic, abscissa):
     data = handmade_run.figure_data()
-    out = dataclasses.replace(data.exposures, clp_angle=np.full(8, np.nan))
+    out = {**data.exposures, "CLP_ANGLE": np.full(8, np.nan)}
     one = dataclasses.replace(data.comparisons[1], harmonic=harmonic)
     figure = figures.signature_figure(one, data.exposures if harmonic > 0 else out, data.cameras)
     assert figure.axes[4].get_xlabel() == abscissa
@@ -65,7 +65,7 @@ def test_exposures_at_one_angle_are_averaged():
     data = handmade_run.figure_data()
     angle = np.repeat([0.0, 45.0, 90.0, 135.0], 2)
     figure = figures.signature_figure(
-        data.comparisons[1], dataclasses.replace(data.exposures, clp_angle=angle), data.cameras
+        data.comparisons[1], {**data.exposures, "CLP_ANGLE": angle}, data.cameras
     )
     dots = figure.axes[0].containers[0].lines[0]
     np.testing.assert_allclose(

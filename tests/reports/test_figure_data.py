@@ -86,6 +86,9 @@ def test_they_come_back_from_their_file(tmp_path):
             a, b = getattr(one, field.name), getattr(other, field.name)
             if dataclasses.is_dataclass(a):
                 same(a, b)
+            elif isinstance(a, dict):
+                for name in a:
+                    np.testing.assert_array_equal(a[name], b[name])
             elif isinstance(a, tuple):
                 for first, second in zip(a, b, strict=True):
                     same(first, second)

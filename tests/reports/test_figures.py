@@ -83,11 +83,11 @@ def test_figures_of_a_diagnosis_hold_its_residuals(fitted):
     made = figure_data(found)
     before, after = (likelihood.residuals(values)[1] for values in (likelihood.model.start, result.values))
     for group in ("camera", "kind", "filter", "exposure"):
-        rows = made.shares.group == group
-        assert made.shares.before[rows].sum() == pytest.approx((before**2).sum())
-        assert made.shares.after[rows].sum() == pytest.approx((after**2).sum())
-        assert made.shares.expected[rows].sum() == pytest.approx(3.0 * likelihood.used.sum())
-    assert made.ladder.chi2.tolist() == [result.chi2]
+        rows = made.shares["GROUP"] == group
+        assert made.shares["BEFORE"][rows].sum() == pytest.approx((before**2).sum())
+        assert made.shares["AFTER"][rows].sum() == pytest.approx((after**2).sum())
+        assert made.shares["EXPECTED"][rows].sum() == pytest.approx(3.0 * likelihood.used.sum())
+    assert made.ladder["CHI2"].tolist() == [result.chi2]
     (whole,) = made.comparisons
     rows = likelihood.used.sum(axis=1)[:, None]
     np.testing.assert_allclose(whole.rms_after**2 * rows, (after**2).sum(axis=1), rtol=1e-9)

@@ -36,7 +36,7 @@ from typing import Any
 
 import numpy as np
 from astropy.io import fits
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Shaped
 
 from walop_jax.data.records import Exposures, Points
 from walop_jax.data.schema import Column, Place, read_table
@@ -53,8 +53,9 @@ FIGURE_DATA = "diagnosis.fits"
 DIAGVERS = 1
 """Version of the file format that is written, and the newest that is read."""
 
-Names = Shaped[np.ndarray, " _"]
-Vector = Float[np.ndarray, " _"]
+Table = Mapping[str, Shaped[np.ndarray, " _"]]
+"""Columns of a table by name."""
+
 PointMap = Float[np.ndarray, "p k"]
 Curve = Float[np.ndarray, "e k"]
 
@@ -107,29 +108,6 @@ _TABLES: Mapping[str, Mapping[str, tuple[Column, str]]] = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Ladder:
-    """χ² and degrees of freedom of the starting model and of every model after it; `model` says what joined."""
-
-    model: Names
-    chi2: Vector
-    dof: Int[np.ndarray, " _"]
-
-
-@dataclasses.dataclass(frozen=True)
-class Shares:
-    """Sums of squared residuals by group (camera, kind, filter, exposure) and member of the group.
-
-    `expected` is what noise alone gives; `before` and `after` are of the starting and the final model.
-    """
-
-    group: Names
-    member: Names
-    expected: Vector
-    before: Vector
-    after: Vector
-
-
-@dataclasses.dataclass(frozen=True)
 class ResidualComparison:
     """Residuals without and with something, as maps over the field and as curves over the exposures.
 
@@ -162,29 +140,22 @@ class ResidualComparison:
 
 
 @dataclasses.dataclass(frozen=True)
-class ExposureLabels:
-    """What the exposures of the curves are: id, kind, MJD (d) and polariser angle (deg; NaN: out)."""
-
-    exposure: Int[np.ndarray, " e"]
-    kind: Shaped[np.ndarray, " e"]
-    mjd: Float[np.ndarray, " e"]
-    clp_angle: Float[np.ndarray, " e"]
-
-
-@dataclasses.dataclass(frozen=True)
 class DiagnosisFigureData:
-    """Everything that `diagnosis.fits` holds; `comparisons[0]` is of the starting and the final model."""
+    """Everything that `diagnosis.fits` holds; `comparisons[0]` is of the starting and the final model.
+
+    `ladder` and `shares` are the tables of these names, `exposures` the columns of CURVES that say which they are.
+    """
 
     points: Points
-    exposures: ExposureLabels
-    ladder: Ladder
-    shares: Shares
+    exposures: Table
+    ladder: Table
+    shares: Table
     comparisons: tuple[ResidualComparison, ...]
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """Names of the cameras, in the order of the columns."""
-        return tuple(str(name) for name in self.shares.member[self.shares.group == "camera"])
+        return tuple(str(name) for name in self.shares["MEMBER"][self.shares["GROUP"] == "camera"])
 
 
 def write_figure_data(
@@ -207,20 +178,17 @@ def write_figure_data(
         sign_and_write(hdus, temporary)
 
 
-def _columns(data: DiagnosisFigureData) -> dict[str, dict[str, np.ndarray]]:
+def _columns(data: DiagnosisFigureData) -> dict[str, Mapping[str, np.ndarray]]:
     points, exposures, all_of = data.points, data.exposures, data.comparisons
     count, many = len(all_of), np.arange(len(all_of))
 
     def stacked(name: str) -> np.ndarray:
         return np.concatenate([getattr(one, name) for one in all_of])
 
-    def record(rows: Ladder | Shares) -> dict[str, np.ndarray]:
-        return {f.name.upper(): getattr(rows, f.name) for f in dataclasses.fields(rows)}
-
     maps = ("before", "after", "explained", "mean_before", "mean_after", "rms_before", "rms_after")
     return {
-        "LADDER": record(data.ladder),
-        "SHARES": record(data.shares),
+        "LADDER": data.ladder,
+        "SHARES": data.shares,
         "COMPARISONS": {
             "COMPARISON": many,
             "EFFECT": np.array([one.effect for one in all_of]),
@@ -233,11 +201,8 @@ def _columns(data: DiagnosisFigureData) -> dict[str, dict[str, np.ndarray]]:
             **{name.upper(): stacked(name) for name in maps},
         },
         "CURVES": {
-            "COMPARISON": np.repeat(many, len(exposures.exposure)),
-            **{
-                field.name.upper(): np.tile(getattr(exposures, field.name), count)
-                for field in dataclasses.fields(exposures)
-            },
+            "COMPARISON": np.repeat(many, len(exposures["EXPOSURE"])),
+            **{name: np.tile(values, count) for name, values in exposures.items()},
             **{n.upper(): stacked(f"curve_{n}") for n in ("before", "error", "after", "explained")},
         },
     }
@@ -286,11 +251,9 @@ def _figure_data(tables: Mapping[str, Mapping[str, Any]]) -> DiagnosisFigureData
     first, rows = field["COMPARISON"] == 0, curves["COMPARISON"] == 0
     return DiagnosisFigureData(
         points=Points(*(field[name][first] for name in ("POINT", "X", "Y"))),
-        exposures=ExposureLabels(
-            *(curves[name][rows] for name in ("EXPOSURE", "KIND", "MJD", "CLP_ANGLE")),
-        ),
-        ladder=Ladder(**{name.lower(): values for name, values in tables["LADDER"].items()}),
-        shares=Shares(**{name.lower(): values for name, values in tables["SHARES"].items()}),
+        exposures={name: curves[name][rows] for name in ("EXPOSURE", "KIND", "MJD", "CLP_ANGLE")},
+        ladder=tables["LADDER"],
+        shares=tables["SHARES"],
         comparisons=tuple(comparisons),
     )
 
@@ -337,7 +300,12 @@ def figure_data(diagnosis: Diagnosis) -> DiagnosisFigureData:
     angle = np.where(exposures.clp_in, exposures.clp_angle, np.nan)
     return DiagnosisFigureData(
         points=final.calset.points,
-        exposures=ExposureLabels(exposures.exposure, exposures.kind, exposures.mjd, angle),
+        exposures={
+            "EXPOSURE": exposures.exposure,
+            "KIND": exposures.kind,
+            "MJD": exposures.mjd,
+            "CLP_ANGLE": angle,
+        },
         ladder=_ladder(diagnosis),
         shares=_shares(final.likelihood, before, after),
         comparisons=tuple(
@@ -425,7 +393,7 @@ def _best_phase(cube: Cube, waves: list[Weight]) -> float:
     return 0.5 * float(np.arctan2(2.0 * np.sum(cosine * sine), np.sum(cosine**2) - np.sum(sine**2)))
 
 
-def _ladder(diagnosis: Diagnosis) -> Ladder:
+def _ladder(diagnosis: Diagnosis) -> Table:
     """Starting model, every addition, and the final fit where it is another one than that of the last addition."""
     final = diagnosis.after
     dof, rungs = diagnosis.before.dof, [("starting model", diagnosis.before.chi2, diagnosis.before.dof)]
@@ -436,10 +404,10 @@ def _ladder(diagnosis: Diagnosis) -> Ladder:
     if abs(final.chi2 - rungs[-1][1]) > 1e-6 * final.chi2:
         rungs.append((UNNAMED if _unnamed_term(diagnosis) else "final fit", final.chi2, final.dof))
     model, chi2, freedom = zip(*rungs, strict=True)
-    return Ladder(np.array(model), np.array(chi2, float), np.array(freedom, int))
+    return {"MODEL": np.array(model), "CHI2": np.array(chi2, float), "DOF": np.array(freedom, int)}
 
 
-def _shares(likelihood: Likelihood, before: Cube, after: Cube) -> Shares:
+def _shares(likelihood: Likelihood, before: Cube, after: Cube) -> Table:
     """Sums of squared residuals by camera, kind, filter and exposure."""
     e = likelihood.calset.exposures
     names = likelihood.model.template.cameras.names
@@ -455,4 +423,4 @@ def _shares(likelihood: Likelihood, before: Cube, after: Cube) -> Shares:
         for member in np.unique(label):
             members.append((group, str(member)))
             sums.append([float(square[label == member].sum()) for square in squares])
-    return Shares(*np.array(members).T, *np.array(sums).T)
+    return dict(zip(_TABLES["SHARES"], (*np.array(members).T, *np.array(sums).T), strict=True))

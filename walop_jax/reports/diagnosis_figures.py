@@ -20,7 +20,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator, NullLocator
 
 from walop_jax.data.records import Points
-from walop_jax.diagnosis.figure_data import ExposureLabels, Ladder, PointMap, ResidualComparison, Shares
+from walop_jax.diagnosis.figure_data import PointMap, ResidualComparison, Table
 from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.reports.style import (
@@ -139,9 +139,7 @@ def _spacing(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> float:
     return float(np.median(nearest)) if nearest.size else 0.05
 
 
-def signature_figure(
-    comparison: ResidualComparison, exposures: ExposureLabels, cameras: Sequence[str]
-) -> Figure:
+def signature_figure(comparison: ResidualComparison, exposures: Table, cameras: Sequence[str]) -> Figure:
     """Residuals averaged over the field, camera by camera: data as dots, what the effect explains as a line.
 
     Against the polariser angle where the comparison shows a harmonic of it, or most of its signal is behind the
@@ -180,8 +178,8 @@ def signature_figure(
     return figure
 
 
-def _against_angle(comparison: ResidualComparison, exposures: ExposureLabels) -> bool:
-    behind = np.isfinite(exposures.clp_angle)
+def _against_angle(comparison: ResidualComparison, exposures: Table) -> bool:
+    behind = np.isfinite(exposures["CLP_ANGLE"])
     if comparison.harmonic >= 0 or not behind.any():
         return comparison.harmonic >= 0
     power = np.nansum(
@@ -191,17 +189,17 @@ def _against_angle(comparison: ResidualComparison, exposures: ExposureLabels) ->
     return bool(power[behind].sum() > 0.5 * power.sum())
 
 
-def _abscissa(exposures: ExposureLabels, angular: bool) -> tuple[Float[np.ndarray, " e"], str]:
+def _abscissa(exposures: Table, angular: bool) -> tuple[Float[np.ndarray, " e"], str]:
     if angular:
-        return exposures.clp_angle, "polariser angle (deg)"
+        return exposures["CLP_ANGLE"], "polariser angle (deg)"
     hours = (
-        24.0 * (exposures.mjd - np.nanmin(exposures.mjd))
-        if np.isfinite(exposures.mjd).any()
-        else exposures.mjd
+        24.0 * (exposures["MJD"] - np.nanmin(exposures["MJD"]))
+        if np.isfinite(exposures["MJD"]).any()
+        else exposures["MJD"]
     )
     if np.isfinite(hours).all() and np.ptp(hours) > 0:
         return hours, "time since the first exposure (h)"
-    return exposures.exposure.astype(float), "exposure"
+    return exposures["EXPOSURE"].astype(float), "exposure"
 
 
 def _binned(x: Float[np.ndarray, " e"], *columns: Float[np.ndarray, " e"]) -> list[Float[np.ndarray, " b"]]:
@@ -216,17 +214,17 @@ def _binned(x: Float[np.ndarray, " e"], *columns: Float[np.ndarray, " e"]) -> li
     return means
 
 
-def ladder_figure(ladder: Ladder, names: Sequence[str] | None = None) -> Figure:
+def ladder_figure(ladder: Table, names: Sequence[str] | None = None) -> Figure:
     """χ² per degree of freedom of the starting model and of every model after it, on a logarithmic scale.
 
     The band is where χ²/dof lies (5 standard deviations) when the model explains the data. `names` replace those
     of the rungs.
     """
-    names = [*ladder.model] if names is None else [*names]
+    names = [*ladder["MODEL"]] if names is None else [*names]
     names = [names[0], *(name if name == "final fit" else f"+ {name}" for name in names[1:])]
-    ratio = ladder.chi2 / np.maximum(ladder.dof, 1)
+    ratio = ladder["CHI2"] / np.maximum(ladder["DOF"], 1)
     place = np.arange(len(ratio))
-    width = EXPLAINS * np.sqrt(2.0 / max(int(ladder.dof[-1]), 1))
+    width = EXPLAINS * np.sqrt(2.0 / max(int(ladder["DOF"][-1]), 1))
     figure = empty_figure(7.0, 0.8 + 0.38 * len(ratio))
     axis = figure.subplots()
     axis.axvspan(max(1.0 - width, 1e-3), 1.0 + width, color="0.88", lw=0, zorder=0)
@@ -265,22 +263,24 @@ def _plain_ticks(axis: Axis) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def shares_figure(shares: Shares) -> Figure:
+def shares_figure(shares: Table) -> Figure:
     """Mean squared residual by camera, kind, filter and exposure, over what noise alone gives: before and after."""
-    groups = [g for g in ("camera", "kind", "filter") if np.count_nonzero(shares.group == g) > 1]
-    widths = [np.count_nonzero(shares.group == g) + 1.0 for g in groups]
+    groups = [g for g in ("camera", "kind", "filter") if np.count_nonzero(shares["GROUP"] == g) > 1]
+    widths = [np.count_nonzero(shares["GROUP"] == g) + 1.0 for g in groups]
     figure = empty_figure(8.6, 2.7)
     axes = figure.subplots(1, len(groups) + 1, width_ratios=[*widths, max(12.0, sum(widths))], sharey=True)
-    before, after = (values / np.maximum(shares.expected, 1e-300) for values in (shares.before, shares.after))
+    before, after = (
+        values / np.maximum(shares["EXPECTED"], 1e-300) for values in (shares["BEFORE"], shares["AFTER"])
+    )
     for axis, group in zip(axes, [*groups, "exposure"], strict=True):
-        rows = np.flatnonzero(shares.group == group)
+        rows = np.flatnonzero(shares["GROUP"] == group)
         place = np.arange(len(rows))
         if group == "exposure":
             # Members are texts; the exposures follow each other by their number.
-            rows = rows[np.argsort(shares.member[rows].astype(int), kind="stable")]
-            place = shares.member[rows].astype(int)
+            rows = rows[np.argsort(shares["MEMBER"][rows].astype(int), kind="stable")]
+            place = shares["MEMBER"][rows].astype(int)
         else:
-            axis.set_xticks(place, shares.member[rows])
+            axis.set_xticks(place, shares["MEMBER"][rows])
             axis.set_xlim(-0.6, len(rows) - 0.4)
         axis.axhline(1.0, color="0.5", lw=0.8, zorder=0)
         size = 5 if group != "exposure" else 3.5

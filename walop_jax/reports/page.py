@@ -169,7 +169,7 @@ def _ladder(run: RunContents) -> list[dict[str, Any]]:
     if run.figure_data is None:
         return []
     ladder, rows, before = run.figure_data.ladder, [], math.nan
-    for model, chi2, dof in zip(ladder.model, ladder.chi2, ladder.dof, strict=True):
+    for model, chi2, dof in zip(ladder["MODEL"], ladder["CHI2"], ladder["DOF"], strict=True):
         rows.append({"model": str(model), "chi2": float(chi2), "dof": int(dof), "gain": before - float(chi2)})
         before = float(chi2)
     return rows
