@@ -150,6 +150,7 @@ CASES = {
     "compare": Case(lambda g: (g.calset,), lambda g, **k: walop.compare(g.calset, **k), "RUN", True),
     "report": Case(lambda g: (g.run,), lambda g, **k: walop.report(g.run, **k), "page.html", True),
     "plot": Case(lambda g: (g.run, "matrix"), lambda g, **k: walop.plot(g.run, "matrix", **k), "m.png", True),
+    "commission": Case(lambda g: (g.calset,), lambda g, **k: walop.commission(g.calset, **k), "RUN", True),
     "matrix": Case(
         lambda g: (g.run, "--points", g.points),
         lambda g, **k: walop.matrix(g.run, points=g.points, **k),

@@ -114,11 +114,11 @@ def nights_at(truth: np.ndarray, days: np.ndarray, rng: np.random.Generator) -> 
     return found
 
 
-def quiet(count: int, nights: int = 1000) -> None:
+def quiet(count: int, start: int = 0, nights: int = 1000) -> None:
     """False breaks, with the bound on their chance at the largest |z|; it is exact where the numbers are uniform."""
     chances, began = [], cpu()
     for k in range(count):
-        rng = np.random.default_rng(10_000 + k)
+        rng = np.random.default_rng(10_000 + start + k)
         days = days_of(nights, rng)
         data = together(nights_at(walked(days, rng), days, rng))
         tried = breaks.Tried.of(breaks.solved(data, laws_of_all(data, LAWS)))
@@ -139,12 +139,12 @@ def information(data: Together, laws: Sequence[Law | None], i: int, first: int, 
     return float(known / data.equations.scale[i] ** 2)
 
 
-def sealed(count: int, nights: int = 200) -> None:
+def sealed(count: int, start: int = 0, nights: int = 200) -> None:
     """One change a series, of any parameter, effect or walk that the laws let be seen, of 5 to 15 standard errors."""
     tally, began, alarm, clear = np.zeros((3, 7), int), cpu(), 0.0, np.zeros(2, int)
     bands = ("5 to 7", "7 to 8", "8 to 15")
     for k in range(count):
-        rng = np.random.default_rng(20_000 + k)
+        rng = np.random.default_rng(20_000 + start + k)
         days, names = days_of(nights, rng), few()[0].names
         truth, bad = walked(days, rng), bool(rng.random() < 0.3)
         first = int(rng.integers(nights // 10, nights - nights // 10))
@@ -207,7 +207,7 @@ def alone(night: Night) -> tuple[np.ndarray, np.ndarray]:
     return (solution.values[0] * scale)[:cut], (solution.errors()[0] * scale)[:cut]
 
 
-def smallest(count: int, nights: int = 200) -> None:
+def smallest(count: int, start: int = 0, nights: int = 200) -> None:
     """Steps in the middle, each method at 1 % false alarms a series; the size found in half of the cases."""
     try:
         import ruptures
@@ -215,7 +215,7 @@ def smallest(count: int, nights: int = 200) -> None:
         ruptures = None
         print("ruptures is not there (pip install ruptures): left out")
     names = [name for name in CHANGING if name in few()[0].names]
-    rng = np.random.default_rng(30_000)
+    rng = np.random.default_rng(30_000 + start)
 
     def tracks(truth: np.ndarray, days: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[Night]]:
         made = nights_at(truth, days, rng)
@@ -269,13 +269,13 @@ def like() -> Calibration:
     return Calibration.from_fit(fit(Likelihood.of(calset, base_model(calset))).judged())
 
 
-def stars(count: int, nights: int = 243) -> None:
+def stars(count: int, start: int = 0, nights: int = 243) -> None:
     """A year with four breaks, two drifts and three bad nights: stars through it, and until the forecast ends."""
     held, inside, beyond = like(), [], []
     habits: dict[str, list[np.ndarray]] = {"ours": [], "average of all nights": [], "latest night": []}
     names = few()[0].names
     for k in range(count):
-        rng = np.random.default_rng(40_000 + k)
+        rng = np.random.default_rng(40_000 + start + k)
         days = days_of(nights, rng)
         later = days[-1] + np.cumsum(1.0 + np.arange(40) / 4.0)
         truth = walked(np.concatenate([days, later]), rng)
@@ -351,10 +351,11 @@ def main() -> None:
     )
     parser.add_argument("study", choices=[*STUDIES, "all"])
     parser.add_argument("--count", type=int)
+    parser.add_argument("--start", type=int, default=0, help="number of the first series")
     given = parser.parse_args()
     for name, (study, count) in STUDIES.items():
         if given.study in (name, "all"):
-            study(given.count or count)
+            study(given.count or count, given.start)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ COMMANDS = {
     "inspect": "Say what is in calibration sets and what is wrong with them.",
     "simulate": "Make a calibration set of an instrument whose as-built values are drawn from their priors.",
     "refit": "Fit all field points of calibration sets jointly.",
+    "commission": "Make a calibration of a night's exposures and say go or no-go, with what is missing.",
     "compress": "Make of whole frames a calibration set of some hundred field points that says the same.",
     "clip": "Flag single intensities that lie far from a fit of all others.",
     "diagnose": "Say what is missing from the model, add it, and fit again.",

@@ -1,0 +1,66 @@
+"""Go or no-go: each requirement missed by itself, and what is told then."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from small_run import small_fit
+
+from walop_jax.science.commissioning import commissioning
+from walop_jax.science.field_accuracy import FieldAccuracy
+
+FIELD = np.linspace(1e-4, 4.9e-4, 100).reshape(10, 10)  # median 2.95e-4
+
+
+def accuracy(**changes):
+    plain = FieldAccuracy(
+        FIELD, (-0.3, 0.3, -0.3, 0.3), "SDSS-r", limited_by="the sky (70 % of the variance)"
+    )
+    return dataclasses.replace(plain, **changes)
+
+
+def test_a_go():
+    found = commissioning(small_fit(), accuracy(hidden=2e-4, hidden_by="the filter"))
+    assert found.go
+    assert "go" in found.display().title
+    assert "p known to 0.050 % in 95 % of the field" in found.display().text()
+    # Eight angles and a set of 25 points: told, and no reason against it.
+    assert all(one.met for one in found.requirements if one.needed)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        # (8.85·10⁻⁴/5·10⁻⁴)² = 3.13 times the light for half of the goal in half of the field.
+        ({"error": 3.0 * FIELD}, "0.088 %, most of it from the sky: 3.1 times the light"),
+        ({"error": FIELD + 1e-2}, "times the light"),
+    ],
+)
+def test_a_no_go(change, words):
+    found = commissioning(small_fit(), accuracy(**change))
+    assert not found.go
+    assert "NO GO" in found.display().title
+    assert words in found.missing[0]
+    assert found.document()["go"] is False
+
+
+def test_what_is_not_trusted_is_no_go():
+    bad = small_fit().judged(["the residuals hold patterns"])
+    assert commissioning(small_fit().remarked("a remark"), accuracy()).go
+    assert not commissioning(bad, accuracy()).go
+    assert "diagnose" in commissioning(bad, accuracy()).missing[0]
+
+
+def test_mistakes_that_could_hide_are_told_but_forbid_nothing():
+    found = commissioning(
+        small_fit(), accuracy(hidden=3e-3, hidden_by="the scale of X and Y (wrong by 0.02)")
+    )
+    assert found.go
+    assert any("off by 0.30 %" in text and "field positions" in text for text in found.missing)
+
+
+def test_the_edge_of_the_field_is_told():
+    """1.6 · 2.95·10⁻⁴ in half of the field, 1.6 · 4.7·10⁻⁴ in 95 % of it: a go, and more nights are advised."""
+    found = commissioning(small_fit(), accuracy(error=1.6 * FIELD))
+    assert found.go
+    assert any(text.startswith("0.075 %") and "walop-jax stack" in text for text in found.missing)
