@@ -56,11 +56,11 @@ def test_print_command_and_page_say_the_same(found: Diagnosis, call, calset_file
     page = html.unescape((run / "report.html").read_text())
     for text in (
         "turn of polariser: 0.100 ± 0.010 deg, growing with X (amplitude at 0.3°)",
-        "these data cannot tell it from clp_zero, a step of the polariser in exposure 4",
-        "to tell them apart: a polarised standard",
+        "these data cannot distinguish it from clp_zero, a step of the polariser in exposure 4",
+        "what would: a polarised standard",
         "equally consistent with camera = 2",
         "added as a free-form term (gain): χ² 1000.0 → 900.0",
-        "these data cannot tell hwp1_axis from hwp2_axis; to tell them apart: stars in the other half",
+        "these data cannot distinguish hwp1_axis from hwp2_axis; what would: stars in the other half",
         "cannot be tested with these data: etalon",
         "χ² 2000.0 → 1000.0",
     ):

@@ -73,7 +73,7 @@ def test_a_run_that_is_interrupted_goes_on_where_it_was(frames, large, tmp_path)
     with pytest.raises(StopError):
         refit(frames, output=tmp_path / "cut", progress=stop)
     assert stop.told[0] == "reading"
-    assert stop.told[1].startswith("preparing the fit; data will take ")
+    assert stop.told[1].startswith("preparing the fit")
     assert [entry.name for entry in (tmp_path / "cut").iterdir()] == ["partial"]
     told: list[str] = []
     again = refit(frames, output=tmp_path / "cut", progress=told.append)

@@ -134,7 +134,7 @@ def _(made: Handmade) -> None:
         entry[2] = entry[2][order]
 
 
-@row("19", "no times", "F", "MJD: no such column")
+@row("19", "no times", "F", "MJD: column missing")
 def _(made: Handmade) -> None:
     made.values(E, "KIND")[6] = "flux"
     del made[E]["MJD"]

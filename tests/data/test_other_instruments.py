@@ -298,8 +298,8 @@ def test_an_element_that_another_file_lacks_is_out(two_cameras):
     np.testing.assert_array_equal(e.position("HWP").angle, np.tile(first.position("HWP").angle, 2))
     assert np.flatnonzero(e.clp_in).tolist() == [8]
     remarks = read_calibration_set(one, two).remarks
-    assert any("two.fits [EXPOSURES] RET_1_ANGLE: no such column, taken as out" in r for r in remarks)
-    assert any("one.fits [EXPOSURES] K_ANGLE: no such column, taken as out" in r for r in remarks)
+    assert any("two.fits [EXPOSURES] RET_1_ANGLE: column missing; taken as out" in r for r in remarks)
+    assert any("one.fits [EXPOSURES] K_ANGLE: column missing; taken as out" in r for r in remarks)
 
 
 def test_other_numbers_of_cameras_are_not_merged(two_cameras):

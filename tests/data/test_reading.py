@@ -94,7 +94,7 @@ def test_optional_columns_may_be_absent(handmade):
     assert not np.any(calset.exposures.chwp_in)
     assert set(calset.exposures.filter.tolist()) == {"SDSS-r"}
     assert len(calset.remarks) == 8
-    assert any("[EXPOSURES] TEFF: no such column" in remark for remark in calset.remarks)
+    assert any("[EXPOSURES] TEFF: column missing" in remark for remark in calset.remarks)
 
 
 def test_unknown_columns_and_extensions_are_remarked_on(handmade):

@@ -81,8 +81,8 @@ def unpolarised(simulated: Simulated) -> CalibrationSet:
 Spoil = Callable[[CalibrationSet], CalibrationSet]
 CASES: dict[str, tuple[Spoil, str]] = {
     "the arms exchanged": (lambda c: with_data(c, (2, 3, 0, 1)), "their order is O1, E1, O2, E2"),
-    "the beams of an arm exchanged": (lambda c: with_data(c, (1, 0, 2, 3)), "hold the cameras E1, O1, O2, E2"),
-    "cameras in a ring": (lambda c: with_data(c, (1, 2, 3, 0)), "hold the cameras E1, O2, E2, O1"),
+    "the beams of an arm exchanged": (lambda c: with_data(c, (1, 0, 2, 3)), "in the order E1, O1, O2, E2"),
+    "cameras in a ring": (lambda c: with_data(c, (1, 2, 3, 0)), "in the order E1, O2, E2, O1"),
     "the polariser runs backwards": (lambda c: with_angle(c, clp_angle=-c.exposures.clp_angle), "give −CLP_ANGLE"),
     "polariser + 90": (lambda c: with_angle(c, clp_angle=c.exposures.clp_angle + 90), r"give CLP_ANGLE \+ 90°"),
     "polariser + 45": (lambda c: with_angle(c, clp_angle=c.exposures.clp_angle + 45), r"give CLP_ANGLE \+ 135°"),

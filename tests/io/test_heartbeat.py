@@ -15,7 +15,7 @@ def test_silence_is_broken_and_ends_with_the_work():
         say("next")
     count = len(told)
     assert told[0] == "compiling"
-    assert told[1].startswith("compiling (for 0 s")
+    assert told[1].startswith("compiling, 0 s so far")
     assert 3 <= told.index("next") <= 5
     time.sleep(0.3)
     assert len(told) == count

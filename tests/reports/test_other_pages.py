@@ -55,7 +55,7 @@ def test_an_epoch_whose_own_fit_is_not_trusted_says_so(tmp_path):
     assert "The new data are not explained" in text
     assert "120 % at most" in text
     assert "χ²/dof = 5.99" in text
-    assert "cannot tell it from pedestal" in text
+    assert "cannot distinguish it from pedestal" in text
 
 
 def test_page_of_a_survey(tmp_path):
@@ -160,7 +160,7 @@ def test_limits_of_the_same_data_stand_beside_the_accuracy(tmp_path):
     handmade_run.make_limits(handmade_run.make_refit(tmp_path))
     accuracy = FieldAccuracy(np.full((4, 4), 0.001), (-0.2, 0.2, -0.2, 0.2), "band")
     page = Page(render(read_run(tmp_path), accuracy))
-    assert "No single effect of the catalogue" in page.text
+    assert "An effect too weak to be detected" in page.text
     assert "clp_zero.angle" in page.text
     handmade_run.make_limits(tmp_path, sha256="cd" * 32)
     found = read_run(tmp_path)

@@ -71,7 +71,7 @@ def test_verdict_and_what_was_found(diagnosed):
     assert (
         "The starting model does not explain these data (χ²/dof = 1.625, p = 2.1 × 10⁻⁷). They are consistent with "
         "clp_wobble (error of the polariser's encoder, once per turn: amplitude = 0.0613 ± 0.0012 deg), with which "
-        "χ²/dof is 1.029. They cannot tell clp_wobble from camera_gain_drift."
+        "χ²/dof is 1.029. They cannot distinguish clp_wobble from camera_gain_drift."
     ) in text
     assert "Would be separated by: polariser angles over a full turn." in text
     assert "caused by" not in text
@@ -144,7 +144,7 @@ def test_unexplained_and_unknown_names(tmp_path):
     )
     page = Page(render(read_run(run)))
     assert "patterns <without> a name (p < 10⁻¹⁵)" in page.text
-    assert "free_form (patterns without a name: 40 parameters)" in " ".join(page.text.split())
+    assert "free_form (unidentified patterns: 40 parameters)" in " ".join(page.text.split())
     assert page.row("vectors_7")[1] == "0.70"
     assert len(page.images) == 9  # two steps (the second of a kind that has no name), rms over all exposures
 

@@ -17,7 +17,7 @@ SET = "walop_south_small.fits"
 FOLDER = Option("Folder to write.", "FOLDER", Path, "-o")
 
 
-@command(stages=("reading", "fitting", "mapping"), writes=())
+@command(stages=("reading", "fitting", "examining", "mapping"), writes=())
 def demo(job: Job, *, output: Annotated[PathLike, FOLDER] = "walop-jax-demo") -> Outcome[FitResult]:
     """Fit the small calibration set that comes with the package, and write the page about it.
 

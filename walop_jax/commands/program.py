@@ -319,20 +319,21 @@ def progress(quiet: bool, stages: Sequence[str] = ()) -> Iterator[Callable[[str]
     console = Console(stderr=True)
     numbered = step_counter(stages)
     if not console.is_terminal:
-        began = told = time.monotonic()
+        told = time.monotonic()
 
         def line(message: str) -> None:
             nonlocal told
             now, text = time.monotonic(), numbered(message)
             if now - told >= LINE_EVERY:
                 told = now
-                typer.echo(f"{now - began:.0f} s: {text}", err=True)
+                typer.echo(f"{seconds_since_start():.0f} s: {text}", err=True)
 
         yield line
         return
     columns = (SpinnerColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False))
     with Progress(*columns, console=console, transient=True) as shown:
         task = shown.add_task("", total=None)
+        shown.tasks[0].start_time = shown.get_time() - seconds_since_start()
         yield lambda message: shown.update(task, description=numbered(message))
 
 

@@ -35,7 +35,7 @@ ProcessesOption = Option(
 )
 
 
-@command(stages=("reading", "fitting", "mapping"), writes=())
+@command(stages=("reading", "fitting", "examining", "mapping"), writes=())
 def refit(
     job: Job,
     data: Sets,
@@ -72,6 +72,7 @@ def refit(
     from walop_jax.fit.misfit import describe
     from walop_jax.fit.refit import refit as fit
     from walop_jax.io.atomic import atomic_path, remove
+    from walop_jax.io.progress import Stage
     from walop_jax.io.text import json_text
     from walop_jax.science.field_accuracy import answered
 
@@ -90,6 +91,7 @@ def refit(
                 fitted = fit(
                     calset, chosen, folder=kept, progress=say, memory=in_bytes(memory), processes=crew
                 )
+                say(Stage("looking for patterns in the residuals", "examining"))
                 result = answered(examined(fitted))
             wanted = output is not None
             mapped = wanted and result.likelihood.layout.large and result.converged

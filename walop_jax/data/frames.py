@@ -101,7 +101,10 @@ class Cube:
                 target = memoryview(plane).cast("B")
                 if file.readinto(target) != len(target):
                     raise fail(
-                        "ends too early", file=self.path, extension=self.extension, advice="start again"
+                        "the file is truncated",
+                        file=self.path,
+                        extension=self.extension,
+                        advice="read it again",
                     )
 
     def _check_stamp(self) -> None:
@@ -110,7 +113,7 @@ class Cube:
         except OSError as error:
             raise fail(f"cannot be read: {error}", file=self.path, extension=self.extension) from error
         if (now.st_size, now.st_mtime_ns) != self.stamp:
-            raise fail("the file has changed since it was opened", file=self.path, advice="start again")
+            raise fail("the file has changed since it was opened", file=self.path, advice="read it again")
 
     def rows(self, start: int, stop: int) -> Float[np.ndarray, "e y x"]:
         """Read some rows of all planes; undefined integers (BLANK) become NaN.

@@ -262,7 +262,7 @@ def _about_angles(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]
         yield Finding(
             "doubt",
             f"only {number} polariser angles",
-            "with fewer than 8, errors of the polariser look like errors of the instrument",
+            "with fewer than 8, polariser errors cannot be told from instrument errors",
         )
     if np.ptp(np.mod(e.clp_angle[e.clp_in], 360.0)) < 180.0:
         yield Finding(

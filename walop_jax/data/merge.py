@@ -201,7 +201,7 @@ def _join_exposures(sets: tuple[CalibrationSet, ...]) -> tuple[Exposures, list[s
         absent = {prefix: Position.out(len(e)) for prefix in prefixes if prefix not in e.moving}
         if absent:
             names = ", ".join(f"{prefix}_ANGLE" for prefix in absent)
-            remarks.append(f"{_name(entry)} [EXPOSURES] {names}: no such column, taken as out of the beam")
+            remarks.append(f"{_name(entry)} [EXPOSURES] {names}: column missing; taken as out of the beam")
         parts.append(dataclasses.replace(e, moving={**e.moving, **absent}).columns())
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return Exposures.from_columns(columns | {"EXPOSURE": ids}), remarks

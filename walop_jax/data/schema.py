@@ -306,7 +306,7 @@ def read_table(hdu: Any, columns: Mapping[str, Column], place: Place) -> tuple[d
         else:
             table[name] = np.full(rows, column.missing)
             if column.remarked:
-                remarks.append(place.remark(f"no such column, {column.missing} taken", name))
+                remarks.append(place.remark(f"column missing; using {column.missing}", name))
     return table, remarks
 
 

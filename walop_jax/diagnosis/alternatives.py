@@ -95,7 +95,9 @@ def mixups_of(result: FitResult) -> tuple[Alternative, ...]:
 def refusal(result: FitResult, found: Sequence[Alternative]) -> DataError:
     """The error of data that other readings explain."""
     reasons = "; or if ".join(str(one) for one in found)
-    return DataError(f"the data do not fit (χ²/dof = {result.chi2 / result.dof:.3g}), and would if {reasons}")
+    return DataError(
+        f"the model does not fit (χ²/dof = {result.chi2 / result.dof:.3g}); it would if {reasons}"
+    )
 
 
 def mixups(calset: CalibrationSet, model: Model, left: float) -> tuple[Alternative, ...]:
@@ -199,7 +201,7 @@ def _orders(model: Model) -> Iterator[Alternative]:
     for order in orders:
         held = ", ".join(names[k] for k in np.argsort(order))
         yield Alternative(
-            f"the columns of N hold the cameras {held}",
+            f"the columns of N were in the order {held}",
             f"their order is {', '.join(names)}",
             lambda calset, order=order: _with_cameras(calset, list(order)),
         )

@@ -385,7 +385,7 @@ def sentences(found: Mapping[str, Any]) -> Iterator[str]:
         yield f"{one['change']}: χ² {sense} by {abs(one['better_by']):.4g}"
     for alike in found.get("classes", ()):
         yield (
-            f"these data cannot tell {alike['effect']} from {', '.join(alike['equivalent'])}; to tell them apart: "
+            f"these data cannot distinguish {alike['effect']} from {', '.join(alike['equivalent'])}; what would: "
             f"{alike['separated_by']}"
         )
     if found.get("cannot_be_tested"):
@@ -415,9 +415,9 @@ def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
         )
     rivals = (*step.get("equivalent", ()), *step.get("nameless", ()))
     if rivals:
-        yield f"{name}: these data cannot tell it from {', '.join(rivals)}"
+        yield f"{name}: these data cannot distinguish it from {', '.join(rivals)}"
     if rivals and step.get("separated_by"):
-        yield f"to tell them apart: {step['separated_by']}"
+        yield f"what would: {step['separated_by']}"
 
 
 def document(diagnosis: Diagnosis) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import two_digits, two_digits_range, with_minus_sign
 
+NO_LEVEL = "q and u cannot both be measured with one exposure"
 PROBABILITY = 0.99
 
 Vector = Float[np.ndarray, " _"]
@@ -179,11 +180,13 @@ class DetectionLimits(Displayed):
             )
             for entry in self.conditions
         )
-        notes = (f"cannot be seen in these data: {', '.join(self.untestable)}",) if self.untestable else ()
+        notes = (
+            (f"cannot be detected in these data: {', '.join(self.untestable)}",) if self.untestable else ()
+        )
         return Display(
             title="What these data can show, with 99 % probability",
-            facts=(("protection level", self.protection_in_words() or "one exposure does not give q and u"),),
-            head=("amplitude", ">detected", ">named", "unit", ">error of q, u (%)", "may be taken for"),
+            facts=(("protection level", self.protection_in_words() or NO_LEVEL),),
+            head=("amplitude", ">detected", ">named", "unit", ">error of q, u (%)", "can be mistaken for"),
             rows=rows,
             notes=notes,
         )
@@ -195,10 +198,10 @@ class DetectionLimits(Displayed):
             return ""
         x, y = (with_minus_sign(f"{value:+.2f}°") for value in (self.x[worst], self.y[worst]))
         return (
-            f"no single effect of the catalogue can make q or u of a star with p ≤ 5 % wrong by more than "
-            f"{two_digits(100 * self.protection[worst])} % without being detected "
-            f"({two_digits(100 * float(np.nanmedian(self.protection)))} % in the median of the field); "
-            f"the largest would be {self.caused_by[worst]} at ({x}, {y})"
+            f"an effect too weak to be detected could still bias q or u by "
+            f"{two_digits(100 * float(np.nanmedian(self.protection)))} % (median over the field, stars with p ≤ 5 %; "
+            f"{two_digits(100 * self.protection[worst])} % at worst); the worst case is {self.caused_by[worst]} "
+            f"at ({x}, {y})"
         )
 
     @property

@@ -273,4 +273,4 @@ def _groups(design: Design) -> Iterator[str]:
         odd.sort(key=lambda s: -abs(np.log(max(s.ratio, 1e-12))))
         listed = ", ".join(f"{s.name} {s.ratio:.3g}" for s in odd[:_SHOWN])
         more = f" and {len(odd) - _SHOWN} more" if len(odd) > _SHOWN else ""
-        yield f"squared residuals differ between parts of the data, beside those of the rest: {listed}{more}"
+        yield f"some parts of the data scatter more than the rest (mean squared residual): {listed}{more}"

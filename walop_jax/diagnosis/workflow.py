@@ -364,7 +364,7 @@ class Refit(Linear):
             # Errors that are a few per cent too small are no effect: nothing but their size is wrong.
             if not state.alarm and (self.fit.explains_data or self.fit.nearly_explains_data):
                 return state, None
-            self.tell("something without a name is left")
+            self.tell("an unidentified residual remains")
             if not parts and (parts := self._parts(first)):
                 dropped = True
                 continue
@@ -484,18 +484,18 @@ def unexplained(state: Examination, patterns: tuple[tuple[str, float], ...]) -> 
     """What an examination leaves without a name: its patterns, and where the residuals sit."""
     if not state.alarm:
         ratio = state.chi2 / state.dof
-        text = f"residuals scatter more than N_ERR says (χ²/dof = {ratio:.3g}) without any pattern that was looked for"
+        text = f"residuals scatter more than N_ERR says (χ²/dof = {ratio:.3g}) without a known pattern"
     elif patterns:
-        text = f"patterns without a name: {'; '.join(f'{name} (p = {p:.1g})' for name, p in patterns)}"
+        text = f"unidentified patterns: {'; '.join(f'{name} (p = {p:.1g})' for name, p in patterns)}"
     else:
-        text = "something is missing, no single pattern is significant by itself"
+        text = "something is missing, but no single pattern is significant by itself"
     where = describe(state.design, state.design.residual)
     text += f". Residuals sit in: cameras {where['camera']}; kinds {where['kind']}; field {where['field']}"
     return Unexplained(state.table.p_global, text, patterns)
 
 
 _LEFT_OUT = (
-    "a term without a name would not predict settings and field points that it has not seen: it was left out"
+    "a free-form term was left out: it does not predict settings and field points that it was not fitted to"
 )
 
 

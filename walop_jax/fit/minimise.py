@@ -188,7 +188,7 @@ def _in_words(result: optx.RESULTS, why: str, steps: int, distance: float, condi
     if bool(result == RESULTS.successful):
         return f"converged: scaled gradient {distance:.1e}"
     if bool(result == RESULTS.conlim):
-        return f"parameters cannot be told apart: condition number {condition:.1e}"
+        return f"parameters cannot be distinguished: condition number {condition:.1e}"
     if bool(result == RESULTS.stagnation):
         return f"{why}, scaled gradient {distance:.1e}"
     if bool(result == RESULTS.nonfinite):

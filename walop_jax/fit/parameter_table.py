@@ -16,6 +16,7 @@ Vector = Float[np.ndarray, " n"]
 Columns = dict[str, tuple[np.ndarray, str, str]]
 
 PRIOR_ONLY = 0.99  # of the prior width: an error above it owes nothing to the data
+MOST_LISTED = 6  # parameters by name, in a note
 HEAD = ("parameter", ">value", ">error", "unit", ">start", "prior", "")
 
 
@@ -82,7 +83,8 @@ def parameter_notes(model: Model, sigma: Vector) -> tuple[str, ...]:
     idle = unconstrained(model, sigma)
     notes = [f"{hidden} throughput terms not shown; to_table() has them"] if hidden else []
     if idle:
-        notes.append(f"not constrained by these data, only by the prior: {', '.join(idle)}")
+        listed = f": {', '.join(idle)}" if len(idle) <= MOST_LISTED else " (marked in to_table())"
+        notes.append(f"{len(idle)} parameters are set by their priors alone{listed}")
     return tuple(notes)
 
 

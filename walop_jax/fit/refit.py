@@ -356,7 +356,7 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
         large = result.noise_scale**2 > 1.0 + EXCESS_NOISE**2
         yield Doubt(
             Quality.EXCESS_NOISE if large else Quality(0),
-            f"the errors of the data were multiplied by {result.noise_scale:.3g} to fit at all: the model is far off",
+            f"the errors of the data had to be multiplied by {result.noise_scale:.3g} for a fit: the model is far off",
             blocking=False,
         )
     for name in result.at_prior_edge:
@@ -369,7 +369,8 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
         )
     yield from (Doubt(Quality.DOUBTED, sentence) for sentence in doubts)
     if result.errors_from != STATED:
-        made = f"standard errors are made from the {result.errors_from}"
+        found = result.errors_from.removeprefix("residuals: ")
+        made = f"error bars were enlarged to match the scatter of the residuals ({found})"
         yield Doubt(Quality(0), made, blocking=False)
 
 
@@ -394,8 +395,8 @@ def refit(
     journal = None if folder is None else _journal(Path(folder), calset, model, crew)
     runner = Runner(processes=crew, progress=progress, journal=journal)
     likelihood = Likelihood.of(calset, model, memory=memory, runner=runner)
-    size = f"{likelihood.layout.memory / 1e9:.2g} GB"
-    runner.tell(Stage(f"preparing the fit; data will take {size}", "fitting"))
+    size = likelihood.layout.memory / 1e9
+    runner.tell(Stage(f"preparing the fit{f' of {size:.2g} GB of data' if size > 0.1 else ''}", "fitting"))
     return with_honest_errors(fit(likelihood))
 
 

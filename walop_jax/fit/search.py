@@ -273,4 +273,7 @@ def _order_starts(likelihood: Likelihood) -> Iterator[tuple[str, Vector]]:
         for sign in (-1, 1):
             start = likelihood.model.start.copy()
             start[likelihood.model.index(name)] += sign * one_wave
-            yield f"{name} {sign:+d} wave", start
+            yield (
+                f"checking for a second minimum ({name} one wave {'thicker' if sign > 0 else 'thinner'})",
+                start,
+            )

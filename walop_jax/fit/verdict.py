@@ -126,7 +126,7 @@ class Hidden:
         ]
         more = f" and {len(sizes) - most} more" if len(sizes) > most else ""
         listed = ", ".join(sizes[:most]) + more
-        return f"too small to be seen, yet beyond the errors: {listed}"
+        return f"too small to be detected, yet larger than the errors: {listed}"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -57,7 +57,7 @@ def repeated(tell: Tell, every: float = EVERY) -> Generator[Tell, None, None]:
                 moment = time.monotonic()
                 if moment - told >= every and not over.is_set():
                     told = moment
-                    tell(f"{text} (for {moment - since:.0f} s)")
+                    tell(f"{text}, {moment - since:.0f} s so far")
 
     thread = threading.Thread(target=again, daemon=True)
     thread.start()

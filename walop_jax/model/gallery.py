@@ -145,7 +145,7 @@ def _sizes(one: Mapping[str, Any], plan: str) -> Iterator[str]:
     else:
         yield f"- named alone, 99 times in 100, from {named:.2g}{_unit(one)} on{', in every shape' if seldom else ''}"
     for rival, separation in one["rivals"]:
-        verdict = "may be taken for" if separation < _UNSEEN else f"{separation:.1f} σ away from"
+        verdict = "can be mistaken for" if separation < _UNSEEN else f"{separation:.1f} σ away from"
         yield f"- at the size from which it is found, {verdict} `{rival}`"
     yield ""
 

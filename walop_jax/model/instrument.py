@@ -395,7 +395,7 @@ def _check(instrument: Instrument, read: Reader) -> None:
             )
     polarisers = [element.name for element in instrument.train() if isinstance(element, Polariser)]
     if len(polarisers) > 1:
-        raise read.fault(f"elements.{polarisers[1]}", "is a second polariser; there can be one")
+        raise read.fault(f"elements.{polarisers[1]}", "is a second polariser; only one is allowed")
     for arm in instrument.arms:
         for element in arm.train():
             if isinstance(element, Analyser | Polariser):

@@ -231,7 +231,10 @@ class Comparison(Displayed):
             "X": (np.concatenate([p.x for p in places]), "[deg] field position"),
             "Y": (np.concatenate([p.y for p in places]), "[deg] field position"),
             "GRID": (on_grid, "a point with a polynomial of its own"),
-            "ZONE": (np.concatenate([p.zone for p in places]), "one exposure holds hardly any u"),
+            "ZONE": (
+                np.concatenate([p.zone for p in places]),
+                "one exposure carries almost no information on u",
+            ),
         }
         for k, quantity in enumerate(QUANTITIES):
             for method in ("paper", "joint"):

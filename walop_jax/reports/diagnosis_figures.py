@@ -21,7 +21,7 @@ from matplotlib.ticker import MaxNLocator, NullLocator
 
 from walop_jax.data.records import Points
 from walop_jax.diagnosis.figure_data import PointMap, ResidualComparison, Table
-from walop_jax.diagnosis.limits_found import DetectionLimits
+from walop_jax.diagnosis.limits_found import NO_LEVEL, DetectionLimits
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.reports.style import (
     AFTER,
@@ -314,7 +314,7 @@ def protection_figure(found: DetectionLimits) -> Figure:
     axis = figure.subplots()
     good = np.isfinite(found.protection)
     if not good.any():
-        axis.text(0.5, 0.5, "one exposure does not give q and u", ha="center", transform=axis.transAxes)
+        axis.text(0.5, 0.5, NO_LEVEL, ha="center", transform=axis.transAxes)
         axis.set_axis_off()
         return figure
     field_axes(axis, "largest error that goes undetected")
@@ -331,7 +331,7 @@ def protection_figure(found: DetectionLimits) -> Figure:
     bar.ax.tick_params(labelsize=SMALL, which="both")
     if (~good).any():
         axis.plot(found.x[~good], found.y[~good], "x", color=QUIET, ms=4)
-        axis.set_xlabel("X (deg); crosses: one exposure does not give q and u", fontsize=FONT)
+        axis.set_xlabel("X (deg); crosses: q and u cannot both be measured with one exposure", fontsize=FONT)
     return figure
 
 

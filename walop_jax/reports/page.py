@@ -313,8 +313,8 @@ PROTECTION = (
     "The largest error of q and u that a single effect can make at each field point without being detected."
 )
 SEPARATION = (
-    "Standard deviations between an effect that is just detected (row) and another that does its best to look like it "
-    "(column)."
+    "Standard deviations between an effect at its detection limit (row) and another fitted to imitate it (column)."
+    ""
 )
 
 Picture = tuple[str, str, str]

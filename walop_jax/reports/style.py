@@ -84,8 +84,8 @@ def element_kind(element: int, arms: int) -> int:
 def matrix_panels(figure: Figure, axes: Any, maps: Maps, extent: Extent, interpolation: str) -> None:
     """Draw the elements over the field, zero offsets in per cent, each on a scale of its own that its title tells.
 
-    Of two arms lines in the second row bound the zone where |m22 m33 − m23 m32| < 0.1: a single exposure holds hardly
-    any u there. `extent` is left, right, bottom and top in degrees.
+    Of two arms lines in the second row bound the zone where |m22 m33 − m23 m32| < 0.1: a single exposure carries
+    almost no information on u there. `extent` is left, right, bottom and top in degrees.
     """
     arms = len(maps) // 3
     weak = np.abs(maps[1] * maps[5] - maps[2] * maps[4]) if arms == 2 else None

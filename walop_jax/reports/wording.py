@@ -28,7 +28,7 @@ _PROPER = ("Wollaston", "Moon", "Stokes")
 def effect_in_words(effect: str) -> str:
     """A few words on an effect that may stand inside a sentence; empty for a name that is not known."""
     if effect == UNNAMED:
-        return "patterns without a name"
+        return "unidentified patterns"
     known = next((entry for entry in EFFECTS if entry.name == effect), None)
     if known is None:
         return ""
@@ -92,16 +92,16 @@ def verdict_of_diagnosis(diagnosis: Mapping[str, Any]) -> tuple[str, str]:
     if diagnosis["unexplained"] and diagnosis["unexplained"].get("free_form"):
         term = f"A free-form term stands for it in this calibration, with which χ²/dof is {after}."
     if not steps:
-        text = f"{base}, and no effect of the catalogue does: something without a name is missing."
+        text = f"{base}, and no effect of the catalogue does: something unidentified is missing."
     else:
-        text = f"{base}. They agree better with {found}{'' if term else f': χ²/dof is {after}'}, but something without "
-        text += "a name is left."
+        text = f"{base}. They agree better with {found}{'' if term else f': χ²/dof is {after}'}, but an "
+        text += "unidentified residual remains."
     return "Unexplained", " ".join(part for part in (text, term, *_confusions(steps)) if part)
 
 
 def _found(step: Mapping[str, Any]) -> str:
     if step.get("sentences"):
-        return f"something that has no name ({'; '.join(told['words'] for told in step['sentences'])})"
+        return f"an effect that is not in the catalogue ({'; '.join(told['words'] for told in step['sentences'])})"
     words, values = effect_in_words(step["effect"]), []
     for name, entry in step["parameters"].items():
         value, sigma = value_and_error(entry["value"], entry["sigma"])
@@ -115,12 +115,12 @@ def _found(step: Mapping[str, Any]) -> str:
 
 def _confusions(steps: Sequence[Mapping[str, Any]]) -> list[str]:
     names = [
-        f"They cannot tell {step['effect']} from {listed(step['equivalent'])}."
+        f"They cannot distinguish {step['effect']} from {listed(step['equivalent'])}."
         for step in steps
         if step["equivalent"]
     ]
     sentences = [
-        f"Beside {step['effect']}, it may as well be: {'; or '.join(step['nameless'])}."
+        f"Equally consistent with {step['effect']}: {'; or '.join(step['nameless'])}."
         for step in steps
         if step.get("nameless")
     ]

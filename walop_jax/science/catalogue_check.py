@@ -114,7 +114,7 @@ class InstrumentChange:
         if not others:
             return text
         more = f", and {len(others) - 4} more" if len(others) > 4 else ""
-        return f"{text}. These rows cannot tell it from {', '.join(others[:4])}{more}"
+        return f"{text}. These rows cannot distinguish it from {', '.join(others[:4])}{more}"
 
     def _words(self, found: FoundChange) -> str:
         return found.question.words(found.size, found.error)

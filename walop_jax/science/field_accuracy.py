@@ -89,7 +89,7 @@ class FieldAccuracy:
         if not self.trusted:
             return (("p of a star", "not known: the calibration is not trusted"),)
         known = f"{two_digits(100 * self.median)} % (error for p ≤ 5 %, median over the field)"
-        lines = [("p of a star", f"{known}; below 0.1 % over {100 * self.share:.0f} % of it")]
+        lines = [("p of a star", f"{known}; below 0.1 % over {100 * self.share:.0f} % of the field")]
         if self.limited_by:
             lines.append(("limited by", self.limited_by))
         if self.hidden > 0:

@@ -77,7 +77,7 @@ class WatchedChange:
             return text
         told = [_words(entry) for entry in list(others.values())[:4]]
         more = f", and {len(others) - 4} more" if len(others) > 4 else ""
-        return f"{text}. These stars cannot tell it from {', '.join(told)}{more}"
+        return f"{text}. These stars cannot distinguish it from {', '.join(told)}{more}"
 
 
 def _words(entry: Suspect) -> str:

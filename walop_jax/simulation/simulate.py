@@ -279,7 +279,7 @@ def effect_from_text(text: str, context: Context, catalogue: Sequence[type[Effec
             raise ValueError(f"{error}; {name} takes {', '.join(known)}")
     if parameters and not any(parameter in values for parameter in kind.amplitudes()):
         wanted = " or ".join(kind.amplitudes())
-        raise ValueError(f"effect {name!r} changes nothing without a value of {wanted}")
+        raise ValueError(f"{name} needs a value of {wanted}, e.g. {name}={kind.amplitudes()[0]}:…")
     try:
         return kind.of(context, **values)
     except (TypeError, ValueError) as error:

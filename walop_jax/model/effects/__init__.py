@@ -17,7 +17,9 @@ def effect_by_name(name: str, catalogue: Sequence[type[Effect]] = EFFECTS) -> ty
         if effect.name == name:
             return effect
     error = unknown_name("effect", name, [effect.name for effect in catalogue])
-    raise ValueError(f"{error}; one of your own needs --effects FILE, or catalogue= in Python")
+    raise ValueError(
+        f"{error}; walop-jax docs effect lists all, --effects FILE (in Python effects=) adds your own"
+    )
 
 
 def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
