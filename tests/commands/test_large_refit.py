@@ -106,7 +106,7 @@ def test_the_map_stays_with_the_calibration(finished, tmp_path):
     copy = read_calibration(tmp_path / "copy.fits", rebuild=False)
     assert copy.content_hash() == again.content_hash()
     np.testing.assert_array_equal(copy.residuals.values, product.residuals.values)
-    figure = figures.residual_map_figure(product.residuals)
+    figure = figures.residual_map_figure(product.residuals, ("O1", "E1", "O2", "E2"))
     assert len(figure.axes) == 16
 
 

@@ -69,9 +69,13 @@ def test_cite_as_bibtex(call):
     assert len(keys) == len(set(keys))
     assert {"walop_jax", "maharana2022", "yeh1980", "golub1969"} <= set(keys)
     yeh = dict(re.findall(r"(\w+)\s*= \{(.*)\}", next(body for _, key, body in entries if key == "yeh1980")))
-    assert yeh == {"author": "Yeh", "journal": "Surf. Sci.", "year": "1980", "volume": "96", "pages": "41"}
-    for _, _, body in entries:
+    assert yeh == {
+        "author": "Yeh, P.", "title": "Optics of anisotropic layered media: A new 4 x 4 matrix algebra",
+        "journal": "Surface Science", "year": "1980", "volume": "96", "pages": "41",
+    }  # fmt: skip
+    for _, key, body in entries:
         assert body.count("{") == body.count("}")
+        assert {"author", "title", "year"} <= set(re.findall(r"^\s*(\w+)\s*=", body, re.MULTILINE)), key
 
 
 def test_an_output_that_exists_names_the_option(call, calset_file, run):

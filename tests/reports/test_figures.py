@@ -11,6 +11,7 @@ import pytest
 from matplotlib import pyplot
 from small_run import small_fit
 
+import walop_jax as walop
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.diagnosis.figure_data import figure_data
 from walop_jax.diagnosis.findings import Diagnosis
@@ -42,7 +43,7 @@ def test_every_figure_can_be_drawn(fitted):
     result, calibration = fitted
     made = {
         "calibration": figures.calibration_figure(result),
-        "matrix": figures.matrix_figure(calibration),
+        "matrix": figures.matrix_maps_figure(calibration.maps),
         "residual": figures.residual_figure(result),
         "modulation": figures.modulation_figure(result.calset, [0, 5]),
     }
@@ -53,13 +54,40 @@ def test_every_figure_can_be_drawn(fitted):
 
 def test_maps_show_the_matrix(fitted):
     _, calibration = fitted
-    figure = figures.matrix_figure(calibration)
-    low_x, high_x, low_y, high_y = calibration.field
+    figure = figures.matrix_maps_figure(calibration.maps)
+    points = calibration.maps.grid.points
+    low_x, high_x, low_y, high_y = points.x.min(), points.x.max(), points.y.min(), points.y.max()
     corner, _ = calibration.matrix(np.array([low_x, high_x]), np.array([low_y, high_y]))
     for k, axis in enumerate(figure.axes[:6]):
         image = np.asarray(axis.images[0].get_array())
-        scale = 100.0 if k in (0, 3) else 1.0
-        np.testing.assert_allclose([image[0, 0], image[-1, -1]], scale * corner[:, k], rtol=1e-9)
+        np.testing.assert_allclose([image[0, 0], image[-1, -1]], 100.0 * corner[:, k], rtol=1e-9)
+    # Colours by kind, not by sign; ends of the scales that other runs have as well.
+    scales = [(axis.images[0].cmap.name, *axis.images[0].get_clim()) for axis in figure.axes[:6]]
+    assert scales[0] == scales[3]
+    assert [name for name, *_ in scales[:3]] == ["RdBu_r", "viridis", "RdBu_r"]
+    assert scales[1][2] == 100.0
+    for name, low, high in scales:
+        assert low == -high or name == "viridis"
+        assert f"{high - low:e}"[0] in "124"  # ends go in steps of 1, 2, 5
+    assert figure.axes[0].get_xlim() == pytest.approx((low_x, high_x))
+
+
+def test_figures_go_into_axes_and_hold_fonts_that_journals_take(fitted):
+    _, calibration = fitted
+    whole = pyplot.figure(layout="constrained")
+    _, right = whole.subplots(1, 2)
+    inside = walop.plot(calibration, "efficiency", ax=right)
+    assert inside in whole.subfigs
+    assert len([axis for axis in inside.axes if axis.images]) == 2
+    pyplot.close(whole)
+    figure = walop.plot(calibration, "matrix", figsize=(3.5, 2.6))
+    assert tuple(figure.get_size_inches()) == (3.5, 2.6)
+    stream = io.BytesIO()
+    figure.savefig(stream, format="pdf")
+    assert b"/Type3" not in stream.getvalue()
+    assert b"/CIDFontType2" in stream.getvalue()
+    with pytest.raises(TypeError, match="colour"):
+        walop.plot(calibration, "matrix", colour="red")
 
 
 def test_modulation_is_that_of_the_data(fitted):

@@ -62,10 +62,10 @@ def test_names_and_files(source, tmp_path):
 def test_maps_say_their_scale(source):
     maps = source.maps
     axis = draw("efficiency", source).axes[0]
-    low, high = (float(part.replace("−", "-")) for part in axis.get_title().splitlines()[1].split(" … "))
-    np.testing.assert_allclose(
-        [low, high], [maps.values[1].min(), maps.values[1].max()], atol=np.ptp(maps.values[1]) / 50
-    )
+    said = axis.get_title().splitlines()[1].removesuffix(" %").split(" to ")
+    low, high = (float(part.replace("−", "-")) for part in said)
+    percent = 100.0 * maps.values[1]
+    np.testing.assert_allclose([low, high], [percent.min(), percent.max()], atol=np.ptp(percent) / 50)
     assert "efficiency" in axis.get_title()
 
 

@@ -73,7 +73,7 @@ def test_verdict_and_what_was_found(diagnosed):
         "clp_wobble (error of the polariser's encoder, once per turn: amplitude = 0.0613 ± 0.0012 deg), with which "
         "χ²/dof is 1.029. They cannot distinguish clp_wobble from camera_gain_drift."
     ) in text
-    assert "Would be separated by: polariser angles over a full turn." in text
+    assert "What would: polariser angles over a full turn." in text
     assert "caused by" not in text
     assert "cos(3θ − 57°), θ the polariser angle" in text
     assert "chwp_axis – fast axis of the calibration plate" in text

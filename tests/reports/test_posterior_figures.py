@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib import pyplot
 
-from walop_jax.reports.posterior_figures import SHARES, corner_figure
+from walop_jax.reports.posterior_figures import MOST_IN_CORNER, SHARES, corner_figure, correlated
 
 NAMES, UNITS = ("half1.wedge", "sky.depolarisation", "noise.ln_f"), ("deg", "", "")
 
@@ -51,7 +51,7 @@ def test_every_panel_shows_its_coefficients(draws: np.ndarray):
     )
     assert panels[0, 0].get_title(loc="left") == "$w_1$\n13.0 ± 2.0 deg"
     assert [line.get_xdata()[0] for line in panels[2, 1].lines[1:2]] == [0.9]
-    assert panels[2, 0].get_xlabel() == "$w_1$ [deg]"
+    assert panels[2, 0].get_xlabel() == "$w_1$ (deg)"
     stream = io.BytesIO()
     figure.savefig(stream, format="png")
     assert stream.getvalue().startswith(b"\x89PNG")
@@ -63,3 +63,18 @@ def test_one_coefficient_and_one_that_never_moved(draws: np.ndarray):
     still = draws[:100].copy()
     still[:, 1] = 0.8
     corner_figure(still, NAMES, UNITS).savefig(io.BytesIO(), format="png")
+
+
+def test_a_corner_plot_shows_what_is_correlated():
+    """Ten independent coefficients, two pairs of them replaced by correlated ones."""
+    rng = np.random.default_rng(1)
+    draws = rng.normal(size=(4000, 10))
+    draws[:, 7] = 0.9 * draws[:, 2] + 0.4 * draws[:, 7]
+    draws[:, 9] = 0.6 * draws[:, 7] + 0.8 * draws[:, 9]
+    names = [f"p{k}" for k in range(10)]
+    shown = correlated(draws, names, {})
+    assert len(shown) == MOST_IN_CORNER
+    assert {"p2", "p7", "p9"} < set(shown)
+    assert list(shown) == sorted(shown)
+    # Pictures of a prior are left out, however correlated they are.
+    assert "p2" not in correlated(draws, names, {"p2": 1.0})

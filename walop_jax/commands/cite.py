@@ -26,14 +26,18 @@ def cite(
     effects: Effects = None,
 ) -> Outcome[tuple[Reference, ...]]:
     """List the sources of the physics in a fitted model, effects included."""
-    from walop_jax import __version__
+    from walop_jax import Run, __version__
     from walop_jax.calibration import product_path
     from walop_jax.fit import minimise
     from walop_jax.fit.model_file import model_without_data
     from walop_jax.model.instrument import nominal_instrument
     from walop_jax.model.references import Reference, references
     from walop_jax.model.references import bibtex as entries
+    from walop_jax.posterior.files import POSTERIOR
 
+    sampled = isinstance(run, Run) and POSTERIOR in run
+    if isinstance(run, str | os.PathLike) and Path(run).is_dir():
+        sampled = (Path(run) / POSTERIOR).exists()
     if run is None:
         model = model_without_data(nominal_instrument())
     else:
@@ -45,5 +49,5 @@ def cite(
     return Outcome(
         found,
         lambda: [{"what": entry.what, "source": entry.source} for entry in found],
-        lambda: entries(found, __version__) if bibtex else "\n".join(lines),
+        lambda: entries(found, __version__, sampled=sampled) if bibtex else "\n".join(lines),
     )

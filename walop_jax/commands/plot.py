@@ -12,6 +12,8 @@ from walop_jax.commands.inputs import Effects, PathLike, catalogue_of
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from walop_jax import Calibration, FitResult, Run
 
 FORMATS = (".pdf", ".png", ".svg", ".eps", ".jpg")
@@ -32,6 +34,8 @@ def plot(
     x: Annotated[float, Option("Field point of transmission and modulation, X (deg).")] = 0.0,
     y: Annotated[float, Option("The same, Y (deg).")] = 0.0,
     effects: Effects = None,
+    ax: Axes | None = None,
+    figsize: tuple[float, float] | None = None,
 ) -> Outcome[Any]:
     """Draw a figure of a run, by name, as a file.
 
@@ -39,17 +43,24 @@ def plot(
     half-wave plates, camera transmissions, corner plots, and others. The format follows the name of the file.
 
     In Python: the matplotlib figure, of a run or of a fit or calibration in memory, written if `output` is given;
-    without a name, what each figure shows, by name.
+    without a name, what each figure shows, by name. `figsize` (inches) is its size; with `ax` it is drawn there (one of
+    several panels in a subfigure that takes the room of these axes).
     Raises `DataError`, with the nearest names, for a figure that does not exist and for what the run lacks.
     """
     from walop_jax import Run
     from walop_jax.io.atomic import check_output
     from walop_jax.reports.named import FIGURES, FigureSource, draw
     from walop_jax.reports.posterior_figures import save_figure
+    from walop_jax.reports.style import Canvas
 
     if run is None or name is None:
-        listed = {key: entry.about for key, entry in FIGURES.items()}
-        width = max(map(len, listed))
+        there = Path(run) if isinstance(run, str | os.PathLike) else None
+        listed = {
+            key: entry.about
+            for key, entry in FIGURES.items()
+            if there is None or (there / entry.needs).exists()
+        }
+        width = max(map(len, listed), default=0)
         lines = [f"{key:<{width}}  {about}" for key, about in listed.items()]
         return Outcome(listed, lambda: listed, lambda: "\n".join(lines))
     chosen = f"{name}.png" if output is None and job.typed else output
@@ -69,7 +80,10 @@ def plot(
     if isinstance(parameters, str):
         parameters = [part.strip() for part in parameters.split(",") if part.strip()]
     job.tell(f"drawing {name}")
-    figure = draw(name, FigureSource.of(held, parameters=tuple(parameters or ()), place=(x, y)))
+    figure = draw(
+        name,
+        FigureSource.of(held, parameters=tuple(parameters or ()), place=(x, y), canvas=Canvas(ax, figsize)),
+    )
     if path is not None:
         save_figure(path, figure, overwrite=job.overwrite)
     return Outcome(figure, lambda: {"figure": name, "output": str(path)}, lambda: str(path))

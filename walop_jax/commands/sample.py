@@ -159,18 +159,14 @@ def _writers(product: Calibration, posterior: PosteriorSample) -> Writers:
 
 
 def _in_corner(posterior: PosteriorSample, product: Calibration) -> tuple[tuple[str, ...], Any]:
-    """Names and draws of the sampled coefficients that the data constrain best, as many as a figure can label."""
+    """Names and draws of the sampled coefficients that a corner plot shows."""
     import numpy as np
 
-    from walop_jax.reports.posterior_figures import MOST_IN_CORNER, informed
+    from walop_jax.reports.posterior_figures import correlated
 
     columns = [posterior.names.index(name) for name in posterior.sampled if name in posterior.names]
     draws = posterior.draws.reshape(-1, len(posterior.names))[:, columns]
     if posterior.ln_f is not None:  # the factor on the errors, the last
         draws = np.concatenate([draws, posterior.ln_f.reshape(-1, 1)], axis=1)
-    spread = dict(zip(posterior.sampled, draws.std(axis=0).tolist(), strict=True))
-    shown = (
-        informed(posterior.sampled, spread, product.prior_width)[:MOST_IN_CORNER]
-        or posterior.sampled[:MOST_IN_CORNER]
-    )
+    shown = correlated(draws, posterior.sampled, product.prior_width)
     return shown, draws[:, [posterior.sampled.index(name) for name in shown]]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 import unicodedata
 from collections.abc import Iterator, Sequence
+from importlib.resources import files
 
 from walop_jax.model import legendre, quadrature
 from walop_jax.model.elements import WavePlate, Wedge
@@ -65,74 +67,51 @@ def references(model: Model) -> tuple[Reference, ...]:
 # ------------------------------------------------------------------------------------------------- as BibTeX
 
 _YEAR = re.compile(r"^(?P<who>[^\d;]+?),? (?P<year>(?:19|20)\d\d), (?P<rest>.+)$")
-_ARTICLE = re.compile(r"^(?P<journal>[^,]*?) (?P<volume>[A-Z]?\d+), (?P<page>[A-Z]?\d+)(?P<more>.*)$")
-_ARXIV = re.compile(r"arXiv:(\d{4}\.\d{4,5})")
-_FULL_NAMES = {
-    "A&A": "Astronomy and Astrophysics",
-    "AJ": "The Astronomical Journal",
-    "PASP": "Publications of the Astronomical Society of the Pacific",
-    "JATIS": "Journal of Astronomical Telescopes, Instruments, and Systems",
-    "JGR": "Journal of Geophysical Research",
-}
-SOFTWARE = """@software{walop_jax,
-  author  = {{The walop-jax developers}},
-  title   = {walop-jax: differentiable end-to-end calibration of the WALOP imaging polarimeters},
-  version = {%s}
-}"""
-_PAPER_II = """@article{maharana2022,
-  author  = {Maharana and others},
-  title   = {WALOP-South: A Four-Camera One-Shot Imaging Polarimeter for PASIPHAE Survey. Paper II --
-             Polarimetric Modelling and Calibration},
-  journal = {arXiv e-prints},
-  year    = {2022},
-  eprint  = {2208.12441}
-}"""
+_SOFTWARE = ("jax2018", "equinox2021", "optimistix2024", "astropy2022")
+_OF_SAMPLES = ("emcee2013", "arviz2019")
 
 
-def bibtex(found: Sequence[Reference], version: str) -> str:
-    """BibTeX entries of the software and of all published works among the sources, each once."""
-    entries = {"walop_jax": SOFTWARE % version}
+@functools.cache
+def _library() -> dict[str, str]:
+    """The entries of `references.bib` by key."""
+    text = (files("walop_jax.model") / "references.bib").read_text(encoding="utf-8")
+    return {found[1]: found[0].strip() for found in re.finditer(r"@\w+{(\w+),.*?\n}", text, re.DOTALL)}
+
+
+def bibtex(found: Sequence[Reference], version: str, *, sampled: bool = False) -> str:
+    """BibTeX entries of this software, of all published works among the sources, and of the packages beneath.
+
+    `sampled`: those of the posterior as well. A work that `references.bib` lacks is an entry with what its source says.
+    """
+    known = _library()
+    entries = {"walop_jax": known["walop_jax"].replace("VERSION", version)}
     for reference in found:
-        for key, entry in _entries(reference.source):
-            entries.setdefault(key, entry)
+        for part in reference.source.split("; "):
+            key = "maharana2022" if "Paper II" in part else _key(part)
+            if key in known:
+                entries[key] = known[key]
+            elif (plain := _YEAR.match(part)) is not None:
+                lines = (
+                    plain["who"].replace(" et al.", " and others").replace(" & ", " and "),
+                    part,
+                    plain["year"],
+                )
+                fields = zip(("author", "note", "year"), map(_escaped, lines), strict=True)
+                listed = ",\n".join(f"  {name:<6} = {{{value}}}" for name, value in fields)
+                entries[key] = f"@misc{{{key},\n{listed}\n}}"
+    entries |= {key: known[key] for key in (*_SOFTWARE, *(_OF_SAMPLES if sampled else ()))}
     return "\n\n".join(entries.values()) + "\n"
 
 
-def _entries(source: str) -> Iterator[tuple[str, str]]:
-    for part in source.split("; "):
-        if part == PAPER_II or "Paper II" in part:
-            yield "maharana2022", _PAPER_II
-            continue
-        found = _YEAR.match(part)
-        if found is None:
-            continue
-        key, fields = _key(found["who"], found["year"]), {"author": _authors(found["who"])}
-        article, preprint = _ARTICLE.match(found["rest"]), _ARXIV.search(found["rest"])
-        kind = "article"
-        if article is not None:
-            journal = article["journal"]
-            fields |= {"journal": _escaped(_FULL_NAMES.get(journal, journal)), "year": found["year"]}
-            fields |= {"volume": article["volume"], "pages": article["page"]}
-        elif preprint is not None:
-            fields |= {"journal": "arXiv e-prints", "year": found["year"], "eprint": preprint[1]}
-            key += preprint[1].replace(".", "")
-        else:
-            kind = "misc"
-            fields |= {"title": _escaped(found["rest"]), "year": found["year"]}
-        width = max(map(len, fields))
-        lines = ",\n".join(f"  {name:<{width}} = {{{value}}}" for name, value in fields.items())
-        yield key, f"@{kind}{{{key},\n{lines}\n}}"
-
-
-def _authors(who: str) -> str:
-    names = who.replace(" et al.", ", others").replace(" & ", ", ").replace(" and ", ", ")
-    return _escaped(" and ".join(name.strip() for name in names.split(",") if name.strip()))
-
-
-def _key(who: str, year: str) -> str:
-    first = re.split(r",| et al\.| & | and ", who)[0]
+def _key(work: str) -> str:
+    """Family name of the first author and the year, that of the library where the work states none."""
+    found = _YEAR.match(work)
+    first = re.split(r",| et al\.| & | and ", found["who"] if found else work)[0]
     plain = unicodedata.normalize("NFKD", first).encode("ascii", "ignore").decode()
-    return re.sub(r"[^a-z]", "", plain.lower()) + year
+    name = re.sub(r"[^a-z]", "", plain.lower())
+    if found:
+        return name + found["year"]
+    return next((key for key in _library() if key.rstrip("0123456789") == name), name)
 
 
 def _escaped(text: str) -> str:

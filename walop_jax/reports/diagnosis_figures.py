@@ -10,14 +10,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
-from matplotlib.collections import PatchCollection
 from matplotlib.colors import BoundaryNorm, LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
-from matplotlib.ticker import MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator
 
 from walop_jax.data.records import Points
 from walop_jax.diagnosis.figure_data import PointMap, ResidualComparison, Table
@@ -28,13 +25,18 @@ from walop_jax.reports.style import (
     BEFORE,
     DIVERGING,
     FONT,
+    PAGE,
     QUIET,
+    SEQUENTIAL,
     SMALL,
-    empty_figure,
+    AnyFigure,
+    Canvas,
+    colour_bar,
     field_axes,
     largest_size,
     outer_labels,
-    plain_numbers,
+    plain_ticks,
+    point_map,
 )
 
 SIGN_BEYOND = 3.0  # σ beyond which a tile carries its sign
@@ -77,7 +79,7 @@ def _maps(
 ) -> Figure:
     shown = np.any([np.isfinite(values).any(axis=1) for values in maps.values()], axis=0)
     shown = shown if shown.any() else np.ones(len(points), bool)
-    figure = empty_figure(0.6 + 2.0 * len(cameras), 0.55 + 1.75 * len(maps))
+    figure = PAGE.figure(0.6 + 2.0 * len(cameras), 0.55 + 1.75 * len(maps))
     axes = figure.subplots(len(maps), len(cameras), sharex=True, sharey=True, squeeze=False)
     tiles: Any = None
     for number, values in enumerate(maps.values()):
@@ -85,41 +87,14 @@ def _maps(
             field_axes(axis, f"camera {cameras[k]}" if number == 0 else "")
             axis.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10], prune="both"))
             axis.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], prune="both"))
-            tiles = _tiles(axis, points, shown, values[:, k], norm, colours)
+            tiles = point_map(axis, points.x, points.y, values[:, k], norm, colours, shown)
             if signs:
                 _signs(axis, points, values[:, k], norm)
     outer_labels(axes)
     for axis, title in zip(axes[:, 0], maps, strict=True):
         axis.set_ylabel(f"{title}\n\nY (deg)", fontsize=FONT)
-    bar = figure.colorbar(tiles, ax=axes, pad=0.015, aspect=18 * len(maps), fraction=0.03)
-    bar.set_label(label, fontsize=FONT)
-    bar.ax.tick_params(labelsize=SMALL)
+    colour_bar(figure, tiles, axes, label, pad=0.015, aspect=18 * len(maps), fraction=0.03)
     return figure
-
-
-def _tiles(
-    axis: Axes,
-    points: Points,
-    shown: Bool[np.ndarray, " p"],
-    values: Float[np.ndarray, " p"],
-    norm: Normalize,
-    colours: str,
-) -> Any:
-    size = _spacing(points.x[shown], points.y[shown])
-    known = shown & np.isfinite(values)
-    corners = zip(points.x[known] - 0.5 * size, points.y[known] - 0.5 * size, strict=True)
-    # Edges in the colour of the tile close the seams that viewers leave between neighbours.
-    tiles = PatchCollection(
-        [Rectangle(corner, size, size) for corner in corners],
-        cmap=colours, norm=norm, edgecolor="face", linewidth=0.3,
-    )  # fmt: skip
-    tiles.set_array(values[known])
-    tiles.set_rasterized(bool(known.sum() > MOST_VECTOR))
-    axis.add_collection(tiles)
-    axis.set_facecolor("0.93")
-    axis.set_xlim(points.x[shown].min() - size, points.x[shown].max() + size)
-    axis.set_ylim(points.y[shown].min() - size, points.y[shown].max() + size)
-    return tiles
 
 
 def _signs(axis: Axes, points: Points, values: Float[np.ndarray, " p"], norm: Normalize) -> None:
@@ -129,16 +104,6 @@ def _signs(axis: Axes, points: Points, values: Float[np.ndarray, " p"], norm: No
         axis.text(points.x[i], points.y[i], sign, color=ink, fontsize=5, ha="center", va="center")
 
 
-def _spacing(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> float:
-    """Side of the tiles: the typical distance to the nearest neighbour."""
-    few = slice(0, MOST_VECTOR)
-    distance = np.hypot(x[few, None] - x[None, few], y[few, None] - y[None, few])
-    distance[distance == 0] = np.inf
-    nearest = distance.min(axis=1)
-    nearest = nearest[np.isfinite(nearest)]
-    return float(np.median(nearest)) if nearest.size else 0.05
-
-
 def signature_figure(comparison: ResidualComparison, exposures: Table, cameras: Sequence[str]) -> Figure:
     """Residuals averaged over the field, camera by camera: data as dots, what the effect explains as a line.
 
@@ -146,7 +111,7 @@ def signature_figure(comparison: ResidualComparison, exposures: Table, cameras: 
     polariser; against time otherwise. Exposures at one angle are averaged. The lower panels hold what is left.
     """
     angular = _against_angle(comparison, exposures)
-    figure = empty_figure(0.6 + 2.0 * len(cameras), 3.5)
+    figure = PAGE.figure(0.6 + 2.0 * len(cameras), 3.5)
     upper, lower = figure.subplots(
         2, len(cameras), sharex=True, sharey="row", height_ratios=(2.2, 1), squeeze=False
     )
@@ -173,7 +138,7 @@ def signature_figure(comparison: ResidualComparison, exposures: Table, cameras: 
                 np.arange(0, 361, 90) if np.max(x, initial=0.0) > 180 else np.arange(0, 181, 45)
             )
     upper[0].set_ylabel("residual (σ)", fontsize=FONT)
-    lower[0].set_ylabel("rest (σ)", fontsize=FONT)
+    lower[0].set_ylabel("remaining (σ)", fontsize=FONT)
     upper[0].legend(frameon=False, fontsize=SMALL, loc="best")
     return figure
 
@@ -225,8 +190,7 @@ def ladder_figure(ladder: Table, names: Sequence[str] | None = None) -> Figure:
     ratio = ladder["CHI2"] / np.maximum(ladder["DOF"], 1)
     place = np.arange(len(ratio))
     width = EXPLAINS * np.sqrt(2.0 / max(int(ladder["DOF"][-1]), 1))
-    figure = empty_figure(7.0, 0.8 + 0.38 * len(ratio))
-    axis = figure.subplots()
+    figure, axis = PAGE.single(7.0, 0.8 + 0.38 * len(ratio))
     axis.axvspan(max(1.0 - width, 1e-3), 1.0 + width, color="0.88", lw=0, zorder=0)
     axis.axvline(1.0, color="0.5", lw=0.8, zorder=1)
     axis.plot(ratio, place, color="0.6", lw=1.0, zorder=2)
@@ -245,29 +209,18 @@ def ladder_figure(ladder: Table, names: Sequence[str] | None = None) -> Figure:
     axis.set_ylim(len(ratio) - 0.5, -0.5)
     axis.tick_params(labelsize=SMALL)
     axis.set_xlabel("χ² per degree of freedom", fontsize=FONT)
-    _plain_ticks(axis.xaxis)
+    plain_ticks(axis.xaxis)
     for side in ("top", "right", "left"):
         axis.spines[side].set_visible(False)
     axis.tick_params(axis="y", length=0, labelsize=FONT)
     return figure
 
 
-def _plain_ticks(axis: Axis) -> None:
-    """Numbers instead of powers of ten on a short logarithmic axis."""
-    low, high = axis.get_view_interval()
-    decades = np.log10(high / low)
-    steps = (1, 1.2, 1.5, 2, 3, 5, 7) if decades < 0.7 else (1, 2, 5) if decades < 2 else (1,)
-    ticks = [step * 10.0**power for power in range(-4, 9) for step in steps]
-    ticks = [tick for tick in ticks if low <= tick <= high]
-    axis.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
-    axis.set_minor_locator(NullLocator())
-
-
 def shares_figure(shares: Table) -> Figure:
     """Mean squared residual by camera, kind, filter and exposure, over what noise alone gives: before and after."""
     groups = [g for g in ("camera", "kind", "filter") if np.count_nonzero(shares["GROUP"] == g) > 1]
     widths = [np.count_nonzero(shares["GROUP"] == g) + 1.0 for g in groups]
-    figure = empty_figure(8.6, 2.7)
+    figure = PAGE.figure(8.6, 2.7)
     axes = figure.subplots(1, len(groups) + 1, width_ratios=[*widths, max(12.0, sum(widths))], sharey=True)
     before, after = (
         values / np.maximum(shares["EXPECTED"], 1e-300) for values in (shares["BEFORE"], shares["AFTER"])
@@ -299,7 +252,7 @@ def shares_figure(shares: Table) -> Figure:
     top = float(np.max(before, initial=1.0))
     if top > 5.0:
         axes[0].set_yscale("log")
-        _plain_ticks(axes[0].yaxis)
+        plain_ticks(axes[0].yaxis)
     axes[0].set_ylabel("mean squared residual /\nwhat noise alone gives", fontsize=FONT)
     axes[-1].legend(frameon=False, fontsize=SMALL, loc="best")
     return figure
@@ -308,48 +261,37 @@ def shares_figure(shares: Table) -> Figure:
 _STEPS = (0.0, 1.0, 2.0, POLICY.separation, 4.0, 5.0, 6.0)
 
 
-def protection_figure(found: DetectionLimits) -> Figure:
-    """Largest error of q and u over the field that a single effect can make without being detected."""
-    figure = empty_figure(5.0, 3.8)
-    axis = figure.subplots()
+def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
+    """Largest error of q and u over the field that a single effect can make without being detected.
+
+    Crosses: q and u cannot both be measured with one exposure there.
+    """
+    figure, axis = on.single(5.0, 3.8)
     good = np.isfinite(found.protection)
     if not good.any():
         axis.text(0.5, 0.5, NO_LEVEL, ha="center", transform=axis.transAxes)
         axis.set_axis_off()
         return figure
     field_axes(axis, "largest error that goes undetected")
-    percent = 100 * found.protection[good]
-    norm = LogNorm(percent.min(), max(percent.max(), 1.2 * percent.min()))
-    side = 100.0 / np.sqrt(max(len(found.x), 16))
-    shown = axis.scatter(
-        found.x[good], found.y[good], c=percent, s=side**2, marker="s", cmap="viridis", norm=norm
-    )
-    bar = figure.colorbar(shown, ax=axis, pad=0.03)
-    bar.set_label("error of q, u (%)", fontsize=SMALL + 1)
-    for which in (bar.ax.yaxis.set_major_formatter, bar.ax.yaxis.set_minor_formatter):
-        which(plain_numbers())
-    bar.ax.tick_params(labelsize=SMALL, which="both")
-    if (~good).any():
-        axis.plot(found.x[~good], found.y[~good], "x", color=QUIET, ms=4)
-        axis.set_xlabel("X (deg); crosses: q and u cannot both be measured with one exposure", fontsize=FONT)
+    percent = 100 * found.protection
+    norm = LogNorm(np.nanmin(percent), max(np.nanmax(percent), 1.2 * np.nanmin(percent)))
+    shown = point_map(axis, found.x, found.y, np.where(good, percent, np.nan), norm, SEQUENTIAL)
+    colour_bar(figure, shown, axis, "error of q, u (%)")
+    axis.plot(found.x[~good], found.y[~good], "x", color="0.5", ms=4)
     return figure
 
 
-def separation_figure(found: DetectionLimits) -> Figure:
-    """Separation (σ) of each effect (column) from each other one (row) when that is just detected."""
+def separation_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
+    """Separation (σ) of each effect (column) from each other one (row) that is present at its detection limit."""
     count = len(found.effects)
     size = max(3.0, 0.17 * count)
-    figure = empty_figure(size + 2.2, size + 1.2)
-    axis = figure.subplots()
-    norm = BoundaryNorm(_STEPS, 256, extend="max")
-    shown = axis.imshow(found.separation, norm=norm, cmap="RdYlBu")
+    figure, axis = on.single(size + 2.2, size + 1.2)
+    shown = axis.imshow(found.separation, norm=BoundaryNorm(_STEPS, 256, extend="max"), cmap="RdYlBu")
     axis.set_xticks(range(count), found.effects, rotation=90, fontsize=SMALL)
     axis.set_yticks(range(count), found.effects, fontsize=SMALL)
-    axis.set_ylabel("just detected", fontsize=FONT)
-    axis.set_xlabel("does its best to look alike", fontsize=FONT)
-    bar = figure.colorbar(shown, ax=axis, shrink=0.7)
-    bar.set_label(
-        f"separation (σ); below {POLICY.separation:g} one may be taken for the other", fontsize=SMALL + 1
+    axis.set_ylabel("effect present (at its detection limit)", fontsize=FONT)
+    axis.set_xlabel("could be mistaken for", fontsize=FONT)
+    colour_bar(
+        figure, shown, axis, f"separation (σ); below {POLICY.separation:g}: can be mistaken", shrink=0.7
     )
-    bar.ax.tick_params(labelsize=SMALL)
     return figure

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from walop_jax.calibration import PRODUCT, Calibration, MatrixMaps
 from walop_jax.diagnosis.limits_found import DetectionLimits
@@ -20,6 +19,7 @@ from walop_jax.posterior import Run
 from walop_jax.posterior.files import LIMITS, POSTERIOR
 from walop_jax.reports import diagnosis_figures, figures, paper_figures, posterior_figures
 from walop_jax.reports.run import read_limits
+from walop_jax.reports.style import PAGE, AnyFigure, Canvas
 from walop_jax.science.field_accuracy import field_accuracy
 
 
@@ -27,11 +27,12 @@ from walop_jax.science.field_accuracy import field_accuracy
 class FigureSource(Run):
     """The run that a figure is drawn from; what it needs and is not there is a `DataError`.
 
-    `parameters` are coefficients that were asked for by name; `place` (deg) is a field point.
+    `parameters` are coefficients by name; `place` (deg) is a field point; `canvas` is where to draw.
     """
 
     parameters: tuple[str, ...] = ()
     place: tuple[float, float] = (0.0, 0.0)
+    canvas: Canvas = PAGE
 
     @classmethod
     def of(cls, given: FitResult | Calibration | Run, **options: Any) -> FigureSource:
@@ -83,26 +84,27 @@ class FigureSource(Run):
         return read_limits(self.wanted(LIMITS, "run walop-jax limits -o RUN first"))
 
 
-def _accuracy(source: FigureSource) -> Figure:
+def _accuracy(source: FigureSource) -> AnyFigure:
     found = field_accuracy(source.rebuilt)
     if found is None:
         advice = "plot matrix-errors"
         raise fail("has a single arm: one exposure holds no p", file=source.folder, advice=advice)
-    return figures.accuracy_figure(found)
+    return figures.accuracy_figure(found, source.canvas)
 
 
-def _residuals(source: FigureSource) -> Figure:
+def _residuals(source: FigureSource) -> AnyFigure:
     c = source.rebuilt
     if source.likelihood.layout.large:
         raise fail("was fitted to whole frames", file=source.folder, advice="plot residual-map")
-    return figures.residuals_figure(source.likelihood, c.values, c.model.start)
+    return figures.residuals_figure(source.likelihood, c.values, c.model.start, source.canvas)
 
 
-def _residual_map(source: FigureSource) -> Figure:
+def _residual_map(source: FigureSource) -> AnyFigure:
     if source.stored.residuals is None:
         advice = "it comes with sets of whole frames"
         raise fail("holds no map of residuals", file=source.folder, advice=advice)
-    return figures.residual_map_figure(source.stored.residuals)
+    cameras = source.rebuilt.model.template.cameras.names
+    return figures.residual_map_figure(source.stored.residuals, cameras, source.canvas)
 
 
 def _draws(source: FigureSource) -> tuple[dict[str, Any], dict[str, str], tuple[str, ...]]:
@@ -121,17 +123,18 @@ def _draws(source: FigureSource) -> tuple[dict[str, Any], dict[str, str], tuple[
     return held, units, source.parameters or tuple(sampled)
 
 
-def _corner(source: FigureSource) -> Figure:
+def _corner(source: FigureSource) -> AnyFigure:
     held, units, shown = _draws(source)
     if not source.parameters:
-        spread = {name: float(held[name].std()) for name in shown}
-        shown = posterior_figures.informed(shown, spread, source.stored.prior_width)
-        shown = shown[: posterior_figures.MOST_IN_CORNER]
+        draws = np.stack([held[name].ravel() for name in shown], axis=1)
+        shown = posterior_figures.correlated(draws, shown, source.stored.prior_width)
+    if source.canvas.ax is not None:
+        raise ValueError("ax: a corner plot needs a figure of its own")
     draws = np.stack([held[name].ravel() for name in shown], axis=1)
     return posterior_figures.corner_figure(draws, shown, [units[name] for name in shown])
 
 
-def _trace(source: FigureSource) -> Figure:
+def _trace(source: FigureSource) -> AnyFigure:
     held, units, shown = _draws(source)
     chains = np.stack([held[name][:, :, None] for name in shown], axis=-1)
     return posterior_figures.trace_figure(
@@ -139,78 +142,82 @@ def _trace(source: FigureSource) -> Figure:
     )
 
 
-def _modulation(source: FigureSource) -> Figure:
+def _modulation(source: FigureSource) -> AnyFigure:
     exposures, points = source.calset.exposures, source.calset.points
     behind = np.flatnonzero(exposures.clp_in & ~exposures.chwp_in)
     seen = source.calset.intensities.block(0, len(points)).used[:, behind].any(axis=1)
     if not seen.any():
         raise fail("no field point was seen behind the polariser", file=source.folder, advice="plot matrix")
     away = np.hypot(points.x - source.place[0], points.y - source.place[1])
-    return figures.modulation_figure(source.calset, [int(np.argmin(np.where(seen, away, np.inf)))])
-
-
-def _coefficients(source: FigureSource) -> Figure:
-    return paper_figures.coefficients_figure(source.calset, source.maps.filter)
-
-
-def _transmission(source: FigureSource) -> Figure:
-    return paper_figures.transmission_figure(source.calset, source.maps.filter, source.place)
+    nearest = int(np.argmin(np.where(seen, away, np.inf)))
+    return figures.modulation_figure(source.calset, [nearest], source.canvas)
 
 
 @dataclasses.dataclass(frozen=True)
 class NamedFigure:
-    """A figure with what it shows in a few words."""
+    """A figure with what it shows in a few words, and the file of a run that it needs beside the calibration."""
 
     about: str
-    draw: Callable[[FigureSource], Figure]
+    draw: Callable[[FigureSource], AnyFigure]
+    needs: str = PRODUCT
 
 
 FIGURES: Mapping[str, NamedFigure] = {
-    name: NamedFigure(about, draw)
-    for name, about, draw in (
-        ("accuracy", "error of p over the field: map and histogram", _accuracy),
-        (
-            "matrix",
-            "the six elements of the instrument matrix",
-            lambda s: figures.matrix_maps_figure(s.maps),
-        ),
-        ("matrix-errors", "their standard errors", lambda s: figures.matrix_errors_figure(s.maps)),
-        ("zero-offset", "maps of m21 and m31", lambda s: figures.element_maps_figure(s.maps, 0)),
-        ("efficiency", "maps of m22 and m33", lambda s: figures.element_maps_figure(s.maps, 1)),
-        ("cross-talk", "maps of m23 and m32", lambda s: figures.element_maps_figure(s.maps, 2)),
-        (
-            "retardance",
-            "maps of the retardance of HWP1 and HWP2",
-            lambda s: paper_figures.retardance_figure(s.rebuilt),
-        ),
-        (
-            "retardance-wavelength",
-            "their retardance against wavelength",
-            lambda s: paper_figures.retardance_wavelength_figure(s.rebuilt),
-        ),
-        ("coefficients", "maps of the coefficients of the method of Paper II", _coefficients),
-        (
-            "transmission",
-            "transmission of the cameras against polariser angle, with residuals",
-            _transmission,
-        ),
-        ("modulation", "q_m and u_m against polariser angle", _modulation),
-        (
-            "protection",
-            "largest error of q and u that an effect can make undetected",
-            lambda s: diagnosis_figures.protection_figure(s.limits),
-        ),
-        ("separation", "which effects look alike", lambda s: diagnosis_figures.separation_figure(s.limits)),
-        ("residual-map", "what the smooth model leaves, of whole frames", _residual_map),
-        ("residuals", "residuals of every field point before and after the fit, and all of them", _residuals),
-        ("corner", "posterior of coefficients in pairs", _corner),
-        ("trace", "chains of the posterior", _trace),
-    )
+    "accuracy": NamedFigure("error of p over the field: map and histogram", _accuracy),
+    "matrix": NamedFigure(
+        "the six elements of the instrument matrix",
+        lambda s: figures.matrix_maps_figure(s.maps, on=s.canvas),
+    ),
+    "matrix-errors": NamedFigure(
+        "their standard errors", lambda s: figures.matrix_errors_figure(s.maps, s.canvas)
+    ),
+    "zero-offset": NamedFigure(
+        "maps of m21 and m31", lambda s: figures.matrix_maps_figure(s.maps, 0, s.canvas)
+    ),
+    "efficiency": NamedFigure(
+        "maps of m22 and m33", lambda s: figures.matrix_maps_figure(s.maps, 1, s.canvas)
+    ),
+    "cross-talk": NamedFigure(
+        "maps of m23 and m32", lambda s: figures.matrix_maps_figure(s.maps, 2, s.canvas)
+    ),
+    "retardance": NamedFigure(
+        "maps of the retardance of HWP1 and HWP2",
+        lambda s: paper_figures.retardance_figure(s.rebuilt, on=s.canvas),
+    ),
+    "retardance-wavelength": NamedFigure(
+        "their retardance against wavelength",
+        lambda s: paper_figures.retardance_wavelength_figure(s.rebuilt, on=s.canvas),
+    ),
+    "coefficients": NamedFigure(
+        "maps of the coefficients of the method of Paper II",
+        lambda s: paper_figures.coefficients_figure(s.calset, s.maps.filter, s.canvas),
+    ),
+    "transmission": NamedFigure(
+        "transmission of the cameras against polariser angle, with residuals",
+        lambda s: paper_figures.transmission_figure(s.calset, s.maps.filter, s.place, s.canvas),
+    ),
+    "modulation": NamedFigure("q_m and u_m against polariser angle", _modulation),
+    "protection": NamedFigure(
+        "largest error of q and u that an effect can make undetected",
+        lambda s: diagnosis_figures.protection_figure(s.limits, s.canvas),
+        LIMITS,
+    ),
+    "separation": NamedFigure(
+        "which effects look alike",
+        lambda s: diagnosis_figures.separation_figure(s.limits, s.canvas),
+        LIMITS,
+    ),
+    "residual-map": NamedFigure("what the smooth model leaves, of whole frames", _residual_map),
+    "residuals": NamedFigure(
+        "residuals of every field point before and after the fit, and all of them", _residuals
+    ),
+    "corner": NamedFigure("posterior of coefficients in pairs", _corner, POSTERIOR),
+    "trace": NamedFigure("chains of the posterior", _trace, POSTERIOR),
 }
 """In the order of the list that is printed."""
 
 
-def draw(name: str, source: FigureSource) -> Figure:
+def draw(name: str, source: FigureSource) -> AnyFigure:
     """The figure of a name; `DataError` with the nearest names if there is none, or if the run lacks what it needs."""
     if name not in FIGURES:
         raise fail(f"there is no figure {name!r}", advice=nearest(name, FIGURES))

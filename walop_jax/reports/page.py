@@ -33,7 +33,7 @@ from walop_jax.io.text import (
 from walop_jax.nights.stacking import SURVEY, TRACKS
 from walop_jax.reports import diagnosis_figures, figures, survey_figures
 from walop_jax.reports.named import FigureSource, draw
-from walop_jax.reports.posterior_figures import MOST_IN_CORNER, informed
+from walop_jax.reports.posterior_figures import unit_in_words
 from walop_jax.reports.run import COMPARISON, EPOCH, LIMITS, SUMMARY, RunContents, read_limits
 from walop_jax.reports.wording import (
     UNNAMED,
@@ -42,7 +42,6 @@ from walop_jax.reports.wording import (
     hidden_in_words,
     model_entries,
     symbols_in_words,
-    unit_in_words,
     verdict_of_diagnosis,
     verdict_of_fit,
 )
@@ -118,7 +117,9 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         "next": _next(run, good and bool(summary.get("trusted", summary["converged"]))),
         "data": [] if run.product is None else data_in_words(run.product),
         "limits": limits_in_words(run.limits),
-        "symbols": "" if run.corner is None else symbols_in_words(_in_corner(run)),
+        "symbols": ""
+        if run.corner is None
+        else symbols_in_words([str(row["NAME"]) for row in run.intervals]),
     }
 
 
@@ -219,13 +220,6 @@ def _interval(row: Mapping[str, Any]) -> dict[str, str]:
     return names | ends | {"median": value, "sigma": sigma}
 
 
-def _in_corner(run: RunContents) -> tuple[str, ...]:
-    """The coefficients of the corner plot, as `sample` chooses them."""
-    spread = {str(r["NAME"]): 0.5 * float(r["HIGH68"] - r["LOW68"]) for r in run.intervals}
-    prior = {} if run.product is None else run.product.prior_width
-    return informed(tuple(spread), spread, prior)[:MOST_IN_CORNER]
-
-
 def _figures(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, str]:
     """The figures of the run as a whole, as data URIs."""
     made: dict[str, Figure] = {}
@@ -237,7 +231,7 @@ def _figures(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, str]
         made["matrix"] = figures.matrix_maps_figure(run.product.maps)
         made["errors"] = figures.matrix_errors_figure(run.product.maps)
         if run.product.residuals is not None:
-            made["residual_map"] = figures.residual_map_figure(run.product.residuals)
+            made["residual_map"] = draw("residual-map", FigureSource(run.folder))
     if run.diagnosis is None and run.product is not None:
         with contextlib.suppress(ValueError, OSError):  # data that are not there: the page says so
             made["fit_residuals"] = draw("residuals", FigureSource(run.folder))

@@ -3,30 +3,31 @@
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
 
-import matplotlib
 import numpy as np
 from jaxtyping import Float
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from walop_jax.io.atomic import atomic_path
-from walop_jax.io.text import with_error
+from walop_jax.io.text import RAISED, with_error
+from walop_jax.reports.style import PAGE, SMALL, PaperFigure
 
 SHARES = (0.393, 0.865)  # of the draws: inside 1 and 2 σ of a normal distribution of two coefficients
 BINS = 30  # of a histogram, along each axis
 MOST_IN_CORNER = 6  # coefficients whose axes can carry numbers
 PRIOR_ONLY = 0.9  # of the prior width: a wider posterior is a picture of the prior
 LABELS = {
-    "sky.depolarisation": "δ",
-    "collimator.diattenuation": "c",
+    "sky.depolarisation": "$\\delta$",
+    "collimator.diattenuation": "$c$",
     "collimator.q": "$c_q$",
     "collimator.u": "$c_u$",
-    "pupil.magnification": "M",
-    "pupil.distortion": "κ",
+    "pupil.magnification": "$M$",
+    "pupil.distortion": "$\\kappa$",
     "half1.wedge": "$w_1$",
     "half2.wedge": "$w_2$",
     "half1.plate.quartz": "$d_{q,1}$",
@@ -35,9 +36,9 @@ LABELS = {
     "half2.plate.mgf2": "$d_{m,2}$",
     "chwp.quartz": "$d_{q,c}$",
     "chwp.mgf2": "$d_{m,c}$",
-    "half1.efficiency": "$η_1$",
-    "half2.efficiency": "$η_2$",
-    "noise.ln_f": "ln f",
+    "half1.efficiency": "$\\eta_1$",
+    "half2.efficiency": "$\\eta_2$",
+    "noise.ln_f": "$\\ln f$",
 }
 """Symbols of the coefficients that people quote; others keep their name."""
 
@@ -45,7 +46,13 @@ LABELS = {
 def label(name: str, unit: str = "") -> str:
     """Symbol of a coefficient, with its unit."""
     text = LABELS.get(name, name)
-    return f"{text} [{unit}]" if unit else text
+    return f"{text} ({unit_in_words(unit)})" if unit else text
+
+
+def unit_in_words(unit: str) -> str:
+    """A unit as it is printed: µm, deg⁻²."""
+    raised = re.sub(r"(?<=[A-Za-z])-?\d+", lambda power: power[0].translate(RAISED), unit)
+    return "µm" if raised == "um" else raised
 
 
 def informed(
@@ -59,6 +66,30 @@ def informed(
         name: spread[name] / prior[name] if np.isfinite(prior.get(name, np.nan)) else 0.0 for name in names
     }
     return tuple(sorted((n for n in names if share[n] < PRIOR_ONLY), key=lambda n: share[n]))
+
+
+def correlated(
+    draws: Float[np.ndarray, "d k"], names: Sequence[str], prior: Mapping[str, float]
+) -> tuple[str, ...]:
+    """The coefficients worth a corner plot, at most `MOST_IN_CORNER`, in their order.
+
+    Of those that the data constrain (`informed`; all where there is none) the two most correlated, then one after the
+    other whatever is most correlated with any of these.
+    """
+    spread = dict(zip(names, draws.std(axis=0).tolist(), strict=True))
+    pool = informed(names, spread, prior) or tuple(names)
+    if len(pool) <= MOST_IN_CORNER:
+        return tuple(name for name in names if name in pool)
+    columns = draws[:, [names.index(name) for name in pool]]
+    size = np.abs(np.corrcoef(columns / columns.std(axis=0), rowvar=False))
+    np.fill_diagonal(size, 0.0)
+    chosen = [int(np.argmax(size.max(axis=1)))]
+    while len(chosen) < MOST_IN_CORNER:
+        nearest = size[chosen].max(axis=0)
+        nearest[chosen] = -1.0
+        chosen.append(int(np.argmax(nearest)))
+    kept = {pool[i] for i in chosen}
+    return tuple(name for name in names if name in kept)
 
 
 def corner_figure(
@@ -83,7 +114,7 @@ def corner_figure(
     # A coefficient that never moved has a panel too.
     margin = 0.05 * np.where(highest > lowest, highest - lowest, 20.0 * (np.abs(lowest) + (lowest == 0)))
     shown = [label(name, unit if few else "") for name, unit in zip(names, units, strict=True)]
-    figure = Figure(figsize=(width, width))
+    figure = PaperFigure(figsize=(width, width))
     corner(
         draws, bins=BINS, range=list(zip(lowest - margin, highest + margin, strict=True)), smooth=1.0, labels=shown,
         label_kwargs={"fontsize": 8 if few else 6}, levels=SHARES, plot_density=False, fill_contours=True, quiet=True,
@@ -96,16 +127,16 @@ def corner_figure(
     panels = np.array(figure.axes, dtype=object).reshape(k, k)
     for i in range(k):
         numbers = with_error(float(middle[i]), float(0.5 * (high[i] - low[i])))
-        title = f"{label(names[i])}\n{numbers} {units[i]}".rstrip()
+        title = f"{label(names[i])}\n{numbers} {unit_in_words(units[i])}".rstrip()
         panels[i, i].set_title(title, fontsize=8 if few else 4.5, loc="left")
         below, left = panels[k - 1, i], panels[i, 0]
         half = 0.5 * below.get_position().width
         below.xaxis.set_label_coords(below.get_position().x0 + half, 0.02, transform=figure.transFigure)
         left.yaxis.set_label_coords(0.015, left.get_position().y0 + half, transform=figure.transFigure)
         if few:
-            below.xaxis.set_major_formatter(ScalarFormatter(useOffset=False))
-            if i > 0:
-                left.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
+            for axis in (below.xaxis, left.yaxis)[: 1 + (i > 0)]:
+                axis.set_major_locator(MaxNLocator(3, prune="both"))
+                axis.set_major_formatter(ScalarFormatter(useOffset=False))
         for j, axes in enumerate(panels[i, : i + 1]):
             axes.tick_params(labelsize=6.5, length=2)
             if reference is not None:
@@ -123,27 +154,33 @@ def trace_figure(
     tau: Float[np.ndarray, " k"],
     width: float = 7.1,
 ) -> Figure:
-    """Median and 68 % band of the walkers against the step, one colour per ensemble, with τ as a bar."""
+    """Median and 68 % band of walkers against the step, a colour per ensemble; the bar is one autocorrelation time."""
     e, n, _, k = chains.shape
-    figure = Figure(figsize=(width, 0.9 * k + 0.6), layout="constrained")
+    figure = PAGE.figure(width, 0.9 * k + 0.6)
     panels = figure.subplots(k, 1, sharex=True, squeeze=False)[:, 0]
     step = thin * np.arange(n)
     for i, axes in enumerate(panels):
         for j in range(e):
             low, middle, high = np.quantile(chains[j, :, :, i], (0.16, 0.5, 0.84), axis=1)
-            axes.fill_between(step, low, high, color=f"C{j}", alpha=0.25, linewidth=0)
+            axes.fill_between(step, low, high, color=(*to_rgb(f"C{j}"), 0.25), linewidth=0)
             axes.plot(step, middle, color=f"C{j}", linewidth=0.6)
         if np.isfinite(tau[i]):
             bottom = axes.get_ylim()[0]
             axes.plot([0, tau[i]], [bottom, bottom], color="k", linewidth=3, solid_capstyle="butt")
             axes.text(
-                1.0, 1.0, f"τ = {tau[i]:.1f}", transform=axes.transAxes, fontsize=6, ha="right", va="bottom"
+                1.0,
+                1.0,
+                f"autocorrelation time (bar) {tau[i]:.1f} steps",
+                transform=axes.transAxes,
+                fontsize=SMALL,
+                ha="right",
+                va="bottom",
             )
-        axes.set_ylabel(label(names[i], units[i]), fontsize=6, rotation=0, ha="right", va="center")
-        axes.tick_params(labelsize=5)
+        axes.set_ylabel(label(names[i], units[i]), fontsize=SMALL, rotation=0, ha="right", va="center")
+        axes.tick_params(labelsize=SMALL - 1)
         axes.yaxis.set_major_locator(MaxNLocator(3))
         axes.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
-    panels[-1].set_xlabel("step after burn-in", fontsize=7)
+    panels[-1].set_xlabel("step after burn-in", fontsize=SMALL)
     return figure
 
 
@@ -151,7 +188,5 @@ def save_figure(
     path: str | os.PathLike[str], figure: Figure, *, overwrite: bool = False, dpi: int = 200
 ) -> None:
     """Write a figure (format by the name); it appears whole or not at all."""
-    # TrueType: journals refuse the Type 3 fonts that matplotlib writes by itself.
-    fonts: dict[Any, int] = {"pdf.fonttype": 42, "ps.fonttype": 42}
-    with atomic_path(path, overwrite=overwrite) as temporary, matplotlib.rc_context(fonts):
+    with atomic_path(path, overwrite=overwrite) as temporary:
         figure.savefig(temporary, dpi=dpi, bbox_inches="tight")

@@ -1,17 +1,23 @@
-"""Common parts of figures: sizes, colours, blank figures, axes of the field, panels of the instrument matrix."""
+"""Common parts of figures: where they are drawn, sizes, colours, maps of the field, panels of the instrument matrix."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
+import matplotlib
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.collections import PatchCollection
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.ticker import FuncFormatter, ScalarFormatter
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import NullLocator, ScalarFormatter
 
 from walop_jax.calibration.matrix import SMALLEST_DETERMINANT
 from walop_jax.io.text import with_minus_sign
@@ -19,29 +25,67 @@ from walop_jax.io.text import with_minus_sign
 FONT = 9
 SMALL = 7
 DIVERGING = "RdBu_r"
+SEQUENTIAL = "viridis"
 BEFORE = "#b2182b"  # dark enough to be told from AFTER in grey as well; both are ends of DIVERGING
 AFTER = "#2166ac"
 QUIET = "0.8"
+MOST_VECTOR = 2000  # points above which tiles are drawn as pixels
+TRUETYPE: dict[Any, int] = {"pdf.fonttype": 42, "ps.fonttype": 42}
+
+Map = Float[np.ndarray, "y x"]
+Maps = Float[np.ndarray, "m y x"]
+Field = tuple[float, float, float, float]
+AnyFigure = Figure | SubFigure
 
 
-def empty_figure(width: float, height: float) -> Figure:
-    """An empty figure, sizes in inches."""
-    layout = ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.05)
-    return Figure(figsize=(width, height), dpi=120, layout=layout)
+class PaperFigure(Figure):
+    """A figure that is written with TrueType fonts (PDF, PostScript): journals refuse Type 3, matplotlib's default."""
+
+    def savefig(self, *args: Any, **options: Any) -> None:
+        """Write the figure, as any other."""
+        with matplotlib.rc_context(TRUETYPE):
+            super().savefig(*args, **options)
 
 
-def field_axes(axis: Axes, title: str) -> None:
+@dataclasses.dataclass(frozen=True)
+class Canvas:
+    """Where a figure is drawn: in one of its own, of its usual size or of `figsize` (inches), or in place of `ax`.
+
+    Figures of several panels take the room of `ax`, which goes, as a subfigure.
+    """
+
+    ax: Axes | None = None
+    figsize: tuple[float, float] | None = None
+
+    def figure(self, width: float, height: float) -> Any:
+        """An empty figure; usual sizes in inches. Raises ValueError for axes that stand in no grid."""
+        if self.ax is None:
+            layout = ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.05)
+            return PaperFigure(figsize=self.figsize or (width, height), dpi=120, layout=layout)
+        place, parent = self.ax.get_subplotspec(), self.ax.get_figure()
+        if place is None or not isinstance(parent, Figure | SubFigure):
+            raise ValueError("ax: give axes made by subplots, so that there is a place to draw in")
+        self.ax.remove()
+        return parent.add_subfigure(place)
+
+    def single(self, width: float, height: float) -> tuple[Any, Axes]:
+        """A figure with one panel: `ax` itself where it is given."""
+        if self.ax is not None:
+            return self.ax.get_figure(), self.ax
+        figure = self.figure(width, height)
+        return figure, figure.subplots()
+
+
+PAGE = Canvas()
+
+
+def field_axes(axis: Axes, title: str = "") -> None:
     """Make axes a map of the field."""
     axis.set_title(title, fontsize=FONT)
     axis.set_xlabel("X (deg)", fontsize=FONT)
     axis.set_ylabel("Y (deg)", fontsize=FONT)
     axis.tick_params(labelsize=SMALL)
     axis.set_aspect("equal")
-
-
-def plain_numbers() -> FuncFormatter:
-    """Ticks of a logarithmic scale as numbers instead of powers: 0.1, 1; a formatter serves one axis only."""
-    return FuncFormatter(lambda value, _: f"{value:g}")
 
 
 def outer_labels(axes: Any) -> None:
@@ -53,24 +97,115 @@ def outer_labels(axes: Any) -> None:
         axis.label_outer()
 
 
+def pixel_map(
+    axis: Axes, values: Map, field: Field, norm: Normalize, colours: str, *, smooth: bool = False
+) -> Any:
+    """A map whose outermost pixels have their centres on the edges of `field` (left, right, bottom, top; degrees)."""
+    low_x, high_x, low_y, high_y = field
+    height, width = values.shape
+    half_x, half_y = 0.5 * (high_x - low_x) / max(width - 1, 1), 0.5 * (high_y - low_y) / max(height - 1, 1)
+    image = axis.imshow(
+        values, origin="lower", extent=(low_x - half_x, high_x + half_x, low_y - half_y, high_y + half_y),
+        norm=norm, cmap=colours, interpolation="bilinear" if smooth else "nearest",
+    )  # fmt: skip
+    axis.set(xlim=(low_x, high_x), ylim=(low_y, high_y))
+    return image
+
+
+def point_map(
+    axis: Axes,
+    x: Float[np.ndarray, " p"],
+    y: Float[np.ndarray, " p"],
+    values: Float[np.ndarray, " p"],
+    norm: Normalize,
+    colours: str,
+    shown: Bool[np.ndarray, " p"] | None = None,
+) -> Any:
+    """A square tile for each field point, as wide as the distance to its neighbours; none where there is no value.
+
+    `shown` are the points that set the distance and the edges of the map (default: all).
+    """
+    shown = np.ones(len(x), bool) if shown is None else shown
+    size = _spacing(x[shown], y[shown])
+    known = shown & np.isfinite(values)
+    corners = zip(x[known] - 0.5 * size, y[known] - 0.5 * size, strict=True)
+    # Edges in the colour of the tile close the seams that viewers leave between neighbours.
+    tiles = PatchCollection(
+        [Rectangle(corner, size, size) for corner in corners],
+        cmap=colours, norm=norm, edgecolor="face", linewidth=0.3,
+    )  # fmt: skip
+    tiles.set_array(values[known])
+    tiles.set_rasterized(bool(known.sum() > MOST_VECTOR))
+    axis.add_collection(tiles)
+    axis.set_facecolor("0.93")
+    axis.set_xlim(x[shown].min() - size, x[shown].max() + size)
+    axis.set_ylim(y[shown].min() - size, y[shown].max() + size)
+    return tiles
+
+
+def _spacing(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> float:
+    """Side of the tiles: the typical distance to the nearest neighbour."""
+    few = slice(0, MOST_VECTOR)
+    distance = np.hypot(x[few, None] - x[None, few], y[few, None] - y[None, few])
+    distance[distance == 0] = np.inf
+    nearest = distance.min(axis=1)
+    nearest = nearest[np.isfinite(nearest)]
+    return float(np.median(nearest)) if nearest.size else 0.05
+
+
+def colour_bar(figure: Any, image: Any, axes: Any, label: str = "", **options: Any) -> Any:
+    """A colour bar with small numbers, plain ones on a logarithmic scale."""
+    bar = figure.colorbar(image, ax=axes, **({"pad": 0.03} | options))
+    bar.set_label(label, fontsize=SMALL + 1)
+    bar.ax.tick_params(labelsize=SMALL, which="both")
+    if bar.ax.get_yscale() == "log":
+        plain_ticks(bar.ax.yaxis)
+    else:
+        bar.ax.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
+    return bar
+
+
+def plain_ticks(axis: Axis) -> None:
+    """Numbers instead of powers of ten on a logarithmic axis, few enough not to collide."""
+    low, high = axis.get_view_interval()
+    decades = np.log10(high / low)
+    steps = (1, 1.2, 1.5, 2, 3, 5, 7) if decades < 0.7 else (1, 2, 5) if decades < 2 else (1,)
+    ticks = [step * 10.0**power for power in range(-9, 9) for step in steps]
+    ticks = [tick for tick in ticks if 0.999 * low <= tick <= 1.001 * high]
+    axis.set_ticks(ticks, labels=[plain(tick, 1 + (tick * 1.001 >= 1)) for tick in ticks])
+    axis.set_minor_locator(NullLocator())
+
+
+def plain(value: float, digits: int = 2) -> str:
+    """A number with so many digits, never as a power of ten below a million: 0.000094."""
+    if not value or not math.isfinite(value):
+        return f"{value:g}"
+    places = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+    text = f"{value:.{places}f}"
+    return with_minus_sign(text.rstrip("0").rstrip(".") if "." in text and abs(value) >= 1e-3 else text)
+
+
 def largest_size(*maps: Any) -> float:
     """The largest size of any finite value: the end of a symmetric scale that all of the maps share."""
     sizes = [np.abs(values[np.isfinite(values)]) for values in map(np.asarray, maps)]
     return max((float(one.max()) for one in sizes if one.size), default=0.0) or 1.0
 
 
-Map = Float[np.ndarray, "y x"]
-Maps = Float[np.ndarray, "m y x"]
-Extent = tuple[float, float, float, float]
+def rounded_up(value: float) -> float:
+    """The next of …, 0.1, 0.2, 0.5, 1, 2, 5, …: scales of similar runs then are the same."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if value <= step * power * (1 + 1e-9))
+
+
+# ------------------------------------------------------------------------------------------ the instrument matrix
+
+PAPER_NAMES = ("zero offset", "efficiency", "cross-talk")
+"""Names in Paper II of the elements of the arm that measures q: m21, m22, m23; those of u are m31, m33, m32."""
 
 
 def element_symbols(arms: int) -> tuple[str, ...]:
     """m21, m22, m23 of the first arm, m31, … of the second, as matplotlib writes mathematics."""
     return tuple(f"$m_{{{2 + arm}{column}}}$" for arm in range(arms) for column in (1, 2, 3))
-
-
-PAPER_NAMES = ("zero offset", "efficiency", "cross-talk")
-"""Names in Paper II of the elements of the arm that measures q: m21, m22, m23; those of u are m31, m33, m32."""
 
 
 def element_kind(element: int, arms: int) -> int:
@@ -81,49 +216,44 @@ def element_kind(element: int, arms: int) -> int:
     return 1 if column == arm + 1 else 2
 
 
-def matrix_panels(figure: Figure, axes: Any, maps: Maps, extent: Extent, interpolation: str) -> None:
-    """Draw the elements over the field, zero offsets in per cent, each on a scale of its own that its title tells.
+def element_scale(element: int, maps: Maps) -> tuple[Normalize, str]:
+    """Scale (per cent) and colours of an element of the matrix; the zero offsets of all arms have one.
 
-    Of two arms lines in the second row bound the zone where |m22 m33 − m23 m32| < 0.1: a single exposure carries
-    almost no information on u there. `extent` is left, right, bottom and top in degrees.
+    Zero offset and cross-talk are symmetric about white; an efficiency ends at 100. The far ends go in steps of 1, 2,
+    5, so that runs of one instrument can be compared.
+    """
+    kind = element_kind(element, len(maps) // 3)
+    values = 100.0 * (maps[element] if kind else maps[::3])
+    if kind == 1:
+        return Normalize(100.0 - rounded_up(max(100.0 - float(values.min()), 1e-3)), 100.0), SEQUENTIAL
+    far = rounded_up(largest_size(values))
+    return Normalize(-far, far), DIVERGING
+
+
+def matrix_panels(
+    figure: Any, axes: Any, maps: Maps, field: Field, elements: Sequence[int], *, smooth: bool = False
+) -> None:
+    """Draw elements of the instrument matrix over the field, in per cent; their ranges stand in the titles.
+
+    Of two arms lines in the maps of u bound the zone where |m22 m33 − m23 m32| < 0.1: a single exposure carries almost
+    no information on u there.
     """
     arms = len(maps) // 3
     weak = np.abs(maps[1] * maps[5] - maps[2] * maps[4]) if arms == 2 else None
-    for i, (axis, name) in enumerate(zip(np.ravel(axes), element_symbols(arms), strict=True)):
-        element_panel(figure, axis, i, maps, extent, interpolation, name)
+    for axis, i in zip(np.ravel(axes), elements, strict=True):
+        kind = element_kind(i, arms)
+        low, high = (100.0 * float(edge(maps[i])) for edge in (np.min, np.max))
+        span = f"{_short(low, high - low)} to {_short(high, high - low)} %"
+        field_axes(axis, f"{PAPER_NAMES[kind]} {element_symbols(arms)[i]}\n{span}")
+        colour_bar(
+            figure, pixel_map(axis, 100.0 * maps[i], field, *element_scale(i, maps), smooth=smooth), axis
+        )
         if weak is not None and i > 3 and weak.min() < SMALLEST_DETERMINANT < weak.max():
-            axis.contour(weak, levels=[SMALLEST_DETERMINANT], extent=extent, colors="0.15", linewidths=0.7)
+            axis.contour(weak, levels=[SMALLEST_DETERMINANT], extent=field, colors="0.15", linewidths=0.7)
     outer_labels(axes)
-
-
-def element_panel(
-    figure: Figure, axis: Axes, i: int, maps: Maps, extent: Extent, interpolation: str, name: str
-) -> None:
-    """One element of the matrix over the field on a scale of its own, zero offsets in per cent."""
-    kind = element_kind(i, len(maps) // 3)
-    values = maps[i] if kind else 100.0 * maps[i]
-    low, high = float(values.min()), float(values.max())
-    span = f"{_short(low, high - low)} … {_short(high, high - low)}"
-    field_axes(axis, f"{PAPER_NAMES[kind]} {name}{'' if kind else ' (%)'}\n{span}")
-    image = _image(axis, values, extent, interpolation)
-    bar = figure.colorbar(image, ax=axis, pad=0.03)
-    bar.ax.tick_params(labelsize=SMALL)
-    bar.ax.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
 
 
 def _short(value: float, span: float) -> str:
     """A number to three digits of the span that it bounds."""
     places = 2 if span <= 0 else max(0, 2 - math.floor(math.log10(span)))
     return with_minus_sign(f"{value:.{min(places, 7)}f}")
-
-
-def _image(axis: Axes, values: Map, extent: Extent, interpolation: str) -> Any:
-    """Values of both signs on a scale with white at zero, others from the smallest to the largest."""
-    low, high = float(values.min()), float(values.max())
-    norm, colours = Normalize(low, high), "viridis"
-    if low < 0 < high:
-        far = largest_size(values)
-        norm, colours = Normalize(-far, far), DIVERGING
-    return axis.imshow(
-        values, origin="lower", extent=extent, norm=norm, cmap=colours, interpolation=interpolation
-    )

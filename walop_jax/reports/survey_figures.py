@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from walop_jax.reports.style import AFTER, BEFORE, FONT, QUIET, SMALL, empty_figure
+from walop_jax.reports.style import AFTER, BEFORE, FONT, PAGE, QUIET, SMALL
 
 MOST = 8  # parameters in a figure
 
@@ -24,7 +24,7 @@ def tracks_figure(tracks: Any, document: Mapping[str, Any]) -> Figure | None:
     names = [*dict.fromkeys(one["name"] for one in found), *laws][:MOST]
     if not names:
         return None
-    figure = empty_figure(6.4, 0.9 + 1.25 * len(names))
+    figure = PAGE.figure(6.4, 0.9 + 1.25 * len(names))
     axes = np.ravel(figure.subplots(len(names), 1, sharex=True, squeeze=False))
     for axis, name in zip(axes, names, strict=True):
         rows = tracks[np.asarray(tracks["NAME"]).astype(str) == name]
@@ -52,7 +52,7 @@ def nights_figure(document: Mapping[str, Any]) -> Figure:
     nights: Sequence[Mapping[str, Any]] = document["by_night"]
     excess = np.array([night["excess"] for night in nights], float)
     mjd = np.array([night["mjd"] for night in nights], float)
-    figure = empty_figure(6.4, 2.0)
+    figure = PAGE.figure(6.4, 2.0)
     axis = figure.subplots()
     axis.axhspan(-2.0, 2.0, color=QUIET, lw=0)
     axis.scatter(mjd, excess, s=6, color=np.where(excess > 5.0, BEFORE, AFTER).tolist())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from walop_jax.reports.style import AFTER, BEFORE, FONT, QUIET, SMALL, empty_figure
+from walop_jax.reports.style import AFTER, BEFORE, FONT, PAGE, QUIET, SMALL
 from walop_jax.science.watch_found import Watch
 
 
@@ -15,7 +15,7 @@ def watch_figure(found: Watch) -> Figure:
     The band is the smallest step from there on that is found in 99 % of cases; lines are changes that were found.
     """
     count = len(found.cameras)
-    figure = empty_figure(6.0, 1.1 + 1.3 * count)
+    figure = PAGE.figure(6.0, 1.1 + 1.3 * count)
     axes = np.ravel(figure.subplots(count, 1, sharex=True, sharey=True, squeeze=False))
     named = {change.camera for change in found.changes}
     for k, axis in enumerate(axes):

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from walop_jax.calibration import Calibration
 from walop_jax.diagnosis.figure_data import UNNAMED
 from walop_jax.fit.parameter_table import PRIOR_ONLY
-from walop_jax.io.text import RAISED, probability, rounded, value_and_error, with_error, with_minus_sign
+from walop_jax.io.text import probability, rounded, value_and_error, with_error, with_minus_sign
 from walop_jax.model.effects import EFFECTS
 from walop_jax.reports.posterior_figures import LABELS
 
@@ -33,12 +33,6 @@ def effect_in_words(effect: str) -> str:
     if known is None:
         return ""
     return in_a_sentence((known.__doc__ or "").strip().splitlines()[0].rstrip("."))
-
-
-def unit_in_words(unit: str) -> str:
-    """A unit as it is printed: µm, deg⁻²."""
-    raised = re.sub(r"(?<=[A-Za-z])-?\d+", lambda power: power[0].translate(RAISED), unit)
-    return "µm" if raised == "um" else raised
 
 
 def in_a_sentence(text: str) -> str:
@@ -210,11 +204,11 @@ def model_entries(product: Calibration) -> dict[str, dict[str, str]]:
 
 def symbols_in_words(names: Sequence[str]) -> str:
     """The symbols that figures of a posterior use, with the names they stand for."""
-    plain = {
-        name: LABELS[name].replace("$", "").replace("{", "").replace("}", "")
-        for name in names
-        if name in LABELS
-    }
-    return (
-        "Symbols: " + ", ".join(f"{symbol} {name}" for name, symbol in plain.items()) + "." if plain else ""
-    )
+    greek = {"\\delta": "δ", "\\kappa": "κ", "\\eta": "η", "\\ln": "ln"}
+    found = []
+    for name in names:
+        symbol = re.sub(r"[${}]", "", LABELS.get(name, ""))
+        for code, letter in greek.items():
+            symbol = symbol.replace(code, letter)
+        found += [f"{symbol} {name}"] if symbol else []
+    return f"Symbols: {', '.join(found)}." if found else ""
