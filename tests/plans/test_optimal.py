@@ -255,3 +255,17 @@ def test_a_budget_below_every_cost_pays_for_nothing():
     problem = random_experiment(1, budget=0.1)
     with pytest.raises(ValueError, match="cheapest"):
         rounded(problem, optimise(problem))
+
+
+def test_two_experiments_share_their_largest_variance():
+    """Half the weight p at each of ±1, the rest at 0: the coefficient of x² has variance 1 / p (1 − p), three times that
+    of a line's slope 3 / p: at best 9 / 2, p = 2 / 3. The second knows no x², and has a parameter that is known."""
+    rows = np.stack([QUADRATIC, QUADRATIC * [1.0, 1.0, 0.0]])
+    family = Listed.of(np.einsum("ria,rib->riab", rows, rows))
+    targets = np.zeros((2, 1, 3, 1))
+    targets[0, 0, 2], targets[1, 0, 1] = 1.0, np.sqrt(3.0)
+    known = np.stack([np.zeros((3, 3)), np.diag([0.0, 0.0, 1.0])])
+    plan = optimise(Experiment(known, targets, (family,), 1.0, together=2), gap=1e-3)
+    assert plan.bound <= 4.5 * (1 + 1e-6)
+    assert plan.value == pytest.approx(4.5, rel=1e-3)
+    assert weights_at(plan, GRID, 0.0) == pytest.approx(1 / 3, abs=0.02)

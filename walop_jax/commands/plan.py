@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command, text_file
+from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, Writers, command, text_file
 from walop_jax.commands.inputs import Folder, PathLike, calibration_of
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
-    from walop_jax import ObservingPlan
+    from walop_jax import Calibration, ObservingPlan
     from walop_jax.plans.plan import ExposurePlan
 
 PLAN, RESULT = "plan.toml", "plan.json"
@@ -33,7 +33,8 @@ Criterion = Annotated[
     Any,
     Option(
         "What is to be known best: worst (default: the largest error of p over field and colour), mean, a parameter, "
-        "or a table of stars (X, Y in degrees, Q, U).",
+        "a table of stars (X, Y in degrees, Q, U), or apart: effects that --apart names, or those that a diagnosis of "
+        "RUN could not tell apart.",
         "NAME|TABLE",
         str,
     ),
@@ -41,6 +42,15 @@ Criterion = Annotated[
 Goal = Annotated[
     "float | None",
     Option("A value of the criterion, in % for errors of p: say how long it takes.", "VALUE", float),
+]
+Apart = Annotated[
+    Any,
+    Option(
+        "Effect that is to be told from the others, NAME=VALUE as for simulate, or NAME alone for one that is a rival "
+        "only. Give it twice or more.",
+        "NAME=VALUE",
+        list[str],
+    ),
 ]
 Draws = Annotated[
     int, Option("Instruments, drawn from the priors, that the plan is made for.", kind=int, least=1)
@@ -57,6 +67,7 @@ def plan(
     criterion: Criterion = "worst",
     goal: Goal = None,
     after: After = None,
+    apart: Apart = None,
     draws: Draws = 20,
     output: Folder = None,
 ) -> Outcome[ExposurePlan]:
@@ -81,6 +92,11 @@ def plan(
         could = candidates
     elif could == "" and known is not None:
         could = known.model.template.name
+    alike = tuple(apart or ())
+    if criterion == "apart" and not alike:
+        if after is None:
+            raise UsageError("give the effects that are to be told apart, or a RUN of diagnose", "apart")
+        alike = _alike(Path(after), known)
     if not minutes > 0:
         raise fail("nothing can be observed in no time", advice="give --minutes")
     wanted = (
@@ -97,6 +113,7 @@ def plan(
             known=known,
             goal=goal,
             draws=draws,
+            apart=alike,
             seed=job.seed,
             progress=say,
         )
@@ -109,4 +126,22 @@ def plan(
         lambda: found.document() | {"seed": job.seed},
         files=files,
         saved_as=RESULT,
+    )
+
+
+def _alike(run: Path, known: Calibration) -> tuple[Any, ...]:
+    """The effects that a diagnosis could not tell apart: that found, as it is, then its rivals by name."""
+    from walop_jax.io.text import read_json
+
+    path = run / "diagnosis.json"
+    if not path.exists():
+        raise fail("no diagnosis", file=path, advice="run diagnose first, or name the effects with --apart")
+    found = {effect.name: effect for effect in known.model.instrument(known.values).effects}
+    for step in read_json(path)["steps"]:
+        if step["equivalent"] and step["effect"] in found:
+            return (found[step["effect"]], *step["equivalent"])
+    raise fail(
+        "the diagnosis left no effects that look alike",
+        file=path,
+        advice="name those that are to be told apart with --apart",
     )

@@ -13,25 +13,35 @@ Limits       Detectors are linear. Exposures know of each other only by the para
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.flux import Sharing, project_flux, sharing
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
+from walop_jax.model import light
 from walop_jax.model.compiled import compiled
+from walop_jax.model.effects import Effect, effect_by_name
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
-from walop_jax.model.specification import Model
+from walop_jax.model.specification import Model, effect_context, with_effects
 from walop_jax.plans.could import CandidateExposure, Could
 from walop_jax.plans.families import Circle, Family, Listed, harmonics
 from walop_jax.simulation.observing_plan import ObservingPlan
-from walop_jax.simulation.simulate import PhotonNoise, draw_instrument, fluxes, simulate, truth_values
+from walop_jax.simulation.simulate import (
+    PhotonNoise,
+    draw_instrument,
+    effect_from_text,
+    fluxes,
+    simulate,
+    truth_values,
+)
 
 NODES = 7  # angles of the polariser at which counts are computed: a series of degree 3 in 2θ, one more than it needs
 ANGLES = 361
@@ -51,7 +61,8 @@ class Candidates:
     `families` go with `choices`, their information scaled to the field points of the plan. `values` (draw, parameter)
     are all parameters of the instruments that were drawn, `prior` what is known of the free ones beforehand, `names`
     of these. `truncation` is the largest error of the information between the angles that were computed, in units of
-    the mean diagonal of each parameter; `notes` say what had to be left out.
+    the mean diagonal of each parameter; `notes` say what had to be left out. `effects` are those that are to be told
+    apart, parameters of the model as well, with whether their size is known.
     """
 
     could: Could
@@ -63,6 +74,7 @@ class Candidates:
     prior: Float[np.ndarray, "f f"]
     truncation: float
     notes: tuple[str, ...]
+    effects: Mapping[str, bool] = dataclasses.field(default_factory=dict)
 
 
 def candidates(
@@ -72,12 +84,14 @@ def candidates(
     seed: int = 0,
     around: Calibration | None = None,
     angles: int = ANGLES,
+    effects: Sequence[str | Effect] = (),
     progress: Callable[[str], None] | None = None,
 ) -> Candidates:
     """The exposures that could be taken, each with its information in `draws` draws of the instrument.
 
     Instruments are drawn from the priors, or from the posterior of the calibration `around`; `angles`, an odd number,
-    are those of the polariser. Raises ValueError where nothing is left to be observed.
+    are those of the polariser. `effects` may be there as well, at their values; those given by name alone at the size
+    of their scale. Raises ValueError where nothing is left to be observed, and for effects that do not act on light.
     """
     tell = progress or (lambda text: None)
     choices, notes = could.choices()
@@ -96,9 +110,12 @@ def candidates(
     tell("expected counts")
     calset = simulate(plan, seed=seed, noiseless=True, steady=True).calset
     model = base_model(calset, plan.design, throughput_degree=plan.throughput_degree)
+    model, stated = _with(model, calset, effects)
     values = drawn(model, draws, seed, around)
+    for i in (model.index(name) for name in model.names if _effect_of(name, stated)):
+        values[:, i] = model.parameters[i].start
     likelihood = Likelihood.of(calset, model)
-    light, factor = _Light(plan, likelihood), _factor(could.plan, few)
+    source, factor = _Light(plan, likelihood), _factor(could.plan, few)
     responses = []
     for number, one in enumerate(values):
         tell(f"expected counts of instrument {number + 1} of {draws}")
@@ -110,7 +127,7 @@ def candidates(
         polarised = choice.kind == "clp"
         where = turn if polarised else None
         information = np.stack(
-            [light.information(rows, unit, slopes, choice.seconds, where) for unit, slopes in responses]
+            [source.information(rows, unit, slopes, choice.seconds, where) for unit, slopes in responses]
         )
         information *= 1.0 if choice.kind == "standard" else factor
         cost = choice.seconds + could.costs.of(choice.kind)
@@ -118,11 +135,36 @@ def candidates(
         if polarised:
             unit, slopes = responses[0]
             between = (np.arange(0, angles, 6) + 0.5) / angles
-            exact = factor * light.information(rows, unit, slopes, choice.seconds, between)
+            exact = factor * source.information(rows, unit, slopes, choice.seconds, between)
             lost = max(lost, _overtone(unit[:, rows]), _apart(information[0], between, exact))
-    known = prior_rows(model).jacobian(model.selection())
+    rows = prior_rows(model).jacobian(model.selection())
     names = tuple(model.names[i] for i in model.free)
-    return Candidates(could, model, choices, tuple(families), values, names, known.T @ known, lost, notes)
+    known = (rows.T @ rows) * np.outer(*2 * [[not _effect_of(name, stated) for name in names]])
+    return Candidates(could, model, choices, tuple(families), values, names, known, lost, notes, stated)
+
+
+def _with(
+    model: Model, calset: CalibrationSet, given: Sequence[str | Effect]
+) -> tuple[Model, dict[str, bool]]:
+    """The model with effects at their values, and which of them have one."""
+    context, stated, whole = effect_context(model.template, calset.exposures), {}, model
+    for one in given:
+        alone = isinstance(one, str) and "=" not in one
+        effect = effect_from_text(one, context) if isinstance(one, str) and not alone else one
+        whole = with_effects(whole, (effect,), context)
+        name = one.strip() if isinstance(one, str) and alone else effect.name
+        stated[name] = not alone
+        for p in whole.parameters if alone else ():
+            if _effect_of(p.name, (name,)) and p.name.split(".")[1] not in effect_by_name(name).shape:
+                whole = whole.change(p.name, start=p.start + p.scale)
+    if given and not light.is_linear(whole.template):
+        raise ValueError("effects of the detectors cannot be planned for: only those that act on light")
+    return whole, stated
+
+
+def _effect_of(name: str, effects: Iterable[str]) -> str:
+    """The effect that a parameter belongs to, of some."""
+    return next((effect for effect in effects if name.startswith(f"{effect}.")), "")
 
 
 def fewer_points(plan: ObservingPlan) -> ObservingPlan:
@@ -246,9 +288,11 @@ def _apart(
     return float(np.max(np.abs(made - exact) / (size[:, None] * size)))
 
 
-def information_of(known: Calibration, names: Sequence[str]) -> Float[np.ndarray, "f f"]:
-    """What a calibration says of parameters by name; nothing of those that it has not."""
-    both = [i for i, name in enumerate(names) if name in known.model.names]
+def information_of(
+    known: Calibration, names: Sequence[str], effects: Iterable[str] = ()
+) -> Float[np.ndarray, "f f"]:
+    """What a calibration says of parameters by name; nothing of those that it has not, nor of those of `effects`."""
+    both = [i for i, name in enumerate(names) if name in known.model.names and not _effect_of(name, effects)]
     there = [known.model.index(names[i]) for i in both]
     covariance = known.covariance[np.ix_(there, there)]
     size = np.sqrt(np.clip(np.diag(covariance), 0.0, None))

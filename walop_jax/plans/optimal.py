@@ -10,8 +10,10 @@ criterion is the largest of them, averaged over draws r of what the instrument m
 
     f(w) = mean_r max_k φ_rk(w),
 
-which holds A-, I- and c-optimality (one target), G-optimality (one target for each place), and naming (one target for
-each pair of hypotheses) as cases. f is convex.
+which holds A-, I- and c-optimality (one target), G-optimality (one target for each place) as cases. f is convex. Draws
+may share their largest variance in groups: the same experiment in other parameters, as for the separation of each pair
+of hypotheses (Atkinson & Fedorov 1975, Biometrika 62, 57). The mean is then one over groups, the maximum over all that
+a group holds.
 
 Proof        For multipliers π_rk ≥ 0, Σ_k π_rk = 1, let L_r = Σ_k π_rk A_rk A_rkᵀ, G_r = M_r(w)⁻¹ L_r M_r(w)⁻¹. Every
              other plan v has, by Cauchy and Schwarz,
@@ -73,13 +75,28 @@ class Experiment:
     """What is wanted, what is known and what can be done.
 
     `known` is M₀ (draw, n, n), `targets` A (draw, target, n, q), `families` the candidates, `budget` the cost that a
-    plan may have. Raises NotEstimableError, when solved, if a target depends on a direction nothing informs about.
+    plan may have; `together` draws in a row share their largest variance. Raises NotEstimableError, when solved, if a
+    target depends on a direction nothing informs about.
     """
 
     known: Float[np.ndarray, "r n n"]
     targets: Float[np.ndarray, "r k n q"]
     families: tuple[Family, ...]
     budget: float
+    together: int = 1
+
+    def largest(self, phi: Float[np.ndarray, "r k"]) -> Float[np.ndarray, " g"]:
+        """The largest variance of each group of draws."""
+        return np.asarray(phi.reshape(len(phi) // self.together, -1).max(axis=1))
+
+    def relative(self, phi: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "r k"]:
+        """Variances over the largest of their group."""
+        return phi / np.repeat(self.largest(phi), self.together)[:, None]
+
+    def of_one(self, shares: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "r k"]:
+        """Multipliers with sum 1 in each group."""
+        whole = shares.reshape(len(shares) // self.together, -1).sum(axis=1)
+        return shares / np.repeat(whole, self.together)[:, None]
 
     def reduced(self) -> Experiment:
         """The same in coordinates in which the information of everything together is the identity.
@@ -114,7 +131,7 @@ class Experiment:
         families = tuple(dataclasses.replace(f, basis=turned(f.basis)) for f in self.families)  # type: ignore[type-var]
         # What a few candidates leave open is known to next to nothing instead: no target needs it, or it is found bad.
         known = turned(self.known) + _NOTHING * np.eye(int(seen.sum()))
-        return Experiment(known, kept, families, self.budget)
+        return Experiment(known, kept, families, self.budget, self.together)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -203,33 +220,34 @@ class _Some:
 
     def value(self, weight: Float[np.ndarray, " s"]) -> float:
         """The criterion f(w)."""
-        return float(self.variances(self.covariance(weight)).max(axis=1).mean())
+        return float(self.experiment.largest(self.variances(self.covariance(weight))).mean())
 
     def solve(
         self, weight: Float[np.ndarray, " s"], gap: float
     ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "r k"]]:
         """Weights within `gap` of the best, and the multipliers π of the targets.
 
-        Barrier: mean_r t_r − μ [Σ log(t_r − φ_rk) + Σ log w_s], Newton in (w, t) on the budget's plane.
+        Barrier: mean_g t_g − μ [Σ log(t_g − φ_rk) + Σ log w_s], g the group of r, Newton in (w, t) on the budget's
+        plane.
         """
         weight = np.maximum(weight, 1e-3 * self.experiment.budget / self.costs.sum())
         weight *= self.experiment.budget / (self.costs @ weight)
         phi = self.variances(self.covariance(weight))
         seen = np.zeros(phi.shape)
         while True:
-            seen = np.maximum(seen, phi / phi.max(axis=1, keepdims=True))
+            seen = np.maximum(seen, self.experiment.relative(phi))
             near = _nearest(seen)
             weight, shares = self._of_targets(near)._solved(weight, gap)
             phi = self.variances(self.covariance(weight))
-            top = np.take_along_axis(phi, near, axis=1).max(axis=1)
-            if np.all(phi.max(axis=1) <= (1.0 + 0.1 * gap) * top):
+            top = self.experiment.largest(np.take_along_axis(phi, near, axis=1))
+            if np.all(self.experiment.largest(phi) <= (1.0 + 0.1 * gap) * top):
                 whole = np.zeros(phi.shape)
                 np.put_along_axis(whole, near, shares, axis=1)
                 return weight, whole
 
     def worst(self, phi: Float[np.ndarray, "r k"]) -> _Some:
         """The same for the targets with the largest variances: whose value bounds that of all from below."""
-        return self._of_targets(_nearest(phi / phi.max(axis=1, keepdims=True)))
+        return self._of_targets(_nearest(self.experiment.relative(phi)))
 
     def _of_targets(self, near: Int[np.ndarray, "r l"]) -> _Some:
         """The same for some of the targets of each draw."""
@@ -245,8 +263,9 @@ class _Some:
     ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "r k"]]:
         phi = self.variances(self.covariance(weight))
         constraints = phi.size + len(weight)
-        mu = phi.max(axis=1).mean() / constraints
-        level = phi.max(axis=1) + len(phi) * mu
+        level = self.experiment.largest(phi)
+        mu = level.mean() / constraints
+        level = level + len(level) * mu
         least = 0.2 * gap * level.mean() / constraints
         while True:
             last = mu <= 1.1 * least
@@ -254,14 +273,19 @@ class _Some:
             if last:
                 break
             mu = max(mu / _SHARPER, least)
-        shares = 1.0 / np.maximum(level[:, None] - self.variances(self.covariance(weight)), 1e-300)
-        return weight, shares / shares.sum(axis=1, keepdims=True)
+        slack = self._slack(level, self.variances(self.covariance(weight)))
+        return weight, self.experiment.of_one(1.0 / np.maximum(slack, 1e-300))
 
-    def _barrier(self, weight: Float[np.ndarray, " s"], level: Float[np.ndarray, " r"], mu: float) -> float:
+    def _slack(
+        self, level: Float[np.ndarray, " g"], phi: Float[np.ndarray, "r k"]
+    ) -> Float[np.ndarray, "r k"]:
+        return np.repeat(level, self.experiment.together)[:, None] - phi
+
+    def _barrier(self, weight: Float[np.ndarray, " s"], level: Float[np.ndarray, " g"], mu: float) -> float:
         if np.any(weight <= 0):
             return np.inf
         try:
-            slack = level[:, None] - self.variances(self.covariance(weight))
+            slack = self._slack(level, self.variances(self.covariance(weight)))
         except np.linalg.LinAlgError:
             return np.inf
         if np.any(slack <= 0):
@@ -269,16 +293,20 @@ class _Some:
         return float(level.mean() - mu * (np.log(slack).sum() + np.log(weight).sum()))
 
     def _centred(
-        self, weight: Float[np.ndarray, " s"], level: Float[np.ndarray, " r"], mu: float, enough: float
-    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " r"]]:
+        self, weight: Float[np.ndarray, " s"], level: Float[np.ndarray, " g"], mu: float, enough: float
+    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " g"]]:
         """Newton's method for one μ, until its decrement is `enough` of μ."""
         s, r = len(weight), len(level)
-        some = slice(None, None, -(-r // _BENT))
+        some = slice(None, None, -(-len(self.wide) // _BENT))
+
+        def grouped(values: Float[np.ndarray, "*d"]) -> Float[np.ndarray, "*g"]:
+            return values.reshape(r, -1, *values.shape[1:]).sum(axis=1)
+
         for _ in range(_NEWTON):
             covariance = self.covariance(weight)
             y = covariance @ self.wide
             slope = -self.gains(y)
-            slack = level[:, None] - self._by_target(self.wide * y)
+            slack = self._slack(level, self._by_target(self.wide * y))
             push = mu / slack
             # Curvature of the φ: Σ_k push_k 2 tr(M_s P M_t Q), P = M⁻¹, Q = Σ_k push_k y_k y_kᵀ. Its main part in some
             # of the draws, which are much alike, is enough to step by.
@@ -290,13 +318,13 @@ class _Some:
             hessian = np.zeros((s + r, s + r))
             gradient = np.zeros(s + r)
             gradient[:s] = np.einsum("rk,rsk->s", push, slope) - mu / weight
-            gradient[s:] = 1.0 / r - push.sum(axis=1)
+            gradient[s:] = 1.0 / r - grouped(push.sum(axis=1))
             hessian[:s, :s] = 2.0 * alike * flat @ flat.T + np.diag(mu / weight**2)
             stiff = mu / slack**2
             hessian[:s, :s] += np.einsum("rsk,rtk->st", slope * stiff[:, None], slope, optimize=True)
-            hessian[:s, s:] = -np.einsum("rk,rsk->sr", stiff, slope)
+            hessian[:s, s:] = -grouped(np.einsum("rk,rsk->rs", stiff, slope)).T
             hessian[s:, :s] = hessian[:s, s:].T
-            hessian[s:, s:] += np.diag(stiff.sum(axis=1))
+            hessian[s:, s:] += np.diag(grouped(stiff.sum(axis=1)))
             step = _on_the_budget(hessian, gradient, np.append(self.costs, np.zeros(r)))
             decrement = float(-gradient @ step)
             here, length = self._barrier(weight, level, mu), 1.0
@@ -424,19 +452,20 @@ def lower_bound(
 ) -> Bound:
     """The least criterion that any plan can have (see the module).
 
-    `covariance` is M(w)⁻¹ of a plan, `shares` multipliers π of the targets with sum 1 in each draw. Any of both gives a
-    valid bound; those of the optimum give the largest.
+    `covariance` is M(w)⁻¹ of a plan, `shares` multipliers π of the targets with sum 1 in each group. Any of both gives
+    a valid bound; those of the optimum give the largest.
     """
     wide = _side_by_side(experiment.targets)
     y = covariance @ wide
     shared = y * np.repeat(shares, experiment.targets.shape[3], axis=1)[:, None]
     g = shared @ y.swapaxes(1, 2)
-    here = float((shared * wide).sum(axis=(1, 2)).mean())
-    known = float((g * experiment.known).sum(axis=(1, 2)).mean())
+    groups = len(g) // experiment.together
+    here = float((shared * wide).sum()) / groups
+    known = float((g * experiment.known).sum()) / groups
     tops, ratio = [], 0.0
     for number, family in enumerate(experiment.families):
         flat = family.basis.reshape(len(g), family.basis.shape[1], -1)
-        gains = (flat @ g.reshape(len(g), -1, 1)).mean(axis=(0, 2))
+        gains = (flat @ g.reshape(len(g), -1, 1)).sum(axis=(0, 2)) / groups
         places, largest = family.best(gains, most)
         ratio = max(ratio, largest)
         tops += [(number, place) for place in places]
@@ -527,7 +556,7 @@ def _filled(
         # A plan that is not whole yet may not determine everything: a thousandth of the weights stands in for the rest.
         base = count + 1e-3 * weight
         phi = some.variances(some.covariance(base))
-        here, near = float(phi.max(axis=1).mean()), some.worst(phi)
+        here, near = float(some.experiment.largest(phi).mean()), some.worst(phi)
         gain = [(here - near.value(base + (np.arange(len(count)) == i))) / some.costs[i] for i in can]
         count = count + (np.arange(len(count)) == can[int(np.argmax(gain))])
 
@@ -540,15 +569,14 @@ def _exchanged(
     covariance = some.covariance(count)
     phi = some.variances(covariance)
     # The worst targets, smoothly: the slope of the maximum alone would forget the next one.
-    shares = (phi / phi.max(axis=1, keepdims=True)) ** _SHARPNESS
-    promising = lower_bound(problem, covariance, shares / shares.sum(axis=1, keepdims=True), most).tops
+    shares = problem.of_one(problem.relative(phi) ** _SHARPNESS)
+    promising = lower_bound(problem, covariance, shares, most).tops
     new = [top for top in promising if not any(_same(top, there) for there in some.chosen)]
     kept = np.flatnonzero(count)
     some = _Some(problem, [*(some.chosen[i] for i in kept), *new])
     count = np.concatenate([count[kept], np.zeros(len(new))])
     y = covariance @ some.wide
-    weights = shares / shares.sum(axis=1, keepdims=True)
-    slope = np.einsum("rsk,rk->s", some.gains(y), weights) / len(y)
+    slope = np.einsum("rsk,rk->s", some.gains(y), shares)
     worst = some.worst(phi)
     left = problem.budget - some.costs @ count
     out, into = np.meshgrid(np.arange(len(kept)), np.arange(len(count)), indexing="ij")

@@ -12,7 +12,7 @@ Order        Settings one after the other, the polariser turning one way in each
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.user_tables import InputTable
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import rounded as digits
+from walop_jax.model.effects import Effect
 from walop_jax.plans.could import Could
 from walop_jax.plans.exposures import DRAWS, Candidates, candidates, information_of
 from walop_jax.plans.optimal import (
@@ -34,10 +35,12 @@ from walop_jax.plans.optimal import (
     rounded,
     worth,
 )
-from walop_jax.plans.wanted import WORST, FieldErrors, Wanted, field_errors, wanted
+from walop_jax.plans.wanted import APART, WORST, FieldErrors, Wanted, field_errors, wanted
 from walop_jax.science.star_errors import GOAL
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, polariser_turn
 
+NAMED = 5.0
+"""Distance (σ) from every rival at which an effect is named."""
 _TRIES = 6  # budgets, until the exposures and the changes between them fit into the time
 
 USUAL: Mapping[str, tuple[tuple[float, ...], bool, int]] = {
@@ -223,23 +226,30 @@ def plan_exposures(
     draws: int = DRAWS,
     seed: int = 0,
     gap: float = GAP,
+    apart: Sequence[str | Effect] = (),
     progress: Callable[[str], None] | None = None,
 ) -> ExposurePlan:
     """The calibration exposures of `minutes` that make a criterion (`wanted`) best.
 
     `known` is a calibration that is there already; `goal` a value of the criterion, as it is told, to which the time is
-    found. Raises ValueError for a time that pays for nothing, NotEstimableError where nothing that could be observed,
-    or too little in that time, determines what is asked.
+    found. `apart` are effects that are to be told apart (`wanted.APART`), each with its value or by name
+    alone; their goal is 5 σ unless another is given. Raises ValueError for a time that pays for nothing,
+    NotEstimableError where nothing that could be observed, or too little in that time, determines what is asked.
     """
-    found = candidates(Could.of(could), draws=draws, seed=seed, around=known, progress=progress)
+    if apart:
+        criterion, goal = APART, NAMED if goal is None else goal
+    found = candidates(
+        Could.of(could), draws=draws, seed=seed, around=known, effects=apart, progress=progress
+    )
     if progress is not None:
         progress("what is wanted")
-    field = None if len(found.model.template.arms) != 2 else field_errors(found)
+    field = None if apart or len(found.model.template.arms) != 2 else field_errors(found)
     if field is None and criterion in ("worst", "mean"):
         field = field_errors(found)  # raises, with advice
     return plan_from(
         found, minutes, wanted(found, field, criterion), field,
-        known=None if known is None else information_of(known, found.names), goal=goal, gap=gap, progress=progress,
+        known=None if known is None else information_of(known, found.names, found.effects),
+        goal=goal, gap=gap, progress=progress,
     )  # fmt: skip
 
 
@@ -298,9 +308,22 @@ def experiment_of(
 ) -> Experiment:
     """The problem of a budget in minutes; `known` is added to what is known beforehand."""
     before = found.prior if known is None else found.prior + known
-    draws = len(want.targets)
+    families, pairs, budget = found.families, want.blocks, 60.0 * minutes
+    if pairs is None:
+        known = np.broadcast_to(before, (len(want.targets), *before.shape)).copy()
+        return Experiment(known, want.targets, families, budget)
+
+    def turned(matrices: Float[np.ndarray, "*s f f"]) -> Float[np.ndarray, "*s b n n"]:
+        return pairs.swapaxes(1, 2) @ matrices[..., None, :, :] @ pairs
+
+    families = tuple(
+        dataclasses.replace(f, basis=np.concatenate(np.moveaxis(turned(f.basis), 2, 1)))  # type: ignore[type-var]
+        for f in families
+    )
+    # Where a rival has fewer parameters than another the rest are known.
+    idle = np.stack([np.diag(1.0 * ~pair.any(axis=0)) for pair in pairs])
     return Experiment(
-        np.broadcast_to(before, (draws, *before.shape)).copy(), want.targets, found.families, 60.0 * minutes
+        np.tile(turned(before) + idle, (len(found.values), 1, 1)), want.targets, families, budget, len(pairs)
     )
 
 
@@ -465,7 +488,7 @@ def criterion(experiment: Experiment, total: Float[np.ndarray, "r n n"]) -> floa
     """f of the information of everything in every draw."""
     a = experiment.targets
     c = covariance(total)
-    return float(np.einsum("rknq,rnm,rkmq->rk", a, c, a, optimize=True).max(axis=1).mean())
+    return float(experiment.largest(np.einsum("rknq,rnm,rkmq->rk", a, c, a, optimize=True)).mean())
 
 
 def _described(

@@ -6,11 +6,15 @@ Error of p   of stars behind the calibration alone: δ(q, u) = −M⁻¹ (δm₁
              `LEAST_DETERMINANT` one exposure holds no u, and no plan of calibrations brings it back.
 Parameter    its variance, e.g. `collimator.curvature`.
 Stars        the error of p of the stars of a table.
+Apart        effects, whichever is there told from every other. Truth i of a known size, rival j with sizes and shapes
+             of its own, and the calibration are fitted together; the rival that does its best stays Δχ² = 1 / φ away, φ
+             the variance of the size of i in its units. The least √Δχ² of all pairs is made largest.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,6 +25,7 @@ from walop_jax.calibration.matrix import matrix_slopes
 from walop_jax.data.schema import Column
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import InputTable, numeric_column
+from walop_jax.model.effects import effect_by_name
 from walop_jax.model.parameters import unknown_name
 from walop_jax.plans.exposures import Candidates
 from walop_jax.science.star_errors import sample_stars
@@ -38,7 +43,8 @@ class Wanted:
     """Linear functions of the parameters, `targets` (draw, target, parameter, column), and what their variance says.
 
     `unit` is that of the root of the largest variance, after `scale`; `what` says in words what it is. `inverse`: its
-    reciprocal is told, in standard deviations.
+    reciprocal is told, in standard deviations. `blocks` (pair, parameter, own) lead from the parameters of each pair to
+    those of the candidates; targets are then one after the other for the pairs of each draw.
     """
 
     name: str
@@ -47,6 +53,7 @@ class Wanted:
     targets: Float[np.ndarray, "r k f q"]
     scale: float = 1.0
     inverse: bool = False
+    blocks: Float[np.ndarray, "b f n"] | None = None
 
     def told(self, variance: float) -> float:
         """The number that is told for a value of the criterion."""
@@ -166,8 +173,10 @@ def wanted(found: Candidates, field: FieldErrors | None, criterion: str | InputT
             return Wanted(WORST, "error of p at the worst point and colour", "%", targets)
         whole = np.einsum("rkfi,rkgi->rfg", targets, targets, optimize=True) / targets.shape[1]
         return Wanted(MEAN, "error of p, rms over the field", "%", _root(whole)[:, None])
+    if criterion == APART:
+        return _apart(found)
     if criterion not in found.names:
-        raise unknown_name("criterion or parameter", criterion, (WORST, MEAN, *found.names))
+        raise unknown_name("criterion or parameter", criterion, (WORST, MEAN, APART, *found.names))
     unit = found.model.parameters[found.model.index(criterion)].unit
     one = np.zeros((len(found.values), 1, len(found.names), 1))
     one[:, 0, found.names.index(criterion)] = 1.0
@@ -196,6 +205,35 @@ def _of_stars(found: Candidates, table: InputTable) -> Wanted:
             f"{table.path}: no star lies where one exposure holds u; observe them at several angles of the rotator"
         )
     return Wanted("stars", f"error of p of the worst of {targets.shape[1]} stars", "%", targets)
+
+
+def _apart(found: Candidates) -> Wanted:
+    names, effects = np.array(found.names), found.effects
+    of = {effect: np.flatnonzero(np.char.startswith(names, f"{effect}.")) for effect in effects}
+    if len(effects) < 2 or not any(effects.values()):
+        raise ValueError(
+            "give two effects or more that are to be told apart, and the size of one: NAME=VALUE"
+        )
+    base = np.setdiff1d(np.arange(len(names)), np.concatenate(list(of.values())))
+    size = np.zeros(len(names))
+    for effect, i in ((effect, i) for effect, places in of.items() for i in places):
+        p = found.model.parameters[found.model.index(names[i])]
+        size[i] = 0.0 if names[i].split(".")[1] in effect_by_name(effect).shape else p.start
+        if size[i] and p.prior is not None:
+            size[i] -= p.prior[0]
+    widest, blocks = max(map(len, of.values())), []
+    for own, rival in itertools.permutations(effects, 2):
+        if not effects[own]:
+            continue
+        block = np.zeros((len(names), len(base) + 1 + widest))
+        block[base, np.arange(len(base))] = 1.0
+        block[of[own], len(base)] = size[of[own]]
+        block[of[rival], len(base) + 1 + np.arange(len(of[rival]))] = 1.0
+        blocks.append(block)
+    targets = np.zeros((len(blocks) * len(found.values), 1, blocks[0].shape[1], 1))
+    targets[:, 0, len(base)] = 1.0
+    what = f"least distance of {', '.join(effects)}"
+    return Wanted(APART, what, "σ", targets, inverse=True, blocks=np.stack(blocks))
 
 
 def _root(squares: Float[np.ndarray, "r f f"]) -> Float[np.ndarray, "r f f"]:

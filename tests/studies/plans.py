@@ -1,0 +1,287 @@
+"""Do plans keep their promises, for instruments as built, and how do they compare with usual procedures?
+
+    python tests/studies/plans.py [errors] [built] [beside] [naming]
+
+errors   20 sets each of the best plan of 20 minutes and of usual ones, each of another instrument drawn from the
+         priors, with noise and standards of its own: the errors of p that a fit makes against those promised. The
+         fits are linear, from the truth; one full fit says how far that is from the real one.
+built    200 instruments as they might be built: what the plan that was made for 20 others is worth in each, beside what
+         no plan for that one alone can undercut.
+beside   time to 0.1 % on 95 % of the field, for South, North and an instrument of a user's own: usual procedures, the
+         best plan found, and the time that no plan can undercut.
+naming   pairs of effects that a standard plan cannot tell apart, simulated with one of them: how often the exposures
+         proposed name it at the time promised.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+import tempfile
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
+
+import jax
+import numpy as np
+
+sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
+
+from walop_jax.fit.model_file import base_model  # noqa: E402
+from walop_jax.fit.refit import refit  # noqa: E402
+from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
+from walop_jax.plans.could import Could  # noqa: E402
+from walop_jax.plans.exposures import Candidates, candidates  # noqa: E402
+from walop_jax.plans.optimal import Experiment, least_budget, lower_bound, optimise  # noqa: E402
+from walop_jax.plans.plan import (  # noqa: E402
+    covariance,
+    criterion,
+    experiment_of,
+    information_of_weights,
+    plan_from,
+    usual_plans,
+)
+from walop_jax.plans.wanted import field_errors, wanted  # noqa: E402
+from walop_jax.simulation.observing_plan import ObservingPlan, Stop  # noqa: E402
+from walop_jax.simulation.simulate import simulate, truth_values  # noqa: E402
+
+MINUTES, RUNS, BUILT, GOAL, FIELD = 20.0, 20, 200, 0.1, 0.95
+OWN = (
+    ("WALOP-SOUTH", "OWN"),
+    ("2407.0, sigma = 1.0", "200.0, sigma = 0.3"),
+    ("1930.0, sigma = 1.0", "180.5, sigma = 0.3"),
+    ("edge = 0.29", "edge = 0.12"),
+    ("value = 15.63", "value = 8.0"),
+    ("default = true\n", ""),
+)
+"""From WALOP-South to what somebody else might have: plates of zero order, a field of 14', a slower pupil."""
+
+
+def own() -> str:
+    """The description file of the instrument of a user's own."""
+    text = (resources.files("walop_jax.instruments") / "WALOP-SOUTH.toml").read_text(encoding="utf-8")
+    for old, new in OWN:
+        text = text.replace(old, new)
+    path = Path(tempfile.mkdtemp()) / "own.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def stops_of(found: Candidates, weights: dict[tuple[int, float], float]) -> tuple[Stop, ...]:
+    """Weights of (choice, place) as exposures."""
+    return tuple(found.choices[i].stop(place, max(round(w), 1)) for (i, place), w in weights.items())
+
+
+def linear_fit(
+    plan: ObservingPlan, found: Candidates, draw: int, seed: int
+) -> tuple[dict[str, float], float]:
+    """By how much the first step of a fit from the truth is wrong; by how many σ a full fit differs from it."""
+    instrument = found.model.instrument(found.values[draw])
+    simulated = simulate(plan, seed=seed, instrument=instrument, steady=True)
+    model = base_model(simulated.calset, plan.design, throughput_degree=plan.throughput_degree)
+    truth = truth_values(simulated.truth)
+    values = np.array([truth[name] for name in model.names])
+    there = Likelihood.of(simulated.calset, model).expand(values)
+    size = np.sqrt(np.diag(there.matrix))
+    inverse = np.linalg.pinv(there.matrix / np.outer(size, size), rcond=1e-13, hermitian=True)
+    step = -(inverse @ (there.gradient / size)) / size
+    apart = float("nan")
+    if seed == 0:
+        fit = refit(simulated.calset, model)
+        sigma = np.sqrt(np.diag(inverse)) / size
+        apart = float(np.max(np.abs((fit.values - values)[list(model.free)] - step) / sigma))
+    return {model.names[i]: s for i, s in zip(model.free, step, strict=True)}, apart
+
+
+def errors() -> None:
+    """Promised errors of p against those of simulated runs."""
+    found = candidates(Could.of("WALOP-SOUTH"), draws=RUNS)
+    field = field_errors(found)
+    want = wanted(found, field, "worst")
+    best = plan_from(found, MINUTES, want, field)
+    experiment = experiment_of(found, MINUTES, want)
+    plans = {"best plan": (best.observing_plan, best.after)}
+    for name, weights in usual_plans(found):
+        whole, _ = information_of_weights(experiment, {key: max(round(w), 1) for key, w in weights.items()})
+        taken = dataclasses.replace(found.could.plan, stops=stops_of(found, weights), patches=(), stars=())
+        plans[name] = (taken, field.error(covariance(experiment.known + whole)))
+    seen = field.seen
+    for name, (plan, promised) in plans.items():
+        square, apart = [], []
+        for draw in range(RUNS):
+            step, far = linear_fit(plan, found, draw, draw)
+            off = np.array([step.get(parameter, 0.0) for parameter in found.names])
+            change = field.slopes[draw] @ off
+            square.append(np.einsum("pi,pij,pj->p", change, field.forms[draw], change)[seen])
+            apart.append(far)
+        ratio = np.sqrt(np.mean(square, axis=1) / np.mean(promised[:, seen] ** 2, axis=1))
+        whole = np.sqrt(np.mean(np.array(square) / promised[:, seen] ** 2))
+        print(
+            f"{name}: error of p over that promised, {RUNS} runs: {whole:.3f} ± {ratio.std() / np.sqrt(RUNS):.3f}; "
+            f"full fit and linear step differ by {np.nanmax(apart):.3f} σ",
+            flush=True,
+        )
+
+
+def built() -> None:
+    """Efficiency of one plan in instruments as built."""
+    found = candidates(Could.of("WALOP-SOUTH"))
+    field = field_errors(found)
+    best = plan_from(found, MINUTES, wanted(found, field, "worst"), field)
+    taken = [(line, choice_of(found, line)) for line in best.lines]
+    efficiency: list[float] = []
+    for seed in range(1, 1 + BUILT // len(found.values)):
+        other = candidates(Could.of("WALOP-SOUTH"), seed=seed)
+        want = wanted(other, field_errors(other), "worst")
+        whole = experiment_of(other, MINUTES, want)
+        total, _ = information_of_weights(whole, {key: float(line.times) for line, key in taken})
+        for draw in range(len(other.values)):
+            alone = one_draw(whole, draw)
+            least = optimise(alone).bound
+            efficiency.append(least / criterion(alone, alone.known + total[draw : draw + 1]))
+        print(f"{len(efficiency)} instruments: {quantiles(np.array(efficiency))}", flush=True)
+
+
+def quantiles(values: np.ndarray) -> str:
+    """What is said of efficiencies."""
+    return (
+        f"efficiency at least {values.min():.3f}, 5 % below {np.quantile(values, 0.05):.3f}, median "
+        f"{np.median(values):.3f}; {100 * np.mean(values >= 0.9):.0f} % at 0.9 or more"
+    )
+
+
+def choice_of(found: Candidates, line) -> tuple[int, float]:
+    """The candidate of a line of a plan."""
+    for i, choice in enumerate(found.choices):
+        if (choice.kind, choice.filter, choice.seconds) != (line.kind, line.filter, line.exptime):
+            continue
+        if choice.positions != line.positions:
+            continue
+        if line.kind == "clp":
+            return i, float(np.deg2rad(2 * line.polariser_angle))
+        return i, float([stop.number for stop in choice.stops].index(line.number))
+    raise LookupError(line)
+
+
+def one_draw(experiment: Experiment, draw: int) -> Experiment:
+    """The problem of one instrument."""
+    pick = slice(draw, draw + 1)
+    families = tuple(dataclasses.replace(f, basis=f.basis[pick]) for f in experiment.families)
+    return dataclasses.replace(
+        experiment, known=experiment.known[pick], targets=experiment.targets[pick], families=families
+    )
+
+
+def minutes_to_goal(experiment: Experiment, whole: np.ndarray, cost: float) -> float:
+    """Minutes until GOAL holds at FIELD of the targets, the exposures of a plan in their proportions."""
+    low, high = 1e-3, 1e5
+    while high / low > 1.001:
+        middle = np.sqrt(low * high)
+        c = covariance(experiment.known + 60 * middle / cost * whole)
+        a = experiment.targets
+        phi = np.einsum("rknq,rnm,rkmq->rk", a, c, a, optimize=True)[0]
+        low, high = (low, middle) if np.mean(phi <= GOAL**2) >= FIELD else (middle, high)
+    return float(high)
+
+
+def least_minutes(experiment: Experiment, plan) -> float:
+    """Minutes below which no plan reaches GOAL at FIELD of the targets, whichever it leaves out.
+
+    For multipliers π, and any set S of targets that a plan brings below GOAL², GOAL² π(S) ≥ here(S)² / (known + B
+    ratio) (`optimal`, for the targets of S): S without the targets that carry most of here(S) is the worst case.
+    """
+    problem = experiment.reduced()
+    total = problem.known + sum(
+        w * np.einsum("j,rjab->rab", problem.families[f].coefficients(p[None])[0], problem.families[f].basis)
+        for f, p, w in zip(plan.family, plan.place, plan.weight, strict=True)
+    )
+    c, a = np.linalg.inv(total), problem.targets
+    phi = np.einsum("rknq,rnm,rkmq->rk", a, c, a, optimize=True)
+    left_out, best = int(np.floor((1 - FIELD) * phi.shape[1])), 0.0
+    for sharpness in (0.0, 1.0, 2.0, 4.0):
+        shares = phi**sharpness / np.sum(phi**sharpness)
+        bound = lower_bound(problem, c, shares)
+        each = np.sort((shares * phi)[0])[::-1]
+        here = each[left_out:].sum()
+        best = max(best, (here**2 / GOAL**2 - bound.known) / bound.ratio)
+    return best / 60
+
+
+def beside() -> None:
+    """Time to 0.1 % on 95 % of the field."""
+    for instrument in ("WALOP-SOUTH", "WALOP-NORTH", own()):
+        could = Could(ObservingPlan(None, plate=(None, 22.5))) if instrument == "WALOP-SOUTH" else None
+        if could is None:
+            could = described(instrument)
+        found = candidates(could, draws=3)
+        field = field_errors(found)
+        want = wanted(found, field, "worst")
+        rows: dict[str, list[float]] = {}
+        for draw in range(len(found.values)):
+            alone = one_draw(experiment_of(found, MINUTES, want), draw)
+            for name, weights in usual_plans(found):
+                whole, cost = information_of_weights(alone, weights)
+                rows.setdefault(name, []).append(minutes_to_goal(alone, whole, cost))
+            best, least = [], 0.0
+            for plan in best_plans(alone):
+                weights = {
+                    (int(f), float(p[0])): w
+                    for f, p, w in zip(plan.family, plan.place, plan.weight, strict=True)
+                }
+                whole, cost = information_of_weights(alone, weights)
+                best.append(minutes_to_goal(alone, whole, cost))
+                least = max(least, least_minutes(alone, plan))
+            rows.setdefault("best plan found", []).append(min(best))
+            rows.setdefault("no plan below", []).append(least)
+        found_best, limit = (np.array(rows[name]) for name in ("best plan found", "no plan below"))
+        for name, minutes in rows.items():
+            factor, most = np.median(minutes / found_best), np.median(np.array(minutes) / limit)
+            print(
+                f"{found.could.plan.name}, {name}: {np.median(minutes):.3g} min, {factor:.2f} times the best found, "
+                f"at most {most:.2f} times any",
+                flush=True,
+            )
+
+
+def described(instrument: str) -> Could:
+    """An instrument by name or file, its plate out and at 22.5°."""
+    if not Path(instrument).exists():
+        return Could(ObservingPlan(instrument, plate=(None, 22.5)))
+    plan = Path(instrument).with_name("plan.toml")
+    plan.write_text(f'instrument = "{Path(instrument).name}"\nplate = ["out", 22.5]\n')
+    return Could.of(plan)
+
+
+def best_plans(experiment: Experiment) -> Iterator:
+    """Plans for the worst of the targets that are left when the worst 5 % are given up, by turns."""
+    plan = optimise(experiment)
+    yield plan
+    for _ in range(2):
+        kept = np.argsort(targets_at(experiment, plan))[: int(np.ceil(FIELD * experiment.targets.shape[1]))]
+        some = dataclasses.replace(experiment, targets=experiment.targets[:, np.sort(kept)])
+        plan, _ = least_budget(some, GOAL**2)
+        yield plan
+
+
+def targets_at(experiment: Experiment, plan) -> np.ndarray:
+    """Variances of the targets."""
+    weights = {(int(f), float(p[0])): w for f, p, w in zip(plan.family, plan.place, plan.weight, strict=True)}
+    c, a = covariance(experiment.known + information_of_weights(experiment, weights)[0]), experiment.targets
+    return np.einsum("rknq,rnm,rkmq->rk", a, c, a, optimize=True)[0]
+
+
+def main() -> None:
+    """Print the study."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parts = {"errors": errors, "built": built, "beside": beside}
+    parser.add_argument("parts", nargs="*", default=list(parts), choices=list(parts))
+    for part in parser.parse_args().parts:
+        parts[part]()
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    main()
