@@ -2,8 +2,8 @@
 
     python tests/studies/plans.py [errors] [built] [beside] [naming]
 
-errors   20 sets each of the best plan of 20 minutes and of usual ones, each of another instrument drawn from the
-         priors, with noise and standards of its own: the errors of p that a fit makes against those promised. The
+errors   200 sets each of the best plan of 20 minutes and of usual ones, of 20 instruments drawn from the priors, with
+         noise and standards of its own: the errors of p that a fit makes against those promised. The
          fits are linear, from the truth; one full fit says how far that is from the real one.
 built    200 instruments as they might be built: what the plan that was made for 20 others is worth in each, beside what
          no plan for that one alone can undercut.
@@ -31,6 +31,7 @@ sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 from walop_jax.fit.model_file import base_model  # noqa: E402
 from walop_jax.fit.refit import refit  # noqa: E402
 from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
+from walop_jax.model.specification import effect_context, with_effects  # noqa: E402
 from walop_jax.plans.could import Could  # noqa: E402
 from walop_jax.plans.exposures import Candidates, candidates  # noqa: E402
 from walop_jax.plans.optimal import Experiment, least_budget, lower_bound, optimise  # noqa: E402
@@ -44,9 +45,18 @@ from walop_jax.plans.plan import (  # noqa: E402
 )
 from walop_jax.plans.wanted import field_errors, wanted  # noqa: E402
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop  # noqa: E402
-from walop_jax.simulation.simulate import simulate, truth_values  # noqa: E402
+from walop_jax.simulation.simulate import effect_from_text, simulate, truth_values  # noqa: E402
 
-MINUTES, RUNS, BUILT, GOAL, FIELD = 20.0, 20, 200, 0.1, 0.95
+MINUTES, INSTRUMENTS, EACH, BUILT, GOAL, FIELD = 20.0, 20, 10, 200, 0.1, 0.95
+SOUTH = ObservingPlan("WALOP-SOUTH", grid=6, standard_grid=3)
+PAIRS = (
+    ("hwp2_axis=0.0022", "hwp2_crossing"),
+    ("hwp2_crossing=0.0036", "hwp2_axis"),
+    ("clp_zero=0.005", "clp_wobble"),
+    ("clp_wobble=amplitude:0.007,phase:0.5", "clp_zero"),
+)
+"""Effects, of sizes that a standard plan finds at some 6 σ, and rivals that it cannot tell from them."""
+NAMED, APART = 5.0, 3.0  # σ promised, and at which a diagnosis names
 OWN = (
     ("WALOP-SOUTH", "OWN"),
     ("2407.0, sigma = 1.0", "200.0, sigma = 0.3"),
@@ -86,7 +96,7 @@ def linear_fit(
     size = np.sqrt(np.diag(there.matrix))
     inverse = np.linalg.pinv(there.matrix / np.outer(size, size), rcond=1e-13, hermitian=True)
     step = -(inverse @ (there.gradient / size)) / size
-    apart = float("nan")
+    apart = 0.0
     if seed == 0:
         fit = refit(simulated.calset, model)
         sigma = np.sqrt(np.diag(inverse)) / size
@@ -96,7 +106,7 @@ def linear_fit(
 
 def errors() -> None:
     """Promised errors of p against those of simulated runs."""
-    found = candidates(Could.of("WALOP-SOUTH"), draws=RUNS)
+    found = candidates(Could(SOUTH), draws=INSTRUMENTS)
     field = field_errors(found)
     want = wanted(found, field, "worst")
     best = plan_from(found, MINUTES, want, field)
@@ -108,18 +118,17 @@ def errors() -> None:
         plans[name] = (taken, field.error(covariance(experiment.known + whole)))
     seen = field.seen
     for name, (plan, promised) in plans.items():
-        square, apart = [], []
-        for draw in range(RUNS):
-            step, far = linear_fit(plan, found, draw, draw)
-            off = np.array([step.get(parameter, 0.0) for parameter in found.names])
-            change = field.slopes[draw] @ off
-            square.append(np.einsum("pi,pij,pj->p", change, field.forms[draw], change)[seen])
-            apart.append(far)
-        ratio = np.sqrt(np.mean(square, axis=1) / np.mean(promised[:, seen] ** 2, axis=1))
-        whole = np.sqrt(np.mean(np.array(square) / promised[:, seen] ** 2))
+        square, apart = np.zeros((EACH, INSTRUMENTS, int(seen.sum()))), 0.0
+        for run, draw in np.ndindex(EACH, INSTRUMENTS):
+            step, far = linear_fit(plan, found, draw, INSTRUMENTS * run + draw)
+            change = field.slopes[draw] @ np.array([step.get(parameter, 0.0) for parameter in found.names])
+            square[run, draw] = np.einsum("pi,pij,pj->p", change, field.forms[draw], change)[seen]
+            apart = max(apart, far)
+        of_each = (square / promised[:, seen] ** 2).mean(axis=2).ravel()
+        ratio, scatter = np.sqrt(of_each.mean()), of_each.std() / np.sqrt(of_each.size)
         print(
-            f"{name}: error of p over that promised, {RUNS} runs: {whole:.3f} ± {ratio.std() / np.sqrt(RUNS):.3f}; "
-            f"full fit and linear step differ by {np.nanmax(apart):.3f} σ",
+            f"{name}: error of p over that promised, {of_each.size} runs: {ratio:.3f} ± {0.5 * scatter / ratio:.3f}; "
+            f"full fit and linear step differ by {apart:.3f} σ at most",
             flush=True,
         )
 
@@ -159,7 +168,7 @@ def choice_of(found: Candidates, line) -> tuple[int, float]:
         if choice.positions != line.positions:
             continue
         if line.kind == "clp":
-            return i, float(np.deg2rad(2 * line.polariser_angle))
+            return i, choice.phase(line.polariser_angle)
         return i, float([stop.number for stop in choice.stops].index(line.number))
     raise LookupError(line)
 
@@ -211,10 +220,7 @@ def least_minutes(experiment: Experiment, plan) -> float:
 def beside() -> None:
     """Time to 0.1 % on 95 % of the field."""
     for instrument in ("WALOP-SOUTH", "WALOP-NORTH", own()):
-        could = Could(ObservingPlan(None, plate=(None, 22.5))) if instrument == "WALOP-SOUTH" else None
-        if could is None:
-            could = described(instrument)
-        found = candidates(could, draws=3)
+        found = candidates(described(instrument), draws=3)
         field = field_errors(found)
         want = wanted(found, field, "worst")
         rows: dict[str, list[float]] = {}
@@ -271,12 +277,89 @@ def targets_at(experiment: Experiment, plan) -> np.ndarray:
     return np.einsum("rknq,rnm,rkmq->rk", a, c, a, optimize=True)[0]
 
 
+def naming() -> None:
+    """How often the exposures proposed name an effect at the time promised."""
+    could = Could(dataclasses.replace(SOUTH, plate=(None, 22.5)))
+    for pair in PAIRS:
+        found = candidates(could, draws=1, effects=pair)
+        want = wanted(found, None, "apart")
+        experiment = experiment_of(found, MINUTES, want)
+        standard = dict(usual_plans(found))["even angles"]
+        standard |= {
+            (i, float(place)): 1.0
+            for i, choice in enumerate(found.choices)
+            if choice.kind != "clp" and choice.positions["CHWP"] is None
+            for place in range(len(choice.stops))
+        }
+        before, _ = information_of_weights(experiment, standard)
+        start = dataclasses.replace(experiment, known=experiment.known + before)
+        at_first = want.told(criterion(start, start.known))
+        cheapest, _ = least_budget(start, want.variance(NAMED))
+        needed = minutes = cost_of(start, cheapest) / 60
+        while True:
+            try:
+                plan = plan_from(found, minutes, want, known=before_of(found, standard))
+                if plan.value >= NAMED:
+                    break
+            except ValueError:
+                pass
+            minutes += 0.5
+        names = [named(found, standard, plan.observing_plan, pair, seed) for seed in range(2 * INSTRUMENTS)]
+        print(
+            f"{pair[0]} against {pair[1]}: standard plan {at_first:.2f} σ apart; 5 σ after {needed:.2f} min, in whole "
+            f"exposures with changes {minutes:.2f} min ({plan.value:.1f} σ); named in {sum(names)} of {len(names)}",
+            flush=True,
+        )
+
+
+def cost_of(experiment: Experiment, plan) -> float:
+    """Time (s) of weights, without changes."""
+    return sum(
+        w * float(experiment.families[f].cost_at(p[None])[0])
+        for f, p, w in zip(plan.family, plan.place, plan.weight, strict=True)
+    )
+
+
+def before_of(found: Candidates, standard: dict[tuple[int, float], float]) -> np.ndarray:
+    """The information of a standard plan on all parameters of the candidates, mean over draws."""
+    return sum(
+        w
+        * np.tensordot(found.families[i].basis[0], found.families[i].coefficients(np.array([[p]]))[0], (0, 0))
+        for (i, p), w in standard.items()
+    )
+
+
+def named(found: Candidates, standard, plan: ObservingPlan, pair: tuple[str, str], seed: int) -> bool:
+    """Whether a set of the standard and the new exposures leaves the rival `APART` or more behind the truth."""
+    whole = dataclasses.replace(plan, stops=stops_of(found, standard) + plan.stops)
+    base = found.model.template
+    truth = dataclasses.replace(found.model.instrument(found.values[0]), effects=())
+    context = effect_context(base, whole.exposures())
+    effect = effect_from_text(pair[0], context)
+    simulated = simulate(whole, seed=seed, instrument=truth, effects=(effect,), steady=True)
+    chi2 = []
+    for name in (effect.name, pair[1]):
+        model = base_model(simulated.calset, whole.design, throughput_degree=whole.throughput_degree)
+        model = with_effects(model, (name,), context)
+        there = truth_values(simulated.truth)
+        values = np.array([there.get(n, p.start) for n, p in zip(model.names, model.parameters, strict=True)])
+        select, likelihood = model.selection(), Likelihood.of(simulated.calset, model)
+        for _ in range(4):
+            at = likelihood.expand(values)
+            size = np.sqrt(np.diag(at.matrix))
+            size = np.where(size > 0, size, 1.0)
+            inverse = np.linalg.pinv(at.matrix / np.outer(size, size), rcond=1e-13, hermitian=True)
+            values = values - select @ ((inverse @ (at.gradient / size)) / size)
+        chi2.append(likelihood.expand(values).data + at.priors)
+    return bool(chi2[1] - chi2[0] >= APART**2)
+
+
 def main() -> None:
     """Print the study."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parts = {"errors": errors, "built": built, "beside": beside}
+    parts = {"errors": errors, "built": built, "beside": beside, "naming": naming}
     parser.add_argument("parts", nargs="*", default=list(parts), choices=list(parts))
     for part in parser.parse_args().parts:
         parts[part]()

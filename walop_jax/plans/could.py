@@ -59,13 +59,17 @@ class Costs:
 
 
 class CandidateExposure(NamedTuple):
-    """Exposures that differ in one thing only: the angle of the polariser, or which of `stops` they are."""
+    """Exposures that differ in one thing only: the angle of the polariser, or which of `stops` they are.
+
+    Angles of the polariser repeat themselves after `turn` (deg): half a turn, or a whole one where it is not ideal.
+    """
 
     kind: str
     filter: str
     positions: Mapping[str, float | None]
     seconds: float
     stops: tuple[Stop, ...]
+    turn: float = 180.0
 
     @property
     def setting(self) -> tuple[Any, ...]:
@@ -73,12 +77,15 @@ class CandidateExposure(NamedTuple):
         return (self.filter, *self.positions.values())
 
     def stop(self, place: float, times: int = 1) -> Stop:
-        """The stop at the angle 2θ (rad) of the polariser, or of that number in the list."""
+        """The stop at a phase (rad) of the polariser's turn, or of that number in the list."""
         if self.kind != "clp":
             return dataclasses.replace(self.stops[round(place)], times=times)
-        return dataclasses.replace(
-            self.stops[0], polariser_angle=round(float(np.rad2deg(place) / 2) % 180.0, 3), times=times
-        )
+        angle = round(float(place / (2 * np.pi) * self.turn) % self.turn, 3)
+        return dataclasses.replace(self.stops[0], polariser_angle=angle, times=times)
+
+    def phase(self, angle: float) -> float:
+        """The phase (rad) of an angle (deg) of the polariser."""
+        return 2 * np.pi * (angle % self.turn) / self.turn
 
     def text(self) -> str:
         """In a few words."""

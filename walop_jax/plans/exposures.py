@@ -43,7 +43,9 @@ from walop_jax.simulation.simulate import (
     truth_values,
 )
 
-NODES = 7  # angles of the polariser at which counts are computed: a series of degree 3 in 2θ, one more than it needs
+NODES, NODES_OF_EFFECTS = 7, 13
+"""Angles of the polariser at which counts are computed: a series of degree 3 in 2θ, one more than it needs.
+Effects that are to be told apart may depend on θ itself, which takes a whole turn."""
 ANGLES = 361
 """Angles over half a turn through which the information is a Fourier series in 2θ.
 
@@ -97,11 +99,12 @@ def candidates(
     choices, notes = could.choices()
     if not choices:
         raise ValueError("; ".join(("nothing could be observed", *notes)))
-    few, stops = fewer_points(could.plan), []
-    turn = 180.0 / NODES * np.arange(NODES)
-    first = np.cumsum([0, *(NODES if c.kind == "clp" else len(c.stops) for c in choices)])
+    few, stops, nodes = fewer_points(could.plan), [], NODES_OF_EFFECTS if effects else NODES
+    choices = tuple(choice._replace(turn=360.0 if effects else 180.0) for choice in choices)
+    turn = choices[0].turn / nodes * np.arange(nodes)
+    first = np.cumsum([0, *(nodes if c.kind == "clp" else len(c.stops) for c in choices)])
     for choice in choices:
-        own = choice.stops * NODES if choice.kind == "clp" else choice.stops
+        own = choice.stops * nodes if choice.kind == "clp" else choice.stops
         stops += [
             dataclasses.replace(s, polariser_angle=a) if choice.kind == "clp" else s
             for s, a in zip(own, turn if choice.kind == "clp" else own, strict=True)
@@ -235,12 +238,12 @@ class _Light:
         seconds: float,
         turn: Float[np.ndarray, " _"] | None = None,
     ) -> Float[np.ndarray, "s f f"]:
-        """JᵀJ of the exposures `rows`; or, of `NODES` that differ in the polariser, at other shares of half a turn."""
+        """JᵀJ of the exposures `rows`; or, of those evenly through a turn of the polariser, at other shares of it."""
         if turn is None:
             return np.concatenate(
                 [self._gram(r, unit[:, [r]], slopes[:, [r]], seconds) for r in rows.tolist()]
             )
-        order, nodes = NODES // 2, 2 * np.pi * np.arange(NODES) / NODES
+        order, nodes = len(rows) // 2, 2 * np.pi * np.arange(len(rows)) / len(rows)
         weights = harmonics(2 * np.pi * turn, order) @ np.linalg.inv(harmonics(nodes, order))
         parts = np.array_split(weights, max(len(weights) // _TOGETHER, 1))
         u, du = unit[:, rows], slopes[:, rows]
@@ -267,8 +270,9 @@ def _mixed(
 
 def _overtone(unit: Float[np.ndarray, "p e k"]) -> float:
     """The highest harmonic of the counts beside their mean: none where the series holds them."""
-    nodes = 2 * np.pi * np.arange(NODES) / NODES
-    series = np.linalg.solve(harmonics(nodes, NODES // 2), unit.swapaxes(0, 1).reshape(NODES, -1))
+    count = unit.shape[1]
+    nodes = 2 * np.pi * np.arange(count) / count
+    series = np.linalg.solve(harmonics(nodes, count // 2), unit.swapaxes(0, 1).reshape(count, -1))
     return float(np.abs(series[-2:]).max() / np.abs(series[0]).max())
 
 
@@ -277,7 +281,7 @@ def _apart(
     between: Float[np.ndarray, " b"],
     exact: Float[np.ndarray, "b f f"],
 ) -> float:
-    """Largest error of the series at shares of half a turn, in units of the mean diagonal of each parameter."""
+    """Largest error of the series at shares of a turn, in units of the mean diagonal of each parameter."""
     count = len(information)
     series = np.linalg.solve(
         harmonics(2 * np.pi * np.arange(count) / count, count // 2), information.reshape(count, -1)

@@ -524,7 +524,9 @@ def usual_plans(found: Candidates) -> Iterator[tuple[str, dict[tuple[int, float]
     for name, (angles, each, patches) in USUAL.items():
         if (each and len(order) < 2) or (patches and moon is None):
             continue
-        weights = {(i, np.deg2rad(2 * a)): 1.0 for i in (order if each else order[:1]) for a in angles}
+        weights = {
+            (i, found.choices[i].phase(a)): 1.0 for i in (order if each else order[:1]) for a in angles
+        }
         if patches and moon is not None:
             there = len(found.choices[moon].stops)
             weights |= {(moon, float(k)): patches / there for k in range(there)}
