@@ -258,8 +258,8 @@ def test_a_budget_below_every_cost_pays_for_nothing():
 
 
 def test_two_experiments_share_their_largest_variance():
-    """Half the weight p at each of ±1, the rest at 0: the coefficient of x² has variance 1 / p (1 − p), three times that
-    of a line's slope 3 / p: at best 9 / 2, p = 2 / 3. The second knows no x², and has a parameter that is known."""
+    """Half the weight p at each of ±1, the rest at 0: the coefficient of x² has the variance 1 / p (1 − p), three times
+    that of the slope of a line 3 / p; at best both are 9 / 2, p = 2 / 3. The line's third parameter is known."""
     rows = np.stack([QUADRATIC, QUADRATIC * [1.0, 1.0, 0.0]])
     family = Listed.of(np.einsum("ria,rib->riab", rows, rows))
     targets = np.zeros((2, 1, 3, 1))
