@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
 
 import numpy as np
 import pytest
 from scipy import stats
-from small_run import SEED, SMALL, small_fit
+from small_run import SEED, SMALL, small_fit, small_fit_with_plate
 
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import change_of_qu, first_setting, matrix_slopes
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
@@ -18,9 +20,15 @@ from walop_jax.diagnosis.alternatives import with_places
 from walop_jax.diagnosis.condition_limits import condition_limits
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.limits_found import PROBABILITY
-from walop_jax.diagnosis.stated_conditions import condition_scores, stated_conditions
+from walop_jax.diagnosis.stated_conditions import (
+    Singles,
+    condition_scores,
+    hidden_mistakes,
+    stated_conditions,
+)
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.refit import FitResult, refit
+from walop_jax.fit.verdict import Hidden
 from walop_jax.simulation.simulate import effect_from_text, simulate
 
 
@@ -125,6 +133,24 @@ def test_an_effect_of_seven_standard_errors_is_told_whatever_patterns_say(text, 
     assert float(value.replace("−", "-")) == pytest.approx(size, abs=4 * float(error))
 
 
+def test_both_crystals_of_a_plate_are_told_by_what_was_known_of_them():
+    """Priors that are 6 µm off in all four plates: told as thicknesses, not as a filter or a colour."""
+    right = small_fit_with_plate()
+    wrong = right.model
+    for name in ("half1.plate.quartz", "half1.plate.mgf2", "half2.plate.quartz", "half2.plate.mgf2"):
+        mean, width = right.model[name].prior
+        wrong = wrong.change(name, prior=(mean - 6.0, width))
+    result = examined(refit(right.calset, wrong))
+    assert not result.trusted
+    (told,) = [text for text in result.verdict.doubts if text.startswith("the residuals ask for ")]
+    assert told.startswith("the residuals ask for half2.plate.quartz ")
+    for crystal, mean in (("quartz", 2401), ("mgf2", 1924)):
+        found = re.search(rf"half2.plate.{crystal} ([\d.]+) ± ([\d.]+) um, not {mean} ± 1", told).groups()  # type: ignore[union-attr]
+        value, error = map(float, found)
+        assert value == pytest.approx(right.value(f"half2.plate.{crystal}")[0], abs=4.0 * error)
+        assert value > mean + 3.0
+
+
 def test_scale_and_angle_are_sums_of_both_coordinates():
     """As differences of two sets that are scaled and turned."""
     design = Design.of(small_fit())
@@ -145,6 +171,20 @@ def test_the_score_is_what_a_fit_gains_that_knows_better():
     away = float(score.amplitudes[0]) - -0.02
     expected = score.statistic - away**2 / score.covariance[0, 0]
     assert wrong.chi2 - right.chi2 == pytest.approx(expected, rel=0.1)
+
+
+def test_what_could_hide_is_ranked_by_what_it_does_to_stars():
+    """In the order of the protection level over the field, each by itself, not of how far parameters move."""
+    design = Design.of(small_fit())
+    hidden = hidden_mistakes(design, Singles.of(design))
+    calibration = Calibration.from_fit(small_fit())
+    x, y = small_fit().calset.points.x, small_fit().calset.points.y
+    seen = []
+    for number, name in enumerate(hidden.names):
+        one = Hidden((name,), hidden.sizes[number : number + 1], ("",), hidden.changes[number : number + 1])
+        seen.append(np.nanmedian(dataclasses.replace(calibration, hidden=one).protection(x, y)[0]))
+    assert len(seen) > 3
+    assert all(after < 1.3 * before for before, after in itertools.pairwise(seen))  # at other points
 
 
 def test_noise_asks_for_no_other_conditions():

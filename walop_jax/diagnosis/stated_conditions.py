@@ -30,6 +30,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
+from walop_jax.calibration.matrix import change_of_qu, first_setting, matrix_slopes
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.alternatives import with_exposures, with_places
 from walop_jax.diagnosis.candidates import Probe, applicable, probes, showable
@@ -55,6 +56,7 @@ from walop_jax.model.effects import EFFECTS
 from walop_jax.model.parameters import field_declarations
 from walop_jax.model.specification import effect_context
 
+STAR_POINTS = 16  # field points at which stars are asked what a mistake does to them
 MOST_HIDDEN = 12  # mistakes that a product keeps: what a star needs for each is a product of two vectors
 _SHOWN = 4  # alternatives that are told in words
 _ALIKE = 25.0  # in χ², within which conditions are told together
@@ -149,33 +151,48 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
 
     A number that is wrong by h moves the parameters by R⁻¹QᵀC h (J = QR) and is found where h² |PC|² reaches the
     noncentrality of its test; h is at most the plausible size. Kept are those that move them by more than their
-    standard errors, the worst first.
+    standard errors, first those that make q and u of stars most wrong, in the median over the field.
     """
-    jacobian = design.jacobian
-    length = np.linalg.norm(jacobian, axis=0)
-    length = np.where(length > 0, length, 1.0)
     least = noncentrality(local_p(ALARM, len(singles.testable)), 1, PROBABILITY)
-    found: list[tuple[float, Single, float, int]] = []
+    found: list[tuple[Single, float, int]] = []
     first = 0
     for one in singles.rivals:
         if one.plausible > 0.0:
             size = one.plausible
             if singles.table[one.candidate.name].testable:
                 size = min(size, float(np.sqrt(least / singles.left[first])))
-            moved = size * float(np.linalg.norm(singles.along[:, first]))
-            if moved > 1.0:
-                found.append((moved, one, size, first))
+            if size * float(np.linalg.norm(singles.along[:, first])) > 1.0:
+                found.append((one, size, first))
         first += len(one.candidate.widths)
-    found = sorted(found, key=lambda entry: -entry[0])[:MOST_HIDDEN]
+    jacobian = design.jacobian
+    length = np.linalg.norm(jacobian, axis=0)
+    length = np.where(length > 0, length, 1.0)
     triangle = design.projector.basis.T @ (jacobian / length)
-    columns = np.array([size * singles.along[:, at] for _, _, size, at in found]).reshape(len(found), -1).T
+    columns = np.array([size * singles.along[:, at] for _, size, at in found]).reshape(len(found), -1).T
     taken = np.linalg.lstsq(triangle, columns, rcond=None)[0] / length[:, None]
+    changes = (design.fit.model.selection() @ taken).T
+    order = np.argsort(-_errors_of_stars(design, changes), kind="stable")[:MOST_HIDDEN]
+    kept = [found[i] for i in order]
     return Hidden(
-        names=tuple(one.candidate.name for _, one, _, _ in found),
-        sizes=tuple(size for _, _, size, _ in found),
-        units=tuple(one.unit for _, one, _, _ in found),
-        changes=(design.fit.model.selection() @ taken).T,
+        names=tuple(one.candidate.name for one, _, _ in kept),
+        sizes=tuple(size for _, size, _ in kept),
+        units=tuple(one.unit for one, _, _ in kept),
+        changes=changes[order],
     )
+
+
+def _errors_of_stars(design: Design, changes: Float[np.ndarray, "c n"]) -> Float[np.ndarray, " c"]:
+    """Median over some field points of what changes of the parameters do to q and u; 0 where these are not measured."""
+    if not len(changes):
+        return np.zeros(0)
+    fit, points = design.fit, design.fit.calset.points
+    some = np.unique(np.linspace(0, len(points) - 1, STAR_POINTS).astype(int))
+    instrument = fit.model.instrument(fit.values)
+    setting = first_setting(fit.calset, instrument)
+    matrix, slopes = matrix_slopes(instrument, setting, fit.calset.filters, points.x[some], points.y[some])
+    errors = np.array([change_of_qu(matrix, matrix + slopes @ change) for change in changes])
+    measured = np.isfinite(errors).all(axis=0)
+    return np.median(errors[:, measured], axis=1) if measured.any() else np.zeros(len(changes))
 
 
 def stated_conditions(design: Design, singles: Singles | None = None) -> Iterator[str]:
