@@ -38,6 +38,7 @@ def test_there_are_notebooks():
         "paper_versus_joint",
         "posteriors",
         "walop_north_design",
+        "year_of_an_instrument",
         "your_own_effect",
     ]
 

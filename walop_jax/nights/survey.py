@@ -1,11 +1,12 @@
 """A survey: nights of one instrument, stacked under laws of time; the calibration at any moment, and until when.
 
 The calibration of a moment is the instrument with the parameters that the laws give for it and their joint covariance.
-It is valid from half a day before the first exposure until walks and drifts have grown the error of p (of stars with
-p ≤ 5 %, from the calibration alone) to half of the goal, 0.05 %, in 5 % of the field; at the latest after as long again
-as the nights span, as nothing vouches for more, and not before half a day after the last exposure. Validity is
-half-open, and parted, without gaps, where something breaks. Between the last exposure before a break that was found and
-the first after it, it may have happened at any time: the calibration takes a share of it there, and its variance.
+It is valid from half a day before the first exposure until walks and drifts have grown the error of p (of stars with p
+≤ 5 %, from the calibration alone) to half of the goal, 0.05 %, in 5 % of the field where one exposure measures q and u
+(the local inverse has a condition number below 10); at the latest after as long again as the nights span, as nothing
+vouches for more, and not before half a day after the last exposure. Validity is half-open, and parted, without gaps,
+where something breaks. Between the last exposure before a break that was found and the first after it, it may have
+happened at any time: the calibration takes a share of it there, and its variance.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.calibration import HIGH_CROSSTALK, Calibration
 from walop_jax.calibration.matrix import matrix_slopes, p_forms, sample_stars
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.refit import FitResult
@@ -150,7 +151,7 @@ class Survey(Displayed):
         return max(low, end + HALF_A_DAY)
 
     def error_of_p(self, mjd: float) -> float:
-        """Error of p (a fraction) that 95 % of the field stays below at a moment, by the calibration alone."""
+        """Error of p (a fraction) that 95 % of the field with q and u stays below at a moment, by calibration alone."""
         assert self._slopes is not None
         form = self._slopes
         variance = np.mean((form @ self._product(mjd).covariance * form).sum(axis=-1), axis=1)
@@ -168,7 +169,9 @@ class Survey(Displayed):
         name = str(np.unique(product.exposures.filter)[0])
         instrument, curves = product.model.instrument(product.values), {name: product.filter_curve(name)}
         matrix, slopes = matrix_slopes(instrument, product.usual_settings(1, name), curves, x, y)
-        return p_forms(matrix.reshape(len(x), 6), sample_stars(STARS)) @ slopes.reshape(len(x), 6, -1)
+        seen = np.linalg.cond(matrix[:, :, 1:]) < HIGH_CROSSTALK
+        matrix, slopes = matrix[seen].reshape(-1, 6), slopes[seen].reshape(seen.sum(), 6, -1)
+        return p_forms(matrix, sample_stars(STARS)) @ slopes if seen.any() else None
 
     @property
     def last(self) -> float:
