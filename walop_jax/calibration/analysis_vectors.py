@@ -24,7 +24,6 @@ from jaxtyping import Array, Float, Int
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import in_chunks, sky_vectors
 from walop_jax.data.settings import Settings
-from walop_jax.likelihood import limits
 from walop_jax.likelihood.field_table import (
     FieldTable,
     accurate_table,
@@ -207,7 +206,7 @@ class AnalysisVectors:
     ) -> Float[np.ndarray, "p c k 3"]:
         """Vectors (point, colour, camera, Stokes) without any table; `teff` NaN is a flat spectrum."""
         plan, bands = self._plan(setting, teff)
-        return sky_vectors(self.instrument, plan, x, y, limits.VECTOR_POINTS)[:, bands, :, :3]
+        return sky_vectors(self.instrument, plan, x, y)[:, bands, :, :3]
 
     def _plan(self, setting: Settings, teff: Sequence[float]) -> tuple[Plan, Int[np.ndarray, " c"]]:
         same = setting[np.zeros(len(teff), int)]
@@ -254,9 +253,7 @@ class AnalysisVectors:
 
         def exact(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p f"]:
             """Derivatives in the order point, (colour, camera, Stokes, parameter)."""
-            (values,) = in_chunks(
-                lambda a, b: (_derivatives_at(self.instrument, plan, a, b),), x, y, size=limits.VECTOR_POINTS
-            )
+            (values,) = in_chunks(lambda a, b: (_derivatives_at(self.instrument, plan, a, b),), x, y)
             return np.moveaxis(values[:, wanted][:, :, bands], 1, -1).reshape(len(x), -1)
 
         def error(found: Float[np.ndarray, "p f"], truth: Float[np.ndarray, "p f"]) -> float:

@@ -192,16 +192,15 @@ def analysis_vectors(
     plan: Plan,
     x: Vector,
     y: Vector,
-    size: int | None = None,
     *,
     from_sky: bool = False,
 ) -> Float[np.ndarray, "p b k 4"]:
-    """Analysis vectors (point, band, camera, Stokes) at field positions in degrees; `size` as for `in_chunks`.
+    """Analysis vectors (point, band, camera, Stokes) at field positions in degrees.
 
     For light behind the telescope, or `from_sky`, which passes the telescope first.
     """
     program = _sky_vectors if from_sky else _vectors
-    return in_chunks(lambda a, b: (program(instrument, plan, a, b),), x, y, size=size)[0]
+    return in_chunks(lambda a, b: (program(instrument, plan, a, b),), x, y)[0]
 
 
 sky_vectors = functools.partial(analysis_vectors, from_sky=True)
@@ -254,13 +253,10 @@ def matrix_draws(
 
 
 def in_chunks(
-    function: Callable[..., tuple[Array, ...]], *columns: Float[np.ndarray, " p"], size: int | None = None
+    function: Callable[..., tuple[Array, ...]], *columns: Float[np.ndarray, " p"]
 ) -> tuple[np.ndarray, ...]:
-    """Apply a compiled function to slices of the columns, padded to `size` rows (None: to one of two sizes)."""
-    count = len(columns[0])
-    if size is None:
-        few, many = limits.MATRIX_POINTS
-        size = few if count <= few else many
+    """Apply a compiled function to slices of the columns, padded to `limits.MATRIX_POINTS` rows."""
+    count, size = len(columns[0]), limits.MATRIX_POINTS
 
     def solved(start: int) -> list[np.ndarray]:
         slices = [column[start : start + size] for column in columns]
@@ -349,8 +345,7 @@ def effect_slopes(
         return np.zeros((len(x), len(instrument.arms), 3, 0))
     there = dataclasses.replace(instrument, effects=(*instrument.effects, *effects))
     plan = plan_for_settings(there, setting, filters)
-    few = limits.MATRIX_POINTS[0]  # many amplitudes at a time: few points
-    return in_chunks(lambda a, b: (_effect_slopes(instrument, plan, effects, a, b),), x, y, size=few)[0][:, 0]
+    return in_chunks(lambda a, b: (_effect_slopes(instrument, plan, effects, a, b),), x, y)[0][:, 0]
 
 
 def _point_effect_slopes(

@@ -86,10 +86,8 @@ POINTS_PER_CELL = 64
 MOST_CELLS = 128
 """Cells of the residual map along a side: 32 × 32 pixels each for a detector of 4096 pixels."""
 
-MATRIX_POINTS = (16, 256)
-"""Field points whose instrument matrices are computed together, a few and many: compiled for these two sizes only."""
-VECTOR_POINTS = 16
-"""Field points whose analysis vectors are computed together: for one star as well as for a table of the field."""
+MATRIX_POINTS = 32
+"""Field points whose matrices or analysis vectors are computed together, for one star as for a map: one program."""
 
 # ------------------------------------------------------------------------------------------------- diagnosis
 

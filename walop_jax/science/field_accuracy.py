@@ -21,7 +21,7 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import two_digits
 from walop_jax.science.star_errors import GOAL
 
-SIZE = 31  # points along each axis of the map
+SIZE = 21  # points along each axis of the map
 COARSE = 8  # the same where the question is what limits it
 FEW_STARS = 20
 
