@@ -12,11 +12,9 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-import walop_jax.calibration.product
 from walop_jax.calibration import read_calibration
 from walop_jax.calibration.matrix import p_errors, sample_stars
 from walop_jax.data.settings import Settings
-from walop_jax.fit import search
 
 SUMMARY_KEYS = (
     "chi2", "dof", "n_data", "parameters", "converged", "message", "seconds", "versions", "inputs",
@@ -62,11 +60,6 @@ def test_refit_says_what_it_found(call, calset_file, tmp_path):
     assert "walop-jax:" not in shown.stderr  # neither an error nor a warning
     assert shown.stderr.count("walop-jax") == 2  # what to do next
     assert f"Next: walop-jax report {tmp_path / 'run'} or walop-jax apply" in shown.stderr
-    told = call("refit", calset_file, "-o", tmp_path / "run", "--json", "--overwrite")
-    summary = json.loads(told.stdout)
-    assert summary == json.loads((tmp_path / "run" / "summary.json").read_text())
-    silent = call("refit", calset_file, "-o", tmp_path / "run", "--quiet", "--overwrite")
-    assert silent.output == ""
 
 
 def test_refit_leaves_results_alone(call, calset_file, run):
@@ -103,30 +96,6 @@ def test_a_misfit_is_written_but_not_trusted(call, spoilt_file, tmp_path):
     used = call("matrix", tmp_path / "run", "--points", tmp_path / "p.csv", "-o", tmp_path / "o.csv")
     assert used.exit_code == 0
     assert "not trusted" in used.stderr
-
-
-def test_no_convergence_no_product(call, calset_file, tmp_path, monkeypatch):
-    whole = search.minimise
-    monkeypatch.setattr(search, "minimise", lambda *args, **how: whole(*args, **{**how, "maximum_steps": 1}))
-    monkeypatch.setattr(search, "MAXIMUM_RESCALINGS", 0)
-    result = call("refit", calset_file, "-o", tmp_path / "run", "--json")
-    assert "did not converge" in one_line(result)
-    assert [entry.name for entry in (tmp_path / "run").iterdir()] == ["summary.failed.json"]
-    assert json.loads(result.stdout)["converged"] is False
-    monkeypatch.undo()
-    assert call("refit", calset_file, "-o", tmp_path / "run", "-q").exit_code == 0
-    assert sorted(e.name for e in (tmp_path / "run").iterdir()) == ["calibration.fits", "summary.json"]
-
-
-@pytest.mark.parametrize("error", [OSError("No space left on device"), KeyboardInterrupt(), MemoryError()])
-def test_an_interrupted_write_leaves_nothing(call, calset_file, tmp_path, monkeypatch, error):
-    def fail(*args):
-        raise error
-
-    monkeypatch.setattr(walop_jax.calibration.product, "sign_and_write", fail)
-    result = call("refit", calset_file, "-o", tmp_path / "run")
-    assert result.exit_code == (130 if isinstance(error, KeyboardInterrupt) else 1)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_outputs_that_cannot_be(call, calset_file, tmp_path, monkeypatch):

@@ -101,12 +101,12 @@ def test_a_path_that_is_not_utf_8(tmp_path):
     assert told["sets"][0]["files"] == [f"{tmp_path}/a\\xff.fits.gz"]
 
 
-def test_refit_as_a_process(calset_file, tmp_path):
+def test_a_command_as_a_process_keeps_its_programs(run, tmp_path):
     cache = tmp_path / "cache"
-    done = program("refit", calset_file, "-o", tmp_path / "run", "--json", WALOP_JAX_CACHE=str(cache))
+    done = program("matrix", run, "--x", "0.1", "--y", "0", "--json", WALOP_JAX_CACHE=str(cache))
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["trusted"] is True
-    assert done.stderr == ""
+    assert json.loads(done.stdout)
+    assert "Traceback" not in done.stderr
     assert any(cache.iterdir())
 
 

@@ -147,14 +147,15 @@ def test_two_folders_are_one_too_many(fitted: FittedSet, tmp_path):
         refit(fitted.calset, output=tmp_path / "RUN", folder=tmp_path / "kept")
 
 
-def test_a_fit_that_does_not_converge_leaves_no_calibration(fitted: FittedSet, tmp_path, monkeypatch):
+def test_a_fit_that_does_not_converge_leaves_no_calibration(fitted: FittedSet, call, tmp_path, monkeypatch):
     def short(*arguments, **options):
         return search_on(*arguments, **(options | {"maximum_steps": 1}))
 
     search_on = search.minimise
     monkeypatch.setattr(search, "minimise", short)
-    found = refit(fitted.calset, output=tmp_path / "RUN")
-    assert not found.converged
+    asked = call("refit", fitted.calset, "-o", tmp_path / "RUN", "--json")
+    assert "did not converge" in asked.stderr
+    assert json.loads(asked.stdout)["converged"] is False
     assert [entry.name for entry in (tmp_path / "RUN").iterdir()] == ["summary.failed.json"]
     assert json.loads((tmp_path / "RUN" / "summary.failed.json").read_text())["misfit"] is not None
     monkeypatch.undo()

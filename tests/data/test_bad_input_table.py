@@ -231,7 +231,7 @@ ELSEWHERE = {
     "38": "fit/test_outliers.py::test_cosmic_rays_are_flagged_and_nothing_else",
     "42": "model/effects/test_effects_contract.py::test_neutral_and_derivatives",
     "43": "diagnosis/test_detection_limits.py::test_two_effects_that_do_the_same_are_told_as_a_class",
-    "44": "commands/test_commands.py::test_no_convergence_no_product",
+    "44": "commands/test_refit_run.py::test_a_fit_that_does_not_converge_leaves_no_calibration",
     "45": "posterior/test_chains.py::test_a_killed_run_loses_one_block_and_ends_up_the_same",
     "46": "posterior/test_chains.py::test_checkpoints_come_back_and_refuse_what_is_not_theirs",
     "47": "posterior/test_full_disk.py::test_full_disk_is_an_error_and_leaves_what_was_there",
