@@ -45,11 +45,16 @@ def test_a_step_is_found_at_its_night_with_its_size(size):
         assert change.camera in (None, watch.cameras[camera])
 
 
-def test_the_smallest_step_that_is_promised_is_found():
+def test_the_smallest_step_that_is_promised_is_found_and_its_night_lies_between_those_told():
     bound = float(study.watched(600, 50).smallest[study.START, 0])
     assert 2e-4 < bound < 1e-3
-    found = [not study.watched(600, 60 + seed, study.step(bound)).holds for seed in range(12)]
-    assert sum(found) >= 11  # 99 % each
+    found = [study.watched(600, 60 + seed, study.step(bound)).changes for seed in range(12)]
+    assert sum(map(bool, found)) >= 11  # 99 % each
+    for change in (one[0] for one in found if one):
+        first, last = change.between
+        assert first <= 60000.0 + study.START <= last
+        assert (f"it began between MJD {first:.4f} and MJD {last:.4f}" in change.words()) == (first < last)
+    assert any(one[0].between[0] < one[0].between[1] for one in found if one)
     missed = [study.watched(600, 60 + seed, study.step(0.4 * bound)).holds for seed in range(12)]
     assert sum(missed) >= 8
 

@@ -375,7 +375,9 @@ class _Watching:
             if before is not None and before[:3] == best[:3] and moved < _SETTLED:
                 break
         assert best is not None
-        return WatchedChange(best, tuple(alike), float(self.time[best.history.start])), left
+        began = self.time[[entry.history.start for entry in alike]]
+        when = float(self.time[best.history.start]), (float(began.min()), float(began.max()))
+        return WatchedChange(best, tuple(alike), *when), left
 
     def near(self, z: Float[np.ndarray, "h c"]) -> list[History]:
         """The best history of each kind, whatever has changed, and its neighbours in time."""

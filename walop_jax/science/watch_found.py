@@ -50,11 +50,15 @@ class Suspect(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class WatchedChange:
-    """A change: the best description, those that describe the stars as well, and when (MJD, or the group's number)."""
+    """A change: the best description, those that describe the stars as well, and when (MJD, or the group's number).
+
+    It began at `time`, or, as others describe the stars as well, at any `between` the first and the last of theirs.
+    """
 
     best: Suspect
     alike: tuple[Suspect, ...]
     time: float
+    between: tuple[float, float]
 
     @property
     def camera(self) -> str | None:
@@ -64,14 +68,17 @@ class WatchedChange:
 
     def words(self) -> str:
         """The change in a sentence."""
-        date = f"MJD {self.time:.4f}" if self.time > _DATE else f"group {self.time:g}"
+        date, *ends = (
+            f"MJD {time:.4f}" if time > _DATE else f"group {time:g}" for time in (self.time, *self.between)
+        )
         how = {
             "step": "from {} on",
             "drift": "at the end, drifting since {}",
             "once": "in the exposures of {} only",
         }
         when = how[self.best.history.kind].format(date)
-        text = f"{_words(self.best)} {when} ({abs(self.best.sigma):.0f} σ)"
+        spread = f"; it began between {ends[0]} and {ends[1]}" if ends[0] != ends[1] else ""
+        text = f"{_words(self.best)} {when} ({abs(self.best.sigma):.0f} σ{spread})"
         others = {entry.name: entry for entry in self.alike if entry.name != self.best.name}
         if not others:
             return text
@@ -142,7 +149,13 @@ class Watch(Displayed):
             }
 
         found = [
-            {"camera": c.camera, "time": c.time, "best": plain(c.best), "alike": [plain(e) for e in c.alike]}
+            {
+                "camera": c.camera,
+                "time": c.time,
+                "between": list(c.between),
+                "best": plain(c.best),
+                "alike": [plain(e) for e in c.alike],
+            }
             for c in self.changes
         ]
         groups = [
