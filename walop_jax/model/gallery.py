@@ -172,7 +172,9 @@ def _element(kind: type[Element]) -> Iterator[str]:
 
 
 def _head_text(kind: type[Any]) -> str:
-    return inspect.cleandoc(sys.modules[kind.__module__].__doc__ or "")
+    """The text with its equation: of the class, or of the head of its file."""
+    own = inspect.cleandoc(kind.__doc__ or "")
+    return own if "\nEquation " in own else inspect.cleandoc(sys.modules[kind.__module__].__doc__ or "")
 
 
 def _indented(head: str) -> Iterator[str]:

@@ -1,42 +1,8 @@
-"""Elements with a formula each: simple ones, the calibration polariser, lenses, analysers.
-
-Elements that are one Mueller matrix: retarder, rotator, diattenuator, depolariser, polarisation of a telescope.
+"""Elements with a formula each: simple matrices, the calibration polariser, lenses, analysers.
 
 Sources     retarder: Paper II of WALOP-South, appendix B; diattenuator: Lu & Chipman 1996, JOSA A 13, 1106, eq. 18;
             depolariser: ibid., eq. 32, diagonal.
 Limits      all are the identity at their neutral numbers.
-
-The calibration polariser: light behind it forgets its past.
-
-Equation    light behind it (1, c cos 2θ, c sin 2θ, v), c = (1 − ε)/(1 + ε), per unit of transmitted light
-            θ = reading + zero
-Symbols     θ transmission axis in the instrument frame; ε extinction ratio, unwanted over wanted transmission;
-            v circular polarisation behind it; reading: encoder [deg]
-Source      Malus' law for a polariser of finite extinction: Goldstein 2003, Polarized Light, ch. 9.
-Limits      ε = 0 is the ideal polariser. What it does to the flux of polarised light is part of the unknown flux.
-
-Lenses that polarise weakly: diattenuation and retardance growing with the square of the field radius.
-
-Equation    diattenuation (q, u) = c r² (cos 2φ, sin 2φ) + (c_q, c_u)
-            retardance Δ = 2π (delta + slope u + bend u²) (r/0.3°)², fast axis radial, u = λ − 0.62 µm (coatings)
-Symbols     r, φ polar coordinates of the field point [deg]; c [deg⁻²]; delta in waves at 0.3°
-Source      Fresnel transmission of curved surfaces and stress of mounted lenses, both ∝ r²: Paper II of WALOP-South
-            (Maharana et al. 2022); Selbing 2010, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146.
-Limits      nothing on the axis but (c_q, c_u). Written with (1 − cos Δ)/Δ² and sin Δ/Δ, both smooth at the centre of
-            the field, Δ(cos 2φ, sin 2φ) being k (x² − y², 2xy).
-
-Analysers: where an arm ends and the beams of its cameras begin.
-
-Equation    beams of an arm ½ (1, ±η cos 2α, ±η sin 2α, 0), first camera +, with η ± ξ in the place of η
-            with a dispersion κ the first camera sees the band at λ (1 + κ), the second at λ (1 − κ), to first order:
-            M → M ± κ λ ∂M/∂λ, M the train ahead of the analyser
-            with balance g and loss l, curves over wavelength taken at the mean wavelength of a band, the beams of η = 1
-            are ½ (1 ± g) (1, ±(1 − l) cos 2α, ±(1 − l) sin 2α, 0): what differs from band to band
-Symbols     η efficiency, near 1, ξ half its difference between the beams; α axis of the first beam, from +X toward +Y;
-            κ half the relative difference of the wavelengths of the two beams
-Source      Wollaston prism as a pair of crossed analysers: Goldstein 2003, Polarized Light, ch. 9.
-Limits      no balance, no loss: as if g = l = 0
-            η = 1, α = 0 are ideal analysers along +X and +Y; κ = 0: both see the filter as it is.
 """
 
 from __future__ import annotations
@@ -162,7 +128,15 @@ class Film(Component):
 
 
 class Polariser(Element):
-    """A polariser whose axis is read from an encoder."""
+    """A polariser whose axis is read from an encoder: light behind it forgets its past.
+
+    Equation    light behind it (1, c cos 2θ, c sin 2θ, v), c = (1 − ε)/(1 + ε), per unit of transmitted light
+                θ = reading + zero
+    Symbols     θ transmission axis in the instrument frame; ε extinction ratio, unwanted over wanted transmission;
+                v circular polarisation behind it; reading: encoder [deg]
+    Source      Malus' law for a polariser of finite extinction: Goldstein 2003, Polarized Light, ch. 9.
+    Limits      ε = 0 is the ideal polariser. What it does to the flux of polarised light is part of the unknown flux.
+    """
 
     extinction: Scalar = number(unit="", about="ε, unwanted over wanted transmission")
     zero: Scalar | None = number(unit="deg", about="added to the encoder reading", default=None)
@@ -192,7 +166,13 @@ PAPER_II = "Maharana et al. 2022, Paper II"
 
 
 class Collimator(Element):
-    """Weak linear diattenuation: a radial part and a constant one."""
+    """Weak linear diattenuation: a radial part and a constant one.
+
+    Equation    diattenuation (q, u) = c r² (cos 2φ, sin 2φ) + (c_q, c_u)
+    Symbols     r, φ polar coordinates of the field point [deg]; c [deg⁻²]
+    Source      Fresnel transmission of curved surfaces, ∝ r²: Paper II of WALOP-South (Maharana et al. 2022)
+    Limits      nothing on the axis but (c_q, c_u)
+    """
 
     diattenuation: Scalar = number(unit="deg-2", about="c, radial diattenuation of curved lenses")
     q: Scalar = number(unit="", about="c_q, constant part")
@@ -209,7 +189,14 @@ class Collimator(Element):
 
 
 class RadialRetarder(Element):
-    """Retardance with a radial fast axis, growing with the square of the field radius."""
+    """Retardance with a radial fast axis, growing with the square of the field radius.
+
+    Equation    Δ = 2π (delta + slope u + bend u²) (r/0.3°)², fast axis radial, u = λ − 0.62 µm (coatings)
+    Symbols     r, φ polar coordinates of the field point [deg]; delta in waves at 0.3°
+    Source      stress of mounted lenses, ∝ r²: Selbing 2010, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146.
+    Limits      written with (1 − cos Δ)/Δ² and sin Δ/Δ, both smooth at the centre of the field, Δ(cos 2φ, sin 2φ) being
+                k (x² − y², 2xy)
+    """
 
     delta: Scalar = number(unit="wave", about="retardance at 0.3° (and 0.62 µm)")
     slope: Scalar | None = number(unit="wave/um", about="change of it with wavelength", default=None)
@@ -234,6 +221,17 @@ class RadialRetarder(Element):
 
 class Analyser(Element):
     """A polarising beam splitter: two beams, one for each of its cameras.
+
+    Equation    beams of an arm ½ (1, ±η cos 2α, ±η sin 2α, 0), first camera +, with η ± ξ in the place of η
+                with a dispersion κ the first camera sees the band at λ (1 + κ), the second at λ (1 − κ), to first
+                order: M → M ± κ λ ∂M/∂λ, M the train ahead of the analyser
+                with balance g and loss l, curves over wavelength taken at the mean wavelength of a band, the beams of
+                η = 1 are ½ (1 ± g) (1, ±(1 − l) cos 2α, ±(1 − l) sin 2α, 0): what differs from band to band
+    Symbols     η efficiency, near 1, ξ half its difference between the beams; α axis of the first beam, from +X toward
+                +Y; κ half the relative difference of the wavelengths of the two beams
+    Source      Wollaston prism as a pair of crossed analysers: Goldstein 2003, Polarized Light, ch. 9.
+    Limits      no balance, no loss: as if g = l = 0
+                η = 1, α = 0 are ideal analysers along +X and +Y; κ = 0: both see the filter as it is.
 
     What depends on the light ahead of it (`seen`) and what does not (`shares`) are kept apart: only the first
     enters the band integral.
