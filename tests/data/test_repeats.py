@@ -17,8 +17,8 @@ from walop_jax.data import (
     write_calibration_set,
     write_frames,
 )
+from walop_jax.data.merge import _Rows, _smallest_singular_value, check_repeats
 from walop_jax.data.records import CalibrationSet, Exposures, Points
-from walop_jax.data.repeats import _Rows, _smallest_singular_value, check_repeats
 
 COLUMNS = ("exposure", "point", "source", "counts", "sigma", "flag", "used")
 

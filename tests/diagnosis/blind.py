@@ -274,9 +274,8 @@ class Blind:
     def _start(self, removed: tuple[str, ...]) -> Evidence:
         """What is asked of a scene, without what is not in the catalogue; the residuals are those of the design."""
         catalogue = [effect for effect in EFFECTS if effect.name not in removed]
-        every = self.sentences, catalogue, self.context, self.template
         names = [p for p in self.probes if p.effect.name not in removed]
-        said, parts = candidates.uncovered(*every), candidates.parts(*every)
+        said, parts = candidates.beside_names(self.sentences, catalogue, self.context, self.template)
         asked = [*(p.name for p in (*names, *said)), *(p.name for p, _ in parts), *self.patterns]
         space = self._behind_nuisance.subset(asked)
         if not removed:

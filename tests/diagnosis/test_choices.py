@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scenes import PLAN
 
-from walop_jax.diagnosis.alternatives import Choices
+from walop_jax.diagnosis.alternatives import other_descriptions
 from walop_jax.diagnosis.findings import Choice, document
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
@@ -90,9 +90,10 @@ def fitted(plan, change: str, seed: int = 5) -> FitResult:
 def best_of(result: FitResult) -> Choice | None:
     """The change that gains most in χ²."""
     context = effect_context(result.model.template, result.calset.exposures)
-    choices = Choices(result, context, POLICY, lambda: True, lambda text: None)
-    assert all(trial.instance.change in choices.tried for trial in choices.trials())
-    fitted_ones = [one for one in choices.tried.values() if np.isfinite(one.better_by)]
+    tried: dict[str, Choice] = {}
+    trials = other_descriptions(result, context, POLICY, lambda: True, lambda text: None, tried)
+    assert all(trial.instance.change in tried for trial in trials)
+    fitted_ones = [one for one in tried.values() if np.isfinite(one.better_by)]
     return max(fitted_ones, key=lambda one: one.better_by, default=None)
 
 

@@ -90,7 +90,7 @@ def test_sentences_that_have_a_name_are_left_to_it(laid):
     template = laid.model.template
     context = effect_context(template, laid.calset.exposures)
     every = candidates.sentences(template, laid.calset.exposures, len(laid.calset.points))
-    left = {p.name for p in candidates.uncovered(every, EFFECTS, context, template)}
+    left = {p.name for p in candidates.beside_names(every, EFFECTS, context, template)[0]}
     gone = {p.name for p in every} - left
     assert "turn of polariser" in gone
     assert "retardance q behind collimator; retardance u behind collimator" in gone
@@ -106,13 +106,13 @@ def test_parts_of_effects_stand_for_them(laid):
     every = candidates.sentences(template, laid.calset.exposures, len(laid.calset.points))
     found = {
         p.name: {e.name for e in effects}
-        for p, effects in candidates.parts(every, EFFECTS, context, template)
+        for p, effects in candidates.beside_names(every, EFFECTS, context, template)[1]
     }
     assert found["light in O1"] == {"pedestal"}
     patches = [name for name in found if name.startswith("polarisation q of sky * exposure")]
     assert len(patches) == 4
     assert all(found[name] == {"moon_patch"} for name in patches)
-    left = {p.name for p in candidates.uncovered(every, EFFECTS, context, template)}
+    left = {p.name for p in candidates.beside_names(every, EFFECTS, context, template)[0]}
     assert not left & set(found)
     assert "turn of polariser" not in found, "this is clp_zero as a whole"
 

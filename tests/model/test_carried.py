@@ -16,7 +16,7 @@ from walop_jax.calibration.matrix import matrices, sky_vectors
 from walop_jax.data.records import Sources
 from walop_jax.data.settings import Settings
 from walop_jax.likelihood import engine
-from walop_jax.model import carried, light, mueller
+from walop_jax.model import dependence, light, mueller
 from walop_jax.model.cameras import DetectorPart
 from walop_jax.model.effects import EFFECTS, FreeForm, effect_by_name
 from walop_jax.model.effects.base import Context, Effect, Scalar
@@ -192,7 +192,7 @@ def test_errors_change_no_matrix(group):
     "name", quick([name for group in IN_THE_PRODUCT for name in group], IN_THE_PRODUCT[1])
 )
 def test_what_the_counts_show_the_product_says(name):
-    assert carried.left_behind(alone(name)) == ()
+    assert dependence.left_behind(alone(name)) == ()
     shown, said = matrix_of_counts(star_counts(*among(name))), product(*among(name))
     assert np.abs(shown - matrix_of_counts(star_counts())).max() > 1e-4
     np.testing.assert_allclose(said, shown, rtol=0, atol=1e-12)
@@ -200,7 +200,7 @@ def test_what_the_counts_show_the_product_says(name):
 
 @pytest.mark.parametrize("name", OF_THE_SOURCE)
 def test_what_belongs_to_the_source_stays_with_it(name):
-    assert carried.left_behind(alone(name)) == ()
+    assert dependence.left_behind(alone(name)) == ()
     np.testing.assert_array_equal(product(*among(name)), product(*among(name, neutral=True)))
     np.testing.assert_allclose(product(*among(name)), product(), rtol=0, atol=1e-14)
 
@@ -215,16 +215,16 @@ def test_what_acts_on_counts_is_no_part_of_the_product(name):
 
 @pytest.mark.parametrize("name", UNDONE)
 def test_what_a_detector_does_to_its_own_counts_is_undone(name):
-    assert carried.left_behind(alone(name)) == ()
+    assert dependence.left_behind(alone(name)) == ()
     shown, linear = star_counts(*among(name)), star_counts()
-    again = np.asarray(carried.reported(alone(name), jnp.asarray(linear.reshape(-1, 4))))
+    again = np.asarray(dependence.reported(alone(name), jnp.asarray(linear.reshape(-1, 4))))
     np.testing.assert_allclose(again.reshape(linear.shape), shown, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", LEFT_BEHIND)
 def test_what_is_left_behind_is_named(name):
     both = instrument(make("hwp1_axis", angle=0.5), make(name, **DETECTORS[name]))
-    assert carried.left_behind(both) == (name,)
+    assert dependence.left_behind(both) == (name,)
 
 
 # ------------------------------------------------------------------------------------------- the free form
@@ -242,7 +242,7 @@ def free(block: str, size: float = 0.01) -> FreeForm:
 def test_patterns_over_the_field_reach_the_product(block):
     """Fine structure changes the counts of a fit by a quarter, and m21 and m31 with them."""
     effect = free(block, 0.02)
-    assert carried.left_behind(instrument(effect)) == ()
+    assert dependence.left_behind(instrument(effect)) == ()
     assert np.abs(star_counts(effect) / star_counts() - 1).max() > (0.03 if block == "fine" else 1e-3)
     shown = matrix_of_counts(star_counts(effect))
     assert np.abs(shown - matrix_of_counts(star_counts())).max() > 1e-3
@@ -252,7 +252,7 @@ def test_patterns_over_the_field_reach_the_product(block):
 @pytest.mark.parametrize("block", quick(["harmonics", "exposures"], ["harmonics"]))
 def test_patterns_of_single_exposures_are_left_behind(block):
     effect = free(block)
-    assert carried.left_behind(instrument(effect)) == ("free_form",)
+    assert dependence.left_behind(instrument(effect)) == ("free_form",)
     np.testing.assert_allclose(product(effect), product(), rtol=0, atol=1e-13)
 
 
@@ -302,10 +302,10 @@ class Bias(Effect):
 def test_optics_that_change_with_time_are_left_behind():
     shown = star_counts(Ageing())
     assert np.abs(shown[:, 3:] / star_counts()[:, 3:] - 1).max() > 1e-3
-    assert carried.left_behind(instrument(Ageing(), make("hwp1_axis", angle=0.5))) == ("ageing",)
+    assert dependence.left_behind(instrument(Ageing(), make("hwp1_axis", angle=0.5))) == ("ageing",)
 
 
 def test_a_detector_that_nobody_knows_is_undone():
-    assert carried.left_behind(instrument(Bias())) == ()
+    assert dependence.left_behind(instrument(Bias())) == ()
     counts = jnp.asarray([[1e5, 2e5, 3e5, 4e5]])
-    np.testing.assert_allclose(carried.reported(instrument(Bias()), counts), counts + 50.0, rtol=1e-15)
+    np.testing.assert_allclose(dependence.reported(instrument(Bias()), counts), counts + 50.0, rtol=1e-15)

@@ -77,7 +77,7 @@ def scores(result: FitResult, draws: int, named: int) -> dict[str, dict[str, flo
     context = effect_context(template, calset.exposures)
     every = list(probes(EFFECTS, context))
     said = candidates.sentences(template, calset.exposures, len(calset.points))
-    said = candidates.uncovered(said, EFFECTS, context, template)
+    said = candidates.beside_names(said, EFFECTS, context, template)[0]
     names = examine(result, every, np.random.default_rng(0))
     whole = examine(result, every, np.random.default_rng(0), None, said)
     p = names.table.local(POLICY.alarm)

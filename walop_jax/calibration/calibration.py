@@ -53,8 +53,7 @@ from walop_jax.io.code import software_versions
 from walop_jax.io.display import Display, Result
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.text import in_ascii
-from walop_jax.model import carried
-from walop_jax.model.dependence import needs
+from walop_jax.model.dependence import left_behind, needs
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.instrument import Instrument, adapted, build, nominal_instrument
 from walop_jax.model.parameters import Parameter
@@ -386,7 +385,7 @@ class Calibration(Result):
     @property
     def left_behind(self) -> tuple[str, ...]:
         """Effects of the model of which a part belongs to its exposures, so that no matrix and no star can have it."""
-        return carried.left_behind(self.model.template)
+        return left_behind(self.model.template)
 
     def filter_curve(self, name: str) -> FilterCurve:
         """The curve of a filter; `DataError` with the nearest names when there is none."""

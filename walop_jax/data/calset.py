@@ -22,7 +22,7 @@ from walop_jax.data.checks import (
     oldest_version,
 )
 from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
-from walop_jax.data.merge import merge_calibration_sets
+from walop_jax.data.merge import check_repeats, merge_calibration_sets
 from walop_jax.data.records import (
     KINDS,
     CalibrationSet,
@@ -35,7 +35,6 @@ from walop_jax.data.records import (
     Site,
     Sources,
 )
-from walop_jax.data.repeats import check_repeats
 from walop_jax.data.schema import CALVERS, Place, column_names, in_unit, read_table, table_of, table_rules
 from walop_jax.data.settings import builtin_filter
 from walop_jax.data.table_intensities import TableIntensities, mask_repeats, table_intensities, usable

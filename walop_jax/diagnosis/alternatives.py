@@ -30,7 +30,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -308,13 +308,6 @@ NO_DIFFERENCE = 1e-6  # change of the residuals, in standard deviations, that is
 Vector = Float[np.ndarray, " n"]
 
 
-@dataclasses.dataclass(frozen=True)
-class _Screened:
-    sentence: str
-    left: float
-    start: Vector
-
-
 def described_otherwise(model: Model, sentence: str, context: Context) -> Model:
     """The model of the instrument changed as a sentence says, on top of what has been changed before."""
     name = OtherDescription.name
@@ -325,96 +318,70 @@ def described_otherwise(model: Model, sentence: str, context: Context) -> Model:
     return with_effects(model, [OtherDescription(change=sentence)], context)
 
 
-class Choices:
-    """All changes of the description of one fit: first screened, then the best of them fitted."""
-
-    def __init__(
-        self,
-        result: FitResult,
-        context: Context,
-        policy: Policy,
-        going_on: Callable[[], bool],
-        tell: Callable[[str], None],
-        *,
-        all_of_them: bool = True,
-    ) -> None:
-        self.result, self.context, self.policy = result, context, policy
-        self.going_on, self.tell = going_on, tell
-        template = dataclasses.replace(result.model.template, effects=())
-        if OtherDescription.name in result.model.effect_names:
-            described = result.model.template.effect(OtherDescription.name)
-            template = described.patch(template)
-        self.curves = other_curves(template)
-        # What is turned, exchanged or left out changes the light by per cents: nothing of that kind is a small misfit.
-        self.sentences = tuple(alternatives(template)) if all_of_them else self.curves
-        self.tried: dict[str, Choice] = {}
-
-    def trials(self) -> Iterator[Trial]:
-        """The best changes, fitted."""
-        for one in self._leaders():
-            if not self.going_on():
-                return
-            self.tell(f"trying another description: {one.sentence}")
-            trial = self._fitted(one)
-            if trial is None:
-                continue
-            assert trial.fit is not None
-            gain = self.result.posterior.objective - trial.fit.posterior.objective
-            scale = self.result.noise_scale**2
-            self.tried[one.sentence] = dataclasses.replace(
-                self.tried[one.sentence], better_by=float(gain * scale)
-            )
-            yield trial
-
-    def _fitted(self, one: _Screened) -> Trial | None:
-        model = described_otherwise(self.result.model, one.sentence, self.context)
+def other_descriptions(
+    result: FitResult,
+    context: Context,
+    policy: Policy,
+    going_on: Callable[[], bool],
+    tell: Callable[[str], None],
+    tried: dict[str, Choice],
+    *,
+    all_of_them: bool = True,
+) -> Iterator[Trial]:
+    """Changes of the description of a fit: all are screened, the best of them fitted. `tried` takes what is found."""
+    template = dataclasses.replace(result.model.template, effects=())
+    if OtherDescription.name in result.model.effect_names:
+        template = result.model.template.effect(OtherDescription.name).patch(template)
+    curves = other_curves(template)
+    # What is turned, exchanged or left out changes the light by per cents: nothing of that kind is a small misfit.
+    sentences = tuple(alternatives(template)) if all_of_them else curves
+    tell(f"comparing {len(sentences)} other descriptions")
+    asked = itertools.takewhile(lambda _: going_on(), sentences)
+    found = sorted(_screened(result, asked, context), key=lambda one: one[0].left)
+    tried |= {choice.change: choice for choice, _, _ in found}
+    promising = [one for one in found if one[1] > policy.least_gain][: policy.descriptions_fitted]
+    chosen = {choice.change for choice, _, _ in promising}
+    rest = [one for one in found if one[0].change in curves and one[0].change not in chosen]
+    for choice, _, start in (*promising, *rest):
+        if not going_on():
+            return
+        tell(f"trying another description: {choice.change}")
+        model = described_otherwise(result.model, choice.change, context)
         try:
-            return try_model(self.result, OtherDescription, model, one.start, len(self.sentences))
+            trial = try_model(result, OtherDescription, model, start, len(sentences))
         except ValueError:  # a free parameter of what was left out has no prior: nothing holds it
-            return None
+            continue
+        assert trial.fit is not None
+        gain = (result.posterior.objective - trial.fit.posterior.objective) * result.noise_scale**2
+        tried[choice.change] = dataclasses.replace(choice, better_by=float(gain))
+        yield trial
 
-    def _leaders(self) -> list[_Screened]:
-        self.tell(f"comparing {len(self.sentences)} other descriptions")
-        every = max(1, limits.CHOICE_ROWS // max(len(self.result.calset.exposures), 1))
-        calset = thinned(self.result.calset, every, neighbours=1)
-        places = [self._design(calset, values) for values in (self.result.values, self._from_start())]
-        given = float(np.sum(places[0].projector(places[0].residual) ** 2))
-        found = []
-        for sentence in self.sentences:
-            if not self.going_on():
-                break
-            if (one := self._screened(sentence, places, given)) is not None:
-                found.append(one)
-                self.tried[sentence] = Choice(sentence, one.left)
-        found.sort(key=lambda one: one.left)
-        promising = [one for one in found if (1.0 - one.left) * given > self.policy.least_gain]
-        promising = promising[: self.policy.descriptions_fitted]
-        curves = [one for one in found if one.sentence in self.curves and one not in promising]
-        return [*promising, *curves]
 
-    def _from_start(self) -> Vector:
-        """Start values, of effects as they have been fitted."""
-        model, values = self.result.model, self.result.model.start.copy()
-        for name in model.effect_names:
-            values[model.positions(name)] = self.result.values[model.positions(name)]
-        return values
-
-    def _design(self, calset: object, values: Vector) -> Design:
-        likelihood = Likelihood.of(calset, self.result.model)  # pyright: ignore[reportArgumentType]
-        return Design.of(dataclasses.replace(self.result, likelihood=likelihood, values=values))
-
-    def _screened(self, sentence: str, places: list[Design], given: float) -> _Screened | None:
-        """What a change leaves at the better of the places; None where it changes nothing."""
-        calset = places[0].fit.calset
-        model = described_otherwise(self.result.model, sentence, self.context)
-        likelihood, best = Likelihood.of(calset, model), None
+def _screened(
+    result: FitResult, sentences: Iterable[str], context: Context
+) -> Iterator[tuple[Choice, float, Vector]]:
+    """What each change leaves at the better of two places, its gain in χ², and the place; but what changes nothing."""
+    every = max(1, limits.CHOICE_ROWS // max(len(result.calset.exposures), 1))
+    calset = thinned(result.calset, every, neighbours=1)
+    start = result.model.start.copy()  # but effects as they have been fitted
+    for name in result.model.effect_names:
+        start[result.model.positions(name)] = result.values[result.model.positions(name)]
+    likelihood = Likelihood.of(calset, result.model)
+    places = [
+        Design.of(dataclasses.replace(result, likelihood=likelihood, values=values))
+        for values in (result.values, start)
+    ]
+    given = float(np.sum(places[0].projector(places[0].residual) ** 2))
+    for sentence in sentences:
+        model = described_otherwise(result.model, sentence, context)
+        changed, left = Likelihood.of(calset, model), []
         for design in places:
             rows = design.residual.copy()
-            residual = likelihood.residuals(design.fit.values, once=True)[1][design.measured.used].reshape(-1)
+            residual = changed.residuals(design.fit.values, once=True)[1][design.measured.used].reshape(-1)
             rows[: design.rows] = residual / design.fit.noise_scale
             if np.abs(rows - design.residual).max() < NO_DIFFERENCE:
-                return None
-            left = float(np.sum(design.projector(rows) ** 2)) / given
-            if np.isfinite(left) and (best is None or left < best.left):
-                best = _Screened(sentence, left, design.fit.values)
-        return best
+                break
+            left.append(float(np.sum(design.projector(rows) ** 2)) / given)
+        if len(left) == len(places) and np.isfinite(left).any():
+            best = int(np.nanargmin(np.where(np.isfinite(left), left, np.nan)))
+            yield Choice(sentence, left[best]), (1.0 - left[best]) * given, places[best].fit.values

@@ -19,7 +19,7 @@ sine, a gradient two directions. Groups are short: at most two things are free b
                   angle; harmonics of the angles; one night; one exposure; the counts; the exposure before
 
 A sentence pays for the number of sentences that there are, and for its length by its evidence. Names are sentences
-with a history: which groups an effect of the catalogue already is (`uncovered`), or holds (`parts`).
+with a history: `beside_names` tells which groups an effect of the catalogue already is, or holds.
 """
 
 from __future__ import annotations
@@ -198,41 +198,32 @@ def _probe(group: tuple[Sentence, ...]) -> Probe:
 # ------------------------------------------------------------------------------------- names that are sentences
 
 
-def uncovered(
+def beside_names(
     probes: Sequence[Probe], catalogue: Sequence[type[Effect]], context: Context, instrument: Instrument
-) -> tuple[Probe, ...]:
-    """The groups that are no effect of a catalogue by another name: those that none holds as a part."""
-    known = [texts for texts, _ in _known(catalogue, context, instrument)]
-    return tuple(probe for probe in probes if not any(texts.issuperset(said_by(probe)) for texts in known))
+) -> tuple[list[Probe], list[tuple[Probe, frozenset[type[Effect]]]]]:
+    """The groups that are no effect of a catalogue by another name: those that none holds, and parts, with the holders.
 
-
-def parts(
-    probes: Sequence[Probe], catalogue: Sequence[type[Effect]], context: Context, instrument: Instrument
-) -> tuple[tuple[Probe, frozenset[type[Effect]]], ...]:
-    """The groups that are a part of effects, and none of them as a whole: one patch of all, the light in one camera."""
-    known = _known(catalogue, context, instrument)
-    found = []
-    for probe in probes:
-        said = frozenset(said_by(probe))
-        holders = frozenset(effect for texts, effect in known if texts > said)
-        if holders and not any(texts == said for texts, _ in known):
-            found.append((probe, holders))
-    return tuple(found)
-
-
-def _known(
-    catalogue: Sequence[type[Effect]], context: Context, instrument: Instrument
-) -> list[tuple[frozenset[str], type[Effect]]]:
-    """What the effects are in sentences, shape by shape, each with an amplitude of its own."""
-    found = []
+    A part is a group that effects hold, none of them as a whole: one patch of all, the light in one camera.
+    """
+    known = []  # what the effects are in sentences, shape by shape, each with an amplitude of its own
     for effect in catalogue:
         for group in effect.probes(context):
             texts = frozenset(group[0].in_sentences(instrument))
             if len(texts) <= sum(
                 np.size(getattr(one, name)) for one in group for name in effect.amplitudes()
             ):
-                found.append((texts, effect))
-    return found
+                known.append((texts, effect))
+    alone, parts = [], []
+    for probe in probes:
+        said = frozenset(said_by(probe))
+        holders = frozenset(effect for texts, effect in known if texts > said)
+        if any(texts == said for texts, _ in known):
+            continue
+        if holders:
+            parts.append((probe, holders))
+        else:
+            alone.append(probe)
+    return alone, parts
 
 
 # -------------------------------------------------------------------------------------------------- the grammar

@@ -162,8 +162,8 @@ class Evidence:
 
     `space` is that of all candidates behind the nuisance that single exposures may have, `scores` are C̃ᵀr and
     `square` r·r there. `probes` are effects, `sentences` what else can be said, `parts` sentences that are told as the
-    effects that hold them (`candidates.parts`), `patterns` the names of patterns without a name. `chi2` and `dof` are
-    those of the fit, `scale` the factor on the errors with which it was made.
+    effects that hold them (`candidates.beside_names`), `patterns` the names of patterns without a name. `chi2` and
+    `dof` are those of the fit, `scale` the factor on the errors with which it was made.
     """
 
     space: ScoreSpace
@@ -471,7 +471,7 @@ def examine(
     parts: Parts = (),
     policy: Policy = POLICY,
 ) -> Examination:
-    """Score effects that a model has not, sentences, `parts` (`candidates.parts`) and patterns against a fit.
+    """Score effects that a model has not, sentences, `parts` (`candidates.beside_names`) and patterns against a fit.
 
     `earlier` is of a smaller model; its columns serve again where the light has hardly changed.
     """

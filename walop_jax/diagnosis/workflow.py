@@ -23,7 +23,7 @@ import numpy as np
 from walop_jax.calibration.matrix import instrument_matrices, largest_change
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import candidates
-from walop_jax.diagnosis.alternatives import Choices, mixups_of, refusal
+from walop_jax.diagnosis.alternatives import mixups_of, other_descriptions, refusal
 from walop_jax.diagnosis.candidates import Probe, applicable
 from walop_jax.diagnosis.candidates import probes as all_probes
 from walop_jax.diagnosis.design import Design, strata
@@ -201,15 +201,15 @@ class Refit(Linear):
         """Fit a model to a set and lay out what may be said beyond it."""
         context = effect_context(model.template, calset.exposures)
         fitting = applicable(catalogue, context, model.template)
-        every = sentences, fitting, context, model.template
+        alone, parts = candidates.beside_names(sentences, fitting, context, model.template)
         tell(Stage("fitting the model", "fitting"))
         return cls(
             calset=calset,
             context=context,
             catalogue=fitting,
             wanted=list(all_probes(fitting, context)),
-            sentences=candidates.uncovered(*every),
-            parts=candidates.parts(*every),
+            sentences=alone,
+            parts=parts,
             rng=rng,
             tell=tell,
             policy=policy,
@@ -265,11 +265,8 @@ class Refit(Linear):
             if effect.is_structural() and effect.name not in self.fit.model.effect_names and self.time_left():
                 self.tell(f"trying {effect.name}")
                 yield try_effect(self.fit, effect.neutral(self.context), self.context)
-        choices = Choices(
-            self.fit, self.context, self.policy, self.time_left, self.tell, all_of_them=state.poor
-        )
-        yield from choices.trials()
-        self.choices |= choices.tried
+        how = self.policy, self.time_left, self.tell, self.choices
+        yield from other_descriptions(self.fit, self.context, *how, all_of_them=state.poor)
 
     def decided(self, trials: list[Trial]) -> list[Trial]:
         """Trials in order of evidence; what scaled errors leave even at the top is decided with errors as stated."""

@@ -9,7 +9,7 @@ stage, and the class says at which:
     ExposurePart    linear in the flux, but known only exposure by exposure
     DetectorPart    acts on electrons; not linear in the light
 
-What of this can be carried over to other exposures, `carried` says.
+What of this can be carried over to other exposures, `dependence.left_behind` says.
 """
 
 from __future__ import annotations

@@ -25,7 +25,8 @@ from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import DataError, rows_text
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
-from walop_jax.model import carried, light
+from walop_jax.model import light
+from walop_jax.model.dependence import reported
 from walop_jax.model.parameters import with_values
 from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, check_catalogue
 from walop_jax.science.estimate import Estimate, calibration_shift, estimate_with
@@ -489,7 +490,7 @@ def linearised(calibration: Calibration, counts: Float[np.ndarray, "n k"]) -> Fl
         return counts
     true = counts
     for _ in range(_ROUNDS):
-        true = true + (counts - np.asarray(carried.reported(instrument, jnp.asarray(true))))
+        true = true + (counts - np.asarray(reported(instrument, jnp.asarray(true))))
     return true
 
 
@@ -507,7 +508,7 @@ def _detector_slopes(
     to_instrument = with_values(template)
 
     def reported(values: jax.Array, counts: jax.Array) -> jax.Array:
-        return carried.reported(to_instrument(values), counts)
+        return reported(to_instrument(values), counts)
 
     probe = jnp.full((1, counts.shape[1]), 1e6)
     known = np.abs(np.asarray(jax.jacfwd(reported)(values, probe))).max(axis=(0, 1)) > 0

@@ -13,8 +13,8 @@ from scipy.linalg import expm, expm_frechet
 
 from walop_jax.fit.model_file import model_without_data, render
 from walop_jax.model import mueller
-from walop_jax.model.carried import left_behind
 from walop_jax.model.compiled import compiled
+from walop_jax.model.dependence import left_behind
 from walop_jax.model.effects import Change, Described, effect_by_name
 from walop_jax.model.effects.change import AMPLITUDES, KINDS
 from walop_jax.model.effects.factors import PLAIN
