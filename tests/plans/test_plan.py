@@ -9,17 +9,23 @@ import numpy as np
 import pytest
 
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.matrix import matrix_slopes
+from walop_jax.data.settings import Settings
+from walop_jax.data.user_tables import in_memory
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
+from walop_jax.io.text import json_text
+from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.plans.could import Costs, Could
 from walop_jax.plans.exposures import candidates
-from walop_jax.plans.plan import plan_from
+from walop_jax.plans.plan import PLANNED, plan_from
 from walop_jax.plans.wanted import FieldErrors, field_errors, wanted
+from walop_jax.reports.page import kind_of_run, render_other
 from walop_jax.science.field_accuracy import p_errors
 from walop_jax.science.star_errors import sample_stars
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, plan_text, read_plan
-from walop_jax.simulation.simulate import simulate
+from walop_jax.simulation.simulate import effect_from_text, simulate
 
 ANGLES = 181
 SMALL = ObservingPlan(
@@ -153,3 +159,62 @@ def test_changes_take_time_from_the_plan(small, field):
 def test_a_series_of_all_angles_is_the_information_between_them():
     plan = dataclasses.replace(SMALL, grid=6)
     assert candidates(Could(plan), draws=1).truncation < 1e-3
+
+
+def test_stars_of_a_table_have_the_errors_of_their_own_p(small):
+    """A changed calibration changes p of each star by what its target says: |M₁⁻¹ (m₀ − m₁ + M₀ s)| − |s|."""
+    at, star = (np.array([0.1, -0.2]), np.array([0.05, 0.15])), np.array([[0.02, 0.01], [-0.003, 0.03]])
+    table = in_memory({"X": at[0], "Y": at[1], "Q": star[:, 0], "U": star[:, 1]})
+    want = wanted(small, None, table)
+    size = np.array([small.model.parameters[i].scale for i in small.model.free])
+    change = 1e-6 * size * np.random.default_rng(1).normal(size=len(size))
+    select, values = small.model.selection(), small.values[0]
+    setting = Settings.default(1, "SDSS-r")
+
+    def matrix(there):
+        return matrix_slopes(small.model.instrument(there), setting, SMALL.curves(), *at)[0]
+
+    (before, after), light = (matrix(values), matrix(values + select @ change)), star[..., None]
+    seen = before[..., :1] + before[..., 1:] @ light
+    found = np.linalg.solve(after[..., 1:], seen - after[..., :1])[..., 0]
+    moved = 100 * (np.linalg.norm(found, axis=1) - np.linalg.norm(star, axis=1))
+    told = np.sqrt(((want.targets[0].swapaxes(1, 2) @ change) ** 2).sum(axis=1))
+    np.testing.assert_allclose(told, np.abs(moved), rtol=2e-3)
+    plan = plan_from(small, 15.0, want)
+    assert plan.bound <= plan.value
+    with pytest.raises(ValueError, match="no p"):
+        wanted(small, None, in_memory({"X": [0.1], "Y": [0.1], "Q": [0.0], "U": [0.0]}))
+
+
+def test_the_page_of_a_plan(planned, tmp_path):
+    (tmp_path / PLANNED).write_text(json_text(planned.document()))
+    text, missing = render_other(tmp_path, kind_of_run(tmp_path))
+    assert not missing
+    assert f"gets below {planned.bound:.3g}" in text
+    assert text.count("<tr><td>clp") == len([line for line in planned.lines if line.kind == "clp"])
+    assert "even angles and the Moon" in text
+    assert "walop-jax limits" in text
+
+
+def test_effects_to_tell_apart_need_the_size_of_one(small):
+    with pytest.raises(ValueError, match="size of one"):
+        wanted(dataclasses.replace(small, effects={"clp_zero": False, "hwp1_axis": False}), None, "apart")
+
+
+@pytest.mark.long
+def test_the_distance_of_two_effects_is_that_of_a_fit():
+    """Noiseless data with one effect, fitted with the other: the least χ² is the square of the distance promised."""
+    pair = ("hwp2_axis=0.005", "hwp2_crossing")
+    found = candidates(Could(SMALL), draws=1, effects=pair)
+    plan = plan_from(found, 15.0, wanted(found, None, "apart"))
+    truth = dataclasses.replace(found.model.instrument(found.values[0]), effects=())
+    context = effect_context(truth, plan.observing_plan.exposures())
+    effect = effect_from_text(pair[0], context)
+    calset = simulate(
+        plan.observing_plan, 0, instrument=truth, effects=(effect,), noiseless=True, steady=True
+    ).calset
+    rival = with_effects(base_model(calset, throughput_degree=2), pair[1:], context)
+    # Priors are centred on the design, the truth is not: what they cost is taken out by a fit of the truth's own model.
+    own = with_effects(base_model(calset, throughput_degree=2), (effect.name,), context)
+    chi2 = [fit.posterior.objective for fit in (refit(calset, rival), refit(calset, own))]
+    assert np.sqrt(chi2[0] - chi2[1]) == pytest.approx(plan.value, rel=0.05)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from walop_jax import Calibration, ObservingPlan
     from walop_jax.plans.plan import ExposurePlan
 
-PLAN, RESULT = "plan.toml", "plan.json"
+PLAN = "plan.toml"
 
 What = Annotated[
     "ObservingPlan | PathLike",
@@ -57,7 +57,7 @@ Draws = Annotated[
 ]
 
 
-@command(stages=("information", "searching"), writes=(PLAN, RESULT), random=True)
+@command(stages=("information", "searching"), writes=(PLAN, "plan.json"), random=True)
 def plan(
     job: Job,
     could: What,
@@ -82,7 +82,7 @@ def plan(
     """
     from walop_jax.data.user_tables import read_input_table
     from walop_jax.plans.could import Could
-    from walop_jax.plans.plan import plan_exposures
+    from walop_jax.plans.plan import PLANNED, plan_exposures
     from walop_jax.simulation.observing_plan import plan_text
 
     if isinstance(could, str | Path) and Path(could).is_dir():
@@ -125,7 +125,7 @@ def plan(
         found,
         lambda: found.document() | {"seed": job.seed},
         files=files,
-        saved_as=RESULT,
+        saved_as=PLANNED,
     )
 
 

@@ -39,6 +39,7 @@ from walop_jax.plans.wanted import APART, WORST, FieldErrors, Wanted, field_erro
 from walop_jax.science.star_errors import GOAL
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, polariser_turn
 
+PLANNED = "plan.json"
 NAMED = 5.0
 """Distance (σ) from every rival at which an effect is named."""
 _TRIES = 6  # budgets, until the exposures and the changes between them fit into the time

@@ -5,7 +5,7 @@ No figure touches the global state of matplotlib, so they may be made in threads
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -282,4 +282,24 @@ def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
     right.set_xlabel("standard error of p (%)", fontsize=FONT)
     right.set_ylabel("share of the field (%)", fontsize=FONT)
     right.tick_params(labelsize=SMALL)
+    return figure
+
+
+def planned_figure(field: Mapping[str, Sequence[float | None]], on: Canvas = PAGE) -> AnyFigure:
+    """Error of p (%) over the field before a plan and after it, from `field` of plan.json; crosses: no u there."""
+    x, y, before, after = (np.array(field[k], float) for k in ("x", "y", "before", "p_error"))
+    places, at = np.unique(np.stack([x, y]), axis=1, return_inverse=True)
+    maps = []
+    for error in (before, after):
+        worst = np.full(places.shape[1], -np.inf)
+        np.maximum.at(worst, at.ravel(), np.where(np.isnan(error), np.inf, 100.0 * error))
+        maps.append(np.where(np.isfinite(worst), worst, np.nan))
+    figure = on.figure(8.2, 3.6)
+    norm = LogNorm(0.5 * np.nanmin(maps[1]), np.clip(np.nanmax(maps[0]), 2.0 * np.nanmax(maps[1]), _RANGE[1]))
+    for axis, values, title in zip(figure.subplots(1, 2), maps, ("before", "after"), strict=True):
+        field_axes(axis, f"error of p {title}")
+        image = point_map(axis, *places, np.minimum(values, norm.vmax), norm, SEQUENTIAL)
+        blind = np.isnan(values)
+        axis.plot(*places[:, blind], "x", color="0.5", ms=4)
+        colour_bar(figure, image, axis, "error of p (%)", extend="max")
     return figure

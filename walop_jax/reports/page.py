@@ -31,6 +31,7 @@ from walop_jax.io.text import (
     with_minus_sign,
 )
 from walop_jax.nights.stacking import SURVEY, TRACKS
+from walop_jax.plans.plan import PLANNED
 from walop_jax.reports import diagnosis_figures, figures, survey_figures
 from walop_jax.reports.named import FigureSource, draw
 from walop_jax.reports.posterior_figures import unit_in_words
@@ -290,10 +291,11 @@ def limits_in_words(found: DetectionLimits | None) -> dict[str, Any] | None:
 
 
 SHOWN = 24  # parameters that have moved
-KINDS = {"comparison": COMPARISON, "epoch": EPOCH, "limits": LIMITS, "survey": SURVEY}
+KINDS = {"comparison": COMPARISON, "epoch": EPOCH, "plan": PLANNED, "limits": LIMITS, "survey": SURVEY}
 NEEDED = {
     "comparison": ("on_grid", "between"),
     "epoch": ("fits", "moved", "star_errors"),
+    "plan": ("exposures", "bound", "value", "beside"),
     "limits": ("probability",),
     "survey": ("breaks", "events", "by_night", "advice"),
 }
@@ -339,6 +341,10 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
             [*document["breaks"], *document["events"]], key=lambda row: row.get("mjd", row.get("night"))
         )
         pictures, missing = _of_survey(folder, document)
+    elif kind == "plan":
+        pictures, missing = _of_plan(document)
+        if (folder / LIMITS).exists():
+            words = limits_in_words(read_limits(folder / LIMITS))
     elif kind == "limits":
         found = read_limits(path)
         words = limits_in_words(found)
@@ -352,6 +358,22 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
         shown=SHOWN, percent=two_digits, words=words, rows=rows,
     )  # fmt: skip
     return text, missing
+
+
+def _of_plan(document: Mapping[str, Any]) -> tuple[list[Picture], tuple[str, ...]]:
+    """Maps of the error of p, if the plan is one of an instrument that measures it, and what each exposure is worth."""
+    found, missing = [], ()
+    if "field" in document:
+        caption = (
+            "Error of p (%) before the plan and after it: median over the instruments drawn, largest of all filters and "
+            "colours. Crosses: one exposure holds no u there."
+        )
+        found.append(
+            (embedded(figures.planned_figure(document["field"])), "Error of p over the field", caption)
+        )
+    else:
+        missing = ("No map: what this plan is for is no error of p.",)
+    return found, missing
 
 
 def _of_survey(folder: Path, document: Mapping[str, Any]) -> tuple[list[Picture], tuple[str, ...]]:
