@@ -365,7 +365,7 @@ def _of_plan(document: Mapping[str, Any]) -> tuple[list[Picture], tuple[str, ...
     found, missing = [], ()
     if "field" in document:
         caption = (
-            "Error of p (%) before the plan and after it: median over the instruments drawn, largest of all filters and "
+            "Error of p (%) before and after the plan: median over the instruments drawn, largest of all filters and "
             "colours. Crosses: one exposure holds no u there."
         )
         found.append(
