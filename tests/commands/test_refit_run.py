@@ -136,8 +136,9 @@ def test_what_a_small_fit_tells(fitted: FittedSet, tmp_path):
     told: list[str] = []
     refit(fitted.calset, output=tmp_path / "RUN", progress=told.append)
     assert told[0] == "reading"
+    assert told[-2].startswith("looking for patterns in the residuals")
     assert told[-1] == "mapping the field"
-    assert [line for line in told if line.startswith("fit: step")] == told[2:-1]
+    assert any(line.startswith("fit: step") for line in told)
     assert json.loads((tmp_path / "RUN" / "summary.json").read_text())["seed"] == 0
 
 

@@ -88,7 +88,7 @@ class FieldAccuracy:
         """The answer in a few lines: how well, limited by what, and what could hide."""
         if not self.trusted:
             return (("p of a star", "not known: the calibration is not trusted"),)
-        known = f"{two_digits(100 * self.median)} % (error for p ≤ 5 %, median over the field)"
+        known = f"{two_digits(100 * self.median)} % (median error for p ≤ 5 %)"
         lines = [("p of a star", f"{known}; below 0.1 % over {100 * self.share:.0f} % of the field")]
         if self.limited_by:
             lines.append(("limited by", self.limited_by))
