@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from walop_jax.plans.plan import ExposurePlan
 
 PLAN = "plan.toml"
+PLATES = (None, 0.0, 22.5, 45.0)  # settings of the calibration plate (deg) among which effects are told apart
 
 What = Annotated[
     "ObservingPlan | PathLike",
@@ -88,15 +90,15 @@ def plan(
     if isinstance(could, str | Path) and Path(could).is_dir():
         after, could = could, ""
     known = None if after is None else calibration_of(after)
-    if candidates is not None:
-        could = candidates
-    elif could == "" and known is not None:
-        could = known.model.template.name
     alike = tuple(apart or ())
     if criterion == "apart" and not alike:
         if after is None:
             raise UsageError("give the effects that are to be told apart, or a RUN of diagnose", "apart")
         alike = _alike(Path(after), known)
+    if candidates is not None:
+        could = candidates
+    elif could == "" and known is not None:
+        could = _any_exposure(known.model.template.name, PLATES if alike else (None,))
     if not minutes > 0:
         raise fail("nothing can be observed in no time", advice="give --minutes")
     wanted = (
@@ -127,6 +129,15 @@ def plan(
         files=files,
         saved_as=PLANNED,
     )
+
+
+def _any_exposure(instrument: str, plates: tuple[float | None, ...]) -> ObservingPlan:
+    """What could be observed with an instrument, its calibration plate, if it has one, at some angles."""
+    from walop_jax import ObservingPlan
+    from walop_jax.data.records import CALIBRATION_PLATE
+
+    plan = ObservingPlan(instrument)
+    return dataclasses.replace(plan, plate=plates) if CALIBRATION_PLATE in plan.design.moving() else plan
 
 
 def _alike(run: Path, known: Calibration) -> tuple[Any, ...]:

@@ -156,6 +156,10 @@ def _with(
         effect = effect_from_text(one, context) if isinstance(one, str) and not alone else one
         whole = with_effects(whole, (effect,), context)
         name = one.strip() if isinstance(one, str) and alone else effect.name
+        if effect_by_name(name).is_structural():
+            raise ValueError(
+                f"{name} is there or it is not, and has no size that could be planned for; leave it out"
+            )
         stated[name] = not alone
         for p in whole.parameters if alone else ():
             if _effect_of(p.name, (name,)) and p.name.split(".")[1] not in effect_by_name(name).shape:
