@@ -157,7 +157,7 @@ def test_a_fit_that_is_not_trusted_says_so(tmp_path):
     run = handmade_run.make_refit(tmp_path / "run", trusted=False, quality=8192, misfit=misfit)
     page = Page(render(read_run(run)))
     assert "Not trusted" in page.text
-    assert "Quality bit set: the model does not explain the data." in page.text
+    assert "Flag: the model does not explain the data." in page.text
     assert ["", "m22", "–"] in page.rows
     assert ["rms disagreement over the field (%)", "m21", "1.23"] in page.rows
 
@@ -317,6 +317,6 @@ def test_what_is_not_trusted_looks_like_it(tmp_path):
 
 def test_the_data_are_told_of(tmp_path):
     text = " ".join(Page(render(read_run(handmade_run.make_refit(tmp_path / "run")))).text.split())
-    assert "Exposures2 (2 clp)" in text
+    assert "Exposures2 (2 through the polariser)" in text
     assert "Polariser angles2 modulo 180°, widest gap 135°" in text
     assert "Standardsnone" in text

@@ -13,6 +13,7 @@ from subprocess import run
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from own_instrument import OWN
 
 from walop_jax.data import (
     TableIntensities,
@@ -24,7 +25,7 @@ from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
 from walop_jax.model.effects import effect_by_name
-from walop_jax.model.instrument import nominal_instrument
+from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.specification import make_model, with_effects
 from walop_jax.simulation.observing_plan import (
@@ -351,3 +352,27 @@ def test_the_documented_command_makes_the_set_in_fits_data(tmp_path: Path, name:
     )
     stored_truth.pop("command", None)
     assert made_truth == stored_truth
+
+
+def test_without_a_polariser_there_are_no_exposures_through_one(tmp_path):
+    file = tmp_path / "own.toml"
+    text = OWN.replace('path = ["polariser", "window"]', 'path = ["window"]')
+    file.write_text(re.sub(r"\[elements\.polariser\]\n(?:.+\n){3}", "", text))
+    instrument = Instrument.read(file)
+    plan = ObservingPlan(
+        instrument,
+        grid=3,
+        moon_patches=0,
+        standards=0,
+        lamps=4,
+        moving={"WIN": (0.0, 45.0)},
+        throughput_degree=1,
+    )
+    exposures = plan.exposures()
+    assert set(exposures.kind.tolist()) == {"lamp"}
+    assert len(exposures) == 8
+    assert not exposures.clp_in.any()
+    with pytest.raises(ValueError, match="no polariser"):
+        dataclasses.replace(plan, polariser_angles=(0.0, 90.0))
+    with pytest.raises(ValueError, match="no exposures"):
+        dataclasses.replace(plan, lamps=0)

@@ -18,9 +18,24 @@ from walop_jax.io.text import read_text
 if TYPE_CHECKING:
     from walop_jax.science.conformance import Deviation
 
-CASES, GIVEN, ANSWERS, RESULTS = "cases.csv", "given.csv", "answers.csv", "results.csv"
-OUTPUTS = (CASES, GIVEN, ANSWERS, RESULTS)
+CASES, GIVEN, ANSWERS, RESULTS, README = "cases.csv", "given.csv", "answers.csv", "results.csv", "README.txt"
+OUTPUTS = (CASES, GIVEN, ANSWERS, RESULTS, README)
+TEXT = """Questions on signs, frames, order of cameras, errors and bias for programs that reduce polarimetry.
+
+cases.csv     CASE, TOPIC, QUESTION (quantities in capitals are those of the other files)
+given.csv     the numbers of each case: CASE, QUANTITY, VALUE
+results.csv   fill in VALUE, in any order of rows; a case that does not concern your program may stay empty
+answers.csv   the right answers
+
+Units: degrees; q, u, v and p are fractions; electrons. q = +1 is an electric vector along +X, u = +1 one at
++45 degrees, angles grow from +X towards +Y; on the sky from north through east. All conventions:
+walop-jax docs conventions.
+An answer is right within 1e-6 of its value (1e-12 where that is 0), an angle within 1e-5 degrees, modulo 180.
+
+    walop-jax conformance --check FOLDER
+"""
 NUMBER = "{:.15g}"
+SHOWN = 4  # numbers that one mistake explains
 MAKE = Option("Write the questions as tables.", "FOLDER", Path)
 CHECK = Option("Judge FOLDER/results.csv.", "FOLDER", Path)
 
@@ -41,9 +56,20 @@ class Conformance(Displayed):
         }
 
     def display(self) -> Display:
-        """Every number that is not right, and how many are."""
+        """How many numbers are right, and those that are not: each mistake once, with all that it explains."""
+        groups: dict[str, list[Deviation]] = {}
+        for one in self.deviations:
+            groups.setdefault("no answer" if one.answer is None else one.mistake, []).append(one)
+        notes = []
+        for mistake, found in groups.items():
+            if not mistake or len(found) == 1:
+                notes += map(str, found)
+                continue
+            names = ", ".join(f"{one.case} {one.quantity}" for one in found[:SHOWN])
+            more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+            notes.append(f"{mistake}: {names}{more}")
         right = self.asked - len(self.deviations)
-        return Display(f"{right} of {self.asked} numbers are right", notes=tuple(map(str, self.deviations)))
+        return Display(f"{right} of {self.asked} numbers are right", notes=tuple(notes))
 
 
 @command(jax=False, writes=())
@@ -53,7 +79,7 @@ def conformance(
     make: Annotated[PathLike | None, MAKE] = None,
     check: Annotated[PathLike | None, CHECK] = None,
 ) -> Outcome[int | Conformance]:
-    """Put another program to the test: 40 small questions on signs, frames, order of cameras, errors and bias.
+    """Put another program to the test: 43 small questions on signs, frames, order of cameras, errors and bias.
 
     --make writes cases.csv (the questions), given.csv (their numbers), answers.csv and results.csv, whose column VALUE
     the other program fills in. --check holds that against the answers and names the usual mistakes; exit code 1 if
@@ -70,7 +96,7 @@ def conformance(
         )
     assert check is not None
     found = _checked(check)
-    wrong = f"{check}: {len(found.deviations)} of {found.asked} numbers are not right"
+    wrong = f"{check}: see above, and README.txt there"
     return Outcome(
         found, found.document, lambda: found.display().text(), failure=wrong if found.deviations else ""
     )
@@ -89,6 +115,7 @@ def _make(job: Job, folder: PathLike) -> int:
         _write(there / GIVEN, head, given)
         _write(there / ANSWERS, head, answers)
         _write(there / RESULTS, head, ((case, key, "") for case, key, _ in answers))
+        (there / README).write_text(TEXT, encoding="utf-8")
     return len(found)
 
 

@@ -10,8 +10,8 @@ from walop_jax.io.errors import nearest
 TOPIC = Argument("Page to print, or effect, or element; without it, the list.", "[TOPIC]", str)
 NAME = Argument("Of an effect or a kind of element; none: list them.", "[NAME]", str)
 SINGLE = {
-    "effect": "One effect; without a name, the list of effects and elements.",
-    "element": "One kind of element of an instrument.",
+    "effect": "One effect; without a name, the list of all.",
+    "element": "One kind of element of an instrument; without a name, the list of all.",
 }
 
 
@@ -53,9 +53,9 @@ def _single(job: Job, topic: str, name: str | None) -> str:
     from walop_jax.model import gallery
 
     if name is None:
-        return gallery.listed()
+        return gallery.listed(topic)
     try:
-        return gallery.effect_page(name) if topic == "effect" else gallery.element_page(name)
+        return gallery.page(topic, name)
     except ValueError as error:
         raise UsageError(str(error), "name") from None
 

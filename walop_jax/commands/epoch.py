@@ -7,7 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command
-from walop_jax.commands.inputs import SETS, Effects, PathLike, calibration_of, catalogue_of, set_of
+from walop_jax.commands.inputs import (
+    SETS,
+    Effects,
+    PathLike,
+    calibration_of,
+    catalogue_of,
+    path_text,
+    set_of,
+)
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
@@ -67,6 +75,8 @@ def epoch(
             progress=job.progress,
         )
 
+    same = {entry.sha256 for entry in calset.inputs} == {entry.sha256 for entry in held.inputs}
+
     def text() -> str:
         shown = found.display().text()
         if lacking is None:
@@ -81,13 +91,26 @@ def epoch(
     return Outcome(
         found,
         lambda: (
-            {"old": held.content_hash(), "new": [entry.sha256 for entry in calset.inputs]}
+            {
+                "old": held.content_hash(),
+                "old_file": path_text(held.path),
+                "old_date": held.date,
+                "new": [entry.sha256 for entry in calset.inputs],
+                "new_files": [str(entry.path) for entry in calset.inputs],
+            }
             | found.document()
             | {"diagnosis": None if lacking is None else document(lacking)}
         ),
         text,
         files,
         saved_as=OUTPUTS[1],
-        warnings=tuple(f"the new fit: {sentence}" for sentence in found.warnings),
+        warnings=(
+            *(
+                ["these are the data from which the old calibration was made: nothing can have moved"]
+                if same
+                else []
+            ),
+            *(f"the new fit: {sentence}" for sentence in found.warnings),
+        ),
         trusted=found.holds,
     )

@@ -69,7 +69,10 @@ def _display(found: Inspection) -> Display:
                 (f"element {use.prefix}", f"in {use.exposures} exposures, {len(use.angles)} angles")
                 for use in found.elements
             ),
-            ("used", f"{found.rows} of {found.possible} (exposure, point) pairs{some}"),
+            (
+                "used",
+                f"{found.rows} of {found.possible} (exposure, point) pairs{some}; standards lie elsewhere",
+            ),
             ("flagged", ", ".join(f"{count} {name}" for name, count in found.flags.items()) or "none"),
             (
                 "median counts",

@@ -12,8 +12,6 @@ from walop_jax.commands.inputs import Effects, PathLike, catalogue_of
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from walop_jax import Calibration, FitResult, Run
 
 FORMATS = (".pdf", ".png", ".svg", ".eps", ".jpg")
@@ -34,7 +32,7 @@ def plot(
     x: Annotated[float, Option("Field point of transmission and modulation, X (deg).")] = 0.0,
     y: Annotated[float, Option("The same, Y (deg).")] = 0.0,
     effects: Effects = None,
-    ax: Axes | None = None,
+    ax: Any = None,
     figsize: tuple[float, float] | None = None,
 ) -> Outcome[Any]:
     """Draw a figure of a run, by name, as a file.

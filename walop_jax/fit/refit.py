@@ -369,7 +369,8 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
         )
     yield from (Doubt(Quality.DOUBTED, sentence) for sentence in doubts)
     if result.errors_from != STATED:
-        found = result.errors_from.removeprefix("residuals: ")
+        found = result.errors_from.removeprefix("residuals: ").replace("chi2/dof", "χ²/dof")
+        found = found.replace(" states", " states of the exposures").replace(" cells", " cells of the field")
         made = f"error bars were enlarged to match the scatter of the residuals ({found})"
         yield Doubt(Quality(0), made, blocking=False)
 

@@ -12,38 +12,46 @@ from collections.abc import Iterator, Mapping
 from importlib.resources import files
 from typing import Any
 
-from walop_jax.model.effects import EFFECTS, Effect, effect_by_name
+from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.effects.catalogue import PARTS
 from walop_jax.model.elements import ELEMENTS
 from walop_jax.model.elements.base import Element
 from walop_jax.model.parameters import field_declarations, numbers_of, unknown_name
 
 NUMBERS = "gallery.json"
+_SHORT, _MOST = 3, 4  # letters of a word that says little; names that are offered
 _UNSEEN = 3.0  # standard deviations below which one effect may be taken for another
 _NOTHING = 5e-4  # per cent of the matrix: not worth a number
 
 
-def effect_page(name: str) -> str:
-    """The page about an effect, as Markdown; ValueError with the nearest names when there is none."""
-    return "\n".join(_effect(effect_by_name(name))).rstrip() + "\n"
+TOPICS: Mapping[str, Mapping[str, type[Any]]] = {
+    "effect": {effect.name: effect for effect in EFFECTS},
+    "element": {kind.kind: kind for kind in ELEMENTS},
+}
+"""What has a page of its own: effects, and kinds of elements, by name."""
 
 
-def element_page(name: str) -> str:
-    """The page about a kind of element, as Markdown; ValueError with the nearest names when there is none."""
-    for kind in ELEMENTS:
-        if kind.kind == name:
-            return "\n".join(_element(kind)).rstrip() + "\n"
-    raise unknown_name("kind of element", name, [kind.kind for kind in ELEMENTS])
+def page(topic: str, name: str) -> str:
+    """The page about an effect or a kind of element (`TOPICS`), as Markdown.
+
+    Raises ValueError where there is none, with the names that the words of `name` speak of, or the nearest ones.
+    """
+    known = TOPICS[topic]
+    if name not in known:
+        words = [word for word in re.split(r"[\W_]+", name.lower()) if len(word) > _SHORT]
+        about = {one: f"{one} {_about(kind)}".lower() for one, kind in known.items()}
+        found = [one for one, text in about.items() if any(word in text for word in words)]
+        if found:
+            raise ValueError(f"there is no {topic} {name!r}; did you mean {' or '.join(found[:_MOST])}?")
+        raise unknown_name(topic, name, list(known))
+    made = _effect(known[name]) if topic == "effect" else _element(known[name])
+    return "\n".join(made).rstrip() + "\n"
 
 
-def listed() -> str:
-    """All effects and elements, each with a few words."""
-    effects = {effect.name: _about(effect) for effect in EFFECTS}
-    elements = {kind.kind: _about(kind) for kind in ELEMENTS}
-    width = max(map(len, (*effects, *elements)))
-    lines = [f"effect  {name:<{width}}  {about}" for name, about in effects.items()]
-    lines += [f"element {name:<{width}}  {about}" for name, about in elements.items()]
-    return "\n".join(lines) + "\n"
+def listed(topic: str) -> str:
+    """All effects, or all kinds of elements, each with a few words."""
+    width = max(map(len, TOPICS[topic]))
+    return "\n".join(f"{name:<{width}}  {_about(kind)}" for name, kind in TOPICS[topic].items()) + "\n"
 
 
 def catalogue_tables() -> str:

@@ -35,6 +35,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data import CalibrationSet, read_calibration_set
 from walop_jax.data.records import InputFile
 from walop_jax.fit.model_file import model_for
+from walop_jax.fit.parameter_table import ParameterValue
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.verdict import STATED
 from walop_jax.io.atomic import atomic_path
@@ -416,6 +417,12 @@ class Run(Result):
                 result, covariance=calibration.covariance, errors_from=verdict.errors_from
             )
         return dataclasses.replace(result, verdict=verdict)
+
+    def __getitem__(self, name: str) -> ParameterValue:
+        """A parameter of the calibration by name, with its error; `DataError` where there is no calibration."""
+        self.wanted(PRODUCT, "give the RUN of walop-jax refit or diagnose")
+        assert self.calibration is not None
+        return self.calibration[name]
 
     def display(self) -> Display:
         """The files, and the calibration if there is one."""

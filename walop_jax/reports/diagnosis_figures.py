@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from scipy.spatial import cKDTree
 
 from walop_jax.data.records import Points
 from walop_jax.diagnosis.figure_data import PointMap, ResidualComparison, Table
@@ -35,6 +36,7 @@ from walop_jax.reports.style import (
     field_axes,
     largest_size,
     outer_labels,
+    pixel_map,
     plain_ticks,
     point_map,
 )
@@ -258,6 +260,7 @@ def shares_figure(shares: Table) -> Figure:
     return figure
 
 
+_PIXELS = 121
 _STEPS = (0.0, 1.0, 2.0, POLICY.separation, 4.0, 5.0, 6.0)
 
 
@@ -275,7 +278,11 @@ def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     field_axes(axis, "largest error that goes undetected")
     percent = 100 * found.protection
     norm = LogNorm(np.nanmin(percent), max(np.nanmax(percent), 1.2 * np.nanmin(percent)))
-    shown = point_map(axis, found.x, found.y, np.where(good, percent, np.nan), norm, SEQUENTIAL)
+    # Standards lie between the other points: every pixel has the value of the point nearest to it.
+    field = (found.x.min(), found.x.max(), found.y.min(), found.y.max())
+    places = np.meshgrid(np.linspace(*field[:2], _PIXELS), np.linspace(*field[2:], _PIXELS))
+    nearest = cKDTree(np.stack([found.x, found.y], axis=1)).query(np.stack(places, axis=-1))[1]
+    shown = pixel_map(axis, percent[nearest], field, norm, SEQUENTIAL)
     colour_bar(figure, shown, axis, "error of q, u (%)")
     axis.plot(found.x[~good], found.y[~good], "x", color="0.5", ms=4)
     return figure

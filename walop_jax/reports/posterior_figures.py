@@ -132,7 +132,7 @@ def corner_figure(
         below, left = panels[k - 1, i], panels[i, 0]
         half = 0.5 * below.get_position().width
         below.xaxis.set_label_coords(below.get_position().x0 + half, 0.02, transform=figure.transFigure)
-        left.yaxis.set_label_coords(0.015, left.get_position().y0 + half, transform=figure.transFigure)
+        left.yaxis.set_label_coords(0.03, left.get_position().y0 + half, transform=figure.transFigure)
         if few:
             for axis in (below.xaxis, left.yaxis)[: 1 + (i > 0)]:
                 axis.set_major_locator(MaxNLocator(3, prune="both"))

@@ -123,12 +123,15 @@ def _confusions(steps: Sequence[Mapping[str, Any]]) -> list[str]:
 
 _MJD_0 = datetime.datetime(1858, 11, 17)
 _MANY = 12
+_KINDS = {"clp": "through the polariser", "moon": "of the Moon sky", "standard": "of standard stars"}
 
 
 def data_in_words(product: Calibration) -> list[tuple[str, str]]:
     """Nights, exposures, polariser angles, plate settings, Moon patches, standards, temperatures, filters."""
     e = product.exposures
-    kinds = ", ".join(f"{number} {kind}" for kind, number in Counter(e.kind.tolist()).items())
+    kinds = ", ".join(
+        f"{number} {_KINDS.get(kind, kind)}" for kind, number in Counter(e.kind.tolist()).items()
+    )
     low_x, high_x, low_y, high_y = product.field
     rows = [
         ("Nights", _nights(e.mjd)),

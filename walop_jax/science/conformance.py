@@ -1,4 +1,4 @@
-"""Forty small questions on conventions, with their right answers, for any program that reduces such data.
+"""Forty-three small questions on conventions, with their right answers, for any program that reduces such data.
 
 Every answer is a closed formula of docs: conventions, written out here and nowhere used in the package, so that the
 package can be put to the test as well. Beside the right answer stand those of the usual mistakes, to name them.
@@ -122,6 +122,18 @@ def _throughput(n: Numbers) -> dict[str, float]:
     """N0 = T0 (1 + q), N1 = T1 (1 − q)."""
     one, other = n["N0"] / n["T0"], n["N1"] / n["T1"]
     return {"Q": (one - other) / (one + other)}
+
+
+def _two_cameras(n: Numbers) -> dict[str, float]:
+    """Half-wave plate at 0°, 45°, 22.5°, 67.5°: (q, −q, u, −u) between the cameras, whatever their throughputs."""
+    d = {a: (n[f"O_{a}"] - n[f"E_{a}"]) / (n[f"O_{a}"] + n[f"E_{a}"]) for a in ("0", "45", "22", "67")}
+    return {"Q": 0.5 * (d["0"] - d["45"]), "U": 0.5 * (d["22"] - d["67"])}
+
+
+def _seen(q: float, u: float) -> Numbers:
+    """What two cameras of equal throughput count behind a half-wave plate."""
+    signals = {"0": q, "45": -q, "22": u, "67": -u}
+    return {f"{c}_{a}": 1e6 * (1 + s * d) for a, d in signals.items() for c, s in (("O", 1), ("E", -1))}
 
 
 def _covariance(n: Numbers) -> dict[str, float]:
@@ -258,6 +270,18 @@ _TOPICS: Sequence[tuple[str, str, Rule, Mapping[str, Rule], Sequence[Numbers]]] 
         ({"N0": 612000.0, "N1": 441000.0, "T0": 6e5, "T1": 4.5e5}, {"N0": 2e5, "N1": 8e5, "T0": 5e5, "T1": 6e5}),
     ),
     (
+        "two cameras",
+        "Q and U from the electrons in cameras O (0°) and E (90°) with a half-wave plate at 0, 45, 22.5 and 67.5 deg",
+        _two_cameras,
+        {
+            "the plate turns the other way": _swapped(_two_cameras, ("O_22", "O_67"), ("E_22", "E_67")),
+            "the cameras are exchanged": _swapped(
+                _two_cameras, *((f"O_{a}", f"E_{a}") for a in ("0", "45", "22", "67"))
+            ),
+        },
+        tuple(_seen(q, u) for q, u in ((0.02, 0.005), (-0.01, 0.03), (0.0, -0.004))),
+    ),
+    (
         "covariance",
         "Errors and covariance of Q, U on the sky from those in the instrument, under ROTATOR",
         _covariance,
@@ -288,7 +312,7 @@ _TOPICS: Sequence[tuple[str, str, Rule, Mapping[str, Rule], Sequence[Numbers]]] 
 
 
 def cases() -> Iterator[Case]:
-    """The questions, forty of them, by topic."""
+    """The questions by topic."""
     for topic, question, rule, mistakes, inputs in _TOPICS:
         for number, given in enumerate(inputs, start=1):
             name = f"{topic.replace(' ', '-')}-{number}"

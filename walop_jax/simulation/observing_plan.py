@@ -114,7 +114,7 @@ class ObservingPlan:
     `instrument` is one that comes with the package, by name, or any other; None: the first of the family. `moving`
     holds the positions (deg, None: out) of further moving elements by the prefix of their columns: the polariser goes
     through its angles for every combination of them, and `lamps` exposures of KIND `lamp` without it follow each
-    time.
+    time. An instrument without a polariser has no exposures through one.
 
     A plan may also say each exposure: `stops` in place of all combinations, in order; `patches` and `stars` are the
     numbers, from 0, of the Moon patches and standards that are taken after them (None: each once, unless stops say).
@@ -167,10 +167,15 @@ class ObservingPlan:
             raise ValueError("numbers of Moon patches and standards cannot be negative")
         if not self.electrons > 0:
             raise ValueError(f"{self.electrons} electrons: a camera needs some light")
-        if not (self.filters and self.plate and self.polariser_angles):
-            raise ValueError(
-                "at least a filter, a setting of the calibration plate, a polariser angle are needed"
-            )
+        if not (self.filters and self.plate):
+            raise ValueError("at least a filter and a setting of the calibration plate are needed")
+        if self.design.polariser is not None:
+            if not self.polariser_angles:
+                raise ValueError("at least one polariser angle is needed")
+        elif self.polariser_angles != polariser_turn():
+            raise ValueError(f"polariser_angles: {self.name} has no polariser")
+        elif not (self.lamps or self.stops or self.moon_patches or self.standards):
+            raise ValueError("no exposures: give lamps, Moon patches or standards")
         for name in self.filters:
             filter_curve(name)
         for stop in self.stops:
@@ -264,11 +269,16 @@ class ObservingPlan:
         """The filters with their curves."""
         return {name: filter_curve(name) for name in self.filters}
 
+    @property
+    def _angles(self) -> tuple[float, ...]:
+        """Those of the polariser; none where the light path has no polariser."""
+        return () if self.design.polariser is None else self.polariser_angles
+
     @functools.cached_property
     def _taken(self) -> tuple[Stop, ...]:
         """Every exposure, in the order in which they are taken."""
         further = [dict(zip(self.moving, m, strict=True)) for m in itertools.product(*self.moving.values())]
-        angles = (*self.polariser_angles, *(None for _ in range(self.lamps)))
+        angles = (*self._angles, *(None for _ in range(self.lamps)))
         indoors = [dataclasses.replace(stop, times=1) for stop in self.stops for _ in range(stop.times)] or [
             Stop(a, f, p, m, kind="lamp" if a is None else "clp")
             for f in self.filters
