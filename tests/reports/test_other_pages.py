@@ -53,7 +53,7 @@ def test_an_epoch_whose_own_fit_is_not_trusted_says_so(tmp_path):
     (tmp_path / "epoch.json").write_text(json.dumps(document))
     text = render_other(tmp_path, "epoch")[0]
     assert "The new data are not explained" in text
-    assert "120 % at most" in text
+    assert "up to 120 %" in text
     assert "χ²/dof = 5.99" in text
     assert "cannot distinguish it from pedestal" in text
 
