@@ -17,6 +17,7 @@ from jaxtyping import Float
 from walop_jax.calibration import Calibration
 from walop_jax.diagnosis.figure_data import UNNAMED
 from walop_jax.fit.parameter_table import PRIOR_ONLY
+from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import probability, rounded, value_and_error, with_error, with_minus_sign
 from walop_jax.model.effects import EFFECTS
 from walop_jax.reports.posterior_figures import LABELS
@@ -51,6 +52,11 @@ def verdict_of_fit(summary: Mapping[str, Any]) -> tuple[str, str]:
     numbers = f"χ²/dof = {ratio:.4g} for {summary['dof']} degrees of freedom"
     if not summary["converged"]:
         return "Not trusted", f"The fit did not converge ({summary['message']}); {numbers}."
+    if Quality.UNEXPLAINED & int(summary.get("quality", 0)):
+        return "Not trusted", (
+            f"The model does not explain the data: χ²/dof = {ratio:.3g}, where 1 is expected. Do not use this "
+            "calibration. To find out what is missing, run walop-jax diagnose."
+        )
     if not summary.get("trusted", True):
         doubts = summary.get("doubts") or summary.get("warnings") or ["the model does not explain the data"]
         told = "" if "χ²/dof" in doubts[0] else f" ({numbers})"
