@@ -30,7 +30,7 @@ from walop_jax.nights import changes
 from walop_jax.nights.algebra import Solution, System, UndeterminedError, solve
 from walop_jax.nights.equations import Together
 
-CHANCE = 0.01  # of any break in a series that has none
+CHANCE = 0.005  # of any break in a series that has none: half of one in a hundred
 RIVAL = 2.0 * math.log(1000.0)  # z² behind the best at which another name is improbable
 DATES = 9.0  # z² behind the best within which a date may be it: 99.7 %
 SURE = 5.0  # standard errors that keep one name from another
