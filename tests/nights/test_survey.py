@@ -188,9 +188,14 @@ def test_bad_input(quiet, single):
     assert any("no night from MJD" in text for text in survey.verdict.warnings)
     with pytest.raises(ValueError, match="did you mean"):
         stack([one, two], {"half1.plate.mgf": {"per": "night"}})
-    shape = next(name for name in one.names if "#" in name)
+    drift = "camera_gain_drift#{}.rate"
+    law = {"per": "step", "at": two.mjd - 1.0}
+    shaped = stack([one, two, three], {drift.format(1): law}, like=single)
+    assert shaped.at(two.mjd)["camera_gain_drift.rate"].sigma > 0.0
+    both = stack([one, two, three], {drift.format(1): law, drift.format(2): law}, like=single)
+    assert "Survey of" in repr(both)
     with pytest.raises(DataError, match="is one shape of its effect"):
-        stack([one, two, three], {shape: {"per": "linear"}}, like=single).at(one.mjd)
+        both.at(one.mjd)
     deaf = dataclasses.replace(two, matrix=np.zeros_like(two.matrix), gradient=np.zeros_like(two.gradient))
     free = next(p.name for p in one.parameters if p.prior is None and p.loose is None)
     with pytest.raises(DataError, match=r"says nothing of .*, which has a value of its own there"):

@@ -16,6 +16,7 @@ import functools
 import itertools
 import math
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -28,7 +29,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Displayed
-from walop_jax.io.errors import fail
+from walop_jax.io.errors import DataError, fail
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import two_digits, value_and_error
 from walop_jax.model.effects import Effect
@@ -162,7 +163,10 @@ class Survey(Displayed):
         """Derivatives of p to the parameters, at points of the field, for some stars; None where p is not measured."""
         if self.like is None or len(self.like.model.template.arms) != 2:
             return None
-        product = self._product(self.last)
+        try:
+            product = self._product(self.last)
+        except DataError:  # `at` says why there is none
+            return None
         low_x, high_x, low_y, high_y = product.field
         grid = np.meshgrid(np.linspace(low_x, high_x, GRID), np.linspace(low_y, high_y, GRID))
         x, y = (part.ravel() for part in grid)
@@ -243,8 +247,8 @@ class Survey(Displayed):
 
     def _product(self, mjd: float) -> Calibration:
         """The calibration of a moment, whether it is valid or not."""
-        full, (value, covariance), names = self._full, self.values_at(mjd), self.data.names
-        model = full.model
+        full, (value, covariance) = self._full, self.values_at(mjd)
+        model, names = full.model, [_in_model(name) for name in self.data.names]
         there = [k for k, name in enumerate(names) if name in model.names and self.laws[k] is not None]
         select = np.zeros((len(model.names), len(there)))
         select[[model.index(names[k]) for k in there], np.arange(len(there))] = 1.0
@@ -270,17 +274,22 @@ class Survey(Displayed):
             p for p, law, has in zip(self.data.parameters, self.laws, self.data.has_value, strict=True)
             if law is not None and not has
         ]  # fmt: skip
+        taken: dict[str, str] = {}
         for p in candidates:
             # Names of parts, not `Parameter.part`, which files of nights do not hold.
-            part = part_of(p.name)
-            kind: type[Effect] | None = next((one for one in model.catalogue if one.name == part), None)
-            if kind is not None and part not in model.effect_names:
-                model = with_effects(model, [kind.neutral(context)], context)
-            if p.name not in model.names:
+            part, shape = part_of(p.name), _shape_of(p.name)
+            if taken.setdefault(part, shape) != shape or part in self.reference.model.effect_names:
                 raise fail(
-                    f"{p.name} is one shape of its effect, which no model has by itself",
+                    f"{p.name} is one shape of its effect, and the model has another",
                     advice="put the effect into the model file and fit the nights again",
                 )
+            kind: type[Effect] = next(one for one in model.catalogue if one.name == part)
+            if part not in model.effect_names:
+                group, _, member = shape.partition("#")
+                chosen = (
+                    kind.probes(context)[int(group)][int(member or 0)] if shape else kind.neutral(context)
+                )
+                model = with_effects(model, [chosen], context)
         values, old = model.start, [model.index(name) for name in like.model.names]
         values[old] = like.values
         return dataclasses.replace(like, fitted=model, values=values, covariance=np.zeros((len(values),) * 2))
@@ -408,3 +417,15 @@ class Survey(Displayed):
             rows,
             tuple(dict.fromkeys((*verdict.warnings, *self.advice))),
         )
+
+
+def _shape_of(name: str) -> str:
+    """The shape of its effect that a candidate stands for, GROUP#MEMBER of its probes; "" where it has one alone."""
+    head, _, leaf = name.partition(".")
+    group, member = head.partition("#")[2], leaf.partition("#")[2]
+    return f"{group or 0}#{member or 0}" if group or member else ""
+
+
+def _in_model(name: str) -> str:
+    """The name that a parameter or candidate has in a model."""
+    return re.sub("#[0-9]+", "", name)
