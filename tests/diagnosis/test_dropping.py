@@ -142,3 +142,22 @@ def test_what_has_no_name_is_told_without_a_name_that_could_stand_in_for_it():
     assert found.unexplained.chi2_after == found.after.chi2
     assert found.unexplained.p_value == pytest.approx(found.p_value, rel=0.5)
     assert list(figure_data(found).ladder["MODEL"]) == ["starting model", "free_form"]
+
+
+@pytest.mark.parametrize(("left", "part"), [(24.0, True), (1.4, False)])
+def test_a_name_that_leaves_the_data_as_unexplained_is_told_as_a_part_and_taken_out(left, part):
+    """χ²/dof 69 → 24 with the name is a part of what is missing; 69 → 1.4 is the cause of most of it."""
+    told, gone = [], []
+    step = SimpleNamespace(effect="flexure", chi2_before=6900.0, chi2_after=100.0 * left)
+    state = SimpleNamespace(
+        steps=[step],
+        policy=POLICY,
+        tell=told.append,
+        _without=gone.append,
+        fit=SimpleNamespace(chi2=100.0 * left, dof=100),
+    )
+    first = Mock(Examination, dof=100, result=SimpleNamespace(chi2=6900.0, dof=100))
+    said = workflow.Refit._parts(state, first)  # pyright: ignore[reportArgumentType]
+    assert said == (("flexure (χ²/dof 69 → 24)",) if part else ())
+    assert gone == (["flexure"] if part else [])
+    assert told == (["flexure explains a part only: not added"] if part else [])

@@ -24,11 +24,13 @@ from walop_jax.diagnosis.stated_conditions import (
     Singles,
     condition_scores,
     hidden_mistakes,
+    rival_conditions,
     stated_conditions,
 )
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.fit.verdict import Hidden
+from walop_jax.model.specification import with_effects
 from walop_jax.simulation.simulate import effect_from_text, simulate
 
 
@@ -58,9 +60,9 @@ def cooler(calset: CalibrationSet) -> CalibrationSet:
     return dataclasses.replace(calset, exposures=dataclasses.replace(e, teff=teff))
 
 
-def of_date(calset: CalibrationSet) -> CalibrationSet:
+def of_date(calset: CalibrationSet, years: float = 80.0) -> CalibrationSet:
     """RA and DEC of the sky as a telescope displays them in 2080: apparent, not ICRS (precession by Meeus, ch. 21)."""
-    e, years = calset.exposures, 80.0
+    e = calset.exposures
     ra, dec, moon = np.deg2rad(e.ra), np.deg2rad(e.dec), e.kind == "moon"
     m, n = 46.124 * years / 3600.0, 20.043 * years / 3600.0
     later = {
@@ -149,6 +151,17 @@ def test_both_crystals_of_a_plate_are_told_by_what_was_known_of_them():
         value, error = map(float, found)
         assert value == pytest.approx(right.value(f"half2.plate.{crystal}")[0], abs=4.0 * error)
         assert value > mean + 3.0
+
+
+def test_a_name_that_explains_no_more_than_a_stated_number_is_told_beside_it():
+    """Patches of the Moon fitted one by one explain what coordinates of date do: sixteen numbers for one mistake."""
+    calset = of_date(simulate(SMALL, seed=SEED).calset, 16.0)
+    patches = effect_from_text("moon_patch=q:0/0/0,u:0/0/0", SMALL.context())
+    wrong = refit(calset)
+    named = refit(calset, with_effects(wrong.model, (patches,), SMALL.context()))
+    (told,) = rival_conditions(Design.of(wrong), named.chi2)
+    assert "one number that the set states would, if it were " in told
+    assert "the equinox of RA and DEC 20" in told
 
 
 def test_scale_and_angle_are_sums_of_both_coordinates():

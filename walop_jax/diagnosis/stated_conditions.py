@@ -128,22 +128,28 @@ class Singles:
     @classmethod
     def of(cls, design: Design) -> Singles:
         """Conditions that the set states, priors, terms of a camera that have one amplitude, effects with a name."""
-        rivals = (*_conditions(design), *_priors(design), *_of_cameras(design), *_of_catalogue(design))
-        names = [one.candidate.name for one in rivals]
-        widths = [one.candidate.widths for one in rivals]
-        columns = np.concatenate(
-            [np.zeros((len(design.residual), 0)), *(one.candidate.columns for one in rivals)], axis=1
+        return scored(
+            design, (*_conditions(design), *_priors(design), *_of_cameras(design), *_of_catalogue(design))
         )
-        along = design.projector.basis.T @ columns
-        if not rivals:
-            return cls((), ScoreTable((), 1.0, 1.0, 1.0), along, np.zeros(0))
-        table, left = _table(design, names, widths, columns)
-        return cls(rivals, table, along, left)
 
     @property
     def testable(self) -> list[Score]:
         """The scores of those of which the parameters leave something."""
         return [score for score in self.table.scores if score.testable]
+
+
+def scored(design: Design, rivals: tuple[Single, ...]) -> Singles:
+    """Single numbers with their scores in the residuals of a design."""
+    names = [one.candidate.name for one in rivals]
+    widths = [one.candidate.widths for one in rivals]
+    columns = np.concatenate(
+        [np.zeros((len(design.residual), 0)), *(one.candidate.columns for one in rivals)], axis=1
+    )
+    along = design.projector.basis.T @ columns
+    if not rivals:
+        return Singles((), ScoreTable((), 1.0, 1.0, 1.0), along, np.zeros(0))
+    table, left = _table(design, names, widths, columns)
+    return Singles(rivals, table, along, left)
 
 
 def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
