@@ -92,7 +92,7 @@ def plan(
     known = None if after is None else calibration_of(after)
     alike = tuple(apart or ())
     if criterion == "apart" and not alike:
-        if after is None:
+        if after is None or known is None:
             raise UsageError("give the effects that are to be told apart, or a RUN of diagnose", "apart")
         alike = _alike(Path(after), known)
     if candidates is not None:

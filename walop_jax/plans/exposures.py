@@ -142,7 +142,8 @@ def candidates(
             lost = max(lost, _overtone(unit[:, rows]), _apart(information[0], between, exact))
     rows = prior_rows(model).jacobian(model.selection())
     names = tuple(model.names[i] for i in model.free)
-    known = (rows.T @ rows) * np.outer(*2 * [[not _effect_of(name, stated) for name in names]])
+    base = np.array([not _effect_of(name, stated) for name in names])
+    known = (rows.T @ rows) * np.outer(base, base)
     return Candidates(could, model, choices, tuple(families), values, names, known, lost, notes, stated)
 
 
@@ -152,10 +153,10 @@ def _with(
     """The model with effects at their values, and which of them have one."""
     context, stated, whole = effect_context(model.template, calset.exposures), {}, model
     for one in given:
-        alone = isinstance(one, str) and "=" not in one
-        effect = effect_from_text(one, context) if isinstance(one, str) and not alone else one
-        whole = with_effects(whole, (effect,), context)
-        name = one.strip() if isinstance(one, str) and alone else effect.name
+        effect = effect_from_text(one, context) if isinstance(one, str) and "=" in one else one
+        alone = isinstance(effect, str)
+        name = effect.strip() if isinstance(effect, str) else effect.name
+        whole = with_effects(whole, (name if alone else effect,), context)
         if effect_by_name(name).is_structural():
             raise ValueError(
                 f"{name} is there or it is not, and has no size that could be planned for; leave it out"

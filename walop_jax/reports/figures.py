@@ -295,11 +295,13 @@ def planned_figure(field: Mapping[str, Sequence[float | None]], on: Canvas = PAG
         np.maximum.at(worst, at.ravel(), np.where(np.isnan(error), np.inf, 100.0 * error))
         maps.append(np.where(np.isfinite(worst), worst, np.nan))
     figure = on.figure(8.2, 3.6)
-    norm = LogNorm(0.5 * np.nanmin(maps[1]), np.clip(np.nanmax(maps[0]), 2.0 * np.nanmax(maps[1]), _RANGE[1]))
+    lowest, most = float(0.5 * np.nanmin(maps[1])), float(2.0 * np.nanmax(maps[1]))
+    most = min(max(float(np.nanmax(maps[0])), most), max(_RANGE[1], most))
     for axis, values, title in zip(figure.subplots(1, 2), maps, ("before", "after"), strict=True):
         field_axes(axis, f"error of p {title}")
-        image = point_map(axis, *places, np.minimum(values, norm.vmax), norm, SEQUENTIAL)
+        shown = np.minimum(values, most)
+        image = point_map(axis, places[0], places[1], shown, LogNorm(lowest, most), SEQUENTIAL)
         blind = np.isnan(values)
-        axis.plot(*places[:, blind], "x", color="0.5", ms=4)
+        axis.plot(places[0, blind], places[1, blind], "x", color="0.5", ms=4)
         colour_bar(figure, image, axis, "error of p (%)", extend="max")
     return figure
