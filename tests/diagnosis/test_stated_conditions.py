@@ -186,6 +186,20 @@ def test_the_score_is_what_a_fit_gains_that_knows_better():
     assert wrong.chi2 - right.chi2 == pytest.approx(expected, rel=0.1)
 
 
+def test_a_number_that_explains_little_of_a_fit_far_off_is_not_told():
+    """Gains of 3 % by exposure and camera: errors are multiplied to fit at all, and single numbers borrow a part."""
+    calset = simulate(SMALL, seed=SEED).calset
+    block = calset.intensities.block(0, len(calset.points))
+    gain = 1.0 + 0.03 * np.random.default_rng(1).standard_normal(block.counts.shape[1:])
+    table = TableIntensities.dense(calset.points, dataclasses.replace(block, counts=block.counts * gain))
+    result = refit(dataclasses.replace(calset, intensities=table))
+    assert result.noise_scale > 2.0
+    design = Design.of(result)
+    scores = Singles.of(design).testable
+    assert min(score.log_p for score in scores) < -20.0
+    assert not list(stated_conditions(design))
+
+
 def test_what_could_hide_is_ranked_by_what_it_does_to_stars():
     """In the order of the protection level over the field, each by itself, not of how far parameters move."""
     design = Design.of(small_fit())

@@ -215,7 +215,7 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     best, result = found[0], design.fit
     square = float(np.sum(design.projector(design.residual) ** 2))
     left = square - best.statistic * table.noise_scale**2
-    if not result.explains_data and left > NEARLY * design.projector.free:
+    if not result.explains_data and left * result.noise_scale**2 > NEARLY * design.projector.free:
         return
     likely = [score for score in found if score.statistic > best.statistic - _ALIKE]
     # Of an element and one of its numbers alone, the shorter statement if it explains as much.
