@@ -14,7 +14,6 @@ from walop_jax.commands.inputs import (
     TableFile,
     calibration_of,
     catalogue_of,
-    folder_of,
     table_of,
     table_outcome,
 )
@@ -74,7 +73,7 @@ def apply(
     job.begin("reading")
     table = table_of(catalogue, {})
     if is_survey(calibration):
-        survey = read_survey(folder_of(calibration), catalogue_of(effects))
+        survey = read_survey(calibration, catalogue_of(effects))
         held = calibration_of_stars(survey, table, force=force)
     else:
         held = calibration_of(calibration, effects)

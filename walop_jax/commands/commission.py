@@ -41,12 +41,13 @@ def commission(
     from walop_jax.science.commissioning import commissioning
 
     fitted = command_of(refit).body(job, data, model, output=output, instrument=instrument, effects=effects)
-    if fitted.failure:
-        return fitted
     result = fitted.value
-    found = commissioning(result, result.answer() if result.answer is not None else None)
+    accuracy = result.answer() if result.converged and result.answer is not None else None
+    found = commissioning(result, accuracy)
     if output is not None:
         with atomic_path(Path(output) / DOCUMENT, overwrite=True) as temporary:
             temporary.write_text(json_text(found.document()), encoding="utf-8")
     stars = (f"walop-jax apply {output} STARS.fits -o OUT.fits",) if found.go else ()
-    return Outcome(found, next=(f"walop-jax report {output}", *stars), trusted=found.go)
+    return Outcome(
+        found, next=(f"walop-jax report {output}", *stars), failure=fitted.failure, trusted=found.go
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -51,11 +50,11 @@ def stack(
     from walop_jax.nights.stacking import FILES, writers
     from walop_jax.nights.stacking import stack as stacked
 
-    several = isinstance(nights, Sequence) and not isinstance(nights, str)
+    given: list[Any] = list(nights) if isinstance(nights, list | tuple) else [nights]
     with job.reserved(output, FILES) as job:
         job.begin("reading")
         survey = stacked(
-            list(nights) if several else [nights],
+            given,
             laws,
             like=None if like is None else calibration_of(like, effects),
             find=not no_breaks,

@@ -18,7 +18,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -145,14 +145,8 @@ def stack(
     """
     opened = [_opened(one, catalogue) for one in nights]
     fits = [one for one in (like, *(some.fit for some in opened)) if one is not None]
-    held = (
-        Calibration.from_fit(fits[0])
-        if fits and isinstance(fits[0], FitResult)
-        else fits[0]
-        if fits
-        else None
-    )
-    maker = _Maker(None if held is None else held.rebuilt(), partial)
+    held = [Calibration.from_fit(one) if isinstance(one, FitResult) else one for one in fits[:1]]
+    maker = _Maker(held[0].rebuilt() if held else None, partial)
     made: list[Night] = []
     at_hand: dict[tuple[str, int], _Data] = {}
     for k, one in enumerate(opened):
@@ -164,11 +158,12 @@ def stack(
         made += some
     data = together(made)
     doubts = [*_about_fits(fits), *_about_time(data.nights)]
+    tables: Mapping[str, Any] = laws if isinstance(laws, Mapping) else {}
     if isinstance(laws, str | os.PathLike):
-        laws = parse_toml(read_text(laws)).get("law", {})
-    elif laws is None:
-        laws = maker.like.model.laws if maker.like else {}
-    chosen = laws_of_all(data, laws)
+        tables = parse_toml(read_text(laws)).get("law", {})
+    elif laws is None and maker.like is not None:
+        tables = maker.like.model.laws
+    chosen = laws_of_all(data, tables)
     _check_filters(data, chosen)
     breaks = [one for some in opened for one in some.breaks]
     try:
@@ -228,7 +223,7 @@ def read_survey(folder: str | os.PathLike[str], catalogue: Sequence[type[Effect]
     return stack([folder], find=False, catalogue=catalogue)
 
 
-def is_survey(given: Any) -> bool:
+def is_survey(given: Any) -> TypeGuard[str | os.PathLike[str]]:
     """Whether something is the path of a survey."""
     return isinstance(given, str | os.PathLike) and (Path(given) / SURVEY).exists()
 
@@ -264,7 +259,7 @@ def _opened(one: Given, catalogue: Sequence[type[Effect]]) -> _Opened:
     path = one.folder if isinstance(one, Run) else Path(one)
     if path.is_dir() and (not (path / PRODUCT).exists() or (path / NIGHTS).exists()):
         fit = read_calibration(path / REFERENCE, catalogue) if (path / REFERENCE).exists() else None
-        said = read_json(path / SURVEY) if is_survey(path) else {"breaks": [], "events": []}
+        said = read_json(path / SURVEY) if (path / SURVEY).exists() else {"breaks": [], "events": []}
         return _Opened(
             nights_in(path),
             fit=fit,
