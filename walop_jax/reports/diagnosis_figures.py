@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from walop_jax.data.records import Points
 from walop_jax.diagnosis.figure_data import PointMap, ResidualComparison, Table
@@ -281,7 +281,7 @@ def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     # Standards lie between the other points: every pixel has the value of the point nearest to it.
     field = (found.x.min(), found.x.max(), found.y.min(), found.y.max())
     places = np.meshgrid(np.linspace(*field[:2], _PIXELS), np.linspace(*field[2:], _PIXELS))
-    nearest = cKDTree(np.stack([found.x, found.y], axis=1)).query(np.stack(places, axis=-1))[1]
+    nearest = KDTree(np.stack([found.x, found.y], axis=1)).query(np.stack(places, axis=-1))[1]
     shown = pixel_map(axis, percent[nearest], field, norm, SEQUENTIAL)
     colour_bar(figure, shown, axis, "error of q, u (%)")
     axis.plot(found.x[~good], found.y[~good], "x", color="0.5", ms=4)

@@ -98,7 +98,7 @@ def _before_and_after(
     The places of the standards, which lie between the others, are left out.
     """
     points, extended = likelihood.calset.points, likelihood.calset.exposures.kind != "standard"
-    shown = likelihood.used[:, extended].any(axis=1)
+    shown = np.asarray(likelihood.used[:, extended].any(axis=1), bool)
     shown = shown if shown.any() else np.ones(len(points), bool)
     for axis, values, title in zip(axes, (before, after), ("before the fit", "after the fit"), strict=True):
         residual = point_residuals(likelihood, values)

@@ -35,7 +35,8 @@ TRUETYPE: dict[Any, int] = {"pdf.fonttype": 42, "ps.fonttype": 42}
 Map = Float[np.ndarray, "y x"]
 Maps = Float[np.ndarray, "m y x"]
 Field = tuple[float, float, float, float]
-AnyFigure = Figure | SubFigure
+AnyFigure = Any
+"""A figure, or the subfigure that took the room of axes: what is drawn on a `Canvas`."""
 
 
 class PaperFigure(Figure):
