@@ -21,7 +21,7 @@ Symbols     w = expected counts / errors of what has a flux in common (an exposu
             that was fitted (0 where it is known); Q orthonormal basis of the derivatives with respect to the free
             parameters.
 Sources     Rao 1948; Satterthwaite 1946, Biometrics Bull. 2, 110 (χ² with two moments); Šidák 1967 (many questions).
-Limits      Noise alone raises a doubt in about one fit of 200. Of a large set a sample of the points is looked at, of
+Limits      Noise alone raises a doubt in about one fit of 100. Of a large set a sample of the points is looked at, of
             whole frames the points that stand for all pixels: what is smaller shows in χ² and in the residual map.
 """
 
