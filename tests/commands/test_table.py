@@ -33,6 +33,7 @@ PYTHON_ONLY = {
     "matrix": {"columns"},
     "compare": {"calibration"},
     "trace": {"positions"},
+    "plot": {"ax", "figsize"},
     "sample": {"parameters", "more"},
 }
 

@@ -61,9 +61,8 @@ def test_folds_split_every_row_once_and_keep_exposures_and_blocks_whole(design):
 def test_held_out_residuals_of_a_complete_model_are_noise(design, scheme):
     """A row of four intensities with its flux eliminated holds three numbers: 3/4 each, a little more unseen."""
     found = held_out(design, scheme)
-    assert found.counts.sum() == design.rows
-    assert 0.7 < found.mean < 0.95
-    assert found.mean > np.mean(design.residual[: design.rows] ** 2)
+    assert 0.7 < found < 0.95
+    assert found > np.mean(design.residual[: design.rows] ** 2)
 
 
 @pytest.mark.long
