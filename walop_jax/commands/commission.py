@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from walop_jax.commands.command import Job, Outcome, command, command_of
 from walop_jax.commands.inputs import Effects, Folder, InstrumentLike, ModelLike, Sets
+from walop_jax.commands.refit import STAGES, refit
 
 if TYPE_CHECKING:
     from walop_jax.science.commissioning import Commissioning
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 DOCUMENT = "commissioning.json"
 
 
-@command(stages=("reading", "fitting", "mapping"), writes=())
+@command(stages=STAGES, writes=())
 def commission(
     job: Job,
     data: Sets,
@@ -35,7 +36,6 @@ def commission(
 
     In Python: a `Commissioning`.
     """
-    from walop_jax.commands.refit import refit
     from walop_jax.io.atomic import atomic_path
     from walop_jax.io.text import json_text
     from walop_jax.science.commissioning import commissioning

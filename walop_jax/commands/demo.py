@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Job, Option, Outcome, command, command_of
 from walop_jax.commands.inputs import PathLike
+from walop_jax.commands.refit import STAGES, refit
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ SET = "walop_south_small.fits"
 FOLDER = Option("Folder to write.", "FOLDER", Path, "-o")
 
 
-@command(stages=("reading", "fitting", "examining", "mapping"), writes=())
+@command(stages=STAGES, writes=())
 def demo(job: Job, *, output: Annotated[PathLike, FOLDER] = "walop-jax-demo") -> Outcome[FitResult]:
     """Fit the small calibration set that comes with the package, and write the page about it.
 
@@ -25,7 +26,6 @@ def demo(job: Job, *, output: Annotated[PathLike, FOLDER] = "walop-jax-demo") ->
 
     In Python: the fit.
     """
-    from walop_jax.commands.refit import refit
     from walop_jax.commands.report import report
 
     folder = Path(output)

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from walop_jax import FitResult
     from walop_jax.likelihood.runner import Processes
 
+STAGES = ("reading", "fitting", "examining", "mapping")
+"""Of the progress, also of the commands that fit and do more."""
+
 ProcessesOption = Option(
     "Share a large set with other processes that run the same command; auto: as Slurm or Open MPI say.",
     "INDEX/COUNT@HOST:PORT",
@@ -35,7 +38,7 @@ ProcessesOption = Option(
 )
 
 
-@command(stages=("reading", "fitting", "examining", "mapping"), writes=())
+@command(stages=STAGES, writes=())
 def refit(
     job: Job,
     data: Sets,
