@@ -169,20 +169,20 @@ def point_matrix(
     return m, to_all(instrument, plain, local, instrument.throughput.basis(x, y)[None])
 
 
-def _matrices_with_covariance(
-    instrument: Instrument, plan: Plan, covariance: Float[Array, "n n"], *columns: Float[Array, " p"]
-) -> tuple[Float[Array, "p m"], Float[Array, "p m m"]]:
+def _slopes_at(
+    instrument: Instrument, plan: Plan, *columns: Float[Array, " p"]
+) -> tuple[Float[Array, "p m"], Float[Array, "p m n"]]:
     """At rows of x, y (deg), colour temperature (0: flat), temperature and hour angle; the plan has one band."""
 
     def one(x: Scalar, y: Scalar, *numbers: Scalar) -> tuple[Float[Array, "b a 3"], Float[Array, "b a 3 n"]]:
         return point_matrix(instrument, with_numbers(plan, *numbers), x, y)
 
-    m, derivative = jax.vmap(one)(*columns)
-    flat = derivative[:, 0].reshape(len(m), m.shape[2] * 3, -1)
-    return m[:, 0].reshape(len(m), -1), jnp.einsum("pin,nk,pjk->pij", flat, covariance, flat)
+    m, slopes = jax.vmap(one)(*columns)
+    size = m.shape[2] * 3
+    return m[:, 0].reshape(len(m), size), slopes[:, 0].reshape(len(m), size, slopes.shape[-1])
 
 
-_matrices = compiled(_matrices_with_covariance, kept_as="matrices")
+_slopes = compiled(_slopes_at, kept_as="slopes")
 _vectors = compiled(jax.vmap(_point_vectors, in_axes=(None, None, 0, 0)), kept_as="vectors")
 _sky_vectors = compiled(jax.vmap(point_sky_vectors, in_axes=(None, None, 0, 0)), kept_as="sky_vectors")
 
@@ -222,14 +222,20 @@ def matrices(
     """
     size = 3 * len(instrument.arms)
     values, errors = np.empty((len(x), size)), np.empty((len(x), size, size))
-    cov = array(covariance)
-    columns = (x, y, np.nan_to_num(settings.teff), settings.temperature, settings.hour_angle)
     for layout, rows in settings.layouts():
         plan = plan_for_settings(instrument, layout, filters)
-        values[rows], errors[rows] = in_chunks(
-            lambda *part, plan=plan: _matrices(instrument, plan, cov, *part), *(c[rows] for c in columns)
-        )
+
+        def part(*columns: Array, plan: Plan = plan) -> tuple[np.ndarray, np.ndarray]:
+            found, slopes = map(np.asarray, _slopes(instrument, plan, *columns))
+            return found, slopes @ covariance @ np.swapaxes(slopes, 1, 2)
+
+        values[rows], errors[rows] = in_chunks(part, x[rows], y[rows], *_numbers(settings[rows]))
     return values, errors
+
+
+def _numbers(settings: Settings) -> tuple[Vector, Vector, Vector]:
+    """What of settings goes into a program as numbers: colour temperature (0: flat), temperature, hour angle."""
+    return np.nan_to_num(settings.teff), settings.temperature, settings.hour_angle
 
 
 def matrix_draws(
@@ -253,7 +259,7 @@ def matrix_draws(
 
 
 def in_chunks(
-    function: Callable[..., tuple[Array, ...]], *columns: Float[np.ndarray, " p"]
+    function: Callable[..., tuple[Array | np.ndarray, ...]], *columns: Float[np.ndarray, " p"]
 ) -> tuple[np.ndarray, ...]:
     """Apply a compiled function to slices of the columns, padded to `limits.MATRIX_POINTS` rows."""
     count, size = len(columns[0]), limits.MATRIX_POINTS
@@ -283,8 +289,10 @@ def matrix_slopes(
     `setting` has one row. Raises KeyError for a filter that `filters` does not hold.
     """
     plan = plan_for_settings(instrument, setting, filters)
-    values, slopes = in_chunks(lambda a, b: _all_slopes(instrument, plan, a, b), x, y)
-    return values[:, 0], slopes[:, 0]
+    numbers = (np.broadcast_to(number, len(x)) for number in _numbers(setting))
+    values, slopes = in_chunks(lambda *columns: _slopes(instrument, plan, *columns), x, y, *numbers)
+    arms = (len(x), values.shape[1] // 3, 3)
+    return values.reshape(arms), slopes.reshape(*arms, slopes.shape[-1])
 
 
 def change_of_qu(
@@ -362,7 +370,6 @@ def _point_effect_slopes(
     return jnp.moveaxis(jax.vmap(lambda one: push(to_tree(one)))(jnp.eye(flat.size)), 0, -1)
 
 
-_all_slopes = compiled(jax.vmap(point_matrix, in_axes=(None, None, 0, 0)), kept_as="slopes")
 _effect_slopes = compiled(
     jax.vmap(_point_effect_slopes, in_axes=(None, None, None, 0, 0)), kept_as="effect_slopes"
 )

@@ -37,7 +37,7 @@ from walop_jax.diagnosis.score import Candidate
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.columns import Change, Columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.dependence import changed_elements, conditions_asked_by
+from walop_jax.model.dependence import conditions_of_effect
 from walop_jax.model.effects import Context, Described, Effect
 from walop_jax.model.effects.change import BAND, OPPOSITE, SKY
 from walop_jax.model.effects.change import Change as Sentence
@@ -111,8 +111,7 @@ def _can_show(calset: CalibrationSet, instrument: Instrument, effect: Effect) ->
     if effect.over_field and len(calset.points) < FEWEST_POINTS:
         return False
     bare = dataclasses.replace(instrument, effects=())
-    changed = changed_elements(bare, effect)
-    asked = frozenset(name for element in changed for name in conditions_asked_by(element))
+    asked = conditions_of_effect(bare, effect)
     stated = {name: getattr(calset.exposures, column.lower()) for name, column in CONDITIONS.items()}
     return all(np.isfinite(stated[name]).any() for name in asked if name in stated)
 

@@ -28,7 +28,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
+from scipy import special
 
 from walop_jax.calibration.matrix import change_of_qu, effect_slopes, first_setting, matrix_slopes
 from walop_jax.diagnosis.candidates import Probe, applicable
@@ -113,7 +113,7 @@ def _columns(examination: Examination, rivals: ScoreSpace, probe: Probe, p: floa
         if nearest <= np.sqrt(_ABSORBED * square):
             named = np.inf
         elif np.isfinite(nearest):
-            named = max(detected, POLICY.separation / nearest + stats.norm.ppf(PROBABILITY) / np.sqrt(square))
+            named = max(detected, POLICY.separation / nearest + special.ndtri(PROBABILITY) / np.sqrt(square))
         others = {name: value * detected for name, value in apart.items()}
         found.append(_Column(probe, number, probe.parameters[number], detected, float(named), others))
     return found

@@ -21,8 +21,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy import stats
+from scipy import special
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.candidates import Probe, all_candidates, said_by
@@ -397,9 +398,9 @@ def explains(chi2: float, dof: float) -> bool:
 def upper_limit(value: float, sigma: float, *, one_sided: bool, probability: float = POLICY.limit) -> float:
     """Size that an amplitude stays below with a probability, for a flat prior (positive when one-sided)."""
     if one_sided:
-        below_zero = stats.norm.cdf(-value / sigma)
-        return float(value + sigma * stats.norm.ppf(below_zero + probability * (1.0 - below_zero)))
-    return float(stats.foldnorm.ppf(probability, abs(value) / sigma, scale=sigma))
+        below_zero = special.ndtr(-value / sigma)
+        return float(value + sigma * special.ndtri(below_zero + probability * (1.0 - below_zero)))
+    return float(scipy.stats.foldnorm.ppf(probability, abs(value) / sigma, scale=sigma))
 
 
 # ----------------------------------------------------------------------------------------------- of one fit
@@ -436,7 +437,7 @@ class Examination(Evidence):
     @property
     def noise_p(self) -> float:
         """Chance that noise of the stated size alone leaves as much as this fit does."""
-        return float(stats.chi2.sf(self.chi2, max(self.dof, 1)))
+        return float(special.chdtrc(max(self.dof, 1), self.chi2))
 
     def untestable(self, catalogue: Sequence[type[Effect]]) -> tuple[str, ...]:
         """Effects that these data cannot show at any plausible size."""

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM
@@ -76,7 +76,7 @@ def pairs_alike(design: Design) -> list[Pair]:
     correlation = product[first, second] / np.sqrt(own * other)
     # The fit takes something of every exposure: the noise is measured by what it leaves.
     deviate = correlation * np.sqrt(expected[first, second])
-    limit = stats.norm.isf(local_p(ALARM, len(first)))
+    limit = -special.ndtri(local_p(ALARM, len(first)))
     excess = 0.5 * (own / free[first] + other / free[second]) / shared[first, second] - 1.0
     pattern = correlation / np.maximum(1.0 - correlation, 1e-12)
     found = (deviate > limit) & (correlation > LEAST) & (excess < 0.5 * pattern)

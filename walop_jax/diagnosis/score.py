@@ -28,10 +28,11 @@ import functools
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy import linalg, optimize, stats
+from scipy import linalg, optimize, special
 
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.runner import cores
@@ -151,9 +152,9 @@ def effective_trials(smallest: Vector) -> float:
 @functools.cache
 def noncentrality(p: float, rank: int, power: float) -> float:
     """λ for which the statistic of a candidate, χ'²_rank(λ), undercuts a local `p` with probability `power`."""
-    least = stats.chi2.isf(p, rank)
+    least = special.chdtri(rank, p)
     found = optimize.root_scalar(
-        lambda value: stats.ncx2.sf(least, rank, value) - power, bracket=(1e-6, 10.0 * least + 100.0)
+        lambda value: 1.0 - special.chndtr(least, rank, value) - power, bracket=(1e-6, 10.0 * least + 100.0)
     )
     return float(found.root)
 
@@ -298,7 +299,7 @@ class ScoreSpace:
         w, alive = self.whitened[name], self.alive[at]
         z = w.T @ np.where(alive, scores[at], 0.0)
         statistic, rank = float(z @ z) / noise**2, w.shape[1]
-        log_p = float(stats.chi2.logsf(statistic, rank)) if rank else 0.0
+        log_p = float(_log_of_chi2(statistic, rank)) if rank else 0.0
         gram = np.where(np.outer(alive, alive), self.gram[at, at], 0.0)
         return Score(
             name=name, statistic=statistic, rank=rank, p_value=float(np.exp(log_p)), log_p=log_p,
@@ -365,10 +366,16 @@ def log_bayes(gram: Matrix, scores: Vector, widths: Vector) -> float:
     return float(0.5 * np.sum(s**2 / information) - 0.5 * np.sum(np.log(information)))
 
 
+def _log_of_chi2(statistic: Any, rank: int) -> Any:
+    """ln of the χ² survival function."""
+    with np.errstate(divide="ignore"):  # far out there is no number so small
+        return np.log(special.chdtrc(rank, statistic))
+
+
 def _log_survival(statistic: np.ndarray, rank: int) -> np.ndarray:
     """ln of the χ² survival function by interpolation: millions of values, 10⁻⁴ is plenty."""
     grid = np.linspace(0.0, rank + 12.0 * np.sqrt(2.0 * rank) + 60.0, 2000)
-    return np.interp(statistic, grid, stats.chi2.logsf(grid, rank))
+    return np.interp(statistic, grid, _log_of_chi2(grid, rank))
 
 
 def separations(space: ScoreSpace, scores: Vector, square: float) -> dict[str, float]:

@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
+from scipy import special
 
 from walop_jax.calibration.matrix import change_of_qu, first_setting, matrix_slopes
 from walop_jax.data.records import CalibrationSet
@@ -233,7 +233,7 @@ def rival_conditions(design: Design, chi2: float) -> Iterator[str]:
     """
     scored = [item for item in condition_scores(design) if item.score.testable]
     square = float(np.sum(design.projector(design.residual) ** 2))
-    least = stats.chi2.isf(local_p(ALARM, len(scored)), 1) if scored else np.inf
+    least = special.chdtri(1, local_p(ALARM, len(scored))) if scored else np.inf
     gains = [float(item.score.amplitudes[0]) ** 2 * item.square for item in scored]
     alike = [
         (gain, item)

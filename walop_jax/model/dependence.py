@@ -112,9 +112,14 @@ def _behind_polariser(instrument: Instrument) -> Iterator[Element]:
         yield from (*arm.train(), arm.analyser)
 
 
-def conditions_asked_by(element: Element) -> frozenset[str]:
-    """What an element asks for, by its name in `ray.CONDITIONS`; found by running it on shapes."""
-    return _conditions_asked(*shapes_of(element))
+def conditions_of_effect(bare: Instrument, effect: Effect) -> frozenset[str]:
+    """What the elements that an effect puts into an instrument or changes ask for, by names in `ray.CONDITIONS`."""
+
+    def find() -> frozenset[str]:
+        changed = changed_elements(bare, effect)
+        return frozenset(name for element in changed for name in _conditions_asked(*shapes_of(element)))
+
+    return answer("conditions_of_effect", *shapes_of((bare, effect)), find)
 
 
 @functools.lru_cache(maxsize=1024)
@@ -179,8 +184,7 @@ def left_behind(instrument: Instrument) -> tuple[str, ...]:
     for effect in instrument.effects:
         cameras = effect.patch(bare).cameras
         kept = all(is_undone(part, len(cameras)) for part in cameras.detectors)
-        asked = {name for element in changed_elements(bare, effect) for name in conditions_asked_by(element)}
-        unknown = asked - KNOWN
+        unknown = conditions_of_effect(bare, effect) - KNOWN
         if cameras.ghosts or cameras.exposures or not kept or unknown:
             names.append(effect.name)
     return tuple(names)

@@ -19,7 +19,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-import emcee
 import numpy as np
 from jaxtyping import Float
 
@@ -62,6 +61,8 @@ class Emcee(Sampler):
 
     def advance(self, density: Density, state: State, steps: int) -> tuple[State, Stretch]:
         """Go on for that many steps of all walkers."""
+        import emcee
+
         count, dimension = state["positions"].shape
         sampler = emcee.EnsembleSampler(
             count, dimension, density.log_density, vectorize=True, moves=mixture(self.moves)
@@ -98,14 +99,16 @@ def _laplace_draws(
 
 def mixture(moves: str) -> list[tuple[Any, float]]:
     """Return emcee's moves with their shares; ValueError for an unknown name."""
-    evolution = [(emcee.moves.DEMove(), 1.0 - JUMPS), (emcee.moves.DEMove(gamma0=1.0), JUMPS)]
+    from emcee import moves as made
+
+    evolution = [(made.DEMove(), 1.0 - JUMPS), (made.DEMove(gamma0=1.0), JUMPS)]
     if moves == "laplace":
         return [
-            (emcee.moves.MHMove(_laplace_draws), 0.5),
+            (made.MHMove(_laplace_draws), 0.5),
             *((move, 0.5 * share) for move, share in evolution),
         ]
     if moves == "de":
         return evolution
     if moves == "stretch":
-        return [(emcee.moves.StretchMove(), 1.0)]
+        return [(made.StretchMove(), 1.0)]
     raise ValueError(f"unknown moves {moves!r}: choose one of {', '.join(MOVES)}")

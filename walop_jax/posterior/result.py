@@ -21,7 +21,6 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from emcee.autocorr import integrated_time
 from jaxtyping import Float
 
 from walop_jax.fit.verdict import STATED
@@ -84,6 +83,8 @@ class Convergence:
 
 def autocorrelation(chains: Chains) -> Float[np.ndarray, " k"]:
     """τ in stored steps, per quantity; NaN for a quantity that never moved."""
+    from emcee.autocorr import integrated_time
+
     e, n, w, k = chains.shape
     tau = np.full(k, np.nan)
     for i in range(k):
