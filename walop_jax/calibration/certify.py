@@ -71,7 +71,8 @@ def _verdict(product: Calibration) -> list[Check]:
         Check(
             "explains the data",
             v.trusted and not v.quality & Quality.UNEXPLAINED,
-            f"χ²/dof = {v.chi2 / max(v.dof, 1):.4f}" + "".join(f"; {text}" for text in v.warnings),
+            f"χ²/dof = {v.chi2 / max(v.dof, 1):.4g}"
+            + (f"; {v.doubts[0]}" if v.doubts and not v.quality & Quality.UNEXPLAINED else ""),
         ),
         Check(
             "conditioned",
@@ -129,8 +130,9 @@ def _physics(calibration: Calibration) -> Check:
     analysis = AnalysisVectors(calibration)
     vectors = analysis.exact(setting, x, y)[:, 0]
     least = np.min(1.0 - np.hypot(vectors[..., 1], vectors[..., 2]) / vectors[..., 0], axis=0)
-    arms = zip(analysis.instrument.arms, analysis.instrument.cameras.pairs, strict=True)
-    found = ", ".join(f"{arm.name} {least[list(pair)].min():.1e}" for arm, pair in arms)
+    pairs = analysis.instrument.cameras.pairs
+    names = analysis.instrument.cameras.names
+    found = ", ".join(f"{'/'.join(names[k] for k in pair)} {least[list(pair)].min():.1e}" for pair in pairs)
     good = bool(np.all(vectors[..., 0] > 0)) and bool(np.all(least > -DARKEST))
     return Check(
         "physics", good, f"least transmission for any polarisation, over that of unpolarised light: {found}"

@@ -46,7 +46,7 @@ class Certificate(Displayed):
 
     def display(self) -> Display:
         """Every check, and the verdict."""
-        rows = [("ok" if check.passed else "BAD", check.name, check.found) for check in self.checks]
+        rows = [("ok" if check.passed else "FAILED", check.name, check.found) for check in self.checks]
         verdict = "NOT fit for use" if self.failed else "fit for use"
         return Display(f"{self.path}: {verdict}", head=("", "check", "found"), rows=tuple(rows))
 

@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import functools
 import inspect
+import logging
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
     from walop_jax.io.folder import OutputFolder
 
 CACHE_VARIABLE = "WALOP_JAX_CACHE"
+LOG = logging.getLogger("walop_jax")
+"""Of calls in Python: progress (INFO), and the warnings of a result; silent unless the caller sets it up."""
+LOG.addHandler(logging.NullHandler())
 
 T = TypeVar("T")
 Tell = Callable[[str], None]
@@ -240,8 +244,16 @@ class Command(Generic[T]):
             }
             arguments = door.bound(self.name, self.signature, self.body, args, kwargs)
             shared = {name: arguments.pop(name) for name in COMMON if name in arguments}
-            shared["progress"] = shared["progress"] or _silent
-            return self.run(Job(**shared), arguments).value
+            tell = shared["progress"] or _silent
+
+            def logged(text: str) -> None:
+                LOG.info("%s", text)
+                tell(text)
+
+            found = self.run(Job(**(shared | {"progress": logged})), arguments)
+            for sentence in found.warnings:
+                LOG.warning("%s", sentence)
+            return found.value
 
         functools.update_wrapper(call, self.body)
         del call.__dict__["__wrapped__"]

@@ -53,6 +53,10 @@ Product = Annotated[
     "Calibration | FitResult | Run | PathLike",
     Argument("Calibration product, or the folder of a run.", "RUN/calibration.fits", Path),
 ]
+DataOf = Annotated[
+    "Sequence[PathLike] | None",
+    Option("Calibration set of the fit, if it has moved; again for each.", "CALSET", list[Path]),
+]
 Posterior = Annotated[
     "PathLike | None",
     Option("Use draws of walop-jax sample, not the covariance.", "posterior.nc", Path),

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.inputs import Effects, PathLike, catalogue_of
+from walop_jax.commands.inputs import DataOf, Effects, PathLike, catalogue_of
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ def plot(
     parameters: Annotated[str | Sequence[str] | None, PARAMETERS] = None,
     x: Annotated[float, Option("Field point of transmission and modulation, X (deg).")] = 0.0,
     y: Annotated[float, Option("The same, Y (deg).")] = 0.0,
+    data: DataOf = None,
     effects: Effects = None,
     ax: Any = None,
     figsize: tuple[float, float] | None = None,
@@ -68,7 +69,7 @@ def plot(
             raise fail("is no picture that can be written", file=path, advice=f"use {', '.join(FORMATS)}")
         check_output(path, overwrite=job.overwrite)
     catalogue = catalogue_of(effects)
-    held = Run(Path(run), catalogue) if isinstance(run, str | os.PathLike) else run
+    held = Run(Path(run), catalogue, tuple(data or ())) if isinstance(run, str | os.PathLike) else run
     if isinstance(held, Run) and not held.folder.is_dir():
         raise fail(
             "is not the folder of a run",

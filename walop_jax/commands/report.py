@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command, command_of
-from walop_jax.commands.inputs import Effects, PathLike, catalogue_of, folder_of, save
+from walop_jax.commands.inputs import DataOf, Effects, PathLike, catalogue_of, folder_of, save
 from walop_jax.io.display import Display, Displayed
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ def report(
     run: Annotated[FitResult | Run | PathLike, RUN],
     output: Annotated[PathLike | None, FILE] = None,
     *,
+    data: DataOf = None,
     effects: Effects = None,
 ) -> Outcome[Page]:
     """Write one HTML page about a run, figures inside: it needs no network and no other file, and can be mailed or
@@ -73,7 +74,7 @@ def report(
     target = folder / PAGE if output is None else Path(output)
     job.begin("reading")
     kind = kind_of_run(folder)
-    found = read_run(Run(folder, catalogue_of(effects))) if kind == "fit" else None
+    found = read_run(Run(folder, catalogue_of(effects), tuple(data or ()))) if kind == "fit" else None
     overwrite = job.overwrite or _is_page(target)
     check_output(target, overwrite=overwrite)
     if found is None:
@@ -108,7 +109,7 @@ def _residuals(run: RunContents) -> tuple[str, ...]:
     if run.product is None or run.diagnosis is not None:
         return ()
     try:
-        Run(run.folder).calset  # noqa: B018
+        Run(run.folder, data=run.data).calset  # noqa: B018
     except (ValueError, OSError) as error:
         return (f"Residuals are not drawn: {error}.",)
     return ()

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command
-from walop_jax.commands.inputs import Effects, ModelLike, PathLike, catalogue_of, folder_of
+from walop_jax.commands.inputs import DataOf, Effects, ModelLike, PathLike, catalogue_of, folder_of
 from walop_jax.io.errors import fail, nearest
 from walop_jax.io.text import read_text
 
@@ -33,6 +33,7 @@ def sample(
     *,
     resume: Annotated[bool, Option("Go on from the checkpoints in RUN/sampling.")] = False,
     model: ModelLike = None,
+    data: DataOf = None,
     effects: Effects = None,
     sampler: Annotated[Any, Option("emcee, nuts, or your own as FILE.py:CLASS.", "NAME", str)] = "emcee",
     inflate: Annotated[bool, Option("Sample a factor on the errors of the data.")] = False,
@@ -53,7 +54,7 @@ def sample(
     sampled (None: the physics coefficients); other keywords are the fields of `walop.Options`. Raises `DataError` if
     the run is no folder of a fit, holds a posterior already, or does not fit its data any more.
     """
-    from walop_jax import FitResult, Options
+    from walop_jax import FitResult, Options, Run
     from walop_jax.posterior import sample as sample_fit
 
     known = {field.name for field in dataclasses.fields(Options)}
@@ -84,7 +85,8 @@ def sample(
         where = "the fit"
     else:
         where = folder_of(fit)
-        posterior = _sampled_run(job, where, options, tell, model, resume, effects)
+        run = Run(where, catalogue_of(effects), tuple(data or ()))
+        posterior = _sampled_run(job, run, options, tell, model, resume)
     return Outcome(
         posterior,
         text=lambda: f"{posterior.display().text()}\n{posterior.seconds:.0f} s",
@@ -97,16 +99,16 @@ def sample(
 
 
 def _sampled_run(
-    job: Job, folder: Path, options: Any, tell: Any, model: ModelLike, resume: bool, effects: Effects
+    job: Job, run: Run, options: Any, tell: Any, model: ModelLike, resume: bool
 ) -> PosteriorSample:
     """The posterior around the fit in a folder, written there, with the covariance in its product if it can be."""
-    from walop_jax import Model, Run
+    from walop_jax import Model
     from walop_jax.calibration import PRODUCT, read_calibration
     from walop_jax.io.folder import output_folder
     from walop_jax.posterior import Checkpoints, digest_of_fit
     from walop_jax.posterior import sample as sample_fit
 
-    catalogue = catalogue_of(effects)
+    folder = run.folder
     if not folder.is_dir():
         raise fail("is not a folder", file=folder, advice="give the RUN of walop-jax refit")
     if isinstance(model, Model):
@@ -116,8 +118,8 @@ def _sampled_run(
     if found and not (job.overwrite or resume):
         raise fail(f"holds {found[0]} already", file=folder, advice="go on with --resume, or --overwrite it")
     with output_folder(folder, OUTPUTS, overwrite=True) as out:
-        product = read_calibration(folder / PRODUCT, catalogue, rebuild=False)
-        result = Run(folder, catalogue).fit(text)
+        product = read_calibration(folder / PRODUCT, run.catalogue, rebuild=False)
+        result = run.fit(text)
         if job.overwrite and not resume:
             Checkpoints(folder / CHAINS, {}).clear()
         posterior = sample_fit(result, options, folder=folder / CHAINS, resume=resume, report=tell)

@@ -223,7 +223,7 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     said = {one.candidate.name: one.said for one in rivals}
     told = "; or for ".join(said[score.name](score) for score in likely[:_SHOWN])
     more = f"; or for {len(likely) - _SHOWN} others" if len(likely) > _SHOWN else ""
-    yield f"the residuals ask for {told}{more} (p = {corrected_p(best.log_p, len(scores)):.2g})"
+    yield f"the residuals ask for {told}{more} (p = {corrected_p(best.log_p, len(scores)):.2g}, limit {ALARM:g})"
 
 
 def rival_conditions(design: Design, chi2: float) -> Iterator[str]:

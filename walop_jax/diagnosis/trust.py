@@ -204,8 +204,8 @@ def _patterns(table: ScoreTable) -> Iterator[str]:
         return
     names = [score.name for score in table.ranked if table.corrected(score) < ALARM][:_SHOWN]
     yield (
-        f"the residuals hold patterns that noise does not make (p = {table.p_global:.2g}: {', '.join(names)}): "
-        "walop-jax diagnose looks for the cause"
+        f"the residuals hold patterns that noise does not make (p = {table.p_global:.2g}, limit {ALARM:g}: "
+        f"{', '.join(names)}): walop-jax diagnose looks for the cause"
     )
 
 

@@ -307,11 +307,13 @@ SAME_FIT = 0.05  # standard errors
 class Run(Result):
     """The folder of a run; everything in it is read when it is asked for. None stands for what is not there.
 
-    `catalogue` are the effects that its model may have.
+    `catalogue` are the effects that its model may have, `data` the sets of its fit (default: where they were, in the
+    folder of the run, or beside it).
     """
 
     folder: Path
     catalogue: Sequence[type[Effect]] = EFFECTS
+    data: Sequence[str | os.PathLike[str]] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "folder", Path(self.folder))
@@ -353,7 +355,7 @@ class Run(Result):
 
     @functools.cached_property
     def calset(self) -> CalibrationSet:
-        """The data of the fit, found as they were named, in the folder of the run, or beside it.
+        """The data of the fit.
 
         Raises `DataError` where the run does not say what they were, and where they are not there or have changed.
         """
@@ -361,9 +363,9 @@ class Run(Result):
         if not inputs:
             advice = "make it with walop-jax refit"
             raise fail("does not say what it was fitted to", file=self.folder, advice=advice)
-        calset = read_calibration_set(*(self._located(entry.path) for entry in inputs))
+        calset = read_calibration_set(*(self.data or [self._located(entry.path) for entry in inputs]))
         if sorted(entry.sha256 for entry in calset.inputs) != sorted(entry.sha256 for entry in inputs):
-            raise fail("the data have changed since the fit", file=inputs[0].path, advice="refit them")
+            raise fail("these are not the data of the fit any more", file=inputs[0].path, advice="refit them")
         return calset
 
     def _located(self, path: Path) -> Path:
@@ -375,7 +377,7 @@ class Run(Result):
         raise fail(
             f"cannot be found, neither from {Path.cwd()} nor beside {self.folder}",
             file=path,
-            advice="copy it into the folder of the run, or run the command where the fit was made",
+            advice="say where it is (--data FILE, for each set of the fit), or copy it into the folder of the run",
         )
 
     def fit(self, model_text: str | None = None) -> FitResult:

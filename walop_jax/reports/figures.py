@@ -34,12 +34,14 @@ from walop_jax.reports.style import (
     element_kind,
     element_symbols,
     field_axes,
+    largest_size,
     matrix_panels,
     outer_labels,
     pixel_map,
     plain,
     plain_ticks,
     point_map,
+    rounded_up,
 )
 from walop_jax.science.field_accuracy import FieldAccuracy
 from walop_jax.science.star_errors import GOAL
@@ -210,6 +212,26 @@ def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
         field_axes(axis, f"error of {name}\n{least} to {most} %")
         image = pixel_map(axis, 100.0 * errors, field_of(maps), LogNorm(low, max(high, 10 * low)), SEQUENTIAL)
     colour_bar(figure, image, axes, "standard error (%)", pad=0.02, extend="min")
+    outer_labels(axes)
+    return figure
+
+
+def matrix_change_figure(old: MatrixMaps, new: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
+    """By how much the elements of the instrument matrix have changed over the field, in per cent, one scale.
+
+    Raises ValueError for maps of different places.
+    """
+    if field_of(old) != field_of(new) or old.values.shape != new.values.shape:
+        raise ValueError("the maps of the two calibrations are of different places")
+    change = 100.0 * (new.values - old.values)
+    far = rounded_up(largest_size(change))
+    figure = on.figure(8.6, 2.3 * new.arms)
+    axes = figure.subplots(new.arms, 3, sharex=True, sharey=True, squeeze=False)
+    image = None
+    for axis, values, name in zip(axes.ravel(), change, element_symbols(new.arms), strict=True):
+        field_axes(axis, f"change of {name}")
+        image = pixel_map(axis, values, field_of(new), Normalize(-far, far), DIVERGING)
+    colour_bar(figure, image, axes, "new − old (%)", pad=0.02)
     outer_labels(axes)
     return figure
 

@@ -38,7 +38,7 @@ class FigureSource(Run):
     def of(cls, given: FitResult | Calibration | Run, **options: Any) -> FigureSource:
         """What a fit or a calibration in memory holds, or the folder of a run."""
         if isinstance(given, Run):
-            return cls(given.folder, given.catalogue, **options)
+            return cls(given.folder, given.catalogue, given.data, **options)
         held = Calibration.from_fit(given) if isinstance(given, FitResult) else given
         made = cls(Path("in memory"), **options)
         vars(made).update(product=held, calibration=held, documents={}, posterior=None)

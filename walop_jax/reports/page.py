@@ -16,6 +16,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from walop_jax.calibration import read_calibration
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.findings import sentences
 from walop_jax.diagnosis.limits_found import DetectionLimits
@@ -42,6 +43,7 @@ from walop_jax.reports.wording import (
     effect_in_words,
     hidden_in_words,
     model_entries,
+    names_in_words,
     symbols_in_words,
     verdict_of_diagnosis,
     verdict_of_fit,
@@ -72,6 +74,7 @@ def environment() -> jinja2.Environment:
     made.filters["unit"] = unit_in_words
     made.globals.update(
         effect_in_words=effect_in_words,
+        names_in_words=names_in_words,
         value_and_error=value_and_error,
         rounded=rounded,
         probability=probability,
@@ -232,10 +235,10 @@ def _figures(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, str]
         made["matrix"] = figures.matrix_maps_figure(run.product.maps)
         made["errors"] = figures.matrix_errors_figure(run.product.maps)
         if run.product.residuals is not None:
-            made["residual_map"] = draw("residual-map", FigureSource(run.folder))
+            made["residual_map"] = draw("residual-map", FigureSource(run.folder, data=run.data))
     if run.diagnosis is None and run.product is not None:
         with contextlib.suppress(ValueError, OSError):  # data that are not there: the page says so
-            made["fit_residuals"] = draw("residuals", FigureSource(run.folder))
+            made["fit_residuals"] = draw("residuals", FigureSource(run.folder, data=run.data))
     if run.figure_data is not None:
         data = run.figure_data
         whole = data.comparisons[0]
@@ -341,6 +344,8 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
             [*document["breaks"], *document["events"]], key=lambda row: row.get("mjd", row.get("night"))
         )
         pictures, missing = _of_survey(folder, document)
+    elif kind == "epoch":
+        pictures, missing = _of_epoch(folder, document)
     elif kind == "plan":
         pictures, missing = _of_plan(document)
         if (folder / LIMITS).exists():
@@ -374,6 +379,21 @@ def _of_plan(document: Mapping[str, Any]) -> tuple[list[Picture], tuple[str, ...
     else:
         missing = ("No map: what this plan is for is no error of p.",)
     return found, missing
+
+
+def _of_epoch(folder: Path, document: Mapping[str, Any]) -> tuple[list[Picture], tuple[str, ...]]:
+    """Maps of what has changed of the instrument matrix, if both calibrations are there."""
+    try:
+        old, new = (
+            read_calibration(Path(path), rebuild=False).maps for path in (document["old_file"], folder)
+        )
+        drawn = figures.matrix_change_figure(old, new)
+    except (ValueError, OSError, KeyError, TypeError) as error:
+        return [], (f"The change of the instrument matrix is not drawn: {error}.",)
+    caption = (
+        "Change of the instrument matrix over the field, new − old, in per cent, all elements on one scale."
+    )
+    return [(embedded(drawn), "Maps of the change of the instrument matrix", caption)], ()
 
 
 def _of_survey(folder: Path, document: Mapping[str, Any]) -> tuple[list[Picture], tuple[str, ...]]:

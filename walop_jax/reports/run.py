@@ -42,7 +42,8 @@ class RunContents:
     """The contents of a run; None for what is not there. `missing` says what that means for a page.
 
     `summary`, `diagnosis` and `sample` are the contents of the JSON files; `intervals` are rows of the table of
-    posterior intervals; `corner` are the bytes of a PNG; `limits` is what `limits` has found for the same data.
+    posterior intervals; `corner` are the bytes of a PNG; `limits` is what `limits` has found for the same data,
+    `data` are the sets of the fit if they are not where they were.
     """
 
     folder: Path
@@ -55,6 +56,7 @@ class RunContents:
     corner: bytes | None
     limits: DetectionLimits | None
     missing: tuple[str, ...]
+    data: tuple[Path, ...] = ()
 
 
 def read_run(run: Run | Path) -> RunContents:
@@ -111,6 +113,7 @@ def read_run(run: Run | Path) -> RunContents:
         corner=optional(CORNER, Path.read_bytes, "no corner plot", sampled),
         limits=optional(LIMITS, lambda path: _limits(path, summary), "no protection level", wanted=False),
         missing=tuple(missing),
+        data=tuple(map(Path, run.data)),
     )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import datetime
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -209,6 +209,21 @@ def model_entries(product: Calibration) -> dict[str, dict[str, str]]:
             "state": state,
         }
     return found
+
+
+PLACES = {
+    "half1": "half1 the half of the pupil behind HWP1",
+    "half2": "half2 that behind HWP2",
+    "chwp": "chwp the calibration half-wave plate",
+    "throughput": "throughput.n0, n1, … the cameras in their order (O1, E1, O2, E2)",
+}
+
+
+def names_in_words(names: Iterable[str]) -> str:
+    """What the first parts of names of parameters stand for, where that is no word of its own."""
+    used = {name.partition(".")[0] for name in names}
+    found = [words for part, words in PLACES.items() if part in used]
+    return f"In names, {listed(found)}." if found else ""
 
 
 def symbols_in_words(names: Sequence[str]) -> str:

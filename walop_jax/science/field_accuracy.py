@@ -15,7 +15,13 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import matrix_slopes, p_errors, p_forms, sample_stars
+from walop_jax.calibration.matrix import (
+    SMALLEST_DETERMINANT,
+    matrix_slopes,
+    p_errors,
+    p_forms,
+    sample_stars,
+)
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import two_digits
@@ -51,7 +57,8 @@ class FieldAccuracy:
 
     `extent` is left, right, bottom and top in degrees. `limited_by` is what most of the error comes from. A
     mistake that the data would not have shown, the worst of them `hidden_by`, can make q or u wrong by `hidden`, the
-    median over the field (NaN: nobody asked), at its just undetected size.
+    median over the field (NaN: nobody asked), at its just undetected size. `without_u` is the share of the field where
+    a single exposure carries almost no information on u.
     """
 
     error: Float[np.ndarray, "y x"]
@@ -61,6 +68,7 @@ class FieldAccuracy:
     hidden: float = np.nan
     hidden_by: str = ""
     trusted: bool = True
+    without_u: float = 0.0
 
     @property
     def share(self) -> float:
@@ -117,6 +125,7 @@ def field_accuracy(calibration: Calibration, size: int = SIZE) -> FieldAccuracy 
     x, y = _grid(calibration, size)
     matrix, covariance = calibration.matrix(x, y, settings)
     error = p_errors(matrix, covariance, sample_stars()).reshape(size, size)
+    determinant = np.abs(matrix[:, 1] * matrix[:, 5] - matrix[:, 2] * matrix[:, 4])
     x, y = _grid(calibration, COARSE)
     hidden, worst = calibration.protection(x, y, settings)
     known = hidden[np.isfinite(hidden)]
@@ -128,6 +137,7 @@ def field_accuracy(calibration: Calibration, size: int = SIZE) -> FieldAccuracy 
         hidden=float(np.median(known)) if known.size else np.nan,
         hidden_by=_with_size(calibration, worst),
         trusted=calibration.verdict.trusted,
+        without_u=float(np.mean(determinant < SMALLEST_DETERMINANT)),
     )
 
 
