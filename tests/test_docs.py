@@ -5,15 +5,22 @@ from __future__ import annotations
 import ast
 import dataclasses
 import importlib
+import json
 import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import handmade_run
+import jsonschema
 import pytest
+from small_run import small_fit
 
+from walop_jax.calibration.summary import summary
 from walop_jax.commands import COMMANDS
 from walop_jax.commands.docs import about, pages
+from walop_jax.io.text import json_text
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = pages()
@@ -220,6 +227,47 @@ def test_keys_of_the_diagnosis():
     names = keys_written("walop_jax.diagnosis.findings", "document", "_step")
     names |= keys_written("walop_jax.diagnosis.findings", "describe")
     assert unexplained(names, section("files", "diagnosis.json")) == []
+
+
+SCHEMAS = json.loads((ROOT / "walop_jax/docs/schemas.json").read_text(encoding="utf-8"))
+WRITTEN = {
+    "summary.json": ("walop_jax.calibration.summary", "summary"),
+    "diagnosis.json": ("walop_jax.diagnosis.findings", "document"),
+    "plan.json": ("walop_jax.plans.plan", "document"),
+}
+
+
+def faults(name: str, document: Any) -> list[str]:
+    """What the schema of a file finds wrong with a document."""
+    validator = jsonschema.Draft202012Validator({"$ref": f"#/$defs/{name}", "$defs": SCHEMAS["$defs"]})
+    return [error.message for error in validator.iter_errors(json.loads(json_text(document)))]
+
+
+def test_schemas_hold_every_key_that_is_written():
+    jsonschema.Draft202012Validator.check_schema(SCHEMAS)
+    for name, (module, function) in WRITTEN.items():
+        tree = ast.parse(Path(importlib.import_module(module).__file__ or "").read_text(encoding="utf-8"))
+        written = next(
+            node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and node.name == function
+        )
+        outer = next(node for node in ast.walk(written) if isinstance(node, ast.Dict))
+        keys = {key.value for key in outer.keys if isinstance(key, ast.Constant)}
+        assert len(keys) > 10
+        assert keys <= set(SCHEMAS["$defs"][name]["properties"]), name
+
+
+def test_documents_follow_their_schemas():
+    summary_of_fit = summary(small_fit(), seconds=1.0)
+    for name, document in (
+        ("summary.json", summary_of_fit),
+        ("summary.json", handmade_run.SUMMARY),
+        ("diagnosis.json", handmade_run.DIAGNOSIS),
+    ):
+        assert faults(name, document) == []
+        for key in SCHEMAS["$defs"][name]["required"]:
+            assert faults(name, {k: v for k, v in document.items() if k != key})
+    assert faults("summary.json", summary_of_fit | {"converged": "yes"})
+    assert faults("diagnosis.json", handmade_run.DIAGNOSIS | {"verdict": "good"})
 
 
 def test_tables_of_the_diagnosis():

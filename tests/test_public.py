@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import ast
+import doctest
+import inspect
 import os
 import subprocess
 import sys
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from small_run import small_fit
 
 import walop_jax
 from walop_jax.commands import COMMANDS
@@ -16,6 +23,36 @@ from walop_jax.commands import COMMANDS
 def test_every_public_name_is_there_and_documented(name: str):
     assert getattr(walop_jax, name).__doc__
     assert name in dir(walop_jax)
+
+
+@pytest.fixture(scope="module")
+def at_hand(tmp_path_factory) -> tuple[Path, dict[str, Any]]:
+    """What the examples of docstrings begin with: a set, its fit, both as files."""
+    folder = tmp_path_factory.mktemp("examples")
+    result = small_fit()
+    walop_jax.write_calibration_set(folder / "night.fits", result.calset)
+    result.save(folder / "RUN")
+    return folder, {"walop": walop_jax, "np": np, "result": result, "calset": result.calset}
+
+
+@pytest.mark.parametrize(
+    "name", sorted(set(walop_jax.__all__) - {"Scalar", "EFFECTS"})
+)  # they have no docstring
+def test_the_example_of_a_public_name(name: str, at_hand, monkeypatch: pytest.MonkeyPatch):
+    """Every one has one, and it runs; one that takes long is held against the signature."""
+    folder, names = at_hand
+    monkeypatch.chdir(folder)
+    flags = doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
+    text = inspect.getdoc(getattr(walop_jax, name)) or ""
+    examples = doctest.DocTestParser().get_doctest(text, dict(names), name, None, None)
+    assert examples.examples
+    assert doctest.DocTestRunner(optionflags=flags, verbose=False).run(examples).failed == 0
+    for one in examples.examples:
+        if doctest.SKIP in one.options:
+            calls = [node for node in ast.walk(ast.parse(one.source)) if isinstance(node, ast.Call)]
+            (call,) = [node for node in calls if ast.unparse(node.func) == f"walop.{name}"]
+            keywords = {str(word.arg): None for word in call.keywords}
+            inspect.signature(getattr(walop_jax, name)).bind(*call.args, **keywords)
 
 
 def test_public_names_are_few_and_each_there_once():

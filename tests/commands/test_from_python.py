@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+import logging
+import shutil
+from pathlib import Path
+
 import numpy as np
 import pytest
 from astropy import units
@@ -9,6 +14,7 @@ from astropy.table import QTable, Table
 from small_run import small_fit
 
 import walop_jax as walop
+from walop_jax.calibration import write_calibration
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
 
@@ -143,6 +149,30 @@ def test_certify_and_epoch(fitted):
     found = walop.epoch(fitted.run, fitted.calset)
     assert found.fits
     assert found.test < 1e-3 * found.directions  # the same data
+
+
+def test_calls_are_logged_and_silent_otherwise(fitted, caplog, capsys):
+    with caplog.at_level(logging.INFO, logger="walop_jax"):
+        walop.inspect(fitted.calset)
+    assert ("walop_jax", logging.INFO, f"reading {fitted.calset}") in caplog.record_tuples
+    assert capsys.readouterr() == ("", "")
+
+
+def test_data_that_have_moved_can_be_named(fitted, tmp_path, monkeypatch):
+    """A run without its data says so; other data are refused; the data under another name will do."""
+    monkeypatch.chdir(tmp_path)
+    Path("a").mkdir()
+    product = shutil.copy(fitted.run / "calibration.fits", "a")
+    held = walop.read(product)
+    lost = tuple(dataclasses.replace(entry, path=Path("lost.fits")) for entry in held.inputs)
+    write_calibration(product, dataclasses.replace(held, inputs=lost), overwrite=True)
+    with pytest.raises(walop.DataError, match=r"lost.fits: cannot be found.*--data FILE"):
+        walop.plot("a", "modulation")
+    moved = shutil.copy(fitted.calset, "moved.fits")
+    assert len(walop.plot("a", "modulation", data=[moved]).axes) == 2
+    walop.write_calibration_set("other.fits", dataclasses.replace(small_fit().calset, origin="elsewhere"))
+    with pytest.raises(walop.DataError, match="not the data of the fit"):
+        walop.plot("a", "modulation", data=["other.fits"])
 
 
 @pytest.mark.long

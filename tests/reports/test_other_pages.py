@@ -42,6 +42,23 @@ def test_page_of_an_epoch(tmp_path):
     page = Page(render_other(tmp_path, "epoch")[0])
     assert page.row("half1.wedge") == ["half1.wedge", "−0.23000", "−0.22890", "+5.2", "rad"]
     assert "The instrument has changed" in page.text
+    assert "half1 the half of the pupil behind HWP1" in page.text
+    assert "The change of the instrument matrix is not drawn" in page.text
+    assert not page.images
+
+
+def test_an_epoch_shows_what_has_changed_of_the_matrix(tmp_path):
+    for name in ("old", "new"):
+        (tmp_path / name).mkdir()
+        handmade_run.make_refit(tmp_path / name)
+    document = {
+        "fits": True, "p_value": 0.5, "moved": [], "star_errors": {"p": {"median": 0.0, "max": 0.0}},
+        "old_file": str(tmp_path / "old"), "old_date": "2026-01-01T20:00:00", "new_files": ["b.fits"],
+    }  # fmt: skip
+    (tmp_path / "new" / "epoch.json").write_text(json.dumps(document))
+    text, missing = render_other(tmp_path / "new", "epoch")
+    assert missing == ()
+    assert len(Page(text).images) == 1
 
 
 def test_an_epoch_whose_own_fit_is_not_trusted_says_so(tmp_path):

@@ -64,3 +64,13 @@ def test_the_edge_of_the_field_is_told():
     found = commissioning(small_fit(), accuracy(error=1.6 * FIELD))
     assert found.go
     assert any(text.startswith("0.075 %") and "walop-jax stack" in text for text in found.missing)
+
+
+def test_where_one_exposure_holds_no_u_more_light_is_no_cure():
+    """8 % of the field in the strip: the edge of the field is its matter, half of the field is not."""
+    found = commissioning(small_fit(), accuracy(error=1.6 * FIELD, without_u=0.08))
+    assert found.go
+    (told,) = [text for text in found.missing if text.startswith("0.075 %")]
+    assert "8 % of the field" in told
+    assert "plate at 22.5°" in told
+    assert "times the light" not in told

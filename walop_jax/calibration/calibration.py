@@ -106,6 +106,10 @@ class Calibration(Result):
     `fitted` is the model, a `ListedModel` where it was not rebuilt from its file (`rebuilt`). `listed` is how the file
     held a model that was rebuilt; `dataclasses.replace` forgets it, and maps and texts are made anew. Raises ValueError
     for shapes that do not belong together.
+
+    >>> m, covariance = walop.Calibration.from_fit(result).matrix(0.1, -0.05)
+    >>> m.shape, covariance.shape
+    ((6,), (6, 6))
     """
 
     fitted: Model | ListedModel

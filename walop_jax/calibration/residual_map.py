@@ -121,7 +121,10 @@ def _main_setting(
 
 
 def residual_map(result: FitResult) -> ResidualMap:
-    """The map of what a fit leaves: from the sums of its last pass, or by one more pass over the points."""
+    """The map of what a fit leaves: from the sums of its last pass, or by one more pass over the points.
+
+    >>> walop.residual_map(result).excess()["m21"]  # doctest: +SKIP
+    """
     if isinstance(result.posterior, PixelPosterior):
         return residual_map_of_pixels(result.posterior.sums)
     return residual_map_at(result.likelihood, result.values, result.posterior)

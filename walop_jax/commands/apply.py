@@ -54,6 +54,9 @@ def apply(
     Of a SURVEY (walop-jax stack) the calibration at the MJD of the stars is taken: those of one night in a catalogue.
 
     In Python: an astropy table; `catalogue` is a path, an astropy table, or columns by name.
+
+    >>> star = {"X": [0.1], "Y": [0.0], "N": [[51e4, 49e4, 50e4, 48e4]], "N_ERR": [[714.0, 700.0, 707.0, 693.0]]}
+    >>> walop.apply(result, star)["P", "P_ERR", "EVPA"]  # doctest: +SKIP
     """
     from walop_jax.data.catalogue import read_catalogue
     from walop_jax.data.user_tables import table_format

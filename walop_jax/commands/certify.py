@@ -60,6 +60,8 @@ def certify(job: Job, calibration: Product, effects: Effects = None) -> Outcome[
 
     In Python: a `Certificate`. Raises `DataError` for a file that cannot be read, has been changed, or is of another
     version.
+
+    >>> [check.name for check in walop.certify("RUN").failed]  # doctest: +SKIP
     """
     from walop_jax import Calibration, FitResult
     from walop_jax.calibration import product_path, read_calibration

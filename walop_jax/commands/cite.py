@@ -25,7 +25,11 @@ def cite(
     bibtex: Annotated[bool, Option("As BibTeX entries.")] = False,
     effects: Effects = None,
 ) -> Outcome[tuple[Reference, ...]]:
-    """List the sources of the physics in a fitted model, effects included."""
+    """List the sources of the physics in a fitted model, effects included.
+
+    >>> walop.cite(result)[1].what
+    'polariser'
+    """
     from walop_jax import Run, __version__
     from walop_jax.calibration import product_path
     from walop_jax.fit import minimise

@@ -46,6 +46,8 @@ def clip(
 
     In Python: the set (`calset`), the fit (`result`) and the number of `rows` that were flagged. Raises `DataError` for
     frames and for what was compressed, ValueError for `sigma` below 3.
+
+    >>> flagged = walop.clip("night.fits")  # doctest: +SKIP
     """
     from walop_jax.data.table_intensities import TableIntensities
     from walop_jax.data.write import write_calibration_set

@@ -35,6 +35,8 @@ def commission(
     RUN holds what refit leaves, and commissioning.json. Exit code 0 for a go, 3 for a no-go.
 
     In Python: a `Commissioning`.
+
+    >>> walop.commission("night.fits").missing  # doctest: +SKIP
     """
     from walop_jax.io.atomic import atomic_path
     from walop_jax.io.text import json_text

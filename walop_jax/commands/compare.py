@@ -55,6 +55,8 @@ def compare(
 
     In Python: a `Comparison`; `calibration` is the joint fit (default: made here). Raises ValueError if that does not
     converge, and for a `calibration` or `truth` in memory together with `output`.
+
+    >>> walop.compare("night.fits").document()["between"]  # doctest: +SKIP
     """
     from walop_jax import Calibration
     from walop_jax.data.catalogue import true_matrices

@@ -43,6 +43,8 @@ def compress(
 
     In Python: the set. Raises `DataError` for one that cannot be compressed, ValueError for a fit that does not
     converge.
+
+    >>> small = walop.compress("frames.fits")  # doctest: +SKIP
     """
     from walop_jax.data.write import write_calibration_set
     from walop_jax.diagnosis.trust import pixel_structure

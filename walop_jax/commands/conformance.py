@@ -86,6 +86,8 @@ def conformance(
     anything differs.
 
     In Python: the number of questions, or a `Conformance`.
+
+    >>> walop.conformance(make="pack")  # doctest: +SKIP
     """
     if (make is None) == (check is None):
         raise UsageError("give either --make FOLDER or --check FOLDER")

@@ -25,6 +25,8 @@ def demo(job: Job, *, output: Annotated[PathLike, FOLDER] = "walop-jax-demo") ->
     A simulated run of WALOP-South: the set is copied to FOLDER, the fit is FOLDER/RUN, its page FOLDER/RUN/report.html.
 
     In Python: the fit.
+
+    >>> walop.demo(output="there")  # doctest: +SKIP
     """
     from walop_jax.commands.report import report
 

@@ -44,6 +44,8 @@ def diagnose(
     `walop-jax report` draws its figures from RUN/diagnosis.fits.
 
     In Python: a `Diagnosis`; `effects=(*walop.EFFECTS, MyEffect)` adds one of your own to those that may be named.
+
+    >>> walop.diagnose("night.fits", progress=print).verdict  # doctest: +SKIP
     """
     from walop_jax import Calibration
     from walop_jax.calibration import PRODUCT, SUMMARY, summary, write_calibration

@@ -26,6 +26,9 @@ def docs(
     what it can be confused with.
 
     In Python: its text.
+
+    >>> print(walop.docs("conventions").splitlines()[0])
+    # Conventions
     """
     found = pages()
     if name is not None and topic not in SINGLE:

@@ -47,6 +47,8 @@ def epoch(
     to be trusted.
 
     In Python: an `Epoch`; what is missing is looked for only with `output`.
+
+    >>> walop.epoch("RUN", "new.fits").holds  # doctest: +SKIP
     """
     from walop_jax import Calibration
     from walop_jax.calibration import write_calibration

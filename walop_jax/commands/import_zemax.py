@@ -37,6 +37,8 @@ def import_zemax(
     Rows that lack a camera are left out, transmissions of 0 are flagged, with a warning in both cases.
 
     In Python: the set; its `remarks` say what was left out.
+
+    >>> design = walop.import_zemax("exports")  # doctest: +SKIP
     """
     from walop_jax.data import import_transmissions, write_calibration_set
     from walop_jax.instruments.description import shipped

@@ -82,6 +82,9 @@ def read(
 
     `kinds` are kinds of exposures beyond those of the format, `catalogue` the effects that a fitted model may have.
     Raises `DataError`, naming file, extension, column and row, for what cannot be read or trusted.
+
+    >>> walop.read("night.fits").instrument
+    'WALOP-SOUTH'
     """
     from walop_jax import Run
     from walop_jax.calibration import FAILED, PRODUCT, read_calibration

@@ -110,6 +110,9 @@ def inspect(
 
     In Python: an `InspectedSets`. Raises `DataError` only if the sets cannot be one: what is wrong with a single file
     is among its faults.
+
+    >>> walop.inspect("night.fits").faults
+    ()
     """
     from walop_jax import CalibrationSet
     from walop_jax.data import read_calibration_set

@@ -92,6 +92,10 @@ def instrument(
     In Python: a `CheckedInstrument`, whose `instrument` is the instrument; without a name, what each is, by name; with
     `text`, the description. Raises `DataError` for a description that is wrong, and for optics that are not finite or
     give more light than came in.
+
+    >>> print(walop.instrument("WALOP-SOUTH"))
+    WALOP-SOUTH: 4 cameras (O1, E1, O2, E2)
+    ...
     """
     from walop_jax.instruments.description import described, read_description, shipped
 

@@ -53,6 +53,8 @@ def limits(
 
     In Python: `DetectionLimits`, of a fit, an observing plan, or what `refit` takes; its `to_table()` is a row for each
     effect and parameter. Raises ValueError for a fit that does not converge.
+
+    >>> walop.limits("night.fits").protection_in_words()  # doctest: +SKIP
     """
     from walop_jax import FitResult, ObservingPlan
     from walop_jax.diagnosis.detection_limits import detection_limits

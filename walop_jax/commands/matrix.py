@@ -57,6 +57,10 @@ def matrix(
 
     In Python: an astropy table, for `x`, `y` (degrees or quantities) or for the table `points`: a path, an astropy
     table, columns by name. `columns` are others of those above, such as teff=5000.
+
+    >>> print(walop.matrix(result, x=0.1, y=-0.05))
+    field point X +0.100°, Y −0.050°
+      m21 0.0716... ± 0.000...
     """
     from walop_jax.data.catalogue import POINT_COLUMNS, field_points
     from walop_jax.data.user_tables import table_format

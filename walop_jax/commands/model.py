@@ -71,6 +71,8 @@ def model(
 
     In Python: a `ModelFile`, whose `model` is the model and `text` the file. Raises ValueError, with the nearest names,
     for an unknown instrument or effect, and for an instrument that is not the sets'.
+
+    >>> text = walop.model(instrument="WALOP-NORTH")  # doctest: +SKIP
     """
     from walop_jax.fit.model_file import effects_text, model_for, model_without_data, render
     from walop_jax.io.atomic import atomic_path

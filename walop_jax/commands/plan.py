@@ -81,6 +81,8 @@ def plan(
     RUN/plan.toml is the plan for `simulate` and `limits`, RUN/plan.json holds all numbers.
 
     In Python: the plan. Raises ValueError for a time that pays for nothing or determines nothing.
+
+    >>> walop.plan(walop.ObservingPlan(grid=3), minutes=20.0)  # doctest: +SKIP
     """
     from walop_jax.data.user_tables import read_input_table
     from walop_jax.plans.could import Could

@@ -45,6 +45,10 @@ def plot(
     without a name, what each figure shows, by name. `figsize` (inches) is its size; with `ax` it is drawn there (one of
     several panels in a subfigure that takes the room of these axes).
     Raises `DataError`, with the nearest names, for a figure that does not exist and for what the run lacks.
+
+    >>> walop.plot()["modulation"]
+    'q_m and u_m against polariser angle'
+    >>> figure = walop.plot(result, "modulation", x=0.1, y=0.0)
     """
     from walop_jax import Run
     from walop_jax.io.atomic import check_output

@@ -67,6 +67,10 @@ def refit(
 
     In Python: the fit. Without `output`, finished slabs are kept in `folder` (default: nowhere), and the same call
     goes on from them. Raises `DataError` for data that cannot be trusted, ValueError for a model that does not fit.
+
+    >>> result = walop.refit(calset)  # doctest: +SKIP
+    >>> result["pupil.magnification"]
+    15.6675 ± 0.0051
     """
     from walop_jax import Calibration
     from walop_jax.calibration import FAILED, PARTIAL, PRODUCT, SUMMARY, summary, write_calibration

@@ -57,6 +57,8 @@ def report(
     that name is left alone unless --overwrite is given.
 
     In Python: a `Page`; of a fit in memory, which needs an `output`.
+
+    >>> walop.report(result, "page.html")  # doctest: +SKIP
     """
     from walop_jax import FitResult, Run
     from walop_jax.io.atomic import atomic_path, check_output

@@ -53,6 +53,8 @@ def sample(
     In Python: a `PosteriorSample`, of a fit in memory or of a run, which is then written. `parameters` names what is
     sampled (None: the physics coefficients); other keywords are the fields of `walop.Options`. Raises `DataError` if
     the run is no folder of a fit, holds a posterior already, or does not fit its data any more.
+
+    >>> walop.sample(result, seed=1).to_arviz()  # doctest: +SKIP
     """
     from walop_jax import FitResult, Options, Run
     from walop_jax.posterior import sample as sample_fit

@@ -45,6 +45,8 @@ def stack(
     nights.
 
     In Python: a `Survey`; nights may be fits and sets in memory, `laws` a mapping of names to [law] tables.
+
+    >>> walop.stack(["night1.fits", "night2.fits"]).trusted  # doctest: +SKIP
     """
     from walop_jax.calibration import PARTIAL
     from walop_jax.nights.stacking import FILES, writers

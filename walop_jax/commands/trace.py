@@ -71,6 +71,8 @@ def trace(
 
     In Python: the stages. Angles of moving elements are keywords, chwp=45, or `at`. Raises ValueError, with the nearest
     names, for an unknown instrument, filter or moving element.
+
+    >>> print(walop.trace(result, x=0.1, y=0.0, q=0.05))  # doctest: +SKIP
     """
     from walop_jax import Settings
     from walop_jax.data.settings import builtin_filter

@@ -38,6 +38,8 @@ def watch(
     Exit code 0 only where the calibration still holds, 3 where it does not.
 
     In Python: a `Watch`; `catalogues` is a path, an astropy table, columns by name, or several of them in a list.
+
+    >>> walop.watch("RUN", ["night1.fits", "night2.fits"])  # doctest: +SKIP
     """
     from walop_jax.data.catalogue import read_catalogue
     from walop_jax.io.errors import errors_naming

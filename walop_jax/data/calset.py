@@ -316,6 +316,12 @@ def from_arrays(
     curves by name. Quantities are converted.
 
     Raises `DataError`, naming column and row, for whatever a file would be refused for.
+
+    >>> angles = [0.0, 30.0, 60.0, 90.0]
+    >>> counts = 1e5 * (1 + np.random.default_rng(1).random((2, 4, 4)))  # 2 field points, 4 exposures, 4 cameras
+    >>> made = walop.from_arrays(counts, np.sqrt(counts), x=[0.0, 0.1], y=[0.0, 0.0], angles=angles)
+    >>> made.exposures.clp_angle
+    array([ 0., 30., 60., 90.])
     """
     counts, errors = in_unit(counts, "electron", "counts"), in_unit(errors, "electron", "errors")
     x, y, angles = (np.atleast_1d(in_unit(v, "deg", n)) for v, n in ((x, "x"), (y, "y"), (angles, "angles")))

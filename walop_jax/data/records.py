@@ -253,6 +253,9 @@ class CalibrationSet(Displayed):
 
     `intensities` gives the data of a slice of the points; whole frames are read from disk only then. `compression` is
     there where the field points stand for the pixels of frames.
+
+    >>> calset.instrument, len(calset.exposures), len(calset.points)
+    ('WALOP-SOUTH', 14, 29)
     """
 
     instrument: str

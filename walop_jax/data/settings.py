@@ -66,6 +66,9 @@ class Settings:
     Filter name; colour temperature of the source (K; NaN: flat photon spectrum); temperature of the instrument
     (Celsius); hour angle (h); `positions` of the moving elements behind the polariser by column prefix (deg; NaN: out).
     An element that is not there is out. Raises ValueError for columns of different lengths.
+
+    >>> walop.Settings.default(2).at(CHWP=22.5).positions
+    {'CHWP': array([22.5, 22.5])}
     """
 
     filter: Shaped[np.ndarray, " n"]

@@ -111,6 +111,8 @@ def write_calibration_set(
 
     Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only,
     for fewer than two cameras, and if a name cannot be written in FITS (ASCII only).
+
+    >>> walop.write_calibration_set("copy.fits", calset)
     """
     with atomic_path(path, overwrite=overwrite) as temporary:
         sign_and_write(_hdus(calset, set_tables(calset), path), temporary)

@@ -55,6 +55,10 @@ class FitResult(Result):
     `errors_from` is what the covariance was made from, the stated errors of the data (`STATED`) or residuals; `hidden`
     are mistakes that the residuals would not show, None until these were examined. `answer` works out how well stars
     are known with it (`science.field_accuracy.answered`), which is shown first.
+
+    >>> result.value("pupil.magnification")[0].__round__(2)
+    15.67
+    >>> table = result.to_table()
     """
 
     likelihood: Likelihood

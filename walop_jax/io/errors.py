@@ -16,7 +16,13 @@ _SHOWN = 5
 
 
 class DataError(ValueError):
-    """An input cannot be trusted; the message says what is wrong, where, and what to do about it."""
+    """An input cannot be trusted; the message says what is wrong, where, and what to do about it.
+
+    >>> walop.read("nowhere.fits")
+    Traceback (most recent call last):
+        ...
+    walop_jax.io.errors.DataError: nowhere.fits: there is no such file; check the name
+    """
 
 
 def fail(

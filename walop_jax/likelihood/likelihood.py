@@ -155,6 +155,10 @@ class Likelihood:
     (`likelihood/layout.py`), several of them at a time (`likelihood/runner.py`). Where `layout` says so, `expand`
     and `residuals` solve the optics on Chebyshev nodes only (`likelihood/field_table.py`). Immutable: what a pass
     finds out beside its sums comes back with them (`Posterior`).
+
+    >>> values, residual = result.likelihood.residuals(result.values)
+    >>> residual.shape  # point, exposure, camera
+    (29, 14, 4)
     """
 
     layout: Layout

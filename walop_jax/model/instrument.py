@@ -91,6 +91,9 @@ class Instrument(Component):
     coordinates reach to ±`field_limit` (deg); `site` is telescope, latitude and longitude (deg, east positive),
     elevation (m) and MJD of a full Moon, `raster` how the points of a simulated run lie, and how far out (deg).
     `description` is the text it was described in, empty for an instrument that comes with the package.
+
+    >>> walop.Instrument.read("WALOP-NORTH").cameras.names
+    ('O1', 'E1', 'O2', 'E2')
     """
 
     name: str = eqx.field(static=True)

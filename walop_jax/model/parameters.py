@@ -102,7 +102,10 @@ def param(
     loose: float | None = None,
     default: float | None = None,
 ) -> Any:
-    """Declare a parameter of an Equinox module; values become float64 arrays."""
+    """Declare a parameter of an Equinox module; values become float64 arrays.
+
+    >>> gain = walop.param(unit="", about="gain of the camera", source="measured", width=0.01)
+    """
     prior = None if width is None else (0.0, width)
     declared = Parameter("", unit, about, source, prior=prior, scale=scale or 0.0, loose=loose)
     extra: dict[str, Any] = {} if default is None else {"default": default}

@@ -32,6 +32,10 @@ class Model:
 
     `catalogue` are the effects that it may be given by name, `laws` how parameters may change from night to night: the
     [law] tables of a model file (`model.laws`), which a fit of one set does not need.
+
+    >>> model = walop.base_model(calset)
+    >>> model.names[:2]
+    ('sky.depolarisation', 'standard.STD00.q')
     """
 
     name: str
@@ -179,6 +183,10 @@ def with_effects(model: Model, effects: Sequence[str | type[Effect] | Effect], c
     A name or a class adds the effect at its neutral value, at the shape of its first probe; an instance starts where it
     stands. Priors are centred on neutral, with the widths of the declarations. Raises ValueError for a name
     that does not exist and for an effect that is there already.
+
+    >>> context = walop.ObservingPlan(grid=3).context()
+    >>> walop.with_effects(walop.base_model(calset), ["hwp1_axis"], context).effect_names
+    ('hwp1_axis',)
     """
     active = list(model.template.effects)
     starts = {}

@@ -309,6 +309,9 @@ class Run(Result):
 
     `catalogue` are the effects that its model may have, `data` the sets of its fit (default: where they were, in the
     folder of the run, or beside it).
+
+    >>> walop.read("RUN")["pupil.magnification"]
+    15.6675 ± 0.0051
     """
 
     folder: Path

@@ -173,6 +173,9 @@ class Options:
     sampled (None: the physics coefficients); samplers of the exact posterior sample all and show these in figures.
     Every `thin`-th step is stored (0: as is usual for the sampler). `checks` is the number of draws compared with the
     exact posterior. Raises ValueError for what makes no sense.
+
+    >>> walop.Options(walkers=128).sampler
+    'emcee'
     """
 
     sampler: str | Sampler | type[Sampler] = "emcee"

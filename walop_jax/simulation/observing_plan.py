@@ -118,6 +118,9 @@ class ObservingPlan:
 
     A plan may also say each exposure: `stops` in place of all combinations, in order; `patches` and `stars` are the
     numbers, from 0, of the Moon patches and standards that are taken after them (None: each once, unless stops say).
+
+    >>> walop.ObservingPlan(grid=4)
+    ObservingPlan('WALOP-SOUTH', grid=4, field=0.29, moving={})
     """
 
     instrument: str | Instrument | None = None

@@ -12,7 +12,11 @@ from walop_jax.model.parameters import unknown_name
 
 
 def effect_by_name(name: str, catalogue: Sequence[type[Effect]] = EFFECTS) -> type[Effect]:
-    """The effect of a catalogue by its name; ValueError with the nearest names when there is none."""
+    """The effect of a catalogue by its name; ValueError with the nearest names when there is none.
+
+    >>> walop.effect_by_name("hwp1_axis").__doc__
+    'Fast axis of HWP1 turned.'
+    """
     for effect in (*catalogue, Described, FreeForm, OtherDescription):
         if effect.name == name:
             return effect

@@ -52,6 +52,9 @@ class Effect(Patch):
     are fitted together and that `combine` turns into one effect. `one_sided` names amplitudes that physics
     keeps above neutral; `over_field` says that only a number of field points can show it; `reference` says where
     the effect is known from; `said` are the changes that it is (`change`), none where no change holds it.
+
+    >>> walop.effect_by_name("hwp1_axis").__mro__[1] is not object
+    True
     """
 
     shape: ClassVar[tuple[str, ...]] = ()

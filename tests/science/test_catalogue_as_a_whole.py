@@ -1,0 +1,160 @@
+"""What all stars of a catalogue say together, and what structure and hidden mistakes add to their errors."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+
+import numpy as np
+import pytest
+from astropy.table import Table
+from star_tables import read, stars
+
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.fit.verdict import Hidden, Quality, Structure
+from walop_jax.science import apply as application
+from walop_jax.science.apply import apply
+
+pytestmark = pytest.mark.usefixtures("tabulated_once")
+
+
+def noisy(vectors, tmp_path, seed=5, count=600, **options):
+    return stars(vectors, count, np.random.default_rng(seed), teff=5500.0, **options)
+
+
+def pulls(found, qu):
+    """Root mean square of q and u off, in stated errors."""
+    return np.sqrt(np.mean((found.qu - qu) ** 2 / np.einsum("sii->si", found.covariance), axis=0))
+
+
+@pytest.mark.parametrize(("factor", "words"), [(0.1, "times too small"), (5.0, "times too large")])
+def test_errors_that_are_not_those_of_the_counts_are_said_and_mended(
+    vectors, calibration, tmp_path, factor, words
+):
+    table, qu = noisy(vectors, tmp_path)
+    table["N_ERR"] *= factor
+    found = apply(calibration, read(table, tmp_path))
+    assert any(
+        f"N_ERR is {1 / factor if factor < 1 else factor:.2g}"[:8] in w and words in w
+        for w in found.check.warnings()
+    )
+    np.testing.assert_allclose(pulls(found, qu), 1.0, atol=0.12)
+    assert np.all(found.flag & Quality.CATALOGUE)
+
+
+def test_quiet_catalogues_say_nothing(vectors, calibration, tmp_path):
+    """Noise alone, bright stars with the error of the calibration, stars without TEFF, and thirty variable ones."""
+    table, _ = noisy(vectors, tmp_path)
+    quiet = apply(calibration, read(table, tmp_path))
+    assert quiet.check.holds
+    assert not np.any(quiet.flag & Quality.CATALOGUE)
+    assert 2e-4 < quiet.check.smallest < 2e-3
+    table["N"][:30, 0] *= 1.0 + 0.2 * np.random.default_rng(1).standard_normal(30)
+    assert apply(calibration, read(table, tmp_path)).check.holds
+    del table["TEFF"]
+    assert apply(calibration, read(table, tmp_path)).check.holds
+    values = calibration.values + np.linalg.cholesky(
+        calibration.covariance + 1e-24 * np.eye(len(calibration.values))
+    ) @ np.random.default_rng(3).standard_normal(len(calibration.values))
+    truth = AnalysisVectors(dataclasses.replace(calibration, values=values))
+    bright, _ = stars(truth, 400, np.random.default_rng(2), flux=4e8, plate=(None, 22.5))
+    assert apply(calibration, read(bright, tmp_path)).check.holds
+
+
+@pytest.mark.parametrize("camera", range(4))
+@pytest.mark.parametrize("gain", [0.01, 0.003])
+def test_a_camera_that_has_become_brighter_is_said(vectors, calibration, tmp_path, camera, gain):
+    """With its size, among the cameras that such rows cannot tell apart; errors hold what it does to q and u."""
+    table, qu = noisy(vectors, tmp_path, seed=camera)
+    table["N"][:, camera] *= 1.0 + gain
+    found = apply(calibration, read(table, tmp_path))
+    (change,) = found.check.changes
+    named = {entry.question.camera: entry for entry in change.alike if entry.question.kind == "gain"}
+    assert named[camera].size == pytest.approx(gain, abs=4 * named[camera].error)
+    assert np.all(pulls(found, qu) < 1.3)
+    # Before, every q or u was off by nine (three) stated errors.
+    assert np.any(pulls(dataclasses.replace(found, changed=0.0 * found.changed), qu) > 1.5)
+
+
+def test_two_settings_of_the_plate_name_the_camera(vectors, calibration, tmp_path):
+    table, _ = noisy(vectors, tmp_path, plate=(None, 22.5))
+    table["N"][:, 1] *= 1.02
+    (change,) = apply(calibration, read(table, tmp_path)).check.changes
+    assert change.cameras == ("E1",)
+    assert "E1 brighter by 2.0" in change.words() or "E1 brighter by 1.9" in change.words()
+
+
+def test_rows_that_are_there_four_times_are_said(vectors, calibration, tmp_path):
+    table, qu = noisy(vectors, tmp_path)
+    fourfold = Table({name: np.concatenate([table[name]] * 4) for name in table.colnames})
+    found = apply(calibration, read(fourfold, tmp_path))
+    (sentence,) = found.check.warnings()
+    assert "the rows of a star agree more than independent rows do" in sentence
+    np.testing.assert_allclose(pulls(found, qu), 1.0, atol=0.15)
+
+
+def test_what_grows_with_time_along_the_field_or_with_light(vectors, calibration, tmp_path):
+    table, _ = noisy(vectors, tmp_path, count=2000)
+    time = np.random.default_rng(0).uniform(60000.0, 60010.0, len(table))
+    clean = table["N"].copy()
+    table["MJD"] = time
+    for kind, factor in (
+        ("time", 0.004 * (time - 60005.0) / 5.0),
+        ("x", 0.004 * table["X"] / 0.28),
+        ("flux", 0.006 * clean[:, 2] / 1e6),
+    ):
+        table["N"] = clean
+        table["N"][:, 2] *= 1.0 + np.asarray(factor)
+        (change,) = apply(calibration, read(table, tmp_path)).check.changes
+        assert kind in {entry.question.kind for entry in change.alike}
+    table["N"] = clean
+    table["N"][:, 2] += 5000.0
+    (change,) = apply(calibration, read(table, tmp_path)).check.changes
+    assert "light" in {entry.question.kind for entry in change.alike}
+
+
+def test_errors_hold_the_structure_of_field_points(vectors, calibration, tmp_path, monkeypatch):
+    """Gains of 0.2 % that every star has for itself: (q, u) scatter by what the structure of the verdict adds."""
+    table, truth = stars(vectors, 600, flux=4e9)
+    table["N"] *= 1.0 + 2e-3 * np.random.default_rng(6).standard_normal(table["N"].shape)
+    verdict = dataclasses.replace(calibration.verdict, structure=Structure(gain=2e-3))
+    rough = copy.copy(vectors)
+    rough.calibration = dataclasses.replace(calibration, verdict=verdict)
+    monkeypatch.setattr(application, "AnalysisVectors", lambda _: rough)
+    found = apply(rough.calibration, read(table, tmp_path))
+    good = np.isfinite(found.qu).all(axis=1) & (found.flag & Quality.HIGH_CROSSTALK == 0)
+    added = found.calibration[good] - apply_plain(vectors, calibration, table, tmp_path, monkeypatch)[good]
+    pull = (found.qu - truth)[good] / np.sqrt(np.einsum("sii->si", added))
+    assert np.sqrt(np.mean(pull**2, axis=0)) == pytest.approx([1.0, 1.0], abs=0.1)
+
+
+def apply_plain(vectors, calibration, table, tmp_path, monkeypatch):
+    """Covariance from the calibration alone, without any structure."""
+    monkeypatch.setattr(application, "AnalysisVectors", lambda _: vectors)
+    return apply(calibration, read(table, tmp_path)).calibration
+
+
+def test_structure_and_hidden_mistakes_of_the_calibration_reach_the_stars(vectors, calibration, tmp_path):
+    """Gains of field points, 2·10⁻³ in every camera: pulls of unit width. What could hide is what it does to a star."""
+    rng = np.random.default_rng(4)
+    table, qu = stars(vectors, 600, plate=(None, 22.5), flux=4e9)
+    gains = np.tile(1.0 + 2e-3 * rng.standard_normal((600, 4)), (2, 1))
+    table["N"] = np.asarray(table["N"]) * gains
+    verdict = dataclasses.replace(calibration.verdict, structure=Structure(gain=2e-3))
+    change = np.zeros((2, len(calibration.values)))
+    index = calibration.model.index("half2.efficiency")
+    change[1, index] = 1e-3
+    hidden = Hidden(("nothing", "efficiency"), (1.0, 1.0), ("", ""), change)
+    known = dataclasses.replace(calibration, verdict=verdict, hidden=hidden)
+    found = apply(known, read(table, tmp_path))
+    assert found.check.holds
+    pull = (found.qu - qu) / np.sqrt(np.einsum("sii->si", found.covariance))
+    assert np.mean(np.abs(pull) < 1.0) == pytest.approx(0.683, abs=0.04)
+    assert np.mean(np.abs(pull) < 1.96) == pytest.approx(0.954, abs=0.02)
+    values = calibration.values.copy()
+    values[index] += 1e-3
+    clean, _ = stars(vectors, 30)
+    other = apply(dataclasses.replace(calibration, values=values), read(clean, tmp_path))
+    plain = apply(known, read(clean, tmp_path))
+    np.testing.assert_allclose(plain.hidden, np.abs(other.qu - plain.qu), rtol=0.02, atol=1e-6)
+    assert np.isnan(apply(calibration, read(clean, tmp_path)).hidden).all()
