@@ -10,7 +10,7 @@ import datetime
 import functools
 import hashlib
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,13 +20,15 @@ from jaxtyping import Bool, Float, Int
 from walop_jax.calibration.matrix import (
     MatrixMaps,
     ResidualMap,
-    change_of_qu,
+    hidden_errors,
     matrices,
     matrix_draws,
     matrix_names,
     matrix_slopes,
     p_errors,
     sample_stars,
+    sky_vectors,
+    slopes_over_field,
 )
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import CALIBRATION_PLATE, Exposures, FilterCurve, InputFile, Site, Sources
@@ -53,10 +55,12 @@ from walop_jax.io.code import software_versions
 from walop_jax.io.display import Display, Result
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.text import in_ascii
+from walop_jax.model import light
 from walop_jax.model.dependence import left_behind, needs
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.instrument import Instrument, adapted, build, nominal_instrument
 from walop_jax.model.parameters import Parameter
+from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import Model, effect_context
 
 Vector = Float[np.ndarray, " n"]
@@ -64,6 +68,10 @@ Matrix = Float[np.ndarray, "n n"]
 Columns = dict[str, tuple[np.ndarray, str]]  # values, description
 
 MAP_SIZE = 31  # pixels along each axis of the maps: 0.02° over ±0.3°
+MAP_NODES, MAP_ERRORS = (
+    (18, 24, 30),
+    1e-6,
+)  # nodes per side for the standard errors in the maps, and their error
 HIGH_CROSSTALK = 10.0  # condition number of the local 2 × 2 inverse
 TEMPERATURE_MARGIN = 2.0  # K beyond the temperatures of the exposures
 
@@ -342,16 +350,34 @@ class Calibration(Result):
         For stars polarised by up to 5 %, in one setting (default: the usual one); NaN where u is hardly measured, and
         where nobody asked.
         """
-        if self.hidden is None or not len(self.hidden):
-            return np.full(len(x), np.nan if self.hidden is None else 0.0), ""
+        if self.hidden is None:
+            return np.full(len(x), np.nan), ""
         settings = self.usual_settings() if settings is None else settings
         filters = {str(settings.filter[0]): self.filter_curve(str(settings.filter[0]))}
-        matrix, slopes = matrix_slopes(self.model.instrument(self.values), settings, filters, x, y)
-        errors = np.array([change_of_qu(matrix, matrix + slopes @ change) for change in self.hidden.changes])
-        worst = int(np.argmax(np.nan_to_num(errors).max(axis=1)))
-        return np.where(
-            np.isnan(errors).all(axis=0), np.nan, np.nan_to_num(errors).max(axis=0)
-        ), self.hidden.names[worst]
+        return hidden_errors(
+            self.hidden, *matrix_slopes(self.model.instrument(self.values), settings, filters, x, y)
+        )
+
+    def over_field(
+        self,
+        x: Float[np.ndarray, " p"],
+        y: Float[np.ndarray, " p"],
+        settings: Settings,
+        counts: Sequence[int],
+        tolerance: float,
+    ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"], Float[np.ndarray, "p m n"]]:
+        """Matrix, covariance and derivatives at many field positions (deg), interpolated (`slopes_over_field`).
+
+        In one setting, a row of `settings`; from the covariance of the parameters, draws left aside.
+        """
+        name = str(settings.filter[0])
+        matrix, slopes = slopes_over_field(
+            self.model.instrument(self.values), settings, {name: self.filter_curve(name)}, x, y,
+            self.covariance, counts, tolerance,
+        )  # fmt: skip
+        matrix, slopes = matrix.reshape(len(x), -1), slopes.reshape(len(x), matrix[0].size, -1)
+        covariance = slopes @ self.covariance @ np.swapaxes(slopes, 1, 2)
+        return matrix, covariance + self._of_structure(matrix), slopes
 
     def _of_structure(self, values: Float[np.ndarray, "p m"]) -> Float[np.ndarray, "p m m"]:
         """Contribution of the structure of field points to the covariance of the matrix at a place.
@@ -447,11 +473,22 @@ class Calibration(Result):
         grid = Grid(size, size, (centre, centre), (0.0, 0.0), ((step, 0.0), (0.0, step)))
         points = grid.points
         settings = self.usual_settings(size * size, name)
-        values, covariance = self._elements(points.x, points.y, settings)
+        if self.draws is not None:
+            values, covariance = self._elements(points.x, points.y, settings)
+        else:
+            instrument, curves = self.model.instrument(self.values), {name: self.filter_curve(name)}
+            plan = plan_for_settings(instrument, settings[:1], curves)
+            vectors = sky_vectors(instrument, plan, points.x, points.y)[:, 0]
+            values = np.asarray(light.instrument_matrix(vectors, instrument.cameras.pairs))
+            _, covariance, _ = self.over_field(points.x, points.y, settings[:1], MAP_NODES, MAP_ERRORS)
         errors = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
         planes = (-1, size, size)
         return MatrixMaps(
-            grid, name, values.T.reshape(planes), errors.T.reshape(planes), settings[:1].further()
+            grid,
+            name,
+            values.reshape(size * size, -1).T.reshape(planes),
+            errors.T.reshape(planes),
+            settings[:1].further(),
         )
 
     @functools.cached_property

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -25,10 +25,12 @@ from walop_jax.data.frames import Grid
 from walop_jax.data.records import CalibrationSet, FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
+from walop_jax.fit.verdict import Hidden
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.field_table import linearised, rows_and_slopes, to_all
+from walop_jax.likelihood.field_table import accurate_table, linearised, rows_and_slopes, to_all
 from walop_jax.likelihood.runner import usual_threads
 from walop_jax.model import light
+from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import array, compiled
 from walop_jax.model.effects.base import Effect, with_amplitudes
 from walop_jax.model.instrument import Instrument
@@ -293,6 +295,54 @@ def matrix_slopes(
     values, slopes = in_chunks(lambda *columns: _slopes(instrument, plan, *columns), x, y, *numbers)
     arms = (len(x), values.shape[1] // 3, 3)
     return values.reshape(arms), slopes.reshape(*arms, slopes.shape[-1])
+
+
+def slopes_over_field(
+    instrument: Instrument,
+    setting: Settings,
+    filters: Mapping[str, FilterCurve],
+    x: Vector,
+    y: Vector,
+    covariance: Float[np.ndarray, "n n"],
+    counts: Sequence[int],
+    tolerance: float,
+) -> tuple[Float[np.ndarray, "p a 3"], Float[np.ndarray, "p a 3 n"]]:
+    """`matrix_slopes` at many positions, interpolated where the optics are smooth.
+
+    `counts` of nodes per side are tried in turn, until standard errors are right to `tolerance` (relative) wherever
+    that is checked (`field_table.held_out`).
+    """
+
+    def exact(x: Vector, y: Vector) -> tuple[np.ndarray, np.ndarray]:
+        return matrix_slopes(instrument, setting, filters, x, y)
+
+    def error(found: tuple[np.ndarray, np.ndarray], truth: tuple[np.ndarray, np.ndarray]) -> float:
+        ours, theirs = (
+            np.sqrt(np.sum(slopes @ covariance * slopes, axis=-1)) for _, slopes in (found, truth)
+        )
+        return float(np.max(np.abs(ours - theirs) / np.where(theirs > 0, theirs, 1.0)))
+
+    corners = Rectangle(np.array([x.min(), y.min()]), np.array([x.max(), y.max()]))
+    table = None
+    if len(x) > counts[0] ** 2 and np.all(corners.high > corners.low):
+        table, off = accurate_table(exact, corners, counts, tolerance, error)
+        table = table if off <= tolerance else None
+    return exact(x, y) if table is None else table(x, y)
+
+
+def hidden_errors(
+    hidden: Hidden, matrix: Float[np.ndarray, "p a 3"], slopes: Float[np.ndarray, "p a 3 n"]
+) -> tuple[Float[np.ndarray, " p"], str]:
+    """Largest error of q and u that a mistake which would not have been found makes, and which is the worst.
+
+    NaN where u is hardly measured.
+    """
+    if not len(hidden):
+        return np.zeros(len(matrix)), ""
+    errors = np.array([change_of_qu(matrix, matrix + slopes @ change) for change in hidden.changes])
+    known = np.nan_to_num(errors)
+    largest = np.where(np.isnan(errors).all(axis=0), np.nan, known.max(axis=0))
+    return largest, hidden.names[int(np.argmax(known.max(axis=1)))]
 
 
 def change_of_qu(

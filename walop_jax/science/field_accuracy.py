@@ -17,12 +17,11 @@ from jaxtyping import Float
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import (
     SMALLEST_DETERMINANT,
-    matrix_slopes,
+    hidden_errors,
     p_errors,
     p_forms,
     sample_stars,
 )
-from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import two_digits
 from walop_jax.science.star_errors import GOAL
@@ -30,6 +29,8 @@ from walop_jax.science.star_errors import GOAL
 SIZE = 21  # points along each axis of the map
 COARSE = 8  # the same where the question is what limits it
 FEW_STARS = 20
+NODES = (10, 14, 20, 28)
+TOLERANCE = 1e-2  # relative, of errors that are told with two digits
 
 GROUPS = {
     "throughput": "the relative throughput of the cameras",
@@ -122,18 +123,24 @@ def field_accuracy(calibration: Calibration, size: int = SIZE) -> FieldAccuracy 
     settings = calibration.usual_settings()
     if str(settings.filter[0]) not in used:
         settings = calibration.usual_settings(filter_name=used[0])
-    x, y = _grid(calibration, size)
-    matrix, covariance = calibration.matrix(x, y, settings)
-    error = p_errors(matrix, covariance, sample_stars()).reshape(size, size)
-    determinant = np.abs(matrix[:, 1] * matrix[:, 5] - matrix[:, 2] * matrix[:, 4])
-    x, y = _grid(calibration, COARSE)
-    hidden, worst = calibration.protection(x, y, settings)
+    fine, coarse = _grid(calibration, size), _grid(calibration, COARSE)
+    x, y = np.concatenate([fine, coarse], axis=1)
+    matrix, covariance, slopes = calibration.over_field(x, y, settings, NODES, TOLERANCE)
+    error = p_errors(matrix[: size**2], covariance[: size**2], sample_stars()).reshape(size, size)
+    determinant = np.abs(np.linalg.det(matrix.reshape(-1, 2, 3)[: size**2, :, 1:]))
+    matrix, slopes = matrix[size**2 :], slopes[size**2 :]
+    arms = (len(matrix), 2, 3)
+    hidden, worst = np.full(len(matrix), np.nan), ""
+    if calibration.hidden is not None:
+        hidden, worst = hidden_errors(
+            calibration.hidden, matrix.reshape(arms), slopes.reshape(*arms, slopes.shape[2])
+        )
     known = hidden[np.isfinite(hidden)]
     return FieldAccuracy(
         error,
         calibration.field,
         str(settings.filter[0]),
-        limited_by=_limited_by(calibration, settings, x, y),
+        limited_by=_limited_by(calibration, matrix, slopes),
         hidden=float(np.median(known)) if known.size else np.nan,
         hidden_by=_with_size(calibration, worst),
         trusted=calibration.verdict.trusted,
@@ -150,21 +157,17 @@ def _with_size(calibration: Calibration, name: str) -> str:
     return f"{name} (wrong by {hidden.sizes[at]:.2g} {hidden.units[at]}".rstrip() + ")"
 
 
-def _grid(calibration: Calibration, size: int) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+def _grid(calibration: Calibration, size: int) -> Float[np.ndarray, "2 p"]:
     low_x, high_x, low_y, high_y = calibration.field
     x, y = np.meshgrid(np.linspace(low_x, high_x, size), np.linspace(low_y, high_y, size))
-    return x.ravel(), y.ravel()
+    return np.stack([x.ravel(), y.ravel()])
 
 
 def _limited_by(
-    calibration: Calibration, settings: Settings, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]
+    calibration: Calibration, matrix: Float[np.ndarray, "p 6"], slopes: Float[np.ndarray, "p 6 n"]
 ) -> str:
     """The group of parameters with most of the variance of p, in the median of the field, in words."""
-    name = str(settings.filter[0])
-    curves = {name: calibration.filter_curve(name)}
-    instrument = calibration.model.instrument(calibration.values)
-    matrix, slopes = matrix_slopes(instrument, settings, curves, x, y)
-    form = p_forms(matrix.reshape(len(x), 6), sample_stars(FEW_STARS)) @ slopes.reshape(len(x), 6, -1)
+    form = p_forms(matrix, sample_stars(FEW_STARS)) @ slopes
     covariance = calibration.covariance
     seen = form @ covariance
     total = np.mean(np.sum(seen * form, axis=-1), axis=1)
