@@ -57,7 +57,7 @@ def test_the_promise_is_the_error_of_a_fit(small, field):
     calibration = Calibration.from_fit(examined(refit(calset, base_model(calset, throughput_degree=2))))
     families = small.families
     places = np.deg2rad(2 * np.array(angles))[:, None]
-    total = small.prior + np.tensordot(families[0].coefficients(places).sum(axis=0), families[0].basis[0], 1)
+    total = small.prior + families[0].information(places)[0].sum(axis=0)
     total += families[1].basis[0, [0, 2]].sum(axis=0)
     # The raster of the candidates has at most 3 × 3 places, that of this plan 2 × 2: nothing is scaled.
     total += families[2].basis[0, [1, 1, 0]].sum(axis=0)
@@ -155,10 +155,43 @@ def test_changes_take_time_from_the_plan(small, field):
     assert second.value >= first.bound
 
 
-@pytest.mark.long
-def test_a_series_of_all_angles_is_the_information_between_them():
-    plan = dataclasses.replace(SMALL, grid=6)
-    assert candidates(Could(plan), draws=1).truncation < 1e-3
+@pytest.fixture(scope="module")
+def turning():
+    """The calibration plate may stand at any angle, the Moon and standards are left out."""
+    return candidates(
+        Could(dataclasses.replace(SMALL, moon_patches=0, standards=0, unpolarised=0), any_plate=True), draws=1
+    )
+
+
+def test_no_angle_of_polariser_and_plate_gains_more_than_the_bound(turning):
+    """Exposures on a dense grid around the best, and at random, each by its own derivatives."""
+    assert turning.truncation < 1e-3
+    (_, family), rng = turning.families, np.random.default_rng(2)
+    start = family.information(family.spread())[0].sum(axis=0) + turning.prior
+    g = np.linalg.pinv(start, rcond=1e-13, hermitian=True)[None]
+    places, bound = family.best(g, 3)
+    around = 0.05 * np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, 21)]), axis=2).reshape(-1, 2)
+    tried = np.concatenate([*(place + around for place in places), 2 * np.pi * rng.random((2000, 2))])
+    gains = np.einsum("sab,ba->s", family.information(tried)[0], g[0]) / family.cost
+    assert gains.max() <= bound <= 1.002 * gains.max()
+    there = np.einsum("sab,ba->s", family.information(places)[0], g[0]) / family.cost
+    assert there.max() >= gains.max() * (1 - 1e-4)
+
+
+def test_the_plate_at_an_angle_is_that_plate(turning):
+    """The information with the plate free is that of exposures with it at 33° from the start."""
+    listed = candidates(Could(dataclasses.replace(turning.could.plan, plate=(33.0,))), draws=1)
+    choice, angles = turning.choices[1], (0.0, 20.0, 77.0)
+    places = np.array([choice.place(angle, 33.0) for angle in angles])
+    assert choice.stop(places[1]).polariser_angle == pytest.approx(20.0)
+    assert choice.stop(places[1]).plate == pytest.approx(33.0)
+    there = np.array([listed.choices[0].place(angle) for angle in angles])
+    expected = listed.families[0].information(there)
+    for found in (
+        turning.families[1].information(places),
+        turning.with_plate([33.0]).families[1].information(there),
+    ):
+        np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
 
 
 def test_stars_of_a_table_have_the_errors_of_their_own_p(small):

@@ -79,7 +79,7 @@ def own() -> str:
     return str(path)
 
 
-def stops_of(found: Candidates, weights: dict[tuple[int, float], float]) -> tuple[Stop, ...]:
+def stops_of(found: Candidates, weights: dict[tuple[int, tuple[float, ...]], float]) -> tuple[Stop, ...]:
     """Weights of (choice, place) as exposures."""
     return tuple(found.choices[i].stop(place, max(round(w), 1)) for (i, place), w in weights.items())
 
@@ -161,7 +161,7 @@ def quantiles(values: np.ndarray) -> str:
     )
 
 
-def choice_of(found: Candidates, line) -> tuple[int, float]:
+def choice_of(found: Candidates, line) -> tuple[int, tuple[float, ...]]:
     """The candidate of a line of a plan."""
     for i, choice in enumerate(found.choices):
         if (choice.kind, choice.filter, choice.seconds) != (line.kind, line.filter, line.exptime):
@@ -169,8 +169,8 @@ def choice_of(found: Candidates, line) -> tuple[int, float]:
         if choice.positions != line.positions:
             continue
         if line.kind == "clp":
-            return i, choice.phase(line.polariser_angle)
-        return i, float([stop.number for stop in choice.stops].index(line.number))
+            return i, choice.place(line.polariser_angle)
+        return i, (float([stop.number for stop in choice.stops].index(line.number)),)
     raise LookupError(line)
 
 
@@ -239,7 +239,7 @@ def beside() -> None:
             best, least = [], 0.0
             for plan in best_plans(alone):
                 weights = {
-                    (int(f), float(p[0])): w
+                    (int(f), tuple(p.tolist())): w
                     for f, p, w in zip(plan.family, plan.place, plan.weight, strict=True)
                 }
                 whole, cost = information_of_weights(alone, weights)
@@ -281,7 +281,7 @@ def best_plans(experiment: Experiment) -> Iterator:
 
 def targets_at(experiment: Experiment, plan) -> np.ndarray:
     """Variances of the targets."""
-    weights = {(int(f), float(p[0])): w for f, p, w in zip(plan.family, plan.place, plan.weight, strict=True)}
+    weights = {(int(f), tuple(p.tolist())): w for f, p, w in zip(plan.family, plan.place, plan.weight, strict=True)}
     c, a = covariance(experiment.known + information_of_weights(experiment, weights)[0]), experiment.targets
     return np.einsum("rknq,rnm,rkmq->rk", a, c, a, optimize=True)[0]
 
@@ -295,7 +295,7 @@ def naming() -> None:
         experiment = experiment_of(found, MINUTES, want)
         standard = dict(usual_plans(found))["even angles"]
         standard |= {
-            (i, float(place)): 1.0
+            (i, (float(place),)): 1.0
             for i, choice in enumerate(found.choices)
             if choice.kind != "clp" and choice.positions["CHWP"] is None
             for place in range(len(choice.stops))
@@ -326,11 +326,10 @@ def cost_of(experiment: Experiment, plan) -> float:
     )
 
 
-def before_of(found: Candidates, standard: dict[tuple[int, float], float]) -> np.ndarray:
+def before_of(found: Candidates, standard: dict[tuple[int, tuple[float, ...]], float]) -> np.ndarray:
     """The information of a standard plan on all parameters of the candidates, mean over draws."""
     return sum(
-        w
-        * np.tensordot(found.families[i].basis[0], found.families[i].coefficients(np.array([[p]]))[0], (0, 0))
+        w * found.families[i].information(np.atleast_2d(p))[0, 0]
         for (i, p), w in standard.items()
     )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +14,6 @@ if TYPE_CHECKING:
     from walop_jax.plans.plan import ExposurePlan
 
 PLAN = "plan.toml"
-PLATES = (None, 0.0, 22.5, 45.0)  # settings of the calibration plate (deg) among which effects are told apart
 
 What = Annotated[
     "ObservingPlan | PathLike",
@@ -76,9 +74,10 @@ def plan(
     """Plan the calibration exposures of a night: those that make the error of p smallest where it is largest.
 
     What could be observed is said by a plan file (see `walop-jax docs files`): filters, settings of the calibration
-    plate, Moon patches, standards, exposure times, costs. The polariser may stand at any angle. Printed are the
-    exposures in order, the errors that they promise, and what no plan of the same time could undercut, which is proven.
-    RUN/plan.toml is the plan for `simulate` and `limits`, RUN/plan.json holds all numbers.
+    plate, Moon patches, standards, exposure times, costs. The polariser may stand at any angle; so may the plate, of an
+    INSTRUMENT, of a RUN, or where the file says so. Printed are the exposures in order, the errors that they promise,
+    and what no plan of the same time could undercut, which is proven. RUN/plan.toml is the plan for `simulate` and
+    `limits`, RUN/plan.json holds all numbers.
 
     In Python: the plan. Raises ValueError for a time that pays for nothing or determines nothing.
 
@@ -100,7 +99,7 @@ def plan(
     if candidates is not None:
         could = candidates
     elif could == "" and known is not None:
-        could = _any_exposure(known.model.template.name, PLATES if alike else (None,))
+        could = known.model.template.name
     if not minutes > 0:
         raise fail("nothing can be observed in no time", advice="give --minutes")
     wanted = (
@@ -131,15 +130,6 @@ def plan(
         files=files,
         saved_as=PLANNED,
     )
-
-
-def _any_exposure(instrument: str, plates: tuple[float | None, ...]) -> ObservingPlan:
-    """What could be observed with an instrument, its calibration plate, if it has one, at some angles."""
-    from walop_jax import ObservingPlan
-    from walop_jax.data.records import CALIBRATION_PLATE
-
-    plan = ObservingPlan(instrument)
-    return dataclasses.replace(plan, plate=plates) if CALIBRATION_PLATE in plan.design.moving() else plan
 
 
 def _alike(run: Path, known: Calibration) -> tuple[Any, ...]:

@@ -1,5 +1,6 @@
 """What could be observed, and what it costs: filters, plates, exposure times, what is up, and the time beside exposing.
 
+    plate = ["out", "any"]  # through the polariser the calibration plate may stand at any angle; or a list (deg)
     altitude = 20           # of the lowest pointing (deg)
     places = true           # standards at single places of their raster
     [seconds]               # exposure times to choose from, by kind
@@ -23,12 +24,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from walop_jax.data.records import CALIBRATION_PLATE
 from walop_jax.io.errors import errors_naming
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.model.parameters import unknown_name
-from walop_jax.simulation.observing_plan import EXPOSED, ObservingPlan, Stop, is_plan, plan_of
+from walop_jax.simulation.observing_plan import EXPOSED, OUT, ObservingPlan, Stop, is_plan, plan_of
 from walop_jax.sky.moon import altitude, body_direction
 
 DARK = -12.0  # altitude of the Sun (deg) below which the sky is dark enough for Moon and stars
@@ -58,10 +60,17 @@ class Costs:
         return float(getattr(self, kind))
 
 
-class CandidateExposure(NamedTuple):
-    """Exposures that differ in one thing only: the angle of the polariser, or which of `stops` they are.
+Place = Float[np.ndarray, " d"] | tuple[float, ...]
+ANY = "any"  # angle of the calibration plate
+PLATE_TURN = 180.0  # deg after which the plate repeats itself
 
-    Angles of the polariser repeat themselves after `turn` (deg): half a turn, or a whole one where it is not ideal.
+
+class CandidateExposure(NamedTuple):
+    """Exposures that differ in the angle of the polariser, and of the plate if `free`, or in which of `stops` they are.
+
+    Angles of the polariser repeat themselves after `turn` (deg): half a turn, or a whole one where it is not ideal. The
+    place of an exposure is the phase (rad) of its angle θ in that turn; where the plate is free, that of the direction
+    2α − θ in which light is polarised behind the plate at α, with which what is seen changes quickly, and that of α.
     """
 
     kind: str
@@ -70,26 +79,45 @@ class CandidateExposure(NamedTuple):
     seconds: float
     stops: tuple[Stop, ...]
     turn: float = 180.0
+    free: bool = False
 
     @property
     def setting(self) -> tuple[Any, ...]:
         """What has to be changed for another choice."""
-        return (self.filter, *self.positions.values())
+        return (self.filter, self.free, *self.positions.values())
 
-    def stop(self, place: float, times: int = 1) -> Stop:
-        """The stop at a phase (rad) of the polariser's turn, or of that number in the list."""
+    def stop(self, place: Place, times: int = 1) -> Stop:
+        """The stop at phases (rad) of polariser and plate, or of that number in the list."""
         if self.kind != "clp":
-            return dataclasses.replace(self.stops[round(place)], times=times)
-        angle = round(float(place / (2 * np.pi) * self.turn) % self.turn, 3)
-        return dataclasses.replace(self.stops[0], polariser_angle=angle, times=times)
+            return dataclasses.replace(self.stops[round(place[0])], times=times)
+        plate, angle = self.stops[0].plate, place[0] / (2 * np.pi) * self.turn
+        if self.free:
+            plate = round(float(place[1] / (2 * np.pi) * PLATE_TURN) % PLATE_TURN, 3)
+            angle = 2 * plate - angle
+        angle = round(float(angle % self.turn), 3)
+        return dataclasses.replace(self.stops[0], polariser_angle=angle, plate=plate, times=times)
 
-    def phase(self, angle: float) -> float:
-        """The phase (rad) of an angle (deg) of the polariser."""
-        return 2 * np.pi * (angle % self.turn) / self.turn
+    def place(self, angle: float, plate: float = 22.5) -> tuple[float, ...]:
+        """The phases (rad) of angles (deg) of the polariser, and of the plate where it is free."""
+        if not self.free:
+            return (2 * np.pi * (angle % self.turn) / self.turn,)
+        return (
+            *self._replace(free=False).place(2 * plate - angle),
+            2 * np.pi * (plate % PLATE_TURN) / PLATE_TURN,
+        )
+
+    def with_plate(self, angle: float) -> CandidateExposure:
+        """The same with the plate at an angle (deg)."""
+        stop = dataclasses.replace(self.stops[0], plate=angle)
+        positions = dict(self.positions) | {CALIBRATION_PLATE: angle}
+        return self._replace(positions=positions, stops=(stop,), free=False)
 
     def text(self) -> str:
         """In a few words."""
-        places = (f"{p} {'out' if a is None else f'{a:g}°'}" for p, a in self.positions.items())
+        places = (
+            f"{p} {ANY if self.free and p == CALIBRATION_PLATE else 'out' if a is None else f'{a:g}°'}"
+            for p, a in self.positions.items()
+        )
         return ", ".join([self.kind, self.filter, *places, f"{self.seconds:g} s"])
 
 
@@ -98,8 +126,9 @@ class Could:
     """Exposures that could be taken: those of an observing plan, at any angle of the polariser; costs and limits.
 
     `seconds` are exposure times to choose from, by kind; pointings lower than `altitude` (deg) are left out; `places`
-    takes standards at single places of their raster, not at all of them for the cost of one. Raises ValueError for
-    values that contradict each other.
+    takes standards at single places of their raster, not at all of them for the cost of one. With `any_plate` the
+    calibration plate may stand at any angle behind the polariser, besides its settings in the plan. Raises ValueError
+    for values that contradict each other.
     """
 
     plan: ObservingPlan
@@ -107,6 +136,7 @@ class Could:
     seconds: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
     altitude: float = 20.0
     places: bool = False
+    any_plate: bool = False
 
     def __post_init__(self) -> None:
         for kind, times in self.seconds.items():
@@ -116,6 +146,12 @@ class Could:
                 raise ValueError(f"seconds: {kind} = {list(times)}; give exposure times above 0")
         if not -90.0 <= self.altitude < 90.0:
             raise ValueError(f"altitude = {self.altitude}: give degrees above the horizon, below 90")
+        if self.any_plate and (self.plan.design.polariser is None or not self._has_plate):
+            raise ValueError(f'plate = "{ANY}": {self.plan.name} has no polariser with a calibration plate')
+
+    @property
+    def _has_plate(self) -> bool:
+        return CALIBRATION_PLATE in self.plan.design.moving()
 
     @classmethod
     def of(cls, given: Could | ObservingPlan | str | os.PathLike[str]) -> Could:
@@ -125,7 +161,8 @@ class Could:
         if isinstance(given, ObservingPlan):
             return cls(given)
         if not is_plan(given):
-            return cls(ObservingPlan(str(given)))
+            plain = cls(ObservingPlan(str(given)))
+            return dataclasses.replace(plain, any_plate=plain._has_plate)
         with errors_naming(given):
             return cls.read(parse_toml(read_text(given)), Path(given).parent)
 
@@ -140,6 +177,10 @@ class Could:
         for name in costs:
             if name not in Costs.__dataclass_fields__:
                 raise unknown_name("cost", name, tuple(Costs.__dataclass_fields__))
+        plate = content.get("plate", ())
+        if own.setdefault("any_plate", ANY in plate if isinstance(plate, list) else plate == ANY):
+            listed = [angle for angle in plate if angle != ANY] if isinstance(plate, list) else []
+            content["plate"] = listed or [OUT]
         seconds = {kind: tuple(np.atleast_1d(v).tolist()) for kind, v in content.pop("seconds", {}).items()}
         return cls(plan_of(content, folder), Costs(**costs), seconds, **own)
 
@@ -171,6 +212,8 @@ class Could:
                     )
                     if members:
                         found.append(CandidateExposure(kind, name, where, seconds, members))
+                    if kind == "clp" and self.any_plate and stops[0] == plan.plate[0]:
+                        found.append(found[-1]._replace(free=True))
         return tuple(found), tuple(notes)
 
     def _members(self, blank: Stop, numbers: tuple[int, ...]) -> Iterator[Stop]:

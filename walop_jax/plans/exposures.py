@@ -2,9 +2,10 @@
 
 Information  of an exposure e: J_eᵀ J_e, J_e the derivatives of its whitened residuals, fluxes eliminated, to the free
              parameters of the base model, from expected counts and the errors that they would have. No noise enters.
-Polariser    Light is linear, so that counts and their derivatives are series of low degree in 2θ: they are computed
-             at `NODES` angles and known at all. The information, which divides by the variance of the counts, is a
-             series of high degree, cut where `ANGLES` angles end it; `Candidates.truncation` is what is lost.
+Polariser    Light is linear, so that counts and their derivatives are series of low degree in 2θ, and in 2α where the
+             calibration plate may stand at any angle α: they are computed at `NODES` angles and known at all. The
+             information, which divides by the variance of the counts, is a series of high degree in the direction
+             2α − θ behind the plate, of a lower one in α, cut at `ORDERS`; `Candidates.truncation` is what is lost.
 Draws        of the instrument as built, from the priors or around a calibration: the best plan depends on it.
 Limits       Detectors are linear. Exposures know of each other only by the parameters. Changes between exposures
              (slews, filters) cost time when the plan is put in order; the bound without them stays a bound.
@@ -13,11 +14,13 @@ Limits       Detectors are linear. Exposures know of each other only by the para
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
@@ -31,9 +34,9 @@ from walop_jax.model.effects import Effect, effect_by_name
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 from walop_jax.model.specification import Model, effect_context, with_effects
-from walop_jax.plans.could import CandidateExposure, Could
-from walop_jax.plans.families import Circle, Family, Listed, harmonics
-from walop_jax.simulation.observing_plan import ObservingPlan
+from walop_jax.plans.could import PLATE_TURN, CandidateExposure, Could
+from walop_jax.plans.families import Family, Listed, even_angles, harmonics, highest, spread_angles
+from walop_jax.simulation.observing_plan import ObservingPlan, Stop
 from walop_jax.simulation.simulate import (
     PhotonNoise,
     draw_instrument,
@@ -43,17 +46,22 @@ from walop_jax.simulation.simulate import (
     truth_values,
 )
 
-NODES, NODES_OF_EFFECTS = 7, 13
+NODES, NODES_OF_EFFECTS, NODES_OF_PLATE = 7, 13, 25
 """Angles of the polariser at which counts are computed: a series of degree 3 in 2θ, one more than it needs.
-Effects that are to be told apart may depend on θ itself, which takes a whole turn."""
+Effects that are to be told apart may depend on θ itself, which takes a whole turn. Beams that cross the plate at an
+angle make series of degree 12 in 2α."""
 ANGLES = 361
-"""Angles over half a turn through which the information is a Fourier series in 2θ.
+"""Angles over half a turn at which the gain of an exposure is known, as a Fourier series in 2θ.
 
 So many since errors vary quickly where a camera is dark: over some √(σ²/N) rad, N its counts in full light."""
+ORDERS = (128, 64)
+"""Degrees of that series in 2(2α − θ) and in 2α where the calibration plate may stand at any angle α."""
 GRID, STAR_GRID = 6, 3
 """Field points along each axis at which the information is computed, scaled to those of the plan."""
 DRAWS = 20
-_TOGETHER = 60  # angles, so that their derivatives stay small
+_BETWEEN = 60  # places at which the series of a gain are held against the information itself
+_AT_ONCE = (36, 1)  # field points, with one angle and with two: arrays stay small
+_ROUNDING = 1e-10  # of the largest eigenvalue
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +86,18 @@ class Candidates:
     notes: tuple[str, ...]
     effects: Mapping[str, bool] = dataclasses.field(default_factory=dict)
 
+    def with_plate(self, angles: Sequence[float]) -> Candidates:
+        """The same with the calibration plate at some angles (deg) where it may stand at any."""
+        both: list[tuple[CandidateExposure, Family]] = []
+        for choice, family in zip(self.choices, self.families, strict=True):
+            if isinstance(family, Polarised) and choice.free:
+                both += [(choice.with_plate(a), family.with_plate(a)) for a in angles]
+            else:
+                both.append((choice, family))
+        return dataclasses.replace(
+            self, choices=tuple(c for c, _ in both), families=tuple(f for _, f in both)
+        )
+
 
 def candidates(
     could: Could,
@@ -99,17 +119,12 @@ def candidates(
     choices, notes = could.choices()
     if not choices:
         raise ValueError("; ".join(("nothing could be observed", *notes)))
-    few, stops, nodes = fewer_points(could.plan), [], NODES_OF_EFFECTS if effects else NODES
-    choices = tuple(choice._replace(turn=360.0 if effects else 180.0) for choice in choices)
-    turn = choices[0].turn / nodes * np.arange(nodes)
-    first = np.cumsum([0, *(nodes if c.kind == "clp" else len(c.stops) for c in choices)])
+    few, stops, turn = fewer_points(could.plan), [], 360.0 if effects else 180.0
+    choices = tuple(choice._replace(turn=turn) for choice in choices)
     for choice in choices:
-        own = choice.stops * nodes if choice.kind == "clp" else choice.stops
-        stops += [
-            dataclasses.replace(s, polariser_angle=a) if choice.kind == "clp" else s
-            for s, a in zip(own, turn if choice.kind == "clp" else own, strict=True)
-        ]
-    plan = dataclasses.replace(few, stops=tuple(stops), patches=(), stars=())
+        stops.append(_nodes(choice, bool(effects)))
+    first = np.cumsum([0, *map(len, stops)])
+    plan = dataclasses.replace(few, stops=tuple(itertools.chain(*stops)), patches=(), stars=())
     tell("expected counts")
     calset = simulate(plan, seed=seed, noiseless=True, steady=True).calset
     model = base_model(calset, plan.design, throughput_degree=plan.throughput_degree)
@@ -118,28 +133,29 @@ def candidates(
     for i in (model.index(name) for name in model.names if _effect_of(name, stated)):
         values[:, i] = model.parameters[i].start
     likelihood = Likelihood.of(calset, model)
-    source, factor = _Light(plan, likelihood), _factor(could.plan, few)
+    factor, flux, exptime = _factor(could.plan, few), fluxes(plan, None), plan.exposures().exptime
+    noise, shared = PhotonNoise(plan.read_noise), Sharing(sharing(model.template, likelihood.plan).cameras)
     responses = []
     for number, one in enumerate(values):
         tell(f"expected counts of instrument {number + 1} of {draws}")
         responses.append(_responses(likelihood, one))
-    families, lost, turn = [], 0.0, np.arange(angles) / angles
+    families: list[Family] = []
     for choice, start, stop in zip(choices, first[:-1], first[1:], strict=True):
         tell(f"information of {choice.text()}")
-        rows = np.arange(start, stop)
+        cost, each = choice.seconds + could.costs.of(choice.kind), []
         polarised = choice.kind == "clp"
-        where = turn if polarised else None
-        information = np.stack(
-            [source.information(rows, unit, slopes, choice.seconds, where) for unit, slopes in responses]
-        )
-        information *= 1.0 if choice.kind == "standard" else factor
-        cost = choice.seconds + could.costs.of(choice.kind)
-        families.append(Circle.sampled(information, cost) if polarised else Listed.of(information, cost))
-        if polarised:
-            unit, slopes = responses[0]
-            between = (np.arange(0, angles, 6) + 0.5) / angles
-            exact = factor * source.information(rows, unit, slopes, choice.seconds, between)
-            lost = max(lost, _overtone(unit[:, rows]), _apart(information[0], between, exact))
+        for rows in [slice(start, stop)] if polarised else [slice(i, i + 1) for i in range(start, stop)]:
+            at = likelihood.used[:, rows.start]
+            there = flux[at, rows.start] * choice.seconds / exptime[rows.start]
+            light = Light(there, noise, shared, 1.0 if choice.kind == "standard" else factor)
+            counts = tuple((unit[at, rows], slopes[at, rows]) for unit, slopes in responses)
+            if polarised:
+                families.append(Polarised(choice, light, counts, _orders(choice, angles), cost))
+            else:
+                each.append(np.stack([light.information(*one)[0] for one in counts]))
+        if each:
+            families.append(Listed.of(np.stack(each, axis=1), cost))
+    lost = max([0.0, *(f.lost() for f in families if isinstance(f, Polarised))])
     rows = prior_rows(model).jacobian(model.selection())
     names = tuple(model.names[i] for i in model.free)
     base = np.array([not _effect_of(name, stated) for name in names])
@@ -227,74 +243,222 @@ def _responses(
     return unit[:count], slopes[:count] @ select
 
 
-class _Light:
-    """How much light there is: from counts of unit flux to information."""
+def _nodes(choice: CandidateExposure, effects: bool) -> tuple[Stop, ...]:
+    """The exposures at which counts are computed: evenly through the turn of the polariser, and of the plate."""
+    if choice.kind != "clp":
+        return choice.stops
+    count = NODES_OF_EFFECTS if effects else 3 if choice.free else NODES
+    polariser = choice.turn / count * np.arange(count)
+    plate = (
+        PLATE_TURN / NODES_OF_PLATE * np.arange(NODES_OF_PLATE) if choice.free else (choice.stops[0].plate,)
+    )
+    return tuple(
+        dataclasses.replace(choice.stops[0], polariser_angle=float(a), plate=None if b is None else float(b))
+        for b in plate
+        for a in polariser
+    )
 
-    def __init__(self, plan: ObservingPlan, likelihood: Likelihood) -> None:
-        self.flux, self.used, self.exptime = fluxes(plan, None), likelihood.used, plan.exposures().exptime
-        self.noise = PhotonNoise(plan.read_noise)
-        self.shared = Sharing(sharing(likelihood.model.template, likelihood.plan).cameras)
+
+def _orders(choice: CandidateExposure, angles: int) -> tuple[int, ...]:
+    """Degrees of the series of a gain."""
+    turns = round(choice.turn / 180.0)
+    return (min(angles // 2, ORDERS[0]) * turns, ORDERS[1]) if choice.free else (angles // 2 * turns,)
+
+
+def _interpolating(angle: Float[np.ndarray, " s"], nodes: int) -> Float[np.ndarray, "s e"]:
+    """Weights of equidistant nodes in the series through them."""
+    there = harmonics(2 * np.pi * np.arange(nodes) / nodes, nodes // 2)
+    return harmonics(angle, nodes // 2) @ np.linalg.inv(there)
+
+
+class Light(NamedTuple):
+    """How much light there is in an exposure: `flux` (electron) at its points, noise, what shares a flux.
+
+    `scale` leads from these points to those of the plan.
+    """
+
+    flux: Float[np.ndarray, " p"]
+    noise: PhotonNoise
+    shared: Sharing
+    scale: float
 
     def information(
-        self,
-        rows: Int[np.ndarray, " _"],
-        unit: Float[np.ndarray, "p e k"],
-        slopes: Float[np.ndarray, "p e k f"],
-        seconds: float,
-        turn: Float[np.ndarray, " _"] | None = None,
+        self, unit: Float[np.ndarray, "p s k"], slopes: Float[np.ndarray, "p s k f"]
     ) -> Float[np.ndarray, "s f f"]:
-        """JᵀJ of the exposures `rows`; or, of those evenly through a turn of the polariser, at other shares of it."""
-        if turn is None:
-            return np.concatenate(
-                [self._gram(r, unit[:, [r]], slopes[:, [r]], seconds) for r in rows.tolist()]
-            )
-        order, nodes = len(rows) // 2, 2 * np.pi * np.arange(len(rows)) / len(rows)
-        weights = harmonics(2 * np.pi * turn, order) @ np.linalg.inv(harmonics(nodes, order))
-        parts = np.array_split(weights, max(len(weights) // _TOGETHER, 1))
-        u, du = unit[:, rows], slopes[:, rows]
-        return np.concatenate([self._gram(int(rows[0]), _mixed(w, u), _mixed(w, du), seconds) for w in parts])
-
-    def _gram(
-        self, row: int, unit: Float[np.ndarray, "p s k"], slopes: Float[np.ndarray, "p s k f"], seconds: float
-    ) -> Float[np.ndarray, "s f f"]:
-        at = self.used[:, row]
-        unit, slopes = unit[at], slopes[at]
-        flux = (self.flux[at, row] * seconds / self.exptime[row])[:, None, None]
+        """JᵀJ of exposures, from counts of unit flux and their derivatives."""
+        flux = self.flux[:, None, None]
         weight = 1.0 / self.noise.sigma(flux * unit)
         columns = np.moveaxis(slopes * (flux * weight)[..., None], -1, 0)
         projected = project_flux(columns, unit * weight, False, self.shared)
         flat = projected.transpose(2, 0, 1, 3).reshape(unit.shape[1], len(projected), -1)
-        return flat @ flat.swapaxes(1, 2)
+        return self.scale * flat @ flat.swapaxes(1, 2)
+
+    def gain(
+        self, unit: Float[np.ndarray, "p k s"], squares: Float[np.ndarray, "p k k s"]
+    ) -> Float[np.ndarray, " s"]:
+        """tr G JᵀJ of exposures, `squares` s_k G s_lᵀ of the derivatives s of the counts of unit flux.
+
+        Without the flux, with w = flux / σ and along a = unit / σ: Σ w_k² s_k G s_k − Σ (w a)_k (w a)_l s_k G s_l /
+        Σ a², the sums over cameras with a flux in common (`likelihood.flux`).
+        """
+        flux = self.flux[:, None, None]
+        weight = 1.0 / self.noise.sigma(flux * unit)
+        along = (unit * weight) ** 2
+        both = unit * weight**2
+        cameras = range(unit.shape[1])
+        together = (
+            np.ones((len(cameras), len(cameras))) if self.shared.cameras is None else self.shared.cameras
+        )
+        power = np.einsum("kl,pls->pks", together, along)
+        found = np.zeros(unit.shape[::2])
+        for k in cameras:
+            found += weight[:, k] ** 2 * squares[:, k, k]
+            for m in cameras:
+                if together[k, m]:
+                    found -= both[:, k] * both[:, m] / power[:, k] * squares[:, k, m]
+        return self.scale * (flux[:, 0] ** 2 * found).sum(axis=0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Polarised(Family):
+    """Exposures through the polariser at any angle, and with the calibration plate at any, if it is free.
+
+    `counts` are those of unit flux and their derivatives at the nodes, for each draw; `orders` the degrees of the
+    series of a gain, `by` the parameters in which the information is asked for.
+    """
+
+    choice: CandidateExposure
+    light: Light
+    counts: tuple[tuple[Float[np.ndarray, "p e k"], Float[np.ndarray, "p e k f"]], ...]
+    orders: tuple[int, ...]
+    cost: float
+    by: Float[np.ndarray, "b f n"] | None = None
+    known: dict[bytes, Float[np.ndarray, "r n n"]] = dataclasses.field(default_factory=dict, compare=False)
+
+    @property
+    def _nodes(self) -> tuple[int, int]:
+        """Numbers of angles of plate and polariser at the nodes."""
+        plates, nodes = NODES_OF_PLATE if self.choice.free else 1, self.counts[0][0].shape[1]
+        return plates, nodes // plates
+
+    def _weights(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, "s e"]:
+        """Weights of the nodes in the counts at places."""
+        plates, angles = self._nodes
+        if plates == 1:
+            return _interpolating(places[:, 0], angles)
+        # The place is the direction behind the plate, 2α − θ.
+        polariser = 2 * PLATE_TURN / self.choice.turn * places[:, 1] - places[:, 0]
+        plate = _interpolating(places[:, 1], plates)
+        return (plate[:, :, None] * _interpolating(polariser, angles)[:, None]).reshape(len(places), -1)
+
+    def information(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, "r s n n"]:
+        """The matrices at these phases (`could.CandidateExposure`), kept for the next time."""
+        new = [place for place in places if place.tobytes() not in self.known]
+        if new:
+            weights = self._weights(np.stack(new))
+            made = []
+            for unit, slopes in self.counts:
+                matrices = self.light.information(_mixed(weights, unit), _mixed(weights, slopes))
+                made += [matrices] if self.by is None else [t.T @ matrices @ t for t in self.by]
+            self.known.update(zip((place.tobytes() for place in new), np.stack(made, axis=1), strict=True))
+        return np.stack([self.known[place.tobytes()] for place in places], axis=1)
+
+    def turned(self, by: Float[np.ndarray, "b f n"]) -> Polarised:
+        """The same exposures."""
+        both = by if self.by is None else np.concatenate([one @ by for one in self.by])
+        return dataclasses.replace(self, by=both, known={})
+
+    def cost_at(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, " s"]:
+        """The cost, which is the same everywhere."""
+        return np.full(len(places), float(self.cost))
+
+    def spread(self) -> Float[np.ndarray, "s d"]:
+        """Some angles."""
+        return spread_angles(self.orders)
+
+    def best(self, g: Float[np.ndarray, "r n n"], most: int) -> tuple[Float[np.ndarray, "s d"], float]:
+        """Local maxima of the gain, and the bound over all angles."""
+        places, largest = highest(self.gains(g), most)
+        return places, largest / self.cost
+
+    def gains(self, g: Float[np.ndarray, "r n n"]) -> Float[np.ndarray, ...]:
+        """Σ_r tr G_r M_r at even angles: products of derivatives are series of twice the degree of the counts."""
+        if self.by is not None:
+            parts = g.reshape(len(self.counts), len(self.by), *g.shape[1:])
+            g = np.einsum("bfn,rbnm,bgm->rfg", self.by, parts, self.by, optimize=True)
+        plates, angles = (count // 2 for count in self._nodes)
+        low = (2 * angles, 2 * (plates + round(2 * PLATE_TURN / self.choice.turn) * angles))[
+            : len(self.orders)
+        ]
+        weights = self._weights(even_angles(low))
+        finer = [
+            _interpolating(2 * np.pi * np.arange(2 * o + 1) / (2 * o + 1), 2 * n + 1)
+            for o, n in zip(self.orders, low, strict=True)
+        ]
+        total = np.zeros(np.prod([len(f) for f in finer]))
+        for (unit, slopes), one in zip(self.counts, g, strict=True):
+            root = _root(one)
+            for i in range(0, len(unit), _AT_ONCE[len(finer) - 1]):
+                part = slice(i, i + _AT_ONCE[len(finer) - 1])
+                along = np.tensordot(weights, slopes[part] @ root, (1, 1))
+                squares = (along @ along.swapaxes(2, 3)).transpose(1, 2, 3, 0)
+                u = np.tensordot(weights, unit[part], (1, 1)).transpose(1, 2, 0)
+                light = self.light._replace(flux=self.light.flux[part])
+                total += light.gain(_refined(u, finer), _refined(squares, finer))
+        return total.reshape([len(f) for f in finer])
+
+    def with_plate(self, angle: float) -> Polarised:
+        """The same with the plate at an angle (deg)."""
+        _, angles = self._nodes
+        plate = 2 * np.pi * angle / PLATE_TURN
+        polariser = 2 * np.pi * np.arange(angles) / angles
+        behind = 2 * PLATE_TURN / self.choice.turn * plate - polariser
+        weights = self._weights(np.stack([behind, np.full(angles, plate)], axis=1))
+        counts = tuple((_mixed(weights, unit), _mixed(weights, slopes)) for unit, slopes in self.counts)
+        orders = (ANGLES // 2 * round(self.choice.turn / 180.0),)
+        return dataclasses.replace(
+            self, choice=self.choice.with_plate(angle), counts=counts, orders=orders, known={}
+        )
+
+    def lost(self) -> float:
+        """Largest relative error of the gain of all parameters between its angles; or of the counts, if more."""
+        places = 2 * np.pi * np.random.default_rng(1).random((_BETWEEN, len(self.orders)))
+        one = dataclasses.replace(self, counts=self.counts[:1], known={})
+        exact = one.information(places)[0]
+        size = np.einsum("saa->a", exact) / len(exact)
+        weight = np.where(size > 0, 1.0 / np.where(size > 0, size, 1.0), 0.0)
+        true = np.einsum("saa,a->s", exact, weight)
+        made = one.gains(np.diag(weight)[None])[None]
+        for order, angle in zip(self.orders, places.T, strict=True):
+            at = _interpolating(angle, 2 * order + 1)
+            made = np.einsum("si,si...->s...", at, np.broadcast_to(made, (len(at), *made.shape[1:])))
+        # The highest harmonic of the counts beside their mean: none where the series holds them.
+        unit = self.counts[0][0]
+        series = np.abs(np.fft.fft2(unit.reshape(len(unit), *self._nodes, unit.shape[2]), axes=(1, 2)))
+        high = [np.take(series, n // 2, i).max() for i, n in enumerate(self._nodes, 1) if n > 3]
+        return float(max(np.abs(made / true - 1.0).max(), *high / series[:, 0, 0].max()))
+
+
+def _refined(values: Float[np.ndarray, "*f s"], finer: Sequence[np.ndarray]) -> Float[np.ndarray, "*f u"]:
+    """Series at more angles."""
+    values = values.reshape(*values.shape[:-1], *(f.shape[1] for f in finer))
+    values = values @ finer[-1].T
+    return values if len(finer) == 1 else (finer[0] @ values).reshape(*values.shape[:-2], -1)
+
+
+def _root(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n m"]:
+    """B with B Bᵀ the matrix, to rounding in the unit of each parameter."""
+    size = np.sqrt(np.clip(np.diag(matrix), 0.0, None))
+    size = np.where(size > 0, size, 1.0)
+    value, vector = np.linalg.eigh(matrix / np.outer(size, size))
+    kept = value > _ROUNDING * value[-1]
+    return size[:, None] * vector[:, kept] * np.sqrt(value[kept])
 
 
 def _mixed(
     weights: Float[np.ndarray, "s e"], values: Float[np.ndarray, "p e *k"]
 ) -> Float[np.ndarray, "p s *k"]:
     return np.tensordot(weights, values, (1, 1)).swapaxes(0, 1)
-
-
-def _overtone(unit: Float[np.ndarray, "p e k"]) -> float:
-    """The highest harmonic of the counts beside their mean: none where the series holds them."""
-    count = unit.shape[1]
-    nodes = 2 * np.pi * np.arange(count) / count
-    series = np.linalg.solve(harmonics(nodes, count // 2), unit.swapaxes(0, 1).reshape(count, -1))
-    return float(np.abs(series[-2:]).max() / np.abs(series[0]).max())
-
-
-def _apart(
-    information: Float[np.ndarray, "a f f"],
-    between: Float[np.ndarray, " b"],
-    exact: Float[np.ndarray, "b f f"],
-) -> float:
-    """Largest error of the series at shares of a turn, in units of the mean diagonal of each parameter."""
-    count = len(information)
-    series = np.linalg.solve(
-        harmonics(2 * np.pi * np.arange(count) / count, count // 2), information.reshape(count, -1)
-    )
-    made = (harmonics(2 * np.pi * between, count // 2) @ series).reshape(exact.shape)
-    size = np.sqrt(np.einsum("saa->a", exact) / len(exact))
-    size = np.where(size > 0, size, 1.0)
-    return float(np.max(np.abs(made - exact) / (size[:, None] * size)))
 
 
 def information_of(

@@ -1,42 +1,46 @@
-"""Families of candidates whose information is linear in a few fixed matrices, M_i = Σ_j F_ij B_j.
+"""Families of candidates: a list, or a continuum of which the best is found, and bounded, from a grid of angles.
 
-A million candidates then cost a million short dot products: the best for their cost are those with the largest F·g,
-g_j = tr G B_j, whatever G a plan asks with (`optimal`). A family may be a list, or a continuum.
+A plan asks for the candidates with the largest gain tr G M_i for their cost, whatever its G is (`optimal`). In a list
+whose matrices are linear in a few fixed ones, M_i = Σ_j F_ij B_j, a million candidates cost a million short dot
+products. In a continuum the gain is a Fourier series in one angle or several, known from its values on a grid.
 """
 
 from __future__ import annotations
 
 import abc
 import dataclasses
+import itertools
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float, Int
+from scipy import fft
 
 Matrices = Float[np.ndarray, "r j n n"]
 
-COMPRESSED = 1e-6
-"""Share of any element, in units of its mean diagonal, that the basis of a `Circle` may leave out."""
-_GRID = 64  # points per period of the highest harmonic: the maximum is known to 1 / cos(π / 64), 0.12 %
-_SPANNING = 20_000  # elements of all matrices from which the basis of a circle is found
+_FINER = (64, 12)  # points per period of the highest harmonic, of one angle and of each of several
+_POINTS = 256  # of a grid at least
+_TAIL = 4  # last harmonics of each angle, which stand for those that are not there
 _SPREAD = 16  # candidates of a family that a plan begins with
 
 
 class Family(abc.ABC):
-    """Candidates whose information is linear in a few fixed matrices, `basis` (draw, member, parameter, parameter)."""
-
-    basis: Matrices
+    """Candidates, each with an information matrix in every draw and a cost; a place says which."""
 
     @abc.abstractmethod
-    def coefficients(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, "s j"]:
-        """Coefficients F of the candidates at `places`, points of the family's own coordinates."""
+    def information(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, "r s n n"]:
+        """The matrices of the candidates at `places`, points of the family's own coordinates."""
+
+    @abc.abstractmethod
+    def turned(self, by: Float[np.ndarray, "b n m"]) -> Family:
+        """The same in other parameters, Tᵀ M T for each T: draws are then one after the other for each of them."""
 
     @abc.abstractmethod
     def cost_at(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, " s"]:
         """Cost of the candidates at `places`."""
 
     @abc.abstractmethod
-    def best(self, gains: Float[np.ndarray, " j"], most: int) -> tuple[Float[np.ndarray, "s d"], float]:
-        """Places of at most `most` local maxima of F·gains / cost, and an upper bound of it over all candidates."""
+    def best(self, g: Float[np.ndarray, "r n n"], most: int) -> tuple[Float[np.ndarray, "s d"], float]:
+        """Places of at most `most` local maxima of Σ_r tr G_r M_r / cost, and an upper bound over all candidates."""
 
     @abc.abstractmethod
     def spread(self) -> Float[np.ndarray, "s d"]:
@@ -47,7 +51,7 @@ class Family(abc.ABC):
 class Listed(Family):
     """Candidates one by one: candidate i has the information Σ_j F_ij B_j; its place is its number i.
 
-    With `basis` left out there is one matrix for each candidate.
+    `basis` is B (draw, member, parameter, parameter), `rows` F; `of` takes one matrix for each candidate.
     """
 
     basis: Matrices
@@ -59,17 +63,24 @@ class Listed(Family):
         """Candidates given by their own matrices (draw, candidate, n, n)."""
         return cls(information, np.eye(information.shape[1]), cost)
 
-    def coefficients(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, "s j"]:
-        """Coefficients of the candidates with these numbers."""
-        return self.rows[self._numbers(places)]
+    def information(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, "r s n n"]:
+        """Matrices of the candidates with these numbers."""
+        r, j, n, _ = self.basis.shape
+        return (self.rows[self._numbers(places)] @ self.basis.reshape(r, j, -1)).reshape(r, -1, n, n)
+
+    def turned(self, by: Float[np.ndarray, "b n m"]) -> Listed:
+        """The same list."""
+        r, j = self.basis.shape[:2]
+        basis = by.swapaxes(1, 2)[:, None] @ self.basis[:, None] @ by[:, None]
+        return dataclasses.replace(self, basis=basis.reshape(r * len(by), j, *basis.shape[-2:]))
 
     def cost_at(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, " s"]:
         """Cost of the candidates with these numbers."""
         return np.broadcast_to(self.cost, len(self.rows))[self._numbers(places)].astype(float)
 
-    def best(self, gains: Float[np.ndarray, " j"], most: int) -> tuple[Float[np.ndarray, "s d"], float]:
+    def best(self, g: Float[np.ndarray, "r n n"], most: int) -> tuple[Float[np.ndarray, "s d"], float]:
         """The candidates with the largest gain for their cost."""
-        ratio = self.rows @ gains / self.cost
+        ratio = self.rows @ np.einsum("rjab,rab->j", self.basis, g, optimize=True) / self.cost
         top = np.argpartition(-ratio, min(most, len(ratio)) - 1)[:most]
         return top[:, None].astype(float), float(ratio.max())
 
@@ -82,77 +93,65 @@ class Listed(Family):
         return np.rint(places[:, 0]).astype(int)
 
 
-@dataclasses.dataclass(frozen=True)
-class Circle(Family):
-    """A continuum of candidates at an angle in [0, 2π), whose information is a Fourier series of degree H in it.
+def even_angles(orders: tuple[int, ...]) -> Float[np.ndarray, "s d"]:
+    """The grid of angles (rad) on which series of these degrees are known, the last angle first to change."""
+    grids = [2 * np.pi * np.arange(2 * order + 1) / (2 * order + 1) for order in orders]
+    return np.stack([a.ravel() for a in np.meshgrid(*grids, indexing="ij")], axis=1)
 
-    F = (1, cos a, sin a, …, cos Ha, sin Ha) · `mixing`: most series hold far fewer matrices than harmonics.
 
-    Limit: a trigonometric polynomial p of degree H is at least max |p| cos(πH/N) somewhere on a grid of N > 2H points
-    (Ehlich & Zeller 1964, Math. Z. 86, 41), so a grid bounds the maximum over the continuum.
+def spread_angles(orders: tuple[int, ...]) -> Float[np.ndarray, "s d"]:
+    """A few places of a continuum of angles: while the first goes round once the others do so several times."""
+    turns = np.arange(_SPREAD)[:, None] / _SPREAD * 5.0 ** np.arange(len(orders))
+    return 2 * np.pi * (turns % 1.0)
+
+
+def highest(values: Float[np.ndarray, ...], most: int) -> tuple[Float[np.ndarray, "s d"], float]:
+    """Places (rad) of at most `most` local maxima of a Fourier series, and a bound of it over the continuum.
+
+    `values` ≥ 0 are those at an odd number of equidistant angles along each axis.
+
+    Limit: the series p, of degrees H, and its second derivatives p_ij, series as well, are bounded on a finer grid.
+    Somewhere on N > 2H points of each angle |p| is at least max |p| Π cos(πH/N) (Ehlich & Zeller 1964, Math. Z. 86,
+    41). Where p is largest its gradient vanishes, and the nearest point of the grid is no further than δ = π/N in each
+    angle: there p is at least max p − ½ Σ δ_i δ_j max |p_ij| (Taylor). What is no series of these degrees is taken to
+    hold no more beyond them than the last harmonics do.
     """
+    orders = [count // 2 for count in values.shape]
+    counts = [max(_FINER[min(len(orders), 2) - 1] * order, _POINTS) for order in orders]
+    waves = [np.fft.fftfreq(n, 1 / n) for n in values.shape]
+    sparse = np.meshgrid(*waves, indexing="ij", sparse=True)
+    series = np.asarray(fft.fftn(values)) / values.size
+    last = np.zeros(values.shape, bool)
+    for wave, order in zip(sparse, orders, strict=True):
+        last |= np.abs(wave) > order - _TAIL
+    beyond = float(np.abs(series[last]).sum()) if min(orders) > _TAIL else 0.0
+    at = np.ix_(*(w.astype(int) % n for w, n in zip(waves, counts, strict=True)))
 
-    basis: Matrices
-    mixing: Float[np.ndarray, "h j"]
-    cost: float = 1.0
+    def finer(series: Complex[np.ndarray, ...]) -> Float[np.ndarray, ...]:
+        whole = np.zeros(counts, complex)
+        whole[at] = series
+        half = whole[..., : counts[-1] // 2 + 1]
+        return np.asarray(fft.irfftn(half, counts)) * whole.size
 
-    @classmethod
-    def sampled(
-        cls, information: Float[np.ndarray, "r s n n"], cost: float = 1.0, tolerance: float = COMPRESSED
-    ) -> Circle:
-        """The series through matrices (draw, angle, n, n) at an odd number of equidistant angles, beginning at 0.
-
-        Singular vectors that hold less than `tolerance` of any element, in units of its mean diagonal, are left out.
-        """
-        draws, samples, n, _ = information.shape
-        size = np.sqrt(np.einsum("rsaa->ra", information) / samples)
-        size = np.where(size > 0, size, 1.0)
-        upper = np.triu_indices(n)
-        scale = size[:, upper[0]] * size[:, upper[1]]
-        flat = np.concatenate([m[:, *upper] / s for m, s in zip(information, scale, strict=True)], axis=1)
-        # Some thousand elements span what all of them do.
-        some = flat[:, :: max(flat.shape[1] // _SPANNING, 1)]
-        value, vector = np.linalg.eigh(some @ some.T * (flat.shape[1] / some.shape[1]))
-        left = vector[:, value > (tolerance * samples) ** 2]
-        packed = (left.T @ flat).reshape(-1, draws, len(upper[0])) * scale
-        basis = np.empty((draws, len(packed), n, n))
-        basis[..., upper[0], upper[1]] = basis[..., upper[1], upper[0]] = packed.swapaxes(0, 1)
-        angle = 2 * np.pi * np.arange(samples) / samples
-        return cls(basis, np.linalg.solve(harmonics(angle, samples // 2), left), cost)
-
-    @property
-    def order(self) -> int:
-        """Degree H of the series."""
-        return len(self.mixing) // 2
-
-    def coefficients(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, "s j"]:
-        """Coefficients at these angles (rad)."""
-        return harmonics(places[:, 0], self.order) @ self.mixing
-
-    def cost_at(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, " s"]:
-        """The cost, which is the same everywhere."""
-        return np.full(len(places), float(self.cost))
-
-    def best(self, gains: Float[np.ndarray, " j"], most: int) -> tuple[Float[np.ndarray, "s d"], float]:
-        """Local maxima on a fine grid, each refined, and the bound over the continuum."""
-        series, count = self.mixing @ gains, max(_GRID * self.order, 1)
-        spectrum = np.zeros(count // 2 + 1, complex)
-        spectrum[0] = series[0]
-        spectrum[1 : self.order + 1] = 0.5 * (series[1::2] - 1j * series[2::2])
-        values = np.fft.irfft(spectrum, count) * count
-        peak = np.flatnonzero((values >= np.roll(values, 1)) & (values > np.roll(values, -1)))
-        peak = peak if len(peak) else np.array([int(np.argmax(values))])
-        peak = peak[np.argsort(-values[peak])][:most]
-        low, mid, high = (values[(peak + k) % count] for k in (-1, 0, 1))
-        bend = np.minimum(low - 2 * mid + high, -1e-300)
-        shift = np.clip(0.5 * (low - high) / bend, -1, 1)
-        top = float(values.max()) / (np.cos(np.pi * self.order / count) if self.order else 1.0)
-        return (2 * np.pi / count * (peak + shift) % (2 * np.pi))[:, None], top / self.cost
-
-    def spread(self) -> Float[np.ndarray, "s d"]:
-        """Equidistant angles."""
-        count = min(2 * self.order + 1, _SPREAD)
-        return 2 * np.pi * np.arange(count)[:, None] / count
+    fine = finer(series)
+    widest = 1 / np.prod([np.cos(np.pi * o / n) for o, n in zip(orders, counts, strict=True)])
+    bend = 0.0
+    for i, j in itertools.combinations_with_replacement(range(len(counts)), 2):
+        largest = np.abs(finer(series * sparse[i] * sparse[j])).max() * widest
+        bend += (0.5 if i == j else 1.0) * np.pi**2 / counts[i] / counts[j] * largest
+    peak = np.ones(fine.shape, bool)
+    for axis in range(len(counts)):
+        peak &= (fine >= np.roll(fine, 1, axis)) & (fine > np.roll(fine, -1, axis))
+    peak.flat[int(np.argmax(fine))] = True
+    tops = np.argwhere(peak)
+    tops = tops[np.argsort(-fine[tuple(tops.T)])][:most]
+    places = np.empty(tops.shape)
+    for axis, count in enumerate(counts):
+        beside = np.eye(len(counts), dtype=int)[axis]
+        low, mid, high = (fine[tuple(((tops + k * beside) % counts).T)] for k in (-1, 0, 1))
+        shift = np.clip(0.5 * (low - high) / np.minimum(low - 2 * mid + high, -1e-300), -1, 1)
+        places[:, axis] = 2 * np.pi / count * (tops[:, axis] + shift) % (2 * np.pi)
+    return places, float(fine.max()) + bend + beyond
 
 
 def harmonics(angle: Float[np.ndarray, " s"], order: int) -> Float[np.ndarray, "s h"]:

@@ -21,8 +21,7 @@ Proof        For multipliers π_rk ≥ 0, Σ_k π_rk = 1, let L_r = Σ_k π_rk A
              and the denominator is at most mean_r tr G_r M₀r + B max_i d_i / c_i, d_i = mean_r tr G_r M_ir. The
              maximum over all candidates, a continuum of them included, therefore bounds f from below: the equivalence
              theorem of Kiefer & Wolfowitz (1960, Canad. J. Math. 12, 363) as an inequality that holds at any w.
-Candidates   come in families whose information is linear in a few fixed matrices, M_i = Σ_j F_ij B_j, so that a million
-             candidates cost a million short dot products. They may be a continuum (`families`).
+Candidates   come in families (`families`): a list, of a million if need be, or a continuum of angles.
 Solution     Column generation: a log-barrier Newton method solves the problem for a few candidates (min mean t_r with
              φ_rk ≤ t_r; Boyd & Vandenberghe 2004, Convex Optimization, 11.3), those with the largest d_i / c_i join,
              those without weight leave, until the proven gap is small.
@@ -107,7 +106,7 @@ class Experiment:
             self.budget / len(self.families) / family.cost_at(family.spread()) for family in self.families
         ]
         whole = self.known.mean(axis=0) + sum(
-            np.einsum("s,sj,jab->ab", w / len(w), f.coefficients(f.spread()), f.basis.mean(axis=0))
+            np.tensordot(w / len(w), f.information(f.spread()).mean(axis=0), (0, 0))
             for w, f in zip(shares, self.families, strict=True)
         )
         size = np.sqrt(np.clip(np.diag(whole), 0.0, None))
@@ -125,12 +124,9 @@ class Experiment:
                 f"targets {', '.join(map(str, bad[:5].tolist()))} depend on parameters that no candidate informs about"
             )
 
-        def turned(matrices: Float[np.ndarray, "*s n n"]) -> Float[np.ndarray, "*s a a"]:
-            return np.einsum("na,...nm,mb->...ab", to_seen, matrices, to_seen, optimize=True)
-
-        families = tuple(dataclasses.replace(f, basis=turned(f.basis)) for f in self.families)  # type: ignore[type-var]
+        families = tuple(family.turned(to_seen[None]) for family in self.families)
         # What a few candidates leave open is known to next to nothing instead: no target needs it, or it is found bad.
-        known = turned(self.known) + _NOTHING * np.eye(int(seen.sum()))
+        known = to_seen.T @ self.known @ to_seen + _NOTHING * np.eye(int(seen.sum()))
         return Experiment(known, kept, families, self.budget, self.together)
 
 
@@ -185,8 +181,7 @@ class _Some:
         matrices, costs = [], []
         for number, place in self.chosen:
             family, at = experiment.families[number], np.atleast_2d(place)
-            r, j, n, _ = family.basis.shape
-            matrices.append((family.coefficients(at) @ family.basis.reshape(r, j, -1)).reshape(r, n, n))
+            matrices.append(family.information(at)[:, 0])
             costs.append(float(family.cost_at(at)[0]))
         self.matrices = np.stack(matrices, axis=1)  # (r, s, n, n)
         self.costs = np.array(costs)
@@ -387,7 +382,11 @@ def optimise(
     """
     if not experiment.budget > 0:
         raise ValueError(f"the budget is {experiment.budget:g}: nothing can be done with it")
-    problem = experiment.reduced()
+    return _best(experiment.reduced(), gap, most, progress)
+
+
+def _best(problem: Experiment, gap: float, most: int, progress: Callable[[str], None] | None) -> Allocation:
+    """As `optimise`, for a problem in the coordinates of `Experiment.reduced`."""
     chosen = [(number, place) for number, f in enumerate(problem.families) for place in f.spread()]
     some = _Some(problem, chosen)
     weight = np.full(len(chosen), problem.budget / some.costs.sum())
@@ -464,9 +463,7 @@ def lower_bound(
     known = float((g * experiment.known).sum()) / groups
     tops, ratio = [], 0.0
     for number, family in enumerate(experiment.families):
-        flat = family.basis.reshape(len(g), family.basis.shape[1], -1)
-        gains = (flat @ g.reshape(len(g), -1, 1)).sum(axis=(0, 2)) / groups
-        places, largest = family.best(gains, most)
+        places, largest = family.best(g / groups, most)
         ratio = max(ratio, largest)
         tops += [(number, place) for place in places]
     return Bound(here, known, ratio, tuple(tops))
@@ -480,8 +477,10 @@ def least_budget(
     The budget of the plan is Σ weight · cost. Raises as `optimise`.
     """
 
+    problem = experiment.reduced()
+
     def best(budget: float) -> Allocation:
-        return optimise(dataclasses.replace(experiment, budget=budget), gap=0.5 * gap, progress=progress)
+        return _best(dataclasses.replace(problem, budget=budget), 0.5 * gap, 8, progress)
 
     budget = experiment.budget
     plan = best(budget)

@@ -4,6 +4,8 @@ The best weights and their proof are those of `optimal`, candidates those of `ex
 `wanted`. Here they become whole exposures in an order with few changes, with the gain of each and the price of leaving
 it out.
 
+Plate        Where it may stand at any angle the bound holds for all of them; exposures are taken at few, those that the
+             best weights use most, as many as are worth their changes.
 Order        Settings one after the other, the polariser turning one way in each, then the sky, the nearest pointing
              next. Changes of filter, moving elements and pointing take time from the budget; whether a setting is worth
              its change is tried. The bound knows of no changes, and holds for every order.
@@ -23,7 +25,7 @@ from walop_jax.data.user_tables import InputTable
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import rounded as digits
 from walop_jax.model.effects import Effect
-from walop_jax.plans.could import Could
+from walop_jax.plans.could import Could, Place
 from walop_jax.plans.exposures import DRAWS, Candidates, candidates, information_of
 from walop_jax.plans.optimal import (
     GAP,
@@ -42,6 +44,7 @@ from walop_jax.simulation.observing_plan import ObservingPlan, Stop, polariser_t
 PLANNED = "plan.json"
 NAMED = 5.0
 """Distance (σ) from every rival at which an effect is named."""
+_ALIKE = 3.0  # deg: angles of the plate that are taken as one
 _TRIES = 6  # budgets, until the exposures and the changes between them fit into the time
 
 USUAL: Mapping[str, tuple[tuple[float, ...], bool, int]] = {
@@ -60,7 +63,7 @@ class Line(NamedTuple):
     """Exposures of a plan that are the same: number of the choice, place in it, how often."""
 
     choice: int
-    place: float
+    place: tuple[float, ...]
     times: int
 
 
@@ -270,19 +273,21 @@ def plan_from(
     if not minutes > 0:
         raise ValueError(f"{minutes:g} minutes: nothing can be observed in no time")
     tell("looking for the best plan")
-    experiment = experiment_of(found, minutes, want, known)
+    whole = experiment = experiment_of(found, minutes, want, known)
     try:
         weights = optimise(experiment, gap=0.5 * gap, progress=tell)
     except NotEstimableError as error:
         missing = [k for k in ("moon", "standard") if not any(c.kind == k for c in found.choices)]
         advice = f"; no {' or '.join(missing)} exposures could be taken" if missing else ""
         raise NotEstimableError("; ".join((f"{error}{advice}", *found.notes))) from None
-    best, lines = _whole(found, experiment, weights)
+    best, lines, found, experiment = _at_few_angles(
+        found, weights, lambda some: experiment_of(some, minutes, want, known), gap
+    )
     needed = None
     if goal is not None:
         tell("how long the goal takes")
-        cheapest, least = least_budget(experiment, want.variance(goal), gap=gap)
-        needed = (_cost(experiment, cheapest) / 60.0, least / 60.0)
+        cheapest, least = least_budget(whole, want.variance(goal), gap=gap)
+        needed = (_cost(whole, cheapest) / 60.0, least / 60.0)
     total = _total(experiment, best)
     return ExposurePlan(
         minutes=minutes,
@@ -314,18 +319,11 @@ def experiment_of(
         known = np.broadcast_to(before, (len(want.targets), *before.shape)).copy()
         return Experiment(known, want.targets, families, budget)
 
-    def turned(matrices: Float[np.ndarray, "*s f f"]) -> Float[np.ndarray, "*s b n n"]:
-        return pairs.swapaxes(1, 2) @ matrices[..., None, :, :] @ pairs
-
-    families = tuple(
-        dataclasses.replace(f, basis=np.concatenate(np.moveaxis(turned(f.basis), 2, 1)))  # type: ignore[type-var]
-        for f in families
-    )
+    families = tuple(family.turned(pairs) for family in families)
     # Where a rival has fewer parameters than another the rest are known.
     idle = np.stack([np.diag(1.0 * ~pair.any(axis=0)) for pair in pairs])
-    return Experiment(
-        np.tile(turned(before) + idle, (len(found.values), 1, 1)), want.targets, families, budget, len(pairs)
-    )
+    known = pairs.swapaxes(1, 2) @ before @ pairs + idle
+    return Experiment(np.tile(known, (len(found.values), 1, 1)), want.targets, families, budget, len(pairs))
 
 
 def _errors(
@@ -336,12 +334,48 @@ def _errors(
 
 def _cost(experiment: Experiment, plan: Allocation) -> float:
     return sum(
-        w * float(experiment.families[f].cost_at(p[None])[0])
+        w * float(experiment.families[f].cost_at(np.atleast_2d(p))[0])
         for f, p, w in zip(plan.family, plan.place, plan.weight, strict=True)
     )
 
 
 # ------------------------------------------------------------------------------------------ whole, and in order
+
+
+def _at_few_angles(
+    found: Candidates, weights: Allocation, experiment: Callable[[Candidates], Experiment], gap: float
+) -> tuple[Allocation, list[Line], Candidates, Experiment]:
+    """Whole exposures in order, with the plate at as many angles as are worth it, of candidates with these alone."""
+    free = [i for i, choice in enumerate(found.choices) if choice.free]
+    angles: dict[float, float] = {}
+    for i in np.argsort(-weights.weight):
+        number, place, weight = int(weights.family[i]), weights.place[i], float(weights.weight[i])
+        if number in free:
+            angle = float(found.choices[number].stop(place).plate or 0.0)
+            near = [a for a in angles if abs((a - angle + 90.0) % 180.0 - 90.0) < _ALIKE]
+            angles[near[0] if near else angle] = angles.get(near[0] if near else angle, 0.0) + weight
+    order = sorted(angles, key=lambda a: -angles[a])
+    best, said = None, None
+    for count in range(len(order) + 1):
+        if best is not None and best[0].value <= weights.bound * (1 + gap):
+            break  # no other angle can be worth more than this
+        some = found.with_plate(order[:count])
+        if not some.choices:
+            continue
+        part = experiment(some)
+        try:
+            one = _whole(some, part, optimise(part, gap=0.5 * gap) if free else weights)
+        except ValueError as error:
+            said = error
+            continue
+        if best is None or one[0].value < best[0].value:
+            best = (dataclasses.replace(one[0], bound=weights.bound), one[1], some, part)
+        elif count > 1:
+            break
+    if best is None:
+        assert said is not None
+        raise said
+    return best
 
 
 def _whole(found: Candidates, experiment: Experiment, weights: Allocation) -> tuple[Allocation, list[Line]]:
@@ -396,7 +430,7 @@ def _within(
 def _ordered(found: Candidates, plan: Allocation) -> list[Line]:
     """Indoors setting by setting, the polariser turning one way; then the sky, last setting first, the nearest next."""
     lines = [
-        Line(int(f), float(p[0]), int(w))
+        Line(int(f), tuple(p.tolist()), int(w))
         for f, p, w in zip(plan.family, plan.place, plan.weight, strict=True)
     ]
     settings = list(dict.fromkeys(found.choices[i].setting for i in sorted({line.choice for line in lines})))
@@ -404,7 +438,7 @@ def _ordered(found: Candidates, plan: Allocation) -> list[Line]:
     def key(line: Line) -> tuple[int, int, float]:
         choice = found.choices[line.choice]
         number = settings.index(choice.setting)
-        return (0, number, line.place) if choice.kind in ("clp", "lamp") else (1, -number, 0.0)
+        return (0, number, line.place[0]) if choice.kind in ("clp", "lamp") else (1, -number, 0.0)
 
     lines.sort(key=key)
     done = [line for line in lines if key(line)[0] == 0]
@@ -465,14 +499,13 @@ def _total(experiment: Experiment, plan: Allocation) -> Float[np.ndarray, "r n n
     """M of a plan in every draw."""
     total = experiment.known.copy()
     for number, place, weight in zip(plan.family, plan.place, plan.weight, strict=True):
-        total += weight * _of(experiment, int(number), float(place[0]))
+        total += weight * _of(experiment, int(number), place)
     return total
 
 
-def _of(experiment: Experiment, number: int, place: float) -> Float[np.ndarray, "r n n"]:
+def _of(experiment: Experiment, number: int, place: Place) -> Float[np.ndarray, "r n n"]:
     """M of one exposure."""
-    family = experiment.families[number]
-    return np.tensordot(family.basis, family.coefficients(np.array([[place]]))[0], (1, 0))
+    return experiment.families[number].information(np.atleast_2d(place))[:, 0]
 
 
 def covariance(total: Float[np.ndarray, "r n n"]) -> Float[np.ndarray, "r n n"]:
@@ -495,12 +528,12 @@ def criterion(experiment: Experiment, total: Float[np.ndarray, "r n n"]) -> floa
 def _described(
     found: Candidates, experiment: Experiment, lines: list[Line], best: Allocation
 ) -> Iterator[PlannedExposure]:
-    keys = [(int(f), float(p[0])) for f, p in zip(best.family, best.place, strict=True)]
+    keys = [(int(f), tuple(p.tolist())) for f, p in zip(best.family, best.place, strict=True)]
     without, more = worth(experiment, best)
     for line, change in zip(lines, _changes(found, lines), strict=True):
         choice, i = found.choices[line.choice], keys.index((line.choice, line.place))
         stop = choice.stop(line.place)
-        each = float(experiment.families[line.choice].cost_at(np.array([[line.place]]))[0])
+        each = float(experiment.families[line.choice].cost_at(np.atleast_2d(line.place))[0])
         yield PlannedExposure(
             kind=choice.kind,
             filter=choice.filter,
@@ -517,7 +550,7 @@ def _described(
         )
 
 
-def usual_plans(found: Candidates) -> Iterator[tuple[str, dict[tuple[int, float], float]]]:
+def usual_plans(found: Candidates) -> Iterator[tuple[str, dict[tuple[int, tuple[float, ...]], float]]]:
     """The plans of `USUAL` that the candidates hold, as weights of (choice, place)."""
     polariser = {c.setting: i for i, c in reversed(list(enumerate(found.choices))) if c.kind == "clp"}
     order = [i for i, c in enumerate(found.choices) if polariser.get(c.setting) == i]
@@ -526,20 +559,22 @@ def usual_plans(found: Candidates) -> Iterator[tuple[str, dict[tuple[int, float]
         if (each and len(order) < 2) or (patches and moon is None):
             continue
         weights = {
-            (i, found.choices[i].phase(a)): 1.0 for i in (order if each else order[:1]) for a in angles
+            (i, found.choices[i].place(a)): 1.0 for i in (order if each else order[:1]) for a in angles
         }
         if patches and moon is not None:
             there = len(found.choices[moon].stops)
-            weights |= {(moon, float(k)): patches / there for k in range(there)}
+            weights |= {(moon, (float(k),)): patches / there for k in range(there)}
         yield name, weights
 
 
 def information_of_weights(
-    experiment: Experiment, weights: Mapping[tuple[int, float], float]
+    experiment: Experiment, weights: Mapping[tuple[int, tuple[float, ...]], float]
 ) -> tuple[Float[np.ndarray, "r n n"], float]:
     """M of weights of (choice, place) without what is known, and their cost."""
     whole = sum(w * _of(experiment, *key) for key, w in weights.items())
-    cost = sum(w * float(experiment.families[i].cost_at(np.array([[p]]))[0]) for (i, p), w in weights.items())
+    cost = sum(
+        w * float(experiment.families[i].cost_at(np.atleast_2d(p))[0]) for (i, p), w in weights.items()
+    )
     return np.asarray(whole), cost
 
 
