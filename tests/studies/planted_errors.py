@@ -174,7 +174,7 @@ ERRORS = (
     # plans
     planted("plans/optimal.py", "return self.here**2 / (self.known", "return self.here**2 / (0.0 * self.known",
             "plans/test_optimal.py"),
-    planted("plans/families.py", "- 1j * series[2::2]", "+ 1j * series[2::2]", "plans/test_optimal.py"),
+    planted("plans/families.py", "bend += (0.5 if", "bend += (0.0 if", "plans/test_optimal.py"),
     # commands
     planted("commands/refit.py", "            if result.converged:", "            if True:",
             "commands/test_commands.py"),

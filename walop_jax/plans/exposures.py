@@ -147,7 +147,7 @@ def candidates(
         for rows in [slice(start, stop)] if polarised else [slice(i, i + 1) for i in range(start, stop)]:
             at = likelihood.used[:, rows.start]
             there = flux[at, rows.start] * choice.seconds / exptime[rows.start]
-            light = Light(there, noise, shared, 1.0 if choice.kind == "standard" else factor)
+            light = Illumination(there, noise, shared, 1.0 if choice.kind == "standard" else factor)
             counts = tuple((unit[at, rows], slopes[at, rows]) for unit, slopes in responses)
             if polarised:
                 families.append(Polarised(choice, light, counts, _orders(choice, angles), cost))
@@ -271,7 +271,7 @@ def _interpolating(angle: Float[np.ndarray, " s"], nodes: int) -> Float[np.ndarr
     return harmonics(angle, nodes // 2) @ np.linalg.inv(there)
 
 
-class Light(NamedTuple):
+class Illumination(NamedTuple):
     """How much light there is in an exposure: `flux` (electron) at its points, noise, what shares a flux.
 
     `scale` leads from these points to those of the plan.
@@ -328,7 +328,7 @@ class Polarised(Family):
     """
 
     choice: CandidateExposure
-    light: Light
+    light: Illumination
     counts: tuple[tuple[Float[np.ndarray, "p e k"], Float[np.ndarray, "p e k f"]], ...]
     orders: tuple[int, ...]
     cost: float
