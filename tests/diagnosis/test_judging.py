@@ -214,7 +214,7 @@ def gains(seed=3):
     return simulate(PLAN, seed=seed, effects=[dataclasses.replace(pattern, exposures=own)])[:2]
 
 
-@pytest.mark.parametrize("hidden", ["slips", "gains"])
+@pytest.mark.parametrize("hidden", [pytest.param("slips", marks=pytest.mark.long), "gains"])
 def test_a_term_is_useful_where_the_matrix_is_closer_to_the_truth_with_it(hidden, slips):
     """Gains of single exposures, for settings that slip and for gains: slips are only made probable by being broad."""
     calset, truth = (slips.fit.calset, simulate(PLAN, seed=1).truth) if hidden == "slips" else gains()

@@ -102,7 +102,7 @@ def test_every_effect_against_the_whole_light_path(laid):
         _alike(ours, own_columns(likelihood, values, probe.group), [effect.name] * ours.shape[1])
 
 
-@pytest.mark.parametrize("name", quick(BESIDE, ["nonlinearity"]))
+@pytest.mark.parametrize("name", quick(BESIDE, []))
 def test_beside_an_active_effect(laid, name):
     """What is active stands in the way of every change: mixed cameras, opposite points, detectors, the train."""
     bare, values = laid

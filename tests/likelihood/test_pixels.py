@@ -174,6 +174,7 @@ def with_stars(path):
     return Likelihood.of(calset, base_model(calset, throughput_degree=2), interpolate=True)
 
 
+@pytest.mark.long
 def test_frames_and_a_table_are_gone_through_each_in_its_way(with_stars):
     model = with_stars.model
     assert stands_for_pixels(with_stars, model.start)

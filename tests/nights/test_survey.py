@@ -12,6 +12,7 @@ from command import run_program
 from small_run import SMALL
 
 import walop_jax as walop
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.fit.model_file import base_model, model_for
 from walop_jax.fit.refit import fit
@@ -22,6 +23,7 @@ from walop_jax.model.specification import effect_context, make_model, with_effec
 from walop_jax.nights import night_file, stacking
 from walop_jax.nights.equations import night_equations
 from walop_jax.nights.stacking import stack
+from walop_jax.science import apply as application
 from walop_jax.simulation.simulate import simulate
 
 TURN = 0.1  # deg, of the axis of a half-wave plate, between the third night and the fourth
@@ -84,6 +86,7 @@ def test_nights_that_share_nothing_are_single_fits(sets, single):
     assert survey.verdict.dof == single.dof + other.dof
 
 
+@pytest.mark.long
 def test_a_step_of_what_the_model_lacks(sets, single):
     """The planted turn, under a law of its date; 0 before; without the law the stack is not trusted."""
     date = SMALL.start + 17.5
@@ -253,8 +256,17 @@ def test_the_program_stacks_what_python_does(kept, sets, single):
     )
 
 
-def test_stars_get_the_calibration_of_their_moment(kept, tmp_path):
+def test_stars_get_the_calibration_of_their_moment(kept, monkeypatch):
     """`apply` of a survey: what `at` gives; outside and without a time an error, by force with a flag."""
+    tables = {}
+
+    def tabulated(calibration):
+        key = (calibration.values.tobytes(), calibration.verdict.quality)
+        if key not in tables:
+            tables[key] = AnalysisVectors(calibration)
+        return tables[key]
+
+    monkeypatch.setattr(application, "AnalysisVectors", tabulated)  # those of the same values are the same
     survey = stacking.read_survey(kept / "SURVEY")
     counts = np.array([[2.1e5, 1.9e5, 2e5, 2e5], [1.9e5, 2.1e5, 2e5, 2.1e5]])
     stars = {"X": [0.1, 0.2], "Y": [0.0, 0.1], "N": counts, "N_ERR": np.sqrt(counts)}
@@ -273,6 +285,7 @@ def test_stars_get_the_calibration_of_their_moment(kept, tmp_path):
         walop.apply(kept / "SURVEY", stars | {"MJD": [start + 1.0, start + 3.0]})
 
 
+@pytest.mark.long
 def test_the_page_runs_as_it_stands(sets, tmp_path, monkeypatch, capsys):
     """The blocks of the page of nights, one after the other."""
     from walop_jax.commands.docs import pages

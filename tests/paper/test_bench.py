@@ -6,11 +6,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "notebooks"))
 from bench import PAPER_CROSS_TALK, PAPER_ERRORS, TILTS, bench_table
 
 
+@pytest.mark.long
 def test_bench_table():
     rows = bench_table(seed=1)
     assert [row.tilt for row in rows] == list(TILTS)
