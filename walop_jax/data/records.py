@@ -17,8 +17,8 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import nearest
 from walop_jax.io.plain_tables import astropy_table
 
-KINDS = ("clp", "moon", "standard", "flux", "lamp")
-"""Kinds of exposures: through the polariser, full-Moon sky, standard star, known throughput, lamp."""
+KINDS = ("clp", "moon", "standard", "flux", "lamp", "steady")
+"""Kinds of exposures: through the polariser, full-Moon sky, standard star, known throughput, lamp, lamp of one flux."""
 
 POLARISER, CALIBRATION_PLATE = "CLP", "CHWP"
 """Column prefixes of the moving elements that every calibration set knows."""

@@ -11,6 +11,7 @@ from walop_jax.data.records import Block, DataFlag, Exposures, Intensities, Poin
 from walop_jax.data.schema import Place
 from walop_jax.io.errors import fail, rows_text
 
+ONE_CAMERA = ("flux", "steady")  # KINDs of which a single camera says something
 NEGATIVE = 5.0
 """Counts below minus this many sigma are no bias-subtracted counts but a fault."""
 
@@ -152,10 +153,10 @@ def table_intensities(
     """Check the rows of an INTENSITIES table against the other tables; return them and remarks.
 
     Raises `DataError` for identifiers that do not exist, repeated (EXPOSURE, POINT) pairs, errors that are
-    not positive, too many spoilt rows, nothing used, counts that are all equal, fewer than two cameras, and
-    another number of errors than of counts.
+    not positive, too many spoilt rows, nothing used, counts that are all equal, a single camera
+    that sees light of unknown flux only, and another number of errors than of counts.
     """
-    _cameras(table["N"], table["N_ERR"], place)
+    _cameras(table["N"], table["N_ERR"], exposures, place)
     exposure = _rows_of(table["EXPOSURE"], exposures.exposure, "EXPOSURE", "EXPOSURES", place)
     point = _rows_of(table["POINT"], points.point, "POINT", "POINTS", place)
     pair = exposure * len(points) + point
@@ -192,10 +193,11 @@ def table_intensities(
     return intensities, remarks + more
 
 
-def _cameras(counts: np.ndarray, sigma: np.ndarray, place: Place) -> None:
+def _cameras(counts: np.ndarray, sigma: np.ndarray, exposures: Exposures, place: Place) -> None:
     number, errors = counts.shape[1], sigma.shape[1]
-    if number < 2:
-        raise place.fail(f"has {number} value in a row", "N", "one row holds all cameras, two at least")
+    if number < 2 and not np.isin(exposures.kind, ONE_CAMERA).any():
+        advice = f"one row holds all cameras, two at least where KIND is not {' or '.join(ONE_CAMERA)}"
+        raise place.fail(f"has {number} value in a row", "N", advice)
     if errors != number:
         what = f"has {errors} value(s) in a row, N has {number}"
         raise place.fail(what, "N_ERR", "give the error of every camera")

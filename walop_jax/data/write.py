@@ -110,7 +110,7 @@ def write_calibration_set(
     version of the format that can hold the set.
 
     Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only,
-    for fewer than two cameras, and if a name cannot be written in FITS (ASCII only).
+    and if a name cannot be written in FITS (ASCII only).
 
     >>> walop.write_calibration_set("copy.fits", calset)
     """
@@ -159,8 +159,6 @@ def _primary(calset: CalibrationSet, version: int, path: object) -> fits.Primary
     primary = fits.PrimaryHDU()
     site = calset.site
     instrument_name(calset.instrument, version, schema.Place(path, "PRIMARY"))
-    if calset.cameras < 2:
-        raise fail(f"{calset.cameras} camera", file=path, advice="a calibration set needs two at least")
     cards = {
         "TELESCOP": (site.telescope, "telescope"),
         "INSTRUME": (calset.instrument, "instrument"),

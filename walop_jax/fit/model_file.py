@@ -274,7 +274,7 @@ def _gauges(model: Model, flux_known: bool) -> list[str]:
     """What the fluxes take up: the scale of the throughput, or all that the cameras of an arm have in common."""
     cameras = model.template.cameras
     if cameras.split:
-        first = tuple(f"throughput.n{a}." for a, _ in cameras.pairs)
+        first = tuple(f"throughput.n{arm[0]}." for arm in cameras.arms)
         return [name for name in model.names if name.startswith(first)]
     return [] if flux_known else [GAUGE]
 

@@ -130,7 +130,7 @@ def _turned_wedges(instrument: Instrument) -> Iterator[Named]:
 def _beams(instrument: Instrument) -> Iterator[Named]:
     arms = instrument.arms
     yield from _each_and_all(
-        tuple(f"{arm.name}.{arm.analyser.name}" for arm in arms),
+        tuple(f"{arm.name}.{arm.analyser.name}" for arm in arms if len(arm.analyser.cameras) > 1),
         "with exchanged beams",
         lambda i, place: _with_cameras(i, {place.rpartition(".")[0]: _cameras(i, place)[::-1]}),
     )
@@ -155,11 +155,8 @@ def _with_cameras(instrument: Instrument, names: dict[str, tuple[str, ...]]) -> 
         analyser = next(one for one in instrument.arms if one.name == arm).analyser
         instrument = instrument.changed(f"{arm}.{analyser.name}", cameras=cameras)
     known = instrument.cameras.names
-    pairs = tuple(
-        (known.index(arm.analyser.cameras[0]), known.index(arm.analyser.cameras[1]))
-        for arm in instrument.arms
-    )
-    return dataclasses.replace(instrument, cameras=dataclasses.replace(instrument.cameras, pairs=pairs))
+    arms = tuple(tuple(map(known.index, arm.analyser.cameras)) for arm in instrument.arms)
+    return dataclasses.replace(instrument, cameras=dataclasses.replace(instrument.cameras, arms=arms))
 
 
 def _order(instrument: Instrument) -> Iterator[Named]:

@@ -57,19 +57,18 @@ def parts(description: Description, elements: Sequence[type[Element]] = ()) -> P
 
 def _cameras(description: Description, arms: Sequence[Arm]) -> Cameras:
     names, fault = description.cameras, description.read.fault
-    pairs = []
+    beams = []
     for arm, elements, path in arms:
         (analyser,) = (one for one in elements if one.name == path[-1])
         assert isinstance(analyser, Analyser)
-        beams = analyser.cameras
-        for name in beams:
+        for name in analyser.cameras:
             if name not in names:
                 raise fault(f"arms.{arm}", f"camera {name!r} does not exist; {nearest(name, names)}")
-        pairs.append((names.index(beams[0]), names.index(beams[1])))
-    seen = [camera for pair in pairs for camera in pair]
+        beams.append(tuple(map(names.index, analyser.cameras)))
+    seen = [camera for own in beams for camera in own]
     if sorted(seen) != list(range(len(names))):
         raise fault("cameras", f"every camera must stand behind one analyser: {', '.join(names)}")
-    return Cameras(names=names, pairs=tuple(pairs), split=description.split, floor=description.floor)
+    return Cameras(names=names, arms=tuple(beams), split=description.split, floor=description.floor)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,8 +87,8 @@ class _Maker:
         last = next(one for one in elements if one.name == path[-1])
         if not isinstance(last, Analyser):
             raise self.read.fault(place, f"its path must end with an analyser, not with {path[-1]!r}")
-        if len(last.cameras) != 2:
-            raise self.read.fault(place, "its analyser needs the names of two cameras")
+        if len(last.cameras) not in (1, 2):
+            raise self.read.fault(place, "its analyser needs the names of two cameras, or of one")
         return name, elements, path
 
     def elements(self, table: Table, path: tuple[str, ...], place: str) -> Iterator[Element]:

@@ -108,7 +108,7 @@ class DetectorPart(Component):
 
 
 class Cameras(Component):
-    """Names of the cameras and what is known of them beyond their throughput.
+    """Names of the cameras, which of them each arm has (`arms`), and what is known beyond their throughput.
 
     `split`: the share of the light that an arm gets is not smooth over the field and unknown, so that every arm has a
     flux of its own (`likelihood.flux`). `floor`: no error is smaller than this share of the mean counts of a row.
@@ -120,7 +120,7 @@ class Cameras(Component):
     ghosts: tuple[GhostPart, ...] = ()
     exposures: tuple[ExposurePart, ...] = ()
     detectors: tuple[DetectorPart, ...] = ()
-    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
+    arms: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())
     split: bool = eqx.field(static=True, default=False)
     floor: float = eqx.field(static=True, default=0.0)
 
@@ -130,7 +130,12 @@ class Cameras(Component):
     @property
     def fluxes(self) -> int:
         """Number of fluxes of a row, where they are unknown."""
-        return len(self.pairs) if self.split else 1
+        return len(self.arms) if self.split else 1
+
+    @property
+    def pairs(self) -> tuple[tuple[int, int], ...]:
+        """Cameras of the arms that have two: each such arm has a row of the instrument matrix."""
+        return tuple((arm[0], arm[1]) for arm in self.arms if len(arm) > 1)
 
     @property
     def together(self) -> Float[np.ndarray, "k k"] | None:
@@ -138,8 +143,8 @@ class Cameras(Component):
         if not self.split:
             return None
         arm = np.zeros(len(self.names), int)
-        for number, pair in enumerate(self.pairs):
-            arm[list(pair)] = number
+        for number, own in enumerate(self.arms):
+            arm[list(own)] = number
         return (arm[:, None] == arm).astype(float)
 
     @property

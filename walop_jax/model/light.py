@@ -367,8 +367,8 @@ def instrument_matrix(
 ) -> Float[Any, "... a 3"]:
     """Rows (m21, m22, m23), (m31, m32, m33), … of the instrument matrix from analysis vectors, one for each arm.
 
-    Difference of the response of the two cameras of an arm (`pairs`) to 1, q, u, each over the sum of their response to
+    Difference of the response of the cameras of an arm of two (`pairs`) to 1, q, u, each over the sum of that to
     unpolarised light. For light from the sky pass `vectors @ telescope(instrument, x, y)`. Arrays of numpy stay so.
     """
-    first, second = (vectors[..., np.array([pair[i] for pair in pairs]), :] for i in (0, 1))
+    first, second = (vectors[..., np.array([pair[i] for pair in pairs], int), :] for i in (0, 1))
     return (first[..., :3] - second[..., :3]) / (first[..., :1] + second[..., :1])

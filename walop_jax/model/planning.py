@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.data.records import Exposures, FilterCurve, Sources
 from walop_jax.data.settings import Settings
@@ -54,25 +54,33 @@ def plan_for(
 
     known = [source.kind for source in instrument.sources if source.flux_known]
     arrays = exposure_arrays(exposures, instrument.kinds, known)
-    if instrument.cameras.split:
-        arrays = _without_shares(arrays, own)
+    steady = np.isin(exposures.kind, [source.kind for source in instrument.sources if source.flux_shared])
+    if instrument.cameras.split or steady.any():
+        arrays = _sharing(arrays, own, steady, split=instrument.cameras.split)
     return _plan(instrument, settings, hours_of(exposures)[row], filters, arrays, band_of)
 
 
-def _without_shares(exposures: ExposureArrays, settings: Settings) -> ExposureArrays:
-    """Exposures whose light is divided between the arms in unknown shares.
+def _sharing(
+    exposures: ExposureArrays, settings: Settings, steady: Bool[np.ndarray, " e"], *, split: bool
+) -> ExposureArrays:
+    """Exposures that have a flux in common: steady light in each filter, and, `split`, light of known flux.
 
-    Where the flux is known the shares are the same in all exposures of a filter with everything in the same place.
+    Such light is divided between the arms in unknown shares, the same ones in all exposures of a filter with everything
+    in the same place.
     """
     known = np.asarray(exposures.flux_known)
     group = np.arange(len(known))
-    for _, rows in settings.layouts():
-        group[rows[known[rows]]] = rows[0]
+    if split:
+        for _, rows in settings.layouts():
+            group[rows[known[rows]]] = rows[0]
+    _, first, of_filter = np.unique(settings.filter[steady], return_index=True, return_inverse=True)
+    group[steady] = np.flatnonzero(steady)[first][of_filter]
+    shares = steady.any() or (split and known.any())
     _, number = np.unique(group, return_inverse=True)
     return dataclasses.replace(
         exposures,
-        flux_known=array(np.zeros(len(known), bool)),
-        shared=jax.nn.one_hot(number, number.max() + 1, dtype=float) if known.any() else None,
+        flux_known=array(known & (not split)),
+        shared=jax.nn.one_hot(number, number.max() + 1, dtype=float) if shares else None,
     )
 
 

@@ -80,13 +80,15 @@ class Sight(NamedTuple):
 class Source(Component):
     """Light of one KIND of exposures: its polarisation ahead of the instrument, per unit of flux.
 
-    `kind` is what EXPOSURES says, `flux_known` whether its flux is one (KIND `flux`) or unknown, `from_sky` whether it
-    comes through the telescope; `reference` says where what is assumed of it comes from.
+    `kind` is what EXPOSURES says, `flux_known` whether its flux is one (KIND `flux`) or unknown, `flux_shared` whether
+    an unknown one is the same in all exposures of a filter (KIND `steady`), `from_sky` whether it comes through the
+    telescope; `reference` says where what is assumed of it comes from.
     """
 
     name: ClassVar[str] = ""
     kind: ClassVar[str] = ""
     flux_known: ClassVar[bool] = False
+    flux_shared: ClassVar[bool] = False
     from_sky: ClassVar[bool] = True
     reference: ClassVar[str] = ""
 
@@ -203,4 +205,13 @@ class KnownFlux(Source):
     from_sky: ClassVar[bool] = False
 
 
-SOURCES: tuple[type[Source], ...] = (MoonSky, Standards, ThroughPolariser, Lamp, KnownFlux)
+class Steady(Source):
+    """Unpolarised light of one flux, unknown but the same in all exposures of a filter, that enters behind the telescope."""
+
+    name: ClassVar[str] = "steady"
+    kind: ClassVar[str] = "steady"
+    flux_shared: ClassVar[bool] = True
+    from_sky: ClassVar[bool] = False
+
+
+SOURCES: tuple[type[Source], ...] = (MoonSky, Standards, ThroughPolariser, Lamp, KnownFlux, Steady)

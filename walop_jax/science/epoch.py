@@ -276,7 +276,7 @@ def _visible(changed: Calibration) -> dict[str, float]:
     name = str(np.unique(changed.exposures.filter)[-1])
     _, covariance = changed.matrix(x, y, changed.usual_settings(1, name))
     error = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
-    elements = matrix_elements(len(changed.model.template.arms))
+    elements = matrix_elements(len(changed.model.template.cameras.pairs))
     return dict(zip(elements, (100.0 * SURE * np.median(error, axis=0)).tolist(), strict=True))
 
 

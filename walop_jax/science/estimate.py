@@ -109,7 +109,7 @@ def estimate_with(
 ) -> Estimate:
     """As `estimate`, by arm where the shares of the arms in the light are not known."""
     if cameras.split:
-        return estimate_by_arm(vectors, counts, sigma, star, cameras.pairs)
+        return estimate_by_arm(vectors, counts, sigma, star, cameras.arms)
     return estimate(vectors, counts, sigma, star)
 
 
@@ -118,16 +118,16 @@ def estimate_by_arm(
     counts: Float[np.ndarray, "r k"],
     sigma: Float[np.ndarray, "r k"],
     star: Int[np.ndarray, " r"],
-    pairs: Sequence[tuple[int, int]],
+    arms_cameras: Sequence[Sequence[int]],
 ) -> Estimate:
-    """As `estimate`, with a flux of its own in every row for each arm; `pairs` are the cameras of the arms.
+    """As `estimate`, with a flux of its own in every row for each arm; `arms_cameras` are the cameras of the arms.
 
     The flux of a row is then the mean of those of its arms.
     """
-    arms, cameras = len(pairs), counts.shape[1]
+    arms, cameras = len(arms_cameras), counts.shape[1]
     mine = np.zeros((arms, cameras), bool)
-    for arm, pair in enumerate(pairs):
-        mine[arm, list(pair)] = True
+    for arm, own in enumerate(arms_cameras):
+        mine[arm, list(own)] = True
     seen = np.where(mine, counts[:, None], np.nan).reshape(-1, cameras)
     row = np.repeat(np.arange(len(counts)), arms)
     found = estimate(vectors[row], seen, sigma[row], star[row])

@@ -185,7 +185,9 @@ class Entry(Effect):
         return {name: getattr(self, name) for name in self.options}
 
     def fits(self, instrument: Instrument) -> bool:
-        """Whether the instrument has what the effect acts on."""
+        """Whether the instrument has what the effect acts on; there may be no star that a choice could name."""
+        if "" in self.choices().values():
+            return False
         if not self.arrangement:
             return super().fits(instrument)
         return self.arrangement in alternatives(dataclasses.replace(instrument, effects=()))

@@ -2,9 +2,11 @@
 
 from walop_jax.model.elements.base import Element
 from walop_jax.model.elements.geometry import FieldShift, PupilMapping, Wedge
+from walop_jax.model.elements.mirror import Mirror
 from walop_jax.model.elements.simple import (
     AddedPolarisation,
     Analyser,
+    AnalysisVector,
     Collimator,
     Depolariser,
     Diattenuator,
@@ -31,6 +33,8 @@ ELEMENTS: tuple[type[Element], ...] = (
     AddedPolarisation,
     SpectralElement,
     FieldDiattenuator,
+    Mirror,
+    AnalysisVector,
     Analyser,
 )
 
@@ -39,6 +43,7 @@ __all__ = [
     "AddedPolarisation",
     "AirGap",
     "Analyser",
+    "AnalysisVector",
     "Collimator",
     "Depolariser",
     "Diattenuator",
@@ -46,6 +51,7 @@ __all__ = [
     "FieldDiattenuator",
     "FieldShift",
     "Layer",
+    "Mirror",
     "Polariser",
     "PupilMapping",
     "RadialRetarder",

@@ -112,6 +112,29 @@ class AddedPolarisation(Element):
         return jnp.eye(4).at[1, 0].add(self.q).at[2, 0].add(self.u)
 
 
+class AnalysisVector(Element):
+    """The response of a camera where nothing is known of the optics ahead of it: a free row of a Mueller matrix.
+
+    Equation    M = [[1, q, u, v], 0, 0, 0]: what arrives is 1 + q Q + u U + v V per unit of light, unpolarised
+    Symbols     q, u, v response to fully polarised light over that to unpolarised light, its scale being throughput
+    Source      analysis vector of a division-of-amplitude polarimeter: Azzam 1985, Opt. Acta 32, 1407
+    Limits      q² + u² + v² = 1: an ideal elliptical analyser; 0: a detector that does not care
+    """
+
+    q: Scalar = number(unit="", about="response to light polarised along +X")
+    u: Scalar = number(unit="", about="response to light polarised along +45°")
+    v: Scalar = number(unit="", about="response to circularly polarised light")
+
+    kind: ClassVar[str] = "analysis_vector"
+    reference: ClassVar[str] = "Azzam 1985, Opt. Acta 32, 1407"
+
+    def mueller(self, ray: Ray) -> Mueller:
+        """The row, and nothing polarised behind it."""
+        del ray
+        row = jnp.stack([jnp.ones_like(self.q), self.q, self.u, self.v])
+        return jnp.zeros((4, 4)).at[0].set(row)
+
+
 # -------------------------------------------------------------------------------------------- the calibration polariser
 
 Angles = Float[Array, " e"]
@@ -220,7 +243,7 @@ class RadialRetarder(Element):
 
 
 class Analyser(Element):
-    """A polarising beam splitter: two beams, one for each of its cameras.
+    """A polarising beam splitter: two beams, one for each of its cameras; with a single camera the first alone.
 
     Equation    beams of an arm ½ (1, ±η cos 2α, ±η sin 2α, 0), first camera +, with η ± ξ in the place of η
                 with a dispersion κ the first camera sees the band at λ (1 + κ), the second at λ (1 − κ), to first
@@ -288,13 +311,15 @@ class Analyser(Element):
         return jnp.stack([whole, analysed], axis=1)
 
     def shares(self) -> Float[Array, "k 2"]:
-        """What each beam takes of `seen`."""
+        """What each beam takes of `seen`: that of the second camera only where there is one."""
         half = 0.5 * jnp.ones_like(self.efficiency)
         extra = jnp.zeros_like(half) if self.contrast is None else 0.5 * self.contrast
         along = 0.5 * self.efficiency
-        return jnp.stack([jnp.stack([half, along + extra]), jnp.stack([half, extra - along])])
+        both = jnp.stack([jnp.stack([half, along + extra]), jnp.stack([half, extra - along])])
+        return both[: len(self.cameras)] if self.cameras else both
 
     def shares_of_slopes(self) -> Float[Array, "k 2"]:
         """What each beam takes of λ ∂/∂λ of `seen`."""
         kappa = jnp.zeros_like(self.efficiency) if self.dispersion is None else self.dispersion
-        return self.shares() * jnp.stack([kappa, -kappa])[:, None]
+        shares = self.shares()
+        return shares * jnp.stack([kappa, -kappa])[: len(shares), None]

@@ -1,0 +1,63 @@
+"""Metal mirrors: Fresnel's equations of a thick layer with a complex index of refraction.
+
+Equation    r_s = (cos θ − w)/(cos θ + w),  r_p = (N² cos θ − w)/(N² cos θ + w),  w = √(N² − sin² θ),  N = n + ik
+            M of the Jones matrix diag(r_p, r_s), p along `axis`, over ½ (|r_p|² + |r_s|²)
+Symbols     θ angle of incidence; n, k index of refraction and extinction coefficient, natural cubic splines through
+            their values at `n_at` and `k_at`; p in the plane of incidence, s normal to it
+Source      Born & Wolf 1999, § 14.2, for fields that go as exp(i(kz − ωt)), k > 0 then absorbs; as an element of a
+            telescope: van Harten, Snik & Keller 2009, PASP 121, 377
+Limits      θ = 0: diag(1, 1, −1, −1), the frame of the reflected beam being (p, s, k) as that of the beam that arrives;
+            k = 0 and tan θ = n (Brewster): light polarised along s alone; k → ∞: no diattenuation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from walop_jax.model import mueller
+from walop_jax.model.elements.base import Element, Mueller
+from walop_jax.model.elements.spectral import Curve, check_curve, spline
+from walop_jax.model.parameters import number
+from walop_jax.model.ray import Ray
+
+Scalar = Float[Array, ""]
+
+
+class Mirror(Element):
+    """A flat metal mirror; reflectance is part of the throughput."""
+
+    n: Curve = number(unit="", about="index of refraction at `n_at`", default=(1.0,), several=True)
+    k: Curve = number(unit="", about="extinction coefficient at `k_at`", default=(1e9,), several=True)
+    incidence: Scalar = number(unit="deg", about="angle of incidence", default=45.0)
+    axis: Scalar = number(unit="deg", about="plane of incidence, from +X toward +Y")
+    n_at: tuple[float, ...] = eqx.field(static=True, default=(0.62,))
+    k_at: tuple[float, ...] = eqx.field(static=True, default=(0.62,))
+
+    kind: ClassVar[str] = "mirror"
+    reference: ClassVar[str] = "Born & Wolf 1999, Principles of Optics, 14.2"
+
+    def __check_init__(self) -> None:
+        check_curve("n", self.n, self.n_at)
+        check_curve("k", self.k, self.k_at)
+
+    def labels(self, field: str) -> Sequence[str]:
+        """Values of a curve are numbered from 1, by wavelength."""
+        knots = {"n": self.n_at, "k": self.k_at}.get(field)
+        return (field,) if knots is None else tuple(f"{field}{i + 1}" for i in range(len(knots)))
+
+    def mueller(self, ray: Ray) -> Mueller:
+        """The mirror at every wavelength, of unit mean reflectance."""
+        index = spline(self.n_at, self.n, ray.wavelength) + 1j * spline(self.k_at, self.k, ray.wavelength)
+        cos, sin = jnp.cos(jnp.deg2rad(self.incidence)), jnp.sin(jnp.deg2rad(self.incidence))
+        inside = jnp.sqrt(index**2 - sin**2)
+        s = (cos - inside) / (cos + inside)
+        p = (index**2 * cos - inside) / (index**2 * cos + inside)
+        nothing = jnp.zeros_like(p)
+        own = mueller.from_jones(mueller.Matrix2(p, nothing, nothing, s))
+        axis = jnp.deg2rad(self.axis)
+        return mueller.rotation(-axis) @ (own / own[..., :1, :1]) @ mueller.rotation(axis)
