@@ -9,6 +9,8 @@ from jaxtyping import Float
 
 from walop_jax.data.records import CalibrationSet, Exposures, FilterCurve, Points, Position, Site, Sources
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.model.effects.described import Described
+from walop_jax.model.specification import effect_context, with_effects
 
 
 def bench_set(
@@ -75,3 +77,13 @@ def left_over(result, values=None):
     likelihood = result.likelihood
     _, residual = likelihood.residuals(result.values if values is None else values)
     return residual[0] / likelihood.points.gathered("weight")[0]
+
+
+def saying(model, calset, sentences):
+    """The model with what sentences say of it, at amplitudes of 0 that a fit finds; priors of the sentences are taken away."""
+    said = Described.of(effect_context(model.template, calset.exposures), sentences=tuple(sentences))
+    made = with_effects(model, [said], effect_context(model.template, calset.exposures))
+    for name in made.names:
+        if name not in model.names:
+            made = made.change(name, prior=None, loose=1.0)
+    return made

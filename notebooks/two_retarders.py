@@ -14,7 +14,9 @@ SCALE = 1e6  # counts of the mean of a bin: nothing depends on it
 HOURS = 1.0 / 60.0  # from one state to the next; not said in the table
 
 
-def two_retarder_set(table: Table | str | Path, together: int = 18, chosen=None, noise: float = 0.0106) -> CalibrationSet:
+def two_retarder_set(
+    table: Table | str | Path, together: int = 18, chosen=None, noise: float = 0.0106
+) -> CalibrationSet:
     """The table as one field point: `together` neighbouring wavelengths are a bin, which is a filter.
 
     Every wavelength is divided by its mean over the states: the lamp is no part of the story. `noise`, a share of the

@@ -166,17 +166,17 @@ def test_a_file_of_ones_own(own):
 class Mirror(Element):
     """An element of a user, with a choice that is no number."""
 
-    kind = "mirror"
+    kind = "flat_mirror"
 
     def mueller(self, ray: Ray):
         return jnp.diag(jnp.asarray([1.0, 1.0, -1.0, -1.0]))
 
 
 def test_elements_of_a_user_are_known_by_their_kind(own):
-    path = own(('kind = "retarder"', 'kind = "mirror"'), ('moves = "WIN"\n', ""), (
+    path = own(('kind = "retarder"', 'kind = "flat_mirror"'), ('moves = "WIN"\n', ""), (
         'delta = { value = 0.1, sigma = 0.02, unit = "rad", source = "a measurement" }\naxis = 10.0\n', ""
     ))  # fmt: skip
-    with pytest.raises(DataError, match="unknown kind of element 'mirror'"):
+    with pytest.raises(DataError, match="unknown kind of element 'flat_mirror'"):
         Instrument.read(path)
     instrument = Instrument.read(path, elements=[Mirror, Diattenuator])
     assert isinstance(instrument.elements[1], Mirror)

@@ -104,9 +104,9 @@ WRONG = {
         ('["left", "right"]', '["left", "right", "third"]'),
         r"\[cameras\] every camera must stand",
     ),
-    "one camera": (
+    "one camera of two": (
         ('cameras = ["right", "left"]\n', 'cameras = ["right"]\n'),
-        r"\[arms\.main\] .* two cameras",
+        r"\[cameras\] every camera must stand behind one analyser",
     ),
     "no cameras": (('cameras = ["right", "left"]\n', ""), r"\[arms\.main\] .* two cameras"),
     "cameras as text": (

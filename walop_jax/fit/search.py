@@ -238,13 +238,14 @@ def _far_off(likelihood: Likelihood, found: FoundMinimum) -> FoundMinimum:
 def check_identifiable(likelihood: Likelihood) -> None:
     """Raise `DataError` when the exposures cannot determine an instrument at all."""
     e, inputs = likelihood.calset.exposures, ", ".join(str(entry.path) for entry in likelihood.calset.inputs)
-    through = e.clp_in & (likelihood.census.rows > 0)
-    angles = np.unique(np.round(np.mod(e.clp_angle[through], 180.0), 3))
+    polariser = likelihood.model.template.polariser is not None
+    through = (e.clp_in | (not polariser)) & (likelihood.census.rows > 0)
+    angles = np.unique(np.round(np.mod(e.clp_angle[through & e.clp_in], 180.0), 3))
     turning = [e.position(prefix).angle for prefix in likelihood.plan.moving]
     states = len(
         np.unique(np.nan_to_num(np.stack([np.zeros(len(e)), *turning], axis=1)[through], nan=-1.0), axis=0)
     )
-    if len(angles) < 3 and (len(angles) == 0 or states < 3):
+    if len(angles) < 3 and ((polariser and len(angles) == 0) or states < 3):
         raise fail(
             f"{len(angles)} distinct polariser angle(s) modulo 180° with usable data",
             file=inputs,

@@ -10,7 +10,8 @@ Sources     Maharana et al. 2022, Paper II, eq. 8; multiple scattering: Berry, D
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -28,9 +29,10 @@ PAPER_II = "Maharana et al. 2022, Paper II"
 class ExposureArrays(eqx.Module):
     """What the light path needs to know of the exposures, one element each; `median` only where it is asked for.
 
-    `kind` counts the kinds of `kinds`. Angles in radians; `clp_angle` is 0 when the polariser is out, `rotator`
-    where it has no meaning; `shared` is 1 where an exposure belongs to a group that has its fluxes in common, None: no
-    exposures have. `hours` since the first exposure, temperature in Celsius, hour angle in h.
+    `kind` counts the kinds of `kinds`. Angles in radians; `clp_angle` is 0 when the polariser is out, `rotator` where
+    it has no meaning; `shared` is 1 where an exposure belongs to a group that has its fluxes in common, None: no
+    exposures have. `moving` holds angles of elements that move behind the polariser (NaN: out). `hours` since the first
+    exposure, temperature in Celsius, hour angle in h.
     """
 
     kind: Int[Array, " e"]
@@ -43,6 +45,7 @@ class ExposureArrays(eqx.Module):
     hour_angle: Float[Array, " e"]
     median_counts: Float[Array, "e k"] | None = None
     shared: Float[Array, "e s"] | None = None
+    moving: Mapping[str, Float[Array, " e"]] = dataclasses.field(default_factory=dict)
     kinds: tuple[str, ...] = eqx.field(static=True, default=())
 
     def of_kind(self, kind: str) -> Bool[Array, " e"]:
@@ -206,7 +209,7 @@ class KnownFlux(Source):
 
 
 class Steady(Source):
-    """Unpolarised light of one flux, unknown but the same in all exposures of a filter, that enters behind the telescope."""
+    """Unpolarised light behind the telescope, its flux unknown but the same in all exposures of a filter."""
 
     name: ClassVar[str] = "steady"
     kind: ClassVar[str] = "steady"

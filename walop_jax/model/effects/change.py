@@ -25,6 +25,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from walop_jax.data.records import POLARISER
 from walop_jax.model.effects.factors import FIELD, WAVELENGTH, Factor, factor
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.ray import NotPlannedError
@@ -248,9 +249,10 @@ class InExposures:
         return jnp.arange(self.exposures.hours.shape[0])
 
     def angle(self, prefix: str) -> Any:
-        """That of the polariser; NaN where it is out."""
-        del prefix
-        return jnp.where(self.exposures.clp_in, self.exposures.clp_angle, jnp.nan)
+        """That of the polariser or of another element that moves; NaN where it is out."""
+        if prefix == POLARISER:
+            return jnp.where(self.exposures.clp_in, self.exposures.clp_angle, jnp.nan)
+        return self.exposures.moving.get(prefix, jnp.full(self.exposures.clp_angle.shape, jnp.nan))
 
 
 def in_exposures(change: Change, exposures: ExposureArrays, x: Any = 0.0, y: Any = 0.0) -> Float[Array, " e"]:

@@ -31,12 +31,12 @@ Scalar = Float[Array, ""]
 class Mirror(Element):
     """A flat metal mirror; reflectance is part of the throughput."""
 
-    n: Curve = number(unit="", about="index of refraction at `n_at`", default=(1.0,), several=True)
-    k: Curve = number(unit="", about="extinction coefficient at `k_at`", default=(1e9,), several=True)
+    n: Curve | None = number(unit="", about="index of refraction at `n_at`", default=None, several=True)
+    k: Curve | None = number(unit="", about="extinction coefficient at `k_at`", default=None, several=True)
     incidence: Scalar = number(unit="deg", about="angle of incidence", default=45.0)
     axis: Scalar = number(unit="deg", about="plane of incidence, from +X toward +Y")
-    n_at: tuple[float, ...] = eqx.field(static=True, default=(0.62,))
-    k_at: tuple[float, ...] = eqx.field(static=True, default=(0.62,))
+    n_at: tuple[float, ...] = eqx.field(static=True, default=())
+    k_at: tuple[float, ...] = eqx.field(static=True, default=())
 
     kind: ClassVar[str] = "mirror"
     reference: ClassVar[str] = "Born & Wolf 1999, Principles of Optics, 14.2"
@@ -44,14 +44,18 @@ class Mirror(Element):
     def __check_init__(self) -> None:
         check_curve("n", self.n, self.n_at)
         check_curve("k", self.k, self.k_at)
+        if (self.n is None) != (self.k is None):
+            raise ValueError(f"{'n' if self.n is None else 'k'} is missing: a metal has both")
 
     def labels(self, field: str) -> Sequence[str]:
         """Values of a curve are numbered from 1, by wavelength."""
         knots = {"n": self.n_at, "k": self.k_at}.get(field)
         return (field,) if knots is None else tuple(f"{field}{i + 1}" for i in range(len(knots)))
 
-    def mueller(self, ray: Ray) -> Mueller:
-        """The mirror at every wavelength, of unit mean reflectance."""
+    def mueller(self, ray: Ray) -> Mueller | None:
+        """The mirror at every wavelength, of unit mean reflectance; no metal: nothing."""
+        if self.n is None or self.k is None:
+            return None
         index = spline(self.n_at, self.n, ray.wavelength) + 1j * spline(self.k_at, self.k, ray.wavelength)
         cos, sin = jnp.cos(jnp.deg2rad(self.incidence)), jnp.sin(jnp.deg2rad(self.incidence))
         inside = jnp.sqrt(index**2 - sin**2)

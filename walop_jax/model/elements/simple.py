@@ -112,11 +112,16 @@ class AddedPolarisation(Element):
         return jnp.eye(4).at[1, 0].add(self.q).at[2, 0].add(self.u)
 
 
+FOLLOWING = ("cos1", "sin1", "cos2", "sin2")
+
+
 class AnalysisVector(Element):
     """The response of a camera where nothing is known of the optics ahead of it: a free row of a Mueller matrix.
 
-    Equation    M = [[1, q, u, v], 0, 0, 0]: what arrives is 1 + q Q + u U + v V per unit of light, unpolarised
+    Equation    M = [a, 0, 0, 0], a = (1, q, u, v) + Σ_m (c_m cos m φ + s_m sin m φ): what arrives is a · S
     Symbols     q, u, v response to fully polarised light over that to unpolarised light, its scale being throughput
+                φ angle of the element that it follows (`moves`), m = 1, 2; c_m, s_m changes of the response to I, Q, U, V:
+                an element that turns and deviates the beam, to first order in the deviation 1, to second order 2
     Source      analysis vector of a division-of-amplitude polarimeter: Azzam 1985, Opt. Acta 32, 1407
     Limits      q² + u² + v² = 1: an ideal elliptical analyser; 0: a detector that does not care
     """
@@ -124,6 +129,13 @@ class AnalysisVector(Element):
     q: Scalar = number(unit="", about="response to light polarised along +X")
     u: Scalar = number(unit="", about="response to light polarised along +45°")
     v: Scalar = number(unit="", about="response to circularly polarised light")
+    cos1: Curve | None = number(
+        unit="", about="change with cos φ of the response to I, Q, U, V", default=None, several=True
+    )
+    sin1: Curve | None = number(unit="", about="change with sin φ", default=None, several=True)
+    cos2: Curve | None = number(unit="", about="change with cos 2φ", default=None, several=True)
+    sin2: Curve | None = number(unit="", about="change with sin 2φ", default=None, several=True)
+    axis: Scalar = number(unit="deg", about="added to the angle that it follows")
 
     kind: ClassVar[str] = "analysis_vector"
     reference: ClassVar[str] = "Azzam 1985, Opt. Acta 32, 1407"
@@ -131,8 +143,21 @@ class AnalysisVector(Element):
     def mueller(self, ray: Ray) -> Mueller:
         """The row, and nothing polarised behind it."""
         del ray
-        row = jnp.stack([jnp.ones_like(self.q), self.q, self.u, self.v])
+        row, angle = jnp.stack([jnp.ones_like(self.q), self.q, self.u, self.v]), jnp.deg2rad(self.axis)
+        for name in FOLLOWING:
+            if (change := getattr(self, name)) is not None:
+                row = row + getattr(jnp, name[:3])(int(name[3:]) * angle) * change
         return jnp.zeros((4, 4)).at[0].set(row)
+
+    def __check_init__(self) -> None:
+        for name in FOLLOWING:
+            change = getattr(self, name)
+            if change is not None and jnp.ndim(change) == 1 and len(change) != 4:
+                raise ValueError(f"{name} has {len(change)} values; one each for I, Q, U and V is needed")
+
+    def labels(self, field: str) -> Sequence[str]:
+        """Those of a change are named by what they are a response to."""
+        return tuple(f"{field}.{one}" for one in "iquv") if field in FOLLOWING else (field,)
 
 
 # -------------------------------------------------------------------------------------------- the calibration polariser
