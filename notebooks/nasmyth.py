@@ -1,4 +1,7 @@
-"""Importer of q, u of unpolarised stars behind a mirror that turns (STAR, PARALLACTIC deg, Q, U with errors, WAVELENGTH um)."""
+"""Importer of q, u of unpolarised stars behind a mirror that turns.
+
+Columns: STAR, PARALLACTIC (deg), Q, Q_ERR, U, U_ERR, WAVELENGTH (um).
+"""
 
 from __future__ import annotations
 
@@ -17,9 +20,10 @@ def nasmyth_set(table: Table | str | Path, floor: float = 0.0) -> CalibrationSet
     """Each measurement as the intensities that it stands for: (1 + q)/2, (1 - q)/2, (1 + u)/2, (1 - u)/2.
 
     q = (N0 - N1)/(N0 + N1) has the error of the table where each of the two has 1/√2 of it. `floor` is added to the
-    errors in quadrature.
+    errors in quadrature. What `copied` doubts is left out.
     """
     rows = table if isinstance(table, Table) else Table.read(table, format="ascii.ecsv")
+    rows = rows[~copied(rows)]
     q, u, wavelength, angle = (
         np.asarray(rows[name], float) for name in ("Q", "U", "WAVELENGTH", "PARALLACTIC")
     )
@@ -36,3 +40,12 @@ def nasmyth_set(table: Table | str | Path, floor: float = 0.0) -> CalibrationSet
         SCALE * np.repeat(errors, 2, axis=1),
         {"MIRROR": angle},
     )
+
+
+def copied(rows: Table):
+    """Measurements of a star that agree with those through another filter to the last digit of q, u and both errors.
+
+    One of them is a copy, and nothing says which.
+    """
+    named = [(str(row["STAR"]), *(float(row[c]) for c in ("Q", "Q_ERR", "U", "U_ERR"))) for row in rows]
+    return np.array([named.count(one) > 1 for one in named])

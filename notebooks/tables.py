@@ -26,7 +26,7 @@ def bench_set(
     polariser: Float[np.ndarray, " e"] | None = None,
     mjd: Float[np.ndarray, " e"] | float = 60000.0,
 ) -> CalibrationSet:
-    """A set of exposures of one KIND; `of_filter` numbers their filters, angles (deg) are NaN where an element is out."""
+    """A set of exposures of one KIND; `of_filter` numbers their filters, angles are in deg, NaN: out of the beam."""
     n = len(counts)
     no, always = np.full(n, np.nan), np.ones(n, bool)
     exposures = Exposures(
@@ -80,7 +80,7 @@ def left_over(result, values=None):
 
 
 def saying(model, calset, sentences):
-    """The model with what sentences say of it, at amplitudes of 0 that a fit finds; priors of the sentences are taken away."""
+    """The model with what sentences say of it, for a fit to find the amplitudes of, without their priors."""
     said = Described.of(effect_context(model.template, calset.exposures), sentences=tuple(sentences))
     made = with_effects(model, [said], effect_context(model.template, calset.exposures))
     for name in made.names:

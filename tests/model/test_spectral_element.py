@@ -14,6 +14,7 @@ from scipy.interpolate import CubicSpline
 
 from walop_jax.data.records import FilterCurve, Position
 from walop_jax.io.errors import DataError
+from walop_jax.model import mueller
 from walop_jax.model.elements import Analyser, SpectralElement
 from walop_jax.model.elements.spectral import spline
 from walop_jax.model.instrument import Instrument
@@ -178,3 +179,18 @@ def test_beams_see_neighbouring_wavelengths():
     analyser = Analyser(dispersion=0.01, cameras=("a", "b"))
     expected = [[0.005, 0.005], [-0.005, 0.005]]
     np.testing.assert_allclose(analyser.shares_of_slopes(), expected, rtol=1e-14)
+
+
+def test_a_spread_of_the_retardance_is_the_mean_of_its_retarders():
+    """Gaussian retardances of width σ: what is not along the axis keeps exp(−σ²/2), by quadrature."""
+    sigma, delta, axis = 0.4, 1.3, np.deg2rad(25.0)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(30)
+    each = np.stack(
+        [np.asarray(mueller.retarder(jnp.asarray(delta + sigma * x), jnp.asarray(axis))) for x in nodes]
+    )
+    expected = np.einsum("n,nij->ij", weights / weights.sum(), each)
+    element = SpectralElement(
+        delta=jnp.array([delta]), delta_at=(0.6,), spread=jnp.array([1.0 - np.exp(-0.5 * sigma**2)]),
+        spread_at=(0.6,), axis=jnp.array(25.0),
+    )  # fmt: skip
+    np.testing.assert_allclose(element.mueller(ray(np.array([0.6])))[0], expected, atol=1e-12)

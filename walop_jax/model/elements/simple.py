@@ -120,8 +120,8 @@ class AnalysisVector(Element):
 
     Equation    M = [a, 0, 0, 0], a = (1, q, u, v) + Σ_m (c_m cos m φ + s_m sin m φ): what arrives is a · S
     Symbols     q, u, v response to fully polarised light over that to unpolarised light, its scale being throughput
-                φ angle of the element that it follows (`moves`), m = 1, 2; c_m, s_m changes of the response to I, Q, U, V:
-                an element that turns and deviates the beam, to first order in the deviation 1, to second order 2
+                φ angle of the element that it follows (`moves`); c_m, s_m changes of the response to I, Q, U, V: an
+                element that turns and deviates the beam, m = 1 to first order in the deviation, 2 to second order
     Source      analysis vector of a division-of-amplitude polarimeter: Azzam 1985, Opt. Acta 32, 1407
     Limits      q² + u² + v² = 1: an ideal elliptical analyser; 0: a detector that does not care
     """

@@ -1,12 +1,13 @@
 """Elements whose polarisation is a curve over wavelength: mirrors, derotators, coatings, what has no closed form.
 
-Equation    M = depolariser(loss) · R(ρ) · [diattenuator(D) retarder(δ), both along `axis`]; the two commute
-            each of δ(λ), D(λ), ρ(λ), loss(λ) is the natural cubic spline through its values at its own wavelengths,
+Equation    M = depolariser(loss) · R(ρ) · [diattenuator(D) spread(s) retarder(δ), all along `axis`]; they commute
+            each of δ(λ), D(λ), ρ(λ), loss(λ), s(λ) is the natural cubic spline through its values at its own wavelengths,
             continued as a straight line beyond the first and the last; one value: constant
             `FieldDiattenuator`: D(x, y, λ) = Σ c_ij(λ) P_i(x/h) P_j(y/h), i + j ≤ 2, along `axis`, c_ij(λ) such splines
 Symbols     δ retardance [rad], of the fast axis; D diattenuation along `axis`; ρ angle [deg] by which it turns the
             polarisation from +X toward +Y, a circular retardance of 2ρ (skew mirrors, optical activity);
-            loss share of q, u, v that is lost
+            loss share of q, u, v that is lost; s share of what is not along `axis` that is lost, 1 − exp(−σ²/2) where the
+            retardance differs by σ [rad] over the beam or the band
 Sources     mirrors as diattenuating retarders: van Harten, Snik & Keller 2009, PASP 121, 377; form of M: Lu & Chipman
             1996, JOSA A 13, 1106; diattenuation of oblique faces (Fresnel): Born & Wolf 1999, § 1.5;
             spline: de Boor 1978, A Practical Guide to Splines, ch. IV.
@@ -33,7 +34,7 @@ from walop_jax.model.ray import Ray
 
 Scalar = Float[Array, ""]
 Curve = Float[Array, " k"]
-CURVES = ("delta", "diattenuation", "rotation", "loss")
+CURVES = ("delta", "diattenuation", "rotation", "loss", "spread")
 FIELD_TERMS = {f"p{i}{j}": n for n, (i, j) in enumerate(legendre.terms(2))}
 
 
@@ -91,11 +92,15 @@ class SpectralElement(Element):
     loss: Curve | None = number(
         unit="", about="share of the polarisation lost at `loss_at`", default=None, several=True
     )
+    spread: Curve | None = number(
+        unit="", about="share lost across the axis at `spread_at`", default=None, several=True
+    )
     axis: Scalar = number(unit="deg", about="fast axis, from +X toward +Y")
     delta_at: tuple[float, ...] = eqx.field(static=True, default=())
     diattenuation_at: tuple[float, ...] = eqx.field(static=True, default=())
     rotation_at: tuple[float, ...] = eqx.field(static=True, default=())
     loss_at: tuple[float, ...] = eqx.field(static=True, default=())
+    spread_at: tuple[float, ...] = eqx.field(static=True, default=())
 
     kind: ClassVar[str] = "spectral"
     reference: ClassVar[str] = "van Harten, Snik & Keller 2009, PASP 121, 377"
@@ -124,6 +129,11 @@ class SpectralElement(Element):
         matrix, axis = None, jnp.deg2rad(self.axis)
         if self.delta is not None:
             matrix = mueller.retarder(self.curve("delta", ray.wavelength), axis)
+        if self.spread is not None:
+            kept, one = 1.0 - self.curve("spread", ray.wavelength), jnp.ones_like(ray.wavelength)
+            own = jnp.stack([one, one, kept, kept], axis=-1)[:, :, None] * jnp.eye(4)
+            own = mueller.rotation(-axis) @ own @ mueller.rotation(axis)
+            matrix = own if matrix is None else own @ matrix
         if self.diattenuation is not None:
             d = self.curve("diattenuation", ray.wavelength)
             own = mueller.diattenuator(d * jnp.cos(2.0 * axis), d * jnp.sin(2.0 * axis))
