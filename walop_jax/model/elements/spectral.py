@@ -1,13 +1,13 @@
 """Elements whose polarisation is a curve over wavelength: mirrors, derotators, coatings, what has no closed form.
 
 Equation    M = depolariser(loss) · R(ρ) · [diattenuator(D) spread(s) retarder(δ), all along `axis`]; they commute
-            each of δ(λ), D(λ), ρ(λ), loss(λ), s(λ) is the natural cubic spline through its values at its own wavelengths,
-            continued as a straight line beyond the first and the last; one value: constant
+            each of δ(λ), D(λ), ρ(λ), loss(λ), s(λ) is the natural cubic spline through its values at its own
+            wavelengths, continued as a straight line beyond the first and the last; one value: constant
             `FieldDiattenuator`: D(x, y, λ) = Σ c_ij(λ) P_i(x/h) P_j(y/h), i + j ≤ 2, along `axis`, c_ij(λ) such splines
 Symbols     δ retardance [rad], of the fast axis; D diattenuation along `axis`; ρ angle [deg] by which it turns the
             polarisation from +X toward +Y, a circular retardance of 2ρ (skew mirrors, optical activity);
-            loss share of q, u, v that is lost; s share of what is not along `axis` that is lost, 1 − exp(−σ²/2) where the
-            retardance differs by σ [rad] over the beam or the band
+            loss share of q, u, v that is lost; s share of what is not along `axis` that is lost, 1 − exp(−σ²/2)
+            where the retardance differs by σ [rad] over the beam or the band
 Sources     mirrors as diattenuating retarders: van Harten, Snik & Keller 2009, PASP 121, 377; form of M: Lu & Chipman
             1996, JOSA A 13, 1106; diattenuation of oblique faces (Fresnel): Born & Wolf 1999, § 1.5;
             spline: de Boor 1978, A Practical Guide to Splines, ch. IV.
