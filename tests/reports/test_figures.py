@@ -52,14 +52,16 @@ def test_every_figure_can_be_drawn(fitted):
     assert pyplot.get_fignums() == []  # nothing was registered with the global state
 
 
-def test_a_change_is_shown_in_per_cent_of_one_scale(fitted):
+def test_a_change_is_shown_in_per_cent(fitted):
     maps = fitted[1].maps
     step = np.array([0.001, 0.0, 0.0, 0.0, -0.0035, 0.0])[:, None, None]
     figure = figures.matrix_change_figure(maps, dataclasses.replace(maps, values=maps.values + step))
     images = [axis.images[0] for axis in figure.axes[:6]]
-    for image, change in zip(images, (0.1, 0.0, 0.0, 0.0, -0.35, 0.0), strict=True):
+    for image, change, far in zip(
+        images, (0.1, 0.0, 0.0, 0.0, -0.35, 0.0), (0.1, 1.0, 0.5, 0.1, 0.5, 1.0), strict=True
+    ):
         np.testing.assert_allclose(image.get_array(), change, atol=1e-10)
-        assert image.get_clim() == (-0.5, 0.5)
+        assert image.get_clim() == (-far, far)
     half = dataclasses.replace(maps.grid, matrix=((0.01, 0.0), (0.0, 0.01)))
     with pytest.raises(ValueError, match="different places"):
         figures.matrix_change_figure(maps, dataclasses.replace(maps, grid=half))

@@ -42,7 +42,7 @@ def test_page_of_an_epoch(tmp_path):
     page = Page(render_other(tmp_path, "epoch")[0])
     assert page.row("half1.wedge") == ["half1.wedge", "−0.23000", "−0.22890", "+5.2", "rad"]
     assert "The instrument has changed" in page.text
-    assert "half1 the half of the pupil behind HWP1" in page.text
+    assert "half1 for the half of the pupil with HWP1" in page.text
     assert "The change of the instrument matrix is not drawn" in page.text
     assert not page.images
 

@@ -217,21 +217,21 @@ def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
 
 
 def matrix_change_figure(old: MatrixMaps, new: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
-    """By how much the elements of the instrument matrix have changed over the field, in per cent, one scale.
+    """By how much the elements of the instrument matrix have changed over the field, in per cent.
 
-    Raises ValueError for maps of different places.
+    Those that Paper II calls by one name share a scale. Raises ValueError for maps of different places.
     """
     if field_of(old) != field_of(new) or old.values.shape != new.values.shape:
         raise ValueError("the maps of the two calibrations are of different places")
     change = 100.0 * (new.values - old.values)
-    far = rounded_up(largest_size(change))
+    kinds = [element_kind(i, new.arms) for i in range(len(change))]
     figure = on.figure(8.6, 2.3 * new.arms)
     axes = figure.subplots(new.arms, 3, sharex=True, sharey=True, squeeze=False)
-    image = None
-    for axis, values, name in zip(axes.ravel(), change, element_symbols(new.arms), strict=True):
+    for axis, values, name, kind in zip(axes.ravel(), change, element_symbols(new.arms), kinds, strict=True):
+        far = rounded_up(largest_size(change[np.equal(kinds, kind)]))
         field_axes(axis, f"change of {name}")
         image = pixel_map(axis, values, field_of(new), Normalize(-far, far), DIVERGING)
-    colour_bar(figure, image, axes, "new − old (%)", pad=0.02)
+        colour_bar(figure, image, axis, "new − old (%)" if axis in axes[:, -1] else "")
     outer_labels(axes)
     return figure
 

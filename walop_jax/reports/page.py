@@ -390,9 +390,7 @@ def _of_epoch(folder: Path, document: Mapping[str, Any]) -> tuple[list[Picture],
         drawn = figures.matrix_change_figure(old, new)
     except (ValueError, OSError, KeyError, TypeError) as error:
         return [], (f"The change of the instrument matrix is not drawn: {error}.",)
-    caption = (
-        "Change of the instrument matrix over the field, new − old, in per cent, all elements on one scale."
-    )
+    caption = "Change of the instrument matrix over the field, new − old, in per cent."
     return [(embedded(drawn), "Maps of the change of the instrument matrix", caption)], ()
 
 

@@ -212,10 +212,10 @@ def model_entries(product: Calibration) -> dict[str, dict[str, str]]:
 
 
 PLACES = {
-    "half1": "half1 the half of the pupil behind HWP1",
-    "half2": "half2 that behind HWP2",
-    "chwp": "chwp the calibration half-wave plate",
-    "throughput": "throughput.n0, n1, … the cameras in their order (O1, E1, O2, E2)",
+    "half1": "half1 for the half of the pupil with HWP1",
+    "half2": "half2 for that with HWP2",
+    "chwp": "chwp for the calibration half-wave plate",
+    "throughput": "n0, n1, … for the cameras in their order (O1, E1, O2, E2)",
 }
 
 
@@ -223,7 +223,7 @@ def names_in_words(names: Iterable[str]) -> str:
     """What the first parts of names of parameters stand for, where that is no word of its own."""
     used = {name.partition(".")[0] for name in names}
     found = [words for part, words in PLACES.items() if part in used]
-    return f"In names, {listed(found)}." if found else ""
+    return f"In names of parameters stand {listed(found)}." if found else ""
 
 
 def symbols_in_words(names: Sequence[str]) -> str:
