@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from walop_jax.reports.style import AFTER, BEFORE, FONT, PAGE, QUIET, SMALL
 
@@ -43,7 +44,7 @@ def tracks_figure(tracks: Any, document: Mapping[str, Any]) -> Figure | None:
         unit = str(rows["UNIT"][0]) if len(rows) else ""
         axis.set_ylabel(f"{name}\n{f'({unit})' if unit else ''}".strip(), fontsize=SMALL)
         axis.tick_params(labelsize=SMALL)
-    axes[-1].set_xlabel("MJD", fontsize=FONT)
+    _dates(axes[-1])
     return figure
 
 
@@ -58,9 +59,16 @@ def nights_figure(document: Mapping[str, Any]) -> Figure:
     axis.scatter(mjd, excess, s=6, color=np.where(excess > 5.0, BEFORE, AFTER).tolist())
     _events(axis, document["events"])
     axis.set_ylabel("(χ² − dof)/σ", fontsize=FONT)
-    axis.set_xlabel("MJD", fontsize=FONT)
     axis.tick_params(labelsize=SMALL)
+    _dates(axis)
     return figure
+
+
+def _dates(axis: Any) -> None:
+    """MJD along X, written in full."""
+    axis.set_xlabel("MJD", fontsize=FONT)
+    axis.xaxis.set_major_locator(MaxNLocator(6))
+    axis.xaxis.set_major_formatter(ScalarFormatter(useOffset=False))
 
 
 def _events(axis: Any, events: Sequence[Mapping[str, Any]]) -> None:
