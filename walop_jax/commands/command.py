@@ -250,7 +250,8 @@ class Command(Generic[T]):
                 LOG.info("%s", text)
                 tell(text)
 
-            found = self.run(Job(**(shared | {"progress": logged})), arguments)
+            shared["progress"] = logged
+            found = self.run(Job(**shared), arguments)
             for sentence in found.warnings:
                 LOG.warning("%s", sentence)
             return found.value
