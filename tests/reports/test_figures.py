@@ -42,9 +42,9 @@ def test_residuals_of_points_are_noise_after_a_fit(fitted):
 def test_every_figure_can_be_drawn(fitted):
     result, calibration = fitted
     made = {
-        "calibration": figures.calibration_figure(result),
+        "calibration": result.plot("calibration"),
         "matrix": figures.matrix_maps_figure(calibration.maps),
-        "residual": figures.residual_figure(result),
+        "residuals": result.plot("residuals"),
         "modulation": figures.modulation_figure(result.calset, [0, 5]),
     }
     for name, figure in made.items():

@@ -13,11 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import MatrixMaps, ResidualMap
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_file import instrument_of
-from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import two_digits, with_minus_sign
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.reports.style import (
@@ -50,12 +48,6 @@ FITTED = Normalize(0.7, 1.3)
 """Scale of rms residuals of a fit that explains its data, the same for every run."""
 
 
-def residual_figure(result: FitResult, before: Float[np.ndarray, " n"] | None = None) -> Figure:
-    """`residuals_figure` of a fit in memory; `before` defaults to the start values of its model."""
-    start = result.model.start if before is None else before
-    return residuals_figure(result.likelihood, result.values, start)
-
-
 def residuals_figure(
     likelihood: Likelihood,
     values: Float[np.ndarray, " n"],
@@ -71,19 +63,20 @@ def residuals_figure(
     return figure
 
 
-def calibration_figure(result: FitResult, before: Float[np.ndarray, " n"] | None = None) -> Figure:
-    """A calibration on one page: maps of the matrix, and what the fit has left of the residuals.
-
-    `before` is a full vector of parameter values to compare with (default: the start values of the model).
-    """
-    maps = Calibration.from_fit(result).maps
-    figure = PAGE.figure(10.2, 2.35 * max(2, maps.arms))
+def calibration_figure(
+    maps: MatrixMaps,
+    likelihood: Likelihood,
+    values: Float[np.ndarray, " n"],
+    before: Float[np.ndarray, " n"],
+    on: Canvas = PAGE,
+) -> AnyFigure:
+    """A calibration on one page: maps of the matrix, residuals of every field point before and after the fit."""
+    figure = on.figure(10.2, 2.35 * max(2, maps.arms))
     grid = figure.add_gridspec(max(2, maps.arms), 4)
     panels = [figure.add_subplot(grid[i, j]) for i in range(maps.arms) for j in range(3)]
     matrix_panels(figure, panels, maps.values, field_of(maps), range(3 * maps.arms), smooth=True)
     right = [figure.add_subplot(grid[i, 3]) for i in range(2)]
-    start = result.model.start if before is None else before
-    _before_and_after(figure, right, result.likelihood, start, result.values)
+    _before_and_after(figure, right, likelihood, before, values)
     outer_labels(right)
     return figure
 

@@ -92,11 +92,12 @@ def _accuracy(source: FigureSource) -> AnyFigure:
     return figures.accuracy_figure(found, source.canvas)
 
 
-def _residuals(source: FigureSource) -> AnyFigure:
+def _residuals(source: FigureSource, whole: bool = False) -> AnyFigure:
     c = source.rebuilt
     if source.likelihood.layout.large:
         raise fail("was fitted to whole frames", file=source.folder, advice="plot residual-map")
-    return figures.residuals_figure(source.likelihood, c.values, c.model.start, source.canvas)
+    shown = source.likelihood, c.values, c.model.start, source.canvas
+    return figures.calibration_figure(source.maps, *shown) if whole else figures.residuals_figure(*shown)
 
 
 def _residual_map(source: FigureSource) -> AnyFigure:
@@ -164,6 +165,9 @@ class NamedFigure:
 
 FIGURES: Mapping[str, NamedFigure] = {
     "accuracy": NamedFigure("error of p over the field: map and histogram", _accuracy),
+    "calibration": NamedFigure(
+        "the instrument matrix, and residuals before and after the fit", lambda s: _residuals(s, whole=True)
+    ),
     "matrix": NamedFigure(
         "the six elements of the instrument matrix",
         lambda s: figures.matrix_maps_figure(s.maps, on=s.canvas),
