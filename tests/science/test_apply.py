@@ -361,6 +361,16 @@ def test_bad_catalogues(tmp_path, columns, message):
         read_catalogue(write(tmp_path, **columns), SOUTH)
 
 
+def test_columns_may_go_by_the_names_of_the_cameras(tmp_path):
+    counts = {"O1": 51.0, "E1": 49.0, "O2": 52.0, "E2": 48.0}
+    errors = {f"{name}_ERR": 7.0 + k for k, name in enumerate(counts)}
+    one = {name: [value] for name, value in {"X": 0.1, "Y": 0.0, **counts, **errors}.items()}
+    Table(one).write(tmp_path / "c.csv")
+    found = read_catalogue(read_input_table(tmp_path / "c.csv"), SOUTH)
+    assert found.counts.tolist() == [[51.0, 49.0, 52.0, 48.0]]
+    assert found.sigma.tolist() == [[7.0, 8.0, 9.0, 10.0]]
+
+
 def test_stars_are_ids_in_a_filter(tmp_path):
     table = Table({"X": np.zeros(6), "Y": np.zeros(6), "ID": ["a", "b", "a", "", "a", ""]})
     for k in range(4):

@@ -19,7 +19,9 @@ from walop_jax.commands.inputs import (
 )
 from walop_jax.io.errors import errors_naming
 
-CATALOGUE = Argument("FITS, CSV or ECSV with X, Y, N, N_ERR.", "CATALOGUE", Path)
+CATALOGUE = Argument(
+    "Table with X, Y, N, N_ERR; in CSV N0, … N0_ERR, … or O1, … O1_ERR, …", "CATALOGUE", Path
+)
 DEBIAS = Option("Estimator of P_DEBIASED: Plaszczynski et al. 2014, or Wardle and Kronberg 1974.", "MAS|WK")
 SATURATION = Option("Counts from here on are not used (FLAG 256).", "ELECTRONS", float)
 FORCE = Option("Also stars whose filter or temperature it does not cover (FLAG 2048).")

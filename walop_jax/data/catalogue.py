@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Collection, Mapping, Sized
+from collections.abc import Collection, Mapping, Sequence, Sized
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -51,6 +51,16 @@ POINT_COLUMNS: Mapping[str, Column] = {
 
 
 @runtime_checkable
+class NamedCameras(Sized, Protocol):
+    """What a table must know of cameras."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Their names, in order."""
+        ...
+
+
+@runtime_checkable
 class InstrumentOfTables(Protocol):
     """What a table must know of the instrument that it is for; the field reaches to ±`field_limit` (deg)."""
 
@@ -65,7 +75,7 @@ class InstrumentOfTables(Protocol):
         ...
 
     @property
-    def cameras(self) -> Sized:
+    def cameras(self) -> NamedCameras:
         """Its cameras."""
         ...
 
@@ -200,7 +210,7 @@ def read_catalogue(
     place = Place(source.path, "")
     points, cameras = field_points(source, instrument, always_in), len(instrument.cameras)
     rule = Column("float", "electron", width=cameras, shape_advice=f"one row holds all {cameras} cameras")
-    counts, sigma = (vector_column(source, name, rule) for name in ("N", "N_ERR"))
+    counts, sigma = (vector_column(source, name, rule, instrument.cameras.names) for name in ("N", "N_ERR"))
     advice = "standard errors in electrons; NaN for a camera that is not to be used"
     place.refuse(np.isfinite(counts) & (sigma <= 0), "is not above 0", "N_ERR", advice)
     bad = _flagged(source, cameras, place) | (counts >= saturation) | (counts < -_NEGATIVE * sigma)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -123,25 +123,25 @@ def _what_is_there(source: InputTable) -> str:
     return f"the table has {', '.join(names[:_LISTED])}{more}"
 
 
-def vector_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
-    """A column with `rule.width` numbers in a row, or that many columns `name`0, `name`1, … side by side.
+def vector_column(source: InputTable, name: str, rule: Column, cameras: Sequence[str]) -> np.ndarray:
+    """A column with `rule.width` numbers in a row, or that many columns side by side, which text formats need.
 
-    Text formats have no vectors, hence the second form; N_ERR is N0_ERR, N1_ERR, … or N_ERR0, N_ERR1, … there. Raises
-    `DataError` as `numeric_column` does, and for a row of another width.
+    These are N0, N1, … and N0_ERR, N1_ERR, … (or N_ERR0, …), or go by the names of the `cameras`: O1, E1, … and
+    O1_ERR, E1_ERR, … Raises `DataError` as `numeric_column` does, and for a row of another width.
     """
     place = Place(source.path, "")
     width = rule.width or 1
     if name not in source.names:
         head, _, tail = name.partition("_")
-        parts = [f"{head}{k}{'_' + tail if tail else ''}" for k in range(width)]
-        behind = [f"{name}{k}" for k in range(width)]
-        if any(part in source.names for part in behind):
-            parts = behind
-        if not any(part in source.names for part in parts):
+        end = f"_{tail}" if tail else ""
+        spelled = [f"{head}{k}{end}" for k in range(width)], [f"{camera.upper()}{end}" for camera in cameras]
+        forms = (*spelled, [f"{name}{k}" for k in range(width)])
+        parts = next((form for form in forms if any(part in source.names for part in form)), None)
+        if parts is None:
             if rule.missing is not None:
                 return np.full((source.rows, width), rule.missing)
-            advice = f"add it, or {parts[0]} … {parts[-1]}; {_what_is_there(source)}"
-            raise place.fail("the column is missing", name, advice)
+            listed = ", or ".join(f"{form[0]} … {form[-1]}" for form in spelled)
+            raise place.fail("the column is missing", name, f"add it, or {listed}; {_what_is_there(source)}")
         single = dataclasses.replace(rule, width=1)
         return np.stack([numeric_column(source, part, single) for part in parts], axis=1)
     column = source.table.columns[source.names.index(name)]
