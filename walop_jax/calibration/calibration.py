@@ -25,6 +25,7 @@ from walop_jax.calibration.matrix import (
     matrix_draws,
     matrix_names,
     matrix_slopes,
+    of_structure,
     p_errors,
     sample_stars,
     sky_vectors,
@@ -340,7 +341,7 @@ class Calibration(Result):
             return drawn.mean(axis=0), np.einsum("dpi,dpj->pij", away, away) / (len(drawn) - 1)
         instrument = self.model.instrument(self.values)
         values, covariance = matrices(instrument, settings, filters, x, y, self.covariance)
-        return values, covariance + self._of_structure(values)
+        return values, covariance + of_structure(self.verdict.structure, values)
 
     def protection(
         self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings | None = None
@@ -377,23 +378,7 @@ class Calibration(Result):
         )  # fmt: skip
         matrix, slopes = matrix.reshape(len(x), -1), slopes.reshape(len(x), matrix[0].size, -1)
         covariance = slopes @ self.covariance @ np.swapaxes(slopes, 1, 2)
-        return matrix, covariance + self._of_structure(matrix), slopes
-
-    def _of_structure(self, values: Float[np.ndarray, "p m"]) -> Float[np.ndarray, "p m m"]:
-        """Contribution of the structure of field points to the covariance of the matrix at a place.
-
-        Gains g of the two cameras of an arm change its elements by (g₁ − g₂)/2 · (1 − m₁², −m₁m₂, −m₁m₃), their
-        responses to q and u the last two by half of their difference.
-        """
-        structure, size = self.verdict.structure, values.shape[1]
-        added = np.zeros((len(values), size, size))
-        for first in range(0, size if structure else 0, 3):
-            m = values[:, first : first + 3]
-            slope = np.array([1.0, 0.0, 0.0]) - m[:, :1] * m
-            at = slice(first, first + 3)
-            added[:, at, at] = 0.5 * structure.gain**2 * slope[:, :, None] * slope[:, None, :]
-            added[:, at, at] += 0.5 * structure.response**2 * np.diag([0.0, 1.0, 1.0])
-        return added
+        return matrix, covariance + of_structure(self.verdict.structure, matrix), slopes
 
     def usual_settings(self, count: int = 1, filter_name: str = DEFAULT_FILTER) -> Settings:
         """Flat photon spectrum, 10 °C, on the meridian, moving elements out.

@@ -25,7 +25,7 @@ from walop_jax.data.frames import Grid
 from walop_jax.data.records import CalibrationSet, FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
-from walop_jax.fit.verdict import Hidden
+from walop_jax.fit.verdict import Hidden, Structure
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.field_table import accurate_table, linearised, rows_and_slopes, to_all
 from walop_jax.likelihood.runner import usual_threads
@@ -328,6 +328,23 @@ def slopes_over_field(
         table, off = accurate_table(exact, corners, counts, tolerance, error)
         table = table if off <= tolerance else None
     return exact(x, y) if table is None else table(x, y)
+
+
+def of_structure(structure: Structure, values: Float[np.ndarray, "p m"]) -> Float[np.ndarray, "p m m"]:
+    """Contribution of the structure of field points to the covariance of the matrix at a place.
+
+    Gains g of the two cameras of an arm change its elements by (g₁ − g₂)/2 · (1 − m₁², −m₁m₂, −m₁m₃), their
+    responses to q and u the last two by half of their difference.
+    """
+    size = values.shape[1]
+    added = np.zeros((len(values), size, size))
+    for first in range(0, size if structure else 0, 3):
+        m = values[:, first : first + 3]
+        slope = np.array([1.0, 0.0, 0.0]) - m[:, :1] * m
+        at = slice(first, first + 3)
+        added[:, at, at] = 0.5 * structure.gain**2 * slope[:, :, None] * slope[:, None, :]
+        added[:, at, at] += 0.5 * structure.response**2 * np.diag([0.0, 1.0, 1.0])
+    return added
 
 
 def hidden_errors(
