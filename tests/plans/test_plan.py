@@ -224,7 +224,7 @@ def test_the_page_of_a_plan(planned, tmp_path):
     text, missing = render_other(tmp_path, kind_of_run(tmp_path))
     assert not missing
     assert f"gets below {planned.bound:.3g}" in text
-    assert text.count("<tr><td>clp") == len([line for line in planned.lines if line.kind == "clp"])
+    assert text.count("<tr><td>polariser") == len([line for line in planned.lines if line.kind == "clp"])
     assert "even angles and the Moon" in text
     assert "walop-jax limits" in text
 
