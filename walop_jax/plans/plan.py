@@ -98,7 +98,8 @@ class ExposurePlan(Displayed):
     tells them (% for errors of p). `needed` are the minutes in which the best plan reaches `goal`, and those in which
     none can.
     `before` and `after` (draw, point) are errors of p (fraction) at `x`, `y` (deg), NaN where one exposure holds no u.
-    `beside` are other plans of the same time: their criterion, told likewise; `notes` what had to be left out.
+    `beside` are other plans of the same time: their criterion, told likewise; `notes` what had to be left out. The
+    bound holds for all angles of the polariser, and of the calibration plate behind it if `any_plate`.
     """
 
     minutes: float
@@ -117,6 +118,7 @@ class ExposurePlan(Displayed):
     beside: Mapping[str, float]
     observing_plan: ObservingPlan
     notes: tuple[str, ...] = ()
+    any_plate: bool = False
 
     @property
     def gap(self) -> float:
@@ -149,6 +151,7 @@ class ExposurePlan(Displayed):
             "bound": self.bound,
             "gap": self.gap,
             "gap_of_weights": self.weights_gap,
+            "any_plate": self.any_plate,
             "truncation": self.truncation,
             "goal": self.goal,
             "minutes_to_goal": None
@@ -273,15 +276,15 @@ def plan_from(
     if not minutes > 0:
         raise ValueError(f"{minutes:g} minutes: nothing can be observed in no time")
     tell("looking for the best plan")
-    whole = experiment = experiment_of(found, minutes, want, known)
+    whole = experiment_of(found, minutes, want, known)
     try:
-        weights = optimise(experiment, gap=0.5 * gap, progress=tell)
+        weights = optimise(whole, gap=0.5 * gap, progress=tell)
     except NotEstimableError as error:
         missing = [k for k in ("moon", "standard") if not any(c.kind == k for c in found.choices)]
         advice = f"; no {' or '.join(missing)} exposures could be taken" if missing else ""
         raise NotEstimableError("; ".join((f"{error}{advice}", *found.notes))) from None
-    best, lines, found, experiment = _at_few_angles(
-        found, weights, lambda some: experiment_of(some, minutes, want, known), gap
+    best, lines, some, experiment = _at_few_angles(
+        found, weights, lambda part: experiment_of(part, minutes, want, known), gap
     )
     needed = None
     if goal is not None:
@@ -291,7 +294,7 @@ def plan_from(
     total = _total(experiment, best)
     return ExposurePlan(
         minutes=minutes,
-        lines=tuple(_described(found, experiment, lines, best)),
+        lines=tuple(_described(some, experiment, lines, best)),
         wanted=want,
         value=want.told(best.value),
         bound=want.told(weights.bound),
@@ -303,9 +306,10 @@ def plan_from(
         y=np.zeros(0) if field is None else field.y,
         before=_errors(found, field, covariance(experiment.known)),
         after=_errors(found, field, covariance(total)),
-        beside=dict(_beside(found, experiment, want)),
-        observing_plan=_as_observed(found, lines),
+        beside=dict(_beside(found, whole, want)),
+        observing_plan=_as_observed(some, lines),
         notes=found.notes,
+        any_plate=found.could.any_plate,
     )
 
 
