@@ -294,29 +294,25 @@ class Illumination(NamedTuple):
         return self.scale * flat @ flat.swapaxes(1, 2)
 
     def gain(
-        self, unit: Float[np.ndarray, "p k s"], squares: Float[np.ndarray, "p k k s"]
+        self, unit: Float[np.ndarray, "p k s"], squares: Float[np.ndarray, "p t s"]
     ) -> Float[np.ndarray, " s"]:
-        """tr G JᵀJ of exposures, `squares` s_k G s_lᵀ of the derivatives s of the counts of unit flux.
+        """tr G JᵀJ of exposures; `squares` are s_k G s_l of each pair k ≤ l, s the derivatives for unit flux.
 
         Without the flux, with w = flux / σ and along a = unit / σ: Σ w_k² s_k G s_k − Σ (w a)_k (w a)_l s_k G s_l /
         Σ a², the sums over cameras with a flux in common (`likelihood.flux`).
         """
-        flux = self.flux[:, None, None]
-        weight = 1.0 / self.noise.sigma(flux * unit)
-        along = (unit * weight) ** 2
-        both = unit * weight**2
-        cameras = range(unit.shape[1])
-        together = (
-            np.ones((len(cameras), len(cameras))) if self.shared.cameras is None else self.shared.cameras
-        )
-        power = np.einsum("kl,pls->pks", together, along)
-        found = np.zeros(unit.shape[::2])
-        for k in cameras:
-            found += weight[:, k] ** 2 * squares[:, k, k]
-            for m in cameras:
-                if together[k, m]:
-                    found -= both[:, k] * both[:, m] / power[:, k] * squares[:, k, m]
-        return self.scale * (flux[:, 0] ** 2 * found).sum(axis=0)
+        flux, count = self.flux[:, None, None], unit.shape[1]
+        weight = 1.0 / self.noise.sigma(flux * unit) ** 2
+        both = unit * weight
+        together = np.ones((count, count)) if self.shared.cameras is None else self.shared.cameras
+        share = both / (together @ (unit * both))
+        found = np.zeros((len(unit), unit.shape[2]))
+        for pair, (k, m) in enumerate(zip(*np.triu_indices(count), strict=True)):
+            if k == m:
+                found += (weight[:, k] - both[:, k] * share[:, k]) * squares[:, pair]
+            elif together[k, m]:
+                found -= 2.0 * both[:, k] * share[:, m] * squares[:, pair]
+        return self.scale * (self.flux**2) @ found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -401,7 +397,8 @@ class Polarised(Family):
             for i in range(0, len(unit), _AT_ONCE[len(finer) - 1]):
                 part = slice(i, i + _AT_ONCE[len(finer) - 1])
                 along = np.tensordot(weights, slopes[part] @ root, (1, 1))
-                squares = (along @ along.swapaxes(2, 3)).transpose(1, 2, 3, 0)
+                squares = (along @ along.swapaxes(2, 3))[:, :, *np.triu_indices(unit.shape[2])]
+                squares = squares.transpose(1, 2, 0)
                 u = np.tensordot(weights, unit[part], (1, 1)).transpose(1, 2, 0)
                 light = self.light._replace(flux=self.light.flux[part])
                 total += light.gain(_refined(u, finer), _refined(squares, finer))
