@@ -2,7 +2,7 @@
 
     python tests/studies/plans.py [errors] [built] [beside] [naming]
 
-errors   100 sets each of the best plan of 20 minutes and of usual ones, of 20 instruments drawn from the priors, with
+errors   20 sets each of the best plan of 20 minutes and of usual ones, of 20 instruments drawn from the priors, with
          noise and standards of its own: the errors of p that a fit makes against those promised. The
          fits are linear, from the truth; one full fit says how far that is from the real one.
 built    200 instruments as they might be built: what the plan that was made for 20 others is worth in each, beside what
@@ -48,7 +48,7 @@ from walop_jax.plans.wanted import field_errors, wanted  # noqa: E402
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop  # noqa: E402
 from walop_jax.simulation.simulate import effect_from_text, simulate, truth_values  # noqa: E402
 
-MINUTES, INSTRUMENTS, EACH, BUILT, GOAL, FIELD = 20.0, 20, 5, 200, 0.1, 0.95
+MINUTES, INSTRUMENTS, EACH, BUILT, GOAL, FIELD = 20.0, 20, 1, 200, 0.1, 0.95
 NODES, ENOUGH = 40, 1.1  # of the search for what is best given up, and the factor at which it ends
 SOUTH = ObservingPlan("WALOP-SOUTH", grid=6, standard_grid=3)
 PAIRS = (

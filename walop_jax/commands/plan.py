@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, Writers, command, text_file
-from walop_jax.commands.inputs import Folder, PathLike, calibration_of
+from walop_jax.commands.inputs import PathLike, calibration_of
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 PLAN = "plan.toml"
 
+FOLDER = Option(f"Folder for {PLAN} and plan.json; without it the plan is printed only.", "RUN", Path, "-o")
 What = Annotated[
     "ObservingPlan | PathLike",
     Argument(
@@ -69,7 +70,7 @@ def plan(
     after: After = None,
     apart: Apart = None,
     draws: Draws = 20,
-    output: Folder = None,
+    output: Annotated[PathLike | None, FOLDER] = None,
 ) -> Outcome[ExposurePlan]:
     """Plan the calibration exposures of a night: those that make the error of p smallest where it is largest.
 

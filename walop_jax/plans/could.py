@@ -180,7 +180,10 @@ class Could:
         plate = content.get("plate", ())
         if own.setdefault("any_plate", ANY in plate if isinstance(plate, list) else plate == ANY):
             listed = [angle for angle in plate if angle != ANY] if isinstance(plate, list) else []
-            content["plate"] = listed or [OUT]
+            content["plate"] = plate = listed or [OUT]
+        for angle in plate:
+            if isinstance(angle, str) and angle != OUT:
+                raise unknown_name("angle of the plate", angle, (OUT, ANY))
         seconds = {kind: tuple(np.atleast_1d(v).tolist()) for kind, v in content.pop("seconds", {}).items()}
         return cls(plan_of(content, folder), Costs(**costs), seconds, **own)
 

@@ -44,6 +44,7 @@ from walop_jax.simulation.observing_plan import ObservingPlan, Stop, polariser_t
 PLANNED = "plan.json"
 NAMED = 5.0
 """Distance (σ) from every rival at which an effect is named."""
+_NOTHING = 1e-6  # of what is known: less of it makes no plan
 _ALIKE = 3.0  # deg: angles of the plate that are taken as one
 _TRIES = 6  # budgets, until the exposures and the changes between them fit into the time
 
@@ -275,10 +276,20 @@ def plan_from(
     tell = progress or (lambda text: None)
     if not minutes > 0:
         raise ValueError(f"{minutes:g} minutes: nothing can be observed in no time")
+    shortest = min(choice.seconds + found.could.costs.of(choice.kind) for choice in found.choices)
+    if 60.0 * minutes < shortest:
+        raise ValueError(
+            f"{minutes:g} minutes do not pay for a single exposure: the shortest takes {shortest / 60:.2g}, read-out or "
+            "pointing included"
+        )
     tell("looking for the best plan")
     whole = experiment_of(found, minutes, want, known)
     try:
         weights = optimise(whole, gap=0.5 * gap, progress=tell)
+        if weights.proof.ratio * whole.budget < _NOTHING * weights.proof.known:
+            raise NotEstimableError(
+                f"nothing that could be observed says more of the {want.what} than is known"
+            )
     except NotEstimableError as error:
         missing = [k for k in ("moon", "standard") if not any(c.kind == k for c in found.choices)]
         advice = f"; no {' or '.join(missing)} exposures could be taken" if missing else ""
