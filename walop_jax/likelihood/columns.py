@@ -357,7 +357,8 @@ class _Block:
         slots = {"inserted", "numbers", "globally", "fringes", "throughput", "mixed"}
         of_vectors = [key for key in keys if key[0] in slots]
         fringes = self._fringes([key[2] for key in of_vectors if key[0] == "fringes"], x, y)
-        some = max(1, int(limits.RESPONSE_NUMBERS // (self.sites * self.cameras * len(self.chosen))))
+        # Points that no exposure measures are in no pair.
+        some = max(1, int(limits.RESPONSE_NUMBERS // max(1, self.sites * self.cameras * len(self.chosen))))
         for first in range(0, len(of_vectors), some):
             part = of_vectors[first : first + some]
             change = np.stack([self._change(key, fringes) for key in part])

@@ -279,8 +279,8 @@ def plan_from(
     shortest = min(choice.seconds + found.could.costs.of(choice.kind) for choice in found.choices)
     if 60.0 * minutes < shortest:
         raise ValueError(
-            f"{minutes:g} minutes do not pay for a single exposure: the shortest takes {shortest / 60:.2g}, read-out or "
-            "pointing included"
+            f"{minutes:g} minutes do not pay for a single exposure: the shortest takes {shortest / 60:.2g}, with "
+            "read-out or pointing"
         )
     tell("looking for the best plan")
     whole = experiment_of(found, minutes, want, known)
