@@ -287,13 +287,12 @@ def plan_from(
     try:
         weights = optimise(whole, gap=0.5 * gap, progress=tell)
         if weights.proof.ratio * whole.budget < _NOTHING * weights.proof.known:
-            raise NotEstimableError(
-                f"nothing that could be observed says more of the {want.what} than is known"
-            )
-    except NotEstimableError as error:
+            raise NotEstimableError
+    except NotEstimableError:
         missing = [k for k in ("moon", "standard") if not any(c.kind == k for c in found.choices)]
         advice = f"; no {' or '.join(missing)} exposures could be taken" if missing else ""
-        raise NotEstimableError("; ".join((f"{error}{advice}", *found.notes))) from None
+        said = f"{want.what}: nothing that could be observed says more of it than is known"
+        raise NotEstimableError("; ".join((f"{said}{advice}", *found.notes))) from None
     best, lines, some, experiment = _at_few_angles(
         found, weights, lambda part: experiment_of(part, minutes, want, known), gap
     )
