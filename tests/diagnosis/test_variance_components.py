@@ -14,7 +14,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.trust import examined
-from walop_jax.diagnosis.variance_components import ALARM, Grouping, asked, groupings, variance_components
+from walop_jax.diagnosis.variance_components import ALARM, _Grouping, asked, groupings, variance_components
 from walop_jax.fit.refit import refit
 from walop_jax.fit.verdict import Structure
 from walop_jax.likelihood.flux import project_flux
@@ -26,7 +26,7 @@ def design() -> Design:
     return Design.of(small_fit())
 
 
-def dense(design: Design, grouping: Grouping) -> np.ndarray:
+def dense(design: Design, grouping: _Grouping) -> np.ndarray:
     """The columns of a grouping one by one, their fluxes and parameters projected out: P A."""
     measured, columns = design.measured, []
     for place in np.unique(grouping.place[grouping.place >= 0]):

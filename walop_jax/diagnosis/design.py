@@ -116,7 +116,7 @@ class Measured:
         unit = self.model / np.sqrt(np.where(power > 0, power, 1.0))
         return np.where(self.known[:, None], 0.0, unit)[self.used]
 
-    def changes(self, strata: Sequence[Stratum]) -> Float[np.ndarray, "r a"]:
+    def changes(self, strata: Sequence[_Stratum]) -> Float[np.ndarray, "r a"]:
         """What every pattern does to its camera in every used row, in standard errors, the flux held."""
         size = (self.flux[..., None] * self.level[:, None, :] * self.weight)[self.used]
         points, exposures = np.nonzero(self.used)
@@ -127,7 +127,7 @@ class Measured:
             np.multiply(size[:, k], there, out=changes[:, a])
         return changes
 
-    def candidate(self, stratum: Stratum) -> Candidate:
+    def candidate(self, stratum: _Stratum) -> Candidate:
         """The columns of a stratum, intensity by intensity."""
         camera, one = np.asarray(stratum.camera), np.eye(self.cameras)
         if self.shared.exposures is None:
@@ -143,7 +143,7 @@ class Measured:
         return Candidate(stratum.name, columns, stratum.widths, stratum.block)
 
 
-class Stratum(NamedTuple):
+class _Stratum(NamedTuple):
     """Patterns of gains of single cameras, each of shape (points or 1, exposures or 1), and the camera of each.
 
     `block` is the block of the free-form term that can take it up.
@@ -166,7 +166,7 @@ class Stratum(NamedTuple):
         name: str,
         patterns: Sequence[Float[np.ndarray, "_ _"]],
         block: str | None = None,
-    ) -> Stratum:
+    ) -> _Stratum:
         """Each pattern in each of these cameras."""
         return cls(
             name, [k for _ in patterns for k in cameras], [p for p in patterns for _ in cameras], block
@@ -191,7 +191,7 @@ def _positions(e: Exposures, prefix: str) -> np.ndarray:
     return np.array([f"{a:g}" if i else "out" for i, a in zip(position.inside, position.angle, strict=True)])
 
 
-def strata(measured: Measured) -> Iterator[Stratum]:
+def strata(measured: Measured) -> Iterator[_Stratum]:
     """All strata that the exposures of the set allow."""
     e, points = measured.likelihood.calset.exposures, measured.likelihood.calset.points
     names = measured.likelihood.model.template.cameras.names
@@ -208,7 +208,7 @@ def strata(measured: Measured) -> Iterator[Stratum]:
     for k, camera in enumerate(names):
         for i, element in ((1, "q"), (2, "u")):
             patterns = [term[:, None] * stokes[..., i] for term in smooth.T]
-            yield Stratum.of_all([k], f"vector {element} of {camera}", patterns, "vectors")
+            yield _Stratum.of_all([k], f"vector {element} of {camera}", patterns, "vectors")
         for symbol, prefix in turning:
             position = e.position(prefix)
             through = position.inside & measured.used.any(axis=0)
@@ -219,9 +219,9 @@ def strata(measured: Measured) -> Iterator[Stratum]:
                 waves = [np.where(through, wave(harmonic * angle), 0.0) for wave in (np.cos, np.sin)]
                 patterns = [term[:, None] * wave for term in smooth.T[:3] for wave in waves]
                 block = "harmonics" if prefix == POLARISER else "exposures"
-                yield Stratum.of_all([k], f"{harmonic}{symbol} of {camera}", patterns, block)
-        yield Stratum.of_all([k], f"fine structure of {camera}", [t[:, None] for t in fine.T], "fine")
-        yield Stratum.of_all([k], f"rings of {camera}", [ring[:, None] for ring in rings.T], "fine")
+                yield _Stratum.of_all([k], f"{harmonic}{symbol} of {camera}", patterns, block)
+        yield _Stratum.of_all([k], f"fine structure of {camera}", [t[:, None] for t in fine.T], "fine")
+        yield _Stratum.of_all([k], f"rings of {camera}", [ring[:, None] for ring in rings.T], "fine")
     for name, quantity, block in (
         ("time", e.mjd[None, :], "exposures"),
         ("temperature", e.temp[None, :], "exposures"),
@@ -233,7 +233,7 @@ def strata(measured: Measured) -> Iterator[Stratum]:
         quantity = quantity - np.nanmean(known)
         spread = np.nanstd(quantity)
         if np.isfinite(spread) and spread > 1e-9 * max(1.0, float(np.nanmax(np.abs(quantity)))):
-            yield Stratum.of_all(every, name, [np.nan_to_num(quantity / spread)], block)
+            yield _Stratum.of_all(every, name, [np.nan_to_num(quantity / spread)], block)
     positions = [(prefix.lower(), _positions(e, prefix)) for prefix in measured.likelihood.plan.moving]
     for name, label, block in (
         ("kind", e.kind, "exposures"),
@@ -244,22 +244,22 @@ def strata(measured: Measured) -> Iterator[Stratum]:
             np.where(label == group, stokes[..., i], 0.0) for group in np.unique(label)[1:] for i in range(3)
         ]
         if patterns:
-            yield Stratum.of_all(every, name, patterns, block)
+            yield _Stratum.of_all(every, name, patterns, block)
     sky_gradients = [
         np.where(e.kind == group, term[:, None], 0.0)
         for group in np.unique(e.kind)[1:]
         for term in smooth.T[1:3]
     ]
     if sky_gradients:
-        yield Stratum.of_all(every, "kind, over the field", sky_gradients)
+        yield _Stratum.of_all(every, "kind, over the field", sky_gradients)
     if measured.has_gains:
         alone = list(np.eye(len(e))[:, None])
-        yield Stratum.of_all(measured.gained, SINGLE_EXPOSURES, alone, "exposures")
+        yield _Stratum.of_all(measured.gained, SINGLE_EXPOSURES, alone, "exposures")
     state = states(measured.likelihood.calset)
     several = np.unique(state) if len(np.unique(state)) < len(state) else ()
     if len(several) and measured.gained:
         patterns = [np.where(state == number, 1.0, 0.0)[None] for number in several]
-        yield Stratum.of_all(measured.gained, STATES, patterns)
+        yield _Stratum.of_all(measured.gained, STATES, patterns)
 
 
 # ----------------------------------------------------------------------------------------------------- one fit laid out
@@ -445,7 +445,7 @@ def pattern_scores(design: Design, seed: int = 0) -> ScoreTable:
     return space.table(scores, square, space.smallest_p(np.random.default_rng(seed)))
 
 
-def _from_columns(design: Design, found: list[Stratum]) -> tuple[ScoreSpace, Vector, float]:
+def _from_columns(design: Design, found: list[_Stratum]) -> tuple[ScoreSpace, Vector, float]:
     """Space, C̃ᵀr and r·r from columns of all intensities."""
     columns = design.stacked([design.measured.candidate(stratum).columns for stratum in found])
     names, widths = [stratum.name for stratum in found], [stratum.widths for stratum in found]
@@ -454,7 +454,7 @@ def _from_columns(design: Design, found: list[Stratum]) -> tuple[ScoreSpace, Vec
     return space, columns.T @ residual, float(residual @ residual)
 
 
-def _from_rows(design: Design, found: list[Stratum]) -> tuple[ScoreSpace, Vector, float]:
+def _from_rows(design: Design, found: list[_Stratum]) -> tuple[ScoreSpace, Vector, float]:
     """The same from the rows of exposures and points."""
     measured, scale = design.measured, design.fit.noise_scale
     camera = np.concatenate([stratum.camera for stratum in found])

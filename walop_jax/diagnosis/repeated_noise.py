@@ -29,7 +29,7 @@ LEAST = 0.25
 _SHOWN = 3
 
 
-class Pair(NamedTuple):
+class _Pair(NamedTuple):
     """Positions of two exposures and the correlation of what the fit leaves of them."""
 
     first: int
@@ -53,7 +53,7 @@ def repeated_noise(design: Design) -> Iterator[str]:
         )
 
 
-def pairs_alike(design: Design) -> list[Pair]:
+def pairs_alike(design: Design) -> list[_Pair]:
     """Pairs of exposures whose residuals hang together as only those of the same measurement do, closest first."""
     measured = design.measured
     if measured.shared.exposures is not None:
@@ -81,7 +81,7 @@ def pairs_alike(design: Design) -> list[Pair]:
     pattern = correlation / np.maximum(1.0 - correlation, 1e-12)
     found = (deviate > limit) & (correlation > LEAST) & (excess < 0.5 * pattern)
     pairs = [
-        Pair(int(a), int(b), float(c))
+        _Pair(int(a), int(b), float(c))
         for a, b, c in zip(first[found], second[found], correlation[found], strict=True)
     ]
     return sorted(pairs, key=lambda pair: -pair.correlation)

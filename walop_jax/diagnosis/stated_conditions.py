@@ -71,7 +71,7 @@ _PRECESSION = (
 STEP = 1e-4  # of the width: what is left out of the derivative is its square
 
 
-class Stated(NamedTuple):
+class _Stated(NamedTuple):
     """A number that a set states: what it is, its unit, what to check, and the set with it changed.
 
     `width` is by how much it may be wrong at most; `value` is None where only a change of it has a meaning.
@@ -89,19 +89,19 @@ class Stated(NamedTuple):
     along: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]] | None = None
 
 
-class Scored(NamedTuple):
+class _Scored(NamedTuple):
     """A number, the score of changing it, and the derivative of the residuals (rows of the design).
 
     `square` is the square of what the model leaves of the derivative: information, in errors as stated.
     """
 
-    stated: Stated
+    stated: _Stated
     score: Score
     column: Float[np.ndarray, " _"]
     square: float
 
 
-class Single(NamedTuple):
+class _Single(NamedTuple):
     """One number, or a few of one thing, that may be otherwise: its columns, and its size in words.
 
     `plausible` is the largest mistake to reckon with where the data would not show it; 0 where errors hold it already.
@@ -120,7 +120,7 @@ class Singles:
     `along` (q, columns) is what the parameters take up of their columns, Qᵀ C; `left` the square of what they leave.
     """
 
-    rivals: tuple[Single, ...]
+    rivals: tuple[_Single, ...]
     table: ScoreTable
     along: Float[np.ndarray, "q c"]
     left: Float[np.ndarray, " c"]
@@ -138,7 +138,7 @@ class Singles:
         return [score for score in self.table.scores if score.testable]
 
 
-def scored(design: Design, rivals: tuple[Single, ...]) -> Singles:
+def scored(design: Design, rivals: tuple[_Single, ...]) -> Singles:
     """Single numbers with their scores in the residuals of a design."""
     names = [one.candidate.name for one in rivals]
     widths = [one.candidate.widths for one in rivals]
@@ -160,7 +160,7 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
     standard errors, first those that make q and u of stars most wrong, in the median over the field.
     """
     least = noncentrality(local_p(ALARM, len(singles.testable)), 1, PROBABILITY)
-    found: list[tuple[Single, float, int]] = []
+    found: list[tuple[_Single, float, int]] = []
     first = 0
     for one in singles.rivals:
         if one.plausible > 0.0:
@@ -253,16 +253,16 @@ def _holds(one: Score, other: Score) -> bool:
     return one.name.startswith(f"{other.name}.") and other.log_p < one.log_p
 
 
-def _conditions(design: Design) -> Iterator[Single]:
+def _conditions(design: Design) -> Iterator[_Single]:
     asked, columns = _asked(design)
     for one, column in zip(asked, columns.T, strict=True):
         candidate = Candidate(one.what, column[:, None], np.array([one.width]))
         # What stars see as well is no mistake of the matrix alone.
         plausible = 0.0 if one.seen_by_stars else one.width
-        yield Single(candidate, lambda score, one=one: _in_words(one, score), plausible, one.unit)
+        yield _Single(candidate, lambda score, one=one: _in_words(one, score), plausible, one.unit)
 
 
-def _priors(design: Design) -> Iterator[Single]:
+def _priors(design: Design) -> Iterator[_Single]:
     """The prior of every free parameter, and those of all numbers of an element, as what may be wrong."""
     rows, parameters = design.fit.likelihood.priors, design.fit.model.parameters
     known = np.flatnonzero(rows.known).tolist()
@@ -284,10 +284,10 @@ def _priors(design: Design) -> Iterator[Single]:
     for name, members in elements.items():
         columns = np.zeros((len(design.residual), len(members)))
         columns[design.rows + np.array(members), np.arange(len(members))] = 1.0
-        yield Single(Candidate(name, columns, np.full(len(members), _PRIOR_WIDTHS)), said)
+        yield _Single(Candidate(name, columns, np.full(len(members), _PRIOR_WIDTHS)), said)
 
 
-def _of_cameras(design: Design) -> Iterator[Single]:
+def _of_cameras(design: Design) -> Iterator[_Single]:
     """What a single camera may do to its counts with one amplitude: closed forms of the counts themselves."""
     measured, names = design.measured, design.fit.model.template.cameras.names
     counts = measured.flux[..., None] * measured.model / np.where(measured.weight > 0, measured.weight, 1.0)
@@ -296,7 +296,7 @@ def _of_cameras(design: Design) -> Iterator[Single]:
     median[seen] = np.nanmedian(np.where(measured.used[..., None], counts, np.nan)[:, seen], axis=0)
     typical = float(np.median(counts[measured.used])) if measured.used.any() else 0.0
 
-    def single(k: int, change: np.ndarray, width: float, words: str, unit: str) -> Single:
+    def single(k: int, change: np.ndarray, width: float, words: str, unit: str) -> _Single:
         cube = np.zeros_like(counts)
         cube[..., k] = change
         column = project_flux(cube * measured.weight, measured.model, measured.known, measured.shared)
@@ -307,7 +307,7 @@ def _of_cameras(design: Design) -> Iterator[Single]:
             value, error = value_and_error(size, sigma)
             return f"{words.format(names[k])} of {value} ± {error} {unit}".rstrip()
 
-        return Single(Candidate(words.format(names[k]), rows, np.array([width])), said, width, unit)
+        return _Single(Candidate(words.format(names[k]), rows, np.array([width])), said, width, unit)
 
     if not measured.used.any():
         return
@@ -321,7 +321,7 @@ def _of_cameras(design: Design) -> Iterator[Single]:
                 yield single(k, counts[..., other], 0.02, f"light of {names[other]} in {{}}", "of its counts")
 
 
-def _of_catalogue(design: Design) -> Iterator[Single]:
+def _of_catalogue(design: Design) -> Iterator[_Single]:
     """Effects that the model has not; those with a place or a gap of their own are left to the patterns."""
     fit = design.fit
     template, calset = fit.model.template, fit.calset
@@ -336,7 +336,7 @@ def _of_catalogue(design: Design) -> Iterator[Single]:
         rows = design.stacked([found[:, first : first + len(probe.widths)]])
         first += len(probe.widths)
         candidate = Candidate(probe.name, rows, probe.widths)
-        yield Single(
+        yield _Single(
             candidate, lambda score, probe=probe: _effect_in_words(probe, score, template.cameras.names)
         )
 
@@ -354,7 +354,7 @@ def _effect_in_words(probe: Probe, score: Score, cameras: Sequence[str]) -> str:
     return f"{effect.name}, {', '.join(texts)}"
 
 
-def _in_words(stated: Stated, score: Score) -> str:
+def _in_words(stated: _Stated, score: Score) -> str:
     size, sigma = float(score.amplitudes[0]), float(np.sqrt(score.covariance[0, 0]))
     if stated.value is None:
         value, error = value_and_error(size, sigma)
@@ -364,7 +364,7 @@ def _in_words(stated: Stated, score: Score) -> str:
     return f"{found}, not {stated.value:g} ({stated.remedy})"
 
 
-def condition_scores(design: Design) -> list[Scored]:
+def condition_scores(design: Design) -> list[_Scored]:
     """The numbers that a set states, each with the score of changing it."""
     asked, columns = _asked(design)
     if not asked:
@@ -373,12 +373,12 @@ def condition_scores(design: Design) -> list[Scored]:
     widths = [np.array([one.width]) for one in asked]
     table, square = _table(design, names, widths, columns.copy())
     return [
-        Scored(one, table[name], column, float(length))
+        _Scored(one, table[name], column, float(length))
         for one, name, column, length in zip(asked, names, columns.T, square, strict=True)
     ]
 
 
-def _asked(design: Design) -> tuple[list[Stated], Float[np.ndarray, "d c"]]:
+def _asked(design: Design) -> tuple[list[_Stated], Float[np.ndarray, "d c"]]:
     """The numbers that a set states and that are used, and the derivatives of the rows."""
     asked = list(_stated(design.fit.calset))
     if not asked:
@@ -398,7 +398,7 @@ def _table(
     return table, np.diag(space.gram)
 
 
-def _columns(design: Design, asked: Sequence[Stated]) -> Iterator[Float[np.ndarray, " _"]]:
+def _columns(design: Design, asked: Sequence[_Stated]) -> Iterator[Float[np.ndarray, " _"]]:
     of_field = [one for one in asked if one.along is not None]
     by_place = [_column(design, one) for one in of_field[:2]]  # X and Y come first
     for one in asked:
@@ -409,7 +409,7 @@ def _columns(design: Design, asked: Sequence[Stated]) -> Iterator[Float[np.ndarr
             yield in_x[design.point] * by_x + in_y[design.point] * by_y
 
 
-def _column(design: Design, one: Stated) -> np.ndarray:
+def _column(design: Design, one: _Stated) -> np.ndarray:
     def residual(step: float) -> np.ndarray:
         likelihood = Likelihood.of(one.changed(step), design.fit.model)
         return likelihood.residuals(design.fit.values)[1][design.measured.used].reshape(-1)
@@ -420,11 +420,11 @@ def _column(design: Design, one: Stated) -> np.ndarray:
     return (residual(step) - residual(-step)) / (2.0 * step)
 
 
-def _stated(calset: CalibrationSet) -> Iterator[Stated]:
+def _stated(calset: CalibrationSet) -> Iterator[_Stated]:
     if len(calset.points) > 1:
         yield from _of_field(calset)
     for name in calset.filters:
-        yield Stated(
+        yield _Stated(
             f"the wavelengths of filter {name}",
             "um",
             "check its curve, and what the polariser exposures were taken through",
@@ -438,7 +438,7 @@ def _stated(calset: CalibrationSet) -> Iterator[Stated]:
         if not chosen.any():
             continue
         typical = float(np.median(e.teff[chosen]))
-        yield Stated(
+        yield _Stated(
             f"TEFF of exposures of kind {kind}",
             "K",
             "check the colour temperature of their light",
@@ -451,7 +451,7 @@ def _stated(calset: CalibrationSet) -> Iterator[Stated]:
     yield from _of_sky(calset)
 
 
-def _of_sky(calset: CalibrationSet) -> Iterator[Stated]:
+def _of_sky(calset: CalibrationSet) -> Iterator[_Stated]:
     """Where and when the sky was, as the exposures and the site state it."""
     e, site = calset.exposures, calset.site
     moon = (e.kind == "moon") & np.isfinite(e.ra) & np.isfinite(e.dec)
@@ -466,7 +466,7 @@ def _of_sky(calset: CalibrationSet) -> Iterator[Stated]:
             np.deg2rad(np.clip(e.dec, -80.0, 80.0))
         )
         along_dec = across * np.cos(np.deg2rad(e.ra))
-        yield Stated(
+        yield _Stated(
             "the equinox of RA and DEC",
             "",
             "they are to be ICRS, not coordinates of date",
@@ -476,17 +476,17 @@ def _of_sky(calset: CalibrationSet) -> Iterator[Stated]:
             ),
             2000.0,
         )
-        yield Stated(
+        yield _Stated(
             "RA of sky exposures",
             "deg",
             at,
             5.0,
             lambda h: changed(ra=np.where(moon, e.ra + h, e.ra)),
         )
-        yield Stated(
+        yield _Stated(
             "DEC of sky exposures", "deg", at, 5.0, lambda h: changed(dec=np.where(moon, e.dec + h, e.dec))
         )
-        yield Stated(
+        yield _Stated(
             "MJD of sky exposures",
             "d",
             "check the clock and the time zone: UTC at mid-exposure",
@@ -494,7 +494,7 @@ def _of_sky(calset: CalibrationSet) -> Iterator[Stated]:
             lambda h: changed(mjd=np.where(moon, e.mjd + h, e.mjd)),
         )
         for name, width in (("longitude", 180.0), ("latitude", 90.0)):
-            yield Stated(
+            yield _Stated(
                 f"the {name} of the site",
                 "deg",
                 "check the site in the header",
@@ -506,7 +506,7 @@ def _of_sky(calset: CalibrationSet) -> Iterator[Stated]:
             )
     for kind in np.unique(e.kind[np.isfinite(e.rotator)]):
         chosen = e.kind == kind
-        yield Stated(
+        yield _Stated(
             f"ROTATOR of exposures of kind {kind}",
             "deg",
             "check its zero and its sense (docs: conventions)",
@@ -515,7 +515,7 @@ def _of_sky(calset: CalibrationSet) -> Iterator[Stated]:
         )
 
 
-def _of_field(calset: CalibrationSet) -> Iterator[Stated]:
+def _of_field(calset: CalibrationSet) -> Iterator[_Stated]:
     check = "check X and Y against the frames (docs: conventions)"
     x, y = calset.points.x, calset.points.y
     radius, one = float(np.hypot(x, y).max()), np.ones(len(x))
@@ -525,7 +525,7 @@ def _of_field(calset: CalibrationSet) -> Iterator[Stated]:
         ("the scale of X and Y", "", 1.0, (x, y)),
         ("the angle of the field", "rad", 1.0, (-y, x)),
     ):
-        yield Stated(
+        yield _Stated(
             what,
             unit,
             check,

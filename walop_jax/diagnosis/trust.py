@@ -210,7 +210,7 @@ def _patterns(table: ScoreTable) -> Iterator[str]:
 
 
 @dataclasses.dataclass(frozen=True)
-class GroupScore:
+class _GroupScore:
     """Squared residuals of a group of the data beside those of the rest.
 
     `ratio` is 1 where the group scatters as the rest does; `p_value` that of a ratio so far from 1, on either side.
@@ -221,7 +221,7 @@ class GroupScore:
     p_value: float
 
 
-def group_scores(design: Design) -> list[GroupScore]:
+def group_scores(design: Design) -> list[_GroupScore]:
     """Every camera, kind, filter and exposure of a fit by itself."""
     measured = design.measured
     residual = design.cube(design.projector(design.residual))
@@ -250,7 +250,7 @@ def group_scores(design: Design) -> list[GroupScore]:
         ratio = squares[0] / means[0] / max(squares[1] / means[1], 1e-300)
         degrees = 2.0 / variance
         above = float(special.chdtrc(degrees, ratio * degrees))
-        found.append(GroupScore(name, ratio, 2.0 * min(above, 1.0 - above)))
+        found.append(_GroupScore(name, ratio, 2.0 * min(above, 1.0 - above)))
     return found
 
 

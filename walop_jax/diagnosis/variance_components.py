@@ -49,7 +49,7 @@ _SHOWN = 2
 WITH_STRUCTURE = "N_ERR with structure of field points"
 
 
-class Grouping(NamedTuple):
+class _Grouping(NamedTuple):
     """A way of grouping the data, and what may differ from place to place.
 
     `place` is the number of the place of every (point, exposure), −1 for none; the gain of a camera there is multiplied
@@ -67,7 +67,7 @@ class Grouping(NamedTuple):
 class VarianceComponent(NamedTuple):
     """What one grouping holds: T in standard deviations of noise, its p, and the size τ with its standard error."""
 
-    grouping: Grouping
+    grouping: _Grouping
     deviate: float
     p_value: float
     size: float
@@ -139,7 +139,7 @@ def with_structure(
     )
 
 
-def groupings(design: Design, *, pixels: bool = False) -> Iterator[Grouping]:
+def groupings(design: Design, *, pixels: bool = False) -> Iterator[_Grouping]:
     """The groupings that the data have; of two that cut them alike, the first."""
     measured, calset = design.measured, design.fit.calset
     e, points, used = calset.exposures, calset.points, measured.used
@@ -155,9 +155,9 @@ def groupings(design: Design, *, pixels: bool = False) -> Iterator[Grouping]:
     at_points = np.where(number % every == 0, number // every, -1)[:, None]
     at_points = np.broadcast_to(at_points, used.shape)
     if used.shape[0] > 1:
-        yield Grouping(f"{point}s", agree, at_points, one, "gain")
+        yield _Grouping(f"{point}s", agree, at_points, one, "gain")
         said = f"{agree} in what they make of q and u"
-        yield Grouping(f"{point}s in q and u", said, at_points, stokes, "response")
+        yield _Grouping(f"{point}s in q and u", said, at_points, stokes, "response")
     if pixels:
         return
     positions = [
@@ -176,7 +176,7 @@ def groupings(design: Design, *, pixels: bool = False) -> Iterator[Grouping]:
         place = np.broadcast_to(place, used.shape)
         if len(np.unique(place[used])) > 1 and not any(np.array_equal(place, other) for other in seen):
             seen.append(place)
-            yield Grouping(name, words, place, features)
+            yield _Grouping(name, words, place, features)
 
 
 def _numbered(*labels: np.ndarray) -> Int[np.ndarray, " e"]:
@@ -186,10 +186,10 @@ def _numbered(*labels: np.ndarray) -> Int[np.ndarray, " e"]:
     return np.array([first.setdefault(row, len(first)) for row in rows])
 
 
-class Question(NamedTuple):
+class _Question(NamedTuple):
     """One grouping made ready: c, the standard error of τ² for noise of unit variance, and the skewness of T."""
 
-    grouping: Grouping
+    grouping: _Grouping
     free: int
     share: float
     error: float
@@ -208,8 +208,8 @@ class Question(NamedTuple):
 
 
 def asked(
-    design: Design, grouping: Grouping, residuals: Float[np.ndarray, "d n"]
-) -> tuple[Question, Float[np.ndarray, "a n"]] | None:
+    design: Design, grouping: _Grouping, residuals: Float[np.ndarray, "d n"]
+) -> tuple[_Question, Float[np.ndarray, "a n"]] | None:
     """One grouping made ready, and Aᵀr of residuals behind the projection; None where the fit takes up all of it."""
     blocks = _blocks(design, grouping, residuals)
     if blocks is None:
@@ -228,7 +228,7 @@ def asked(
     if not (free > 0 and first > 1e-6 * whole and known > 1e-6 * second):
         return None
     skew = 8.0 * (third - 3.0 * share * second + 2.0 * share**2 * first) / (2.0 * known) ** 1.5
-    question = Question(grouping, free, float(share), float(np.sqrt(2.0 / known)), float(skew))
+    question = _Question(grouping, free, float(share), float(np.sqrt(2.0 / known)), float(skew))
     return question, pull.reshape(-1, pull.shape[-1])
 
 
@@ -241,7 +241,7 @@ def _tail(deviate: float, skew: float) -> float:
 
 
 def _blocks(
-    design: Design, grouping: Grouping, residuals: Float[np.ndarray, "d n"]
+    design: Design, grouping: _Grouping, residuals: Float[np.ndarray, "d n"]
 ) -> tuple[Float[np.ndarray, "l a a"], Float[np.ndarray, "l a q"], Float[np.ndarray, "l a n"]] | None:
     """D, QᵀA and Aᵀr, place by place; columns are camera × feature. None where a flux belongs to several places."""
     measured = design.measured
