@@ -14,6 +14,17 @@ SCALE = 1e6  # counts of one volt, and of one milliwatt
 LASER = FilterCurve("532nm", np.array([0.532]), np.ones(1))
 DIODE, METER = 5e-4, 1.5e-3  # scatter of a diode, over its mean, and of the meter, over its reading
 
+DIODES = ("d1", "d2", "d3", "d4")
+WAVES = ("cos", "sin")
+PLATE = {
+    "plate deviates the beam": [f"gain of {d} * {w} 1 QWP" for d in DIODES for w in WAVES],
+    "plate shifts the beam": [f"gain of {d} * cos 0 QWP" for d in DIODES],
+    "plate polarises": [f"diattenuation q of plate * {w} 2 QWP" for w in WAVES],
+    "axis of the plate wobbles": [f"turn of plate * {w} 1 QWP" for w in WAVES],
+    "plate, second order": [f"gain of {d} * {w} 2 QWP" for d in DIODES for w in WAVES],
+}
+"""What the plate does beyond a retardance, in the order in which it was found."""
+
 
 def metasurface_set(table: Table | str | Path, diode: float = DIODE, meter: float = METER) -> CalibrationSet:
     """The table as one field point: voltages less the dark ones, and the reading of the meter as a fifth camera.
@@ -47,7 +58,21 @@ def _start(plate, polariser):
     return np.nanmedian((plate - polariser) % 90.0) - 45.0
 
 
-def held_out(rows: Table):
-    """States that are left out of a fit: every fifth angle of the polariser, and the second sequence of the plate."""
-    number = np.round(np.asarray(rows["POLARISER_ANGLE"], float) / 5.0).astype(int)
-    return (number % 5 == 2) | (np.asarray(rows["SEQUENCE"]) == "qwp_R")
+def fifth_angles(rows: Table):
+    """Every fifth angle of the polariser, in all sequences."""
+    return np.round(np.asarray(rows["POLARISER_ANGLE"], float) / 5.0).astype(int) % 5 == 2
+
+
+def with_free(model, *names: str):
+    """The model with the parameters frozen whose names do not begin with one of `names`."""
+    for parameter in model.parameters:
+        if parameter.free and not parameter.name.startswith(names):
+            model = model.change(parameter.name, free=False)
+    return model
+
+
+def started(model, result):
+    """The model beginning at the values of a fit."""
+    for name, value in zip(result.model.names, result.values, strict=True):
+        model = model.change(name, start=float(value))
+    return model

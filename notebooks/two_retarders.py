@@ -44,3 +44,21 @@ def two_retarder_set(
         polariser=np.zeros(len(means)),
         mjd=60000.0 + np.tile(np.arange(count), len(parts)) * HOURS / 24.0,
     )
+
+
+WAVES = ("cos", "sin")
+WANDER = {
+    "second retarder deviates the beam": [
+        f"diattenuation q of second * {w} 1 R2{colour}"
+        for colour in ("", " * colour", " * colour * colour")
+        for w in WAVES
+    ],
+    "first retarder tilted": [
+        *(f"retardance u of first * {w} 1 R1" for w in WAVES),
+        *(f"retardance v of first * {w} 1 R1{colour}" for colour in ("", " * colour") for w in WAVES),
+        *(f"diattenuation v of first * {w} 1 R1" for w in WAVES),
+    ],
+    "first retarder deviates the beam": [f"gain of detector * {w} 1 R1" for w in WAVES],
+    "lamp": ["gain of detector * hours * hours"],
+}
+"""What turns with the retarders beyond their retardance, step by step, and the lamp."""

@@ -14,6 +14,9 @@ FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 NOT_OURS = {
     "charis": ("CHARIS_TABLE", "charis_internal.ecsv"),
+    "metasurface": ("METASURFACE_TABLE", "metasurface_calibration5.ecsv"),
+    "nasmyth": ("NASMYTH_TABLE", "efosc2_2016.ecsv"),
+    "two_retarders": ("TWO_RETARDERS_TABLE", "uah_2021.ecsv"),
     "walop_north_design": ("NORTH_DESIGN", "walop_north_design.fits"),
 }
 """Notebooks that read what does not come with the project: the variable that says where it lies, and the file."""
@@ -35,8 +38,11 @@ def test_there_are_notebooks():
         "charis",
         "first_calibration",
         "hidden_effect",
+        "metasurface",
+        "nasmyth",
         "paper_versus_joint",
         "posteriors",
+        "two_retarders",
         "walop_north_design",
         "year_of_an_instrument",
         "your_own_effect",
