@@ -1,6 +1,6 @@
 """Do plans keep their promises, for instruments as built, and how do they compare with usual procedures?
 
-    python tests/studies/plans.py [errors] [built] [beside] [naming]
+    python tests/studies/plans.py [errors] [built] [beside] [naming] [diagnosed]
 
 errors   20 sets each of the best plan of 20 minutes and of usual ones, of 20 instruments drawn from the priors, with
          noise and standards of its own: the errors of p that a fit makes against those promised. The
@@ -11,6 +11,8 @@ beside   time to 0.1 % on 95 % of the field, for South, North and an instrument 
          usual procedures, the best plan found, and the time that no plan can undercut, whatever it gives up.
 naming   pairs of effects that a standard plan cannot tell apart, simulated with one of them: how often the exposures
          proposed name it at the time promised.
+diagnosed a run from end to end: a set is diagnosed, the exposures that tell apart what is left as a class are planned
+         from that run, taken, and diagnosed together with the set.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import json
 import sys
 import tempfile
 from importlib import resources
@@ -29,6 +32,7 @@ from scipy.optimize import linprog
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
+import walop_jax as walop  # noqa: E402
 from walop_jax.fit.model_file import base_model  # noqa: E402
 from walop_jax.fit.refit import refit  # noqa: E402
 from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
@@ -439,12 +443,38 @@ def named(found: Candidates, standard, plan: ObservingPlan, pair: tuple[str, str
     return bool(chi2[1] - chi2[0] >= APART**2)
 
 
+def diagnosed() -> None:
+    """From a class of effects to one name."""
+    (text, _), seed = PAIRS[0], 1
+    text = text.replace("0.0022", "0.003")
+    folder = Path(tempfile.mkdtemp())
+    sets, runs = [folder / "first.fits", folder / "second.fits"], [folder / "FIRST", folder / "BOTH"]
+    truth = dataclasses.replace(walop.simulate(SOUTH, seed=seed).truth, effects=())
+    plan = SOUTH
+    for count, run in enumerate(runs):
+        # The seed is that of the standards as well.
+        taken, _ = walop.simulate(plan, seed=seed + 100, instrument=truth, effect=[text])
+        walop.write_calibration_set(sets[count], taken)
+        walop.diagnose(sets[: count + 1], output=run)
+        for step in json.loads((run / "diagnosis.json").read_text())["steps"]:
+            print(
+                f"{text}: {step['effect']}, equivalent: {', '.join(step['equivalent']) or 'none'}", flush=True
+            )
+        if not count:
+            found = walop.plan(run, minutes=15.0, criterion="apart", draws=1)
+            print(
+                f"{found.value:.2f} σ apart in {found.minutes:g} minutes; 5 σ takes {found.needed[0]:.1f}",
+                flush=True,
+            )
+            plan = found.observing_plan
+
+
 def main() -> None:
     """Print the study."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parts = {"errors": errors, "built": built, "beside": beside, "naming": naming}
+    parts = {"errors": errors, "built": built, "beside": beside, "naming": naming, "diagnosed": diagnosed}
     parser.add_argument("parts", nargs="*", default=list(parts), choices=list(parts))
     for part in parser.parse_args().parts:
         parts[part]()
