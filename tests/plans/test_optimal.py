@@ -180,6 +180,11 @@ def test_the_largest_value_of_a_series_is_found_and_bounded_over_the_continuum(o
         assert series(*places[:1].T).item() == pytest.approx(largest, rel=3e-4)
 
 
+def lists(problem: Experiment) -> list[Listed]:
+    """Its families, which are lists."""
+    return [family for family in problem.families if isinstance(family, Listed)]
+
+
 def random_experiment(seed: int, *, draws: int = 1, count: int = 60, budget: float = 7.0) -> Experiment:
     """A few parameters seen by candidates of several rows each, some known before, wanted in several combinations."""
     rng = np.random.default_rng(seed)
@@ -202,10 +207,10 @@ def test_against_a_semidefinite_program(seed, draws, count):
     cvxpy = pytest.importorskip("cvxpy")
     problem = random_experiment(seed, draws=draws, count=count)
     weight = cvxpy.Variable(count, nonneg=True)
-    cost = np.concatenate([f.cost for f in problem.families])
+    cost = np.concatenate([f.cost for f in lists(problem)])
     constraints, levels = [cost @ weight <= problem.budget], cvxpy.Variable(draws)
     for r in range(draws):
-        matrices = np.concatenate([f.basis[r] for f in problem.families])
+        matrices = np.concatenate([f.basis[r] for f in lists(problem)])
         total = problem.known[r] + cvxpy.sum([weight[i] * matrices[i] for i in range(count)])
         for a in problem.targets[r]:
             corner = cvxpy.Variable((2, 2), symmetric=True)
@@ -221,8 +226,8 @@ def test_no_plan_is_better_than_the_bound():
     """A thousand plans of the same budget, those of few candidates among them; the bound holds for any multipliers."""
     problem, rng = random_experiment(4).reduced(), np.random.default_rng(6)
     plan = optimise(problem)
-    cost = np.concatenate([f.cost for f in problem.families])
-    matrices = np.concatenate([f.basis[0] for f in problem.families])
+    cost = np.concatenate([f.cost for f in lists(problem)])
+    matrices = np.concatenate([f.basis[0] for f in lists(problem)])
 
     def variances(weight):
         covariance = np.linalg.inv(problem.known[0] + np.tensordot(weight, matrices, 1))
@@ -266,7 +271,7 @@ def test_scales_of_parameters_do_not_matter():
     other = Experiment(
         turn @ problem.known @ turn,
         np.einsum("an,rknq->rkaq", turn, problem.targets),
-        tuple(Listed.of(turn @ f.basis @ turn, f.cost) for f in problem.families),
+        tuple(Listed.of(turn @ f.basis @ turn, f.cost) for f in lists(problem)),
         problem.budget,
     )
     assert optimise(other, gap=1e-4).value == pytest.approx(optimise(problem, gap=1e-4).value, rel=1e-4)
