@@ -245,7 +245,7 @@ def test_maps_are_of_a_setting_that_was_used(calibration):
 def test_no_camera_sees_less_than_nothing(calibration):
     check = _physics(calibration)
     assert check.passed
-    assert "only " in check.found
+    assert "left/right " in check.found
     index = calibration.model.index("only.analyser.efficiency")
     values = calibration.values.copy()
     values[index] = 1.05

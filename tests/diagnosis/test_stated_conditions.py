@@ -136,6 +136,7 @@ def test_an_effect_of_seven_standard_errors_is_told_whatever_patterns_say(text, 
     assert float(value.replace("−", "-")) == pytest.approx(size, abs=4 * float(error))
 
 
+@pytest.mark.long
 def test_both_crystals_of_a_plate_are_told_by_what_was_known_of_them():
     """Priors that are 6 µm off in all four plates: told as thicknesses, not as a filter or a colour."""
     right = small_fit_with_plate()

@@ -94,6 +94,7 @@ def test_a_fit_of_what_the_model_describes_is_trusted(clean):
     assert clean.verdict == dataclasses.replace(clean.verdict, against=())
 
 
+@pytest.mark.long
 def test_a_lamp_of_another_temperature(calset):
     """3200 K given as 5772 K: χ²/dof stays at 1, the matrix is off by half a per cent."""
     plan = dataclasses.replace(SMALL, teff=3200.0)

@@ -169,6 +169,7 @@ def test_a_fit_has_the_derivatives_of_its_formula(group):
     assert [name for name, s in zip(names, size, strict=True) if not s > 0] == []
 
 
+@pytest.mark.long
 def test_an_effect_that_declares_nothing_has_derivatives_and_is_fitted():
     """A turn of 0.05° in the counts is found where it is, though nobody said that it enters the optics."""
     names, _ = check_jacobian(TiltedPlate(angle=jnp.asarray(0.2)))

@@ -24,6 +24,7 @@ def test_bench_table():
     assert np.sqrt(np.mean(joint**2)) < 0.7 * np.sqrt(np.mean(paper**2))
 
 
+@pytest.mark.long
 def test_errors_fall_with_the_light():
     """Four times the electrons, half the error of the joint fit, up to the luck of one draw."""
     faint, bright = (np.array([row.joint for row in bench_table(seed=2, electrons=n)]) for n in (1e5, 1.6e6))

@@ -130,9 +130,10 @@ def _physics(calibration: Calibration) -> Check:
     analysis = AnalysisVectors(calibration)
     vectors = analysis.exact(setting, x, y)[:, 0]
     least = np.min(1.0 - np.hypot(vectors[..., 1], vectors[..., 2]) / vectors[..., 0], axis=0)
-    pairs = analysis.instrument.cameras.pairs
-    names = analysis.instrument.cameras.names
-    found = ", ".join(f"{'/'.join(names[k] for k in pair)} {least[list(pair)].min():.1e}" for pair in pairs)
+    cameras = analysis.instrument.cameras
+    found = ", ".join(
+        f"{'/'.join(cameras.names[k] for k in arm)} {least[list(arm)].min():.1e}" for arm in cameras.arms
+    )
     good = bool(np.all(vectors[..., 0] > 0)) and bool(np.all(least > -DARKEST))
     return Check(
         "physics", good, f"least transmission for any polarisation, over that of unpolarised light: {found}"
