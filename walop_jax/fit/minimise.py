@@ -28,7 +28,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from walop_jax.model.compiled import compiled
+from walop_jax.model.compiled import array, compiled
 
 SOURCE = "Moré 1978, Lecture Notes in Mathematics 630, 105; Conn, Gould & Toint 2000, Trust Region Methods"
 
@@ -132,8 +132,8 @@ def minimise(
     for a numerical outcome: the gates, `result` and `message` say what happened.
     """
     x = trial = np.asarray(start, float)
-    region = _REGION.init(jnp.zeros(len(x)), None)  # pyright: ignore[reportArgumentType]
-    region = eqx.tree_at(lambda s: s.step_size, region, jnp.asarray(1.0 / damping if damping > 0 else np.inf))
+    region = _REGION.init(array(np.zeros(len(x))), None)  # pyright: ignore[reportArgumentType]
+    region = eqx.tree_at(lambda s: s.step_size, region, array(1.0 / damping if damping > 0 else np.inf))
     here, near, history, best = None, None, [], []
     distance, before, condition = np.inf, np.inf, np.inf
     result, why = RESULTS.nonlinear_max_steps_reached, ""

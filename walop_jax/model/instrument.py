@@ -32,6 +32,7 @@ from walop_jax.instruments.description import (
 from walop_jax.model import legendre
 from walop_jax.model.build import parts
 from walop_jax.model.cameras import Cameras, Throughput
+from walop_jax.model.compiled import array
 from walop_jax.model.elements import Analyser, Element, Polariser, WavePlate
 from walop_jax.model.elements.wave_plate import MODELS
 from walop_jax.model.parameters import Component, leaves, number, unknown_name
@@ -365,7 +366,7 @@ def adapted(
     coefficients[:, 0] = level
     return dataclasses.replace(
         instrument,
-        throughput=dataclasses.replace(series, degree=degree, coefficients=jnp.asarray(coefficients)),
+        throughput=dataclasses.replace(series, degree=degree, coefficients=array(coefficients)),
     )
 
 
@@ -386,7 +387,7 @@ def sources() -> tuple[Source, ...]:
 
 def _standards(stars: Sequence[STAR]) -> Standards:
     names, q, u = zip(*stars, strict=True) if stars else ((), (), ())
-    return Standards(names=tuple(names), q=jnp.asarray(np.array(q, float)), u=jnp.asarray(np.array(u, float)))
+    return Standards(names=tuple(names), q=array(np.array(q, float)), u=array(np.array(u, float)))
 
 
 def _check(instrument: Instrument, read: Reader) -> None:

@@ -40,6 +40,7 @@ from importlib.resources import files
 from typing import Any, ClassVar, NamedTuple, Self, TypeGuard
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -48,6 +49,7 @@ from walop_jax.io.code import classes_of
 from walop_jax.io.errors import fail
 from walop_jax.io.text import parse_toml
 from walop_jax.model.alternatives import alternatives, changed
+from walop_jax.model.compiled import array
 from walop_jax.model.conventions import EXTINCTION
 from walop_jax.model.effects.base import Context, Effect, Scalar, check_camera
 from walop_jax.model.effects.change import Change, patched
@@ -128,12 +130,12 @@ class Entry(Effect):
         values: dict[str, Any] = {}
         for member in cls.members:
             if member.each == "camera":
-                values[member.name] = jnp.zeros(context.cameras)
+                values[member.name] = array(np.zeros(context.cameras))
             elif member.each:
-                values[member.name] = jnp.zeros(len(context.moon))
+                values[member.name] = array(np.zeros(len(context.moon)))
                 values |= {"positions": context.moon, "ids": context.moon_ids}
             elif member.absolute:
-                values[member.name] = jnp.asarray(context.extinction)
+                values[member.name] = array(context.extinction, float)
         if cls.options.get("source") == "stars":
             values["source"] = context.sources[0] if context.sources else ""
         return cls(**values)
@@ -233,14 +235,15 @@ class Entry(Effect):
         if member.absolute:
             polariser = instrument.polariser
             value = value - (EXTINCTION if polariser is None else polariser.extinction)
-        return list(jnp.atleast_1d(value))
+        return list(value) if jnp.ndim(value) else [value]
 
     def _parts(self, member: Member, instrument: Instrument) -> list[list[tuple[Any, Change]]]:
         """For each value of a parameter the changes, with their sizes for one unit of it."""
         weights: tuple[Any, ...] = (1.0,) * len(member.does)
         if member.polar:
             phase = self._phase(member, getattr(self, member.polar))
-            weights = (jnp.cos(phase), jnp.sin(phase))
+            of = jnp if isinstance(phase, jax.Array) else np  # known ones need no program
+            weights = (of.cos(phase), of.sin(phase))
         found: list[list[tuple[Any, Change]]] = []
         for text, size, weight in zip(member.does, member.per_unit, weights, strict=True):
             for i, texts in enumerate(self._each(member, text, instrument)):
@@ -263,6 +266,7 @@ class Entry(Effect):
         return [every]
 
     def _phase(self, member: Member, angle: Any) -> Any:
+        angle = angle if isinstance(angle, jax.core.Tracer) else np.asarray(angle)
         return member.turns * (angle * _RADIANS[field_declarations(type(self))[member.polar].unit])
 
 

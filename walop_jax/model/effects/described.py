@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.model.alternatives import changed
+from walop_jax.model.compiled import array
 from walop_jax.model.effects.base import Context, Effect, Scalar
 from walop_jax.model.effects.change import AMPLITUDES, Change, patched
 from walop_jax.model.effects.optics import SOURCE
@@ -38,7 +39,7 @@ def _amplitude(name: str) -> Any:
 def _zeros(count: int) -> Float[Array, " n"]:
     """So many zeros; there are thousands of changes that have no size yet."""
     with jax.ensure_compile_time_eval():
-        return jnp.zeros(count)
+        return array(np.zeros(count))
 
 
 class Described(Effect):
