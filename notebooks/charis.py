@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import tables
 from astropy.table import Table
 from scipy.optimize import least_squares
+from tables import bench_set
 
-from walop_jax.data.records import CalibrationSet, Exposures, FilterCurve, Points, Position, Site, Sources
-from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.data.records import CalibrationSet, FilterCurve
 
 RESOLUTION = 19.0  # λ/FWHM of the low-resolution mode: wider than the step between bins
 
@@ -29,56 +30,16 @@ def charis_set(table: Table | str | Path, floor: float = 1e-3, mjd: float = 6000
     """
     rows = table if isinstance(table, Table) else Table.read(table, format="ascii.ecsv")
     counts, photon = np.asarray(rows["N"], float), np.asarray(rows["N_ERR"], float)
-    n, no = len(rows), np.full(len(rows), np.nan)
     bins, first = np.unique(rows["BIN"], return_index=True)
     curves = [
         bin_curve(int(b), float(w)) for b, w in zip(bins, np.asarray(rows["WAVELENGTH"])[first], strict=True)
     ]
-    place = {int(b): curve.name for b, curve in zip(bins, curves, strict=True)}
-    always = np.ones(n, bool)
-    exposures = Exposures(
-        exposure=np.arange(n),
-        kind=np.full(n, "lamp"),
-        mjd=np.full(n, mjd),
-        exptime=np.full(n, 1.0),
-        filter=np.array([place[int(b)] for b in rows["BIN"]]),
-        clp_in=always,
-        clp_angle=np.zeros(n),
-        chwp_in=~always,
-        chwp_angle=no,
-        temp=no,
-        ha=no,
-        ra=no,
-        dec=no,
-        rotator=no,
-        teff=no,
-        moving={
-            "HWP": Position(always, np.asarray(rows["HWP_ANGLE"], float)),
-            "DEROT": Position(always, np.asarray(rows["ROTATOR_ANGLE"], float)),
-        },
-    )
-    points = Points(np.array([0]), np.zeros(1), np.zeros(1))
-    none = np.zeros(0)
-    return CalibrationSet(
-        instrument="CHARIS-INTERNAL",
-        site=Site("", np.nan, np.nan, np.nan),
-        origin="measured; public repository UCSB-Exoplanet-Polarimetry-Lab/pyPolCal",
-        exposures=exposures,
-        points=points,
-        sources=Sources(np.zeros(0, int), np.zeros(0, str), none, none, none, none, none),
-        filters={curve.name: curve for curve in curves},
-        intensities=TableIntensities(
-            n,
-            points,
-            exposure=np.arange(n),
-            point=np.zeros(n, int),
-            source=np.full(n, -1),
-            counts=counts,
-            sigma=np.hypot(photon, floor * counts.mean(axis=1, keepdims=True)),
-            flag=np.zeros(n, int),
-            used=always,
-        ),
-    )
+    moving = {"HWP": np.asarray(rows["HWP_ANGLE"], float), "DEROT": np.asarray(rows["ROTATOR_ANGLE"], float)}
+    return bench_set(
+        "CHARIS-INTERNAL", "measured; public repository UCSB-Exoplanet-Polarimetry-Lab/pyPolCal", "lamp", curves,
+        np.searchsorted(bins, rows["BIN"]), counts, np.hypot(photon, floor * counts.mean(axis=1, keepdims=True)),
+        moving, polariser=np.zeros(len(rows)), mjd=mjd,
+    )  # fmt: skip
 
 
 def asymmetry(left, right):
@@ -91,10 +52,8 @@ def left_over(result, values=None):
 
     `values` are those of another fit of the same model, e.g. to a part of the set.
     """
-    likelihood = result.likelihood
-    _, residual = likelihood.residuals(result.values if values is None else values)
-    counts, weight = (likelihood.points.gathered(name)[0] for name in ("counts", "weight"))
-    model = counts - residual[0] / weight
+    counts = result.likelihood.points.gathered("counts")[0]
+    model = counts - tables.left_over(result, values)
     return (asymmetry(*counts.T) - asymmetry(*model.T)).reshape(-1, 8, 8)
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import walop_jax as walop
+from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.write import write_calibration_set
@@ -110,6 +112,20 @@ def test_one_detector_and_one_flux_for_each_filter(tmp_path):
     again = read_calibration_set(tmp_path / "one.fits")
     np.testing.assert_array_equal(again.intensities.counts, calset.intensities.counts)
     assert set(again.exposures.kind) == {"steady"}
+
+
+def test_without_an_arm_of_two_cameras_there_is_a_fit_and_no_product(tmp_path):
+    """No pair, no row of the instrument matrix: the fit is examined, and a run is refused before it is made."""
+    instrument, calset = described(tmp_path, ONE_DETECTOR), one_detector()
+    result = walop.refit(calset, instrument=instrument)
+    assert result.verdict is not None
+    assert result.value("plate.delta")[0] == pytest.approx(1.4, abs=1e-5)
+    assert instrument_matrices(result).shape == (1, 0, 3)
+    write_calibration_set(tmp_path / "one.fits", calset)
+    (description,) = tmp_path.glob("*.toml")
+    with pytest.raises(DataError, match="no arm has two cameras"):
+        walop.refit(tmp_path / "one.fits", instrument=description, output=tmp_path / "RUN")
+    assert not (tmp_path / "RUN").exists()
 
 
 def test_a_gain_may_follow_any_element_that_moves(tmp_path):

@@ -27,8 +27,8 @@ from walop_jax.calibration.matrix import (
     matrix_slopes,
     of_structure,
     p_errors,
+    planned_matrices,
     sample_stars,
-    sky_vectors,
     slopes_over_field,
 )
 from walop_jax.data.frames import Grid
@@ -56,7 +56,6 @@ from walop_jax.io.code import software_versions
 from walop_jax.io.display import Display, Result
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.text import in_ascii
-from walop_jax.model import light
 from walop_jax.model.dependence import left_behind, needs
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.instrument import Instrument, adapted, build, nominal_instrument
@@ -69,10 +68,8 @@ Matrix = Float[np.ndarray, "n n"]
 Columns = dict[str, tuple[np.ndarray, str]]  # values, description
 
 MAP_SIZE = 31  # pixels along each axis of the maps: 0.02° over ±0.3°
-MAP_NODES, MAP_ERRORS = (
-    (18, 24, 30),
-    1e-6,
-)  # nodes per side for the standard errors in the maps, and their error
+MAP_NODES = (18, 24, 30)  # per side, for the standard errors in the maps
+MAP_ERRORS = 1e-6  # of those, relative
 HIGH_CROSSTALK = 10.0  # condition number of the local 2 × 2 inverse
 TEMPERATURE_MARGIN = 2.0  # K beyond the temperatures of the exposures
 
@@ -325,7 +322,7 @@ class Calibration(Result):
             settings = settings[np.zeros(count, int)]
         x, y = x.ravel(), y.ravel()
         inside = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) <= self.model.template.field_limit)
-        size = 3 * len(self.model.template.arms)
+        size = 3 * len(self.model.template.cameras.pairs)
         m, covariance = np.full((count, size), np.nan), np.full((count, size, size), np.nan)
         if inside.size:
             m[inside], covariance[inside] = self._elements(x[inside], y[inside], settings[inside])
@@ -463,17 +460,12 @@ class Calibration(Result):
         else:
             instrument, curves = self.model.instrument(self.values), {name: self.filter_curve(name)}
             plan = plan_for_settings(instrument, settings[:1], curves)
-            vectors = sky_vectors(instrument, plan, points.x, points.y)[:, 0]
-            values = np.asarray(light.instrument_matrix(vectors, instrument.cameras.pairs))
+            values = planned_matrices(instrument, plan, points.x, points.y)
             _, covariance, _ = self.over_field(points.x, points.y, settings[:1], MAP_NODES, MAP_ERRORS)
         errors = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
-        planes = (-1, size, size)
+        planes, flat = (-1, size, size), values.reshape(size * size, -1)
         return MatrixMaps(
-            grid,
-            name,
-            values.reshape(size * size, -1).T.reshape(planes),
-            errors.T.reshape(planes),
-            settings[:1].further(),
+            grid, name, flat.T.reshape(planes), errors.T.reshape(planes), settings[:1].further()
         )
 
     @functools.cached_property

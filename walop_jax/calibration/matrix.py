@@ -34,7 +34,7 @@ from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import array, compiled
 from walop_jax.model.effects.base import Effect, with_amplitudes
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import with_values
+from walop_jax.model.parameters import values_of, with_values
 from walop_jax.model.plan import Plan, with_numbers
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import Model
@@ -209,6 +209,11 @@ sky_vectors = functools.partial(analysis_vectors, from_sky=True)
 """Analysis vectors for light from the sky."""
 
 
+def planned_matrices(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> Float[np.ndarray, "p a 3"]:
+    """Instrument matrices at field positions (deg) in the one setting of a plan."""
+    return light.instrument_matrix(sky_vectors(instrument, plan, x, y)[:, 0], instrument.cameras.pairs)
+
+
 def matrices(
     instrument: Instrument,
     settings: Settings,
@@ -222,7 +227,7 @@ def matrices(
     `settings` has one row per position. Raises KeyError for a filter that `filters` does not hold and ValueError for a
     moving element that the instrument does not have.
     """
-    size = 3 * len(instrument.arms)
+    size = 3 * len(instrument.cameras.pairs)
     values, errors = np.empty((len(x), size)), np.empty((len(x), size, size))
     for layout, rows in settings.layouts():
         plan = plan_for_settings(instrument, layout, filters)
@@ -249,14 +254,12 @@ def matrix_draws(
     y: Vector,
 ) -> Float[np.ndarray, "d p m"]:
     """Elements of the instrument matrix at field positions (deg) for every draw of all parameters."""
-    pairs = model.template.cameras.pairs
-    result = np.empty((len(draws), len(x), 3 * len(pairs)))
+    result = np.empty((len(draws), len(x), 3 * len(model.template.cameras.pairs)))
     for setting, rows in settings.distinct():
         plan = plan_for_settings(model.template, setting, filters)
         for i, values in enumerate(draws):
-            vectors = sky_vectors(model.instrument(values), plan, x[rows], y[rows])[:, 0]
-            matrix = light.instrument_matrix(jnp.asarray(vectors), pairs)
-            result[i, rows] = np.asarray(matrix).reshape(len(rows), -1)
+            matrix = planned_matrices(model.instrument(values), plan, x[rows], y[rows])
+            result[i, rows] = matrix.reshape(len(rows), -1)
     return result
 
 
@@ -290,6 +293,8 @@ def matrix_slopes(
 
     `setting` has one row. Raises KeyError for a filter that `filters` does not hold.
     """
+    if not instrument.cameras.pairs:  # no row, and nothing to compile
+        return np.zeros((len(x), 0, 3)), np.zeros((len(x), 0, 3, values_of(instrument).size))
     plan = plan_for_settings(instrument, setting, filters)
     numbers = (np.broadcast_to(number, len(x)) for number in _numbers(setting))
     values, slopes = in_chunks(lambda *columns: _slopes(instrument, plan, *columns), x, y, *numbers)
@@ -356,10 +361,19 @@ def hidden_errors(
     """
     if not len(hidden):
         return np.zeros(len(matrix)), ""
-    errors = np.array([change_of_qu(matrix, matrix + slopes @ change) for change in hidden.changes])
+    errors = errors_of_changes(matrix, slopes, hidden.changes)
     known = np.nan_to_num(errors)
     largest = np.where(np.isnan(errors).all(axis=0), np.nan, known.max(axis=0))
     return largest, hidden.names[int(np.argmax(known.max(axis=1)))]
+
+
+def errors_of_changes(
+    matrix: Float[np.ndarray, "p a 3"],
+    slopes: Float[np.ndarray, "p a 3 n"],
+    changes: Float[np.ndarray, "c n"],
+) -> Float[np.ndarray, "c p"]:
+    """`change_of_qu` of every change of all parameters, to first order."""
+    return np.array([change_of_qu(matrix, matrix + slopes @ change) for change in changes])
 
 
 def change_of_qu(
@@ -417,7 +431,7 @@ def effect_slopes(
     What of an effect does not go with the matrix (single exposures, ghosts, detectors) has none.
     """
     if not effects:
-        return np.zeros((len(x), len(instrument.arms), 3, 0))
+        return np.zeros((len(x), len(instrument.cameras.pairs), 3, 0))
     there = dataclasses.replace(instrument, effects=(*instrument.effects, *effects))
     plan = plan_for_settings(there, setting, filters)
     return in_chunks(lambda a, b: (_effect_slopes(instrument, plan, effects, a, b),), x, y)[0][:, 0]
@@ -455,8 +469,7 @@ def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p a 3"]:
     """Instrument matrix at the field points of a fit, in the filter and plate setting of its first exposure."""
     instrument, calset = result.model.instrument(result.values), result.calset
     plan = plan_for_settings(instrument, first_setting(calset, instrument), calset.filters)
-    vectors = sky_vectors(instrument, plan, calset.points.x, calset.points.y)[:, 0]
-    return light.instrument_matrix(vectors, instrument.cameras.pairs)
+    return planned_matrices(instrument, plan, calset.points.x, calset.points.y)
 
 
 def largest_change(

@@ -150,7 +150,7 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
         return SlabSums(np.concatenate(sums), np.zeros(4))
 
     total = likelihood.runner.total("residual map", None, work, likelihood.layout).sums.reshape(-1, count)
-    n = len(residual_names(len(instrument.arms)))
+    n = len(residual_names(len(instrument.cameras.pairs)))
     left = np.zeros((count, n, n))
     i, j = np.triu_indices(n)
     left[:, i, j] = left[:, j, i] = total[2 + n :].T

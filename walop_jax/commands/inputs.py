@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome
 from walop_jax.commands.door import PathLike
-from walop_jax.io.errors import errors_naming, fail
+from walop_jax.io.errors import DataError, errors_naming, fail
 from walop_jax.io.text import in_ascii, read_text
 
 if TYPE_CHECKING:
@@ -176,6 +176,11 @@ def set_and_model(
         paths_of(data)
     design = design_of(instrument)
     calset = set_of(data, design)
+    if output is not None and design is not None and not design.cameras.pairs:
+        raise DataError(
+            f"{design.name}: no arm has two cameras, so there is no instrument matrix and no calibration to write; "
+            "fit it in Python, without output"
+        )
     if isinstance(model, Model):
         known = model.catalogue if effects is None else catalogue_of(effects)
         return calset, dataclasses.replace(model, catalogue=known)

@@ -161,7 +161,7 @@ def true_matrices(
     """
     source = read_input_table(path)
     points = field_points(source, instrument)
-    names = [f"M{arm + 2}{column}" for arm in range(len(instrument.arms)) for column in (1, 2, 3)]
+    names = [f"M{arm + 2}{column}" for arm in range(len(instrument.cameras.pairs)) for column in (1, 2, 3)]
     matrix = np.stack([numeric_column(source, name, Column("float")) for name in names], axis=1)
     Place(path, "").refuse(
         ~np.isfinite(matrix), "not finite", f"{names[0]} … {names[-1]}", "remove these rows"

@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import special
 
-from walop_jax.calibration.matrix import change_of_qu, first_setting, matrix_slopes
+from walop_jax.calibration.matrix import errors_of_changes, first_setting, matrix_slopes
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.alternatives import with_exposures, with_places
 from walop_jax.diagnosis.candidates import Probe, applicable, probes, showable
@@ -196,7 +196,7 @@ def _errors_of_stars(design: Design, changes: Float[np.ndarray, "c n"]) -> Float
     instrument = fit.model.instrument(fit.values)
     setting = first_setting(fit.calset, instrument)
     matrix, slopes = matrix_slopes(instrument, setting, fit.calset.filters, points.x[some], points.y[some])
-    errors = np.array([change_of_qu(matrix, matrix + slopes @ change) for change in changes])
+    errors = errors_of_changes(matrix, slopes, changes)
     measured = np.isfinite(errors).all(axis=0)
     return np.median(errors[:, measured], axis=1) if measured.any() else np.zeros(len(changes))
 

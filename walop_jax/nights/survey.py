@@ -161,7 +161,7 @@ class Survey(Displayed):
     @functools.cached_property
     def _slopes(self) -> Float[np.ndarray, "p n k"] | None:
         """Derivatives of p to the parameters, at points of the field, for some stars; None where p is not measured."""
-        if self.like is None or len(self.like.model.template.arms) != 2:
+        if self.like is None or len(self.like.model.template.cameras.pairs) != 2:
             return None
         try:
             product = self._product(self.last)

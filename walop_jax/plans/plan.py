@@ -251,7 +251,7 @@ def plan_exposures(
     )
     if progress is not None:
         progress("what is wanted")
-    field = None if apart or len(found.model.template.arms) != 2 else field_errors(found)
+    field = None if apart or len(found.model.template.cameras.pairs) != 2 else field_errors(found)
     if field is None and criterion in ("worst", "mean"):
         field = field_errors(found)  # raises, with advice
     return plan_from(

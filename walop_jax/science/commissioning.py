@@ -64,10 +64,6 @@ class Commissioning(Displayed):
         return Display(title, head=("met", "asked", "found"), rows=rows, notes=self.missing)
 
 
-def _asked(share: float) -> str:
-    return f"p known to {two_digits(100 * MOST)} % in {100 * share:.0f} % of the field"
-
-
 def commissioning(result: FitResult, accuracy: FieldAccuracy | None) -> Commissioning:
     """What is asked of an examined fit; `accuracy` is that of p over the field, None where nobody knows it."""
     found = [
@@ -84,27 +80,18 @@ def commissioning(result: FitResult, accuracy: FieldAccuracy | None) -> Commissi
         limit = accuracy.limited_by.split(" (")[0]
         for share, needed in ((0.5, True), (SHARE, False)):
             reached = float(np.quantile(accuracy.error, share))
-            if accuracy.without_u > 1.0 - share:
-                strip = (
-                    f"{100 * accuracy.without_u:.0f} % of the field, where one exposure holds hardly any u"
-                )
-                found.append(
-                    Requirement(
-                        _asked(share), reached <= MOST, f"{two_digits(100 * reached)} %, because of {strip}",
-                        "observe the stars there with the calibration plate at 22.5° as well", needed,
-                    )
-                )  # fmt: skip
-                continue
-            found.append(
-                Requirement(
-                    _asked(share),
-                    reached <= MOST,
-                    f"{two_digits(100 * reached)} %" + (f", most of it from {limit}" if limit else ""),
-                    f"{two_digits((reached / MOST) ** 2)} times the light, over several nights (walop-jax stack); "
-                    "walop-jax plan says which exposures",
-                    needed,
-                )
+            cause = f", most of it from {limit}" if limit else ""
+            advice = (
+                f"{two_digits((reached / MOST) ** 2)} times the light, over several nights (walop-jax stack); "
+                "walop-jax plan says which exposures"
             )
+            if accuracy.without_u > 1.0 - share:
+                strip = f"{100 * accuracy.without_u:.0f} % of the field"
+                cause = f", because of {strip}, where one exposure holds hardly any u"
+                advice = "observe the stars there with the calibration plate at 22.5° as well"
+            asked = f"p known to {two_digits(100 * MOST)} % in {100 * share:.0f} % of the field"
+            said = f"{two_digits(100 * reached)} %{cause}"
+            found.append(Requirement(asked, reached <= MOST, said, advice, needed))
         if accuracy.hidden > 0:
             found.append(
                 Requirement(

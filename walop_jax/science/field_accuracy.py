@@ -117,7 +117,7 @@ def answered(result: FitResult) -> FitResult:
 
 def field_accuracy(calibration: Calibration, size: int = SIZE) -> FieldAccuracy | None:
     """The map for an instrument with two arms, in the usual settings; None for others: they need several exposures."""
-    if len(calibration.model.template.arms) != 2:
+    if len(calibration.model.template.cameras.pairs) != 2:
         return None
     used = [str(name) for name in np.unique(calibration.exposures.filter)]
     settings = calibration.usual_settings()
