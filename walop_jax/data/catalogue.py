@@ -59,6 +59,11 @@ class NamedCameras(Sized, Protocol):
         """Their names, in order."""
         ...
 
+    @property
+    def pairs(self) -> Sized:
+        """Those of the arms with two: a row of the matrix each."""
+        ...
+
 
 @runtime_checkable
 class InstrumentOfTables(Protocol):
@@ -77,11 +82,6 @@ class InstrumentOfTables(Protocol):
     @property
     def cameras(self) -> NamedCameras:
         """Its cameras."""
-        ...
-
-    @property
-    def arms(self) -> Sized:
-        """Its arms."""
         ...
 
     def moving(self) -> tuple[str, ...]:

@@ -43,6 +43,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from walop_jax.io.code import classes_of
@@ -266,7 +267,7 @@ class Entry(Effect):
         return [every]
 
     def _phase(self, member: Member, angle: Any) -> Any:
-        angle = angle if isinstance(angle, jax.core.Tracer) else np.asarray(angle)
+        angle = angle if isinstance(angle, Tracer) else np.asarray(angle)
         return member.turns * (angle * _RADIANS[field_declarations(type(self))[member.polar].unit])
 
 
