@@ -13,12 +13,15 @@ from science.truth import TrueInstrument, chance
 from small_run import WITH_PLATE, small_fit_with_plate
 
 from walop_jax.calibration import Calibration, read_calibration, write_calibration
+from walop_jax.calibration.matrix import of_structure
 from walop_jax.data import DataError
 from walop_jax.data.settings import Settings
 from walop_jax.fit.minimise import RESULTS
 from walop_jax.fit.model_file import model_for, model_without_data, render
 from walop_jax.fit.refit import FitResult
+from walop_jax.fit.verdict import Structure
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model import light
 from walop_jax.model.references import references
 
 X, Y = np.array([-0.21, 0.03, 0.2]), np.array([0.1, -0.05, 0.22])
@@ -312,3 +315,21 @@ def test_error_between_grid_points(whole_south_set, south_fit, name, limit):
         f"rms pulls of the matrix {np.sqrt(np.mean(found.pulls**2, axis=0)).round(2)}"
     )
     assert np.all(found.error <= limit)
+
+
+@pytest.mark.parametrize(("gain", "response"), [(1e-3, 0.0), (0.0, 2e-3), (1e-3, 2e-3)])
+def test_structure_is_the_scatter_of_gains_and_responses(gain, response):
+    """Gains of 1 ± g of both cameras of an arm, and responses that change by r of their counts: drawn, not derived."""
+    rng, m = np.random.default_rng(6), np.array([0.02, 0.8, -0.3])
+    one, other = 0.5 * (np.array([1.0, 0.0, 0.0]) + m), 0.5 * (np.array([1.0, 0.0, 0.0]) - m)
+    drawn = []
+    for camera in (one, other):
+        changed = camera + 0.5 * response * rng.standard_normal((200_000, 3)) * [0.0, 1.0, 1.0]
+        changed *= 1.0 + gain * rng.standard_normal((200_000, 1))
+        drawn.append(np.pad(changed, ((0, 0), (0, 1))))
+    matrix = light.instrument_matrix(np.stack(drawn, axis=1), ((0, 1),))[:, 0]
+    found = of_structure(Structure(gain, response), m[None])[0]
+    sigma = np.sqrt(np.diag(found))
+    measured = np.cov(matrix.T)
+    np.testing.assert_allclose(np.sqrt(np.diag(measured)), sigma, rtol=0.01)
+    np.testing.assert_allclose(found, measured, atol=0.02 * sigma.max() ** 2)
