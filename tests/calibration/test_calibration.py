@@ -331,5 +331,5 @@ def test_structure_is_the_scatter_of_gains_and_responses(gain, response):
     found = of_structure(Structure(gain, response), m[None])[0]
     sigma = np.sqrt(np.diag(found))
     measured = np.cov(matrix.T)
-    np.testing.assert_allclose(np.sqrt(np.diag(measured)), sigma, rtol=0.01)
+    np.testing.assert_allclose(np.sqrt(np.diag(measured)), sigma, rtol=0.01, atol=1e-12)
     np.testing.assert_allclose(found, measured, atol=0.02 * sigma.max() ** 2)
