@@ -47,7 +47,7 @@ def test_a_plan_says_what_it_says(plan):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("grids = 4", "nearest: grid"),
+        ("grids = 4", "did you mean 'grid'"),
         ("grid = 0", "must be at least 1"),
         ('filters = ["SDSS-x"]', "SDSS-x"),
         ('instrument = "WALOP-EAST"', "WALOP-EAST"),

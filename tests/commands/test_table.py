@@ -33,7 +33,7 @@ PYTHON_ONLY = {
     "matrix": {"columns"},
     "compare": {"calibration"},
     "trace": {"positions"},
-    "plot": {"ax", "figsize"},
+    "plot": {"ax", "figsize", "reference"},
     "sample": {"parameters", "more"},
 }
 

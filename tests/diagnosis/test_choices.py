@@ -78,7 +78,7 @@ def test_it_is_an_effect_like_any_other_once_it_is_in_a_model(south):
     assert effect_by_name("other_description") is OtherDescription
     both = with_effects(model, [OtherDescription(change=f"{TURNED}; {REVERSED}")], context)
     assert both.names == model.names
-    with pytest.raises(ValueError, match="no such change"):
+    with pytest.raises(ValueError, match="there is no change of"):
         with_effects(model, [OtherDescription(change="half1.wedge turned by 91 deg")], context)
 
 

@@ -176,7 +176,7 @@ def test_elements_of_a_user_are_known_by_their_kind(own):
     path = own(('kind = "retarder"', 'kind = "flat_mirror"'), ('moves = "WIN"\n', ""), (
         'delta = { value = 0.1, sigma = 0.02, unit = "rad", source = "a measurement" }\naxis = 10.0\n', ""
     ))  # fmt: skip
-    with pytest.raises(DataError, match="unknown kind of element 'flat_mirror'"):
+    with pytest.raises(DataError, match="there is no kind of element 'flat_mirror'"):
         Instrument.read(path)
     instrument = Instrument.read(path, elements=[Mirror, Diattenuator])
     assert isinstance(instrument.elements[1], Mirror)

@@ -14,16 +14,16 @@ from walop_jax.model.instrument import Instrument
 WINDOW = OWN[OWN.index('kind = "retarder"') : OWN.index("\n[arms.main]\n")]
 # What is changed in OWN, and what the message says beside the name of the file: table, key, what to do.
 WRONG = {
-    "unknown key": (("[field]\n", "[field]\nsize = 3\n"), r"\[field\] unknown key 'size'"),
+    "unknown key": (("[field]\n", "[field]\nsize = 3\n"), r"\[field\] there is no key 'size'"),
     "unknown key, nearest": (
         ("[field]\n", "[field]\nlimits = 3\n"),
-        r"\[field\] unknown key 'limits'.*limit",
+        r"\[field\] there is no key 'limits'.*limit",
     ),
-    "unknown table": (("[site]", "[sites]"), r"unknown key 'sites'.*site"),
+    "unknown table": (("[site]", "[sites]"), r"there is no key 'sites'.*site"),
     "unknown key of an element": (("delta =", "detla ="), r"\[elements\.window\].*'detla'.*delta"),
     "unknown key of a number": (
         ("sigma = 0.02", "width = 0.02"),
-        r"\[elements\.window\.delta\] unknown key 'width'",
+        r"\[elements\.window\.delta\] there is no key 'width'",
     ),
     "unknown key of a layer": (
         ("thickness = 30.0", "thikness = 30.0"),
@@ -31,15 +31,15 @@ WRONG = {
     ),
     "unknown key of an arm": (
         ("[arms.main]\n", "[arms.main]\ncamera = 1\n"),
-        r"\[arms\.main\] unknown key 'camera'",
+        r"\[arms\.main\] there is no key 'camera'",
     ),
     "unknown key of cameras": (
         ("[cameras]\n", "[cameras]\nnumber = 2\n"),
-        r"\[cameras\] unknown key 'number'",
+        r"\[cameras\] there is no key 'number'",
     ),
     "kind": (
         ('"retarder"', '"retardr"'),
-        r"\[elements\.window\] unknown kind of element 'retardr'.*retarder",
+        r"\[elements\.window\] there is no kind of element 'retardr'.*retarder",
     ),
     "no kind": (('kind = "retarder"\n', ""), r"\[elements\.window\] has no kind"),
     "unit": (
@@ -48,14 +48,14 @@ WRONG = {
     ),
     "crystal": (
         ('"mgf2"', '"calcite"'),
-        r"\[arms\.main\.elements\.plate\.layers\.second\] unknown crystal 'calcite'",
+        r"\[arms\.main\.elements\.plate\.layers\.second\] there is no crystal 'calcite'",
     ),
     "glass": (
         (
             'path = ["plate", "analyser"]',
             'path = ["w", "plate", "analyser"]\n[arms.main.elements.w]\nkind = "wedge"\nmaterial = "SF11"\n',
         ),
-        r"\[arms\.main\.elements\.w\] unknown glass 'SF11'.*BK7",
+        r"\[arms\.main\.elements\.w\] there is no glass 'SF11'.*BK7",
     ),
     "no value": (("{ value = 0.1, sigma", "{ sigma"), r"\[elements\.window\.delta\] has no value"),
     "no thickness": (("thickness = 30.0\n", ""), r"layers\.second\] needs a thickness"),
@@ -210,6 +210,6 @@ def test_a_file_that_cannot_be_read(tmp_path: Path):
 
 def test_an_unknown_name_lists_the_nearest():
     with pytest.raises(
-        DataError, match=r"unknown instrument 'WALOP-SUOTH'; .*WALOP-SOUTH.*, or give a description"
+        DataError, match=r"there is no instrument 'WALOP-SUOTH'; .*WALOP-SOUTH.*or give a description"
     ):
         Instrument.read("WALOP-SUOTH")

@@ -29,7 +29,7 @@ def test_laws_are_read_written_and_resolved():
         ({"a": {"per": ["walk", "night"], "rate": 1.0}}, "only one of"),
         ({"a": {"per": "step", "at": [2.0, 1.0]}}, "ascending"),
         ({"a": {"per": "walk", "rate": -1.0}}, "above 0"),
-        ({"a": {"pre": "walk"}}, "no such key"),
+        ({"a": {"pre": "walk"}}, "there is no key 'pre'"),
         ({"a": 3}, "must be a table"),
     ],
 )

@@ -123,7 +123,7 @@ def test_other_arms_are_the_product_of_their_plates():
 
 
 def test_unknown_kind_of_element_lists_the_nearest():
-    with pytest.raises(ValueError, match="unknown kind of element 'blue_depolariser'"):
+    with pytest.raises(ValueError, match="there is no kind of element 'blue_depolariser'"):
         Instrument.read(HERE / "other_arms.toml")
 
 

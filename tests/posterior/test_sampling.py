@@ -138,6 +138,7 @@ def test_posterior_file_table_and_report(posterior: PosteriorSample, tmp_path: P
     assert data.posterior["half1.plate.quartz"].attrs["units"] == "um"
     assert data.posterior["half1.wedge"].shape == posterior.draws.shape[:2]
     assert data.posterior.attrs["converged"] == 1
+    assert data.posterior.attrs["inference_library"] == "walop-jax"
 
     columns = posterior.intervals()
     row = list(columns["NAME"][0]).index("half2.wedge")
@@ -150,6 +151,44 @@ def test_posterior_file_table_and_report(posterior: PosteriorSample, tmp_path: P
         table = read_input_table(tmp_path / name)
         assert {"NAME", "MEDIAN", "LOW68", "HIGH68", "LOW95", "HIGH95"} <= set(table.names)
     assert posterior.document()["trusted"] is True
+
+
+def test_arviz_finds_what_it_looks_for(scene: Scene, posterior: PosteriorSample) -> None:
+    """Its own numbers: means and widths; rows of the data; as many effective parameters as the posterior is worth.
+
+    For normal posteriors the mean of χ² over draws is that at the mean plus p_D, and p_loo is near p_D.
+    """
+    import arviz as az
+
+    few = dataclasses.replace(
+        posterior, draws=posterior.draws[:, ::4], log_posterior=posterior.log_posterior[:, ::4]
+    )
+    data = few.to_arviz(log_likelihood=True)
+    said = az.summary(data, var_names=["half2.wedge"], round_to="none").loc["half2.wedge"]
+    mean, width = posterior.value("half2.wedge")
+    assert abs(said["mean"] - mean) < 0.2 * width
+    assert said["sd"] == pytest.approx(width, rel=0.15)
+    block = scene.world.likelihood.calset.intensities
+    counts = block.counts[block.used]
+    assert dict(data.observed_data.sizes) == {"row": len(counts), "camera": 4}
+    np.testing.assert_array_equal(np.sort(data.observed_data["N"], axis=0), np.sort(counts, axis=0))
+    np.testing.assert_allclose(
+        np.sort(data.constant_data["N_ERR"], axis=0), np.sort(block.sigma[block.used], axis=0), rtol=1e-12
+    )
+    first = data.observed_data.isel(row=0)  # where its coordinates say
+    (row,) = np.flatnonzero((block.point == int(first.point)) & (block.exposure == int(first.exposure)))
+    np.testing.assert_array_equal(first["N"], block.counts[row])
+    by_row = data.log_likelihood["N"].values
+    centre = np.broadcast_to(posterior.mean, (2, 1, len(posterior.mean)))
+    one = dataclasses.replace(posterior, draws=centre, log_posterior=np.zeros((2, 1)))
+    at_mean = one.log_likelihood()[0, 0]
+    worth = -2.0 * (by_row.sum(axis=2).mean() - at_mean.sum())
+    assert 0.5 * len(scene.target.free) < worth < 1.02 * len(scene.target.free)
+    assert at_mean.sum() == pytest.approx(
+        -0.5 * scene.target.data(posterior.mean[scene.target.free])
+        - 0.5 * scene.target.measured * np.log(2 * np.pi) - np.log(block.sigma[block.used]).sum()
+    )  # fmt: skip
+    assert az.loo(data).p_loo == pytest.approx(worth, rel=0.35)
 
 
 def test_matrix_by_draws_agrees_with_the_covariance(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import handmade_run
 import jax.numpy as jnp
 import numpy as np
@@ -12,16 +14,19 @@ from walop_jax.calibration import write_calibration
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.commands.plot import plot
 from walop_jax.data import read_calibration_set, write_calibration_set
+from walop_jax.diagnosis.figure_data import write_figure_data
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model import mueller
 from walop_jax.paper.wavelength import plate_retardances, retardance
-from walop_jax.reports.named import FIGURES, FigureSource, draw
+from walop_jax.reports.named import FIGURES, FigureSource, draw, possible
 from walop_jax.reports.posterior_figures import informed
 from walop_jax.reports.style import element_kind
 from walop_jax.simulation.simulate import simulate
 
-WITHOUT = ("corner", "trace", "residual-map", "protection", "separation")  # what this run has not
+OF_A_DIAGNOSIS = ("ladder", "effect", "signature", "rms", "shares")
+WITHOUT = ("corner", "trace", "residual-map", "protection", "separation", *OF_A_DIAGNOSIS)
+"""What this run has not."""
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +48,28 @@ def test_figures_are_drawn(source, name):
 
 @pytest.mark.parametrize("name", WITHOUT)
 def test_what_a_run_lacks_is_said(source, name):
-    with pytest.raises(DataError, match=r"has no posterior|holds no (map|limits)"):
+    with pytest.raises(DataError, match=r"has no posterior|holds no (map|limits|diagnosis)"):
         draw(name, source)
+
+
+def test_figures_that_a_run_can_give_are_listed(source):
+    assert [*possible(source)] == [name for name in FIGURES if name not in WITHOUT]
+    assert [*plot(source.folder)] == [*possible(source)]
+
+
+def test_figures_of_a_diagnosis(tmp_path):
+    """Of what was found (step 1), or of the whole (0): their titles are those of the arrays typed by hand."""
+    write_figure_data(tmp_path / "diagnosis.fits", handmade_run.figure_data())
+    run = FigureSource(tmp_path)
+    assert [*possible(run)] == [*OF_A_DIAGNOSIS]
+    for name in OF_A_DIAGNOSIS:
+        assert draw(name, run).axes[0].has_data()
+    rows = [axis.get_ylabel().splitlines()[:-2] for axis in draw("effect", run).axes[:12:4]]
+    assert rows == [["without", "clp_wobble"], ["clp_wobble"], ["with", "clp_wobble"]]
+    whole = draw("effect", dataclasses.replace(run, step=0))
+    assert whole.axes[0].get_ylabel().splitlines()[:2] == ["starting", "model"]
+    with pytest.raises(DataError, match=r"step 2: the diagnosis added 1 effect; step 0"):
+        plot(tmp_path, "signature", step=2)
 
 
 def test_names_and_files(source, tmp_path):

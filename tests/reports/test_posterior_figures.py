@@ -35,7 +35,7 @@ def test_contours_hold_their_share_of_the_draws(draws: np.ndarray):
 
 
 def test_every_panel_shows_its_coefficients(draws: np.ndarray):
-    figure = corner_figure(draws, NAMES, UNITS, reference=np.array([13.5, 0.9, 0.0]))
+    figure = corner_figure(draws, NAMES, UNITS, reference=dict(zip(NAMES, (13.5, 0.9, 0.0), strict=True)))
     panels = np.array(figure.axes).reshape(3, 3)
     assert [[axes.get_frame_on() for axes in row] for row in panels] == np.tri(3, dtype=bool).tolist()
     for i in range(3):
@@ -59,7 +59,7 @@ def test_every_panel_shows_its_coefficients(draws: np.ndarray):
 
 
 def test_one_coefficient_and_one_that_never_moved(draws: np.ndarray):
-    assert len(corner_figure(draws[:, :1], NAMES, UNITS, reference=draws[0, :1]).axes) == 1
+    assert len(corner_figure(draws[:, :1], NAMES, UNITS, reference={NAMES[0]: 13.0}).axes) == 1
     still = draws[:100].copy()
     still[:, 1] = 0.8
     corner_figure(still, NAMES, UNITS).savefig(io.BytesIO(), format="png")

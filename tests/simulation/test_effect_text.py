@@ -16,7 +16,7 @@ CONTEXT = ObservingPlan().context()
     [
         ("clp_wobbel=1", "clp_wobble"),
         ("clp_wobble=1", "2 parameters"),
-        ("clp_wobble=amplitud:1,phase:0", "nearest: amplitude"),
+        ("clp_wobble=amplitud:1,phase:0", "did you mean 'amplitude'"),
         ("clp_zero", "needs a value of angle, e.g. clp_zero=angle:"),
         ("clp_zero=fast", "does not fit"),
         ("clp_zero=1%", "not a number"),

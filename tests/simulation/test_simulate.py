@@ -144,7 +144,7 @@ def test_narrow_bands_are_fifteen_nanometres_wide():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"instrument": "WALOP-EAST"}, "unknown instrument"),
+        ({"instrument": "WALOP-EAST"}, "there is no instrument"),
         ({"grid": 0}, "grid"),
         ({"standards": -1}, "negative"),
         ({"electrons": 0.0}, "light"),

@@ -41,7 +41,9 @@ def docs(
         width = max(map(len, listed))
         text = "\n".join(f"{key:<{width}}   {words}" for key, words in listed.items())
     elif (text := found.get(topic.lower().removesuffix(".md"), "")) == "":
-        raise UsageError(f"there is no page {topic!r}: {nearest(topic, found)}", "topic")
+        raise UsageError(
+            f"there is no page {topic!r}; {nearest(topic, found)} (walop-jax docs lists all)", "topic"
+        )
     return Outcome(
         text,
         lambda: {"topic": topic, "name": name, "text": text},

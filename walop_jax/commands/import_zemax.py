@@ -54,7 +54,7 @@ def import_zemax(
     if not 0.0 <= error < 1.0:
         raise UsageError(f"{error} is not a share, as in 0.001", "error")
     if instrument is not None and instrument.upper() not in shipped():
-        raise UsageError(f"there is no {instrument!r}: {nearest(instrument, shipped())}", "instrument")
+        raise UsageError(f"there is no {instrument!r}; {nearest(instrument, shipped())}", "instrument")
     made = import_transmissions(
         folder, instrument=instrument, configurations=configurations, error=error, tell=job.tell
     )

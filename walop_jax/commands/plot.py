@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,37 +13,43 @@ from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Run
+    from walop_jax.diagnosis.findings import Diagnosis
+    from walop_jax.posterior import PosteriorSample
 
 FORMATS = (".pdf", ".png", ".svg", ".eps", ".jpg")
 RUN = Argument("Folder of results; none: list the figures.", "[RUN]", Path)
 NAME = Argument("The figure.", "[NAME]", str)
 FILE = Option("File to write: .pdf, .png, .svg (default: NAME.png).", "FILE", Path, "-o")
+STEP = Option("Effect of a diagnosis (effect, signature); 0: starting and final model.", least=0)
 PARAMETERS = Option("Coefficients of a corner or trace plot, by name.", "A,B,…", str)
 
 
 @command(writes=())
 def plot(
     job: Job,
-    run: Annotated[FitResult | Calibration | Run | PathLike | None, RUN] = None,
+    run: Annotated[FitResult | Calibration | Diagnosis | PosteriorSample | Run | PathLike | None, RUN] = None,
     name: Annotated[str | None, NAME] = None,
     *,
     output: Annotated[PathLike | None, FILE] = None,
     parameters: Annotated[str | Sequence[str] | None, PARAMETERS] = None,
     x: Annotated[float, Option("Field point of transmission and modulation, X (deg).")] = 0.0,
     y: Annotated[float, Option("The same, Y (deg).")] = 0.0,
+    step: Annotated[int, STEP] = 1,
     data: DataOf = None,
     effects: Effects = None,
     ax: Any = None,
     figsize: tuple[float, float] | None = None,
+    reference: Mapping[str, float] | None = None,
 ) -> Outcome[Any]:
     """Draw a figure of a run, by name, as a file.
 
     Without a name the figures are listed: accuracy of p over the field, maps of the matrix and of the retardance of the
     half-wave plates, camera transmissions, corner plots, and others. The format follows the name of the file.
 
-    In Python: the matplotlib figure, of a run or of a fit or calibration in memory, written if `output` is given;
-    without a name, what each figure shows, by name. `figsize` (inches) is its size; with `ax` it is drawn there (one of
-    several panels in a subfigure that takes the room of these axes).
+    In Python: the matplotlib figure, of a run or of a fit, calibration, diagnosis or posterior in memory, written if
+    `output` is given; without a name, what each figure shows, by name. `figsize` (inches) is its size; with `ax` it is
+    drawn there (one of several panels in a subfigure that takes the room of these axes). `reference` holds values by
+    name that a corner plot marks.
     Raises `DataError`, with the nearest names, for a figure that does not exist and for what the run lacks.
 
     >>> walop.plot()["modulation"]
@@ -52,17 +58,21 @@ def plot(
     """
     from walop_jax import Run
     from walop_jax.io.atomic import check_output
-    from walop_jax.reports.named import FIGURES, FigureSource, draw
+    from walop_jax.reports.named import FIGURES, FigureSource, draw, possible
     from walop_jax.reports.posterior_figures import save_figure
     from walop_jax.reports.style import Canvas
 
-    if run is None or name is None:
-        there = Path(run) if isinstance(run, str | os.PathLike) else None
-        listed = {
-            key: entry.about
-            for key, entry in FIGURES.items()
-            if there is None or (there / entry.needs).exists()
-        }
+    catalogue = catalogue_of(effects)
+    held = Run(Path(run), catalogue, tuple(data or ())) if isinstance(run, str | os.PathLike) else run
+    if isinstance(held, Run) and not held.folder.is_dir():
+        raise fail(
+            "is not the folder of a run",
+            file=held.folder,
+            advice="give the RUN of walop-jax refit or diagnose",
+        )
+    if held is None or name is None:
+        found = FIGURES if held is None else possible(FigureSource.of(held))
+        listed = {key: entry.about for key, entry in found.items()}
         width = max(map(len, listed), default=0)
         lines = [f"{key:<{width}}  {about}" for key, about in listed.items()]
         return Outcome(listed, lambda: listed, lambda: "\n".join(lines))
@@ -72,21 +82,18 @@ def plot(
         if path.suffix.lower() not in FORMATS:
             raise fail("is no picture that can be written", file=path, advice=f"use {', '.join(FORMATS)}")
         check_output(path, overwrite=job.overwrite)
-    catalogue = catalogue_of(effects)
-    held = Run(Path(run), catalogue, tuple(data or ())) if isinstance(run, str | os.PathLike) else run
-    if isinstance(held, Run) and not held.folder.is_dir():
-        raise fail(
-            "is not the folder of a run",
-            file=held.folder,
-            advice="give the RUN of walop-jax refit or diagnose",
-        )
     if isinstance(parameters, str):
         parameters = [part.strip() for part in parameters.split(",") if part.strip()]
     job.tell(f"drawing {name}")
-    figure = draw(
-        name,
-        FigureSource.of(held, parameters=tuple(parameters or ()), place=(x, y), canvas=Canvas(ax, figsize)),
+    source = FigureSource.of(
+        held,
+        parameters=tuple(parameters or ()),
+        place=(x, y),
+        step=step,
+        reference=reference,
+        canvas=Canvas(ax, figsize),
     )
+    figure = draw(name, source)
     if path is not None:
         save_figure(path, figure, overwrite=job.overwrite)
     return Outcome(figure, lambda: {"figure": name, "output": str(path)}, lambda: str(path))

@@ -139,38 +139,20 @@ def _writers(product: Calibration, posterior: PosteriorSample) -> Writers:
     from walop_jax.io.plain_tables import write_columns
     from walop_jax.io.text import json_text
     from walop_jax.posterior import write_posterior
-    from walop_jax.reports.posterior_figures import corner_figure, save_figure, trace_figure
+    from walop_jax.reports.named import FigureSource, draw
+    from walop_jax.reports.posterior_figures import save_figure
 
-    units = dict(zip(posterior.names, posterior.units, strict=True))
-    sampled = [units.get(name, "") for name in posterior.sampled]
     notes = {"TRUSTED": posterior.trusted, "STEPS": posterior.convergence.steps}
-    shown, draws = _in_corner(posterior, product)
-    corner = corner_figure(draws, shown, [units.get(name, "") for name in shown])
-    tau = posterior.convergence.tau
-    trace = trace_figure(posterior.chains, posterior.sampled, sampled, posterior.thin, tau)
+    figures = FigureSource.of(posterior)
     writers: dict[str, Any] = {
         "posterior.nc": lambda path: write_posterior(path, posterior),
         "posterior.fits": lambda path: write_columns(path, posterior.intervals(), notes),
         "posterior.ecsv": lambda path: write_columns(path, posterior.intervals(), notes),
-        "posterior_corner.png": lambda path: save_figure(path, corner),
-        "posterior_trace.png": lambda path: save_figure(path, trace),
+        "posterior_corner.png": lambda path: save_figure(path, draw("corner", figures)),
+        "posterior_trace.png": lambda path: save_figure(path, draw("trace", figures)),
         "sample.json": lambda path: path.write_text(json_text(posterior.document()), encoding="utf-8"),
     }
     if posterior.trusted:
         better = product.rebuilt().with_covariance(posterior.covariance, posterior.errors_from)
         writers[PRODUCT] = lambda path: write_calibration(path, better)
     return writers
-
-
-def _in_corner(posterior: PosteriorSample, product: Calibration) -> tuple[tuple[str, ...], Any]:
-    """Names and draws of the sampled coefficients that a corner plot shows."""
-    import numpy as np
-
-    from walop_jax.reports.posterior_figures import correlated
-
-    columns = [posterior.names.index(name) for name in posterior.sampled if name in posterior.names]
-    draws = posterior.draws.reshape(-1, len(posterior.names))[:, columns]
-    if posterior.ln_f is not None:  # the factor on the errors, the last
-        draws = np.concatenate([draws, posterior.ln_f.reshape(-1, 1)], axis=1)
-    shown = correlated(draws, posterior.sampled, product.prior_width)
-    return shown, draws[:, [posterior.sampled.index(name) for name in shown]]

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.fit.refit import FitResult
-from walop_jax.io.display import Display, Displayed
+from walop_jax.io.display import Display, Drawn
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import value_and_error
 from walop_jax.model import legendre
@@ -203,7 +203,7 @@ class Choice:
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Diagnosis(Displayed):
+class Diagnosis(Drawn):
     """What is missing from a model, according to one calibration set.
 
     `candidates` are (effect, score, corrected p) in the first examination; `before` is the fit of the model given,
@@ -213,6 +213,8 @@ class Diagnosis(Displayed):
     the stated size scatters as much. `classes` are significant effects of the first examination with those that
     these data cannot tell from them, `limits` what effects that were not found stay below: rows of `diagnosis.json`.
     """
+
+    first_figure = "ladder"
 
     verdict: Outcome
     steps: tuple[Step, ...]

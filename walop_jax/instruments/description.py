@@ -92,7 +92,7 @@ def described(name: str) -> Description:
     known = {each.upper(): each for each in shipped()}
     if name.upper() not in known:
         raise DataError(
-            f"unknown instrument {name!r}; {nearest(name.upper(), shipped())}, or give a description file"
+            f"there is no instrument {name!r}; {nearest(name.upper(), shipped())} (or give a description file)"
         )
     return parsed(_shipped_text(known[name.upper()]), f"instrument {name}")
 
@@ -172,7 +172,7 @@ class Reader:
         """Raise `DataError` for a key that is none of those known."""
         for key in table:
             if key not in keys:
-                raise self.fault(place, f"unknown key {key!r}; {nearest(key, keys)}")
+                raise self.fault(place, f"there is no key {key!r}; {nearest(key, keys)}")
 
     def table(self, value: Any, place: str, what: str = "") -> Table:
         """A table."""

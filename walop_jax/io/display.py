@@ -8,7 +8,7 @@ import html
 import importlib
 import os
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 MOST_LINES = 25
 """Of what a result shows of itself unasked."""
@@ -108,12 +108,20 @@ class Displayed(abc.ABC):
         return self.display().text()
 
 
-class Result(Displayed):
+class Drawn(Displayed):
+    """Something of which there are figures; the class says which one to begin with."""
+
+    first_figure: ClassVar[str]
+
+    def plot(self, name: str | None = None, **options: Any) -> Any:
+        """One of its figures by name; `walop_jax.plot(self)` lists them, and `options` are its."""
+        return importlib.import_module("walop_jax").plot(self, name or self.first_figure, **options)
+
+
+class Result(Drawn):
     """Something with a calibration in it: what can be done with it is asked of the public functions."""
 
-    def plot(self, name: str = "matrix", **options: Any) -> Any:
-        """One of its figures by name; `walop_jax.plot()` lists them, and `options` are its."""
-        return importlib.import_module("walop_jax").plot(self, name, **options)
+    first_figure = "matrix"
 
     def report(self, output: str | os.PathLike[str], **options: Any) -> Any:
         """Write the page about it."""

@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterator
 
 import jax.numpy as jnp
 
-from walop_jax.io.errors import nearest
 from walop_jax.model import materials
 from walop_jax.model.elements import Analyser, Element, Layer, Polariser, WavePlate, Wedge
 from walop_jax.model.instrument import Arm, Instrument
+from walop_jax.model.parameters import unknown_name
 
 Rearrangement = Callable[[Instrument], Instrument]
 Named = tuple[str, Rearrangement]
@@ -53,7 +53,7 @@ def changed(instrument: Instrument, sentence: str) -> Instrument:
     for part in sentence.split(JOINED) if sentence else ():
         known = alternatives(instrument)
         if part not in known:
-            raise ValueError(f"no such change of {instrument.name}: {part!r}; {nearest(part, list(known))}")
+            raise unknown_name(f"change of {instrument.name}", part, known)
         instrument = known[part](instrument)
     return instrument
 

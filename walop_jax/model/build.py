@@ -107,7 +107,7 @@ class _Maker:
             raise self.read.fault(place, "has no kind")
         kind = self.kinds.get(self.read.text(table["kind"], "kind", place))
         if kind is None:
-            what = f"unknown kind of element {table['kind']!r}; {nearest(table['kind'], self.kinds)} "
+            what = f"there is no kind of element {table['kind']!r}; {nearest(table['kind'], self.kinds)} "
             what += f"Kinds are {', '.join(self.kinds)}; walop-jax docs element says what each is"
             raise self.read.fault(place, what)
         moves, layers = table.get("moves"), table.get("layers", [])

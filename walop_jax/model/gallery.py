@@ -38,12 +38,14 @@ def page(topic: str, name: str) -> str:
     """
     known = TOPICS[topic]
     if name not in known:
+        every = f"walop-jax docs {topic} lists all"
         words = [word for word in re.split(r"[\W_]+", name.lower()) if len(word) > _SHORT]
         about = {one: f"{one} {_about(kind)}".lower() for one, kind in known.items()}
         found = [one for one, text in about.items() if any(word in text for word in words)]
         if found:
-            raise ValueError(f"there is no {topic} {name!r}; did you mean {' or '.join(found[:_MOST])}?")
-        raise unknown_name(topic, name, list(known))
+            meant = " or ".join(map(repr, found[:_MOST]))
+            raise ValueError(f"there is no {topic} {name!r}; did you mean {meant}? ({every})")
+        raise ValueError(f"{unknown_name(topic, name, known)} ({every})")
     made = _effect(known[name]) if topic == "effect" else _element(known[name])
     return "\n".join(made).rstrip() + "\n"
 

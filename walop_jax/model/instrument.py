@@ -356,7 +356,7 @@ def adapted(
     instrument = instrument.with_source(_standards(standards))
     if plates is not None:
         if plates not in PLATE_MODELS:
-            raise ValueError(f"unknown plate model {plates!r}: choose one of {', '.join(PLATE_MODELS)}")
+            raise ValueError(f"there is no plate model {plates!r}: choose one of {', '.join(PLATE_MODELS)}")
         for place in instrument.places(WavePlate):
             instrument = instrument.changed(place, model=plates)
     series = instrument.throughput

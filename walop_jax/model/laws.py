@@ -83,7 +83,7 @@ class Law:
     def __post_init__(self) -> None:
         for word in self.per:
             if word not in BASES + ADDED:
-                raise ValueError(f"per = {word!r}: no such law; {nearest(word, BASES + ADDED)}")
+                raise ValueError(f"per: there is no law {word!r}; {nearest(word, BASES + ADDED)}")
         if len([word for word in self.per if word in BASES]) > 1:
             raise ValueError(f"per = {list(self.per)}: only one of {', '.join(BASES)} may hold")
         if "interval" in self.per and "step" in self.per:
@@ -168,7 +168,7 @@ def laws_of(tables: Mapping[str, Any]) -> dict[str, Law]:
             raise ValueError(f"{where} must be a table; names with dots stand in quotes")
         for key in entry:
             if key not in KEYS:
-                raise ValueError(f"{where} {key}: no such key; {nearest(key, KEYS)}")
+                raise ValueError(f"{where}: there is no key {key!r}; {nearest(key, KEYS)}")
         try:
             found[name] = _law(entry)
         except (ValueError, TypeError) as error:
@@ -198,6 +198,6 @@ def resolved(laws: Laws, names: Sequence[str], candidates: Sequence[str]) -> tup
                 continue
             some = [key] if exact else fnmatch.filter(found, key)
             if not some:
-                raise ValueError(f'[law."{key}"]: no such parameter; {nearest(key, found)}')
+                raise ValueError(f"[law]: there is no parameter {key!r}; {nearest(key, found)}")
             found |= dict.fromkeys(some, law)
     return tuple(found.values())

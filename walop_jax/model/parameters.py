@@ -10,7 +10,6 @@ um or deg), conversions stand in the equations.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -22,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from walop_jax.io.errors import nearest
 from walop_jax.model.compiled import array
 
 PARAMETER = "walop_jax.parameter"
@@ -128,10 +128,7 @@ def _array(value: Any) -> Any:
 
 def unknown_name(what: str, name: str, known: Iterable[str]) -> ValueError:
     """The error for a name that does not exist, with the nearest ones that do."""
-    known = list(known)
-    near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
-    hint = f"nearest: {', '.join(near)}" if near else f"known: {', '.join(sorted(known)[:12])}"
-    return ValueError(f"unknown {what} {name!r}; {hint}")
+    return ValueError(f"there is no {what} {name!r}; {nearest(name, known)}")
 
 
 class Component(eqx.Module):

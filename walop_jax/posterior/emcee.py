@@ -111,4 +111,4 @@ def mixture(moves: str) -> list[tuple[Any, float]]:
         return evolution
     if moves == "stretch":
         return [(made.StretchMove(), 1.0)]
-    raise ValueError(f"unknown moves {moves!r}: choose one of {', '.join(MOVES)}")
+    raise ValueError(f"there are no moves {moves!r}: choose one of {', '.join(MOVES)}")

@@ -24,9 +24,11 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.fit.verdict import STATED
-from walop_jax.io.display import Display, Displayed
+from walop_jax.io.code import versions_of
+from walop_jax.io.display import Display, Drawn
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import value_and_error
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.posterior.samplers import Sampler, make_sampler
 from walop_jax.posterior.surrogate import Accuracy
 from walop_jax.posterior.target import INFLATION, LARGEST_SAMPLED
@@ -118,6 +120,33 @@ def arviz() -> Any:
         import arviz
 
     return arviz
+
+
+def _of_rows(likelihood: Likelihood) -> dict[str, Any]:
+    """ArviZ's groups of the data: the used rows (point, exposure), with the ids of both as coordinates."""
+    from xarray import Dataset
+
+    calset, gathered = likelihood.calset, likelihood.points.gathered
+    used = likelihood.used
+    point, exposure = np.nonzero(used)
+    place = {
+        "point": ("row", calset.points.point[point]),
+        "exposure": ("row", calset.exposures.exposure[exposure]),
+        "camera": list(likelihood.model.template.cameras.names),
+    }
+    columns = {
+        "observed_data": {"N": gathered("counts")[used]},
+        "constant_data": {
+            "N_ERR": 1.0 / gathered("weight")[used],
+            "X": calset.points.x[point],
+            "Y": calset.points.y[point],
+        },
+    }
+    dims = ("row", "camera")
+    return {
+        group: Dataset({name: (dims[: values.ndim], values) for name, values in found.items()}, coords=place)
+        for group, found in columns.items()
+    }
 
 
 def assess(chains: Chains, names: tuple[str, ...], thin: int = 1) -> Convergence:
@@ -228,7 +257,7 @@ Report = Callable[[Progress], None]
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class PosteriorSample(Displayed):
+class PosteriorSample(Drawn):
     """The posterior of all coefficients.
 
     `draws` holds (ensemble, draw, parameter) of all parameters in tree order, tied and frozen ones
@@ -236,8 +265,11 @@ class PosteriorSample(Displayed):
     figures show. `accuracy` is that of the surrogate, None where the exact posterior was sampled; `trusted` needs
     convergence, a surrogate that is exact enough, and a fit that is trusted (`of_trusted_fit`). `errors_from` says
     what their spread was made from: the stated errors of the data or, as for the fit, its residuals
-    (`sandwich_adjusted`). `counts` are those of the sampler, `fit` is the `digest_of_fit` of the fit sampled around.
+    (`sandwich_adjusted`). `counts` are those of the sampler, `fit` is the `digest_of_fit` of the fit sampled around,
+    `likelihood` that of its data, whose errors were taken times `noise_scale`.
     """
+
+    first_figure = "corner"
 
     sampler: str
     names: tuple[str, ...]
@@ -259,6 +291,8 @@ class PosteriorSample(Displayed):
     of_trusted_fit: bool = True
     fit: str = ""
     errors_from: str = STATED
+    likelihood: Likelihood | None = None
+    noise_scale: float = 1.0
 
     @property
     def trusted(self) -> bool:
@@ -356,8 +390,39 @@ class PosteriorSample(Displayed):
         """The columns of `intervals` as an astropy table."""
         return astropy_table(self.intervals(), {"TRUSTED": self.trusted})
 
-    def to_arviz(self) -> Any:
-        """ArviZ InferenceData: one variable per coefficient that varies, under its name, with its unit."""
+    def log_likelihood(self) -> Float[np.ndarray, "e d r"]:
+        """ln p of every used row (point, exposure) at every draw, for `arviz.loo`.
+
+        Equation    ln p = −½ (χ²/f² + m ln 2π f²) − Σ ln σ
+        Symbols     χ² of the intensities of the row, its flux eliminated; σ their errors, f the factor on them; m the
+                    number of intensities less the fluxes
+        Limits      the flux is at its best value, not integrated over. Rows that share a flux are not independent
+
+        Raises ValueError where the data are not at hand, and where rows share a flux.
+        """
+        likelihood = self.likelihood
+        if likelihood is None:
+            raise ValueError("the data are not at hand: sample the fit, or the run, again")
+        if likelihood.plan.exposures.shared is not None:
+            raise ValueError(
+                "exposures share their flux (KIND steady): their rows cannot be left out one by one"
+            )
+        used, per_row = likelihood.used, np.broadcast_to(likelihood.data_per_row, likelihood.used.shape)
+        chi2 = np.empty((*self.draws.shape[:2], int(used.sum())))
+        for at in np.ndindex(chi2.shape[:2]):
+            chi2[at] = np.sum(likelihood.residuals(self.draws[at])[1] ** 2, axis=2)[used]
+        f = np.full(chi2.shape[:2], self.noise_scale) * (1.0 if self.ln_f is None else np.exp(self.ln_f))
+        f, m = f[..., None], per_row[used]
+        ln_weight = np.log(likelihood.points.gathered("weight")[used]).sum(axis=1)
+        return -0.5 * (chi2 / f**2 + m * np.log(2 * np.pi * f**2)) + ln_weight
+
+    def to_arviz(self, log_likelihood: bool = False) -> Any:
+        """ArviZ InferenceData: one variable per coefficient that varies, under its name, with its unit.
+
+        A chain is an ensemble. Beside `posterior` and `sample_stats` (`lp`) it has `observed_data`, N of every used row
+        (point, exposure), and `constant_data`, its N_ERR, X and Y; with `log_likelihood`, that group as well, which
+        takes some milliseconds for each draw.
+        """
         varies = self.varying
         posterior = {self.names[i]: self.draws[:, :, i] for i in varies}
         if self.ln_f is not None:
@@ -390,6 +455,18 @@ class PosteriorSample(Displayed):
         if self.accuracy is not None:
             numbers = {"efficiency": self.accuracy.efficiency, "spread": self.accuracy.spread}
             data.posterior.attrs.update({f"surrogate_{key}": value for key, value in numbers.items()})
+        if self.likelihood is not None:
+            data.add_groups(_of_rows(self.likelihood))
+        if log_likelihood:
+            by_row = {"N": (("chain", "draw", "row"), self.log_likelihood())}
+            rows = data.observed_data.coords.drop_vars("camera")
+            data.add_groups(
+                log_likelihood=rows.to_dataset().assign(by_row).assign_coords(data.posterior.coords)
+            )
+        versions = versions_of(("walop-jax",))
+        made_by = {"inference_library": "walop-jax", "inference_library_version": versions["walop-jax"]}
+        for group in data.groups():
+            data[group].attrs.update(made_by, sampling_time=self.seconds)
         return data
 
     def display(self) -> Display:

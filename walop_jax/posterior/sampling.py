@@ -301,6 +301,8 @@ def _finish(
         counts=ensembles.counts,
         seconds=seconds + ensembles.seconds,
         fingerprint={} if checkpoints is None else dict(checkpoints.fingerprint),
+        likelihood=target.likelihood,
+        noise_scale=target.noise_scale,
     )
 
 

@@ -13,12 +13,11 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, LogNorm, Normalize
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy.spatial import KDTree
 
 from walop_jax.data.records import Points
-from walop_jax.diagnosis.figure_data import PointMap, ResidualComparison, Table
+from walop_jax.diagnosis.figure_data import DiagnosisFigureData, PointMap, ResidualComparison, Table
 from walop_jax.diagnosis.limits_found import NO_LEVEL, DetectionLimits
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.reports.style import (
@@ -45,10 +44,13 @@ SIGN_BEYOND = 3.0  # σ beyond which a tile carries its sign
 MOST_MARKED = 400  # points above which signs would run into each other
 MOST_VECTOR = 2000  # points above which tiles are drawn as pixels
 MOST_BINS = 48  # of polariser angle
+_MODELS = ("starting\nmodel", "final\nmodel")
 EXPLAINS = 5.0  # standard deviations of χ² within which a model counts as explaining the data
 
 
-def residual_maps(points: Points, maps: Mapping[str, PointMap], cameras: Sequence[str]) -> Figure:
+def residual_maps(
+    points: Points, maps: Mapping[str, PointMap], cameras: Sequence[str], on: Canvas = PAGE
+) -> AnyFigure:
     """Residuals of every field point in the cameras of those names: a row of maps for each entry, one colour scale.
 
     `maps` are (point, camera) by title, NaN where there is nothing. The scale is symmetric about 0; tiles beyond
@@ -56,18 +58,40 @@ def residual_maps(points: Points, maps: Mapping[str, PointMap], cameras: Sequenc
     """
     far = max(largest_size(*maps.values()), SIGN_BEYOND)
     return _maps(
-        points, maps, cameras, Normalize(-far, far), DIVERGING, "residual (σ)", len(points) <= MOST_MARKED
+        points, maps, cameras, Normalize(-far, far), DIVERGING, "residual (σ)", len(points) <= MOST_MARKED, on
     )
 
 
-def rms_maps(points: Points, maps: Mapping[str, PointMap], cameras: Sequence[str]) -> Figure:
+def effect_figure(data: DiagnosisFigureData, number: int = 1, on: Canvas = PAGE) -> AnyFigure:
+    """Residuals without the effect of a comparison, what it explains, and with it; of 0: starting and final model."""
+    one = data.comparisons[number]
+    without, with_it = (f"without\n{one.effect}", f"with\n{one.effect}") if number else _MODELS
+    rows = {without: one.before, one.effect or "explained": one.explained, with_it: one.after}
+    return residual_maps(data.points, rows, data.cameras, on)
+
+
+def rms_figure(data: DiagnosisFigureData, on: Canvas = PAGE) -> AnyFigure:
+    """Rms residuals of the starting and the final model over the field.
+
+    Several effects need not show in one combination of the exposures: rms over all of them. Standards lie between the
+    other points and are measured in other exposures: left out, if need be.
+    """
+    whole = data.comparisons[0]
+    there = np.isfinite(whole.before)
+    rms = (np.where(there, values, np.nan) for values in (whole.rms_before, whole.rms_after))
+    return rms_maps(data.points, dict(zip(_MODELS, rms, strict=True)), data.cameras, on)
+
+
+def rms_maps(
+    points: Points, maps: Mapping[str, PointMap], cameras: Sequence[str], on: Canvas = PAGE
+) -> AnyFigure:
     """Rms residual of every field point in the cameras, rows and scale as in `residual_maps`.
 
     It shows all that is wrong at once, whatever exposures it sits in; noise alone gives √(1 − 1/K) with K cameras and
     a free flux: 0.87 of four.
     """
     far = max(largest_size(*maps.values()), 1.5)
-    return _maps(points, maps, cameras, Normalize(0.5, far), "magma_r", "rms residual (σ)", signs=False)
+    return _maps(points, maps, cameras, Normalize(0.5, far), "magma_r", "rms residual (σ)", False, on)
 
 
 def _maps(
@@ -78,10 +102,11 @@ def _maps(
     colours: str,
     label: str,
     signs: bool,
-) -> Figure:
+    on: Canvas,
+) -> AnyFigure:
     shown = np.any([np.isfinite(values).any(axis=1) for values in maps.values()], axis=0)
     shown = shown if shown.any() else np.ones(len(points), bool)
-    figure = PAGE.figure(0.6 + 2.0 * len(cameras), 0.55 + 1.75 * len(maps))
+    figure = on.figure(0.6 + 2.0 * len(cameras), 0.55 + 1.75 * len(maps))
     axes = figure.subplots(len(maps), len(cameras), sharex=True, sharey=True, squeeze=False)
     tiles: Any = None
     for number, values in enumerate(maps.values()):
@@ -106,14 +131,16 @@ def _signs(axis: Axes, points: Points, values: Float[np.ndarray, " p"], norm: No
         axis.text(points.x[i], points.y[i], sign, color=ink, fontsize=5, ha="center", va="center")
 
 
-def signature_figure(comparison: ResidualComparison, exposures: Table, cameras: Sequence[str]) -> Figure:
+def signature_figure(
+    comparison: ResidualComparison, exposures: Table, cameras: Sequence[str], on: Canvas = PAGE
+) -> AnyFigure:
     """Residuals averaged over the field, camera by camera: data as dots, what the effect explains as a line.
 
     Against the polariser angle where the comparison shows a harmonic of it, or most of its signal is behind the
     polariser; against time otherwise. Exposures at one angle are averaged. The lower panels hold what is left.
     """
     angular = _against_angle(comparison, exposures)
-    figure = PAGE.figure(0.6 + 2.0 * len(cameras), 3.5)
+    figure = on.figure(0.6 + 2.0 * len(cameras), 3.5)
     upper, lower = figure.subplots(
         2, len(cameras), sharex=True, sharey="row", height_ratios=(2.2, 1), squeeze=False
     )
@@ -181,18 +208,17 @@ def _binned(x: Float[np.ndarray, " e"], *columns: Float[np.ndarray, " e"]) -> li
     return means
 
 
-def ladder_figure(ladder: Table, names: Sequence[str] | None = None) -> Figure:
+def ladder_figure(ladder: Table, on: Canvas = PAGE) -> AnyFigure:
     """χ² per degree of freedom of the starting model and of every model after it, on a logarithmic scale.
 
-    The band is where χ²/dof lies (5 standard deviations) when the model explains the data. `names` replace those
-    of the rungs.
+    The band is where χ²/dof lies (5 standard deviations) when the model explains the data.
     """
-    names = [*ladder["MODEL"]] if names is None else [*names]
+    names = [*ladder["MODEL"]]
     names = [names[0], *(name if name == "final fit" else f"+ {name}" for name in names[1:])]
     ratio = ladder["CHI2"] / np.maximum(ladder["DOF"], 1)
     place = np.arange(len(ratio))
     width = EXPLAINS * np.sqrt(2.0 / max(int(ladder["DOF"][-1]), 1))
-    figure, axis = PAGE.single(7.0, 0.8 + 0.38 * len(ratio))
+    figure, axis = on.single(7.0, 0.8 + 0.38 * len(ratio))
     axis.axvspan(max(1.0 - width, 1e-3), 1.0 + width, color="0.88", lw=0, zorder=0)
     axis.axvline(1.0, color="0.5", lw=0.8, zorder=1)
     axis.plot(ratio, place, color="0.6", lw=1.0, zorder=2)
@@ -218,11 +244,11 @@ def ladder_figure(ladder: Table, names: Sequence[str] | None = None) -> Figure:
     return figure
 
 
-def shares_figure(shares: Table) -> Figure:
+def shares_figure(shares: Table, on: Canvas = PAGE) -> AnyFigure:
     """Mean squared residual by camera, kind, filter and exposure, over what noise alone gives: before and after."""
     groups = [g for g in ("camera", "kind", "filter") if np.count_nonzero(shares["GROUP"] == g) > 1]
     widths = [np.count_nonzero(shares["GROUP"] == g) + 1.0 for g in groups]
-    figure = PAGE.figure(8.6, 2.7)
+    figure = on.figure(8.6, 2.7)
     axes = figure.subplots(1, len(groups) + 1, width_ratios=[*widths, max(12.0, sum(widths))], sharey=True)
     before, after = (
         values / np.maximum(shares["EXPECTED"], 1e-300) for values in (shares["BEFORE"], shares["AFTER"])

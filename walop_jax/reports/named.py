@@ -11,48 +11,102 @@ from typing import Any
 import numpy as np
 
 from walop_jax.calibration import PRODUCT, Calibration, MatrixMaps
+from walop_jax.diagnosis.figure_data import FIGURE_DATA, DiagnosisFigureData, figure_data, read_figure_data
+from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import fail, nearest
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.posterior import Run
+from walop_jax.paper.polynomial import TERMS
+from walop_jax.posterior import PosteriorSample, Run
 from walop_jax.posterior.files import LIMITS, POSTERIOR
 from walop_jax.reports import diagnosis_figures, figures, paper_figures, posterior_figures
 from walop_jax.reports.run import read_limits
 from walop_jax.reports.style import PAGE, AnyFigure, Canvas
 from walop_jax.science.field_accuracy import field_accuracy
 
+Drawable = FitResult | Calibration | Diagnosis | PosteriorSample | Run
+_IN_MEMORY = {PRODUCT: "product", POSTERIOR: "posterior", FIGURE_DATA: "figure_data"}
+"""Where a result in memory holds what the file of a run would."""
+
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class FigureSource(Run):
     """The run that a figure is drawn from; what it needs and is not there is a `DataError`.
 
-    `parameters` are coefficients by name; `place` (deg) is a field point; `canvas` is where to draw.
+    `parameters` are coefficients by name; `place` (deg) is a field point; `step` numbers the effects of a diagnosis;
+    `reference` are values to be marked, by name; `canvas` is where to draw.
     """
 
     parameters: tuple[str, ...] = ()
     place: tuple[float, float] = (0.0, 0.0)
+    step: int = 1
+    reference: Mapping[str, float] | None = None
     canvas: Canvas = PAGE
 
     @classmethod
-    def of(cls, given: FitResult | Calibration | Run, **options: Any) -> FigureSource:
-        """What a fit or a calibration in memory holds, or the folder of a run."""
+    def of(cls, given: Drawable, **options: Any) -> FigureSource:
+        """What a result in memory holds, or the folder of a run."""
         if isinstance(given, Run):
             return cls(given.folder, given.catalogue, given.data, **options)
-        held = Calibration.from_fit(given) if isinstance(given, FitResult) else given
         made = cls(Path("in memory"), **options)
-        vars(made).update(product=held, calibration=held, documents={}, posterior=None)
-        if isinstance(given, FitResult):
-            vars(made).update(calset=given.calset, likelihood=given.likelihood)
+        held: dict[str, Any] = {"documents": {}, "product": None, "calibration": None, "posterior": None}
+        if isinstance(given, PosteriorSample):
+            held |= {"posterior": given.to_arviz(), "sample": given}
+            model = None if given.likelihood is None else given.likelihood.model
+            held["prior_width"] = (
+                {} if model is None else {p.name: p.width or np.nan for p in model.parameters}
+            )
+        if isinstance(given, Diagnosis):
+            held["figure_data"] = figure_data(given)
+        fit = given.after if isinstance(given, Diagnosis) else given
+        if isinstance(fit, FitResult):
+            held |= {"calset": fit.calset, "likelihood": fit.likelihood}
+            fit = Calibration.from_fit(fit)
+        if isinstance(fit, Calibration):
+            held |= {"product": fit, "calibration": fit}
+        vars(made).update(held)
         return made
+
+    def __contains__(self, name: str) -> bool:
+        """True where a file is there, or what it would hold is in memory."""
+        if "documents" in vars(self):
+            return vars(self).get(_IN_MEMORY.get(name, "")) is not None
+        return super().__contains__(name)
 
     def wanted(self, name: str, advice: str) -> Path:
         """As for any run; what is held in memory has no file."""
-        return (
-            self.folder / name
-            if name == PRODUCT and "product" in vars(self)
-            else super().wanted(name, advice)
-        )
+        if "documents" not in vars(self):
+            return super().wanted(name, advice)
+        if name not in self:
+            raise fail(f"there is no {name} of this result in memory", advice=advice)
+        return self.folder / name
+
+    @functools.cached_property
+    def sample(self) -> PosteriorSample | None:
+        """A posterior in memory, which has the walkers as well."""
+        return None
+
+    @functools.cached_property
+    def figure_data(self) -> DiagnosisFigureData:
+        """What the figures of a diagnosis are drawn from."""
+        return read_figure_data(self.wanted(FIGURE_DATA, "it comes with walop-jax diagnose"))
+
+    @functools.cached_property
+    def prior_width(self) -> Mapping[str, float]:
+        """Widths of the priors by name, as far as they are known."""
+        return {} if self.product is None else self.product.prior_width
+
+    @property
+    def examined(self) -> int:
+        """Number of the comparison of a diagnosis that is asked for."""
+        count = len(self.figure_data.comparisons) - 1
+        if self.step > count:
+            found = f"the diagnosis added {count or 'no'} effect{'s' if count != 1 else ''}"
+            raise fail(
+                f"step {self.step}: {found}", advice="step 0 compares the starting with the final model"
+            )
+        return self.step
 
     @functools.cached_property
     def likelihood(self) -> Likelihood:
@@ -120,26 +174,36 @@ def _draws(source: FigureSource) -> tuple[dict[str, Any], dict[str, str], tuple[
         if name not in held:
             path = source.folder / POSTERIOR
             raise fail(f"has no coefficient {name!r}", file=path, advice=nearest(name, held))
-    sampled = [name for name in held if "sampled_by" in data[name].attrs]
-    return held, units, source.parameters or tuple(sampled)
+    sampled = tuple(name for name in held if "sampled_by" in data[name].attrs)
+    if source.sample is not None:
+        sampled = source.sample.sampled
+    return held, units, source.parameters or sampled
 
 
 def _corner(source: FigureSource) -> AnyFigure:
     held, units, shown = _draws(source)
     if not source.parameters:
         draws = np.stack([held[name].ravel() for name in shown], axis=1)
-        shown = posterior_figures.correlated(draws, shown, source.stored.prior_width)
+        shown = posterior_figures.correlated(draws, shown, source.prior_width)
     if source.canvas.ax is not None:
         raise ValueError("ax: a corner plot needs a figure of its own")
     draws = np.stack([held[name].ravel() for name in shown], axis=1)
-    return posterior_figures.corner_figure(draws, shown, [units[name] for name in shown])
+    size = {} if source.canvas.figsize is None else {"width": source.canvas.figsize[0]}
+    return posterior_figures.corner_figure(
+        draws, shown, [units[name] for name in shown], source.reference, **size
+    )
 
 
 def _trace(source: FigureSource) -> AnyFigure:
     held, units, shown = _draws(source)
     chains = np.stack([held[name][:, :, None] for name in shown], axis=-1)
+    steps, tau = 1, np.full(len(shown), np.nan)
+    sample = source.sample
+    if sample is not None and set(shown) <= set(sample.sampled):  # the walkers, not the draws
+        column = [sample.sampled.index(name) for name in shown]
+        chains, steps, tau = sample.chains[..., column], sample.thin, sample.convergence.tau[column]
     return posterior_figures.trace_figure(
-        chains, shown, [units[name] for name in shown], 1, np.full(len(shown), np.nan)
+        chains, shown, [units[name] for name in shown], steps, tau, source.canvas
     )
 
 
@@ -156,17 +220,43 @@ def _modulation(source: FigureSource) -> AnyFigure:
 
 @dataclasses.dataclass(frozen=True)
 class NamedFigure:
-    """A figure with what it shows in a few words, and the file of a run that it needs beside the calibration."""
+    """A figure with what it shows in a few words, the file of a run that it needs, and whether a run can give it."""
 
     about: str
     draw: Callable[[FigureSource], AnyFigure]
     needs: str = PRODUCT
+    possible: Callable[[FigureSource], bool] = lambda source: True
+
+
+def _two_arms(source: FigureSource) -> bool:
+    return source.maps.arms > 1
+
+
+def _small(source: FigureSource) -> bool:
+    return source.stored.residuals is None  # which comes with whole frames
+
+
+def _plates(source: FigureSource) -> bool:
+    return any(name.endswith(("plate.quartz", "plate.mgf2")) for name in source.stored.fitted.names)
+
+
+def _angles(fewest: int) -> Callable[[FigureSource], bool]:
+    """True where a filter was seen at so many polariser angles, the calibration plate out."""
+
+    def enough(source: FigureSource) -> bool:
+        e = source.stored.exposures
+        rows = e.clp_in & ~e.chwp_in & (e.filter == source.maps.filter)
+        return _small(source) and len(np.unique(np.round(e.clp_angle[rows] % 180.0, 6))) >= fewest
+
+    return enough
 
 
 FIGURES: Mapping[str, NamedFigure] = {
-    "accuracy": NamedFigure("error of p over the field: map and histogram", _accuracy),
+    "accuracy": NamedFigure("error of p over the field: map and histogram", _accuracy, possible=_two_arms),
     "calibration": NamedFigure(
-        "the instrument matrix, and residuals before and after the fit", lambda s: _residuals(s, whole=True)
+        "the instrument matrix, and residuals before and after the fit",
+        lambda s: _residuals(s, whole=True),
+        possible=_small,
     ),
     "matrix": NamedFigure(
         "the six elements of the instrument matrix",
@@ -187,20 +277,24 @@ FIGURES: Mapping[str, NamedFigure] = {
     "retardance": NamedFigure(
         "maps of the retardance of HWP1 and HWP2",
         lambda s: paper_figures.retardance_figure(s.rebuilt, on=s.canvas),
+        possible=_plates,
     ),
     "retardance-wavelength": NamedFigure(
         "their retardance against wavelength",
         lambda s: paper_figures.retardance_wavelength_figure(s.rebuilt, on=s.canvas),
+        possible=_plates,
     ),
     "coefficients": NamedFigure(
         "maps of the coefficients of the method of Paper II",
         lambda s: paper_figures.coefficients_figure(s.calset, s.maps.filter, s.canvas),
+        possible=_angles(len(TERMS)),
     ),
     "transmission": NamedFigure(
         "transmission of the cameras against polariser angle, with residuals",
         lambda s: paper_figures.transmission_figure(s.calset, s.maps.filter, s.place, s.canvas),
+        possible=_angles(3),
     ),
-    "modulation": NamedFigure("q_m and u_m against polariser angle", _modulation),
+    "modulation": NamedFigure("q_m and u_m against polariser angle", _modulation, possible=_angles(1)),
     "protection": NamedFigure(
         "largest error of q and u that an effect can make undetected",
         lambda s: diagnosis_figures.protection_figure(s.limits, s.canvas),
@@ -211,9 +305,40 @@ FIGURES: Mapping[str, NamedFigure] = {
         lambda s: diagnosis_figures.separation_figure(s.limits, s.canvas),
         LIMITS,
     ),
-    "residual-map": NamedFigure("what the smooth model leaves, of whole frames", _residual_map),
+    "ladder": NamedFigure(
+        "χ² of the starting model and of every model after it",
+        lambda s: diagnosis_figures.ladder_figure(s.figure_data.ladder, s.canvas),
+        FIGURE_DATA,
+    ),
+    "effect": NamedFigure(
+        "residuals over the field without and with an effect that was found",
+        lambda s: diagnosis_figures.effect_figure(s.figure_data, s.examined, s.canvas),
+        FIGURE_DATA,
+    ),
+    "signature": NamedFigure(
+        "residuals of every exposure, and what the effect explains of them",
+        lambda s: diagnosis_figures.signature_figure(
+            s.figure_data.comparisons[s.examined], s.figure_data.exposures, s.figure_data.cameras, s.canvas
+        ),
+        FIGURE_DATA,
+    ),
+    "rms": NamedFigure(
+        "rms residuals over the field, of the starting and the final model",
+        lambda s: diagnosis_figures.rms_figure(s.figure_data, s.canvas),
+        FIGURE_DATA,
+    ),
+    "shares": NamedFigure(
+        "residuals by camera, kind, filter and exposure",
+        lambda s: diagnosis_figures.shares_figure(s.figure_data.shares, s.canvas),
+        FIGURE_DATA,
+    ),
+    "residual-map": NamedFigure(
+        "what the smooth model leaves, of whole frames", _residual_map, possible=lambda s: not _small(s)
+    ),
     "residuals": NamedFigure(
-        "residuals of every field point before and after the fit, and all of them", _residuals
+        "residuals of every field point before and after the fit, and all of them",
+        _residuals,
+        possible=_small,
     ),
     "corner": NamedFigure("posterior of coefficients in pairs", _corner, POSTERIOR),
     "trace": NamedFigure("chains of the posterior", _trace, POSTERIOR),
@@ -221,8 +346,15 @@ FIGURES: Mapping[str, NamedFigure] = {
 """In the order of the list that is printed."""
 
 
+def possible(source: FigureSource) -> dict[str, NamedFigure]:
+    """The figures that a run, or a result in memory, can give."""
+    return {name: one for name, one in FIGURES.items() if one.needs in source and one.possible(source)}
+
+
 def draw(name: str, source: FigureSource) -> AnyFigure:
     """The figure of a name; `DataError` with the nearest names if there is none, or if the run lacks what it needs."""
     if name not in FIGURES:
-        raise fail(f"there is no figure {name!r}", advice=nearest(name, FIGURES))
+        raise fail(
+            f"there is no figure {name!r}", advice=f"{nearest(name, FIGURES)} (walop-jax plot RUN lists all)"
+        )
     return FIGURES[name].draw(source)

@@ -161,9 +161,8 @@ def _drawn(run: RunContents, number: int) -> dict[str, str]:
     if run.figure_data is None or number >= len(run.figure_data.comparisons):
         return {"maps": "", "signature": "", "combination": ""}
     data, one = run.figure_data, run.figure_data.comparisons[number]
-    rows = {f"without\n{one.effect}": one.before, one.effect: one.explained, f"with\n{one.effect}": one.after}
     return {
-        "maps": embedded(diagnosis_figures.residual_maps(data.points, rows, data.cameras)),
+        "maps": embedded(diagnosis_figures.effect_figure(data, number)),
         "signature": embedded(diagnosis_figures.signature_figure(one, data.exposures, data.cameras)),
         "combination": in_greek(one.combination),
     }
@@ -249,14 +248,7 @@ def _figures(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, str]
         else:
             made["ladder"] = diagnosis_figures.ladder_figure(data.ladder)
         if len(data.comparisons) > 2:
-            # Several effects need not show in one combination of the exposures: rms over all of them.
-            # Standards lie between the other points and are measured in other exposures: left out, if need be.
-            there = np.isfinite(whole.before)
-            rows = {
-                "starting\nmodel": np.where(there, whole.rms_before, np.nan),
-                "final\nmodel": np.where(there, whole.rms_after, np.nan),
-            }
-            made["rms"] = diagnosis_figures.rms_maps(data.points, rows, data.cameras)
+            made["rms"] = diagnosis_figures.rms_figure(data)
     uris = {name: embedded(figure) for name, figure in made.items()}
     if run.corner is not None:
         uris["corner"] = "data:image/png;base64," + base64.b64encode(run.corner).decode("ascii")

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.text import RAISED, with_error
-from walop_jax.reports.style import PAGE, SMALL, PaperFigure
+from walop_jax.reports.style import PAGE, SMALL, AnyFigure, Canvas, PaperFigure
 
 SHARES = (0.393, 0.865)  # of the draws: inside 1 and 2 σ of a normal distribution of two coefficients
 BINS = 30  # of a histogram, along each axis
@@ -96,20 +96,20 @@ def corner_figure(
     draws: Float[np.ndarray, "d k"],
     names: Sequence[str],
     units: Sequence[str],
-    reference: Float[np.ndarray, " k"] | None = None,
+    reference: Mapping[str, float] | None = None,
     width: float = 7.1,
 ) -> Figure:
     """Histogram of every coefficient, and below the diagonal contours of every pair of them, drawn by `corner`.
 
     Contours hold 39 and 86 % of the draws, which is 1 and 2 σ of a normal distribution of two coefficients.
-    `reference` marks values (the fit, or a known truth). `width` in inches: 7.1 is two columns of A&A or ApJ. Median
-    and half the 68 % interval stand above the diagonal; beyond six coefficients the axes carry no numbers.
+    `reference` marks values by name (the fit, or a known truth). `width` in inches: 7.1 is two columns of A&A or ApJ.
+    Median and half the 68 % interval stand above the diagonal; beyond six coefficients the axes carry no numbers.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # ArviZ, which it imports, makes an announcement
         from corner import corner
     k = draws.shape[1]
-    few = k <= MOST_IN_CORNER
+    few, marked = k <= MOST_IN_CORNER, reference or {}
     lowest, highest = draws.min(axis=0), draws.max(axis=0)
     # A coefficient that never moved has a panel too.
     margin = 0.05 * np.where(highest > lowest, highest - lowest, 20.0 * (np.abs(lowest) + (lowest == 0)))
@@ -139,10 +139,10 @@ def corner_figure(
                 axis.set_major_formatter(ScalarFormatter(useOffset=False))
         for j, axes in enumerate(panels[i, : i + 1]):
             axes.tick_params(labelsize=6.5, length=2)
-            if reference is not None:
-                axes.axvline(reference[j], color="tab:orange", linewidth=0.8)
-                if i != j:
-                    axes.axhline(reference[i], color="tab:orange", linewidth=0.8)
+            if names[j] in marked:
+                axes.axvline(marked[names[j]], color="tab:orange", linewidth=0.8)
+            if names[i] in marked and i != j:
+                axes.axhline(marked[names[i]], color="tab:orange", linewidth=0.8)
     return figure
 
 
@@ -152,11 +152,11 @@ def trace_figure(
     units: Sequence[str],
     thin: int,
     tau: Float[np.ndarray, " k"],
-    width: float = 7.1,
-) -> Figure:
+    on: Canvas = PAGE,
+) -> AnyFigure:
     """Median and 68 % band of walkers against the step, a colour per ensemble; the bar is one autocorrelation time."""
     e, n, _, k = chains.shape
-    figure = PAGE.figure(width, 0.9 * k + 0.6)
+    figure = on.figure(7.1, 0.9 * k + 0.6)
     panels = figure.subplots(k, 1, sharex=True, squeeze=False)[:, 0]
     step = thin * np.arange(n)
     for i, axes in enumerate(panels):

@@ -43,7 +43,7 @@ def polarisation(
     Raises ValueError for an estimator that is none of `ESTIMATORS`.
     """
     if estimator not in ESTIMATORS:
-        raise ValueError(f"unknown estimator {estimator!r}: choose {' or '.join(ESTIMATORS)}")
+        raise ValueError(f"there is no estimator {estimator!r}: choose {' or '.join(ESTIMATORS)}")
     q, u = qu.T
     p = np.hypot(q, u)
     lit = p > 0

@@ -296,13 +296,13 @@ def test_what_cannot_be_carried_over_is_said():
     ("text", "message"),
     [
         ("retardence q behind collimator", "cannot read"),
-        ("turn of polariser * z", "unknown factor 'z'"),
-        ("gain of O3", "nearest: O2"),
+        ("turn of polariser * z", "there is no factor 'z'"),
+        ("gain of O3", "did you mean 'O2'"),
         ("polarisation q of sky", "of which exposure"),
-        ("polarisation q of green_star", "nearest: polarisation q of"),
-        ("polarisation of blue_star", "unknown description 'polarisation of blue_star'"),
+        ("polarisation q of green_star", "did you mean 'polarisation q of"),
+        ("polarisation of blue_star", "there is no description 'polarisation of blue_star'"),
         ("fringes of half1.plate", "of which gap"),
-        ("shift of filter", "unknown place of shift 'filter'"),
+        ("shift of filter", "there is no place of shift 'filter'"),
     ],
 )
 def test_what_is_no_sentence_is_an_error(text, message):

@@ -104,7 +104,7 @@ def test_names_in_class_variables_are_parameters(kind: type[Effect]):
 
 @every_effect
 def test_unknown_value_lists_the_nearest(kind: type[Effect]):
-    with pytest.raises(ValueError, match=f"unknown parameter of {kind.name}"):
+    with pytest.raises(ValueError, match=f"there is no parameter of {kind.name}"):
         kind.of(scenes.CONTEXT, no_such_thing=1.0)
 
 

@@ -22,7 +22,7 @@ def effect_by_name(name: str, catalogue: Sequence[type[Effect]] = EFFECTS) -> ty
             return effect
     error = unknown_name("effect", name, [effect.name for effect in catalogue])
     raise ValueError(
-        f"{error}; walop-jax docs effect lists all, --effects FILE (in Python effects=) adds your own"
+        f"{error} (walop-jax docs effect lists all; --effects FILE, in Python effects=, adds your own)"
     )
 
 

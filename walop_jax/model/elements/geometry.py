@@ -117,7 +117,9 @@ class Wedge(Element):
 
     def __check_init__(self) -> None:
         if self.material not in materials.GLASSES:
-            raise ValueError(f"unknown glass {self.material!r}; {nearest(self.material, materials.GLASSES)}")
+            raise ValueError(
+                f"there is no glass {self.material!r}; {nearest(self.material, materials.GLASSES)}"
+            )
         if self.frame not in FRAMES:
             raise ValueError(f"frame = {self.frame!r} of a wedge must be {' or '.join(FRAMES)}")
 

@@ -50,7 +50,7 @@ class Layer(Component):
     def __check_init__(self) -> None:
         if self.material not in materials.CRYSTALS:
             raise ValueError(
-                f"unknown crystal {self.material!r}; {nearest(self.material, materials.CRYSTALS)}"
+                f"there is no crystal {self.material!r}; {nearest(self.material, materials.CRYSTALS)}"
             )
 
     def declarations(self) -> Mapping[str, Parameter]:
