@@ -4,9 +4,11 @@
     python tests/studies/nights.py series [--count 300]      one step or bad night each: found, dated, named
     python tests/studies/nights.py smallest [--count 40]     the smallest step, beside ruptures and a person's rule
     python tests/studies/nights.py stars [--count 40]        coverage over a year and of the forecast; other habits
+    python tests/studies/nights.py passes [--count 100]      a first pass over nights as files, and what follows
 
-Series are linear: gradients with their noise, made from the matrices of six simulated nights of 144 points (NIGHTS,
-made when it is not there). So a series costs no optics, and what is shown is the statistics, not the linearisation.
+Series but those of `passes` are linear: gradients with their noise, made from the matrices of six simulated nights of
+144 points (NIGHTS, made when it is not there). So a series costs no optics, and what is shown is the statistics, not
+the linearisation.
 """
 
 from __future__ import annotations
@@ -14,9 +16,14 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
+import os
 import resource
+import shutil
+import subprocess
 import sys
 import tempfile
+import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -29,22 +36,25 @@ import numpy as np  # noqa: E402
 from scipy import linalg  # noqa: E402
 
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
+from walop_jax.data import read_calibration_set, write_calibration_set  # noqa: E402
 from walop_jax.fit.model_file import base_model  # noqa: E402
 from walop_jax.fit.refit import fit  # noqa: E402
 from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
 from walop_jax.model.laws import YEAR, Law  # noqa: E402
+from walop_jax.model.specification import effect_context  # noqa: E402
 from walop_jax.nights import breaks, changes  # noqa: E402
 from walop_jax.nights.equations import Night, Together, night_equations, together  # noqa: E402
 from walop_jax.nights.night_file import read_nights, write_nights  # noqa: E402
 from walop_jax.nights.stacking import laws_of_all, stack  # noqa: E402
 from walop_jax.nights.survey import Survey  # noqa: E402
 from walop_jax.simulation.observing_plan import ObservingPlan  # noqa: E402
-from walop_jax.simulation.simulate import simulate, truth_values  # noqa: E402
+from walop_jax.simulation.simulate import effect_from_text, simulate, truth_values  # noqa: E402
 
 NIGHTS = Path(tempfile.gettempdir()) / "walop-nights-of-the-study.fits"
 RATE = 1e-4  # of throughputs, per √day
 LAWS = {"throughput.n?.p00": Law(("walk",), rate=RATE)}
 START = 61000.85
+KILLS = 20
 CHANGING = (
     "half1.plate.mgf2", "half2.plate.quartz", "half2.wedge", "half1.wedge", "collimator.q", "collimator.u",
     "collimator.diattenuation", "throughput.n2.p10", "throughput.n3.p01",
@@ -403,7 +413,132 @@ def off(survey, mjd, form, names, reference, true) -> tuple[float, np.ndarray]:
     return float(np.sqrt(np.mean(error**2))), error / sigma
 
 
-STUDIES = {"quiet": (quiet, 50), "series": (sealed, 300), "smallest": (smallest, 40), "stars": (stars, 40)}
+def command(*arguments: object, kill_after: float | None = None) -> tuple[float, float, float]:
+    """CPU seconds, memory (GB) and wall time of a command in a process of its own, killed after a time (s)."""
+    began = time.perf_counter()
+    child = subprocess.Popen(
+        [sys.executable, "-m", "walop_jax", *map(str, arguments), "--quiet"], start_new_session=True
+    )
+    watch = None if kill_after is None else threading.Timer(kill_after, child.kill)
+    if watch is not None:
+        watch.start()
+    _, status, used = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    if watch is not None:
+        watch.cancel()
+    elif child.returncode not in (0, 3):
+        raise SystemExit(f"{' '.join(map(str, arguments))}: exit code {child.returncode}")
+    return used.ru_utime + used.ru_stime, used.ru_maxrss / 1e6, time.perf_counter() - began
+
+
+def as_files(folder: Path, count: int, start: int) -> list[str]:
+    """Nights as files, and in words what was hidden in them: four steps, two drifts, three bad nights, a filter."""
+    first, rng = first_night(), np.random.default_rng(50_000 + start)
+    model = base_model(first.calset)
+    values, days = np.array([truth_values(first.truth)[name] for name in model.names]), days_of(count, rng)
+    truth, errors = np.tile(values, (count, 1)), dict(zip(few()[0].names, alone(few()[0])[1], strict=False))
+    said = []
+    for j, name in enumerate(rng.permutation(CHANGING)):
+        i, at = model.names.index(str(name)), int(rng.integers(count // 10, count - count // 10))
+        size = rng.choice([-1.0, 1.0]) * rng.uniform(3.0, 6.0) * errors[str(name)]
+        if j < 4:
+            truth[at:, i] += size
+        elif j < 6:
+            truth[:, i] += size * (days - days[0]) / (days[-1] - days[0])
+        else:
+            truth[at, i] += 5.0 * size
+        kind = "step" if j < 4 else "drift" if j < 6 else "bad night"
+        said.append(f"{kind} of {name} in night {int(START + days[at])}")
+    exchanged = int(rng.integers(count // 10, count - count // 10))
+    said.append(f"filter_shift from night {int(START + days[exchanged])}")
+    for u, day in enumerate(days):
+        plan = dataclasses.replace(ObservingPlan(), mjd=START + float(day))
+        there = model.instrument(truth[u] * 1.0)
+        context = effect_context(model.template, plan.exposures())
+        shifted = (effect_from_text("filter_shift=0.001", context),) if u >= exchanged else ()
+        calset = simulate(
+            plan, seed=60_000 + start + u, instrument=there, effects=shifted, catalogue_seed=1
+        ).calset
+        write_calibration_set(folder / f"night{u:04d}.fits", calset)
+    return said
+
+
+def passes(count: int, start: int = 0) -> None:
+    """The first pass over nights that lie there as files, by the commands that users run."""
+    folder = Path(tempfile.mkdtemp())
+    said, began = as_files(folder, count, start), cpu()
+    print(f"passes: hidden: {'; '.join(said)}", flush=True)
+    files = sorted(folder.glob("night*.fits"))
+    (folder / "laws.toml").write_text(f'[law."throughput.n?.p00"]\nper = "walk"\nrate = {RATE}\n')
+    command("refit", files[0], "-o", folder / "RUN")
+
+    def stacked(output: str, **more: float) -> tuple[float, float, float]:
+        return command(
+            "stack",
+            *files,
+            "--like",
+            folder / "RUN",
+            "--laws",
+            folder / "laws.toml",
+            "-o",
+            folder / output,
+            **more,
+        )
+
+    stacked("COLD")
+    used, memory, wall = stacked("WHOLE")
+    print(
+        f"  {count} nights: {used:.1f} s of CPU ({used / count:.2f} a night), {memory:.2f} GB, {wall:.1f} s",
+        flush=True,
+    )
+    one = dataclasses.replace(ObservingPlan(), grid=round(12 * count**0.5))
+    write_calibration_set(folder / "one.fits", simulate(one, seed=1).calset)
+    command("refit", folder / "one.fits", "-o", folder / "COLD1")
+    alike, size, _ = command("refit", folder / "one.fits", "-o", folder / "ONE")
+    print(f"  one set as large: {alike:.1f} s of CPU, {size:.2f} GB: ratio {used / alike:.2f}", flush=True)
+    rng = np.random.default_rng(start)
+    for _ in range(KILLS):
+        stacked("KILLED", kill_after=float(rng.uniform(0.3, 1.5) * wall / KILLS) + 3.0)
+    more, _, _ = stacked("KILLED")
+    both = [read_nights(folder / name / "nights.fits") for name in ("WHOLE", "KILLED")]
+    same = all(
+        np.array_equal(a.matrix, b.matrix) and np.array_equal(a.gradient, b.gradient)
+        for a, b in zip(*both, strict=True)
+    )
+    print(
+        f"  killed {KILLS} times: the last run took {more:.1f} s of CPU; nights the same: {same}", flush=True
+    )
+    held = Calibration.from_fit(
+        fit(Likelihood.of(read_calibration_set(files[0]), base_model(first_night().calset)))
+    )
+    for name, laws in (
+        ("steps looked for again", LAWS),
+        ("another law", {"half1.wedge": Law(("walk",), rate=1e-5)}),
+    ):
+        began = cpu()
+        survey = stack(both[0], laws, like=held)
+        print(f"  {name}: {cpu() - began:.2f} s of CPU, {len(survey.breaks)} breaks", flush=True)
+        for found in survey.breaks:
+            print(
+                f"    {found.kind} of {found.name}, night {found.night} ({found.nights}), z = {found.z:.1f}"
+            )
+    began = cpu()
+    stack(both[0], LAWS, like=held, find=False)
+    print(f"  jointly, nothing looked for: {cpu() - began:.2f} s of CPU", flush=True)
+    print(
+        f"  one night's refit: {command('refit', files[1], '-o', folder / 'NIGHT')[0]:.1f} s of CPU",
+        flush=True,
+    )
+    shutil.rmtree(folder)
+
+
+STUDIES = {
+    "quiet": (quiet, 50),
+    "series": (sealed, 300),
+    "smallest": (smallest, 40),
+    "stars": (stars, 40),
+    "passes": (passes, 100),
+}
 
 
 def main() -> None:
