@@ -402,8 +402,9 @@ def naming() -> None:
                 plan = plan_from(found, minutes, want, known=before_of(found, standard))
         names = [named(found, standard, plan.observing_plan, pair, seed) for seed in range(2 * INSTRUMENTS)]
         print(
-            f"{pair[0]} against {pair[1]}: standard plan {at_first:.2f} σ apart; {NAMED:.2g} σ after "
-            f"{needed:.2f} min, in whole exposures with changes {minutes:.2f} min ({plan.value:.1f} σ); named in {sum(names)} of {len(names)}",
+            f"{pair[0]} against {pair[1]}: standard plan {at_first:.2f} σ apart; {NAMED:.2g} σ after {needed:.2f} min, "
+            f"in whole exposures with changes {minutes:.2f} min ({plan.value:.1f} σ); "
+            f"named in {sum(names)} of {len(names)}",
             flush=True,
         )
 
