@@ -43,7 +43,6 @@ from walop_jax.plans.could import Could  # noqa: E402
 from walop_jax.plans.exposures import Candidates, Polarised, candidates  # noqa: E402
 from walop_jax.plans.optimal import Experiment, least_budget, optimise  # noqa: E402
 from walop_jax.plans.plan import (  # noqa: E402
-    NAMED,
     covariance,
     criterion,
     experiment_of,
@@ -51,7 +50,7 @@ from walop_jax.plans.plan import (  # noqa: E402
     plan_from,
     usual_plans,
 )
-from walop_jax.plans.wanted import field_errors, wanted  # noqa: E402
+from walop_jax.plans.wanted import NAMED, field_errors, wanted  # noqa: E402
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop  # noqa: E402
 from walop_jax.simulation.simulate import effect_from_text, simulate, truth_values  # noqa: E402
 

@@ -37,13 +37,11 @@ from walop_jax.plans.optimal import (
     rounded,
     worth,
 )
-from walop_jax.plans.wanted import APART, WORST, FieldErrors, Wanted, field_errors, wanted
+from walop_jax.plans.wanted import APART, NAMED, WORST, FieldErrors, Wanted, field_errors, wanted
 from walop_jax.science.star_errors import GOAL
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, polariser_turn
 
 PLANNED = "plan.json"
-NAMED = 5.0
-"""Distance (σ) from every rival at which an effect is named."""
 _NOTHING = 1e-6  # of what is known: less of it makes no plan
 _ALIKE = 3.0  # deg: angles of the plate that are taken as one
 _TRIES = 6  # budgets, until the exposures and the changes between them fit into the time
@@ -241,7 +239,7 @@ def plan_exposures(
 
     `known` is a calibration that is there already; `goal` a value of the criterion, as it is told, to which the time is
     found. `apart` are effects that are to be told apart (`wanted.APART`), each with its value or by name
-    alone; their goal is 5 σ unless another is given. Raises ValueError for a time that pays for nothing,
+    alone; their goal is `NAMED` unless another is given. Raises ValueError for a time that pays for nothing,
     NotEstimableError where nothing that could be observed, or too little in that time, determines what is asked.
     """
     if apart:

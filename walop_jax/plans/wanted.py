@@ -25,6 +25,7 @@ from walop_jax.calibration.matrix import matrix_slopes
 from walop_jax.data.schema import Column
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import InputTable, numeric_column
+from walop_jax.diagnosis.policy import POLICY
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.parameters import unknown_name
 from walop_jax.plans.exposures import Candidates
@@ -33,6 +34,11 @@ from walop_jax.simulation.observing_plan import ObservingPlan
 
 WORST, MEAN, APART = "worst", "mean", "apart"
 LEAST_DETERMINANT = 0.1
+_SURE = 1.645  # standard deviations above which 95 % of a normal distribution lie, below zero
+NAMED = _SURE + float(np.sqrt(_SURE**2 + 2.0 * POLICY.improbable))
+"""Distance d (σ) from a rival of as many numbers at which a diagnosis names an effect in 95 of 100 sets: 5.7.
+
+The evidence beside the rival has mean d²/2 and scatter d, and must exceed `Policy.improbable`."""
 COLOURS = (float("nan"), 4000.0, 8000.0)
 """Colour temperatures (K; NaN: flat photon spectrum) at which p is to be known."""
 TARGET_GRID = 9  # field points along each axis at which the error of p is asked
