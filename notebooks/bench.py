@@ -18,7 +18,6 @@ from jaxtyping import Float
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.settings import Settings
-from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.model.instrument import Instrument, adapted
@@ -64,7 +63,7 @@ def bench_table(seed: int = 0, electrons: float = 1e6) -> list[BenchRow]:
     for p in model.parameters:
         if p.part in _ABSENT:
             model = model.change(p.name, free=False)
-    fitted = Calibration.from_fit(examined(refit(run.calset, model)))
+    fitted = Calibration.from_fit(refit(run.calset, model).judged())
     true = dataclasses.replace(fitted, values=np.array([truth_values(run.truth)[n] for n in model.names]))
     made, stars = fit_paper(run.calset), sample_stars(seed=seed)
     at = [int(np.flatnonzero(np.isclose(made.x, tilt))[0]) for tilt in TILTS]

@@ -71,8 +71,9 @@ def with_free(model, *names: str):
     return model
 
 
-def started(model, result):
-    """The model beginning at the values of a fit."""
-    for name, value in zip(result.model.names, result.values, strict=True):
-        model = model.change(name, start=float(value))
+def started(model, result=None):
+    """The model beginning at the values of a fit, as far as it has its parameters."""
+    known = {} if result is None else dict(zip(result.model.names, result.values.tolist(), strict=True))
+    for name in set(known) & set(model.names):
+        model = model.change(name, start=known[name])
     return model

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import ast
-import importlib
 import re
 from pathlib import Path
 
 import nbformat
 import pytest
+from calls_fit import complaints
 
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
-NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+NOTEBOOKS, MODULES = sorted(FOLDER.glob("*.ipynb")), sorted(FOLDER.glob("*.py"))
 NOT_OURS = {
     "charis": ("CHARIS_TABLE", "charis_internal.ecsv"),
     "metasurface": ("METASURFACE_TABLE", "metasurface_calibration5.ecsv"),
@@ -64,17 +64,38 @@ def test_notebooks_are_stored_as_they_came_out(path: Path):
     assert not [text for text in texts if re.search(r"/(home|root|tmp|work|Users)/", text)]
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_what_notebooks_import_is_there(path: Path):
-    """Quick: the notebooks themselves take minutes."""
-    tree = ast.parse("\n".join(code_of(read(path))))
-    wanted = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-    for node in wanted:
-        if (node.module or "").startswith("walop_jax"):
-            module = importlib.import_module(node.module or "")
-            for name in node.names:
-                if not hasattr(module, name.name):
-                    importlib.import_module(f"{node.module}.{name.name}")
+@pytest.mark.parametrize("path", [*NOTEBOOKS, *MODULES], ids=lambda path: path.name)
+def test_calls_of_notebooks_fit(path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Quick: the notebooks themselves take minutes. Names, attributes, arguments and figures are all there."""
+    monkeypatch.syspath_prepend(FOLDER)
+    cells = code_of(read(path)) if path in NOTEBOOKS else [path.read_text(encoding="utf-8")]
+    assert complaints(cells, [module.stem for module in MODULES]) == []
+
+
+def test_calls_that_do_not_fit_are_found():
+    code = """
+import walop_jax as walop
+from walop_jax.reports.figures import nothing
+calset, truth = walop.simulate(gird=3)
+result = walop.refit(calset)
+print(result.trustd, result.model.nmes)
+result.plot("matrx")
+walop.Calibration.from_fit(result).matrix()
+[step.name for step in walop.diagnose(calset).stps]
+for one in (walop.refitt, calset.exposures.clpin):
+    print(one)
+"""
+    assert complaints([code]) == [
+        "walop_jax.reports.figures has no nothing",
+        "walop.simulate: got an unexpected keyword argument 'gird'",
+        "FitResult has no trustd",
+        "Model has no nmes",
+        "there is no figure matrx",
+        "walop.Calibration.from_fit(result).matrix: missing a required argument: 'x'",
+        "Diagnosis has no stps",
+        "walop_jax has no refitt",
+        "Exposures has no clpin",
+    ]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

@@ -13,7 +13,7 @@ throughput series only through its local values.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -97,14 +97,6 @@ def _derivatives(
 _derivatives_at = compiled(jax.vmap(_derivatives, in_axes=(None, None, 0, 0)))
 
 
-@dataclasses.dataclass(frozen=True)
-class _Tables:
-    """The interpolated functions of one setting, in the order (colour, camera, Stokes, …)."""
-
-    vectors: FieldTable
-    derivatives: FieldTable
-
-
 class AnalysisVectors:
     """The analysis vectors of a calibration, ready to be asked for at many field points.
 
@@ -118,7 +110,7 @@ class AnalysisVectors:
         reach = REACH * float(np.abs(calibration.field).max())
         self.half_width = min(self.instrument.field_limit, reach)
         self.cameras = len(self.instrument.cameras)
-        self._tables: dict[tuple[object, ...], _Tables] = {}
+        self._tables: dict[tuple[object, ...], FieldTable] = {}
         series, plain = series_positions(self.instrument), plain_positions(self.instrument)
         self._uncertain: Int[np.ndarray, " o"] = np.flatnonzero(np.diag(calibration.covariance)[plain] > 0)
         self.parameters: Int[np.ndarray, " n"] = np.concatenate([plain[self._uncertain], series])
@@ -152,7 +144,7 @@ class AnalysisVectors:
         self, setting: Settings, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]
     ) -> Float[np.ndarray, "p c k 3"]:
         """Vectors (point, colour, camera, Stokes) in one setting, for the spectra that `colour_weights` mixes."""
-        return self._of(setting).vectors(x, y).reshape(len(x), COLOURS + 1, self.cameras, 3)
+        return self._kept(self._vector_table, setting)(x, y).reshape(len(x), COLOURS + 1, self.cameras, 3)
 
     def coloured(
         self,
@@ -176,7 +168,8 @@ class AnalysisVectors:
         weights = colour_weights(teff, DERIVATIVE_COLOURS)
         plain = self.plain
         size = plain + self.cameras
-        values = self._of(setting).derivatives(x, y).reshape(len(x), DERIVATIVE_COLOURS + 1, -1)
+        table = self._kept(self._derivative_table, setting)
+        values = table(x, y).reshape(len(x), DERIVATIVE_COLOURS + 1, -1)
         mixed = np.einsum("pc,pcf->pf", weights, values).reshape(len(x), self.cameras, 3, size)
         return Local(mixed[..., :plain], mixed[..., plain:])
 
@@ -218,10 +211,12 @@ class AnalysisVectors:
         )
         return plan, np.asarray(plan.band_of)[:, 0]
 
-    def _of(self, setting: Settings) -> _Tables:
-        if setting.key not in self._tables:
-            self._tables[setting.key] = _Tables(self._vector_table(setting), self._derivative_table(setting))
-        return self._tables[setting.key]
+    def _kept(self, make: Callable[[Settings], FieldTable], setting: Settings) -> FieldTable:
+        """The interpolated function of one setting, in the order (colour, camera, Stokes, …), made when asked for."""
+        key = (make.__name__, setting.key)
+        if key not in self._tables:
+            self._tables[key] = make(setting)
+        return self._tables[key]
 
     @property
     def _rectangle(self) -> Rectangle:

@@ -100,7 +100,7 @@ def plate_errors(
     an ideal instrument, large where the settings hold hardly any u.
     """
     r, n = len(settings), len(x)
-    rows = np.stack([analysis.coloured(s, x, y) for s in settings], axis=1)
+    rows = np.stack([analysis.exact(s, x, y)[:, 0] for s in settings], axis=1)
     counts = _ELECTRONS * rows[..., 0]
     each, star = counts.reshape(n * r, -1), np.repeat(np.arange(n), r)
     found = estimate_with(analysis.instrument.cameras, rows.reshape(n * r, -1, 3), each, np.sqrt(each), star)
