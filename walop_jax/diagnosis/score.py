@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy import linalg, optimize, special
+from scipy import linalg, special
 
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.runner import cores
@@ -152,11 +152,7 @@ def effective_trials(smallest: Vector) -> float:
 @functools.cache
 def noncentrality(p: float, rank: int, power: float) -> float:
     """λ for which the statistic of a candidate, χ'²_rank(λ), undercuts a local `p` with probability `power`."""
-    least = special.chdtri(rank, p)
-    found = optimize.root_scalar(
-        lambda value: 1.0 - special.chndtr(least, rank, value) - power, bracket=(1e-6, 10.0 * least + 100.0)
-    )
-    return float(found.root)
+    return float(special.chndtrinc(special.chdtri(rank, p), rank, 1.0 - power))
 
 
 def whitening(gram: Matrix) -> Matrix:

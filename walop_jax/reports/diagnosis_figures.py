@@ -14,7 +14,6 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, LogNorm, Normalize
 from matplotlib.ticker import MaxNLocator
-from scipy.spatial import KDTree
 
 from walop_jax.data.records import Points
 from walop_jax.diagnosis.figure_data import DiagnosisFigureData, PointMap, ResidualComparison, Table
@@ -295,6 +294,8 @@ def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
 
     Crosses: q and u cannot both be measured with one exposure there.
     """
+    from scipy.spatial import KDTree  # takes a tenth of a second, and this figure alone needs it
+
     figure, axis = on.single(5.0, 3.8)
     good = np.isfinite(found.protection)
     if not good.any():
