@@ -380,7 +380,7 @@ class Calibration(Result):
     def usual_settings(self, count: int = 1, filter_name: str = DEFAULT_FILTER) -> Settings:
         """Flat photon spectrum, 10 °C, on the meridian, moving elements out.
 
-        Those `always_in` stand where they did in most exposures, as without them the instrument was never seen.
+        Elements that were in the beam in every exposure (`always_in`) are placed at their most frequent angle.
         """
         settings = Settings.default(count, filter_name)
         for prefix in self.always_in:

@@ -40,7 +40,7 @@ from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import Model
 
 SMALLEST_DETERMINANT = 0.1
-"""|m22 m33 − m23 m32| below which a single exposure holds hardly any u."""
+"""|m22 m33 − m23 m32| below which a single exposure carries almost no information on u."""
 
 
 def matrix_names(arms: int) -> tuple[str, ...]:

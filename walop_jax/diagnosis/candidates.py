@@ -18,8 +18,8 @@ sine, a gradient two directions. Groups are short: at most two things are free b
     dependence    none; gradient, r², radial, diagonal, astigmatic over the field; wavelength; time, temperature, hour
                   angle; harmonics of the angles; one night; one exposure; the counts; the exposure before
 
-A sentence pays for the number of sentences that there are, and for its length by its evidence. Names are sentences
-with a history: `beside_names` tells which groups an effect of the catalogue already is, or holds.
+Each sentence carries a look-elsewhere penalty, the logarithm of their number; longer ones are penalised by their
+evidence. `beside_names` tells which groups an effect of the catalogue already is, or holds.
 """
 
 from __future__ import annotations

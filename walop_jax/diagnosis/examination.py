@@ -259,7 +259,7 @@ class Evidence:
         return self._beside_patterns[0]
 
     def stands(self, probes: Sequence[Probe], evidence: float) -> bool:
-        """Whether an explanation with this evidence need not fear patterns that have no name.
+        """True if an explanation with this evidence is preferred over every unnamed pattern.
 
         It is more probable than any of them, or is significant beside those that are needed.
         """
@@ -336,9 +336,9 @@ class Evidence:
         return tuple(sorted(close, key=close.__getitem__))
 
     def nameless(self, item: Ranked, own: Collection[str] = ()) -> tuple[str, ...]:
-        """Sentences beside a candidate that are not improbable, or no longer and not to be told from it.
+        """Sentences beside a candidate that are not improbable, or no longer and indistinguishable from it.
 
-        The most probable come first; `own` are the sentences that it is.
+        The most probable come first; `own` are its equivalent sentences.
         """
         least, apart = max(0.0, item.log_bayes - self.policy.improbable), self.apart(item)
         length, limit = len(item.score.amplitudes), self.policy.separation * self.floor

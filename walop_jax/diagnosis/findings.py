@@ -132,7 +132,7 @@ class Step:
     (data − model, in standard deviations as given; point, exposure, camera) without and with the effect at the time it
     was added; where another name has been dropped since, they and χ² are of fits without that name. `told` are the
     sentences of an effect without a name (`described`) with amplitude and error, `nameless` those that are not
-    improbable beside what was found.
+    improbable in addition to what was found.
     """
 
     effect: str

@@ -73,7 +73,7 @@ class Trial:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The sentences that it is, where it has no name."""
+        """Its equivalent sentences, where it has no name."""
         if self.effect is not Described:
             return ()
         if self.fit is None:
@@ -180,7 +180,7 @@ def amplitude_positions(model: Model, name: str) -> list[int]:
 
 
 def with_refuted_priors_widened(model: Model, values: Float[np.ndarray, " n"], name: str) -> Model:
-    """The model in which amplitudes of an effect that lie far outside of their priors lie one width from the mean.
+    """The model with the priors of strongly deviating amplitudes widened to one width at the fitted value.
 
     A prior says how large such an effect usually is. One that the data refute would go on pulling at the value and
     count the square of its distance as a misfit, of data that are explained to within the noise.

@@ -15,7 +15,8 @@ Components  the variance of what field points, exposures, states, standards, nig
 Conditions  the efficient score of every number that the set states of itself: field, filters, colours, sky; of every
             prior, term of a camera and effect of the catalogue (`stated_conditions`).
 Repeats     the correlation of what is left of two exposures (`repeated_noise`).
-Errors      χ²/dof far below 1 says that N_ERR is not the error of N; a few per cent off is no matter of the model.
+Errors      χ²/dof far below 1: N_ERR is overestimated. A few per cent are attributed to the stated errors,
+            not to the model.
 
 Symbols     w = expected counts / errors of what has a flux in common (an exposure at a point), of unit length, where
             that was fitted (0 where it is known); Q orthonormal basis of the derivatives with respect to the free

@@ -303,8 +303,8 @@ def _start(likelihood: Likelihood) -> Vector:
 def with_honest_errors(result: FitResult) -> FitResult:
     """The fit with errors from its residuals where it does not explain the data (`robust`); as it is where it does.
 
-    Nothing but the covariance changes, and the verdict is to be made anew. For what leaves the program: evidence is
-    weighed with errors as stated.
+    Only the covariance changes; the verdict is to be made anew. For reported errors: model comparison keeps the stated
+    ones.
     """
     if result.explains_data or result.errors_from != STATED or result.dof <= 0 or not result.converged:
         return result

@@ -1,7 +1,7 @@
 """A ray on its way through the train: where it comes from, where it goes, and under which conditions.
 
 Units       field coordinates deg; direction cosines of the unit vector along the ray in air, axes of the instrument
-            frame; vacuum wavelength µm. Leading achromatic elements meet a ray that knows no wavelength.
+            frame; vacuum wavelength µm. Leading achromatic elements are evaluated without a wavelength.
 """
 
 from __future__ import annotations

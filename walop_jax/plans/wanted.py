@@ -217,9 +217,7 @@ def _apart(found: Candidates) -> Wanted:
     names, effects = np.array(found.names), found.effects
     of = {effect: np.flatnonzero(np.char.startswith(names, f"{effect}.")) for effect in effects}
     if len(effects) < 2 or not any(effects.values()):
-        raise ValueError(
-            "give two effects or more that are to be told apart, and the size of one: NAME=VALUE"
-        )
+        raise ValueError("give two or more effects to be distinguished, and the size of one: NAME=VALUE")
     base = np.setdiff1d(np.arange(len(names)), np.concatenate(list(of.values())))
     size = np.zeros(len(names))
     for effect, i in ((effect, i) for effect, places in of.items() for i in places):

@@ -58,7 +58,7 @@ class Target:
 
     @property
     def scale(self) -> Vector:
-        """The unit of each free parameter (its prior width, or the step a solver thinks in)."""
+        """A typical step of each free parameter (its prior width, or what preconditions the solver)."""
         return np.array([self.model.parameters[i].scale for i in self.free])
 
     @property

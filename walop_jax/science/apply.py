@@ -446,7 +446,7 @@ def _brightness(counts: Float[np.ndarray, "r k"], sigma: Float[np.ndarray, "r k"
 def _disagree(
     chi2: Float[np.ndarray, " s"], dof: Int[np.ndarray, " s"], brightness: Float[np.ndarray, " s"]
 ) -> Bool[np.ndarray, " s"]:
-    """Stars whose intensities no Stokes parameters explain, noise and `ROUGH` of the light allowed for."""
+    """Stars with significant residual χ² after adding `ROUGH` × flux to the errors."""
     found = np.zeros(len(chi2), bool)
     chi2 = chi2 / (1.0 + (ROUGH * brightness) ** 2)
     for k in np.unique(dof[dof > 0]).tolist():

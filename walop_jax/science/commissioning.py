@@ -14,7 +14,7 @@ from walop_jax.io.text import two_digits
 from walop_jax.science.field_accuracy import FieldAccuracy
 from walop_jax.science.star_errors import GOAL
 
-SHARE = 0.95  # of the field: the rest is where a single exposure holds hardly any u
+SHARE = 0.95  # of the field: the rest is where a single exposure carries almost no information on u
 MOST = GOAL / 2  # error of p that the calibration may make
 
 
@@ -87,7 +87,7 @@ def commissioning(result: FitResult, accuracy: FieldAccuracy | None) -> Commissi
             )
             if accuracy.without_u > 1.0 - share:
                 strip = f"{100 * accuracy.without_u:.0f} % of the field"
-                cause = f", because of {strip}, where one exposure holds hardly any u"
+                cause = f", because of {strip}, where one exposure carries almost no information on u"
                 advice = "observe the stars there with the calibration plate at 22.5° as well"
             asked = f"p known to {two_digits(100 * MOST)} % in {100 * share:.0f} % of the field"
             said = f"{two_digits(100 * reached)} %{cause}"

@@ -97,7 +97,7 @@ def plate_errors(
     """Photon error of (q, u) in the worse direction for an unpolarised star seen once through each setting.
 
     In units of the error of q that an ideal instrument would have with the same light: 1 for a single exposure of
-    an ideal instrument, large where the settings hold hardly any u.
+    an ideal instrument, large where the settings carry almost no information on u.
     """
     r, n = len(settings), len(x)
     rows = np.stack([analysis.exact(s, x, y)[:, 0] for s in settings], axis=1)
