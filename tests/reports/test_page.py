@@ -45,6 +45,24 @@ def test_page_stands_by_itself(diagnosed, refitted):
         assert all(image["alt"] for image in page.images)
 
 
+def test_a_commissioning_is_told_first(tmp_path):
+    folder = handmade_run.make_refit(tmp_path / "run")
+    asked = {
+        "what": "p known to 0.050 % in 50 % of the field",
+        "found": "0.088 %",
+        "advice": "3.1 times the light",
+    }
+    told = {"go": False, "requirements": [{**asked, "met": False, "needed": True}]}
+    (folder / "commissioning.json").write_text(json.dumps(told))
+    text = render(read_run(folder))
+    page = Page(text)
+    assert page.headings[0] == "Go or no-go"
+    assert "No-go – trusted" in page.text
+    row = ("p known to 0.050 % in 50 % of the field (required)", "no", "0.088 %", "3.1 times the light")
+    assert "".join(row) in page.text  # cells side by side
+    assert 'class="verdict good"' not in text
+
+
 def test_every_section_is_there(diagnosed, refitted):
     both = [
         "Warnings",

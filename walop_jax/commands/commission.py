@@ -12,8 +12,6 @@ from walop_jax.commands.refit import STAGES, refit
 if TYPE_CHECKING:
     from walop_jax.science.commissioning import Commissioning
 
-DOCUMENT = "commissioning.json"
-
 
 @command(stages=STAGES, writes=())
 def commission(
@@ -40,6 +38,7 @@ def commission(
     """
     from walop_jax.io.atomic import atomic_path
     from walop_jax.io.text import json_text
+    from walop_jax.posterior.files import COMMISSIONING
     from walop_jax.science.commissioning import commissioning
 
     fitted = command_of(refit).body(job, data, model, output=output, instrument=instrument, effects=effects)
@@ -47,7 +46,7 @@ def commission(
     accuracy = result.answer() if result.converged and result.answer is not None else None
     found = commissioning(result, accuracy)
     if output is not None:
-        with atomic_path(Path(output) / DOCUMENT, overwrite=True) as temporary:
+        with atomic_path(Path(output) / COMMISSIONING, overwrite=True) as temporary:
             temporary.write_text(json_text(found.document()), encoding="utf-8")
     stars = (f"walop-jax apply {output} STARS.fits -o OUT.fits",) if found.go else ()
     return Outcome(

@@ -289,6 +289,7 @@ class Checkpoints:
 
 
 DIAGNOSIS, COMPARISON, EPOCH, LIMITS = "diagnosis.json", "comparison.json", "epoch.json", "limits.json"
+COMMISSIONING = "commissioning.json"
 POSTERIOR, INTERVALS, CORNER, SAMPLE = "posterior.nc", "posterior.ecsv", "posterior_corner.png", "sample.json"
 DOCUMENTS = {
     "summary": SUMMARY,

@@ -86,6 +86,8 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
     summary, diagnosis = run.summary, run.diagnosis
     label, sentence = verdict_of_fit(summary) if diagnosis is None else verdict_of_diagnosis(diagnosis)
     good = diagnosis is None or diagnosis["verdict"] != "unexplained"
+    if run.commissioning is not None:
+        label = f"{'Go' if run.commissioning['go'] else 'No-go'} – {label[:1].lower()}{label[1:]}"
     main, rest = _parameters(run)
     quality = Quality(int(summary.get("quality", 0)))
     return {
@@ -94,6 +96,7 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         "instrument": summary.get("instrument", "WALOP"),
         "summary": summary,
         "diagnosis": diagnosis,
+        "commissioning": run.commissioning,
         "said": [] if diagnosis is None else tuple(sentences(diagnosis)),
         "label": label,
         "sentence": sentence,

@@ -16,6 +16,7 @@ from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.text import read_json
 from walop_jax.posterior.files import (
+    COMMISSIONING,
     COMPARISON,
     CORNER,
     DIAGNOSIS,
@@ -43,7 +44,7 @@ class RunContents:
 
     `summary`, `diagnosis` and `sample` are the contents of the JSON files; `intervals` are rows of the table of
     posterior intervals; `corner` are the bytes of a PNG; `limits` is what `limits` has found for the same data,
-    `data` are the sets of the fit if they are not where they were.
+    `data` are the sets of the fit if they are not where they were, `commissioning` is a go or no-go with its reasons.
     """
 
     folder: Path
@@ -57,6 +58,7 @@ class RunContents:
     limits: DetectionLimits | None
     missing: tuple[str, ...]
     data: tuple[Path, ...] = ()
+    commissioning: dict[str, Any] | None = None
 
 
 def read_run(run: Run | Path) -> RunContents:
@@ -114,6 +116,12 @@ def read_run(run: Run | Path) -> RunContents:
         limits=optional(LIMITS, lambda path: _limits(path, summary), "no protection level", wanted=False),
         missing=tuple(missing),
         data=tuple(map(Path, run.data)),
+        commissioning=optional(
+            COMMISSIONING,
+            lambda path: _document(path, ("go", "requirements")),
+            "no go or no-go",
+            wanted=False,
+        ),
     )
 
 
