@@ -25,6 +25,14 @@ MODEL = "model.toml"
 OUTPUTS = ("calibration.fits", "summary.json", "diagnosis.json", "diagnosis.fits", MODEL)
 
 
+MINUTES = Option(
+    "Minutes after which no further name is looked for (default: 20; 5 where the model is far from the data).",
+    "MINUTES",
+    float,
+    least=0.0,
+)
+
+
 @command(stages=("reading", "fitting", "scoring", "naming", "mapping"), writes=OUTPUTS, random=True)
 def diagnose(
     job: Job,
@@ -34,7 +42,7 @@ def diagnose(
     output: Folder = None,
     instrument: InstrumentLike = None,
     effects: Effects = None,
-    minutes: Annotated[float, Option("Minutes after which no further name is looked for.", least=0.0)] = 20.0,
+    minutes: Annotated[float | None, MINUTES] = None,
 ) -> Outcome[Diagnosis]:
     """Say what is missing from the model, add it, and fit again: RUN/diagnosis.json and RUN/calibration.fits.
 

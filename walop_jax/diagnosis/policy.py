@@ -93,7 +93,9 @@ class Policy:
     # How long?
     most_steps: int = 6
     minutes: float = 20.0
-    """After which nothing further is tried."""
+    """After which nothing further is tried;"""
+    minutes_far_off: float = 5.0
+    """where the model is so far from the data that their errors were scaled (`fit.search.FAR_OFF`)."""
 
     def document(self) -> dict[str, Any]:
         """The thresholds by name."""

@@ -8,7 +8,8 @@ verdict is `unexplained`; a free-form term for it stays in the model where it pr
 that it has not seen, and names that only stood in for it are dropped. 7. List for each name what the data cannot tell
 from it, and give the verdict. Names are given at any size; `Step.negligible` says when it does not matter for q and u.
 
-Nothing further is tried after `Policy.minutes`: the best found so far comes back, and says so.
+Nothing further is tried after `Policy.minutes`, fewer where the model is far from the data: the best found so far
+comes back, and says so.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ def diagnose(
     `catalogue` are the effects that may be named (default: those that the model knows), `policy` the thresholds. Of a
     set with more than `limits.DIAGNOSED_ROWS` (exposure, point) pairs, or whose columns would be more than
     `limits.DIAGNOSED_NUMBERS`, points spread over the field are looked at. Nothing further is tried after `minutes`
-    (default: those of the policy);
+    (default: those of the policy for such a model);
     what is left then has no name, and `Diagnosis.caution` says so. Both fits are examined. Other readings of the data
     are not tried where the caller has done that already (`as_written`). Raises what `fit` raises, and `DataError` for
     data that another reading explains (`alternatives`).
@@ -108,6 +109,9 @@ def diagnose(
     if readings and readings[0].explained < policy.reading_sure:
         raise refusal(judge.fit, readings)
     before = judge.fit
+    if minutes is None and judge.fit.noise_scale > 1.0:
+        policy = dataclasses.replace(policy, minutes=min(policy.minutes, policy.minutes_far_off))
+        judge = dataclasses.replace(judge, policy=policy, until=began + 60.0 * policy.minutes)
     tell(Stage("scoring every effect and pattern", "scoring"))
     last = first = judge.examined()
     for _, _, left in search(first, judge, policy):
