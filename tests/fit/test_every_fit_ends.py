@@ -9,6 +9,8 @@ import pytest
 from small_run import SEED, SMALL
 
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.diagnosis.policy import POLICY
+from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.fit.search import FAR_OFF, most_passes
@@ -89,3 +91,13 @@ def test_good_data_take_one_search(passes):
     result = refit(calset)
     assert result.explains_data
     assert passes[0] == result.minimum.steps <= 10
+
+
+def test_a_diagnosis_of_data_far_off_has_less_time():
+    calset = with_random_intensities(simulate(SMALL, seed=SEED).calset, np.random.default_rng(1))
+    at_once = dataclasses.replace(POLICY, minutes_far_off=0.0)
+    found = diagnose(calset, policy=at_once, as_written=True)
+    assert found.before.noise_scale > 1.0
+    assert found.steps == ()
+    assert found.verdict == "unexplained"
+    assert "the search ended after 0 minutes" in found.caution
