@@ -10,7 +10,7 @@ import pytest
 
 from walop_jax.data import builtin_filter
 from walop_jax.model import light
-from walop_jax.model.compiled import compiled, require_double_precision
+from walop_jax.model.compiled import compiled, knows, require_double_precision
 from walop_jax.model.dependence import optical_indices
 from walop_jax.model.parameters import values_of, with_values
 
@@ -73,3 +73,9 @@ def test_single_precision_is_refused():
             require_double_precision()
     finally:
         jax.config.update("jax_enable_x64", True)
+
+
+def test_an_option_that_xla_does_not_have_is_noticed():
+    """Versions of XLA drop options, and refuse to compile with one that they do not know."""
+    assert knows("xla_cpu_enable_fast_math")
+    assert not knows("xla_of_another_day")

@@ -11,7 +11,8 @@ they are code: the folder must be the user's own. A file that is damaged is made
 
 On CPU the fusion emitters of XLA compute shared sub-expressions over and over when a derivative of the plates is
 compiled (measured with jax 0.10.2: 35 s and 9.6 s a call instead of 3 s and 0.08 s), so they are switched off
-there. `tests/model/test_compiled.py` keeps an eye on it. What is called once or twice is not worth optimising.
+there where XLA has the option (that of jax 0.12 has not: a fit takes twice the CPU to begin with).
+`tests/model/test_compiled.py` keeps an eye on it. What is called once or twice is not worth optimising.
 """
 
 from __future__ import annotations
@@ -182,6 +183,19 @@ Result = TypeVar("Result")
 _kept: list[dict[Any, Any]] = []  # programs that came from disk, of every compiled function
 
 
+EMITTERS = "xla_cpu_use_fusion_emitters"
+
+
+@functools.cache
+def knows(option: str) -> bool:
+    """True if this version of XLA has an option."""
+    try:
+        jax.jit(lambda: 0, compiler_options={option: False}).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
+
+
 def compiled(
     function: Callable[..., Result], *, fuse: bool = False, kept_as: str = ""
 ) -> Callable[..., Result]:
@@ -194,7 +208,7 @@ def compiled(
 
     def options(once: bool) -> dict[str, Any] | None:
         on_cpu = jax.default_backend() == "cpu"
-        chosen: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if on_cpu and not fuse else {}
+        chosen: dict[str, Any] = {EMITTERS: False} if on_cpu and not fuse and knows(EMITTERS) else {}
         if once:
             chosen["xla_backend_optimization_level"] = 0
         return chosen or None
