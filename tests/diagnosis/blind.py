@@ -18,7 +18,7 @@ import functools
 import hashlib
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import candidates
 from walop_jax.diagnosis.candidates import Probe, probes
 from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Measured
-from walop_jax.diagnosis.examination import Evidence, Ranked, examine
+from walop_jax.diagnosis.examination import Evidence, Examination, Ranked, examine
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.score import ScoreSpace, separations, whitening
 from walop_jax.diagnosis.search import Linear, Trial, search
@@ -36,6 +36,8 @@ from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Described
 from walop_jax.model.specification import effect_context
+
+Examined = Callable[..., Examination]
 
 SEPARABLE = 5.0  # σ between the truth and its nearest rival above which a name is asked for
 CONFOUNDED = 2.0  # below which a class is asked for
@@ -75,6 +77,7 @@ class Verdict:
     first_probe: str = ""
     amplitudes: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
     covariance: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
+    added: tuple[str, ...] = ()  # probes
 
 
 # What each shape outside the catalogue is in sentences; none: no sentence holds it.
@@ -164,14 +167,14 @@ def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[s
 class Blind:
     """A design made ready for drawing and judging scenes."""
 
-    def __init__(self, calset: CalibrationSet, seed: int = 1) -> None:
+    def __init__(self, calset: CalibrationSet, seed: int = 1, examined: Examined = examine) -> None:
         model = base_model(calset)
         result = fit(Likelihood.of(calset, model))
         self.rng = np.random.default_rng(seed)
         wanted = list(probes(EFFECTS, effect_context(model.template, calset.exposures)))
         self.context, self.template = effect_context(model.template, calset.exposures), model.template
         every = candidates.sentences(model.template, calset.exposures, len(calset.points))
-        examination = examine(result, wanted, self.rng, None, every)
+        examination = examined(result, wanted, self.rng, None, every)
         self.sentences = examination.sentences
         self.probes = list(examination.probes)
         self.in_sentences = {p.name: set(p.group[0].in_sentences(model.template)) for p in self.probes}
@@ -198,7 +201,7 @@ class Blind:
         self._behind_nuisance, self._reduce = self.space.with_base(
             [SINGLE_EXPOSURES], examination.common_mode
         )
-        self.evidence: Evidence = examination
+        self.evidence = examination
         self._spaces: dict[tuple[str, ...], ScoreSpace] = {}
         self.free = examination.space.free
         self.visible = sorted({p.effect.name for p in self.probes if examination.table[p.name].testable})
@@ -271,7 +274,7 @@ class Blind:
     # --------------------------------------------------------------------------------------------------- judging
 
     @functools.cache  # noqa: B019
-    def _start(self, removed: tuple[str, ...]) -> Evidence:
+    def _asked(self, removed: tuple[str, ...]) -> Evidence:
         """What is asked of a scene, without what is not in the catalogue; the residuals are those of the design."""
         catalogue = [effect for effect in EFFECTS if effect.name not in removed]
         names = [p for p in self.probes if p.effect.name not in removed]
@@ -284,12 +287,12 @@ class Blind:
             self.evidence, space=space, probes=names, sentences=said, parts=parts, patterns=self.patterns
         )
 
-    def _evidence(self, scene: Scene) -> Evidence:
+    def start(self, scene: Scene) -> Evidence:
         """The scores of a scene; noise and number of trials are those of the whole catalogue, which is dear to draw."""
         scores, square = self._reduce(
             self._root @ scene.coordinates, float(scene.coordinates @ scene.coordinates) + scene.rest
         )
-        whole, start = self._start(()), self._start(scene.removed)
+        whole, start = self._asked(()), self._asked(scene.removed)
         table = whole.space.table(
             scores[self._behind_nuisance.chosen(whole.space.names)], square, self._smallest
         )
@@ -302,29 +305,34 @@ class Blind:
 
     def judge(self, scene: Scene) -> Verdict:
         """What the search finds."""
+        return self.judged(scene, self.start(scene))[0]
+
+    def judged(self, scene: Scene, last: Evidence) -> tuple[Verdict, Evidence]:
+        """What the search finds from the scores of a scene, and what it leaves."""
         named: list[str] = []
         said: list[str] = []
+        added: list[str] = []
         classes: list[frozenset[str]] = []
-        last = self._evidence(scene)
         first: Ranked | None = None
         for trial, before, left in search(last, Cached(self._spaces, scene.removed), POLICY):
             last, item = left, trial.item
             assert item is not None
             first, name = first or item, item.effect.name
             named.append(name)
+            added.append(item.probe.name)
             if item.effect is Described:
                 said.append(item.probe.name)
             told = {*trial.rivals, *trial.nameless, *before.close(item)}
             classes.append(frozenset(told - {name, item.probe.name}))
         missing = last.alarm or len(said) > POLICY.most_sentences
         kind = "unexplained" if missing else "effect_found" if named else "consistent"
-        verdict = Verdict(kind, tuple(named), tuple(classes), tuple(said))
+        verdict = Verdict(kind, tuple(named), tuple(classes), tuple(said), added=tuple(added))
         if first is None:
-            return verdict
+            return verdict, last
         score = first.score
         return dataclasses.replace(
             verdict, first_probe=first.probe.name, amplitudes=score.amplitudes, covariance=score.covariance
-        )
+        ), last
 
 
 class Cached(Linear):
