@@ -84,12 +84,6 @@ class Bench:
         rows = np.concatenate([data, rng.standard_normal(len(known)) * known])
         return rows - self.at["base"] @ (self.at["base"].T @ rows)
 
-    @cached_property
-    def truth(self) -> np.ndarray:
-        """What is hidden, in the rows that were fitted: for the matched filter alone."""
-        with np.load(self.folder / "truth.npz") as truth:
-            return truth["signature"].astype(float)
-
     def columns_of(self, names: list[str]) -> tuple[np.ndarray, np.ndarray]:
         """Which columns belong to candidates, and their widths."""
         group = [np.flatnonzero(self.said["names"] == name)[0] for name in names]
@@ -111,12 +105,14 @@ class Bench:
 
 def matched(bench: Bench) -> Callable[[int], Answer]:
     """The filter that knows the truth; of an empty scene it is that of one of the others, in turn."""
-    with_signal = np.flatnonzero(np.any(bench.truth, axis=1))
     _, beyond, _ = opened(bench.folder)
+    with np.load(bench.folder / "truth.npz") as truth:
+        signals = truth["signature"].astype(float)
+    with_signal = np.flatnonzero(np.any(signals, axis=1))
 
     def answer(scene: int) -> Answer:
         of = scene if scene in with_signal else with_signal[scene % len(with_signal)]
-        signal = bench.truth[of]
+        signal = signals[of]
         power = signal @ signal
         along = float(signal @ bench.residual(scene) / power)
         return {"score": along * np.sqrt(power), "told": [], "kept_back": along * beyond[of]}
@@ -271,10 +267,6 @@ class Groups:
         return self.effect != self.bench.without[scene]
 
     @cached_property
-    def half_grams(self) -> list[np.ndarray]:
-        return [self.x[rows].T @ self.x[rows] for rows in self.halves]
-
-    @cached_property
     def alike(self) -> np.ndarray:
         """Groups of which the smaller lies in the larger, all canonical correlations at least `ALIKE`."""
         square = np.add.reduceat(
@@ -416,6 +408,7 @@ def mcp(bench: Bench) -> Callable[[int], Answer]:
 def stability(bench: Bench) -> Callable[[int], Answer]:
     """Candidates that are among the first in most halves of the data."""
     groups = Groups(bench)
+    grams = [groups.x[rows].T @ groups.x[rows] for rows in groups.halves]
 
     def answer(scene: int) -> Answer:
         r = bench.residual(scene)
@@ -428,7 +421,7 @@ def stability(bench: Bench) -> Callable[[int], Answer]:
         votes = np.zeros((len(groups.halves), len(chosen)), bool)
         for k, rows in enumerate(groups.halves):
             *_, b = path(
-                groups.half_grams[k][block],
+                grams[k][block],
                 groups.x[np.ix_(rows, at)].T @ r[rows],
                 0.5 * lambdas,
                 None,

@@ -46,7 +46,6 @@ PLAN = ObservingPlan(
     grid=15, standard_grid=3, polariser_angles=polariser_turn(15), moon_patches=6, standards=6
 )
 ANGLES_KEPT_BACK = (2, 7, 12)  # exposures
-RATIOS = (10.0, 30.0)
 STEP = 1e-3  # of a standard error: residuals are stored in this unit
 
 
@@ -145,7 +144,7 @@ class Hidden:
     beyond: np.ndarray
 
 
-def hidden(layout: Layout, seed: int, draws: int, nulls: int) -> Iterator[Hidden]:
+def hidden(layout: Layout, seed: int, draws: int, nulls: int, ratios: Sequence[float]) -> Iterator[Hidden]:
     """All scenes in a fixed order; each is judged without one entry of the catalogue, that which it hides or any."""
     blind, named, rng = layout.blind, layout.columns, np.random.default_rng([seed, 32])
     blind.rng = np.random.default_rng([seed, 33])
@@ -159,13 +158,13 @@ def hidden(layout: Layout, seed: int, draws: int, nulls: int) -> Iterator[Hidden
         yield Hidden("null", "", 0.0, (), str(rng.choice(blind.visible)), *nothing)
     for name, column in outside(layout.whole, single):
         rows, beyond = (part[:, 0] for part in layout.projected(column[:, None]))
-        for ratio in RATIOS:
+        for ratio in ratios:
             for _ in range(draws):
                 size = rng.choice([-1.0, 1.0]) * ratio / np.linalg.norm(rows)
                 without = str(rng.choice(blind.visible))
                 yield Hidden("outside", name, ratio, OUTSIDE[name], without, size * rows, size * beyond)
     for name in blind.visible:
-        for ratio in RATIOS:
+        for ratio in ratios:
             drawn = blind.hidden(name, ratio, (name,), "removed")
             if drawn is None:
                 continue
@@ -231,12 +230,12 @@ def stored(residual: np.ndarray) -> np.ndarray:
     return steps.astype(np.int16)
 
 
-def generate(folder: Path, seed: int, draws: int, nulls: int) -> dict[str, str]:
+def generate(folder: Path, seed: int, draws: int, nulls: int, ratios: Sequence[float]) -> dict[str, str]:
     """Write all files; returns their hashes."""
     folder.mkdir(parents=True, exist_ok=True)
     layout = Layout(seed)
     noise = np.random.default_rng([seed, 34])
-    scenes = list(hidden(layout, seed, draws, nulls))
+    scenes = list(hidden(layout, seed, draws, nulls, ratios))
     order = np.random.default_rng([seed, 35]).permutation(len(scenes))
     scenes = [scenes[i] for i in order]
     residuals = np.stack([stored(one.rows + layout.noise(noise)) for one in scenes])
@@ -266,10 +265,11 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--draws", type=int, default=5)
     parser.add_argument("--nulls", type=int, default=200)
+    parser.add_argument("--ratios", type=float, nargs="+", default=(10.0, 30.0), help="signal to noise")
     parser.add_argument("--check", action="store_true", help="fail unless the hashes are the published ones")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    hashes = generate(options.folder, options.seed, options.draws, options.nulls)
+    hashes = generate(options.folder, options.seed, options.draws, options.nulls, options.ratios)
     print(json.dumps(hashes, indent=1))
     if options.check and hashes != json.loads((HERE / "published.json").read_text())["sha256"]:
         raise SystemExit("these are not the published files: other options, versions or processor")
