@@ -443,7 +443,7 @@ def stability(bench: Bench) -> Callable[[int], Answer]:
 
 
 def _shape_columns(bench: Bench, degree: int, harmonics: int, suffix: str) -> np.ndarray:
-    """Relative changes of each camera: polynomials of the field × harmonics; Moon sky and standards have their own."""
+    """Per camera, in shares of unpolarised light: polynomials of the field × harmonics; the sky has its own."""
     at, point, exposure = bench.at, bench.at[f"point{suffix}"], bench.at[f"exposure{suffix}"]
     data = point >= 0
     point, exposure, camera = point[data], exposure[data], bench.at[f"camera{suffix}"][data]
@@ -459,7 +459,7 @@ def _shape_columns(bench: Bench, degree: int, harmonics: int, suffix: str) -> np
     patterns = [term * turn * through for term in smooth(degree) for turn in turns]
     patterns += [term * (at["kind"][exposure] == "moon") for term in smooth(min(degree, 1))]
     patterns += [1.0 * (at["kind"][exposure] == "standard")]
-    size = at[f"counts_over_error{suffix}"]
+    size = at[f"unpolarised_over_error{suffix}"]
     each = np.column_stack([p * size * (camera == k) for k in range(bench.cameras) for p in patterns])
     return bench.without_flux(each, f"flux_direction{suffix}")
 

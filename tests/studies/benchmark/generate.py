@@ -209,12 +209,9 @@ def context(layout: Layout) -> dict[str, np.ndarray]:
     for name, value in {"point": point, "exposure": exposure, "camera": camera}.items():
         found[name] = np.append(value[layout.inside], np.full(priors, -1))
         found[f"{name}_kept_back"] = value[~layout.inside]
-    counts = (measured.flux[..., None] * measured.model)[measured.used].ravel()
-    found["counts_over_error"] = counts[layout.inside]
-    found["counts_over_error_kept_back"] = counts[~layout.inside]
-    found["flux_direction_kept_back"] = measured.unit_model[
-        ~layout.inside.reshape(-1, measured.cameras)[:, 0]
-    ]
+    light = (measured.flux[..., None] * measured.level[:, None, :] * measured.weight)[measured.used].ravel()
+    found["unpolarised_over_error"] = light[layout.inside]
+    found["unpolarised_over_error_kept_back"] = light[~layout.inside]
     found["flux_direction"] = layout.design.measured.unit_model
     found["prior_is_known"] = np.asarray(layout.design.fit.likelihood.priors.known, bool)
     return found | {"base": layout.basis, "base_kept_back": layout.beyond}
