@@ -146,7 +146,10 @@ class Exposures:
         if prefix in self.moving:
             return self.moving[prefix]
         known = (POLARISER, CALIBRATION_PLATE, *self.moving)
-        raise ValueError(f"the exposures have no moving element {prefix!r}: {nearest(prefix, known)}")
+        advice = f"give {prefix}_IN and {prefix}_ANGLE, in an observing plan its positions (moving)"
+        raise ValueError(
+            f"the exposures have no moving element {prefix!r}: {advice}; {nearest(prefix, known)}"
+        )
 
     def columns(self) -> dict[str, np.ndarray]:
         """All columns by their names in EXPOSURES, further moving elements last."""

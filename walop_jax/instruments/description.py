@@ -268,7 +268,7 @@ def _description(read: Reader, table: Table, text: str) -> Description:
         site=dict(site),
         read=read,
         raster=raster,
-        edge=read.number(field.get("edge", 0.0), "edge", "field"),
+        edge=read.number(field.get("edge", field.get("limit", 0.0)), "edge", "field"),
         split=split,
         floor=floor,
         default=table.get("default") is True and "default" in text,

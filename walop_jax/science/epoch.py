@@ -127,7 +127,8 @@ class Epoch(Displayed):
         """The verdict, and the parameters that have moved farthest."""
         rows = []
         for entry in self.moved[:_SHOWN]:
-            old, new = (value_and_error(value, entry.error)[0] for value in (entry.old, entry.new))
+            error = max(entry.error, 1e-6 * abs(entry.new))  # of the same data it is rounding alone
+            old, new = (value_and_error(value, error)[0] for value in (entry.old, entry.new))
             rows.append((entry.name, old, new, with_minus_sign(f"{entry.z:+.1f}"), entry.unit))
         errors = self.star_errors["p"]
         return Display(
