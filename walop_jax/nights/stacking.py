@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
+from jaxtyping import Float
 
 from walop_jax.calibration import PRODUCT, read_calibration, write_calibration
 from walop_jax.calibration.calibration import Calibration
@@ -58,7 +59,8 @@ Given = FitResult | CalibrationSet | Night | Run | str | os.PathLike[str]
 """What nights are made of: a fit, a set, a night, or a path: of a set, of a RUN, of a SURVEY or of its nights."""
 
 LONG = 60.0  # days without a night that are worth a remark
-FAR = 0.02  # standard errors from the solution beyond which a night is linearised again
+FAR = 0.02  # standard errors from the solution up to which a night need not be linearised again
+EXACT = 1e-3  # standard errors by which linearising all nights again may move the solution at most
 ROUNDS = 6
 REFERENCE = "reference.fits"
 TRACKS, SURVEY = "tracks.fits", "survey.json"
@@ -281,29 +283,45 @@ def _opened(one: Given, catalogue: Sequence[type[Effect]]) -> _Opened:
 def _settled(
     data: Together, laws: Sequence[Law | None], at_hand: Mapping[tuple[str, int], _Data], maker: _Maker
 ) -> tuple[Together, Solution, bool]:
-    """Linearise nights at the common solution until none is far from it; whether none is."""
+    """Linearise nights at the common solution until that would not move it; whether it would not.
+
+    The night that lies farthest from the solution is linearised there first: were every other night as far from linear,
+    the solution would move by no more than as many times what it moves. If that is `EXACT`, they stay as they are.
+    """
+    solution = solved(data, laws)
     for _ in range(ROUNDS):
-        solution = solved(data, laws)
-        scale = data.equations.scale
-        values = data.origin + solution.values * scale
-        sigma = np.maximum(solution.errors() * scale, 1e-12 * scale)
+        values, sigma = _in_units(data, solution)
         # Candidates have no place in the model: their part stays first-order, at 0.
-        far = np.abs(values - data.reference) > FAR * sigma
+        away = (np.abs(values - data.reference) / sigma)[:, data.has_value].max(axis=1)
         again = [
-            u for u in np.flatnonzero(far[:, data.has_value].any(axis=1))
-            if (data.nights[u].sha256, data.nights[u].number) in at_hand
+            u for u in np.argsort(-away, kind="stable")
+            if away[u] > FAR and (data.nights[u].sha256, data.nights[u].number) in at_hand
         ]  # fmt: skip
-        if not again:
-            return data, solution, True
         nights = list(data.nights)
-        for u in again:
+        for count, u in enumerate(again):
             night = nights[u]
             made = maker.nights(
                 at_hand[night.sha256, night.number], dict(zip(data.names, values[u].tolist(), strict=True))
             )
             nights[u] = next(one for one in made if one.number == night.number)
+            if not count:
+                first = together(nights)
+                moved, _ = _in_units(first, there := solved(first, laws))
+                if np.all(len(again) * np.abs(moved - values) <= EXACT * sigma):
+                    return first, there, True
+        if not again:
+            return data, solution, True
         data = together(nights)
-    return data, solved(data, laws), False
+        solution = solved(data, laws)
+    return data, solution, False
+
+
+def _in_units(
+    data: Together, solution: Solution
+) -> tuple[Float[np.ndarray, "u n"], Float[np.ndarray, "u n"]]:
+    """Values and errors (night, parameter) of a solution."""
+    scale = data.equations.scale
+    return data.origin + solution.values * scale, np.maximum(solution.errors() * scale, 1e-12 * scale)
 
 
 def _about_fits(fits: Sequence[Calibration | FitResult]) -> list[Doubt]:
