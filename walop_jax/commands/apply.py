@@ -91,6 +91,8 @@ def apply(
             used, rows, lambda done, total: job.tell(f"{done} of {total} rows"), force=force
         )
     job.begin("writing")
+    alone = len(set(rows.star.tolist())) == len(rows.star) and len(used.model.template.arms) == 1
+    settings = ": with one arm a star needs rows at several settings, of one ID" if alone else ""
     on_the_sky = sum(map(math.isfinite, rows.rotator)) / max(len(rows.rotator), 1)
     return table_outcome(
         job,
@@ -101,7 +103,7 @@ def apply(
         output,
         flag=stars.flag,
         told={
-            Quality.NO_STOKES: "star(s) without a result (FLAG 16384)",
+            Quality.NO_STOKES: f"star(s) without a result (FLAG 16384){settings}",
             Quality.BEYOND_FIELD: "star(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)",
             Quality.BEYOND_SETTINGS: "star(s) with a filter, temperature or TEFF beyond the calibration",
             Quality.DISAGREES: "star(s) whose intensities disagree with the calibration (FLAG 131072, CHI2): is "

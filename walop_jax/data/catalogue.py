@@ -124,7 +124,9 @@ def field_points(
     for prefix in instrument.moving():
         name = f"{prefix}_ANGLE"
         if prefix in always_in and name not in source.names:
-            advice = f"add it: {prefix} was in the beam in all exposures of the calibration (NaN: it is out)"
+            advice = (
+                f"give it in a table: {prefix} was in the beam in all exposures of the calibration (NaN: out)"
+            )
             raise place.fail("the column is missing", name, advice)
         angle = numeric_column(source, name, EXPOSURES["CLP_ANGLE"])
         inside = np.isfinite(angle)
