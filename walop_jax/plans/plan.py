@@ -194,7 +194,8 @@ class ExposurePlan(Displayed):
         own = self.wanted.variance(self.value)
         for name, told in self.beside.items():
             factor = self.wanted.variance(told) / own
-            facts[name] = f"{digits(told, '.3g')}{unit}; {factor:.2g} times the variance"
+            variance = "the same variance" if f"{factor:.2g}" == "1" else f"{factor:.2g} times the variance"
+            facts[name] = f"{digits(told, '.3g')}{unit}; {variance}"
         rows = tuple(
             (
                 line.kind
