@@ -212,6 +212,8 @@ def context(layout: Layout) -> dict[str, np.ndarray]:
     light = (measured.flux[..., None] * measured.level[:, None, :] * measured.weight)[measured.used].ravel()
     found["unpolarised_over_error"] = light[layout.inside]
     found["unpolarised_over_error_kept_back"] = light[~layout.inside]
+    beyond = ~layout.inside.reshape(-1, measured.cameras)[:, 0]
+    found["flux_direction_kept_back"] = measured.unit_model[beyond]
     found["flux_direction"] = layout.design.measured.unit_model
     found["prior_is_known"] = np.asarray(layout.design.fit.likelihood.priors.known, bool)
     return found | {"base": layout.basis, "base_kept_back": layout.beyond}
