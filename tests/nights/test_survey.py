@@ -229,10 +229,11 @@ def kept(sets, single, tmp_path_factory):
         patch.setattr(stacking, "night_equations", interrupted)
         assert run_program("stack", *words).exit_code == 130
         assert [entry.name for entry in stopped.iterdir()] == ["partial"]
-        # The first night is kept: the other two are made, then all three again at the common solution, twice.
+        # The first night is kept: the other two are made, then all three again at the common solution, as often as need
+        # be, twice or three times.
         made[:] = [0, 1]
         assert run_program("stack", *words, "--quiet").exit_code == 0
-    assert len(made) - 2 == 2 + 3 + 3
+    assert 2 + 3 <= len(made) - 2 <= 2 + 3 + 3 + 3
     return folder
 
 

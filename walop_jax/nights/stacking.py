@@ -60,7 +60,8 @@ Given = FitResult | CalibrationSet | Night | Run | str | os.PathLike[str]
 
 LONG = 60.0  # days without a night that are worth a remark
 FAR = 0.02  # standard errors from the solution up to which a night need not be linearised again
-EXACT = 1e-3  # standard errors by which linearising all nights again may move the solution at most
+EXACT = 1e-3  # standard errors by which linearising all nights again may move the solution at most,
+ENOUGH = 0.1  # and while breaks are looked for
 ROUNDS = 6
 REFERENCE = "reference.fits"
 TRACKS, SURVEY = "tracks.fits", "survey.json"
@@ -169,12 +170,12 @@ def stack(
     _check_filters(data, chosen)
     breaks = [one for some in opened for one in some.breaks]
     try:
-        data, solution, settled = _settled(data, chosen, at_hand, maker)
-        if find and len({night.number for night in data.nights}) > 2:
+        looking = find and len({night.number for night in data.nights}) > 2
+        data, solution, settled = _settled(data, chosen, at_hand, maker, ENOUGH if looking else EXACT)
+        if looking:
             found, chosen, solution = breaks_of(data, chosen, catalogue)
             breaks += found
-            if found:
-                data, solution, settled = _settled(data, chosen, at_hand, maker)
+            data, solution, settled = _settled(data, chosen, at_hand, maker)
     except UndeterminedError as error:
         raise _undetermined(data, error) from None
     if not settled:
@@ -281,14 +282,18 @@ def _opened(one: Given, catalogue: Sequence[type[Effect]]) -> _Opened:
 
 
 def _settled(
-    data: Together, laws: Sequence[Law | None], at_hand: Mapping[tuple[str, int], _Data], maker: _Maker
+    data: Together,
+    laws: Sequence[Law | None],
+    at_hand: Mapping[tuple[str, int], _Data],
+    maker: _Maker,
+    exact: float = EXACT,
 ) -> tuple[Together, Solution, bool]:
-    """Linearise nights at the common solution until that would not move it; whether it would not.
+    """Linearise nights at the common solution until that would not move it by `exact` errors; whether it would not.
 
-    The night that lies farthest from the solution is linearised there first: were every other night as far from linear,
-    the solution would move by no more than as many times what it moves. If that is `EXACT`, they stay as they are.
+    Those that lie farthest from the solution are linearised there first, the n-th of them to see: were each of the rest
+    as far from linear, how far would all together move the solution? As far as may be, and the rest stays as it is.
     """
-    solution = solved(data, laws)
+    solution, anew, enough = solved(data, laws), list[int](), False
     for _ in range(ROUNDS):
         values, sigma = _in_units(data, solution)
         # Candidates have no place in the model: their part stays first-order, at 0.
@@ -297,20 +302,22 @@ def _settled(
             u for u in np.argsort(-away, kind="stable")
             if away[u] > FAR and (data.nights[u].sha256, data.nights[u].number) in at_hand
         ]  # fmt: skip
-        nights = list(data.nights)
-        for count, u in enumerate(again):
+        if not again or (enough and not set(again) & set(anew)):
+            return data, solution, True
+        nights, anew, enough = list(data.nights), [], False
+        for number, u in enumerate(again, start=1):
+            seeing = number.bit_count() == 1  # the first, second, fourth …: solving costs time as well
+            before = _in_units(one := together(nights), solved(one, laws))[0] if seeing else values
             night = nights[u]
             made = maker.nights(
                 at_hand[night.sha256, night.number], dict(zip(data.names, values[u].tolist(), strict=True))
             )
             nights[u] = next(one for one in made if one.number == night.number)
-            if not count:
-                first = together(nights)
-                moved, _ = _in_units(first, there := solved(first, laws))
-                if np.all(len(again) * np.abs(moved - values) <= EXACT * sigma):
-                    return first, there, True
-        if not again:
-            return data, solution, True
+            anew.append(u)
+            if seeing:
+                moved = np.abs(_in_units(one := together(nights), solved(one, laws))[0] - before)
+                if enough := bool(np.all((len(again) - number) * moved <= exact * sigma)):
+                    break
         data = together(nights)
         solution = solved(data, laws)
     return data, solution, False
