@@ -488,7 +488,7 @@ def passes(count: int, start: int = 0) -> None:
             **more,
         )
 
-    stacked("COLD")
+    stacked("COLD", 2)
     used, memory, wall = stacked("WHOLE")
     print(
         f"  {count} nights: {used:.1f} s of CPU ({used / count:.2f} a night), {memory:.2f} GB, {wall:.1f} s",
@@ -496,7 +496,7 @@ def passes(count: int, start: int = 0) -> None:
     )
     one = dataclasses.replace(ObservingPlan(), grid=round(12 * count**0.5))
     write_calibration_set(folder / "one.fits", simulate(one, seed=1).calset)
-    command("refit", folder / "one.fits", "-o", folder / "COLD1")
+    command("refit", folder / "one.fits", "-o", folder / "COLD1")  # keeps its programs, as those above
     alike, size, _ = command("refit", folder / "one.fits", "-o", folder / "ONE")
     print(f"  one set as large: {alike:.1f} s of CPU, {size:.2f} GB: ratio {used / alike:.2f}", flush=True)
     rng = np.random.default_rng(start)
