@@ -475,17 +475,10 @@ def passes(count: int, start: int = 0) -> None:
     (folder / "laws.toml").write_text(f'[law."throughput.n?.p00"]\nper = "walk"\nrate = {RATE}\n')
     command("refit", files[0], "-o", folder / "RUN")
 
-    def stacked(output: str, **more: float) -> tuple[float, float, float]:
+    def stacked(output: str, nights: int = count, **more: float) -> tuple[float, float, float]:
+        like, laws = folder / "RUN", folder / "laws.toml"
         return command(
-            "stack",
-            *files,
-            "--like",
-            folder / "RUN",
-            "--laws",
-            folder / "laws.toml",
-            "-o",
-            folder / output,
-            **more,
+            "stack", *files[:nights], "--like", like, "--laws", laws, "-o", folder / output, **more
         )
 
     stacked("COLD", 2)
