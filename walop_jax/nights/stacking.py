@@ -316,7 +316,9 @@ def _settled(
             anew.append(u)
             if seeing:
                 moved = np.abs(_in_units(one := together(nights), solved(one, laws))[0] - before)
-                if enough := bool(np.all((len(again) - number) * moved <= exact * sigma)):
+                rest = np.full((len(nights), 1), len(again) - number)
+                rest[u] = min(rest[u], 1)  # what is its own moves with no other night
+                if enough := bool(np.all(rest * moved <= exact * sigma)):
                     break
         data = together(nights)
         solution = solved(data, laws)
