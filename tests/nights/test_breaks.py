@@ -1,5 +1,6 @@
 """Breaks in series of linear equations with a known truth: chances, dates, names, and nights that took no part."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -91,3 +92,21 @@ def test_a_step_a_bad_night_and_a_drift():
     assert drift.nights_needed > NIGHTS
     assert breaks.find(data, laws, ())[0] == ()
     assert solution.chi2 == pytest.approx(breaks.solved(data, laws).chi2)
+
+
+def test_a_model_holds_one_shape_of_an_effect():
+    """Where a law or the model has one shape of an effect, the others are no breaks."""
+    names = ("half1.wedge", "ghost.depth", "cut#0.angle", "cut#1.angle", "ghost#1.depth", "drift#1.rate")
+    one = series(0)
+    nights = tuple(
+        dataclasses.replace(
+            n, parameters=tuple(Parameter(name, "deg", "", "", 0.0) for name in names), candidates=4
+        )
+        for n in one.nights
+    )
+    data = dataclasses.replace(one, nights=nights, parameters=nights[0].parameters, candidates=4)
+    laws = (Law(), Law(), None, Law(("night",)), None, None)
+    assert breaks._other_shapes(data, laws) == [names.index("cut#0.angle"), names.index("ghost#1.depth")]
+    assert breaks._other_shapes(data, (Law(), Law(), None, None, None, None)) == [
+        names.index("ghost#1.depth")
+    ]

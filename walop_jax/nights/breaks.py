@@ -127,6 +127,13 @@ class Tried(NamedTuple):
             (scan.step_information, scan.once_information, np.diag(information)[None]),
         )
 
+    def without(self, barred: Sequence[int]) -> Tried:
+        """The same but for some parameters."""
+        known = tuple(one.copy() for one in self.information)
+        for one in known:
+            one[:, barred] = 0.0
+        return self._replace(information=known)
+
     def z(self, kind: int) -> Float[np.ndarray, "_ n"]:
         """Changes of a kind in their standard errors; 0 where the laws take them up."""
         known = self.information[kind]
@@ -220,11 +227,25 @@ def with_breaks(data: Together, laws: Sequence[Law | None], found: Sequence[Brea
     return tuple(changed)
 
 
+def _other_shapes(data: Together, laws: Sequence[Law | None]) -> list[int]:
+    """Candidates that are another shape of an effect that the model or a law has: a model holds one shape alone."""
+    taken: dict[str, str | None] = {}
+    for name, law, has in zip(data.names, laws, data.has_value, strict=True):
+        if has:
+            taken[part_of(name)] = None
+        elif law is not None:
+            taken.setdefault(part_of(name), shape_of(name))
+    return [
+        i for i, (name, has) in enumerate(zip(data.names, data.has_value, strict=True))
+        if not has and taken.get(part_of(name), shape_of(name)) != shape_of(name)
+    ]  # fmt: skip
+
+
 def _largest(
     data: Together, solution: Solution, chance: float, catalogue: Sequence[type[Effect]]
 ) -> Break | None:
     """The change that stands out most; None where chance does as well."""
-    tried = Tried.of(solution)
+    tried = Tried.of(solution).without(_other_shapes(data, solution.system.laws))
     kind, cell, i = at = tried.largest()
     z, scale = tried.z(kind), float(data.equations.scale[i])
     p_value = tried.chance(abs(float(z[cell, i])))
@@ -253,6 +274,13 @@ def _largest(
         separated_by=tuple(dict.fromkeys(said)) if rivals else (),
         nights_needed=_nights_needed(solution, at, rivals, best) if rivals else 0.0,
     )
+
+
+def shape_of(name: str) -> str:
+    """The shape of its effect that a candidate stands for, GROUP#MEMBER of its probes; "" where it has one alone."""
+    head, _, leaf = name.partition(".")
+    group, member = head.partition("#")[2], leaf.partition("#")[2]
+    return f"{group or 0}#{member or 0}" if group or member else ""
 
 
 def part_of(name: str) -> str:

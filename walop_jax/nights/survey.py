@@ -36,7 +36,7 @@ from walop_jax.model.effects import Effect
 from walop_jax.model.laws import Law
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.nights.algebra import Solution
-from walop_jax.nights.breaks import Break, part_of
+from walop_jax.nights.breaks import Break, part_of, shape_of
 from walop_jax.nights.changes import scan
 from walop_jax.nights.equations import Night, Together, night_numbers
 from walop_jax.science.star_errors import GOAL
@@ -277,7 +277,7 @@ class Survey(Displayed):
         taken: dict[str, str] = {}
         for p in candidates:
             # Names of parts, not `Parameter.part`, which files of nights do not hold.
-            part, shape = part_of(p.name), _shape_of(p.name)
+            part, shape = part_of(p.name), shape_of(p.name)
             if taken.setdefault(part, shape) != shape or part in self.reference.model.effect_names:
                 raise fail(
                     f"{p.name} is one shape of its effect, and the model has another",
@@ -417,13 +417,6 @@ class Survey(Displayed):
             rows,
             tuple(dict.fromkeys((*verdict.warnings, *self.advice))),
         )
-
-
-def _shape_of(name: str) -> str:
-    """The shape of its effect that a candidate stands for, GROUP#MEMBER of its probes; "" where it has one alone."""
-    head, _, leaf = name.partition(".")
-    group, member = head.partition("#")[2], leaf.partition("#")[2]
-    return f"{group or 0}#{member or 0}" if group or member else ""
 
 
 def _in_model(name: str) -> str:
