@@ -16,16 +16,17 @@ from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.io.text import json_text
+from walop_jax.likelihood.flux import Sharing
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.plans.could import Costs, Could
-from walop_jax.plans.exposures import candidates
+from walop_jax.plans.exposures import Illumination, candidates
 from walop_jax.plans.plan import PLANNED, plan_from
 from walop_jax.plans.wanted import FieldErrors, field_errors, wanted
 from walop_jax.reports.page import kind_of_run, render_other
 from walop_jax.science.field_accuracy import p_errors
 from walop_jax.science.star_errors import sample_stars
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, plan_text, read_plan
-from walop_jax.simulation.simulate import effect_from_text, simulate
+from walop_jax.simulation.simulate import PhotonNoise, effect_from_text, simulate
 
 ANGLES = 181
 SMALL = ObservingPlan(
@@ -67,6 +68,15 @@ def test_the_promise_is_the_error_of_a_fit(small, field):
     seen = np.isfinite(promised)
     assert 0.5 < seen.mean() < 1.0
     np.testing.assert_allclose(promised[seen], found[seen], rtol=0.02)
+
+
+def test_errors_have_the_floor_of_the_instrument():
+    """Two cameras, by hand: both errors 1 % of the mean of 6·10⁵ and 4·10⁵, the flux eliminated."""
+    light = Illumination(np.array([1e6]), PhotonNoise(1.0), 0.01, Sharing(None), 1.0)
+    information = light.information(np.array([[[0.6, 0.4]]]), np.array([[[[1.0], [-1.0]]]]))
+    assert information[0, 0, 0] == pytest.approx(2 * 200.0**2 - 40.0**2 / 0.52, rel=1e-12)
+    gain = light.gain(np.array([[[0.6], [0.4]]]), np.array([[[1.0], [-1.0], [1.0]]]))
+    assert gain == pytest.approx(information[0, 0], rel=1e-12)
 
 
 def test_a_plan_is_proven_and_reads_back(planned, tmp_path):

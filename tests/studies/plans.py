@@ -33,6 +33,8 @@ from scipy.optimize import linprog
 sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
 import walop_jax as walop  # noqa: E402
+from walop_jax.data.records import CalibrationSet  # noqa: E402
+from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
 from walop_jax.diagnosis.policy import POLICY  # noqa: E402
 from walop_jax.diagnosis.search import try_effect  # noqa: E402
 from walop_jax.fit.model_file import base_model  # noqa: E402
@@ -99,19 +101,32 @@ def linear_fit(
     """By how much the first step of a fit from the truth is wrong; by how many σ a full fit differs from it."""
     instrument = found.model.instrument(found.values[draw])
     simulated = simulate(plan, seed=seed, instrument=instrument, steady=True)
-    model = base_model(simulated.calset, plan.design, throughput_degree=plan.throughput_degree)
+    calset = scattered(simulated.calset, instrument.cameras.floor, seed)
+    model = base_model(calset, plan.design, throughput_degree=plan.throughput_degree)
     truth = truth_values(simulated.truth)
     values = np.array([truth[name] for name in model.names])
-    there = Likelihood.of(simulated.calset, model).expand(values)
+    there = Likelihood.of(calset, model).expand(values)
     size = np.sqrt(np.diag(there.matrix))
     inverse = np.linalg.pinv(there.matrix / np.outer(size, size), rcond=1e-13, hermitian=True)
     step = -(inverse @ (there.gradient / size)) / size
     apart = 0.0
     if seed == 0:
-        fit = refit(simulated.calset, model)
+        fit = refit(calset, model)
         sigma = np.sqrt(np.diag(inverse)) / size
         apart = float(np.max(np.abs((fit.values - values)[list(model.free)] - step) / sigma))
     return {model.names[i]: s for i, s in zip(model.free, step, strict=True)}, apart
+
+
+def scattered(calset: CalibrationSet, floor: float, seed: int) -> CalibrationSet:
+    """A set that scatters as a fit takes it to, where errors have a floor: what the model lacks is no photon noise."""
+    if floor == 0.0:
+        return calset
+    block = calset.intensities.block(0, len(calset.points))
+    least = floor * block.counts.mean(axis=2, keepdims=True)
+    more = np.sqrt(np.clip(least**2 - block.sigma**2, 0.0, None))
+    counts = block.counts + more * np.random.default_rng([seed, 1]).normal(size=block.counts.shape)
+    block = dataclasses.replace(block, counts=counts)
+    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
 
 
 def errors() -> None:

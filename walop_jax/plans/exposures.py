@@ -134,7 +134,8 @@ def candidates(
         values[:, i] = model.parameters[i].start
     likelihood = Likelihood.of(calset, model)
     factor, flux, exptime = _factor(could.plan, few), fluxes(plan, None), plan.exposures().exptime
-    noise, shared = PhotonNoise(plan.read_noise), Sharing(sharing(model.template, likelihood.plan).cameras)
+    noise, floor = PhotonNoise(plan.read_noise), model.template.cameras.floor
+    shared = Sharing(sharing(model.template, likelihood.plan).cameras)
     responses = []
     for number, one in enumerate(values):
         tell(f"expected counts of instrument {number + 1} of {draws}")
@@ -147,7 +148,7 @@ def candidates(
         for rows in [slice(start, stop)] if polarised else [slice(i, i + 1) for i in range(start, stop)]:
             at = likelihood.used[:, rows.start]
             there = flux[at, rows.start] * choice.seconds / exptime[rows.start]
-            light = Illumination(there, noise, shared, 1.0 if choice.kind == "standard" else factor)
+            light = Illumination(there, noise, floor, shared, 1.0 if choice.kind == "standard" else factor)
             counts = tuple((unit[at, rows], slopes[at, rows]) for unit, slopes in responses)
             if polarised:
                 families.append(Polarised(choice, light, counts, _orders(choice, angles), cost))
@@ -274,20 +275,29 @@ def _interpolating(angle: Float[np.ndarray, " s"], nodes: int) -> Float[np.ndarr
 class Illumination(NamedTuple):
     """How much light there is in an exposure: `flux` (electron) at its points, noise, what shares a flux.
 
-    `scale` leads from these points to those of the plan.
+    No error is smaller than `floor`, a share of the mean counts of all cameras, as in a fit (`Cameras.floor`). `scale`
+    leads from these points to those of the plan.
     """
 
     flux: Float[np.ndarray, " p"]
     noise: PhotonNoise
+    floor: float
     shared: Sharing
     scale: float
+
+    def sigma(self, counts: Float[np.ndarray, "p a b"], cameras: int) -> Float[np.ndarray, "p a b"]:
+        """Standard errors of counts; `cameras` is the axis of these."""
+        found = self.noise.sigma(counts)
+        if self.floor == 0.0:
+            return found
+        return np.maximum(found, self.floor * counts.mean(axis=cameras, keepdims=True))
 
     def information(
         self, unit: Float[np.ndarray, "p s k"], slopes: Float[np.ndarray, "p s k f"]
     ) -> Float[np.ndarray, "s f f"]:
         """JᵀJ of exposures, from counts of unit flux and their derivatives."""
         flux = self.flux[:, None, None]
-        weight = 1.0 / self.noise.sigma(flux * unit)
+        weight = 1.0 / self.sigma(flux * unit, 2)
         columns = np.moveaxis(slopes * (flux * weight)[..., None], -1, 0)
         projected = project_flux(columns, unit * weight, False, self.shared)
         flat = projected.transpose(2, 0, 1, 3).reshape(unit.shape[1], len(projected), -1)
@@ -302,7 +312,7 @@ class Illumination(NamedTuple):
         Σ a², the sums over cameras with a flux in common (`likelihood.flux`).
         """
         flux, count = self.flux[:, None, None], unit.shape[1]
-        weight = 1.0 / self.noise.sigma(flux * unit) ** 2
+        weight = 1.0 / self.sigma(flux * unit, 1) ** 2
         both = unit * weight
         together = np.ones((count, count)) if self.shared.cameras is None else self.shared.cameras
         share = both / (together @ (unit * both))
