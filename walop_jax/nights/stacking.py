@@ -307,7 +307,9 @@ def _settled(
         nights, anew, enough = list(data.nights), [], False
         for number, u in enumerate(again, start=1):
             seeing = number.bit_count() == 1  # the first, second, fourth …: solving costs time as well
-            before = _in_units(one := together(nights), solved(one, laws))[0] if seeing else values
+            before = values
+            if seeing and number > 1:
+                before, _ = _in_units(one := together(nights), solved(one, laws))
             night = nights[u]
             made = maker.nights(
                 at_hand[night.sha256, night.number], dict(zip(data.names, values[u].tolist(), strict=True))
@@ -315,10 +317,10 @@ def _settled(
             nights[u] = next(one for one in made if one.number == night.number)
             anew.append(u)
             if seeing:
-                moved = np.abs(_in_units(one := together(nights), solved(one, laws))[0] - before)
+                after, _ = _in_units(one := together(nights), solved(one, laws))
                 rest = np.full((len(nights), 1), len(again) - number)
                 rest[u] = min(rest[u], 1)  # what is its own moves with no other night
-                if enough := bool(np.all(rest * moved <= exact * sigma)):
+                if enough := bool(np.all(rest * np.abs(after - before) <= exact * sigma)):
                     break
         data = together(nights)
         solution = solved(data, laws)
