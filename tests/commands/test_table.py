@@ -62,7 +62,11 @@ def test_defaults_are_those_of_what_is_called():
     def default(name: str, key: str) -> Any:
         return inspect.signature(FUNCTIONS[name]).parameters[key].default
 
-    assert default("diagnose", "minutes") == POLICY.minutes
+    assert default("diagnose", "minutes") is None  # those of the policy, which the help names
+    assert (
+        f"default: {POLICY.minutes:g}; {POLICY.minutes_far_off:g}"
+        in FUNCTIONS["diagnose"].command.options["minutes"].help
+    )
     assert default("compare", "filter") == default("trace", "filter") == DEFAULT_FILTER
     assert default("clip", "sigma") == outliers.BEYOND
     assert default("apply", "debias") == ESTIMATORS[0]
