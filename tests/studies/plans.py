@@ -40,6 +40,7 @@ from walop_jax.diagnosis.search import try_effect  # noqa: E402
 from walop_jax.fit.model_file import base_model  # noqa: E402
 from walop_jax.fit.refit import refit  # noqa: E402
 from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
+from walop_jax.model.cameras import with_floor  # noqa: E402
 from walop_jax.model.specification import effect_context  # noqa: E402
 from walop_jax.plans.could import Could  # noqa: E402
 from walop_jax.plans.exposures import Candidates, Polarised, candidates  # noqa: E402
@@ -122,8 +123,7 @@ def scattered(calset: CalibrationSet, floor: float, seed: int) -> CalibrationSet
     if floor == 0.0:
         return calset
     block = calset.intensities.block(0, len(calset.points))
-    least = floor * block.counts.mean(axis=2, keepdims=True)
-    more = np.sqrt(np.clip(least**2 - block.sigma**2, 0.0, None))
+    more = np.sqrt(with_floor(block.sigma, block.counts, floor) ** 2 - block.sigma**2)
     counts = block.counts + more * np.random.default_rng([seed, 1]).normal(size=block.counts.shape)
     block = dataclasses.replace(block, counts=counts)
     return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))

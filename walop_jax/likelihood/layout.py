@@ -22,6 +22,7 @@ from walop_jax.data.records import Block, CalibrationSet, Exposures, Intensities
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.engine import PointData
 from walop_jax.model import light
+from walop_jax.model.cameras import with_floor
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
@@ -235,9 +236,7 @@ class PointReader:
     def point_data(self, block: Block) -> PointData:
         """A block of measurements as the engine wants it."""
         band = np.take_along_axis(self.plan.band_of[None], block.source[:, :, None] + 1, axis=2)[:, :, 0]
-        sigma = block.sigma
-        if self.floor > 0.0:
-            sigma = np.maximum(sigma, self.floor * block.counts.mean(axis=2, keepdims=True))
+        sigma = with_floor(block.sigma, block.counts, self.floor)
         weight = np.where(block.used[:, :, None], 1.0 / np.where(sigma > 0, sigma, 1.0), 0.0)
         opposite = self.sky_polarisation(-block.x, -block.y) if self.mirrored else None
         return PointData(

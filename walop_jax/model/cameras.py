@@ -154,3 +154,10 @@ class Cameras(Component):
         for a, b in self.pairs:
             other[a], other[b] = b, a
         return tuple(other)
+
+
+def with_floor(
+    sigma: Float[np.ndarray, "p a b"], counts: Float[np.ndarray, "p a b"], floor: float, cameras: int = 2
+) -> Float[np.ndarray, "p a b"]:
+    """Standard errors of counts, none smaller than `Cameras.floor` allows; `cameras` is the axis of these."""
+    return sigma if floor == 0.0 else np.maximum(sigma, floor * counts.mean(axis=cameras, keepdims=True))

@@ -29,6 +29,7 @@ from walop_jax.likelihood import engine
 from walop_jax.likelihood.flux import Sharing, project_flux, sharing
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
 from walop_jax.model import light
+from walop_jax.model.cameras import with_floor
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects import Effect, effect_by_name
 from walop_jax.model.instrument import Instrument
@@ -287,10 +288,7 @@ class Illumination(NamedTuple):
 
     def sigma(self, counts: Float[np.ndarray, "p a b"], cameras: int) -> Float[np.ndarray, "p a b"]:
         """Standard errors of counts; `cameras` is the axis of these."""
-        found = self.noise.sigma(counts)
-        if self.floor == 0.0:
-            return found
-        return np.maximum(found, self.floor * counts.mean(axis=cameras, keepdims=True))
+        return with_floor(self.noise.sigma(counts), counts, self.floor, cameras)
 
     def information(
         self, unit: Float[np.ndarray, "p s k"], slopes: Float[np.ndarray, "p s k f"]
