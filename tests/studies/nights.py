@@ -456,7 +456,7 @@ def as_files(folder: Path, count: int, start: int) -> list[str]:
     said.append(f"filter_shift from night {int(START + days[exchanged])}")
     for u, day in enumerate(days):
         plan = dataclasses.replace(ObservingPlan(), mjd=START + float(day))
-        there = model.instrument(truth[u] * 1.0)
+        there = model.instrument(truth[u])
         context = effect_context(model.template, plan.exposures())
         shifted = (effect_from_text("filter_shift=0.001", context),) if u >= exchanged else ()
         calset = simulate(

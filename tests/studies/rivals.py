@@ -356,27 +356,35 @@ class GroupPath:
                 return
 
 
-def _screened(groups: Groups, z: np.ndarray, scene: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Groups that take part, their columns and the penalties of a path."""
-    strength = np.where(groups.allowed(scene), groups.strength(z), 0.0)
-    chosen = np.sort(np.argsort(-strength)[:SCREENED])
-    top = strength.max()
-    return (
-        chosen,
-        groups.columns(chosen),
-        np.geomspace(top, max(FINEST * top, min(LEAST, 0.9 * top)), LAMBDAS),
-    )
+Screened = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, GroupPath]
 
 
-def _validated(groups: Groups, gamma: float | None) -> Callable[[int], Answer]:
+def _alarmed(groups: Groups, choose: Callable[[Screened], np.ndarray]) -> Callable[[int], Answer]:
+    """Nothing below the alarm; else the groups that `choose` takes of those that take part.
+
+    It is given the residuals and their products with all columns, the groups, their columns, penalties and path.
+    """
+
     def answer(scene: int) -> Answer:
         r = groups.bench.residual(scene)
         z = groups.x.T @ r
-        chosen, at, lambdas = _screened(groups, z, scene)
-        path, block = GroupPath(groups, chosen), np.ix_(at, at)
-        score = float(groups.strength(z)[groups.allowed(scene)].max())
-        if score < groups.alarm:
-            return {"score": score, "told": [], "complete": True}
+        strength = np.where(groups.allowed(scene), groups.strength(z), 0.0)
+        top = strength.max()
+        if top < groups.alarm:
+            return {"score": float(top), "told": [], "complete": True}
+        chosen = np.sort(np.argsort(-strength)[:SCREENED])
+        lambdas = np.geomspace(top, max(FINEST * top, min(LEAST, 0.9 * top)), LAMBDAS)
+        path = GroupPath(groups, chosen)
+        inside = choose((r, z, chosen, groups.columns(chosen), lambdas, path))
+        return {"score": float(top)} | groups.told(r, chosen[inside], scene)
+
+    return answer
+
+
+def _validated(groups: Groups, gamma: float | None) -> Callable[[int], Answer]:
+    def choose(screened: Screened) -> np.ndarray:
+        r, z, _, at, lambdas, path = screened
+        block = np.ix_(at, at)
         errors = np.zeros((FOLDS, LAMBDAS))
         for k, rows in enumerate(groups.folds):
             own = groups.x[np.ix_(rows, at)].T @ r[rows]
@@ -389,10 +397,9 @@ def _validated(groups: Groups, gamma: float | None) -> Callable[[int], Answer]:
         spread = (errors - errors[:, [np.argmin(mean)]]).std(axis=0, ddof=1) / np.sqrt(FOLDS)
         best = int(np.flatnonzero(mean <= mean.min() + spread)[0])
         *_, b = path(groups.gram[block], z[at], lambdas[: best + 1], gamma)
-        inside = np.add.reduceat(b**2, path.ptr[:-1]) > 0
-        return {"score": score} | groups.told(r, chosen[inside], scene)
+        return np.flatnonzero(np.add.reduceat(b**2, path.ptr[:-1]) > 0)
 
-    return answer
+    return _alarmed(groups, choose)
 
 
 def lasso(bench: Bench) -> Callable[[int], Answer]:
@@ -410,14 +417,9 @@ def stability(bench: Bench) -> Callable[[int], Answer]:
     groups = Groups(bench)
     grams = [groups.x[rows].T @ groups.x[rows] for rows in groups.halves]
 
-    def answer(scene: int) -> Answer:
-        r = bench.residual(scene)
-        z = groups.x.T @ r
-        chosen, at, lambdas = _screened(groups, z, scene)
-        path, block = GroupPath(groups, chosen), np.ix_(at, at)
-        score = float(groups.strength(z)[groups.allowed(scene)].max())
-        if score < groups.alarm:
-            return {"score": score, "told": [], "complete": True}
+    def choose(screened: Screened) -> np.ndarray:
+        r, _, chosen, at, lambdas, path = screened
+        block = np.ix_(at, at)
         votes = np.zeros((len(groups.halves), len(chosen)), bool)
         for k, rows in enumerate(groups.halves):
             *_, b = path(
@@ -434,9 +436,9 @@ def stability(bench: Bench) -> Callable[[int], Answer]:
             if open_[g] and votes[:, g].any() and votes[:, alike[g]].any(axis=1).mean() >= VOTES:
                 kept.append(g)
                 open_ &= ~alike[g]
-        return {"score": score} | groups.told(r, chosen[np.array(kept, int)], scene)
+        return np.array(kept, int)
 
-    return answer
+    return _alarmed(groups, choose)
 
 
 # ------------------------------------------------------------------------ C and D: shapes over the field and the angle

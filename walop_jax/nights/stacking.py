@@ -316,14 +316,15 @@ def _settled(
             )
             nights[u] = next(one for one in made if one.number == night.number)
             anew.append(u)
+            if seeing or number == len(again):
+                data = together(nights)
+                solution = solved(data, laws)
             if seeing:
-                after, _ = _in_units(one := together(nights), solved(one, laws))
+                after, _ = _in_units(data, solution)
                 rest = np.full((len(nights), 1), len(again) - number)
                 rest[u] = min(rest[u], 1)  # what is its own moves with no other night
                 if enough := bool(np.all(rest * np.abs(after - before) <= exact * sigma)):
                     break
-        data = together(nights)
-        solution = solved(data, laws)
     return data, solution, False
 
 
