@@ -131,7 +131,7 @@ def test_every_library_is_declared():
 def test_every_library_is_locked_with_its_hashes():
     """A version and the hashes of its files for every dependency, within the bounds of pyproject.toml."""
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
-    text = (PACKAGE.parent / "requirements.lock").read_text()
+    text = (PACKAGE.parent / ".ci" / "requirements.lock").read_text()
     locked = dict(
         re.findall(r"^([\w.-]+)==([\w.]+)[^\n]*\\\n    --hash=sha256:[0-9a-f]{64}", text, re.MULTILINE)
     )
