@@ -272,10 +272,9 @@ def base_model(
 
 def _gauges(model: Model, flux_known: bool) -> list[str]:
     """What the fluxes take up: the scale of the throughput, or all that the cameras of an arm have in common."""
-    cameras = model.template.cameras
-    if cameras.split:
-        first = tuple(f"throughput.n{arm[0]}." for arm in cameras.arms)
-        return [name for name in model.names if name.startswith(first)]
+    units = tuple(f"throughput.n{camera}." for camera in model.template.cameras.units)
+    if units:
+        return [name for name in model.names if name.startswith(units)]
     return [] if flux_known else [GAUGE]
 
 

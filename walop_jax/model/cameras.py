@@ -133,6 +133,11 @@ class Cameras(Component):
         return len(self.arms) if self.split else 1
 
     @property
+    def units(self) -> tuple[int, ...]:
+        """The cameras that those of their arm are compared with: of a `split` arm only ratios can be known."""
+        return tuple(arm[0] for arm in self.arms) if self.split else ()
+
+    @property
     def pairs(self) -> tuple[tuple[int, int], ...]:
         """Cameras of the arms that have two: each such arm has a row of the instrument matrix."""
         return tuple((arm[0], arm[1]) for arm in self.arms if len(arm) > 1)

@@ -63,7 +63,8 @@ def draw_instrument(model: Model, rng: np.random.Generator) -> Instrument:
 
     Every parameter with a prior is drawn from it (efficiencies of analysers stop at 1), tied ones follow; throughputs
     are drawn as smooth maps: levels 0.5 ± 0.03, structure over the field of 2 % rms. The scale that all cameras
-    share is a gauge, so the constant of camera N0 is 0.5. What else has no prior stays at its start value.
+    share is a gauge, so the constant of camera N0 is 0.5; of arms whose share of the light is unknown the first camera
+    is 0.5 all over. What else has no prior stays at its start value.
     """
     values = model.start
     for i, p in enumerate(model.parameters):
@@ -94,6 +95,8 @@ def _throughput(template: Instrument, rng: np.random.Generator) -> Float[np.ndar
     # The mean square of P_i P_j over the field is 1 / ((2i + 1)(2j + 1)).
     relative = STRUCTURE * shape * share * np.sqrt(np.prod(2 * terms + 1, axis=1))
     relative[:, 0] = 1.0
+    units = list(template.cameras.units)
+    level[units], relative[units, 1:] = level[0], 0.0
     return 0.5 * level[:, None] / level[0] * relative
 
 
