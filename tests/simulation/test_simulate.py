@@ -187,6 +187,14 @@ def test_throughputs_have_two_per_cent_of_structure():
     assert np.sqrt(np.mean(np.square(relative))) == pytest.approx(0.02, rel=0.15)
 
 
+def test_arms_with_a_flux_of_their_own_are_drawn_by_the_ratio_of_their_cameras():
+    """Two maps of degree 4 have a ratio of no degree at all, which no fit could follow."""
+    model = make_model("WALOP-NORTH", nominal_instrument("WALOP-NORTH"))
+    drawn = np.asarray(draw_instrument(model, np.random.default_rng(5)).throughput.coefficients)
+    np.testing.assert_array_equal(drawn[[0, 2]], np.eye(1, drawn.shape[1])[[0, 0]] * 0.5)
+    assert (drawn[[1, 3]] != 0.0).all()
+
+
 def test_tied_parameters_are_built_alike():
     model = make_model("WALOP-SOUTH", nominal_instrument())
     model = model.change("half2.plate.mgf2", tie="half1.plate.mgf2")
