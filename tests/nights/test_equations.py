@@ -14,7 +14,7 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.nights import equations, night_file
-from walop_jax.nights.equations import night_equations, night_numbers, together
+from walop_jax.nights.equations import night_equations, night_numbers, together, with_candidates_of
 from walop_jax.simulation.simulate import simulate
 
 SAAO = Site("SAAO", -32.4, 20.8, 1798.0)
@@ -132,3 +132,35 @@ def test_clocks_in_local_time_are_refused(two, hours):
     local = dataclasses.replace(e, mjd=e.mjd + hours / 24.0)
     with pytest.raises(DataError, match=rf"is [+-]{abs(hours):.2f} h from UTC"):
         equations.check_clock(local, two[0].site)
+
+
+def test_candidates_follow_a_night_that_is_linearised_anew(nights):
+    """In a linear problem, r(θ) = r₀ + J θ + C c, they do so exactly; elsewhere no information is made up."""
+    rng, (n, k) = np.random.default_rng(0), (len(nights[0].names), nights[0].candidates)
+    cut = n - k
+    columns, r = rng.normal(size=(3 * n, n)), rng.normal(size=3 * n)
+    columns[:, cut] = columns[:, 0] + 1e-6 * columns[:, cut]  # one that is nearly a parameter
+    moved = rng.normal(size=cut)
+
+    def at(theta, J, candidates):
+        left, some = r + J[:, :cut] @ theta, J[:, : cut + candidates]
+        return dataclasses.replace(
+            nights[0],
+            parameters=nights[0].parameters[: cut + candidates],
+            candidates=candidates,
+            reference=np.append(theta, np.zeros(candidates)),
+            gradient=some.T @ left,
+            matrix=some.T @ some,
+        )
+
+    before, there = at(np.zeros(cut), columns, k), at(moved, columns, k)
+    found = with_candidates_of(at(moved, columns, 0), before)
+    np.testing.assert_allclose(found.matrix, there.matrix, rtol=1e-9, atol=1e-9 * there.matrix.max())
+    np.testing.assert_allclose(
+        found.gradient, there.gradient, rtol=1e-8, atol=1e-8 * np.abs(there.gradient).max()
+    )
+    bent = columns * (1.0 + 0.01 * rng.normal(size=columns.shape))
+    size = np.sqrt(np.diag(before.matrix))
+    found = with_candidates_of(at(moved, bent, 0), before)
+    assert np.linalg.eigvalsh(found.matrix / np.outer(size, size))[0] > -1e-12
+    np.testing.assert_allclose(found.matrix[:cut, :cut], (bent.T @ bent)[:cut, :cut], rtol=1e-12)

@@ -215,17 +215,21 @@ def night_equations(
     model: Model,
     values: Vector | Mapping[str, float],
     changes: Candidates | None = None,
+    *,
+    number: int | None = None,
 ) -> list[Night]:
     """The nights of a set, linearised at values of the parameters: a full vector, or by name (others: start values).
 
-    `changes` are the candidates (None: `candidates_of` each night). Of sets too large for a table of derivatives none
-    are kept. Raises `DataError` as `split` does.
+    `changes` are the candidates (None: `candidates_of` each night), `number` the only night that is asked for. Of sets
+    too large for a table of derivatives no candidates are kept. Raises `DataError` as `split` does.
     """
     if isinstance(values, Mapping):
         values = np.array([values.get(p.name, p.start) for p in model.parameters])
     source = ", ".join(str(entry.path) for entry in calset.inputs) or calset.origin
     found = []
-    for number, some in split(calset):
+    for evening, some in split(calset):
+        if number not in (None, evening):
+            continue
         likelihood = Likelihood.of(some, model)
         if likelihood.layout.large:
             terms, _ = likelihood.data_terms(values)
@@ -241,7 +245,7 @@ def night_equations(
             Night(
                 instrument=model.name,
                 model=model_hash(model),
-                number=number,
+                number=evening,
                 begin=float(e.mjd.min()),
                 end=float(e.mjd.max()),
                 mjd=float(e.mjd.mean()),
@@ -259,6 +263,31 @@ def night_equations(
             )
         )
     return found
+
+
+def with_candidates_of(night: Night, before: Night) -> Night:
+    """A night that was linearised anew without candidates, with those it had `before`.
+
+    A candidate is C = A J + R with R beyond the parameters, Jᵀ R = 0. A, RᵀR and, to first order, Rᵀr are the same at
+    both places, so that only A J is to follow J: columns of candidates cost six times as much as all others.
+    """
+    cut = len(before.parameters) - before.candidates
+    if not before.candidates or night.candidates or night.names != before.names[:cut]:
+        return night
+    known, cross, own = before.matrix[:cut, :cut], before.matrix[cut:, :cut], before.matrix[cut:, cut:]
+    size = np.sqrt(np.where(np.diag(known) > 0.0, np.diag(known), 1.0))
+    inverse = np.linalg.pinv(known / np.outer(size, size), rcond=1e-13, hermitian=True) / np.outer(size, size)
+    along = cross @ inverse
+    beyond, pull = own - along @ cross.T, before.gradient[cut:] - along @ before.gradient[:cut]
+    slope = along @ night.matrix
+    return dataclasses.replace(
+        night,
+        parameters=before.parameters,
+        candidates=before.candidates,
+        reference=np.append(night.reference, before.reference[cut:]),
+        gradient=np.append(night.gradient, along @ night.gradient + pull),
+        matrix=np.block([[night.matrix, slope.T], [slope, slope @ along.T + beyond]]),
+    )
 
 
 def data_hash(calset: CalibrationSet) -> str:

@@ -16,7 +16,7 @@ import dataclasses
 import hashlib
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
 
@@ -50,6 +50,7 @@ from walop_jax.nights.equations import (
     model_hash,
     night_equations,
     together,
+    with_candidates_of,
 )
 from walop_jax.nights.night_file import NIGHTS, nights_in, read_nights, write_nights
 from walop_jax.nights.survey import Survey
@@ -95,32 +96,59 @@ class _Maker:
     folder: Path | None
     candidates: dict[tuple[str, ...], Candidates] = dataclasses.field(default_factory=dict)
 
-    def nights(self, data: _Data, values: Mapping[str, float] | None = None) -> list[Night]:
-        """The nights of data, linearised at `values` by name; None: as they are kept, or at those of `like`."""
-        like, place = self.like, None
-        if like is None:
+    def nights(self, data: _Data) -> list[Night]:
+        """The nights of data, as they are kept or linearised at the values of `like`, without candidates."""
+        if self.like is None:
             raise fail(
                 f"{data.read().origin} is a set, and nothing says at which values to linearise it",
                 advice="give --like RUN, a fit of the same model (like= in Python)",
             )
-        if self.folder is not None:
-            named = f"{data.sha256} {model_hash(data.model or like.model)}"
-            place = self.folder / f"night-{hashlib.sha256(named.encode()).hexdigest()[:16]}.fits"
-            if values is None and place.exists():
-                return read_nights(place)
+        place = self._place(data, self.like)
+        if place is not None and place.exists():
+            return read_nights(place)
+        values = dict(zip(self.like.model.names, self.like.values.tolist(), strict=True))
+        return self._kept(data, self._made(data, values, {}))
+
+    def again(self, data: _Data, night: Night, values: Mapping[str, float]) -> Night:
+        """A night linearised at other values; its candidates follow (`with_candidates_of`)."""
+        (made,) = self._made(data, values, {}, night.number)
+        return with_candidates_of(made, night)
+
+    def complete(self, data: _Data, values: Mapping[int, Mapping[str, float]]) -> list[Night]:
+        """Nights of data with candidates, each linearised at its own values."""
+        found = [night for number, own in values.items() for night in self._made(data, own, None, number)]
+        return self._kept(data, found)
+
+    def names(self) -> Iterator[str]:
+        """Names of all candidates that may be asked for."""
+        for known in self.candidates.values():
+            yield from known
+
+    def _made(
+        self, data: _Data, values: Mapping[str, float], known: Candidates | None, number: int | None = None
+    ) -> list[Night]:
+        assert self.like is not None
         calset = data.read()
-        model = data.model or model_like(calset, like.model)
-        if values is None:
-            values = dict(zip(like.model.names, like.values.tolist(), strict=True))
+        model = data.model or model_like(calset, self.like.model)
         # Candidates depend on cameras, standards and the effects of the model alone: listing them takes a while.
         key = (*model.names, *model.effect_names)
         if key not in self.candidates:
             self.candidates[key] = candidates_of(model, calset.exposures, model.catalogue)
-        found = night_equations(calset, model, values, self.candidates[key])
-        if place is not None:
+        known = self.candidates[key] if known is None else known
+        return night_equations(calset, model, values, known, number=number)
+
+    def _place(self, data: _Data, like: Calibration) -> Path | None:
+        if self.folder is None:
+            return None
+        named = f"{data.sha256} {model_hash(data.model or like.model)}"
+        return self.folder / f"night-{hashlib.sha256(named.encode()).hexdigest()[:16]}.fits"
+
+    def _kept(self, data: _Data, nights: list[Night]) -> list[Night]:
+        assert self.like is not None
+        if (place := self._place(data, self.like)) is not None:
             place.parent.mkdir(parents=True, exist_ok=True)
-            write_nights(place, found, overwrite=True)
-        return found
+            write_nights(place, nights, overwrite=True)
+        return nights
 
 
 def stack(
@@ -166,11 +194,14 @@ def stack(
         tables = parse_toml(read_text(laws)).get("law", {})
     elif laws is None and maker.like is not None:
         tables = maker.like.model.laws
-    chosen = laws_of_all(data, tables)
+    chosen = laws_of_all(data, tables, maker.names())
     _check_filters(data, chosen)
     breaks = [one for some in opened for one in some.breaks]
     try:
         looking = find and len({night.number for night in data.nights}) > 2
+        data, solution, _ = _settled(data, chosen, at_hand, maker, ENOUGH)
+        data = _completed(data, solution, at_hand, maker, tell)
+        chosen = laws_of_all(data, tables)
         data, solution, settled = _settled(data, chosen, at_hand, maker, ENOUGH if looking else EXACT)
         if looking:
             found, chosen, solution = breaks_of(data, chosen, catalogue)
@@ -203,11 +234,17 @@ def events_of(table: Any) -> list[tuple[float, str]]:
     return list(zip(mjd.tolist(), map(str, words), strict=True))
 
 
-def laws_of_all(data: Together, laws: Mapping[str, Law | Mapping[str, Any]]) -> tuple[Law | None, ...]:
-    """A law for every parameter and candidate of nights (None: absent). ValueError for what is wrong in `laws`."""
+def laws_of_all(
+    data: Together, laws: Mapping[str, Law | Mapping[str, Any]], coming: Iterable[str] = ()
+) -> tuple[Law | None, ...]:
+    """A law for every parameter and candidate of nights (None: absent). ValueError for what is wrong in `laws`.
+
+    Laws of candidates that are yet to be computed, `coming`, are none of that.
+    """
     tables = {name: law.document() if isinstance(law, Law) else law for name, law in laws.items()}
     cut = len(data.names) - data.candidates
-    return resolved(laws_of(tables), data.names[:cut], data.names[cut:])
+    candidates = dict.fromkeys((*data.names[cut:], *coming))
+    return resolved(laws_of(tables), data.names[:cut], tuple(candidates))[: len(data.names)]
 
 
 def writers(survey: Survey) -> dict[str, Callable[[Path], object]]:
@@ -310,11 +347,8 @@ def _settled(
             before = values
             if seeing and number > 1:
                 before, _ = _in_units(one := together(nights), solved(one, laws))
-            night = nights[u]
-            made = maker.nights(
-                at_hand[night.sha256, night.number], dict(zip(data.names, values[u].tolist(), strict=True))
-            )
-            nights[u] = next(one for one in made if one.number == night.number)
+            night, there = nights[u], dict(zip(data.names, values[u].tolist(), strict=True))
+            nights[u] = maker.again(at_hand[night.sha256, night.number], night, there)
             anew.append(u)
             if seeing or number == len(again):
                 data = together(nights)
@@ -326,6 +360,28 @@ def _settled(
                 if enough := bool(np.all(rest * np.abs(after - before) <= exact * sigma)):
                     break
     return data, solution, False
+
+
+def _completed(
+    data: Together,
+    solution: Solution,
+    at_hand: Mapping[tuple[str, int], _Data],
+    maker: _Maker,
+    tell: Callable[[str], None],
+) -> Together:
+    """The nights with candidates: those that have none yet are linearised at the solution, file by file."""
+    values, _ = _in_units(data, solution)
+    of_file: dict[str, dict[int, Mapping[str, float]]] = {}
+    for night, own in zip(data.nights, values.tolist(), strict=True):
+        if not night.candidates and (night.sha256, night.number) in at_hand:
+            there = dict(zip(data.names, own, strict=True))
+            of_file.setdefault(night.sha256, {})[night.number] = there
+    nights = {(night.sha256, night.number): night for night in data.nights}
+    for k, (sha256, of_nights) in enumerate(of_file.items()):
+        tell(f"{k + 1} of {len(of_file)}, with what may have changed")
+        one = at_hand[sha256, next(iter(of_nights))]
+        nights |= {(sha256, night.number): night for night in maker.complete(one, of_nights)}
+    return together(list(nights.values())) if of_file else data
 
 
 def _in_units(
