@@ -270,10 +270,23 @@ class Evidence:
             self._p(table[probe.name]) < self.policy.alarm for probe in probes if table[probe.name].testable
         )
 
-    def is_worth_telling(self, effect: type[Effect], evidence: float, left: float, *, noise: bool) -> bool:
+    def _followed(self, item: Ranked) -> float:
+        """What further sentences would be worth behind one: a pattern of many numbers may hold several at once."""
+        gain, state = 0.0, self
+        for _ in range(1, self.policy.most_together):
+            state = state.joined(item)
+            if not state.significant_sentences:
+                break
+            item = state.significant_sentences[0]
+            gain += item.log_bayes
+        return gain
+
+    def is_worth_telling(
+        self, effect: type[Effect], evidence: float, left: float, *, noise: bool, item: Ranked | None = None
+    ) -> bool:
         """Whether an addition explains a good part of what is missing, and patterns without a name do not do better.
 
-        `left` is its χ², `noise` says whether that is what noise alone would leave.
+        `left` is its χ², `noise` says whether that is what noise alone would leave, `item` is its linear step.
         """
         evidence /= self.floor**2
         if evidence <= self.least_evidence:
@@ -284,7 +297,10 @@ class Evidence:
         if noise and not explains(self.chi2, self.dof):
             return True
         probes = [probe for probe in self.probes if probe.effect is effect]
-        return self.stands(probes, evidence) if probes or effect is Described else True
+        if self.stands(probes, evidence) if probes or effect is Described else True:
+            return True
+        more = self._followed(item) if effect is Described and item is not None else 0.0
+        return more > 0.0 and self.stands(probes, evidence + more / self.floor**2)
 
     def joined(self, item: Ranked, known: ScoreSpace | None = None) -> Evidence:
         """The evidence once a candidate has joined the base, by a linear step; `known` is the space of that."""

@@ -439,7 +439,9 @@ def names_first(trial: Trial, policy: Policy) -> float:
 
 
 def _worth(state: Evidence, trial: Trial) -> bool:
-    return state.is_worth_telling(trial.effect, trial.evidence, trial.left, noise=trial.noise)
+    return state.is_worth_telling(
+        trial.effect, trial.evidence, trial.left, noise=trial.noise, item=trial.item
+    )
 
 
 def _promising(state: Evidence, trial: Trial, policy: Policy) -> bool:
