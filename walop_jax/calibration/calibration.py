@@ -434,7 +434,7 @@ class Calibration(Result):
         return flags
 
     def beyond_settings(self, settings: Settings) -> Bool[np.ndarray, " p"]:
-        """Which settings have a filter, or where that matters a temperature, that the exposures do not cover."""
+        """True for settings whose filter, or temperature where that matters, the exposures do not cover."""
         beyond = ~np.isin(settings.filter, np.unique(self.exposures.filter))
         if "temperature" in needs(self.model.template).conditions:
             low, high = np.nanmin(self.exposures.temp), np.nanmax(self.exposures.temp)

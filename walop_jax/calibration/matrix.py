@@ -241,7 +241,7 @@ def matrices(
 
 
 def _numbers(settings: Settings) -> tuple[Vector, Vector, Vector]:
-    """What of settings goes into a program as numbers: colour temperature (0: flat), temperature, hour angle."""
+    """Settings that enter a program as numbers: colour temperature (0: flat), temperature, hour angle."""
     return np.nan_to_num(settings.teff), settings.temperature, settings.hour_angle
 
 

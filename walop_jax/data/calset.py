@@ -282,7 +282,7 @@ def _frames(
 
 
 NAME = "arrays"
-"""What errors call the file that is none."""
+"""Name in errors of the file that is none."""
 
 _SHOWN = 3
 _UNITS = {name: rule.unit for name, rule in schema.EXPOSURES.items()}
@@ -398,7 +398,7 @@ def _in_memory(tables: Mapping[str, Mapping[str, Any]], *, version: int, **said:
 
 
 def _spoilt(counts: np.ndarray) -> Iterator[str]:
-    """What is measured in some cameras only, by its place in the array."""
+    """Remark on values that are finite in some cameras only, by their place in the array."""
     finite = np.isfinite(counts)
     places = np.argwhere(finite.any(axis=2) & ~finite.all(axis=2))
     if len(places):

@@ -52,7 +52,7 @@ POINT_COLUMNS: Mapping[str, Column] = {
 
 @runtime_checkable
 class NamedCameras(Sized, Protocol):
-    """What a table must know of cameras."""
+    """Cameras as a table needs to know them."""
 
     @property
     def names(self) -> Sequence[str]:
@@ -67,7 +67,7 @@ class NamedCameras(Sized, Protocol):
 
 @runtime_checkable
 class InstrumentOfTables(Protocol):
-    """What a table must know of the instrument that it is for; the field reaches to ±`field_limit` (deg)."""
+    """The instrument of a table, as that needs to know it; the field reaches to ±`field_limit` (deg)."""
 
     @property
     def name(self) -> str:
@@ -91,7 +91,7 @@ class InstrumentOfTables(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class FieldPoints:
-    """Where, and under which optical settings, an instrument matrix is asked for.
+    """Field points, and the optical settings there, for which an instrument matrix is asked.
 
     `x`, `y` in degrees; `outside` marks points beyond the field of the instrument.
     """

@@ -1,4 +1,4 @@
-"""What the numbers of a calibration set must satisfy before anyone believes them."""
+"""Checks of the numbers of a calibration set, before anyone believes them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LONGEST_NAME = 32
 _FIRST_KINDS = ("clp", "moon", "standard", "flux")  # of version 1
 
 EPHEMERIS_MJD = (15020.0, 88069.0)
-"""Where astropy's built-in ephemeris (ERFA `moon98`, the years 1900 to 2100) is meant to be used."""
+"""Range of astropy's built-in ephemeris (ERFA `moon98`, the years 1900 to 2100)."""
 
 _WAVELENGTH = (0.2, 20.0)  # µm, from the ultraviolet to the thermal infrared
 
@@ -182,7 +182,7 @@ def _site(site: Site, place: Place, *, needed: bool) -> None:
 
 
 def like_radians(angles: np.ndarray) -> bool:
-    """Whether angles are clearly radians, not degrees.
+    """True if angles are clearly radians, not degrees.
 
     Clearly: five or more, from more than a quarter of a turn in radians, none beyond a turn, and most of
     them off the round numbers that anyone would choose in degrees.

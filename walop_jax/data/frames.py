@@ -62,7 +62,7 @@ class Grid:
 
 @dataclasses.dataclass(frozen=True)
 class Cube:
-    """Where the values of an image extension (exposures, rows, columns) lie, and how to read them."""
+    """Place of the values of an image extension (exposures, rows, columns) in its file, and their reader."""
 
     path: Path
     extension: str

@@ -1,4 +1,4 @@
-"""What is in a calibration set and what is wrong with it: numbers and findings; nothing is printed here."""
+"""Contents of a calibration set, and what is wrong with it: numbers and findings; nothing is printed here."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Group:
 
 @dataclasses.dataclass(frozen=True)
 class ElementUse:
-    """How a further moving element was used: exposures with it in the beam, and its distinct angles (deg)."""
+    """Use of a further moving element: exposures with it in the beam, and its distinct angles (deg)."""
 
     prefix: str
     exposures: int

@@ -156,7 +156,7 @@ def _agreeing(rows: _Rows) -> list[tuple[int, int]]:
 
 
 def _holds_noise(rows: _Rows, exposures: Exposures, copies: set[int]) -> bool | None:
-    """Whether counts scatter at all, None where that cannot be seen, in the largest group of alike exposures."""
+    """True if counts scatter at all in the largest group of alike exposures, None where that cannot be seen."""
     labels = [
         (str(kind), str(name), bool(polariser), bool(plate))
         for kind, name, polariser, plate in zip(
@@ -194,7 +194,7 @@ def _smallest_singular_value(rows: _Rows, group: Int[np.ndarray, " e"]) -> float
 
 
 def _same_settings(exposures: Exposures, one: int, other: int) -> bool:
-    """Whether two exposures differ in nothing but number and time."""
+    """True if two exposures differ in nothing but number and time."""
     return all(
         str(values[one]) == str(values[other])
         for name, values in exposures.columns().items()
@@ -268,7 +268,7 @@ def frames_among(calset: CalibrationSet) -> tuple[FrameIntensities, Int[np.ndarr
 
 
 def without_frames(calset: CalibrationSet) -> CalibrationSet | None:
-    """What a set holds beside its frames, with the exposures of all of it; None with no frames or nothing else."""
+    """Part of a set beside its frames, with the exposures of all of it; None with no frames or nothing else."""
     whole = calset.intensities
     parts = whole.parts if isinstance(whole, JoinedIntensities) else ()
     beside = tuple(part for part in parts if not isinstance(part[0], FrameIntensities))
@@ -370,7 +370,7 @@ def _conflict(
 
 
 def _same_site(one: Site, other: Site) -> bool:
-    """Whether two sites agree: a thousandth of a degree, ten metres."""
+    """True if two sites agree: to a thousandth of a degree, and ten metres."""
     fields = ("latitude", "longitude", "elevation")
     return all(
         np.isclose(getattr(one, name), getattr(other, name), rtol=0, atol=atol, equal_nan=True)
@@ -474,7 +474,7 @@ def _join_tables(
 
 
 def _earlier_ones(points: Points) -> Int[np.ndarray, " p"]:
-    """How many points ahead of each one lie at the same place."""
+    """Number of points ahead of each one at the same place."""
     _, place = np.unique(np.column_stack([points.x, points.y]) + 0.0, axis=0, return_inverse=True)
     place = place.reshape(-1)
     order = np.argsort(place, kind="stable")

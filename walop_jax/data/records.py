@@ -24,7 +24,7 @@ POLARISER, CALIBRATION_PLATE = "CLP", "CHWP"
 """Column prefixes of the moving elements that every calibration set knows."""
 
 PREFIX = re.compile(r"[A-Z][A-Z0-9_]*")
-"""What a column prefix of a moving element looks like."""
+"""Form of the column prefix of a moving element."""
 
 
 class DataFlag(enum.IntFlag):
@@ -44,7 +44,7 @@ class DataFlag(enum.IntFlag):
 
 @dataclasses.dataclass(frozen=True)
 class Site:
-    """Where the telescope stands.
+    """Place of the telescope.
 
     `latitude` and `longitude` in degrees (east positive), `elevation` in metres.
     """
@@ -66,7 +66,7 @@ class FilterCurve:
 
 @dataclasses.dataclass(frozen=True)
 class Position:
-    """Where a moving element stands in every exposure: whether in the beam, and at what angle.
+    """State of a moving element in every exposure: in the beam or not, and at what angle.
 
     `angle` is the encoder reading in degrees, NaN where the element is out.
     """
@@ -235,7 +235,7 @@ class InputFile:
 
 @dataclasses.dataclass(frozen=True)
 class Compression:
-    """What a calibration set stands for that was made of whole frames: so many `pixels` of the files `frames`.
+    """Origin of a calibration set made of whole frames: it stands for so many `pixels` of the files `frames`.
 
     The pixels were summed at `values` of the model's parameters, where their χ² and its degrees of freedom were these.
     `gain` and `response` are by how much single pixels differ there (`fit.verdict.Structure`); None: nobody asked.
@@ -279,7 +279,7 @@ class CalibrationSet(Displayed):
         return self.intensities.cameras
 
     def display(self) -> Display:
-        """What was observed, without reading frames."""
+        """Summary of what was observed, without reading frames."""
         e, points = self.exposures, self.points
         kinds = ", ".join(f"{number} {kind}" for kind, number in Counter(e.kind.tolist()).items())
         facts = {

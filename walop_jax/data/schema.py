@@ -26,7 +26,7 @@ CALVERS = 2
 
 
 class Rule(NamedTuple):
-    """What the values of a column must satisfy: where `broken` is true, what they are and what to do about it."""
+    """Condition on the values of a column: where `broken` is true, what they are and what to do about it."""
 
     broken: Callable[[np.ndarray], np.ndarray]
     what: str
@@ -180,7 +180,7 @@ TABLES: Mapping[str, Mapping[str, Column]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """Where a table came from, so that every check can say so."""
+    """Origin of a table, so that every check can name it."""
 
     file: object
     extension: str

@@ -14,7 +14,7 @@ from walop_jax.data.records import CALIBRATION_PLATE, Exposures, FilterCurve
 from walop_jax.io.errors import fail, nearest
 
 DEFAULT_FILTER = "SDSS-r"
-"""What an exposure without a FILTER was taken through."""
+"""Filter of an exposure without a FILTER."""
 
 _TABLES = {"SDSS-r": "sdss_r.csv"}
 """Files beside this one. The WALOP filters are custom: the survey's curve is where one starts."""
@@ -134,7 +134,7 @@ class Settings:
         return self.filter, self.teff, self.temperature, self.hour_angle
 
     def position(self, prefix: str) -> Float[np.ndarray, " n"]:
-        """Where a moving element stands (deg; NaN: out)."""
+        """Angle of a moving element (deg; NaN: out)."""
         return self.positions.get(prefix, np.full(len(self), np.nan))
 
     def further(self) -> dict[str, float]:
@@ -178,7 +178,7 @@ class Settings:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """What makes the optics of a single row differ from those of others; ValueError for several rows."""
+        """Key that tells the optics of a single row from those of others; ValueError for several rows."""
         if len(self) != 1:
             raise ValueError(f"one setting is asked for, {len(self)} are given")
         inside = sorted((p, float(a[0])) for p, a in self.positions.items() if np.isfinite(a[0]))

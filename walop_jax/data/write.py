@@ -87,7 +87,7 @@ def _asked(header: Any, name: str) -> float | None:
 
 
 def remark(found: Compression, points: int) -> str:
-    """What to bear in mind with a set that stands for pixels."""
+    """Caution about a set that stands for pixels."""
     return (
         f"{points} field points stand for {found.pixels:,} pixels, of which χ²/dof was "
         f"{found.chi2 / max(found.dof, 1):.5g}: what is smaller than a twentieth of the field is not seen here"

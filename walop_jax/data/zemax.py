@@ -77,7 +77,7 @@ class TransmissionExport:
 
 @dataclasses.dataclass
 class _Block:
-    """What stands under one `Field Pos`."""
+    """Content under one `Field Pos`."""
 
     line: int
     position: tuple[float, float]

@@ -154,7 +154,7 @@ def merged(old: Table, new: Table) -> Table:
 
 
 def is_named(value: Any) -> TypeGuard[list[Table]]:
-    """Whether something is a list of tables with a name each."""
+    """True for a list of tables with a name each."""
     return isinstance(value, list) and all(isinstance(entry, Mapping) and "name" in entry for entry in value)
 
 

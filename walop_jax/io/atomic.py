@@ -130,12 +130,12 @@ PREFIX = ".walop-"
 
 
 def prefix_of(target: Path) -> str:
-    """What the names of temporary files and folders of `target` begin with, whoever makes them."""
+    """Beginning of the names of temporary files and folders of `target`, whoever makes them."""
     return f"{PREFIX}{_short(target.name)}-"
 
 
 def own_prefix(target: Path) -> str:
-    """What the names of temporary files and folders of `target` begin with that this process makes."""
+    """Beginning of the names of temporary files and folders of `target` that this process makes."""
     return f"{prefix_of(target)}{_short(socket.gethostname())}-{os.getpid()}-"
 
 
@@ -171,7 +171,7 @@ def errors_of(target: object, temporary: Path) -> Iterator[None]:
 
 
 def _lives(process: int) -> bool:
-    """Whether a process of this machine is there; one of another user counts."""
+    """True if a process of this machine is there; one of another user counts."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:

@@ -1,4 +1,4 @@
-"""How results show themselves where they are looked at: in a terminal as text, in a notebook as HTML."""
+"""Display of results where they are looked at: in a terminal as text, in a notebook as HTML."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class Displayed(abc.ABC):
 
     @abc.abstractmethod
     def display(self) -> Display:
-        """What to show."""
+        """Title, facts, table and notes to show."""
 
     def __repr__(self) -> str:
         return self.display().shortened(MOST_LINES).text()

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 _SHOWN = 5
-"""How many rows or names a message spells out before it only counts the rest."""
+"""Number of rows or names that a message spells out before it only counts the rest."""
 
 
 class DataError(ValueError):

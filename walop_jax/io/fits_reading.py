@@ -50,7 +50,7 @@ UNREADABLE = (
     zlib.error,
     fits.VerifyError,
 )
-"""What astropy raises on a damaged file, some of it only when a header or a column is used."""
+"""Errors that astropy raises on a damaged file, some of it only when a header or a column is used."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -139,7 +139,7 @@ def output_folder(
 
 
 def _exchangeable(folder: Path) -> bool:
-    """Whether a folder may be replaced by another of the same name without anybody missing something."""
+    """True if a folder may be replaced by another of the same name without anybody missing something."""
     if os.path.ismount(folder) or not os.access(folder.parent, os.W_OK | os.X_OK):
         return False
     try:
@@ -227,7 +227,7 @@ def _exchange(one: Path, other: Path) -> None:
 
 
 def _aside(target: Path) -> Path:
-    """Where a folder stands for a moment that cannot be exchanged in one step."""
+    """Momentary place of a folder that cannot be exchanged in one step."""
     return target.parent / f"{prefix_of(target)}before"
 
 
@@ -293,7 +293,7 @@ def _acquired(place: Path, output: object) -> int | None:
 
 
 def _is_at(descriptor: int, place: Path) -> bool:
-    """Whether an open file is still the one of that name: its last holder may have removed it before it was locked."""
+    """True if an open file is still the one of that name: its last holder may have removed it before it was locked."""
     try:
         return os.path.samestat(os.fstat(descriptor), os.stat(place))
     except OSError:

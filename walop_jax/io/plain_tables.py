@@ -61,7 +61,7 @@ class MatrixTable(Table):
 
 
 def table_format(path: str | os.PathLike[str]) -> str:
-    """What astropy calls the format of a table with this name.
+    """Format of a table with this name, as astropy calls it.
 
     Raises `DataError` for an extension that is none of `FORMATS`.
     """

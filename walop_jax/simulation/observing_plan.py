@@ -360,7 +360,7 @@ class ObservingPlan:
         return offset_direction(*moon_direction(mjd, self.site), 360.0 * _GOLDEN * order, separation)
 
     def layout(self) -> tuple[Bool[np.ndarray, "p e"], np.ndarray]:
-        """Which (point, exposure) pairs are measured, and the row of the star in each (−1: none)."""
+        """True for the (point, exposure) pairs that are measured, and the row of the star in each (−1: none)."""
         taken, points = self._taken, self.points()
         place = np.arange(len(points)) - (len(points) - (self.standard_grid**2 if self.standards else 0))
         star = np.array([stop.number if stop.kind == "standard" else -1 for stop in taken])
