@@ -1,1 +1,1 @@
-"""How probable data are: noise that scores and draws, the flux eliminated, priors, a set in memory or read anew."""
+"""Probability of data: noise that scores and draws, the flux eliminated, priors, a set in memory or read anew."""

@@ -1,4 +1,4 @@
-"""What small changes of an instrument would do to the residuals: the columns of the score test, all from one program.
+"""Responses of the residuals to small changes of an instrument: the columns of the score test, all from one program.
 
 A change is a sum of sentences (`model.effects.change`), with a coefficient each. Its column is the derivative of the
 used residuals with respect to its amplitude, at neutral: what it does to the light or to the analysis vectors
@@ -112,7 +112,7 @@ _own = compiled(jax.vmap(_own_at_point, (None, None, None, 0)), kept_as="own_col
 
 
 class _AtPoint(NamedTuple):
-    """What a field point brings with it; sites are the point itself and, where ghosts are active, the opposite one."""
+    """Quantities of a field point; sites are the point itself and, where ghosts are active, the opposite one."""
 
     vectors: Responses  # leading axis: sites
     light: LightResponses
@@ -181,7 +181,7 @@ def _pushed(
     counts: Float[Array, "p e k"],
     change: Float[Array, "a p e k"],
 ) -> Float[Array, "a p e k"]:
-    """What the detectors report more for counts that change."""
+    """Change of the counts that the detectors report, for counts that change."""
 
     def at(counts: Float[Array, "e k"], change: Float[Array, "e k"]) -> Float[Array, "e k"]:
         return jax.jvp(lambda n: light.detected(instrument, plan.exposures, n), (counts,), (change,))[1]
@@ -200,7 +200,7 @@ _detectors = compiled(_pushed, kept_as="detector_slopes")
 
 @dataclasses.dataclass(frozen=True)
 class _Laid:
-    """What factors may ask for: points along the first axis, exposures along the second.
+    """Quantities that factors may ask for: points along the first axis, exposures along the second.
 
     Of angles those in the list of exposures: NaN where an element is out.
     """
@@ -239,7 +239,7 @@ class Columns:
         self.shared = Sharing(self.patched.cameras.together, None if groups is None else np.asarray(groups))
 
     def has(self, change: Change) -> bool:
-        """Whether the responses hold a change."""
+        """True if the responses hold a change."""
         try:
             self._pieces(change)
         except NoColumnError:
@@ -255,7 +255,7 @@ class Columns:
         return found
 
     def survives(self, gaps: Sequence[float]) -> dict[float, bool]:
-        """Whether the bands leave anything of the fringes of air, by its thickness (µm)."""
+        """True where the bands leave anything of the fringes of air, by its thickness (µm)."""
         every = list(dict.fromkeys(gaps))
         if not every:
             return {}
@@ -447,7 +447,7 @@ class _Block:
         return self._alone(added * cameras) * (self.weight if self.linear else 1.0)
 
     def _alone(self, values: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "m k n"]:
-        """What comes in once, whatever sites there are."""
+        """Values that come in once, whatever sites there are."""
         own = self._pairs(values)[None]
         return np.concatenate([own, *([np.zeros_like(own)] * (self.sites - 1))])
 

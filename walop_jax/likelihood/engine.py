@@ -153,7 +153,7 @@ def best_flux(
 def real_counts(
     instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], flux: Float[Array, "e f"]
 ) -> Float[Array, "e k"]:
-    """What the detectors report for light of a flux, `unit` being the counts for light of unit flux."""
+    """Counts that the detectors report for light of a flux, `unit` being the counts for light of unit flux."""
     return light.detected(instrument, plan.exposures, flux * unit)
 
 

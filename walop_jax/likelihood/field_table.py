@@ -45,7 +45,7 @@ from walop_jax.model.specification import series_indices
 
 Values = Float[Array, " n"]
 Quantity = Callable[[Array, Values, Array], Array]
-"""What is computed from the rows, all parameters and the local throughputs."""
+"""Quantity computed from the rows, all parameters and the local throughputs."""
 
 
 class LocalDerivatives(NamedTuple):
@@ -255,7 +255,7 @@ def solved_optics(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> O
 
 
 def in_batches(solve: Callable[[Vector, Vector], Any], x: Vector, y: Vector) -> Any:
-    """What `solve` gives at field positions (deg), a tree of arrays, solved so many at a time as it is compiled for."""
+    """Results of `solve` at field positions (deg), a tree of arrays, as many at a time as it is compiled for."""
     parts = []
     for start in range(0, len(x), limits.SOLVED_TOGETHER):
         # The last batch is filled up with its last place.

@@ -28,7 +28,7 @@ def _namespace(array: Any) -> ModuleType:
 
 
 class Sharing(NamedTuple):
-    """What has a flux in common: `cameras` is 1 where two of them have, `exposures` where one is of a group.
+    """Common fluxes: `cameras` is 1 where two of them share one, `exposures` where one is of a group that does.
 
     None: all cameras; every exposure for itself.
     """
@@ -51,7 +51,7 @@ ALONE = Sharing()
 
 
 def sharing(instrument: Instrument, plan: Plan) -> Sharing:
-    """What has a flux in common in the exposures of a plan."""
+    """Common fluxes in the exposures of a plan."""
     return Sharing(instrument.cameras.together, plan.exposures.shared)
 
 

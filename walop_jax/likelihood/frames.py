@@ -74,7 +74,7 @@ class CellSums(NamedTuple):
 
 
 class StripSums(NamedTuple):
-    """What a strip of image rows contributes; `moments` are Σ g T_i T_j, `impossible` counts errors not above zero."""
+    """Contribution of a strip of image rows; `moments` are Σ g T_i T_j, `impossible` counts errors not above zero."""
 
     cells: CellSums
     moments: Float[Array, "j i k e"]
@@ -206,7 +206,7 @@ def piece_of(cell: int) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class Cells:
-    """How frames are cut: square cells of `side` pixels, those at the far ends partly beyond the frame."""
+    """Cut of frames into square cells of `side` pixels, those at the far ends partly beyond the frame."""
 
     grid: Grid
     side: int
@@ -257,7 +257,7 @@ class Cells:
 
 
 class Smooth(NamedTuple):
-    """What is smooth over the frame: counts for light of unit flux, analysis vectors, Stokes vectors."""
+    """Smooth quantities of the frame: counts for light of unit flux, analysis vectors, Stokes vectors."""
 
     unit: Any
     vectors: Any
@@ -277,7 +277,7 @@ _slopes = compiled(jax.vmap(engine.unit_slopes, in_axes=(None, None, 0)))
 
 
 def smooth_at(likelihood: Likelihood, instrument: Instrument, x: Vector, y: Vector) -> Smooth:
-    """What is smooth over the frame, at field positions (deg): exact. First axis: positions."""
+    """Smooth quantities of the frame, at field positions (deg): exact. First axis: positions."""
     return _at(_solve, likelihood, instrument, x, y)
 
 
@@ -302,7 +302,7 @@ def blank_points(reader: PointReader, x: Vector, y: Vector) -> engine.PointData:
 
 @dataclasses.dataclass(frozen=True)
 class FrameSums:
-    """What the pixels of a set say at some values of the parameters: sums for each cell, and what was smooth there.
+    """Sums over the pixels of a set, for each cell, at some values of the parameters, and what was smooth there.
 
     One strip of image rows in `every` was gone through.
     """
@@ -363,7 +363,7 @@ def strips_of(likelihood: Likelihood) -> int:
 
 
 def stands_for_pixels(likelihood: Likelihood, values: Vector) -> bool:
-    """Whether cells can stand for the pixels of a set: counts linear in a flux of their own, smooth over the frames.
+    """True if cells can stand for the pixels of a set: counts linear in a flux of their own, smooth over the frames.
 
     There may be a table beside the frames.
     """
@@ -519,7 +519,7 @@ def in_blocks(values: Float[np.ndarray, "... r c"], side: int) -> Float[np.ndarr
 
 
 def information(found: FrameSums, together: int = 1) -> Float[np.ndarray, "k k e r c"]:
-    """What the pixels say of the counts for light of unit flux: the K of each cell, or of blocks of cells."""
+    """Information of the pixels on the counts for light of unit flux: the K of each cell, or of blocks of cells."""
     return information_of(found, in_blocks(found.sums.weight, together), found.unit(together))
 
 

@@ -1,4 +1,4 @@
-"""What will be computed for a set under a model, and in what pieces: decided once, before anything is computed.
+"""Layout of the computation for a set under a model, and its pieces: decided once, before anything is computed.
 
 Measurements come in chunks of field points of equal size. A set that fits into half of the memory it may take is turned
 into arrays once. A larger one is read, slab by slab, on every pass: memory is that of a few slabs however many points
@@ -333,7 +333,7 @@ class StreamedPoints(MeasuredPoints):
 
 @functools.lru_cache(maxsize=32)
 def _moon_at(mjd: tuple[float, ...], site: Site) -> tuple[Vector, Vector]:
-    """Where the Moon stands: the same set is brought together with many models."""
+    """Direction of the Moon, kept: the same set is brought together with many models."""
     return moon_direction(np.array(mjd), site)
 
 

@@ -40,7 +40,7 @@ class Census(NamedTuple):
         return self.cameras * int(self.rows.sum())
 
     def joined(self, other: Census) -> Census:
-        """What is used of two parts of a set."""
+        """Census of two parts of a set."""
         (a, b, c, d), (e, f, g, h) = self.field, other.field
         return Census(self.rows + other.rows, (min(a, e), max(b, f), min(c, g), max(d, h)), self.cameras)
 
@@ -64,7 +64,7 @@ class DataTerms(NamedTuple):
 
 
 class OpticsUsed(NamedTuple):
-    """How optics were found: on so many nodes per side, with that error between them; None: point by point."""
+    """Sampling of the optics: so many nodes per side, with that error between them; None: point by point."""
 
     nodes_per_side: int | None
     error: float = 0.0
@@ -97,7 +97,7 @@ class Posterior:
 
     @property
     def objective(self) -> float:
-        """What a fit minimises."""
+        """Number that a fit minimises."""
         return self.data / self.noise_scale**2 + self.priors + self.loose
 
     @property
@@ -211,7 +211,7 @@ class Likelihood:
 
     @property
     def plan(self) -> Plan:
-        """What is computed for the exposures."""
+        """Plan of the computation for the exposures."""
         return self.layout.plan
 
     @property
@@ -228,7 +228,7 @@ class Likelihood:
 
     @cached_property
     def priors(self) -> PriorRows:
-        """What the model says of its free parameters beforehand."""
+        """Prior knowledge of the free parameters, from the model."""
         return prior_rows(self.model)
 
     def nodes(
@@ -259,7 +259,7 @@ class Likelihood:
         return self.posterior(values, terms, noise_scale, optics)
 
     def data_terms(self, values: Vector, near: Posterior | None = None) -> tuple[DataTerms, OpticsUsed]:
-        """What the data say at a full vector of parameter values; `near` as for `expand`."""
+        """Terms of the data at a full vector of parameter values; `near` as for `expand`."""
         instrument, n = self.model.instrument(values), len(values)
         nodes, optics = self.nodes(instrument, near)
         (data, gradient, matrix), census = self._total(
@@ -334,7 +334,7 @@ class Likelihood:
 
     @cached_property
     def census(self) -> Census:
-        """What is used of the set: a pass of its own; an expansion brings its own census with it."""
+        """Count of what is used of the set: a pass of its own; an expansion brings its own census with it."""
         return self._total("counting", "census", lambda _: (), ())[1]
 
     @property
@@ -380,7 +380,7 @@ class Likelihood:
 
     @property
     def is_small(self) -> bool:
-        """Whether columns that are asked for once or twice are compiled for longer than they are computed."""
+        """True if columns that are asked for once or twice are compiled for longer than they are computed."""
         return self.pairs <= limits.COMPILED_ONCE
 
     @property

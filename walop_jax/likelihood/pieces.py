@@ -1,4 +1,4 @@
-"""What the parts of a change act on: sentences in terms of the responses of an instrument (`model.responses`).
+"""Places at which the parts of a change act: sentences in terms of the responses (`model.responses`).
 
 A piece is a slot of the responses with a coefficient and factors:
 

@@ -1,4 +1,4 @@
-"""How a pass over the points of a set is run: slab by slab, on several threads, devices and processes, told and kept.
+"""Passes over the points of a set: slab by slab, on several threads, devices and processes, told and kept.
 
 Slabs are worked on by as many threads as there are processor cores, or by two for each of the other devices of this
 process; and they are dealt to the processes in turn. Sums are added in the order of the slabs, so that a result
@@ -149,7 +149,7 @@ class Processes:
         return cls(jax.process_index(), jax.process_count())
 
     def share(self, count: int) -> range:
-        """Which of `count` pieces of work are this process's."""
+        """Share of this process in `count` pieces of work."""
         return range(self.index, count, self.count)
 
     def gather(self, label: str, values: Vector) -> Float[np.ndarray, "processes n"]:
@@ -229,7 +229,7 @@ TOLD_EVERY = 1.0  # s
 
 @dataclasses.dataclass(frozen=True)
 class SlabSums:
-    """What some points contribute: sums, and the extent of the used ones (−x, x, −y, y at most; deg).
+    """Contribution of some points: sums, and the extent of the used ones (−x, x, −y, y at most; deg).
 
     `parts` are numbers that belong to one slab and are not added to those of others; all are of the same size.
     """
@@ -239,7 +239,7 @@ class SlabSums:
     parts: dict[int, Float[np.ndarray, " m"]] = dataclasses.field(default_factory=dict)
 
     def plus(self, other: SlabSums) -> SlabSums:
-        """What these points and others contribute."""
+        """Contribution of these points and others."""
         return SlabSums(
             self.sums + other.sums, np.maximum(self.extent, other.extent), self.parts | other.parts
         )
@@ -253,7 +253,7 @@ class SlabSums:
 
     @classmethod
     def unpacked(cls, values: Vector) -> SlabSums:
-        """What `packed` holds; zeros may follow."""
+        """Inverse of `packed`; zeros may follow."""
         size, count, each = (int(value) for value in values[:3])
         sums, extent, rest = np.split(values[3:], [size, size + 4])
         rows = rest[: count * each].reshape(count, each)
@@ -275,7 +275,7 @@ def cores() -> int:
 
 @dataclasses.dataclass(frozen=True)
 class Runner:
-    """How passes are run: on how many threads, by which processes, who is told, and where finished slabs are kept."""
+    """Means of passes: on how many threads, by which processes, who is told, and where finished slabs are kept."""
 
     threads: int = dataclasses.field(default_factory=usual_threads)
     processes: Processes = dataclasses.field(default_factory=Processes)

@@ -27,7 +27,7 @@ Declared = tuple[tuple[str, Parameter], ...]
 
 
 class Parts(NamedTuple):
-    """What a description makes of an instrument; an arm is its name, its elements and their order."""
+    """Parts of an instrument that a description makes; an arm is its name, its elements and their order."""
 
     elements: tuple[Element, ...]
     arms: tuple[Arm, ...]

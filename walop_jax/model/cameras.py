@@ -77,7 +77,7 @@ class GhostPart(Component):
 
     @abc.abstractmethod
     def seen(self, extended: Bool[Array, " e"], opposite: Float[Array, "e k"]) -> Float[Array, "e k"]:
-        """What is added to the counts; `opposite` are those of the same source at (−X, −Y)."""
+        """Addition to the counts; `opposite` are those of the same source at (−X, −Y)."""
 
 
 class ExposurePart(Component):
@@ -100,7 +100,7 @@ class ExposurePart(Component):
 
 
 class DetectorPart(Component):
-    """What a detector does to electrons."""
+    """Response of a detector to electrons."""
 
     @abc.abstractmethod
     def reported(self, counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:

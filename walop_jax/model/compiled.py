@@ -51,7 +51,7 @@ class _NotKept(Exception):
 
 
 def folder() -> Path | None:
-    """Where programs are kept; None where they are not."""
+    """Folder in which programs are kept; None where they are not."""
     cache = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     here = Path(cache) / FOLDER if cache else None
     return here if here is not None and here.is_dir() else None
@@ -60,7 +60,7 @@ def folder() -> Path | None:
 def program(
     here: Path, name: str, function: Callable[..., Any], args: tuple[Any, ...], options: dict[str, Any] | None
 ) -> Callable[..., Any] | None:
-    """What runs `function` on arguments like these: a kept program, or one that is kept from now on.
+    """Program that runs `function` on arguments like these: one that is kept, or is from now on.
 
     None where it cannot be kept.
     """
@@ -79,7 +79,7 @@ def program(
 
 
 def answer(name: str, tree: Any, kinds: Sequence[Any], find: Callable[[], Any]) -> Any:
-    """What `find` finds, which depends on nothing but a structure and the kinds of its numbers: kept like a program."""
+    """Result of `find`, which depends on nothing but a structure and the kinds of its numbers: kept like a program."""
     here = folder()
     if here is None:
         return find()
@@ -95,7 +95,7 @@ def answer(name: str, tree: Any, kinds: Sequence[Any], find: Callable[[], Any]) 
 
 
 def kind(leaf: Any) -> tuple[Any, ...]:
-    """What a program depends on of a number."""
+    """Kind of a number, as far as a program depends on it."""
     seen = jax.typeof(leaf)
     return seen.shape, str(seen.dtype), bool(seen.weak_type)
 
@@ -152,7 +152,7 @@ def _source() -> bytes:
 
 
 def _read(path: Path) -> Any:
-    """What is kept under a name; None where there is nothing, or a damaged file."""
+    """Content kept under a name; None where there is nothing, or a damaged file."""
     with contextlib.suppress(OSError):
         content = path.read_bytes()
         if hashlib.sha256(content[_DIGEST:]).digest() == content[:_DIGEST]:

@@ -1,4 +1,4 @@
-"""What a light path depends on, found by running it on shapes alone: nothing of this is declared by hand.
+"""Dependences of a light path, found by running it on shapes alone: nothing of this is declared by hand.
 
 `needs` runs the path until it asks for nothing more that a plan would have to hold. `optical_indices` follows every
 parameter through the operations of `light.band_rows`: those that reach the result enter before the band integral.
@@ -34,7 +34,7 @@ from walop_jax.model.sources import ExposureArrays
 
 
 class Needs(NamedTuple):
-    """What a light path asks for: conditions of the optics, median counts, fringes that nodes must follow."""
+    """Requirements of a light path: conditions of the optics, median counts, fringes that nodes must follow."""
 
     conditions: frozenset[str]
     median: bool
@@ -42,7 +42,7 @@ class Needs(NamedTuple):
 
 
 def needs(instrument: Instrument) -> Needs:
-    """What the light path of an instrument, effects included, asks for; found by running it on shapes alone."""
+    """Requirements of the light path of an instrument, effects included; found by running it on shapes alone."""
     return _followed(*shapes_of(instrument))[0]
 
 
@@ -56,7 +56,7 @@ def optical_indices(instrument: Instrument) -> tuple[int, ...]:
 
 @functools.lru_cache(maxsize=256)
 def _followed(structure: Any, shapes: Shapes) -> tuple[Needs, tuple[bool, ...]]:
-    """What the light path asks for, and which arrays of the instrument reach the rows of its bands: in one go."""
+    """Requirements of the light path, and the arrays of the instrument that reach the rows of its bands: in one go."""
     return answer("light_path", structure, shapes, lambda: _follow(structure, shapes))
 
 
@@ -113,7 +113,7 @@ def _behind_polariser(instrument: Instrument) -> Iterator[Element]:
 
 
 def conditions_of_effect(bare: Instrument, effect: Effect) -> frozenset[str]:
-    """What the elements that an effect puts into an instrument or changes ask for, by names in `ray.CONDITIONS`."""
+    """Conditions that the elements which an effect inserts or changes ask for, by names in `ray.CONDITIONS`."""
 
     def find() -> frozenset[str]:
         changed = changed_elements(bare, effect)
@@ -143,7 +143,7 @@ def _conditions_asked(structure: Any, shapes: Shapes) -> frozenset[str]:
 
 
 def _reaching(program: Any, result: Any) -> tuple[bool, ...]:
-    """Which inputs of a traced program reach one of its results; an inner program counts as using all it is given."""
+    """True for inputs of a traced program that reach one of its results; an inner program uses all that it is given."""
     needed = {id(result)}
     for equation in reversed(program.jaxpr.eqns):
         if any(id(v) in needed for v in equation.outvars):
@@ -169,7 +169,7 @@ def _untold() -> _Untold:
 
 
 def is_undone(part: DetectorPart, cameras: int) -> bool:
-    """Whether a detector asks for nothing but its own counts, so that a catalogue can be freed of it."""
+    """True if a detector asks for nothing but its own counts, so that a catalogue can be freed of it."""
     try:
         jax.eval_shape(lambda p: p.reported(jnp.ones((1, cameras)), _untold()), part)
     except NotPlannedError:
@@ -191,7 +191,7 @@ def left_behind(instrument: Instrument) -> tuple[str, ...]:
 
 
 def reported(instrument: Instrument, counts: Float[Array, "n k"]) -> Float[Array, "n k"]:
-    """What the detectors that can be undone report for counts (electrons)."""
+    """Counts that are reported for counts (electrons) by the detectors that can be undone."""
     for part in instrument.patched().cameras.detectors:
         if is_undone(part, len(instrument.cameras)):
             counts = part.reported(counts, _untold())

@@ -34,7 +34,7 @@ def stations(elements: Sequence[Element], ray: Ray) -> tuple[list[Station], Ray]
 
 
 def positions(element: Element, moving: Sequence[str], states: Sequence[State]) -> list[float | None]:
-    """Where an element stands in each state; None where it is out (or does not move: see `Solved`)."""
+    """Angles (deg) of an element, state by state; None where it is out (or does not move: see `Solved`)."""
     if element.moves is None:
         return [None] * len(states)
     column = moving.index(element.moves)

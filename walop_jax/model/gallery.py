@@ -28,7 +28,7 @@ TOPICS: Mapping[str, Mapping[str, type[Any]]] = {
     "effect": {effect.name: effect for effect in EFFECTS},
     "element": {kind.kind: kind for kind in ELEMENTS},
 }
-"""What has a page of its own: effects, and kinds of elements, by name."""
+"""Subjects of a page of their own: effects, and kinds of elements, by name."""
 
 
 def page(topic: str, name: str) -> str:
@@ -129,7 +129,7 @@ def _effect(effect: type[Effect]) -> Iterator[str]:
 
 
 def _maps(one: Mapping[str, Any]) -> Iterator[str]:
-    """What it does to the maps of the instrument matrix, at its usual size."""
+    """Changes of the maps of the instrument matrix, at its usual size."""
     yield "## What it does to the maps"
     yield ""
     size = f"{one['parameter']} = {one['usual']:g}{_unit(one)}"

@@ -55,7 +55,7 @@ class NoSuchPlaceError(ValueError):
 
 
 class Arm(Component):
-    """What one part of the pupil goes through; `path` names its elements in the order light meets them."""
+    """Light path of one part of the pupil; `path` names its elements in the order light meets them."""
 
     name: str = eqx.field(static=True)
     elements: tuple[Element, ...]
@@ -76,7 +76,7 @@ class Arm(Component):
 
 
 class Patch(Component):
-    """What changes an instrument: an effect."""
+    """Change of an instrument: an effect."""
 
     name: ClassVar[str] = ""
 
@@ -197,7 +197,7 @@ class Instrument(Component):
 
     @property
     def plates(self) -> str | None:
-        """How its wave plates are computed (`wave_plate.MODELS`); None where it has none."""
+        """Model of its wave plates (`wave_plate.MODELS`); None where it has none."""
         elements = (*self.elements, *(element for arm in self.arms for element in arm.elements))
         return next((element.model for element in elements if isinstance(element, WavePlate)), None)
 

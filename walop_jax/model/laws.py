@@ -69,7 +69,7 @@ ALWAYS = Form("window")
 
 @dataclasses.dataclass(frozen=True)
 class Law:
-    """How a parameter may change. `per` are words of the table above, `rate` per √day, `at` and `bad` MJD.
+    """Allowed changes of a parameter. `per` are words of the table above, `rate` per √day, `at` and `bad` MJD.
 
     Raises ValueError for words that do not go together and for numbers that are missing or of no use.
     """

@@ -61,7 +61,7 @@ def divided(instrument: Instrument) -> Train:
 
 @functools.lru_cache(maxsize=256)
 def _leading(structure: Any, shapes: Shapes) -> int:
-    """How many elements lead; asked once for all numbers that the elements may take."""
+    """Number of elements that lead; asked once for all numbers that the elements may take."""
     count = 0
 
     def follow(elements: tuple[Element, ...]) -> None:
@@ -183,7 +183,7 @@ def in_bands(
 
 
 def is_dispersed(instrument: Instrument) -> bool:
-    """Whether the beams of an analyser differ in wavelength."""
+    """True if the beams of an analyser differ in wavelength."""
     return any(arm.analyser.dispersion is not None for arm in instrument.arms)
 
 
@@ -215,7 +215,7 @@ def camera_vectors(
 
 
 def beams(instrument: Instrument, rows: Float[Array, "b r 4"]) -> Float[Array, "b k 4"]:
-    """What the beam of each camera takes of the rows of its analyser."""
+    """Rows of the cameras: what each beam takes of the rows of its analyser."""
     index, shares = _beams(instrument)
     taken = (shares[:, j, None] * rows[:, index[:, j]] for j in range(index.shape[1]))
     return functools.reduce(jnp.add, taken)
@@ -291,7 +291,7 @@ def stokes(
 
 
 def _sight(instrument: Instrument, sight: Sight) -> Sight:
-    """What is looked at, with the true position angle of the instrument."""
+    """Sight with the true position angle of the instrument."""
     if instrument.rotator_zero is None:
         return sight
     offset = jnp.deg2rad(instrument.rotator_zero)
@@ -329,7 +329,7 @@ def counts(
 
 
 def has_ghosts(instrument: Instrument) -> bool:
-    """Whether counts depend on the light of the opposite field point."""
+    """True if counts depend on the light of the opposite field point."""
     return bool(instrument.patched().cameras.ghosts)
 
 
@@ -346,14 +346,14 @@ def with_ghosts(
 
 
 def is_linear(instrument: Instrument) -> bool:
-    """Whether the detectors report the electrons as they are."""
+    """True if the detectors report the electrons as they are."""
     return not instrument.patched().cameras.detectors
 
 
 def detected(
     instrument: Instrument, exposures: ExposureArrays, counts: Float[Array, "e k"]
 ) -> Float[Array, "e k"]:
-    """What the detectors report for counts in electrons: the one stage that is not linear in the light."""
+    """Counts that the detectors report for counts in electrons: the one stage that is not linear in the light."""
     for part in instrument.patched().cameras.detectors:
         counts = part.reported(counts, exposures)
     return counts

@@ -67,7 +67,7 @@ class Parameter:
         return None if self.prior is None else self.prior[1]
 
     def is_of(self, place: str) -> bool:
-        """Whether it belongs to a part of the instrument, or to a part of that."""
+        """True if it belongs to a part of the instrument, or to a part of that."""
         return f"{self.part}.".startswith(f"{place}.")
 
     def at(self, value: float, prior: tuple[float, float] | None = None) -> Parameter:
@@ -192,7 +192,7 @@ def numbers_of(kind: type[Component]) -> dict[str, Parameter]:
 
 
 def is_row(kind: type[Component], number: str) -> bool:
-    """Whether a number of a component class is a row of values."""
+    """True if a number of a component class is a row of values."""
     return next(f.metadata[SEVERAL] for f in dataclasses.fields(kind) if f.name == number)
 
 

@@ -1,4 +1,4 @@
-"""What is to be computed for a set of exposures: wavelength nodes, bands, positions of the moving elements.
+"""Plan of the computation for a set of exposures: wavelength nodes, bands, positions of the moving elements.
 
 Light is linear, so an exposure is a dot product with the analysis vectors of its *band* (filter, colour temperature,
 positions of the moving elements, conditions); the optics are worked out once per point and wavelength node, never per

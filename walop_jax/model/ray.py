@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 Real = Float[Array, "..."]
 
 CONDITIONS = {"temperature": "TEMP", "hour_angle": "HA", "hours": "MJD"}
-"""What the optics may depend on from exposure to exposure, and the column of EXPOSURES that says it."""
+"""Conditions on which the optics may depend from exposure to exposure, and their columns of EXPOSURES."""
 
 
 class NotPlannedError(ValueError):
@@ -30,7 +30,7 @@ class NotPlannedError(ValueError):
 
 
 class Conditions(eqx.Module):
-    """What an exposure says of the moment, at every wavelength node; only what the optics have asked for is there.
+    """Conditions of an exposure at every wavelength node; only those that the optics have asked for are there.
 
     `band_width` is the equivalent width (µm) of the filter that a node belongs to.
     """
@@ -88,7 +88,7 @@ class Ray(eqx.Module):
 
     @property
     def conditions(self) -> Conditions:
-        """What the exposure says."""
+        """Conditions of the exposure."""
         if self.spectrum is None:
             raise NotPlannedError("conditions")
         return self.spectrum[1]

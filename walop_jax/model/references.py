@@ -1,4 +1,4 @@
-"""Where the physics of a model comes from, also as BibTeX: what elements, sources, materials and effects say of it."""
+"""Sources of the physics of a model, also as BibTeX: those that elements, sources, materials and effects name."""
 
 from __future__ import annotations
 

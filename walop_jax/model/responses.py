@@ -104,7 +104,7 @@ def places(instrument: Instrument) -> dict[TrainPlace, int]:
 
 
 def acts(element: Element) -> bool:
-    """Whether an element does anything to polarisation."""
+    """True if an element does anything to polarisation."""
     return _acts(*shapes_of(element))
 
 
@@ -146,7 +146,7 @@ def mappings(instrument: Instrument) -> tuple[str, ...]:
 
 
 def global_slots(instrument: Instrument) -> tuple[str, ...]:
-    """What acts on many elements at once, in the order of `globally`: "x pupil" displaces what stands behind it."""
+    """Slots that act on many elements, in the order of `globally`: "x pupil" displaces what stands behind it."""
     return (*(f"{axis} {name}" for name in mappings(instrument) for axis in "xy"), "wavelength")
 
 
@@ -487,7 +487,7 @@ def _banded_fringes(
 # ----------------------------------------------------------------------------------------------------- light
 
 LIGHT = ("zero", "extinction", "ellipticity", "rotator", "sky", "sky q", "sky u", "star q", "star u")
-"""What changes the light behind the polariser: see `light_responses`."""
+"""Changes of the light behind the polariser: see `light_responses`."""
 
 
 class LightResponses(NamedTuple):

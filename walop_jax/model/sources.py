@@ -27,7 +27,7 @@ PAPER_II = "Maharana et al. 2022, Paper II"
 
 
 class ExposureArrays(eqx.Module):
-    """What the light path needs to know of the exposures, one element each; `median` only where it is asked for.
+    """Exposures as the light path needs to know them, one element each; `median` only where it is asked for.
 
     `kind` counts the kinds of `kinds`. Angles in radians; `clp_angle` is 0 when the polariser is out, `rotator` where
     it has no meaning; `shared` is 1 where an exposure belongs to a group that has its fluxes in common, None: no
@@ -67,7 +67,7 @@ class ExposureArrays(eqx.Module):
 
 
 class Sight(NamedTuple):
-    """What is looked at from one field point, exposure by exposure.
+    """Target at one field point, exposure by exposure.
 
     `sky` is (q, u) in the instrument frame of singly scattered moonlight for δ = 1, `source` the row of the
     standard star or −1; field coordinates in degrees.
@@ -111,7 +111,7 @@ def turned(qu: Float[Array, "e 2"], angle: Float[Array, " e"]) -> Float[Array, "
 
 
 class MoonPatches(Component):
-    """What single Moon exposures, at some positions of the list, have beyond single scattering."""
+    """Polarisation of single Moon exposures, at some positions of the list, beyond single scattering."""
 
     q: Float[Array, " m"]
     u: Float[Array, " m"]

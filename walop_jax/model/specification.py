@@ -165,7 +165,7 @@ def make_model(
 
 
 def effect_context(instrument: Instrument, exposures: Exposures) -> Context:
-    """What effects need to know of a data set: its Moon exposures, its standards, how many exposures."""
+    """Facts about a data set for effects: its Moon exposures, its standards, how many exposures."""
     moon = np.flatnonzero((exposures.kind == "moon") & ~exposures.clp_in)
     return Context(
         exposures=len(exposures),

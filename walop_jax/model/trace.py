@@ -167,7 +167,7 @@ def _followed(instrument: Instrument, plan: Plan, beam: Float[Array, " 4"], ray:
 
 
 def _about(element: Element, plan: Plan) -> str:
-    """What to say of an element: what it is, or where it stands."""
+    """Remark on an element: what it is, or where it stands."""
     if element.moves is None:
         return type(element).__doc__ or ""
     (angle,) = fold.positions(element, plan.moving, [plan.settings[0][0]])

@@ -1,4 +1,4 @@
-"""What an effect is: a component with a name that patches the instrument.
+"""Effects: components with a name that patch the instrument.
 
 `patch` is all that an effect does: it changes a number that an element has, or inserts an element, a part of the
 cameras, or something of a source. What patches the instrument reaches everything that asks for light; an effect that is
@@ -27,7 +27,7 @@ Scalar = Float[Array, ""]
 
 
 class Context(NamedTuple):
-    """What effects that grow with the data need to know of them.
+    """Facts about the data for effects that grow with them.
 
     `moon` holds the positions of the Moon exposures and `moon_ids` their EXPOSURE numbers; `sources` the
     names of the standards, `exposures` the number of exposures, `cameras` that of cameras; `extinction` is that of the
@@ -127,7 +127,7 @@ class Effect(Patch):
 
     @classmethod
     def is_structural(cls) -> bool:
-        """Whether the effect has no parameter: it is there or it is not."""
+        """True if the effect has no parameter: it is there or it is not."""
         return not field_declarations(cls)
 
     def choices(self) -> dict[str, Any]:
@@ -157,7 +157,7 @@ class Effect(Patch):
         return self
 
     def fits(self, instrument: Instrument) -> bool:
-        """Whether the instrument has what the effect acts on."""
+        """True if the instrument has what the effect acts on."""
         try:
             jax.eval_shape(lambda: self.patch(dataclasses.replace(instrument, effects=())))
         except NoSuchPlaceError:

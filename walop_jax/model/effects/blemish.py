@@ -45,7 +45,7 @@ class Spot(Transmission):
     cameras: int = eqx.field(static=True)
 
     def factors(self, x: Scalar, y: Scalar) -> Float[Array, " k"]:
-        """What the spot leaves of the throughput."""
+        """Share of the throughput that the spot leaves."""
         distance = _distance(self, x, y)
         return jnp.ones(self.cameras).at[self.camera].add(-self.depth * jnp.exp(-distance))
 

@@ -87,15 +87,15 @@ class Ghost(GhostPart):
     shares: Float[Array, " k"]
 
     def seen(self, extended: Bool[Array, " e"], opposite: Float[Array, "e k"]) -> Float[Array, "e k"]:
-        """What the opposite point adds."""
+        """Addition from the opposite point."""
         return jnp.where(extended[:, None], self.shares * opposite, 0.0)
 
 
 class OfDetectors(_Cameras, DetectorPart):
-    """What is added to counts as they arrive."""
+    """Additions to counts as they arrive."""
 
     def added(self, counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
-        """What is added by a change of amplitude 1 without factors."""
+        """Addition by a change of amplitude 1 without factors."""
         raise NotImplementedError
 
     def reported(self, counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
@@ -137,7 +137,7 @@ class Diffuse(OfDetectors):
 
 
 class Left(OfDetectors):
-    """What the exposure before leaves behind."""
+    """Remainder of the exposure before."""
 
     def added(self, counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
         """The counts of the exposure before."""

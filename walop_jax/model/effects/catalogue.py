@@ -188,7 +188,7 @@ class Entry(Effect):
         return {name: getattr(self, name) for name in self.options}
 
     def fits(self, instrument: Instrument) -> bool:
-        """Whether the instrument has what the effect acts on; there may be no star that a choice could name."""
+        """True if the instrument has what the effect acts on; there may be no star that a choice could name."""
         if "" in self.choices().values():
             return False
         if not self.arrangement:
@@ -452,7 +452,7 @@ PARTS: Mapping[str, str] = {
 
 
 def is_own(effect: Effect) -> TypeGuard[Entry]:
-    """Whether an effect is an entry that does not come with the package."""
+    """True if an effect is an entry that does not come with the package."""
     return isinstance(effect, Entry) and type(effect) not in EFFECTS
 
 

@@ -138,7 +138,7 @@ class Change:
         return float(self._only("gap", "of which gap (µm)", "gap 10"))
 
     def _only(self, form: str, what: str, example: str) -> str:
-        """What is given in the only factor of a form."""
+        """Value given in the only factor of a form."""
         found = [one.given[0] for one in self.grows_with if one.form == form]
         if len(found) != 1:
             raise ValueError(f"{self.text!r}: say {what}, as in '{self.kind} of {self.place} * {example}'")
@@ -214,7 +214,7 @@ def patched(instrument: Instrument, terms: Iterable[Term]) -> Instrument:
 
 
 def add(size: Scalar) -> Any:
-    """What adds an amplitude to a number of an instrument that may not have it."""
+    """Function that adds an amplitude to a number of an instrument that may not have it."""
     return lambda value: size if value is None else value + size
 
 

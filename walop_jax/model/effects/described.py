@@ -1,4 +1,4 @@
-"""What is missing and has no name: changes (`change`), each with an amplitude; several of them are one effect.
+"""Missing physics without a name: changes (`change`), each with an amplitude; several of them are one effect.
 
 Not in the catalogue: `diagnose` tries all changes that an instrument and its exposures allow
 (`diagnosis/candidates.py`) beside the names, and adds one where it explains the data better than any name.

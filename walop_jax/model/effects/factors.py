@@ -1,4 +1,4 @@
-"""What a change grows with: over the field, with wavelength, time, temperature, counts, or the angle of an element.
+"""Factors with which a change grows: field, wavelength, time, temperature, counts, or the angle of an element.
 
 A factor knows its `text` as it is typed, its `value`, its `words`, the observation that would `test` it (empty: none of
 its own) and what it `depends_on`: FIELD, WAVELENGTH, EXPOSURE, COUNTS, or SHAPE (of the change itself). `factor` is the

@@ -86,7 +86,7 @@ class FreeShares(ExposurePart):
         return len(self.exposures) or None
 
     def share(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"]:
-        """What is added, in units of the response to unpolarised light."""
+        """Addition in units of the response to unpolarised light."""
         found = jnp.zeros(())
         if self.harmonics.size:
             angle = exposures.clp_angle[:, None] * jnp.asarray(HARMONICS)

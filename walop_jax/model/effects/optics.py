@@ -165,7 +165,7 @@ def matrix_of(terms: Sequence[tuple[Change, Any]], x: Any, y: Any) -> Mueller:
 
 @dataclasses.dataclass(frozen=True)
 class _InTrain:
-    """What a ray knows; `axis` (deg) is where the element stands that moves."""
+    """Quantities of a ray; `axis` (deg) is where the element stands that moves."""
 
     ray: Ray
     axis: Any

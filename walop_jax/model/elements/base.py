@@ -1,4 +1,4 @@
-"""What an element of the train is: it maps a ray to a ray and has a Mueller matrix for it.
+"""Elements of the train: each maps a ray to a ray and has a Mueller matrix for it.
 
 An element is neutral when it is made without numbers. It may move: `moves` is the prefix of its columns in EXPOSURES
 (`CHWP` for CHWP_IN and CHWP_ANGLE), which say whether it stands in the beam and at what angle.

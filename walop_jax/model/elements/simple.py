@@ -166,7 +166,7 @@ Angles = Float[Array, " e"]
 
 
 class Film(Component):
-    """What light meets directly behind the polariser, at its angle and only when it is in."""
+    """Layer directly behind the polariser, at its angle and only when it is in."""
 
     @abc.abstractmethod
     def through(
@@ -336,7 +336,7 @@ class Analyser(Element):
         return jnp.stack([whole, analysed], axis=1)
 
     def shares(self) -> Float[Array, "k 2"]:
-        """What each beam takes of `seen`: that of the second camera only where there is one."""
+        """Share of `seen` that each beam takes: that of the second camera only where there is one."""
         half = 0.5 * jnp.ones_like(self.efficiency)
         extra = jnp.zeros_like(half) if self.contrast is None else 0.5 * self.contrast
         along = 0.5 * self.efficiency
@@ -344,7 +344,7 @@ class Analyser(Element):
         return both[: len(self.cameras)] if self.cameras else both
 
     def shares_of_slopes(self) -> Float[Array, "k 2"]:
-        """What each beam takes of λ ∂/∂λ of `seen`."""
+        """Share of λ ∂/∂λ of `seen` that each beam takes."""
         kappa = jnp.zeros_like(self.efficiency) if self.dispersion is None else self.dispersion
         shares = self.shares()
         return shares * jnp.stack([kappa, -kappa])[: len(shares), None]

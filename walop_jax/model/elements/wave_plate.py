@@ -54,7 +54,7 @@ class Layer(Component):
             )
 
     def declarations(self) -> Mapping[str, Parameter]:
-        """What the instrument has declared."""
+        """Declarations of the instrument."""
         return dict(self.declared)
 
     def labels(self, field: str) -> tuple[str, ...]:
