@@ -360,7 +360,7 @@ def other_descriptions(
 def _screened(
     result: FitResult, sentences: Iterable[str], context: Context
 ) -> Iterator[tuple[Choice, float, Vector]]:
-    """What each change leaves at the better of two places, its gain in χ², and the place; but what changes nothing."""
+    """Each change with what it leaves at the better of two places, its gain in χ², and the place; but no idle ones."""
     every = max(1, limits.CHOICE_ROWS // max(len(result.calset.exposures), 1))
     calset = thinned(result.calset, every, neighbours=1)
     start = result.model.start.copy()  # but effects as they have been fitted

@@ -83,7 +83,7 @@ class Probe:
 
     @property
     def one_sided(self) -> Bool[np.ndarray, " _"]:
-        """Which amplitudes physics keeps above neutral, member by member."""
+        """True for amplitudes that physics keeps above neutral, member by member."""
         return np.array([name in self.effect.one_sided for name in self._fields()], bool)
 
 
@@ -107,7 +107,7 @@ def probes(catalogue: Sequence[type[Effect]], context: Context) -> Iterator[Prob
 
 
 def _can_show(calset: CalibrationSet, instrument: Instrument, effect: Effect) -> bool:
-    """Whether a set has what an effect acts on: several field points, or the conditions that its elements ask for."""
+    """True if a set has what an effect acts on: several field points, or the conditions that its elements ask for."""
     if effect.over_field and len(calset.points) < FEWEST_POINTS:
         return False
     bare = dataclasses.replace(instrument, effects=())
@@ -230,7 +230,7 @@ def beside_names(
 
 @dataclasses.dataclass(frozen=True)
 class _Asked:
-    """What factors the exposures can tell apart."""
+    """Factors that the exposures can tell apart."""
 
     exposures: Exposures
     over_field: bool
@@ -240,7 +240,7 @@ class _Asked:
 
     @classmethod
     def of(cls, exposures: Exposures, points: int) -> _Asked:
-        """Whether there are several filters, times and temperatures, and points enough for a pattern."""
+        """Look for several filters, times and temperatures, and points enough for a pattern."""
 
         def varies(values: np.ndarray) -> bool:
             return bool(

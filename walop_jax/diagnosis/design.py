@@ -61,7 +61,7 @@ Cube = Float[np.ndarray, "p e k"]
 
 
 def numpy_sharing(likelihood: Likelihood) -> Sharing:
-    """What has a flux in common, in arrays of numpy."""
+    """Common fluxes, in arrays of numpy."""
     groups = likelihood.plan.exposures.shared
     return Sharing(likelihood.model.template.cameras.together, None if groups is None else np.asarray(groups))
 
@@ -92,7 +92,7 @@ class Measured:
 
     @property
     def has_gains(self) -> bool:
-        """Whether exposures are seen at so many field points that gains of single ones are not all there is."""
+        """True if exposures are seen at so many field points that gains of single ones are not all there is."""
         return bool(self.used.sum() >= limits.MANY_POINTS * self.used.any(axis=0).sum())
 
     @property
@@ -117,7 +117,7 @@ class Measured:
         return np.where(self.known[:, None], 0.0, unit)[self.used]
 
     def changes(self, strata: Sequence[_Stratum]) -> Float[np.ndarray, "r a"]:
-        """What every pattern does to its camera in every used row, in standard errors, the flux held."""
+        """Change by every pattern in its camera in every used row, in standard errors, the flux held."""
         size = (self.flux[..., None] * self.level[:, None, :] * self.weight)[self.used]
         points, exposures = np.nonzero(self.used)
         each = [(k, pattern) for one in strata for k, pattern in zip(one.camera, one.patterns, strict=True)]
@@ -320,11 +320,11 @@ class Design:
         return fluxes + int((~self.fit.likelihood.priors.known).sum())
 
     def _columns_of(self, name: str) -> Bool[np.ndarray, " f"]:
-        """Which columns of the Jacobian are those of an effect."""
+        """True for the columns of the Jacobian that are those of an effect."""
         return np.isin(self.fit.model.free, self.fit.model.positions(name))
 
     def without(self, name: str) -> tuple[Projector, Float[np.ndarray, "_ _"]]:
-        """What all parameters but those of one effect absorb, and an orthonormal basis of what these add to it."""
+        """Projector off all parameters but those of one effect, and an orthonormal basis of what these add to it."""
         of_effect = self._columns_of(name)
         rest = Projector(self.jacobian[:, ~of_effect], self.eliminated)
         own = rest(self.jacobian[:, of_effect])

@@ -1,4 +1,4 @@
-"""What a calibration set can show before anything is found in it: the sizes at which effects are detected and named.
+"""Power of a calibration set before anything is found in it: the sizes at which effects are detected and named.
 
 Everything is linear algebra on the columns of the score test (`score`), at a fit or at a plan without noise.
 
@@ -213,7 +213,7 @@ def _collected(
 
 
 def _nearest(columns: Sequence[_Column]) -> dict[str, float]:
-    """How far each rival stays from the amplitude and shape that it follows best."""
+    """Distance of each rival from the amplitude and shape that it follows best."""
     found: dict[str, float] = {}
     for column in columns:
         for name, value in column.rivals.items():

@@ -1,4 +1,4 @@
-"""What a fit lacks, by linear algebra: the scores of all candidates, their order of evidence, and who does the same.
+"""Physics that a fit lacks, by linear algebra: the scores of all candidates, their order of evidence, their equals.
 
 Evidence      Of a candidate alone: ln B of the score test (`score.log_bayes`). Alternative shapes of an effect share
               its prior, sentences share that of one name.
@@ -107,7 +107,7 @@ def leaders(ranked: Sequence[Ranked], policy: Policy = POLICY) -> list[Ranked]:
 
 
 def follow_physics(probe: Probe, score: Score, policy: Policy = POLICY) -> bool:
-    """Whether a linear step leaves one-sided amplitudes on their side, within `Policy.separation`."""
+    """True if a linear step leaves one-sided amplitudes on their side, within `Policy.separation`."""
     sigma = np.sqrt(np.clip(np.diag(score.covariance), 0.0, None))
     return bool(np.all((score.amplitudes >= -policy.separation * sigma)[probe.one_sided]))
 
@@ -131,7 +131,7 @@ def name_first(
     joined: Callable[[Ranked], Evidence],
     policy: Policy = POLICY,
 ) -> bool:
-    """Whether significant `names` come before a more probable sentence; `joined` is `Evidence.joined`.
+    """True if significant `names` come before a more probable sentence; `joined` is `Evidence.joined`.
 
     They do where the best of them leaves nothing significant and the sentence does, or where two of them are more
     probable than the sentence with whatever is best behind it.
@@ -159,7 +159,7 @@ def name_first(
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Evidence:
-    """What every candidate would explain of one set of residuals, beyond what the base parameters do.
+    """Part of one set of residuals that every candidate would explain, beyond what the base parameters do.
 
     `space` is that of all candidates behind the nuisance that single exposures may have, `scores` are C̃ᵀr and
     `square` r·r there. `probes` are effects, `sentences` what else can be said, `parts` sentences that are told as the
@@ -202,17 +202,17 @@ class Evidence:
 
     @property
     def alarm(self) -> bool:
-        """Whether anything is missing at all."""
+        """True if anything is missing at all."""
         return self.table.p_global < self.policy.alarm
 
     @property
     def poor(self) -> bool:
-        """Whether so much is missing that what cannot be differentiated is worth trying."""
+        """True if so much is missing that what cannot be differentiated is worth trying."""
         return self.chi2 > self.policy.poor_fit * self.dof
 
     @property
     def floor(self) -> float:
-        """What is left behind everything that was looked for, in standard deviations of the data as stated; 1 or more.
+        """Scatter behind everything that was looked for, in standard deviations of the data as stated; 1 or more.
 
         Above `Policy.floor` no candidate explains the data to within N_ERR. Evidence and separations then count in this
         unit: in that of photons everything would be certain.
@@ -271,7 +271,7 @@ class Evidence:
         )
 
     def _followed(self, item: Ranked) -> float:
-        """What further sentences would be worth behind one: a pattern of many numbers may hold several at once."""
+        """Evidence of further sentences behind one: a pattern of many numbers may hold several at once."""
         gain, state = 0.0, self
         for _ in range(1, self.policy.most_together):
             state = state.joined(item)
@@ -284,7 +284,7 @@ class Evidence:
     def is_worth_telling(
         self, effect: type[Effect], evidence: float, left: float, *, noise: bool, item: Ranked | None = None
     ) -> bool:
-        """Whether an addition explains a good part of what is missing, and patterns without a name do not do better.
+        """True if an addition explains a good part of what is missing, and patterns without a name do not do better.
 
         `left` is its χ², `noise` says whether that is what noise alone would leave, `item` is its linear step.
         """
@@ -331,7 +331,7 @@ class Evidence:
     # ------------------------------------------------------------------------------- what cannot be told apart
 
     def apart(self, item: Ranked) -> dict[str, float]:
-        """How far (σ) every candidate stays from what one does at its amplitudes, by linear steps."""
+        """Distance (σ) of every candidate from what one does at its amplitudes, by linear steps."""
         at, amplitudes = self.space.places()[item.probe.name], item.score.amplitudes
         change = self.space.gram[:, at] @ amplitudes
         return separations(self.space, change, float(amplitudes @ change[at]))
@@ -379,7 +379,7 @@ class Evidence:
         )
 
     def classes(self) -> Iterator[dict[str, Any]]:
-        """Which other effects could follow what each significant one would explain, by linear steps: rows of a file."""
+        """Rows of a file: effects that could follow what each significant one would explain, by linear steps."""
         for item in self.significant[: self.policy.most_classes]:
             if close := self.close(item):
                 effect = item.effect
@@ -391,7 +391,7 @@ class Evidence:
         return tuple(sorted(rows, key=lambda row: row[2]))
 
     def limits(self) -> Iterator[dict[str, Any]]:
-        """What each effect with a single amplitude stays below: rows of a file."""
+        """Rows of a file: upper limits on each effect with a single amplitude."""
         for item in self.ranked:
             names = item.effect.amplitudes()
             if len(item.score.amplitudes) != 1 or sum(p.effect is item.effect for p in self.probes) > 1:
@@ -407,7 +407,7 @@ class Evidence:
 
 
 def explains(chi2: float, dof: float) -> bool:
-    """Whether χ² is what noise alone would give, as `FitResult.explains_data` has it."""
+    """True if χ² is what noise alone would give, as `FitResult.explains_data` has it."""
     return bool(dof > 0 and chi2 - dof < SUSPECT_SIGMA * np.sqrt(2.0 * dof))
 
 
@@ -424,7 +424,7 @@ def upper_limit(value: float, sigma: float, *, one_sided: bool, probability: flo
 
 @dataclasses.dataclass(frozen=True)
 class _Absorbed:
-    """What the parameters of an active effect absorb: the projection without them, and the columns' share of it."""
+    """Absorption by the parameters of an active effect: the projection without them, and the columns' share of it."""
 
     rest: Projector
     basis: Matrix
@@ -464,7 +464,7 @@ class Examination(Evidence):
         )
 
     def separation(self, name: str, change: Vector) -> dict[str, float]:
-        """How far (σ) each rival stays from an active effect that changes the residuals (data rows) by `change`."""
+        """Distance (σ) of each rival from an active effect that changes the residuals (data rows) by `change`."""
         own = self.absorbed[name]
         whole = np.pad(change, (0, len(self.design.residual) - len(change)))
         projected = own.rest(whole)
@@ -474,7 +474,7 @@ class Examination(Evidence):
         return {rival: apart / self.floor for rival, apart in found.items()}
 
     def is_like(self, design: Design) -> bool:
-        """Whether the counts that another fit expects differ so little that derivatives with respect to others do."""
+        """True if another fit expects so nearly the same counts that its columns may serve again."""
         ours, theirs = self.design.measured.model, design.measured.model
         return bool(np.linalg.norm(ours - theirs) < self.policy.same_counts * np.linalg.norm(ours))
 

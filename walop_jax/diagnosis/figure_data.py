@@ -1,4 +1,4 @@
-"""What the figures of a diagnosis are drawn from, `diagnosis.fits` (DIAGVERS = 1): small arrays, no data set.
+"""Data of the figures of a diagnosis, `diagnosis.fits` (DIAGVERS = 1): small arrays, no data set.
 
     LADDER       MODEL, CHI2, DOF: the starting model and every model after it, a row for each
     SHARES       GROUP (camera, kind, filter or exposure), MEMBER, EXPECTED, BEFORE, AFTER: sums of squared
@@ -130,12 +130,12 @@ class ResidualComparison:
 
     @property
     def explained(self) -> PointMap:
-        """What the effect makes of the maps, all other parameters having followed."""
+        """Effect on the maps, all other parameters having followed."""
         return self.before - self.after
 
     @property
     def curve_explained(self) -> Curve:
-        """What the effect makes of the curves, all other parameters having followed."""
+        """Effect on the curves, all other parameters having followed."""
         return self.curve_before - self.curve_after
 
 

@@ -1,4 +1,4 @@
-"""What a diagnosis finds: values, words, where it sits, and the content of `diagnosis.json` (docs: files)."""
+"""Findings of a diagnosis: values, words, where they sit, and the content of `diagnosis.json` (docs: files)."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def _field_words(design: Design, field: Float[np.ndarray, " p"]) -> str:
 
 
 def describe(design: Design, rows: Float[np.ndarray, " _"]) -> dict[str, Any]:
-    """Where a change of the residuals (data rows of `design`) sits, as `where` of diagnosis.json (docs: files)."""
+    """Place of a change of the residuals (data rows of `design`), as `where` of diagnosis.json (docs: files)."""
     cube = design.cube(rows)
     square = cube**2
     e, names = design.fit.calset.exposures, design.fit.model.template.cameras.names
@@ -161,18 +161,18 @@ class Step:
 
     @property
     def confirmed(self) -> bool:
-        """Whether data that took no part in the fit agree better with the effect than without."""
+        """True if data that took no part in the fit agree better with the effect than without."""
         return self.heldout_after < self.heldout_before
 
     @property
     def negligible(self) -> bool:
-        """Whether the effect hardly matters for calibrated q and u."""
+        """True if the effect hardly matters for calibrated q and u."""
         return self.change_of_qu < POLICY.negligible
 
 
 @dataclasses.dataclass(frozen=True)
 class Unexplained:
-    """What is left and has no name; `term` are the blocks of the free-form term that was added for it.
+    """Remainder that has no name; `term` are the blocks of the free-form term that was added for it.
 
     `chi2_before` and `chi2_after` are without and with that term, `change_of_qu` is what it changes in calibrated q
     and u of a star with p ≤ 5 %. `parts` are names that were taken out again because they explain a part only, with
@@ -204,7 +204,7 @@ class Choice:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Diagnosis(Drawn):
-    """What is missing from a model, according to one calibration set.
+    """Effects that a model lacks, according to one calibration set.
 
     `candidates` are (effect, score, corrected p) in the first examination; `before` is the fit of the model given,
     `after` that of the extended one; `remaining_p` is the significance of what is left at the end. `choices` are other
@@ -237,7 +237,7 @@ class Diagnosis(Drawn):
 
     @property
     def caution(self) -> str:
-        """What to bear in mind with these findings; empty when there is nothing."""
+        """Caution about these findings; empty when there is none."""
         parts = []
         if self.ended:
             parts.append(
@@ -366,7 +366,7 @@ def _step(step: Step) -> dict[str, Any]:
 
 
 def sentences(found: Mapping[str, Any]) -> Iterator[str]:
-    """What stands beside the numbers of a diagnosis, from the content of diagnosis.json: `print`, the command and the
+    """Sentences beside the numbers of a diagnosis, from the content of diagnosis.json: `print`, the command and the
     page say the same."""
     for step in found["steps"]:
         yield from _of_step(step)

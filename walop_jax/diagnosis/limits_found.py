@@ -1,4 +1,4 @@
-"""What `detection_limits` finds, as a table, as plain data and in words."""
+"""Findings of `detection_limits` as a table, as plain data and in words."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class ConditionLimit:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class DetectionLimits(Displayed):
-    """What a set can show of every effect, and what the effects that it cannot show may do.
+    """Sizes at which a set shows every effect, and the harm that smaller ones may do.
 
     `separation` (row, column) is how far (σ) the effect of the column stays from that of the row when this is just
     detected. `protection` is, by field point (`x`, `y`, degrees), the largest error of q and u that a single effect
@@ -120,7 +120,7 @@ class DetectionLimits(Displayed):
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> DetectionLimits:
-        """What `document` describes. Raises KeyError or TypeError for one that it has not made."""
+        """Inverse of `document`. Raises KeyError or TypeError for one that it has not made."""
         protection = document["protection"]
         return cls(
             limits=tuple(

@@ -43,9 +43,9 @@ class Policy:
     same_counts: float = 0.01
     """Relative change of the counts up to which columns of an earlier model serve again."""
     poor_fit: float = 1.5
-    """χ²/dof above which what cannot be differentiated is tried: structural effects, other descriptions; but not"""
+    """χ²/dof above which what cannot be differentiated is tried: structural effects, other descriptions."""
     good_share: float = 0.5
-    """where a name explains this share of what is missing."""
+    """Share of what is missing that a name must explain for these not to be tried."""
 
     # What is worth telling?
     even_odds: float = 3.0
@@ -93,9 +93,9 @@ class Policy:
     # How long?
     most_steps: int = 6
     minutes: float = 20.0
-    """After which nothing further is tried;"""
+    """Time after which nothing further is tried."""
     minutes_far_off: float = 5.0
-    """where the model is so far from the data that their errors were scaled (`fit.search.FAR_OFF`)."""
+    """The same where the model is so far from the data that their errors were scaled (`fit.search.FAR_OFF`)."""
 
     def document(self) -> dict[str, Any]:
         """The thresholds by name."""

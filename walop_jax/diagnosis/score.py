@@ -210,7 +210,7 @@ class ScoreSpace:
         )
 
     def places(self) -> dict[str, slice]:
-        """Where the amplitudes of each candidate stand."""
+        """Places of the amplitudes of each candidate."""
         stop = np.cumsum(self.sizes)
         return {n: slice(int(b - k), int(b)) for n, k, b in zip(self.names, self.sizes, stop, strict=True)}
 
@@ -375,7 +375,7 @@ def _log_survival(statistic: np.ndarray, rank: int) -> np.ndarray:
 
 
 def separations(space: ScoreSpace, scores: Vector, square: float) -> dict[str, float]:
-    """How far (σ) each candidate stays from a change D of the residuals when it does its best to follow.
+    """Distance (σ) of each candidate from a change D of the residuals when it does its best to follow.
 
     `scores` are C̃ᵀD and `square` D·D, both behind the projection (Atkinson & Fedorov 1975, Biometrika 62, 57).
     """

@@ -247,7 +247,7 @@ def refit_without(result: FitResult, name: str) -> FitResult:
 
 
 def signature(result: FitResult, name: str, context: Context) -> Float[np.ndarray, " _"]:
-    """What an active effect does to the residuals (data rows): theirs without it, minus theirs with it."""
+    """Change of the residuals (data rows) by an active effect: theirs without it, minus theirs with it."""
     effect = result.model.template.effect(name)
     if type(effect).is_structural():
         model = model_without(result.model, name)
@@ -303,7 +303,7 @@ def refitted_in_order(steps: Sequence[Step], start: Design, end: Design) -> list
 def predicts_unseen(
     design: Design, terms: Sequence[Candidate], least: float, *, of_states: bool = True
 ) -> bool:
-    """Whether terms without a name predict states and parts of the field that they have not seen.
+    """True if terms without a name predict states and parts of the field that they have not seen.
 
     One Gauss–Newton step of everything, with and without the terms, from all data but those of a unit gives the
     density of that unit, ln p = −½ (dᵀΣ⁻¹d + ln det Σ), Σ = s² (1 + A H⁻¹ Aᵀ): it is broad where the step leaves it
@@ -371,10 +371,10 @@ State = TypeVar("State", bound=Evidence)
 
 
 class Linear:
-    """What a trial is worth by its linear step; nothing is held out and no time runs. `workflow.Refit` fits instead."""
+    """Judge of trials by their linear steps; nothing is held out and no time runs. `workflow.Refit` fits instead."""
 
     def time_left(self) -> bool:
-        """Whether another trial may begin."""
+        """True if another trial may begin."""
         return True
 
     def fitted(self, state: Any, trial: Trial) -> Trial | None:
@@ -390,7 +390,7 @@ class Linear:
         return trials
 
     def confirmed(self, state: Any, trial: Trial) -> bool:
-        """Whether data that took no part in a trial agree better with it than without; a score space has no rows."""
+        """True, for want of data that took no part in a trial: a score space has no rows."""
         return True
 
     def adopted(self, state: Any, trial: Trial) -> Any:
@@ -420,7 +420,7 @@ def linear_trials(state: Evidence, policy: Policy) -> list[Trial]:
 
 
 def linear_trial(state: Evidence, item: Ranked) -> Trial:
-    """What one candidate explains by its linear step; `linear` is what a fit should find, with its errors."""
+    """Trial of one candidate by its linear step; `linear` is what a fit should find, with its errors."""
     noise, statistic = state.table.noise_scale, item.score.statistic
     left = state.chi2 - statistic * (noise * state.scale) ** 2
     return Trial(
@@ -445,7 +445,7 @@ def _worth(state: Evidence, trial: Trial) -> bool:
 
 
 def _promising(state: Evidence, trial: Trial, policy: Policy) -> bool:
-    """Whether a linear trial could be worth telling, were it better by as much as linear steps may miss."""
+    """True if a linear trial could be worth telling, were it better by as much as linear steps may miss."""
     if trial.evidence <= policy.linear_below:
         return _worth(state, trial)
     more = 1.0 + policy.linear_share

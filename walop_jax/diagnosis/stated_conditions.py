@@ -153,7 +153,7 @@ def scored(design: Design, rivals: tuple[_Single, ...]) -> Singles:
 
 
 def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
-    """What single mistakes do to the parameters that the data would just have shown with a probability of 99 %.
+    """Changes of the parameters by single mistakes as large as the data would just have shown at 99 % probability.
 
     A number that is wrong by h moves the parameters by R⁻¹QᵀC h (J = QR) and is found where h² |PC|² reaches the
     noncentrality of its test; h is at most the plausible size. Kept are those that move them by more than their
@@ -288,7 +288,7 @@ def _priors(design: Design) -> Iterator[_Single]:
 
 
 def _of_cameras(design: Design) -> Iterator[_Single]:
-    """What a single camera may do to its counts with one amplitude: closed forms of the counts themselves."""
+    """Mistakes of a single camera in its counts with one amplitude: closed forms of the counts themselves."""
     measured, names = design.measured, design.fit.model.template.cameras.names
     counts = measured.flux[..., None] * measured.model / np.where(measured.weight > 0, measured.weight, 1.0)
     counts = np.where(measured.used[..., None], counts, 0.0)
@@ -452,7 +452,7 @@ def _stated(calset: CalibrationSet) -> Iterator[_Stated]:
 
 
 def _of_sky(calset: CalibrationSet) -> Iterator[_Stated]:
-    """Where and when the sky was, as the exposures and the site state it."""
+    """Mistakes in the place and the time of the sky, as the exposures and the site state them."""
     e, site = calset.exposures, calset.site
     moon = (e.kind == "moon") & np.isfinite(e.ra) & np.isfinite(e.dec)
 

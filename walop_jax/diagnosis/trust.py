@@ -118,14 +118,14 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
 
 
 def _of_pixels(result: FitResult) -> list[VarianceComponent]:
-    """What single pixels of whole frames have in common between exposures, of a sample of them."""
+    """Variance components common to exposures in single pixels of whole frames, of a sample of them."""
     if not isinstance(result.posterior, PixelPosterior):
         return []
     return variance_components(Design.of(sampled(result, _most(result))), pixels=True)
 
 
 def _summed_pixels(result: FitResult) -> Iterator[str]:
-    """What was found in the pixels that a set stands for, when they were summed."""
+    """Findings in the pixels that a set stands for, when they were summed."""
     found = result.calset.compression
     if found is None:
         return
@@ -161,7 +161,7 @@ def _most(result: FitResult) -> int:
 
 
 def _errors_too_small(result: FitResult, seed: int) -> Iterator[str]:
-    """Whether residuals far larger than the stated errors are nothing but noise."""
+    """A warning if residuals far larger than the stated errors are nothing but noise."""
     factor = float(np.sqrt(result.chi2 / max(result.dof, 1)))
     scaled = fit(result.likelihood, start=result.values, noise_scale=factor)
     whole = on_field_points(scaled)
@@ -176,7 +176,7 @@ def _errors_too_small(result: FitResult, seed: int) -> Iterator[str]:
 
 
 def _far_from_pixels(result: FitResult) -> Iterator[str]:
-    """Whether the values have left the place where the pixels that a set stands for were summed."""
+    """A warning if the values have left the place where the pixels that a set stands for were summed."""
     distance = moved(result)
     if distance > FARTHEST:
         yield (
@@ -186,7 +186,7 @@ def _far_from_pixels(result: FitResult) -> Iterator[str]:
 
 
 def _hold_no_noise(design: Design) -> bool:
-    """Whether the data are the model's at some values of its parameters: what priors pull at, noise has not made."""
+    """True if the data are the model's at some values of its parameters: what priors pull at, noise has not made."""
     data = slice(0, design.rows)
     left = Projector(design.jacobian[data])(design.residual[data])
     return float(left @ left) < NOISELESS * design.rows

@@ -65,7 +65,7 @@ class _Grouping(NamedTuple):
 
 
 class VarianceComponent(NamedTuple):
-    """What one grouping holds: T in standard deviations of noise, its p, and the size τ with its standard error."""
+    """Content of one grouping: T in standard deviations of noise, its p, and the size τ with its standard error."""
 
     grouping: _Grouping
     deviate: float
@@ -101,7 +101,7 @@ def in_words(found: list[VarianceComponent]) -> Iterator[str]:
 
 
 def structure_of(found: list[VarianceComponent]) -> Structure:
-    """What field points differ by, of the components that were found."""
+    """Differences between field points, of the components that were found."""
 
     def size(name: str) -> float:
         return float(np.sqrt(sum(c.size**2 for c in found if c.grouping.structure == name)))

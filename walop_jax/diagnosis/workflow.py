@@ -160,7 +160,7 @@ def _examined(found: Diagnosis) -> Diagnosis:
 
 
 def _promise(choice: Choice) -> tuple[float, float]:
-    """What other descriptions are sorted by: the gain where it is known, then what is left."""
+    """Order of other descriptions: by the gain where it is known, then by what is left."""
     return (-choice.better_by if np.isfinite(choice.better_by) else np.inf), choice.left
 
 
@@ -236,7 +236,7 @@ class Refit(Linear):
     # ------------------------------------------------------------------------------------------ as a judge
 
     def time_left(self) -> bool:
-        """Whether another trial may begin."""
+        """True if another trial may begin."""
         self.ended |= time.perf_counter() >= self.until
         return not self.ended
 
@@ -258,7 +258,7 @@ class Refit(Linear):
         return dataclasses.replace(found, item=item, linear=trial.linear)
 
     def _hopeful(self, state: Examination, item: Ranked) -> bool:
-        """Whether a sentence predicts what it has not seen, by its linear step: nobody has a name for it to believe."""
+        """True if a sentence predicts what it has not seen, by its linear step: nobody has a name for it to believe."""
         single = any("exposure" in text for text in candidates.said_by(item.probe))
         columns = [state.said[item.probe.name]]
         return predicts_unseen(state.design, columns, self.policy.hopeful, of_states=not single)
@@ -289,7 +289,7 @@ class Refit(Linear):
         return [*clearly, *trials[len(even) :]]
 
     def confirmed(self, state: Examination, trial: Trial) -> bool:
-        """Whether data that took no part in the fit agree better with the effect than without."""
+        """True if data that took no part in the fit agree better with the effect than without."""
         assert trial.fit is not None
         self._compared = before_and_after(trial.effect.name, state.design, Design.of(trial.fit))
         return self._compared["heldout_after"] < self._compared["heldout_before"]
@@ -482,7 +482,7 @@ class Refit(Linear):
 
 
 def unexplained(state: Examination, patterns: tuple[tuple[str, float], ...]) -> Unexplained:
-    """What an examination leaves without a name: its patterns, and where the residuals sit."""
+    """Remainder of an examination without a name: its patterns, and where the residuals sit."""
     if not state.alarm:
         ratio = state.chi2 / state.dof
         text = f"residuals scatter more than N_ERR says (χ²/dof = {ratio:.3g}) without a known pattern"
@@ -505,6 +505,6 @@ def _and(found: Unexplained, text: str) -> Unexplained:
 
 
 def too_many_sentences(state: Examination, said: Sequence[str]) -> Unexplained:
-    """What is said where so many sentences were needed that none of them is the thing itself."""
+    """Remainder where so many sentences were needed that none of them is the thing itself."""
     text = f"{len(said)} descriptions were needed: they say where it sits, no single one of them what it is"
     return Unexplained(state.table.p_global, f"{text} ({' | '.join(said)})", ())

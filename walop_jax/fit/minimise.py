@@ -52,7 +52,7 @@ WELL_PREDICTED = 0.75
 
 @runtime_checkable
 class Expansion(Protocol):
-    """What is minimised, and half its gradient and Hessian, at one place."""
+    """Value, and half the gradient and Hessian, of what is minimised, at one place."""
 
     @property
     def objective(self) -> float:
@@ -72,7 +72,7 @@ class Expansion(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Minimum:
-    """Where the search ended: `x` in the units it was given, the expansion there and the gates.
+    """End of a search: `x` in the units it was given, the expansion there and the gates.
 
     `steps` counts the places looked at, `history` holds their objectives; `result` is a member of
     `optimistix.RESULTS`, and `message` says it in words.
@@ -89,7 +89,7 @@ class Minimum:
 
     @property
     def converged(self) -> bool:
-        """Whether the minimum was reached and is well conditioned."""
+        """True if the minimum was reached and is well conditioned."""
         return bool(self.result == RESULTS.successful)
 
 

@@ -73,7 +73,7 @@ class ModelTable:
 
 
 def header_of(model: Model) -> ModelTable:
-    """What decides which parameters a model has."""
+    """Choices that decide which parameters a model has."""
     instrument = model.template
     choices = {effect.name: effect.choices() for effect in model.effects}
     return ModelTable(
@@ -271,7 +271,7 @@ def base_model(
 
 
 def _gauges(model: Model, flux_known: bool) -> list[str]:
-    """What the fluxes take up: the scale of the throughput, or all that the cameras of an arm have in common."""
+    """Parameters that fluxes take up: the scale of the throughput, or all that the cameras of an arm have in common."""
     units = tuple(f"throughput.n{camera}." for camera in model.template.cameras.units)
     if units:
         return [name for name in model.names if name.startswith(units)]
@@ -305,7 +305,7 @@ def standard_names(sources: Sources) -> tuple[str, ...]:
 
 
 def has_known_flux(calset: CalibrationSet) -> bool:
-    """Whether any exposure is of KIND `flux`, so that the overall scale of the throughput is measured."""
+    """True if any exposure is of KIND `flux`, so that the overall scale of the throughput is measured."""
     return bool((calset.exposures.kind == "flux").any())
 
 

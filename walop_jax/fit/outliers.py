@@ -49,7 +49,7 @@ class Clipped:
 
     @property
     def too_many(self) -> bool:
-        """Whether so many rows lie off that it is the model that lacks something."""
+        """True if so many rows lie off that it is the model that lacks something."""
         return self.share > MOST
 
 
@@ -96,7 +96,7 @@ def _mean_square(likelihood: Likelihood, residual: Float[np.ndarray, "p e k"]) -
 
 
 def _distance(likelihood: Likelihood, residual: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "p e"]:
-    """How far the worst camera of every row lies off, in standard errors; 0 where unused."""
+    """Distance of the worst camera of every row, in standard errors; 0 where unused."""
     used = likelihood.used
     residual = np.abs(residual) / np.sqrt(likelihood.data_per_row / likelihood.cameras)[:, None]
     scatter = _GAUSSIAN * float(np.median(residual[used])) if used.any() else 1.0

@@ -78,7 +78,7 @@ def parameter_rows(model: Model, values: Vector, sigma: Vector) -> tuple[tuple[s
 
 
 def parameter_notes(model: Model, sigma: Vector) -> tuple[str, ...]:
-    """What a table of `parameter_rows` leaves out, and which parameters the data do not constrain."""
+    """Notes on what a table of `parameter_rows` leaves out, and on parameters that the data do not constrain."""
     hidden = len(model.positions(THROUGHPUT))
     idle = unconstrained(model, sigma)
     notes = [f"{hidden} throughput terms not shown; to_table() has them"] if hidden else []

@@ -110,7 +110,7 @@ class FitResult(Result):
 
     @property
     def converged(self) -> bool:
-        """Whether the minimum was reached and is well conditioned."""
+        """True if the minimum was reached and is well conditioned."""
         return self.minimum.converged
 
     @property
@@ -120,17 +120,17 @@ class FitResult(Result):
 
     @property
     def explains_data(self) -> bool:
-        """Whether χ² is what noise alone would give."""
+        """True if χ² is what noise alone would give."""
         return self.dof > 0 and bool(self.excess < SUSPECT_SIGMA)
 
     @property
     def nearly_explains_data(self) -> bool:
-        """Whether χ² is so little too large that the stated errors may be all that is wrong."""
+        """True if χ² is so little too large that the stated errors may be all that is wrong."""
         return self.dof > 0 and not self.explains_data and bool(self.chi2 < NEARLY * self.dof)
 
     @property
     def errors_too_large(self) -> bool:
-        """Whether χ² is far smaller than noise of the stated size would make it."""
+        """True if χ² is far smaller than noise of the stated size would make it."""
         return bool(self.excess < -SUSPECT_SIGMA and self.chi2 < TOO_LOW * self.dof)
 
     @property
@@ -209,7 +209,7 @@ class FitResult(Result):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What its table leaves out, what the data do not constrain, and which mistakes they would not show."""
+        """Notes on what its table leaves out, what the data do not constrain, and mistakes they would not show."""
         notes = parameter_notes(self.model, self.sigma)
         if self.answer is not None or self.hidden is None or not len(self.hidden):
             return notes
@@ -406,7 +406,7 @@ def refit(
 
 
 def _journal(folder: Path, calset: CalibrationSet, model: Model, processes: Processes) -> Journal:
-    """Where the work of one fit is kept, by all that it depends on: data, model, software, and who does it."""
+    """Journal of one fit, named by all that it depends on: data, model, software, and who does it."""
     texts = [fingerprint(calset), render(model), f"{processes.index}/{processes.count}"]
     texts += [f"{name} {version}" for name, version in software_versions().items()]
     return Journal(folder, hashlib.sha256("\n".join(texts).encode()).hexdigest())

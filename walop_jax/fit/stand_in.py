@@ -73,7 +73,7 @@ def with_pixels(result: FitResult) -> FitResult:
 
 
 def values_then(result: FitResult) -> Float[np.ndarray, " n"]:
-    """Where the pixels of a set were summed; parameters that were not there then have their start values."""
+    """Values at which the pixels of a set were summed; parameters that were not there then have their start values."""
     compression = result.calset.compression
     assert compression is not None
     names, start = [p.name for p in result.model.parameters], result.model.start
@@ -81,7 +81,7 @@ def values_then(result: FitResult) -> Float[np.ndarray, " n"]:
 
 
 def moved(result: FitResult) -> float:
-    """How far (standard errors, all parameters together) a fit lies from where the pixels of its set were summed.
+    """Distance (standard errors, all parameters together) of a fit from where the pixels of its set were summed.
 
     0 for a set that stands for no pixels. Parameters that were not there then count from their start values.
     """

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 STATED = "N_ERR"
-"""What errors of a fit are made from where it explains the data: the stated errors."""
+"""Origin of the errors of a fit that explains the data: the stated errors."""
 
 
 class Quality(enum.IntFlag):
@@ -42,7 +42,7 @@ class Quality(enum.IntFlag):
 
     @property
     def meanings(self) -> tuple[str, ...]:
-        """What the bits that are set say, in words."""
+        """Meanings of the bits that are set, in words."""
         return tuple(text for bit, text in _MEANINGS.items() if bit & self)
 
 

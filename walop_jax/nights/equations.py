@@ -1,4 +1,4 @@
-"""What a night leaves: the normal equations of its data in all free parameters and in candidates, at reference values.
+"""Summary of a night: the normal equations of its data in all free parameters and in candidates, at reference values.
 
     χ²(θ) = χ² + 2 gᵀ(θ − θ₀) + (θ − θ₀)ᵀ H (θ − θ₀),      g = Jᵀr,   H = JᵀJ
 

@@ -57,7 +57,7 @@ from walop_jax.nights.survey import Survey
 from walop_jax.posterior.files import Run
 
 Given = FitResult | CalibrationSet | Night | Run | str | os.PathLike[str]
-"""What nights are made of: a fit, a set, a night, or a path: of a set, of a RUN, of a SURVEY or of its nights."""
+"""Sources of nights: a fit, a set, a night, or a path: of a set, of a RUN, of a SURVEY or of its nights."""
 
 LONG = 60.0  # days without a night that are worth a remark
 FAR = 0.02  # standard errors from the solution up to which a night need not be linearised again
@@ -79,7 +79,7 @@ class _Data(NamedTuple):
 
 
 class _Opened(NamedTuple):
-    """What was given: nights, or data that they can be made of, with what comes with them."""
+    """Nights as given, or data that they can be made of, with what comes with them."""
 
     nights: list[Night]
     data: _Data | None = None
@@ -248,7 +248,7 @@ def laws_of_all(
 
 
 def writers(survey: Survey) -> dict[str, Callable[[Path], object]]:
-    """What writes the files of a survey, but for its document."""
+    """Writers of the files of a survey, but for its document."""
     last, reference = survey.at(survey.last), dataclasses.replace(survey.reference, path=None)
     return {
         NIGHTS: lambda path: write_nights(path, survey.data.aligned()),
@@ -264,7 +264,7 @@ def read_survey(folder: str | os.PathLike[str], catalogue: Sequence[type[Effect]
 
 
 def is_survey(given: Any) -> TypeGuard[str | os.PathLike[str]]:
-    """Whether something is the path of a survey."""
+    """True for the path of a survey."""
     return isinstance(given, str | os.PathLike) and (Path(given) / SURVEY).exists()
 
 
@@ -289,7 +289,7 @@ def calibration_of_stars(survey: Survey, stars: InputTable, *, force: bool = Fal
 
 
 def _opened(one: Given, catalogue: Sequence[type[Effect]]) -> _Opened:
-    """What nights can be made of, or are, with the fit, breaks and events that come with them."""
+    """Nights, or data that they can be made of, with the fit, breaks and events that come with them."""
     if isinstance(one, Night):
         return _Opened([one])
     if isinstance(one, FitResult):

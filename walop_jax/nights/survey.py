@@ -44,7 +44,7 @@ from walop_jax.science.star_errors import GOAL
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "n n"]
 Given = FitResult | CalibrationSet | Night | str | os.PathLike[str]
-"""What nights are made of: a fit, a set, a night, or the path of nights that were written."""
+"""Sources of nights: a fit, a set, a night, or the path of nights that were written."""
 Again = Callable[[Mapping[str, float]], Night]
 """Linearises a night at other values."""
 
@@ -373,7 +373,7 @@ class Survey(Displayed):
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """What to do, in sentences, the most urgent first."""
+        """Advice, in sentences, the most urgent first."""
         found = (
             [] if self.trusted else ["Look at the nights that scatter too much: walop-jax diagnose NIGHT."]
         )
@@ -391,7 +391,7 @@ class Survey(Displayed):
         return (*found, f"Calibrate again before MJD {self.until:.1f}.")
 
     def display(self) -> Display:
-        """How good it is tonight, what has changed since when, and what to do."""
+        """Quality tonight, what has changed since when, and what to do."""
         verdict, (start, stop), nights = self.verdict, self.span, self.data.nights
         facts = {
             "χ²/dof": f"{verdict.chi2:.1f} / {verdict.dof} = {verdict.chi2 / max(verdict.dof, 1):.4g}",

@@ -1,4 +1,4 @@
-"""What could be observed, and what it costs: filters, plates, exposure times, what is up, and the time beside exposing.
+"""Possible observations and their costs: filters, plates, exposure times, what is up, the time beside exposing.
 
     plate = ["out", "any"]  # through the polariser the calibration plate may stand at any angle; or a list (deg)
     altitude = 20           # of the lowest pointing (deg)
@@ -83,7 +83,7 @@ class CandidateExposure(NamedTuple):
 
     @property
     def setting(self) -> tuple[Any, ...]:
-        """What has to be changed for another choice."""
+        """Settings that have to be changed for another choice."""
         return (self.filter, self.free, *self.positions.values())
 
     def stop(self, place: Place, times: int = 1) -> Stop:

@@ -274,7 +274,7 @@ def _interpolating(angle: Float[np.ndarray, " s"], nodes: int) -> Float[np.ndarr
 
 
 class Illumination(NamedTuple):
-    """How much light there is in an exposure: `flux` (electron) at its points, noise, what shares a flux.
+    """Light of an exposure: `flux` (electron) at its points, noise, what shares a flux.
 
     No error is smaller than `floor`, a share of the mean counts of all cameras, as in a fit (`Cameras.floor`). `scale`
     leads from these points to those of the plan.
@@ -469,7 +469,7 @@ def _mixed(
 def information_of(
     known: Calibration, names: Sequence[str], effects: Iterable[str] = ()
 ) -> Float[np.ndarray, "f f"]:
-    """What a calibration says of parameters by name; nothing of those that it has not, nor of those of `effects`."""
+    """Information of a calibration on parameters by name; none on those that it has not, nor on those of `effects`."""
     both = [i for i, name in enumerate(names) if name in known.model.names and not _effect_of(name, effects)]
     there = [known.model.index(names[i]) for i in both]
     covariance = known.covariance[np.ix_(there, there)]

@@ -66,12 +66,12 @@ _PATIENCE = 4  # rounds without a better bound or value after which the search e
 
 
 class NotEstimableError(ValueError):
-    """What is wanted depends on parameters that neither the candidates nor what is known inform about."""
+    """A target depends on parameters that neither the candidates nor what is known inform about."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """What is wanted, what is known and what can be done.
+    """Problem to be solved: what is wanted, what is known and what can be done.
 
     `known` is M₀ (draw, n, n), `targets` A (draw, target, n, q), `families` the candidates, `budget` the cost that a
     plan may have; `together` draws in a row share their largest variance. Raises NotEstimableError, when solved, if a
@@ -132,7 +132,7 @@ class Experiment:
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """What no plan can undercut: f ≥ here² / (known + budget · ratio), in the symbols of the module.
+    """Bound on all plans: f ≥ here² / (known + budget · ratio), in the symbols of the module.
 
     `tops` are the candidates that promise most, as number of the family and place.
     """
@@ -153,7 +153,7 @@ class Bound:
 
 @dataclasses.dataclass(frozen=True)
 class Allocation:
-    """How often each candidate is done, the criterion, and the least that any plan of this budget can have.
+    """Number of times for each candidate, the criterion, and the least that any plan of this budget can have.
 
     `family` (number of the family), `place` (its coordinates there) and `weight` are one for each candidate in it.
     `bound` ≤ the criterion of every plan; `proof` says so for other budgets as well.

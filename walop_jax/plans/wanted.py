@@ -1,4 +1,4 @@
-"""What a plan is to know well: linear functions of the parameters, by name.
+"""Targets of a plan: linear functions of the parameters, by name, that are to be known well.
 
 Error of p   of stars behind the calibration alone: δ(q, u) = −M⁻¹ (δm₁ + δM (q, u)), hence δp = −e · M⁻¹ δm s, linear
              in the six elements of δm and so in the parameters (`science.field_accuracy`). Mean square over stars with
@@ -88,7 +88,7 @@ class FieldErrors:
 
     @property
     def seen(self) -> Bool[np.ndarray, " p"]:
-        """Where one exposure holds u in all draws."""
+        """True where one exposure holds u in all draws."""
         return np.asarray(self.forms.any(axis=(2, 3)).all(axis=0))
 
     def targets(self) -> Float[np.ndarray, "r k f 6"]:
@@ -111,7 +111,7 @@ def field_errors(
     points: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]] | None = None,
     stars: Float[np.ndarray, "*b m 2"] | None = None,
 ) -> FieldErrors:
-    """How p depends on the parameters, at a grid of points (or those given, deg).
+    """Dependence of p on the parameters, at a grid of points (or those given, deg).
 
     `stars` (q, u) are those over which the square is averaged, at all points or at each: those with p ≤ 5 %.
     """
