@@ -46,6 +46,7 @@ OWNERS = {
 # Imported by nobody: tools of the tests, and what there is no need of.
 STRANGERS = {"pandas", "elli", "beartype", "hypothesis", "pytest", "oracle", "tests"}
 LONGEST = 600  # a question, not a goal: split by idea, never by length
+QUESTION = re.compile(r"(what|whether|where|how|who|which)\b", re.IGNORECASE)  # no opening of a docstring
 MACHINE = re.compile(r"""/(?:home|root|work|tmp|Users|opt|mnt|data)/|[A-Z]:\\\\|\.\./shared|file://""")
 
 
@@ -113,6 +114,24 @@ def test_module_keeps_to_its_room(path):
     assert complaints(source, module_name(path), path.name == "__init__.py") == []
     assert len(source.splitlines()) <= LONGEST
     assert [line for line in source.splitlines() if MACHINE.search(line)] == []
+
+
+def questions(tree: ast.AST) -> list[str]:
+    """Docstrings, those of constants included, that open like a question where a noun phrase or a verb would say it."""
+    texts = (
+        node.value.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    )
+    return [text for text in texts if isinstance(text, str) and QUESTION.match(text.lstrip())]
+
+
+def test_docstrings_open_with_what_comes_back():
+    assert {str(path): found for path in files() if (found := questions(ast.parse(path.read_text())))} == {}
+    assert (
+        len(questions(ast.parse('"""What it is."""\nN = 1\n"""How many."""\ndef f():\n    "True if so."')))
+        == 2
+    )
 
 
 def test_every_library_is_declared():

@@ -1,4 +1,4 @@
-"""What makes a function a command: the record that it works with, the outcome that it returns, and a decorator.
+"""The parts of a command: the record that it works with, the outcome that it returns, and a decorator.
 
 The body of a command takes a `Job` and its own arguments, and returns an `Outcome`. The decorator makes two faces of
 it: the Python function, which takes `overwrite`, `progress` and `seed` beside those arguments and returns the value;
@@ -69,7 +69,7 @@ def _silent(text: str) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """How a command is to work, apart from its own arguments.
+    """Working conditions of a command, apart from its own arguments.
 
     `overwrite`: replace outputs that exist. `seed`: of random numbers. `progress` is told what is being done. `folder`
     is the reserved folder of results (None: nothing is written). `typed`: on the command line, not from Python.
@@ -127,12 +127,12 @@ class Job:
 
 
 def text_file(text: str) -> Callable[[Path], object]:
-    """What writes a file of text."""
+    """Writer of a text file."""
     return lambda path: path.write_text(text, encoding="utf-8")
 
 
 def figure_file(figure: Any) -> Callable[[Path], object]:
-    """What writes a figure as a picture."""
+    """Writer of a figure as a picture."""
     return lambda path: figure.savefig(path, dpi=130)
 
 
@@ -142,7 +142,7 @@ def _nothing() -> Writers:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome(Generic[T]):
-    """What a command has found: `value` for Python; the rest is worked out when it is asked for.
+    """Result of a command: `value` for Python; the rest is worked out when it is asked for.
 
     `document` is the result as plain data, `text` as a terminal shows it: what the value says of itself, unless given.
     `files` write the files of the output folder,
@@ -307,7 +307,7 @@ def command_of(function: Callable[..., T]) -> Command[T]:
 
 
 def cache_folder() -> Path | None:
-    """Where compiled code is kept between runs; None when that is switched off or impossible.
+    """Folder of compiled code that is kept between runs; None when that is switched off or impossible.
 
     WALOP_JAX_CACHE names the folder ("off": none), otherwise it is walop-jax/xla in the user's cache folder.
     """

@@ -42,7 +42,7 @@ CHECK = Option("Judge FOLDER/results.csv.", "FOLDER", Path)
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Conformance(Displayed):
-    """How many numbers were asked for, and those that are not right."""
+    """Number of values that were asked for, and those that are not right."""
 
     asked: int
     deviations: tuple[Deviation, ...]
@@ -56,7 +56,7 @@ class Conformance(Displayed):
         }
 
     def display(self) -> Display:
-        """How many numbers are right, and those that are not: each mistake once, with all that it explains."""
+        """Number of right values, and the wrong ones: each mistake once, with all that it explains."""
         groups: dict[str, list[Deviation]] = {}
         for one in self.deviations:
             groups.setdefault("no answer" if one.answer is None else one.mistake, []).append(one)

@@ -98,6 +98,6 @@ def diagnose(
 
 
 def _with_answer(found: Diagnosis, after: FitResult) -> Display:
-    """What was found, and how well stars are known with the extended model."""
+    """The findings, and how well stars are known with the extended model."""
     shown, known = found.display(), after.answer() if after.answer is not None and after.converged else None
     return dataclasses.replace(shown, facts=(*shown.facts, *(known.facts() if known is not None else ())))

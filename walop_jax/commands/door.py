@@ -159,7 +159,7 @@ def _kind(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
 
 
 def _fits(value: Any, kind: Any) -> bool:
-    """Whether a value is of a kind, as far as that can be told: a doubt is no error."""
+    """True if a value is of a kind, as far as that can be told: a doubt is no error."""
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if kind is Any:
         return True

@@ -1,4 +1,4 @@
-"""What commands share: the arguments that several take, on the command line and in Python, and how they are read.
+"""Arguments that several commands take, on the command line and in Python, and their readers.
 
 Sets, models, calibrations and tables may be given in memory or as files; `read` is the door for whatever the program
 has written.
@@ -27,7 +27,7 @@ IN_MEMORY = "in memory"
 """In place of the path of a file."""
 
 NOT_CARRIED_OVER = "not_carried_over"
-"""Where results in JSON list the effects of a model that had to be left out."""
+"""Key under which results in JSON list the effects of a model that had to be left out."""
 
 # --------------------------------------------------------------------------------------------------- options
 

@@ -47,7 +47,7 @@ class ModelFile(Displayed):
         }
 
     def display(self) -> Display:
-        """Where it is and how large."""
+        """Its file and its size."""
         where = self.model.name if self.path is None else self.path
         return Display(
             f"{where}: {len(self.model.parameters)} parameters, {len(self.model.free)} of them free"

@@ -57,7 +57,7 @@ NEXT = {
     "report": ("open the page in a browser",),
     "certify": ("walop-jax apply {calibration} STARS.fits -o OUT.fits",),
 }
-"""What one might type after a command, where the command itself does not say; names are those of its arguments."""
+"""Commands to type next, where a command itself does not say; names are those of its arguments."""
 
 QUIET = Option("Print nothing but warnings and errors.", short="-q", kind=bool)
 JSON = Option("Machine-readable result to stdout, nothing else.", kind=bool)
@@ -157,7 +157,7 @@ def _command(name: str) -> Any:
 
 
 def _function(command: Command[Any]) -> Callable[..., None]:
-    """What typer calls: a function whose signature is made of the options of a command."""
+    """Function that typer calls: its signature is made of the options of a command."""
     defaults = {p.name: p.default for p in inspect.signature(command.body).parameters.values()}
     parameters = [_parameter(name, option, defaults[name]) for name, option in command.options.items()]
     for name, (default, option) in COMMON.items():
@@ -281,7 +281,7 @@ def _print(text: str, markdown: bool) -> None:
 
 
 def _is_interrupt(error: BaseException) -> bool:
-    """Whether an error was made of an interrupt by whoever caught it first."""
+    """True if an error goes back to an interrupt that was caught on the way."""
     before: BaseException | None = error
     for _ in range(20):
         if before is None or isinstance(before, KeyboardInterrupt):

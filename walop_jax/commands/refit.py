@@ -147,7 +147,7 @@ def refit(
 
 
 def next_steps(trusted: bool, output: PathLike | None, data: Sets) -> tuple[str, ...]:
-    """What to type after a fit."""
+    """Command lines to type after a fit."""
     if trusted:
         return (f"walop-jax report {output}", f"walop-jax apply {output} STARS.fits -o OUT.fits")
     sets = " ".join(str(path) for path in paths_of(data)) if output is not None else "CALSET"
@@ -180,7 +180,7 @@ def _crew(processes: Processes | str | None) -> Iterator[Processes]:
 
 @contextlib.contextmanager
 def _standard_output_to_error() -> Iterator[None]:
-    """What a library prints by itself must not end up in the machine-readable result."""
+    """Send what a library prints to standard error: it must not end up in the machine-readable result."""
     sys.stdout.flush()
     kept = os.dup(1)
     os.dup2(2, 1)

@@ -34,7 +34,7 @@ class Page(Displayed):
         return {"page": str(self.path), "bytes": self.length, "missing": list(self.missing)}
 
     def display(self) -> Display:
-        """Where it is, and what the run lacked for it."""
+        """Its file and size, and what the run lacked for it."""
         return Display(f"{self.path}: {self.length / 1e6:.1f} MB", notes=self.missing)
 
 
@@ -96,7 +96,7 @@ def report(
 
 
 def _is_page(path: Path) -> bool:
-    """Whether a file is a page that this program has written: then it is made anew without asking."""
+    """True if a file is a page that this program has written: then it is made anew without asking."""
     try:
         with path.open(encoding="utf-8") as stream:
             return GENERATOR in stream.read(1000)

@@ -180,7 +180,7 @@ def _texts(effect: str | Sequence[str | Effect] | Mapping[str, Any] | None) -> S
 
 
 def truth_document(plan: ObservingPlan, seed: int, instrument: Instrument) -> dict[str, Any]:
-    """What a simulated set was made of, as plain data: the plan, the effects, the true value of every parameter."""
+    """Truth of a simulated set as plain data: the plan, the effects, the true value of every parameter."""
     from walop_jax.model.parameters import leaves
     from walop_jax.simulation.simulate import truth_values
 

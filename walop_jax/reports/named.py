@@ -27,7 +27,7 @@ from walop_jax.science.field_accuracy import field_accuracy
 
 Drawable = FitResult | Calibration | Diagnosis | PosteriorSample | Run
 _IN_MEMORY = {PRODUCT: "product", POSTERIOR: "posterior", FIGURE_DATA: "figure_data"}
-"""Where a result in memory holds what the file of a run would."""
+"""Attributes in which a result in memory holds what the file of a run would."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -46,7 +46,7 @@ class FigureSource(Run):
 
     @classmethod
     def of(cls, given: Drawable, **options: Any) -> FigureSource:
-        """What a result in memory holds, or the folder of a run."""
+        """Source of the figures of a result in memory, or of the folder of a run."""
         if isinstance(given, Run):
             return cls(given.folder, given.catalogue, given.data, **options)
         made = cls(Path("in memory"), **options)
@@ -89,7 +89,7 @@ class FigureSource(Run):
 
     @functools.cached_property
     def figure_data(self) -> DiagnosisFigureData:
-        """What the figures of a diagnosis are drawn from."""
+        """Data of the figures of a diagnosis."""
         return read_figure_data(self.wanted(FIGURE_DATA, "it comes with walop-jax diagnose"))
 
     @functools.cached_property

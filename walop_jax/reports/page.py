@@ -131,7 +131,7 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
 
 
 def _next(run: RunContents, trusted: bool) -> list[tuple[str, str]]:
-    """What to do next: words and a command line."""
+    """Next steps: words and a command line."""
     name = run.folder.resolve().name
     sets = " ".join(str(entry["path"]) for entry in run.summary["inputs"]) or "CALSET"
     steps = [("correct stars", f"walop-jax apply {name} STARS.fits -o OUT.fits")] if trusted else []

@@ -50,7 +50,7 @@ class PaperFigure(Figure):
 
 @dataclasses.dataclass(frozen=True)
 class Canvas:
-    """Where a figure is drawn: in one of its own, of its usual size or of `figsize` (inches), or in place of `ax`.
+    """Place of a figure: one of its own, of its usual size or of `figsize` (inches), or in place of `ax`.
 
     Figures of several panels take the room of `ax`, which goes, as a subfigure.
     """

@@ -49,7 +49,7 @@ def tracks_figure(tracks: Any, document: Mapping[str, Any]) -> Figure | None:
 
 
 def nights_figure(document: Mapping[str, Any]) -> Figure:
-    """How far χ² of every night lies from its expectation, in standard deviations."""
+    """Distance of χ² of every night from its expectation, in standard deviations."""
     nights: Sequence[Mapping[str, Any]] = document["by_night"]
     excess = np.array([night["excess"] for night in nights], float)
     mjd = np.array([night["mjd"] for night in nights], float)

@@ -220,7 +220,7 @@ PLACES = {
 
 
 def names_in_words(names: Iterable[str]) -> str:
-    """What the first parts of names of parameters stand for, where that is no word of its own."""
+    """Meanings of the first parts of names of parameters, where that is no word of its own."""
     used = {name.partition(".")[0] for name in names}
     found = [words for part, words in PLACES.items() if part in used]
     return f"In names of parameters stand {listed(found)}." if found else ""

@@ -237,7 +237,7 @@ class _Application:
         return np.mod(stars * 0.6180339887498949, 1.0) < most / len(self.catalogue)
 
     def residuals(self, block: _Block, chosen: Bool[np.ndarray, " s"]) -> list[StarResiduals]:
-        """What the chosen stars of a block leave: none, or one list of those that have a result within the field."""
+        """Residuals of the chosen stars of a block: none, or one list of those that have a result within the field."""
         catalogue, vectors, stars = self.catalogue, self.vectors, block.stars
         number = catalogue.star[block.rows]
         first = np.flatnonzero(np.diff(block.star, prepend=-1))
@@ -278,7 +278,7 @@ class _Application:
         return [left]
 
     def checked(self, watched: list[StarResiduals]) -> CatalogueCheck:
-        """What the stars say together."""
+        """Check of all stars together."""
         if not watched:
             return NOTHING_TO_SPARE
         vectors = self.vectors
@@ -529,7 +529,7 @@ def _hidden(vectors: AnalysisVectors, derivative: Float[np.ndarray, "s 2 n"]) ->
 
 
 def _rotator_zero(vectors: AnalysisVectors) -> tuple[float, Float[np.ndarray, " n"]]:
-    """What the model adds to ROTATOR (rad), and its derivatives to `vectors.parameters`."""
+    """Offset that the model adds to ROTATOR (rad), and its derivatives to `vectors.parameters`."""
     to_instrument = with_values(vectors.calibration.model.template)
 
     def zero(values: jax.Array) -> jax.Array:

@@ -64,7 +64,7 @@ class ChangeQuestion(NamedTuple):
 
     @property
     def of_camera(self) -> bool:
-        """Whether a camera has changed, not the optics."""
+        """True if a camera has changed, not the optics."""
         return self.camera >= 0
 
     def words(self, size: float, error: float) -> str:
@@ -122,7 +122,7 @@ class InstrumentChange:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class CatalogueCheck(Displayed):
-    """What the stars of a catalogue say together.
+    """Findings from the stars of a catalogue together.
 
     `noise` is χ² per degree of freedom behind the changes (1 expected; without outliers) and `noise_p` its chance;
     `rows` the factor by which the variance of what the rows of a star share exceeds N_ERR, None where every star has
@@ -165,20 +165,20 @@ class CatalogueCheck(Displayed):
 
     @property
     def noise_is_off(self) -> bool:
-        """Whether N_ERR is not what the counts scatter by."""
+        """True if N_ERR is not what the counts scatter by."""
         off = not 1.0 / NOISE_MATTERS < self.noise < NOISE_MATTERS
         return self.noise > NO_NOISE and self.noise_p < self.alarm and off and not self.rows_agree
 
     @property
     def rows_agree(self) -> bool:
-        """Whether rows of a star have more in common than light."""
+        """True if rows of a star have more in common than light."""
         if self.rows is None or self.rows < NO_NOISE:
             return False
         return self.rows_p < self.alarm and self.rows > NOISE_MATTERS * self.noise
 
     @property
     def holds(self) -> bool:
-        """Whether calibration and errors stand."""
+        """True if calibration and errors stand."""
         return not (self.changes or self.noise_is_off or self.rows_agree)
 
     def warnings(self) -> tuple[str, ...]:
@@ -434,7 +434,7 @@ class _Search:
         return ALARM / (self.asked + 2)
 
     def _suspicious(self, look: _Look, tests: list[FoundChange]) -> bool:
-        """Whether anything comes near an alarm."""
+        """True if anything comes near an alarm."""
         near = 100.0 * self._alarm
         rows = 1.0 if look.rows is None else _chance_beside(look.rows, look.noise)
         strongest = max((abs(test.sigma) for test in tests), default=0.0)
@@ -474,7 +474,7 @@ class _Search:
     def _change(
         self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int], asked: int
     ) -> InstrumentChange:
-        """What was found, and what describes the same residuals as well."""
+        """Change that was found, and what describes the same residuals as well."""
         away = np.zeros_like(sizes)
         away[asked] = sizes[asked]
         score = look.score + look.matrix @ away

@@ -46,7 +46,7 @@ class Commissioning(Displayed):
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """What to do, what is needed first."""
+        """Advice on requirements that are not met, what is needed first."""
         ordered = sorted(self.requirements, key=lambda one: not one.needed)
         return tuple(f"{one.found}: {one.advice}" for one in ordered if not one.met)
 
@@ -65,7 +65,7 @@ class Commissioning(Displayed):
 
 
 def commissioning(result: FitResult, accuracy: FieldAccuracy | None) -> Commissioning:
-    """What is asked of an examined fit; `accuracy` is that of p over the field, None where nobody knows it."""
+    """Requirements on an examined fit; `accuracy` is that of p over the field, None where nobody knows it."""
     found = [
         Requirement(
             "the fit has reached its minimum", result.converged, result.minimum.message or "converged",

@@ -61,7 +61,7 @@ def _mistake(case: Case, quantity: str, answer: float | None) -> str:
 
 
 def _same(quantity: str, answer: float | None, expected: float) -> bool:
-    """Whether two numbers agree to 10⁻⁶, angles to 10⁻⁵ degrees."""
+    """True if two numbers agree to 10⁻⁶, angles to 10⁻⁵ degrees."""
     if answer is None or not math.isfinite(answer):
         return False
     if quantity in EVPA:
@@ -131,7 +131,7 @@ def _two_cameras(n: Numbers) -> dict[str, float]:
 
 
 def _seen(q: float, u: float) -> Numbers:
-    """What two cameras of equal throughput count behind a half-wave plate."""
+    """Counts of two cameras of equal throughput behind a half-wave plate."""
     signals = {"0": q, "45": -q, "22": u, "67": -u}
     return {f"{c}_{a}": 1e6 * (1 + s * d) for a, d in signals.items() for c, s in (("O", 1), ("E", -1))}
 

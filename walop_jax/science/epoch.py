@@ -108,7 +108,7 @@ class Epoch(Displayed):
 
     @property
     def holds(self) -> bool:
-        """Whether the old calibration may be used on: nothing has moved, and a fit to be trusted says so."""
+        """True if the old calibration may be used on: nothing has moved, and a fit to be trusted says so."""
         return self.fits and self.new_trusted
 
     def document(self) -> dict[str, Any]:

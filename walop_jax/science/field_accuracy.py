@@ -1,4 +1,4 @@
-"""How well a calibration knows the degree of polarisation over the field, what limits it, and what could hide.
+"""Accuracy of the degree of polarisation over the field of a calibration, what limits it, and what could hide.
 
 Stars with p ≤ 5 % at any angle, without photon noise. An error δm of the instrument matrix makes
 δ(q, u) = −M⁻¹ (δm₁ + δM (q, u)), hence its variance along the polarisation, averaged over the stars, is the error of p.
@@ -49,7 +49,7 @@ REMEDIES = (
     (("X of", "Y of", "the scale", "the field"), "an independent check of the field positions"),
     (("TEFF", "the filter", "filter"), "a measured spectrum of the lamp and of the filter"),
 )
-"""What tells a mistake, by the beginning of its name: a measurement of the quantity itself."""
+"""Cures of a mistake, by the beginning of its name: a measurement of the quantity itself."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""How far off stars come out of a calibration: errors of q, u and p over the field, true or promised.
+"""Errors of calibrated stars: of q, u and p over the field, true or promised.
 
 Test stars with p ≤ 5 % are seen, noise-free, through *reference* analysis vectors and recovered with a calibration; the
 error at a field point is the rms over the stars.
@@ -110,7 +110,7 @@ def plate_errors(
 
 
 def determinant(vectors: Vectors, pairs: CameraPairs | None = None) -> Float[np.ndarray, " p"]:
-    """What the exposures hold of (q, u) at every point: |m22 m33 − m23 m32| for one exposure of two arms.
+    """Information of the exposures on (q, u) at every point: |m22 m33 − m23 m32| for one exposure of two arms.
 
     In general the root of det MᵀM, M having a row (m22, m23) for every arm and exposure: 0 where all see the same
     direction. `pairs` are the cameras of the arms; None takes them two by two.

@@ -1,4 +1,4 @@
-"""What stars leave once their flux and (q, u) are fitted: the residuals that watch a calibration.
+"""Residuals of stars once their flux and (q, u) are fitted: they watch a calibration.
 
 A row of four cameras has three unknowns, so one number of it is left, whose expectation is 0. For the rows of a star,
 
@@ -255,7 +255,7 @@ def chance_of_scale(scale: Scale) -> float:
 
 
 def is_off(scale: Scale, alarm: float) -> bool:
-    """Whether a scale is not that of noise; counts without any noise are expected ones, whose errors stand."""
+    """True if a scale is not that of noise; counts without any noise are expected ones, whose errors stand."""
     return scale.value > NO_NOISE and chance_of_scale(scale) < alarm
 
 

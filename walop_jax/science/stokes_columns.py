@@ -1,4 +1,4 @@
-"""What `walop-jax apply` adds to a catalogue: the columns, one value per row, and the cards of the header."""
+"""Additions of `walop-jax apply` to a catalogue: columns, one value per row, and the cards of the header."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What watching a calibration has found: histories of cameras and of the optics, night by night (`watch`)."""
+"""Findings from watching a calibration: histories of cameras and of the optics, night by night (`watch`)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _DATE = 1e3  # times above are dates, not numbers of groups
 
 
 class History(NamedTuple):
-    """How a change went: `kind` is step, drift or once; `start` the group it began in."""
+    """Course of a change: `kind` is step, drift or once; `start` the group it began in."""
 
     kind: str
     start: int
@@ -33,7 +33,7 @@ class History(NamedTuple):
 
 
 class Suspect(NamedTuple):
-    """What may have changed: a camera or a number of the optics, by how much, and its significance."""
+    """Possible change: a camera or a number of the optics, by how much, and its significance."""
 
     name: str
     camera: bool
@@ -119,7 +119,7 @@ class Watch(Displayed):
 
     @property
     def holds(self) -> bool:
-        """Whether the calibration still holds."""
+        """True if the calibration still holds."""
         return not self.changes
 
     @property
