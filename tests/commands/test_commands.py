@@ -12,6 +12,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
+import walop_jax as walop
 from walop_jax.calibration import read_calibration
 from walop_jax.calibration.matrix import p_errors, sample_stars
 from walop_jax.data.settings import Settings
@@ -176,6 +177,33 @@ def test_matrix_adds_columns(call, run, tmp_path, suffix):
         np.testing.assert_allclose(table[name], values[:, k], rtol=0, atol=1e-12)
         np.testing.assert_allclose(table[f"{name}_ERR"], np.sqrt(covariance[:, k, k]), rtol=1e-9)
     np.testing.assert_allclose(table["P_ERR"], p_errors(values, covariance, sample_stars()), rtol=1e-9)
+
+
+def test_matrix_behind_a_plate_that_stands_in_the_beam(call, run, tmp_path):
+    """One point on the command line, in Python, and a table: the plate at 45° turns q into −q."""
+    place = ("--x", 0.1, "--y", -0.05, "--teff", 5772)
+    known = read_calibration(run / "calibration.fits", rebuild=False).rebuilt()
+    sun = dataclasses.replace(Settings.default(1).at(CHWP=45.0), teff=np.array([5772.0]))
+    expected = known.matrix(np.array([0.1]), np.array([-0.05]), sun)[0][0]
+    found = json.loads(call("matrix", run, *place, "--at", "CHWP=45", "--json").stdout)["matrix"]
+    names = ["M21", "M22", "M23", "M31", "M32", "M33"]
+    np.testing.assert_allclose([found[name][0] for name in names], expected, rtol=1e-9)
+    out = json.loads(call("matrix", run, *place, "--json").stdout)["matrix"]
+    assert found["M22"][0] == pytest.approx(-out["M22"][0], abs=0.05)
+    assert found["M33"][0] == pytest.approx(out["M33"][0], abs=0.05)
+    assert (
+        "field point X +0.100°, Y −0.050°, CHWP at 45°"
+        in call("matrix", run, *place, "--at", "CHWP=45").stdout
+    )
+    (tmp_path / "p.csv").write_text("x,Y,CHWP_ANGLE\n0.1,-0.05,\n0.2,0.1,30\n")
+    for given in (tmp_path / "p.csv", Table.read(tmp_path / "p.csv")):
+        table = walop.matrix(run, points=given, at={"chwp": 45.0}, teff=5772.0, filter="SDSS-r")
+        np.testing.assert_allclose([table[name][0] for name in names], expected, rtol=1e-9)
+        assert table["CHWP_ANGLE"].tolist() == [45.0, 45.0]
+    for wrong in ("CHPW=45", "CHWP"):
+        refused = call("matrix", run, *place, "--at", wrong)
+        assert refused.exit_code == 2
+        assert "CHWP" in refused.stderr
 
 
 def test_matrix_marks_what_is_outside(call, run, tmp_path):

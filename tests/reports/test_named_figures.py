@@ -15,11 +15,13 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.commands.plot import plot
 from walop_jax.data import read_calibration_set, write_calibration_set
 from walop_jax.diagnosis.figure_data import write_figure_data
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model import mueller
 from walop_jax.paper.wavelength import plate_retardances, retardance
 from walop_jax.reports.named import FIGURES, FigureSource, draw, possible
+from walop_jax.reports.paper_figures import retardance_figure, retardance_wavelength_figure
 from walop_jax.reports.posterior_figures import informed
 from walop_jax.reports.style import element_kind
 from walop_jax.simulation.simulate import simulate
@@ -117,6 +119,25 @@ def _whole(rotation: np.ndarray) -> np.ndarray:
     whole = np.eye(4)
     whole[1:, 1:] = rotation
     return whole
+
+
+def test_plates_go_by_their_names(source):
+    """Of an instrument whose first arm has no plate the other one is still HWP2."""
+    assert possible(source)["retardance"].about == "maps of the retardance of HWP1 and HWP2"
+    assert FIGURES["retardance"].about == "maps of the retardance of the half-wave plates"
+    whole, first = source.rebuilt, source.rebuilt.model.template.arms[0]
+    bare = dataclasses.replace(
+        first,
+        elements=tuple(element for element in first.elements if element.name != "plate"),
+        path=tuple(name for name in first.path if name != "plate"),
+    )
+    lacking = dataclasses.replace(whole.model.template, arms=(bare, whole.model.template.arms[1]))
+    model = base_model(source.calset, lacking)
+    n = len(model.parameters)
+    one = dataclasses.replace(whole, fitted=model, values=model.start, covariance=np.zeros((n, n)))
+    assert [axis.get_title() for axis in retardance_wavelength_figure(one).axes] == ["HWP2"]
+    assert retardance_figure(one).axes[0].get_title().startswith("retardance of HWP2 at")
+    assert possible(FigureSource.of(one))["retardance"].about == "maps of the retardance of HWP2"
 
 
 def test_retardance_on_the_axis_is_that_of_the_crystals(source):

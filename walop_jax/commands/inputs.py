@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome
+from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError
 from walop_jax.commands.door import PathLike
 from walop_jax.io.errors import DataError, errors_naming, fail
 from walop_jax.io.text import in_ascii, read_text
@@ -31,6 +31,8 @@ NOT_CARRIED_OVER = "not_carried_over"
 
 # --------------------------------------------------------------------------------------------------- options
 
+TEFF = Option("Colour temperature (K); without it, a flat spectrum.", kind=float)
+FILTER = Option("Filter of the calibration, or SDSS-r.", kind=str)
 SETS = Argument("Calibration sets (FITS), fitted as one.", metavar="CALSET...", kind=list[Path])
 EFFECTS = Option(
     "Effects of your own beside those of the catalogue; see walop-jax docs adding-an-effect.", "FILE.py", Path
@@ -60,6 +62,14 @@ DataOf = Annotated[
 Posterior = Annotated[
     "PathLike | None",
     Option("Use draws of walop-jax sample, not the covariance.", "posterior.nc", Path),
+]
+Angles = Annotated[
+    "Mapping[str, float] | Sequence[str] | None",
+    Option(
+        "Angle (deg) of a moving element in the beam, named like its columns: CHWP=45. May be repeated.",
+        "P=ANGLE",
+        list[str],
+    ),
 ]
 Memory = Annotated["float | None", Option("Memory for the data, in GB.", "GB", float, least=0.1)]
 
@@ -234,16 +244,33 @@ def folder_of(run: Run | PathLike) -> Path:
     return run.folder if isinstance(run, Run) else Path(run)
 
 
-def table_of(given: Any, columns: dict[str, Any]) -> InputTable:
-    """A table: a file of one, an astropy table, or columns by name; with `columns` added."""
+def angles_of(at: Mapping[str, float] | Sequence[str] | None) -> dict[str, float]:
+    """Angles (deg) by column prefix, also of texts such as CHWP=45."""
+    if isinstance(at, Mapping):
+        return {name.upper(): value for name, value in at.items()}
+    found = {}
+    for text in at or ():
+        prefix, _, angle = text.partition("=")
+        try:
+            found[prefix.strip().upper()] = float(angle)
+        except ValueError:
+            raise UsageError(f"{text!r} is no P=ANGLE, such as CHWP=45", "at") from None
+    return found
+
+
+def table_of(given: Any, columns: Mapping[str, Any]) -> InputTable:
+    """A table: a file of one, an astropy table, or columns by name; `columns` are added, or stand in place of its."""
     from walop_jax.data.user_tables import in_memory, read_input_table
 
-    if isinstance(given, str | os.PathLike):
-        return read_input_table(given)
+    read = read_input_table(given) if isinstance(given, str | os.PathLike) else None
+    if read is not None and not columns:
+        return read
+    table = given if read is None else read.table
     if columns:
-        given = {str(k): given[k] for k in getattr(given, "colnames", given)}
-        given |= {name.upper(): values for name, values in columns.items()}
-    return in_memory(given)
+        named = {name.upper(): values for name, values in columns.items()}
+        kept = [key for key in getattr(table, "colnames", table) if str(key).upper() not in named]
+        table = {key: table[key] for key in kept} | named
+    return in_memory(table) if read is None else in_memory(table, str(read.path))
 
 
 def in_bytes(memory: float | None) -> float | None:

@@ -8,10 +8,14 @@ from typing import Annotated, Any
 
 from walop_jax.commands.command import Job, Option, Outcome, UsageError, command
 from walop_jax.commands.inputs import (
+    FILTER,
+    TEFF,
+    Angles,
     Effects,
     PathLike,
     Posterior,
     Product,
+    angles_of,
     calibration_of,
     table_of,
     table_outcome,
@@ -41,6 +45,9 @@ def matrix(
     output: Annotated[PathLike | None, OUT] = None,
     posterior: Posterior = None,
     effects: Effects = None,
+    at: Angles = None,
+    teff: Annotated[Any, TEFF] = None,
+    filter: Annotated[Any, FILTER] = None,
     **columns: Any,
 ) -> Outcome[Any]:
     """Say what the instrument matrix is at a field point, or at every point of a table.
@@ -56,7 +63,7 @@ def matrix(
     of the instrument (0.35 degrees for the WALOPs) there is no value: NaN and FLAG 32.
 
     In Python: an astropy table, for `x`, `y` (degrees or quantities) or for the table `points`: a path, an astropy
-    table, columns by name. `columns` are others of those above, such as teff=5000.
+    table, columns by name. `columns` are others of those above, such as temp=5 or chwp_angle=45.
 
     >>> print(walop.matrix(result, x=0.1, y=-0.05))
     field point X +0.100°, Y −0.050°
@@ -80,8 +87,13 @@ def matrix(
         table_format(output)
     held = calibration_of(calibration, effects)
     instrument = held.model.template.patched()
-    moving = (f"{prefix}{end}" for prefix in instrument.moving() for end in ("_IN", "_ANGLE"))
-    known = (*POINT_COLUMNS, *moving)
+    moving = instrument.moving()
+    columns |= {name: value for name, value in (("teff", teff), ("filter", filter)) if value is not None}
+    for prefix, angle in angles_of(at).items():
+        if prefix not in moving:
+            raise UsageError(f"there is no moving element {prefix!r}; {nearest(prefix, moving)}", "at")
+        columns |= {f"{prefix}_IN": True, f"{prefix}_ANGLE": angle}
+    known = (*POINT_COLUMNS, *(f"{prefix}{end}" for prefix in moving for end in ("_IN", "_ANGLE")))
     for name in columns:
         if name.upper() not in known:
             what = f"there is no argument or column {name!r}; {nearest(name.upper(), known)}"

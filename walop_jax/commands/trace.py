@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
 from walop_jax.commands.inputs import (
+    FILTER,
     NOT_CARRIED_OVER,
+    TEFF,
+    Angles,
     Effects,
     InstrumentLike,
     PathLike,
+    angles_of,
     calibration_of,
     design_of,
     left_out_sentences,
@@ -25,12 +29,6 @@ if TYPE_CHECKING:
 
 PRODUCT = Argument("An instrument as fitted; without it, as designed.", "[RUN/calibration.fits]", Path)
 ANGLE = Option("Polariser in, with its axis here (deg).", kind=float)
-AT = Option(
-    "Angle (deg) of a moving element in the beam, named like its columns: CHWP=45. May be repeated.",
-    "P=ANGLE",
-    list[str],
-)
-TEFF = Option("Colour temperature (K); without it, a flat spectrum.", kind=float)
 
 
 class Traced(tuple["LightStage", ...]):
@@ -59,9 +57,9 @@ def trace(
     q: Annotated[float, Option("Stokes q of the source, a fraction.")] = 0.0,
     u: Annotated[float, Option("Stokes u of the source, a fraction.")] = 0.0,
     angle: Annotated[float | None, ANGLE] = None,
-    at: Annotated[Mapping[str, float] | Sequence[str] | None, AT] = None,
+    at: Angles = None,
     teff: Annotated[float | None, TEFF] = None,
-    filter: Annotated[str, Option("Filter of the calibration, or SDSS-r.")] = "SDSS-r",
+    filter: Annotated[str, FILTER] = "SDSS-r",
     **positions: float,
 ) -> Outcome[Traced]:
     """Follow the light of one source through the instrument.
@@ -80,7 +78,7 @@ def trace(
     from walop_jax.model.trace import Sightline
     from walop_jax.model.trace import trace as traced
 
-    there = {name.upper(): value for name, value in positions.items()} | _angles(at)
+    there = {name.upper(): value for name, value in positions.items()} | angles_of(at)
     try:
         setting = Settings.default(1, filter).at(**there)
         setting.teff[0] = math.nan if teff is None else teff
@@ -115,20 +113,6 @@ def trace(
         lambda: "\n".join(table(stages)),
         warnings=warnings,
     )
-
-
-def _angles(at: Mapping[str, float] | Sequence[str] | None) -> dict[str, float]:
-    """Angles (deg) by column prefix, also of texts such as CHWP=45."""
-    if isinstance(at, Mapping):
-        return {name.upper(): value for name, value in at.items()}
-    found = {}
-    for text in at or ():
-        prefix, _, angle = text.partition("=")
-        try:
-            found[prefix.strip().upper()] = float(angle)
-        except ValueError:
-            raise UsageError(f"{text!r} is no P=ANGLE, such as CHWP=45", "at") from None
-    return found
 
 
 def table(stages: Sequence[LightStage]) -> list[str]:

@@ -48,7 +48,10 @@ class MatrixTable(Table):
         names = [name for name in self.colnames if f"{name}_ERR" in self.colnames and name.startswith("M")]
         cells = [f"{name.lower()} {with_error(number(name), number(f'{name}_ERR'))}" for name in names]
         width = max(map(len, cells)) + 3
-        lines = [f"field point X {x}, Y {y}"]
+        # `matrix` itself writes both columns; those of a user's table may be texts, or masked.
+        inside = [name[:-3] for name in self.colnames if name.endswith("_IN") and self[name][row] is np.True_]
+        stand = "".join(f", {prefix} at {number(f'{prefix}_ANGLE'):g}°" for prefix in inside)
+        lines = [f"field point X {x}, Y {y}{stand}"]
         lines += [
             "  " + "".join(f"{cell:<{width}}" for cell in cells[k : k + 3]) for k in range(0, len(cells), 3)
         ]

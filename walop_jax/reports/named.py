@@ -23,6 +23,7 @@ from walop_jax.posterior.files import LIMITS, POSTERIOR
 from walop_jax.reports import diagnosis_figures, figures, paper_figures, posterior_figures
 from walop_jax.reports.run import read_limits
 from walop_jax.reports.style import PAGE, AnyFigure, Canvas
+from walop_jax.reports.wording import PLATES, listed
 from walop_jax.science.field_accuracy import field_accuracy
 
 Drawable = FitResult | Calibration | Diagnosis | PosteriorSample | Run
@@ -236,8 +237,10 @@ def _small(source: FigureSource) -> bool:
     return source.stored.residuals is None  # which comes with whole frames
 
 
-def _plates(source: FigureSource) -> bool:
-    return any(name.endswith(("plate.quartz", "plate.mgf2")) for name in source.stored.fitted.names)
+def _plates(source: FigureSource) -> list[str]:
+    """Plates in the arms as figures call them."""
+    crystals = (name for name in source.stored.fitted.names if name.endswith(("plate.quartz", "plate.mgf2")))
+    return list(dict.fromkeys(PLATES.get(plate := name.rpartition(".")[0], plate) for name in crystals))
 
 
 def _angles(fewest: int) -> Callable[[FigureSource], bool]:
@@ -275,14 +278,14 @@ FIGURES: Mapping[str, NamedFigure] = {
         "maps of m23 and m32", lambda s: figures.matrix_maps_figure(s.maps, 2, s.canvas)
     ),
     "retardance": NamedFigure(
-        "maps of the retardance of HWP1 and HWP2",
+        "maps of the retardance of the half-wave plates",
         lambda s: paper_figures.retardance_figure(s.rebuilt, on=s.canvas),
-        possible=_plates,
+        possible=lambda s: bool(_plates(s)),
     ),
     "retardance-wavelength": NamedFigure(
         "their retardance against wavelength",
         lambda s: paper_figures.retardance_wavelength_figure(s.rebuilt, on=s.canvas),
-        possible=_plates,
+        possible=lambda s: bool(_plates(s)),
     ),
     "coefficients": NamedFigure(
         "maps of the coefficients of the method of Paper II",
@@ -347,8 +350,12 @@ FIGURES: Mapping[str, NamedFigure] = {
 
 
 def possible(source: FigureSource) -> dict[str, NamedFigure]:
-    """The figures that a run, or a result in memory, can give."""
-    return {name: one for name, one in FIGURES.items() if one.needs in source and one.possible(source)}
+    """The figures that a run, or a result in memory, can give; its plates go by their names."""
+    found = {name: one for name, one in FIGURES.items() if one.needs in source and one.possible(source)}
+    if "retardance" in found:
+        about = f"maps of the retardance of {listed(_plates(source))}"
+        found["retardance"] = dataclasses.replace(found["retardance"], about=about)
+    return found
 
 
 def draw(name: str, source: FigureSource) -> AnyFigure:

@@ -34,6 +34,7 @@ from walop_jax.reports.style import (
     plain_ticks,
     point_map,
 )
+from walop_jax.reports.wording import PLATES
 from walop_jax.science.star_errors import GOAL, QUANTITIES, plate_errors
 
 _PIXELS, _LINES = 31, 41
@@ -49,10 +50,10 @@ def retardance_figure(calibration: Calibration, wavelength: float = 0.62, on: Ca
     found = plate_retardances(instrument, np.array([wavelength]), x.ravel(), y.ravel())[..., 0]
     figure = on.figure(3.9 * len(names), 3.3)
     axes = figure.subplots(1, len(names), squeeze=False)
-    for k, (axis, values) in enumerate(zip(axes[0], found, strict=True), start=1):
+    for name, axis, values in zip(names, axes[0], found, strict=True):
         # Unwrapped: a map that jumps by 360° would show the jump and nothing else.
         whole = np.unwrap(np.unwrap(values.reshape(x.shape), axis=1, period=360.0), axis=0, period=360.0)
-        field_axes(axis, f"retardance of HWP{k} at {1e3 * wavelength:.0f} nm (deg)")
+        field_axes(axis, f"retardance of {PLATES.get(name, name)} at {1e3 * wavelength:.0f} nm (deg)")
         norm = Normalize(float(whole.min()), float(whole.max()))
         colour_bar(figure, pixel_map(axis, whole, calibration.field, norm, SEQUENTIAL), axis)
         lines = axis.contour(
@@ -78,12 +79,12 @@ def retardance_wavelength_figure(
     found = plate_retardances(instrument, line, x, y)
     figure = on.figure(3.9 * len(names), 3.1)
     axes = figure.subplots(1, len(names), squeeze=False)[0]
-    for k, (axis, curves) in enumerate(zip(axes, found, strict=True), start=1):
+    for name, axis, curves in zip(names, axes, found, strict=True):
         for n, (place, curve) in enumerate(zip(places, curves, strict=True)):
             shown = np.unwrap(curve, period=360.0)
             style = ("-", "--", "-.", ":", (0, (5, 1)))[n]
             axis.plot(1e3 * line, shown, linestyle=style, color=f"C{n}", lw=1.3, label=place)
-        axis.set_title(f"HWP{k}", fontsize=FONT)
+        axis.set_title(PLATES.get(name, name), fontsize=FONT)
         axis.set_xlabel("wavelength (nm)", fontsize=FONT)
         axis.tick_params(labelsize=SMALL)
     axes[0].set_ylabel("retardance (deg, plus multiples of 360)", fontsize=FONT)

@@ -211,6 +211,7 @@ def model_entries(product: Calibration) -> dict[str, dict[str, str]]:
     return found
 
 
+PLATES = {"half1.plate": "HWP1", "half2.plate": "HWP2"}
 PLACES = {
     "half1": "half1 for the half of the pupil with HWP1",
     "half2": "half2 for that with HWP2",
