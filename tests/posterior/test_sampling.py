@@ -153,6 +153,26 @@ def test_posterior_file_table_and_report(posterior: PosteriorSample, tmp_path: P
     assert posterior.document()["trusted"] is True
 
 
+def test_a_fit_in_arviz_has_its_values_and_covariance(scene: Scene) -> None:
+    """Sample moments of 40 000 independent draws, to 5 of their own standard errors; what is frozen does not vary."""
+    import arviz as az
+
+    fit = scene.result
+    data = fit.to_arviz(draws=10_000, seed=1)
+    names = [p.name for p, sigma in zip(fit.model.parameters, fit.sigma, strict=True) if sigma > 0]
+    assert [*data.posterior.data_vars] == names
+    at = [fit.model.index(name) for name in names]
+    z = np.stack([(data.posterior[n].values.ravel() - fit.value(n)[0]) / fit.value(n)[1] for n in names])
+    correlation = fit.covariance[np.ix_(at, at)] / np.outer(fit.sigma[at], fit.sigma[at])
+    assert np.abs(z.mean(axis=1)).max() < 5 / np.sqrt(40_000)
+    np.testing.assert_allclose(z @ z.T / 40_000, correlation, atol=5 * np.sqrt(2 / 40_000))
+    assert data.posterior["half1.plate.quartz"].attrs["units"] == "um"
+    assert data.observed_data.sizes["camera"] == 4
+    said = az.summary(data, var_names=["half2.wedge"], round_to="none").loc["half2.wedge"]
+    assert said["sd"] == pytest.approx(fit.value("half2.wedge")[1], rel=0.02)
+    assert said["r_hat"] < 1.01
+
+
 def test_arviz_finds_what_it_looks_for(scene: Scene, posterior: PosteriorSample) -> None:
     """Its own numbers: means and widths; rows of the data; as many effective parameters as the posterior is worth.
 

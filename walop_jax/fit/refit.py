@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import importlib
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -206,6 +207,13 @@ class FitResult(Result):
     def to_table(self) -> Any:
         """All parameters as an astropy table: value, error, unit, start, prior, and whether it was free."""
         return parameter_table(self.model, self.values, self.sigma)
+
+    def to_arviz(self, draws: int = 1000, seed: int = 0) -> Any:
+        """ArviZ InferenceData of the parameters that vary: 4 chains of independent draws from values and covariance.
+
+        Exact as far as the model is linear within the errors; `walop_jax.sample` draws from the posterior itself.
+        """
+        return importlib.import_module("walop_jax.posterior.result").arviz_of_fit(self, draws, seed)
 
     @property
     def notes(self) -> tuple[str, ...]:

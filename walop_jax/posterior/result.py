@@ -13,6 +13,7 @@ Rules             N > 50 τ; τ the same within 25 % after N/4, N/2 and N steps;
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import json
 import math
@@ -23,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import STATED
 from walop_jax.io.code import versions_of
 from walop_jax.io.display import Display, Drawn
@@ -147,6 +149,24 @@ def _of_rows(likelihood: Likelihood) -> dict[str, Any]:
         group: Dataset({name: (dims[: values.ndim], values) for name, values in found.items()}, coords=place)
         for group, found in columns.items()
     }
+
+
+def arviz_of_fit(result: FitResult, draws: int, seed: int) -> Any:
+    """InferenceData of independent draws from the normal distribution of a fit; see `FitResult.to_arviz`."""
+    size, parameters = result.sigma, result.model.parameters
+    varies = np.flatnonzero(size > 0)
+    correlation = result.covariance[np.ix_(varies, varies)] / np.outer(size[varies], size[varies])
+    normal = functools.partial(np.random.default_rng(seed).multivariate_normal, method="eigh")
+    made = result.values[varies] + size[varies] * normal(np.zeros(len(varies)), correlation, (4, draws))
+    names = [parameters[i].name for i in varies]
+    data = arviz().from_dict(posterior={name: made[..., k] for k, name in enumerate(names)})
+    for i, name in zip(varies, names, strict=True):
+        data.posterior[name].attrs["units"] = parameters[i].unit or "1"
+    trusted = result.verdict is not None and result.trusted
+    data.posterior.attrs.update(sampler="none: covariance of the fit", trusted=int(trusted))
+    if not result.likelihood.layout.large:
+        data.add_groups(_of_rows(result.likelihood))
+    return data
 
 
 def assess(chains: Chains, names: tuple[str, ...], thin: int = 1) -> Convergence:
