@@ -44,6 +44,7 @@ class Page(HTMLParser):
     def handle_data(self, data):
         if "style" in self.open:
             return
+        data = data.replace("\N{NO-BREAK SPACE}", " ")
         self.text += data
         if self.open and self.open[-1] in ("td", "th"):
             self.rows[-1][-1] += data

@@ -121,6 +121,16 @@ def _whole(rotation: np.ndarray) -> np.ndarray:
     return whole
 
 
+def test_map_and_curves_of_the_retardance_agree(source):
+    """At the centre of the field, whose value lies in the first turn."""
+    (image,) = draw("retardance", source).axes[0].images
+    grid = np.asarray(image.get_array())
+    centre = float(grid[len(grid) // 2, len(grid) // 2])
+    line = draw("retardance-wavelength", source).axes[0].lines[0]
+    assert 0.0 <= centre < 360.0
+    assert centre == pytest.approx(np.interp(620.0, *line.get_data()) % 360.0, abs=0.1)
+
+
 def test_plates_go_by_their_names(source):
     """Of an instrument whose first arm has no plate the other one is still HWP2."""
     assert possible(source)["retardance"].about == "maps of the retardance of HWP1 and HWP2"

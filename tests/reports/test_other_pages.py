@@ -68,9 +68,10 @@ def test_an_epoch_whose_own_fit_is_not_trusted_says_so(tmp_path):
         "diagnosis": {"steps": [{"effect": "ghost", "p_value": 1e-9, "equivalent": ["pedestal"]}], "unexplained": None},
     }  # fmt: skip
     (tmp_path / "epoch.json").write_text(json.dumps(document))
-    text = render_other(tmp_path, "epoch")[0]
+    html = render_other(tmp_path, "epoch")[0]
+    text = Page(html).text
     assert "The new data are not explained" in text
-    assert "up to 120 %" in text
+    assert "up to 120\N{NO-BREAK SPACE}%" in html
     assert "χ²/dof = 5.99" in text
     assert "cannot distinguish it from pedestal" in text
 

@@ -161,7 +161,7 @@ def test_unexplained_and_unknown_names(tmp_path):
         tmp_path / "run", verdict="unexplained", steps=steps, unexplained=unexplained
     )
     page = Page(render(read_run(run)))
-    assert "patterns <without> a name (p < 10⁻¹⁵)" in page.text
+    assert "Patterns <without> a name (p < 10⁻¹⁵)" in page.text
     assert "free_form (unidentified patterns: 40 parameters)" in " ".join(page.text.split())
     assert page.row("vectors_7")[1] == "0.70"
     assert len(page.images) == 9  # two steps (the second of a kind that has no name), rms over all exposures
@@ -331,6 +331,17 @@ def test_what_is_not_trusted_looks_like_it(tmp_path):
     assert "<strong>0.050" not in html
     assert "not known: the calibration is not trusted" in text
     assert "walop-jax apply" not in text
+
+
+def test_an_accuracy_beside_an_unidentified_residual_is_conditional(tmp_path):
+    """The fit itself is trusted, so it is not that which is said to be at fault."""
+    accuracy = FieldAccuracy(np.full((2, 2), 5e-4), (-0.2, 0.2, -0.2, 0.2), "SDSS-r", trusted=True)
+    run = handmade_run.make_diagnosis(tmp_path / "run", verdict="unexplained")
+    page = Page(render(read_run(run), accuracy))
+    text = " ".join(page.text.split())
+    assert "of the field, if nothing were missing" in text
+    assert "An unidentified residual remains, and the covariance knows nothing of it." in text
+    assert "The calibration is not trusted" not in text
 
 
 def test_the_data_are_told_of(tmp_path):

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.io.text import rounded
+
 STATED = "N_ERR"
 """Origin of the errors of a fit that explains the data: the stated errors."""
 
@@ -121,7 +123,7 @@ class Hidden:
     def in_words(self, most: int = 1) -> str:
         """The worst of them in a sentence."""
         sizes = [
-            f"{name} of {size:.2g} {unit}".rstrip()
+            f"{name} of {rounded(size, '.2g')} {unit}".rstrip()
             for name, size, unit in zip(self.names, self.sizes, self.units, strict=True)
         ]
         more = f" and {len(sizes) - most} more" if len(sizes) > most else ""

@@ -159,11 +159,11 @@ def modulation_figure(calset: CalibrationSet, points: Sequence[int], on: Canvas 
         name = f"({one} − {other}) / ({one} + {other})"
         if arms == 2:
             name, ideal = (("$q_m$", np.cos), ("$u_m$", np.sin))[arm]
-            axis.plot(angle, ideal(2 * np.deg2rad(angle)), color="0.8", lw=1.0, zorder=0)
+            axis.plot(angle, ideal(2 * np.deg2rad(angle)), color="0.8", lw=1.0, zorder=0, label="ideal")
         for k, point in enumerate(points):
             rows = shown[block.used[point, shown]]
             first, second = block.counts[point, rows, pair], block.counts[point, rows, pair + 1]
-            where = with_minus_sign(f"({block.x[point]:+.2f}°, {block.y[point]:+.2f}°)")
+            where = with_minus_sign(f"X {block.x[point]:+.2f}°, Y {block.y[point]:+.2f}°")
             axis.plot(
                 e.clp_angle[rows], (first - second) / (first + second), "os^Dv"[k % 5], ms=4, label=where
             )
@@ -171,7 +171,7 @@ def modulation_figure(calset: CalibrationSet, points: Sequence[int], on: Canvas 
         axis.set_ylabel(name, fontsize=FONT)
         axis.set_xticks(np.arange(0, 361, 90))
         axis.tick_params(labelsize=SMALL)
-    figure.axes[0].legend(frameon=False, fontsize=SMALL, title="(X, Y)", title_fontsize=SMALL)
+    figure.axes[0].legend(frameon=False, fontsize=SMALL)
     return figure
 
 
@@ -276,7 +276,7 @@ def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
     """The error of p over the field (%, logarithmic; a line at 0.1 %), and which share of the field has which error."""
     percent = np.clip(100.0 * np.nan_to_num(accuracy.error, nan=np.inf), *_RANGE)
     figure = on.figure(8.2, 3.4)
-    left, right = figure.subplots(1, 2, width_ratios=(1.15, 1.0))
+    left, right = figure.subplots(1, 2, width_ratios=(1.15, 1.0), gridspec_kw={"wspace": 0.1})
     low, high = float(percent.min()), float(percent.max())
     field_axes(left, f"error of p, {accuracy.filter}")
     image = pixel_map(left, percent, accuracy.extent, LogNorm(0.003, _RANGE[1]), SEQUENTIAL)

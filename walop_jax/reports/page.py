@@ -59,7 +59,13 @@ MANY = 24  # parameters of an effect above which its table is folded
 
 def render(run: RunContents, accuracy: FieldAccuracy | None = None) -> str:
     """The HTML text of the page about a run; `accuracy` is that of p over the field, if it is known."""
-    return environment().get_template("report.html").render(_context(run, accuracy))
+    return filled("report.html", **_context(run, accuracy))
+
+
+def filled(template: str, **content: Any) -> str:
+    """The text of a page; no line ends between a number and its sign or unit."""
+    text = environment().get_template(template).render(content)
+    return re.sub(r"(?<=\d) (?=[%σ±])|(?<=[=±≤]) (?=\d)", "\N{NO-BREAK SPACE}", text)
 
 
 def environment() -> jinja2.Environment:
@@ -85,7 +91,8 @@ def environment() -> jinja2.Environment:
 def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]:
     summary, diagnosis = run.summary, run.diagnosis
     label, sentence = verdict_of_fit(summary) if diagnosis is None else verdict_of_diagnosis(diagnosis)
-    good = diagnosis is None or diagnosis["verdict"] != "unexplained"
+    trusted = bool(summary.get("trusted", summary["converged"]))
+    good = trusted and (diagnosis is None or diagnosis["verdict"] != "unexplained")
     if run.commissioning is not None:
         label = f"{'Go' if run.commissioning['go'] else 'No-go'} – {label[:1].lower()}{label[1:]}"
     main, rest = _parameters(run)
@@ -101,7 +108,8 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         "label": label,
         "sentence": sentence,
         "fit_sentence": ": ".join(verdict_of_fit(summary)),
-        "good": good and bool(summary.get("trusted", summary["converged"])),
+        "good": good,
+        "trusted": trusted,
         "quality": quality.meanings,
         "hidden": hidden_in_words(summary),
         "steps": [] if diagnosis is None else _steps(run),
@@ -121,7 +129,7 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         "versions": summary["versions"],
         "accuracy": None if accuracy is None else _accuracy_in_words(accuracy),
         "facts": [] if accuracy is None else accuracy.facts(),
-        "next": _next(run, good and bool(summary.get("trusted", summary["converged"]))),
+        "next": _next(run, good),
         "data": [] if run.product is None else data_in_words(run.product),
         "limits": limits_in_words(run.limits),
         "symbols": ""
@@ -353,8 +361,8 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
             (embedded(figure), caption, caption)
             for caption, figure in (drawn | {SEPARATION: diagnosis_figures.separation_figure(found)}).items()
         ]
-    text = environment().get_template(f"{kind}.html").render(
-        document=document, name=folder.resolve().name, versions={}, pictures=pictures, missing=missing,
+    text = filled(
+        f"{kind}.html", document=document, name=folder.resolve().name, versions={}, pictures=pictures, missing=missing,
         shown=SHOWN, percent=two_digits, words=words, rows=rows,
     )  # fmt: skip
     return text, missing

@@ -53,6 +53,7 @@ def retardance_figure(calibration: Calibration, wavelength: float = 0.62, on: Ca
     for name, axis, values in zip(names, axes[0], found, strict=True):
         # Unwrapped: a map that jumps by 360° would show the jump and nothing else.
         whole = np.unwrap(np.unwrap(values.reshape(x.shape), axis=1, period=360.0), axis=0, period=360.0)
+        whole -= 360.0 * np.floor(whole[_PIXELS // 2, _PIXELS // 2] / 360.0)
         field_axes(axis, f"retardance of {PLATES.get(name, name)} at {1e3 * wavelength:.0f} nm (deg)")
         norm = Normalize(float(whole.min()), float(whole.max()))
         colour_bar(figure, pixel_map(axis, whole, calibration.field, norm, SEQUENTIAL), axis)
@@ -82,7 +83,7 @@ def retardance_wavelength_figure(
     for name, axis, curves in zip(names, axes, found, strict=True):
         for n, (place, curve) in enumerate(zip(places, curves, strict=True)):
             shown = np.unwrap(curve, period=360.0)
-            style = ("-", "--", "-.", ":", (0, (5, 1)))[n]
+            style = ("-", "--", "-.", ":", (0, (4, 4)))[n]
             axis.plot(1e3 * line, shown, linestyle=style, color=f"C{n}", lw=1.3, label=place)
         axis.set_title(PLATES.get(name, name), fontsize=FONT)
         axis.set_xlabel("wavelength (nm)", fontsize=FONT)

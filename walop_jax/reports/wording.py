@@ -67,10 +67,12 @@ def verdict_of_fit(summary: Mapping[str, Any]) -> tuple[str, str]:
 def hidden_in_words(summary: Mapping[str, Any]) -> str:
     """The mistakes that these data would not have shown, the worst first; empty where nobody asked or none counts."""
     entries = (summary.get("hidden") or [])[:4]
-    sizes = [f"{entry['name']} ({entry['size']:.2g} {entry['unit']})".replace(" )", ")") for entry in entries]
-    return (
-        f"Not found if smaller than in brackets, and more than the errors: {listed(sizes)}." if sizes else ""
-    )
+    sizes = [
+        f"{entry['name']} ({rounded(entry['size'], '.2g')} {entry['unit']})".replace(" )", ")")
+        for entry in entries
+    ]
+    told = "Mistakes larger than the errors that these data would not show, up to the size in brackets"
+    return f"{told}: {listed(sizes)}." if sizes else ""
 
 
 def verdict_of_diagnosis(diagnosis: Mapping[str, Any]) -> tuple[str, str]:

@@ -23,7 +23,7 @@ from walop_jax.calibration.matrix import (
     sample_stars,
 )
 from walop_jax.fit.refit import FitResult
-from walop_jax.io.text import two_digits
+from walop_jax.io.text import rounded, two_digits
 from walop_jax.science.star_errors import GOAL
 
 SIZE = 21  # points along each axis of the map
@@ -154,7 +154,7 @@ def _with_size(calibration: Calibration, name: str) -> str:
     if hidden is None or name not in hidden.names:
         return ""
     at = hidden.names.index(name)
-    return f"{name} (wrong by {hidden.sizes[at]:.2g} {hidden.units[at]}".rstrip() + ")"
+    return f"{name} (wrong by {rounded(hidden.sizes[at], '.2g')} {hidden.units[at]}".rstrip() + ")"
 
 
 def _grid(calibration: Calibration, size: int) -> Float[np.ndarray, "2 p"]:
