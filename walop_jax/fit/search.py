@@ -110,6 +110,16 @@ def _search(
     return FoundMinimum(minimum, full(minimum.x))
 
 
+def nearer(likelihood: Likelihood, values: Vector, distance: float) -> Vector:
+    """Values that are no more than a distance (standard errors, all parameters together) from the minimum.
+
+    They are `values` themselves where these are; the closest that a few steps reach where there is no such place.
+    """
+    return _search(
+        likelihood, "closer to the data", values, 1.0, maximum_steps=FIRST_STEPS, tolerance=distance
+    ).values
+
+
 def find_minimum(
     likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
 ) -> FoundMinimum:

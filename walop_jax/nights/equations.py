@@ -23,6 +23,7 @@ from jaxtyping import Bool, Float, Int
 from walop_jax.data.records import CalibrationSet, Exposures, Site
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.model_file import SKY_AND_STARS, header_of
+from walop_jax.fit.search import nearer
 from walop_jax.io.errors import DataError, fail
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.columns import Columns
@@ -40,6 +41,7 @@ OF_ONE_SET = ("moon_patch", "standard_outlier")
 MOST_SHAPES = (
     4  # of an effect whose shapes are all candidates: cameras and plates, not places and thicknesses
 )
+OWN = 3.0  # squared distance of a night from its own minimum, for each parameter, that two nights' noise may make
 SIDEREAL = 1.00273791  # sidereal hours in an hour
 CLOCK = (
     0.2,
@@ -217,11 +219,13 @@ def night_equations(
     changes: Candidates | None = None,
     *,
     number: int | None = None,
+    own: bool = False,
 ) -> list[Night]:
     """The nights of a set, linearised at values of the parameters: a full vector, or by name (others: start values).
 
-    `changes` are the candidates (None: `candidates_of` each night), `number` the only night that is asked for. Of sets
-    too large for a table of derivatives no candidates are kept. Raises `DataError` as `split` does.
+    `changes` are the candidates (None: `candidates_of` each night), `number` the only night that is asked for. Nights
+    whose `own` minimum is farther from the values than noise explains are linearised closer to it. Of sets too large
+    for a table of derivatives no candidates are kept. Raises `DataError` as `split` does.
     """
     if isinstance(values, Mapping):
         values = np.array([values.get(p.name, p.start) for p in model.parameters])
@@ -230,15 +234,17 @@ def night_equations(
     for evening, some in split(calset):
         if number not in (None, evening):
             continue
-        likelihood = Likelihood.of(some, model)
+        likelihood, there = Likelihood.of(some, model), values
+        if own:
+            there = nearer(likelihood, values, np.sqrt(OWN * len(model.free)))
         if likelihood.layout.large:
-            terms, _ = likelihood.data_terms(values)
+            terms, _ = likelihood.data_terms(there)
             select = model.selection()
             chi2, gradient, matrix = terms.data, select.T @ terms.gradient, select.T @ terms.matrix @ select
             known, census = {}, terms.census
         else:
             known = candidates_of(model, some.exposures, model.catalogue) if changes is None else changes
-            chi2, gradient, matrix = with_candidates(likelihood, values, [c for _, c in known.values()])
+            chi2, gradient, matrix = with_candidates(likelihood, there, [c for _, c in known.values()])
             census = likelihood.census
         e = some.exposures
         found.append(
@@ -257,7 +263,7 @@ def night_equations(
                 chi2=chi2,
                 parameters=(*(model.parameters[i] for i in model.free), *(p for p, _ in known.values())),
                 candidates=len(known),
-                reference=np.concatenate([values[model.free], np.zeros(len(known))]),
+                reference=np.concatenate([there[model.free], np.zeros(len(known))]),
                 gradient=gradient,
                 matrix=matrix,
             )

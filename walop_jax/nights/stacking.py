@@ -16,7 +16,7 @@ import dataclasses
 import hashlib
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
 
@@ -61,8 +61,7 @@ Given = FitResult | CalibrationSet | Night | Run | str | os.PathLike[str]
 
 LONG = 60.0  # days without a night that are worth a remark
 FAR = 0.02  # standard errors from the solution up to which a night need not be linearised again
-EXACT = 1e-3  # standard errors by which linearising all nights again may move the solution at most,
-ENOUGH = 0.1  # and while breaks are looked for
+EXACT = 1e-3  # standard errors by which linearising all nights again may move the solution at most
 ROUNDS = 6
 REFERENCE = "reference.fits"
 TRACKS, SURVEY = "tracks.fits", "survey.json"
@@ -97,58 +96,38 @@ class _Maker:
     candidates: dict[tuple[str, ...], Candidates] = dataclasses.field(default_factory=dict)
 
     def nights(self, data: _Data) -> list[Night]:
-        """The nights of data, as they are kept or linearised at the values of `like`, without candidates."""
+        """The nights of data, as they are kept or linearised near their own minimum, from the values of `like` on."""
         if self.like is None:
             raise fail(
                 f"{data.read().origin} is a set, and nothing says at which values to linearise it",
                 advice="give --like RUN, a fit of the same model (like= in Python)",
             )
-        place = self._place(data, self.like)
-        if place is not None and place.exists():
-            return read_nights(place)
-        values = dict(zip(self.like.model.names, self.like.values.tolist(), strict=True))
-        return self._kept(data, self._made(data, values, {}))
-
-    def again(self, data: _Data, night: Night, values: Mapping[str, float]) -> Night:
-        """A night linearised at other values; its candidates follow (`with_candidates_of`)."""
-        (made,) = self._made(data, values, {}, night.number)
-        return with_candidates_of(made, night)
-
-    def complete(self, data: _Data, values: Mapping[int, Mapping[str, float]]) -> list[Night]:
-        """Nights of data with candidates, each linearised at its own values."""
-        found = [night for number, own in values.items() for night in self._made(data, own, None, number)]
-        return self._kept(data, found)
-
-    def names(self) -> Iterator[str]:
-        """Names of all candidates that may be asked for."""
-        for known in self.candidates.values():
-            yield from known
-
-    def _made(
-        self, data: _Data, values: Mapping[str, float], known: Candidates | None, number: int | None = None
-    ) -> list[Night]:
-        assert self.like is not None
+        place = None
+        if self.folder is not None:
+            named = f"{data.sha256} {model_hash(data.model or self.like.model)}"
+            place = self.folder / f"night-{hashlib.sha256(named.encode()).hexdigest()[:16]}.fits"
+            if place.exists():
+                return read_nights(place)
         calset = data.read()
         model = data.model or model_like(calset, self.like.model)
         # Candidates depend on cameras, standards and the effects of the model alone: listing them takes a while.
         key = (*model.names, *model.effect_names)
         if key not in self.candidates:
             self.candidates[key] = candidates_of(model, calset.exposures, model.catalogue)
-        known = self.candidates[key] if known is None else known
-        return night_equations(calset, model, values, known, number=number)
-
-    def _place(self, data: _Data, like: Calibration) -> Path | None:
-        if self.folder is None:
-            return None
-        named = f"{data.sha256} {model_hash(data.model or like.model)}"
-        return self.folder / f"night-{hashlib.sha256(named.encode()).hexdigest()[:16]}.fits"
-
-    def _kept(self, data: _Data, nights: list[Night]) -> list[Night]:
-        assert self.like is not None
-        if (place := self._place(data, self.like)) is not None:
+        values = dict(zip(self.like.model.names, self.like.values.tolist(), strict=True))
+        found = night_equations(calset, model, values, self.candidates[key], own=True)
+        if place is not None:
             place.parent.mkdir(parents=True, exist_ok=True)
-            write_nights(place, nights, overwrite=True)
-        return nights
+            write_nights(place, found, overwrite=True)
+        return found
+
+    def again(self, data: _Data, night: Night, values: Mapping[str, float]) -> Night:
+        """A night linearised at other values; its candidates follow (`with_candidates_of`)."""
+        assert self.like is not None
+        calset = data.read()
+        model = data.model or model_like(calset, self.like.model)
+        (made,) = night_equations(calset, model, values, {}, number=night.number)
+        return with_candidates_of(made, night)
 
 
 def stack(
@@ -194,23 +173,19 @@ def stack(
         tables = parse_toml(read_text(laws)).get("law", {})
     elif laws is None and maker.like is not None:
         tables = maker.like.model.laws
-    chosen = laws_of_all(data, tables, maker.names())
+    chosen = laws_of_all(data, tables)
     _check_filters(data, chosen)
     breaks = [one for some in opened for one in some.breaks]
     try:
-        looking = find and len({night.number for night in data.nights}) > 2
-        data, solution, _ = _settled(data, chosen, at_hand, maker, ENOUGH)
-        data = _completed(data, solution, at_hand, maker, tell)
-        chosen = laws_of_all(data, tables)
-        data, solution, settled = _settled(data, chosen, at_hand, maker, ENOUGH if looking else EXACT)
-        if looking:
-            found, chosen, solution = breaks_of(data, chosen, catalogue)
+        if find and len({night.number for night in data.nights}) > 2:
+            # Ahead of linearising again: with breaks that are no law yet the common solution is one of no night.
+            found, chosen, _ = breaks_of(data, chosen, catalogue)
             breaks += found
-            data, solution, settled = _settled(data, chosen, at_hand, maker)
+        data, solution, settled = _settled(data, chosen, at_hand, maker)
     except UndeterminedError as error:
         raise _undetermined(data, error) from None
     if not settled:
-        what = f"the solution has not settled after {ROUNDS} linearisations: the nights are too different"
+        what = "the solution has not settled: the nights differ by more than their laws and the breaks that were found"
         doubts.append(Doubt(Quality.NOT_CONVERGED, what))
     if kept := sum((night.sha256, night.number) not in at_hand for night in data.nights):
         what = f"{kept} of {len(data.nights)} nights stay as they were linearised: their data are not at hand"
@@ -234,17 +209,11 @@ def events_of(table: Any) -> list[tuple[float, str]]:
     return list(zip(mjd.tolist(), map(str, words), strict=True))
 
 
-def laws_of_all(
-    data: Together, laws: Mapping[str, Law | Mapping[str, Any]], coming: Iterable[str] = ()
-) -> tuple[Law | None, ...]:
-    """A law for every parameter and candidate of nights (None: absent). ValueError for what is wrong in `laws`.
-
-    Laws of candidates that are yet to be computed, `coming`, are none of that.
-    """
+def laws_of_all(data: Together, laws: Mapping[str, Law | Mapping[str, Any]]) -> tuple[Law | None, ...]:
+    """A law for every parameter and candidate of nights (None: absent). ValueError for what is wrong in `laws`."""
     tables = {name: law.document() if isinstance(law, Law) else law for name, law in laws.items()}
     cut = len(data.names) - data.candidates
-    candidates = dict.fromkeys((*data.names[cut:], *coming))
-    return resolved(laws_of(tables), data.names[:cut], tuple(candidates))[: len(data.names)]
+    return resolved(laws_of(tables), data.names[:cut], data.names[cut:])
 
 
 def writers(survey: Survey) -> dict[str, Callable[[Path], object]]:
@@ -323,14 +292,14 @@ def _settled(
     laws: Sequence[Law | None],
     at_hand: Mapping[tuple[str, int], _Data],
     maker: _Maker,
-    exact: float = EXACT,
 ) -> tuple[Together, Solution, bool]:
-    """Linearise nights at the common solution until that would not move it by `exact` errors; whether it would not.
+    """Linearise nights at the common solution until that would not move it by `EXACT` errors; whether it would not.
 
     Those that lie farthest from the solution are linearised there first, the n-th of them to see: were each of the rest
     as far from linear, how far would all together move the solution? As far as may be, and the rest stays as it is.
+    What a model lacks may lead ever farther away: the search ends where all nights come no closer.
     """
-    solution, anew, enough = solved(data, laws), list[int](), False
+    solution, anew, enough, farthest = solved(data, laws), list[int](), False, np.inf
     for _ in range(ROUNDS):
         values, sigma = _in_units(data, solution)
         # Candidates have no place in the model: their part stays first-order, at 0.
@@ -341,6 +310,9 @@ def _settled(
         ]  # fmt: skip
         if not again or (enough and not set(again) & set(anew)):
             return data, solution, True
+        if float(away.max()) >= farthest:
+            break
+        farthest = float(away.max())
         nights, anew, enough = list(data.nights), [], False
         for number, u in enumerate(again, start=1):
             seeing = number.bit_count() == 1  # the first, second, fourth …: solving costs time as well
@@ -357,31 +329,9 @@ def _settled(
                 after, _ = _in_units(data, solution)
                 rest = np.full((len(nights), 1), len(again) - number)
                 rest[u] = min(rest[u], 1)  # what is its own moves with no other night
-                if enough := bool(np.all(rest * np.abs(after - before) <= exact * sigma)):
+                if enough := bool(np.all(rest * np.abs(after - before) <= EXACT * sigma)):
                     break
     return data, solution, False
-
-
-def _completed(
-    data: Together,
-    solution: Solution,
-    at_hand: Mapping[tuple[str, int], _Data],
-    maker: _Maker,
-    tell: Callable[[str], None],
-) -> Together:
-    """The nights with candidates: those that have none yet are linearised at the solution, file by file."""
-    values, _ = _in_units(data, solution)
-    of_file: dict[str, dict[int, Mapping[str, float]]] = {}
-    for night, own in zip(data.nights, values.tolist(), strict=True):
-        if not night.candidates and (night.sha256, night.number) in at_hand:
-            there = dict(zip(data.names, own, strict=True))
-            of_file.setdefault(night.sha256, {})[night.number] = there
-    nights = {(night.sha256, night.number): night for night in data.nights}
-    for k, (sha256, of_nights) in enumerate(of_file.items()):
-        tell(f"{k + 1} of {len(of_file)}, with what may have changed")
-        one = at_hand[sha256, next(iter(of_nights))]
-        nights |= {(sha256, night.number): night for night in maker.complete(one, of_nights)}
-    return together(list(nights.values())) if of_file else data
 
 
 def _in_units(
