@@ -381,7 +381,7 @@ class Survey(Displayed):
             if one.alike:
                 more = (
                     "no more nights like these would tell" if math.isinf(one.nights_needed)
-                    else f"or {one.nights_needed:.0f} more nights like these"
+                    else f"{'or ' if one.separated_by else ''}{one.nights_needed:.0f} more nights like these"
                 )  # fmt: skip
                 names = ", ".join(one.alike[:3]) + (" …" if len(one.alike) > 3 else "")
                 how = "; ".join((*one.separated_by, more))
