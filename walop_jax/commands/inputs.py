@@ -265,7 +265,7 @@ def table_of(given: Any, columns: Mapping[str, Any]) -> InputTable:
     read = read_input_table(given) if isinstance(given, str | os.PathLike) else None
     if read is not None and not columns:
         return read
-    table = given if read is None else read.table
+    table: Any = given if read is None else read.table
     if columns:
         named = {name.upper(): values for name, values in columns.items()}
         kept = [key for key in getattr(table, "colnames", table) if str(key).upper() not in named]

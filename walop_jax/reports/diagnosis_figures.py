@@ -105,8 +105,8 @@ def _maps(
 ) -> AnyFigure:
     shown = np.any([np.isfinite(values).any(axis=1) for values in maps.values()], axis=0)
     shown = shown if shown.any() else np.ones(len(points), bool)
-    figure = on.figure(0.6 + 2.0 * len(cameras), 0.55 + 1.75 * len(maps))
-    axes = figure.subplots(len(maps), len(cameras), sharex=True, sharey=True, squeeze=False)
+    size, grid = (0.6 + 2.0 * len(cameras), 0.55 + 1.75 * len(maps)), (len(maps), len(cameras))
+    figure, axes = on.panels(*size, *grid, sharex=True, sharey=True, squeeze=False)
     tiles: Any = None
     for number, values in enumerate(maps.values()):
         for k, axis in enumerate(axes[number]):
@@ -139,10 +139,8 @@ def signature_figure(
     polariser; against time otherwise. Exposures at one angle are averaged. The lower panels hold what is left.
     """
     angular = _against_angle(comparison, exposures)
-    figure = on.figure(0.6 + 2.0 * len(cameras), 3.5)
-    upper, lower = figure.subplots(
-        2, len(cameras), sharex=True, sharey="row", height_ratios=(2.2, 1), squeeze=False
-    )
+    grid = {"sharex": True, "sharey": "row", "height_ratios": (2.2, 1), "squeeze": False}
+    figure, (upper, lower) = on.panels(0.6 + 2.0 * len(cameras), 3.5, 2, len(cameras), **grid)
     position, label = _abscissa(exposures, angular)
     for k, camera in enumerate(cameras):
         known = np.isfinite(position) & np.isfinite(comparison.curve_before[:, k])
@@ -157,7 +155,6 @@ def signature_figure(
         for axis, dots in ((upper[k], before), (lower[k], after)):
             axis.axhline(0.0, color=QUIET, lw=0.8, zorder=0)
             axis.errorbar(x, dots, error, fmt="o", ms=3, lw=0.8, color="0.15", label="data", zorder=3)
-            axis.tick_params(labelsize=SMALL)
         upper[k].plot(x, explained, color=BEFORE, lw=1.4, label="effect", zorder=2)
         upper[k].set_title(f"camera {camera}", fontsize=FONT)
         lower[k].set_xlabel(label, fontsize=FONT)
@@ -246,9 +243,9 @@ def ladder_figure(ladder: Table, on: Canvas = PAGE) -> AnyFigure:
 def shares_figure(shares: Table, on: Canvas = PAGE) -> AnyFigure:
     """Mean squared residual by camera, kind, filter and exposure, over what noise alone gives: before and after."""
     groups = [g for g in ("camera", "kind", "filter") if np.count_nonzero(shares["GROUP"] == g) > 1]
-    widths = [np.count_nonzero(shares["GROUP"] == g) + 1.0 for g in groups]
-    figure = on.figure(8.6, 2.7)
-    axes = figure.subplots(1, len(groups) + 1, width_ratios=[*widths, max(12.0, sum(widths))], sharey=True)
+    widths = [float(np.count_nonzero(shares["GROUP"] == g) + 1) for g in groups]
+    widths.append(max(12.0, sum(widths)))
+    figure, axes = on.panels(8.6, 2.7, 1, len(widths), width_ratios=widths, sharey=True)
     before, after = (
         values / np.maximum(shares["EXPECTED"], 1e-300) for values in (shares["BEFORE"], shares["AFTER"])
     )
@@ -275,7 +272,6 @@ def shares_figure(shares: Table, on: Canvas = PAGE) -> AnyFigure:
         axis.plot(place, before[rows], "o", color=BEFORE, ms=size, mfc="white", label="starting model")
         axis.plot(place, after[rows], "s", color=AFTER, ms=size - 0.5, label="final model")
         axis.set_xlabel(group, fontsize=FONT)
-        axis.tick_params(labelsize=SMALL)
     top = float(np.max(before, initial=1.0))
     if top > 5.0:
         axes[0].set_yscale("log")

@@ -55,8 +55,7 @@ def residuals_figure(
     on: Canvas = PAGE,
 ) -> AnyFigure:
     """Residuals of every field point before and after a fit, full vectors of parameters; a histogram of the latter."""
-    figure = on.figure(9.6, 3.0)
-    left, middle, right = figure.subplots(1, 3)
+    figure, (left, middle, right) = on.panels(9.6, 3.0, 1, 3)
     _before_and_after(figure, (left, middle), likelihood, before, values)
     middle.set_ylabel("")
     _histogram(right, likelihood, values)
@@ -135,7 +134,6 @@ def _histogram(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " n
     axis.plot(t, np.exp(-0.5 * t**2) / np.sqrt(2 * np.pi), color="C3", lw=1.2, label="noise alone")
     axis.set_xlabel("residual / its expected width", fontsize=FONT)
     axis.set_ylabel("density", fontsize=FONT)
-    axis.tick_params(labelsize=SMALL)
     axis.set_ylim(top=0.55)  # room for the legend above the curve
     axis.legend(frameon=False, fontsize=SMALL, loc="upper right")
 
@@ -151,10 +149,9 @@ def modulation_figure(calset: CalibrationSet, points: Sequence[int], on: Canvas 
     block = calset.intensities.block(0, len(calset.points))
     names = instrument_of(calset).cameras.names
     arms = len(names) // 2
-    figure = on.figure(4.1 * arms, 3.2)
+    figure, panels = on.panels(4.1 * arms, 3.2, 1, arms, sharex=True, sharey=True, squeeze=False)
     angle = np.linspace(0.0, 360.0, 181)
-    row = figure.subplots(1, arms, sharex=True, sharey=True, squeeze=False)[0]
-    for arm, axis in enumerate(row):
+    for arm, axis in enumerate(panels[0]):
         pair, (one, other) = 2 * arm, names[2 * arm : 2 * arm + 2]
         name = f"({one} − {other}) / ({one} + {other})"
         if arms == 2:
@@ -170,7 +167,6 @@ def modulation_figure(calset: CalibrationSet, points: Sequence[int], on: Canvas 
         axis.set_xlabel("polariser angle (deg)", fontsize=FONT)
         axis.set_ylabel(name, fontsize=FONT)
         axis.set_xticks(np.arange(0, 361, 90))
-        axis.tick_params(labelsize=SMALL)
     figure.axes[0].legend(frameon=False, fontsize=SMALL)
     return figure
 
@@ -183,8 +179,8 @@ def matrix_maps_figure(maps: MatrixMaps, kind: int | None = None, on: Canvas = P
     chosen = [i for i in range(len(maps.values)) if kind in (None, element_kind(i, maps.arms))]
     rows = maps.arms if kind is None else 1
     columns = max(len(chosen) // rows, 1)
-    figure = on.figure((2.9 if rows > 1 else 4.0) * columns, 2.65 * rows + 0.7 * (rows == 1))
-    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    size = ((2.9 if rows > 1 else 4.0) * columns, 2.65 * rows + 0.7 * (rows == 1))
+    figure, axes = on.panels(*size, rows, columns, sharex=True, sharey=True, squeeze=False)
     matrix_panels(figure, axes, maps.values, field_of(maps), chosen)
     return figure
 
@@ -194,8 +190,7 @@ def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
 
     It ends at whole decades, so that the errors of different runs can be compared.
     """
-    figure = on.figure(8.6, 2.3 * maps.arms)
-    axes = figure.subplots(maps.arms, 3, sharex=True, sharey=True, squeeze=False)
+    figure, axes = on.panels(8.6, 2.3 * maps.arms, maps.arms, 3, sharex=True, sharey=True, squeeze=False)
     low, high = (100.0 * float(edge(maps.errors[maps.errors > 0], initial=1e-6)) for edge in (np.min, np.max))
     high = 10.0 ** np.ceil(np.log10(high))
     low = max(10.0 ** np.floor(np.log10(low)), high / 1e4)
@@ -218,8 +213,7 @@ def matrix_change_figure(old: MatrixMaps, new: MatrixMaps, on: Canvas = PAGE) ->
         raise ValueError("the maps of the two calibrations are of different places")
     change = 100.0 * (new.values - old.values)
     kinds = [element_kind(i, new.arms) for i in range(len(change))]
-    figure = on.figure(8.6, 2.3 * new.arms)
-    axes = figure.subplots(new.arms, 3, sharex=True, sharey=True, squeeze=False)
+    figure, axes = on.panels(8.6, 2.3 * new.arms, new.arms, 3, sharex=True, sharey=True, squeeze=False)
     for axis, values, name, kind in zip(axes.ravel(), change, element_symbols(new.arms), kinds, strict=True):
         far = rounded_up(largest_size(change[np.equal(kinds, kind)]))
         field_axes(axis, f"change of {name}")
@@ -237,8 +231,7 @@ def residual_map_figure(residuals: ResidualMap, cameras: Sequence[str], on: Canv
     """
     arms = (len(residuals.values) + 1) // 4
     elements, ratios = residuals.values[: 3 * arms], residuals.values[3 * arms :]
-    figure = on.figure(9.4, 2.0 * arms)
-    axes = figure.subplots(arms, 4, sharex=True, sharey=True, squeeze=False)
+    figure, axes = on.panels(9.4, 2.0 * arms, arms, 4, sharex=True, sharey=True, squeeze=False)
 
     def draw(axis: Axes, title: str, values: Float[np.ndarray, "y x"], norm: Normalize, colours: str) -> None:
         field_axes(axis, title)
@@ -275,8 +268,7 @@ _RANGE = (1e-4, 3.0)  # per cent
 def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
     """The error of p over the field (%, logarithmic; a line at 0.1 %), and which share of the field has which error."""
     percent = np.clip(100.0 * np.nan_to_num(accuracy.error, nan=np.inf), *_RANGE)
-    figure = on.figure(8.2, 3.4)
-    left, right = figure.subplots(1, 2, width_ratios=(1.15, 1.0), gridspec_kw={"wspace": 0.1})
+    figure, (left, right) = on.panels(8.2, 3.4, 1, 2, width_ratios=(1.15, 1.0), gridspec_kw={"wspace": 0.1})
     low, high = float(percent.min()), float(percent.max())
     field_axes(left, f"error of p, {accuracy.filter}")
     image = pixel_map(left, percent, accuracy.extent, LogNorm(0.003, _RANGE[1]), SEQUENTIAL)
@@ -296,7 +288,6 @@ def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
     plain_ticks(right.xaxis)
     right.set_xlabel("standard error of p (%)", fontsize=FONT)
     right.set_ylabel("share of the field (%)", fontsize=FONT)
-    right.tick_params(labelsize=SMALL)
     return figure
 
 
@@ -309,10 +300,10 @@ def planned_figure(field: Mapping[str, Sequence[float | None]], on: Canvas = PAG
         worst = np.full(places.shape[1], -np.inf)
         np.maximum.at(worst, at.ravel(), np.where(np.isnan(error), np.inf, 100.0 * error))
         maps.append(np.where(np.isfinite(worst), worst, np.nan))
-    figure = on.figure(8.2, 3.6)
+    figure, axes = on.panels(8.2, 3.6, 1, 2)
     lowest, most = float(0.5 * np.nanmin(maps[1])), float(2.0 * np.nanmax(maps[1]))
     most = min(max(float(np.nanmax(maps[0])), most), max(_RANGE[1], most))
-    for axis, values, title in zip(figure.subplots(1, 2), maps, ("before", "after"), strict=True):
+    for axis, values, title in zip(axes, maps, ("before", "after"), strict=True):
         field_axes(axis, f"error of p {title}")
         shown = np.minimum(values, most)
         image = point_map(axis, places[0], places[1], shown, LogNorm(lowest, most), SEQUENTIAL)

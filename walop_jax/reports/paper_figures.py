@@ -48,8 +48,7 @@ def retardance_figure(calibration: Calibration, wavelength: float = 0.62, on: Ca
     low_x, high_x, low_y, high_y = calibration.field
     x, y = np.meshgrid(np.linspace(low_x, high_x, _PIXELS), np.linspace(low_y, high_y, _PIXELS))
     found = plate_retardances(instrument, np.array([wavelength]), x.ravel(), y.ravel())[..., 0]
-    figure = on.figure(3.9 * len(names), 3.3)
-    axes = figure.subplots(1, len(names), squeeze=False)
+    figure, axes = on.panels(3.9 * len(names), 3.3, 1, len(names), squeeze=False)
     for name, axis, values in zip(names, axes[0], found, strict=True):
         # Unwrapped: a map that jumps by 360° would show the jump and nothing else.
         whole = np.unwrap(np.unwrap(values.reshape(x.shape), axis=1, period=360.0), axis=0, period=360.0)
@@ -78,26 +77,23 @@ def retardance_wavelength_figure(
     places |= {with_minus_sign(f"Y = {y:+.2f}°"): (0.0, y) for y in (low_y, high_y)}
     x, y = (np.array(values) for values in zip(*places.values(), strict=True))
     found = plate_retardances(instrument, line, x, y)
-    figure = on.figure(3.9 * len(names), 3.1)
-    axes = figure.subplots(1, len(names), squeeze=False)[0]
-    for name, axis, curves in zip(names, axes, found, strict=True):
+    figure, axes = on.panels(3.9 * len(names), 3.1, 1, len(names), squeeze=False)
+    for name, axis, curves in zip(names, axes[0], found, strict=True):
         for n, (place, curve) in enumerate(zip(places, curves, strict=True)):
             shown = np.unwrap(curve, period=360.0)
             style = ("-", "--", "-.", ":", (0, (4, 4)))[n]
             axis.plot(1e3 * line, shown, linestyle=style, color=f"C{n}", lw=1.3, label=place)
         axis.set_title(PLATES.get(name, name), fontsize=FONT)
         axis.set_xlabel("wavelength (nm)", fontsize=FONT)
-        axis.tick_params(labelsize=SMALL)
-    axes[0].set_ylabel("retardance (deg, plus multiples of 360)", fontsize=FONT)
-    axes[0].legend(frameon=False, fontsize=SMALL)
+    axes[0, 0].set_ylabel("retardance (deg, plus multiples of 360)", fontsize=FONT)
+    axes[0, 0].legend(frameon=False, fontsize=SMALL)
     return figure
 
 
 def coefficients_figure(calset: CalibrationSet, filter_name: str, on: Canvas = PAGE) -> AnyFigure:
     """Maps of the ten coefficients of the method of Paper II, a row for q and one for u."""
     found = fit_paper(calset, filter_name)
-    figure = on.figure(10.6, 4.3)
-    axes = figure.subplots(2, 5, sharex=True, sharey=True)
+    figure, axes = on.panels(10.6, 4.3, 2, 5, sharex=True, sharey=True)
     for row, quantity, coefficients in zip(axes, "qu", np.moveaxis(found.coefficients, 1, 0), strict=True):
         for axis, name, values in zip(row, COEFFICIENTS, coefficients.T, strict=True):
             field_axes(axis, f"{quantity}: {name}")
@@ -147,8 +143,8 @@ def transmission_figure(
     fitted = terms @ model.T
     fine = np.linspace(angle.min(), angle.max(), 181)
     curve = np.concatenate([np.ones((181, 1)), polariser_states(fine)], axis=1) @ model.T
-    figure, names = on.figure(6.6, 4.2), instrument_of(calset).cameras.names
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1.0))
+    names = instrument_of(calset).cameras.names
+    figure, (above, below) = on.panels(6.6, 4.2, 2, 1, sharex=True, height_ratios=(2.2, 1.0))
     for k in range(counts.shape[1]):
         above.plot(fine, curve[:, k] / curve.sum(axis=1), color=f"C{k}", lw=1.0)
         above.plot(angle, counts[:, k] / total[:, 0], "osD^"[k % 4], color=f"C{k}", ms=4, label=names[k])
@@ -165,8 +161,6 @@ def transmission_figure(
     above.legend(
         frameon=False, fontsize=SMALL, ncols=len(names), loc="lower right", bbox_to_anchor=(1.0, 0.99)
     )
-    for axis in (above, below):
-        axis.tick_params(labelsize=SMALL)
     return figure
 
 
@@ -178,8 +172,7 @@ _PLATE_PIXELS = 49
 
 def histogram_figure(comparison: Comparison) -> Figure:
     """Distribution over the field of the errors of q, u and p: on the grid points above, between them below."""
-    figure = PAGE.figure(9.6, 4.8)
-    axes = figure.subplots(2, 3, sharex=True, sharey="row")
+    figure, axes = PAGE.panels(9.6, 4.8, 2, 3, sharex=True, sharey="row")
     bins = np.geomspace(*_RANGE, 33)
     for row, (place, title) in zip(
         axes, ((comparison.grid, "on grid points"), (comparison.between, "between them")), strict=True
@@ -192,7 +185,6 @@ def histogram_figure(comparison: Comparison) -> Figure:
             axis.set_xscale("log")
             plain_ticks(axis.xaxis)
             axis.set_title(f"{QUANTITIES[k]}, {title}", fontsize=FONT)
-            axis.tick_params(labelsize=SMALL)
         row[0].set_ylabel("field points", fontsize=FONT)
     for axis in axes[1]:
         axis.set_xlabel("rms error (%); the end bins hold all beyond", fontsize=FONT)
@@ -202,8 +194,7 @@ def histogram_figure(comparison: Comparison) -> Figure:
 
 def map_figure(comparison: Comparison) -> Figure:
     """Maps of the errors of q and u of both methods, on the grid points and between them, a tile for each point."""
-    figure = PAGE.figure(10.4, 5.0)
-    axes = figure.subplots(2, 4, sharex=True, sharey=True)
+    figure, axes = PAGE.panels(10.4, 5.0, 2, 4, sharex=True, sharey=True)
     shown = None
     for row, k in zip(axes, (0, 1), strict=True):
         panels = [(place, m) for place in (comparison.grid, comparison.between) for m in ("paper", "joint")]
@@ -220,8 +211,7 @@ def map_figure(comparison: Comparison) -> Figure:
 def offset_figure(comparison: Comparison) -> Figure:
     """Δq and Δu: against what the weakest direction of the design matrix predicts, and with one exposure more."""
     found = comparison.offsets
-    figure = PAGE.figure(9.6, 3.2)
-    left, middle, right = figure.subplots(1, 3)
+    figure, (left, middle, right) = PAGE.panels(9.6, 3.2, 1, 3)
     for axis, c, name in ((left, 0, "q"), (middle, 1, "u")):
         for along, label, color in (
             (found.along, "one", "tab:orange"),
@@ -241,15 +231,12 @@ def offset_figure(comparison: Comparison) -> Figure:
     right.set_xticks(range(3), labels, fontsize=SMALL)
     right.set_ylabel("rms over the grid (%)", fontsize=FONT)
     right.legend(fontsize=FONT)
-    for axis in (left, middle, right):
-        axis.tick_params(labelsize=SMALL)
     return figure
 
 
 def spectral_figure(comparison: Comparison) -> Figure:
     """Efficiencies and cross-talk across the filter at the extreme point; Δq_m, Δu_m of stars of four colours."""
-    figure = PAGE.figure(9.6, 3.2)
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = PAGE.panels(9.6, 3.2, 1, 2)
     lines = comparison.lines
     for column, label in ((2, "$m_{22}$: q to q"), (6, "$m_{33}$: u to u"), (5, "$m_{32}$: q to u")):
         left.plot(1000 * lines[:, 0], lines[:, column], label=label, lw=1.2)
@@ -265,8 +252,6 @@ def spectral_figure(comparison: Comparison) -> Figure:
     right.set_xlabel("largest change with the colour of a star, p = 1 % (%)", fontsize=FONT)
     right.set_ylabel("grid points", fontsize=FONT)
     right.legend(fontsize=FONT)
-    for axis in (left, right):
-        axis.tick_params(labelsize=SMALL)
     return figure
 
 
@@ -279,10 +264,9 @@ def plate_figure(calibration: Calibration, combinations: Sequence[Sequence[float
     analysis = AnalysisVectors(calibration)
     low_x, high_x, low_y, high_y = calibration.field
     x, y = np.meshgrid(np.linspace(low_x, high_x, _PLATE_PIXELS), np.linspace(low_y, high_y, _PLATE_PIXELS))
-    figure = PAGE.figure(2.6 * len(combinations) + 0.9, 2.9)
-    axes = figure.subplots(1, len(combinations), sharey=True, squeeze=False)[0]
-    norm, shown = LogNorm(1.0, 100.0), None
-    for axis, plates in zip(axes, combinations, strict=True):
+    count, norm, shown = len(combinations), LogNorm(1.0, 100.0), None
+    figure, axes = PAGE.panels(2.6 * count + 0.9, 2.9, 1, count, sharey=True, squeeze=False)
+    for axis, plates in zip(axes[0], combinations, strict=True):
         settings = [Settings.default(1).at(CHWP=plate) for plate in plates]
         worst = plate_errors(analysis, settings, x.ravel(), y.ravel()).reshape(x.shape)
         shown = pixel_map(axis, np.clip(worst, 1.0, 100.0), calibration.field, norm, "magma_r")

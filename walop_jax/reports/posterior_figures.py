@@ -156,10 +156,9 @@ def trace_figure(
 ) -> AnyFigure:
     """Median and 68 % band of walkers against the step, a colour per ensemble; the bar is one autocorrelation time."""
     e, n, _, k = chains.shape
-    figure = on.figure(7.1, 0.9 * k + 0.6)
-    panels = figure.subplots(k, 1, sharex=True, squeeze=False)[:, 0]
+    figure, panels = on.panels(7.1, 0.9 * k + 0.6, k, 1, sharex=True, squeeze=False)
     step = thin * np.arange(n)
-    for i, axes in enumerate(panels):
+    for i, axes in enumerate(panels[:, 0]):
         for j in range(e):
             low, middle, high = np.quantile(chains[j, :, :, i], (0.16, 0.5, 0.84), axis=1)
             axes.fill_between(step, low, high, color=(*to_rgb(f"C{j}"), 0.25), linewidth=0)
@@ -180,7 +179,7 @@ def trace_figure(
         axes.tick_params(labelsize=SMALL - 1)
         axes.yaxis.set_major_locator(MaxNLocator(3))
         axes.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
-    panels[-1].set_xlabel("step after burn-in", fontsize=SMALL)
+    panels[-1, 0].set_xlabel("step after burn-in", fontsize=SMALL)
     return figure
 
 

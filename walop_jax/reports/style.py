@@ -69,12 +69,17 @@ class Canvas:
         self.ax.remove()
         return parent.add_subfigure(place)
 
+    def panels(self, width: float, height: float, *shape: int, **options: Any) -> tuple[Any, Any]:
+        """A figure, and panels in it with small numbers, as `subplots` makes them."""
+        figure = self.figure(width, height)
+        axes = figure.subplots(*shape, **options)
+        for axis in np.ravel(axes):
+            axis.tick_params(labelsize=SMALL)
+        return figure, axes
+
     def single(self, width: float, height: float) -> tuple[Any, Axes]:
         """A figure with one panel: `ax` itself where it is given."""
-        if self.ax is not None:
-            return self.ax.get_figure(), self.ax
-        figure = self.figure(width, height)
-        return figure, figure.subplots()
+        return self.panels(width, height) if self.ax is None else (self.ax.get_figure(), self.ax)
 
 
 PAGE = Canvas()
@@ -92,9 +97,6 @@ def field_axes(axis: Axes, title: str = "") -> None:
 def outer_labels(axes: Any) -> None:
     """Keep the labels of a grid of maps on its outer edge only."""
     for axis in np.ravel(axes):
-        axis.tick_params(labelsize=SMALL)
-        axis.set_xlabel("X (deg)", fontsize=FONT)
-        axis.set_ylabel("Y (deg)", fontsize=FONT)
         axis.label_outer()
 
 

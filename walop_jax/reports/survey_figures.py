@@ -25,9 +25,9 @@ def tracks_figure(tracks: Any, document: Mapping[str, Any]) -> Figure | None:
     names = [*dict.fromkeys(one["name"] for one in found), *laws][:MOST]
     if not names:
         return None
-    figure = PAGE.figure(6.4, 0.9 + 1.25 * len(names))
-    axes = np.ravel(figure.subplots(len(names), 1, sharex=True, squeeze=False))
-    for axis, name in zip(axes, names, strict=True):
+    count = len(names)
+    figure, axes = PAGE.panels(6.4, 0.9 + 1.25 * count, count, 1, sharex=True, squeeze=False)
+    for axis, name in zip(axes[:, 0], names, strict=True):
         rows = tracks[np.asarray(tracks["NAME"]).astype(str) == name]
         mjd, value, error, alone, alone_error = (
             np.asarray(rows[key], float) for key in ("MJD", "VALUE", "ERROR", "DEVIATION", "DEVIATION_ERR")
@@ -43,8 +43,7 @@ def tracks_figure(tracks: Any, document: Mapping[str, Any]) -> Figure | None:
         _events(axis, document["events"])
         unit = str(rows["UNIT"][0]) if len(rows) else ""
         axis.set_ylabel(f"{name}\n{f'({unit})' if unit else ''}".strip(), fontsize=SMALL)
-        axis.tick_params(labelsize=SMALL)
-    _dates(axes[-1])
+    _dates(axes[-1, 0])
     return figure
 
 
@@ -53,13 +52,11 @@ def nights_figure(document: Mapping[str, Any]) -> Figure:
     nights: Sequence[Mapping[str, Any]] = document["by_night"]
     excess = np.array([night["excess"] for night in nights], float)
     mjd = np.array([night["mjd"] for night in nights], float)
-    figure = PAGE.figure(6.4, 2.0)
-    axis = figure.subplots()
+    figure, axis = PAGE.panels(6.4, 2.0)
     axis.axhspan(-2.0, 2.0, color=QUIET, lw=0)
     axis.scatter(mjd, excess, s=6, color=np.where(excess > 5.0, BEFORE, AFTER).tolist())
     _events(axis, document["events"])
     axis.set_ylabel("(χ² − dof)/σ", fontsize=FONT)
-    axis.tick_params(labelsize=SMALL)
     _dates(axis)
     return figure
 
