@@ -43,17 +43,22 @@ def found() -> Diagnosis:
     )  # fmt: skip
 
 
-def test_print_command_and_page_say_the_same(found: Diagnosis, call, calset_file, tmp_path, monkeypatch):
+def comes_out(found: Diagnosis, monkeypatch) -> None:
+    """What the command gets in place of a search of minutes."""
     monkeypatch.setattr("walop_jax.diagnosis.workflow.diagnose", lambda *args, **how: found)
     monkeypatch.setattr("walop_jax.diagnosis.figure_data.figure_data", lambda found: None)
     monkeypatch.setattr(
         "walop_jax.diagnosis.figure_data.write_figure_data", lambda path, data: path.write_bytes(b"")
     )
+
+
+def test_print_command_and_page_say_the_same(found: Diagnosis, call, calset_file, tmp_path, monkeypatch):
+    comes_out(found, monkeypatch)
     run = handmade_run.make_refit(tmp_path / "run")
     (run / "diagnosis.json").write_text(json.dumps(document(dataclasses.replace(found))))
     shown = call("diagnose", calset_file, "-o", tmp_path / "made").stdout
     call("report", run)
-    page = html.unescape((run / "report.html").read_text())
+    page = html.unescape((run / "report.html").read_text()).replace("\N{NO-BREAK SPACE}", " ")
     for text in (
         "turn of polariser: 0.100 ± 0.010 deg, growing with X (amplitude at 0.3°)",
         "these data cannot distinguish it from clp_zero, a step of the polariser in exposure 4",
@@ -66,3 +71,20 @@ def test_print_command_and_page_say_the_same(found: Diagnosis, call, calset_file
     ):
         for said in (repr(found), shown, page):
             assert text in said
+    assert "mean squared residual of data left out (exposures) 1 → 1" in shown
+    assert "kind: clp" not in shown  # of one kind there is nothing to say
+
+
+@pytest.mark.parametrize(
+    ("verdict", "doubts", "code"), [("unexplained", [], 0), ("effect_found", ["odd"], 3)]
+)
+def test_what_is_not_to_be_used_is_not_recommended(
+    verdict, doubts, code, found: Diagnosis, call, calset_file, tmp_path, monkeypatch
+):
+    made = dataclasses.replace(found, verdict=verdict, after=small_fit().judged(doubts))
+    comes_out(made, monkeypatch)
+    done = call("diagnose", calset_file, "-o", tmp_path / "made")
+    assert done.exit_code == code
+    assert "walop-jax report" in done.stderr
+    assert "walop-jax apply" not in done.stderr
+    assert ("if nothing were missing" in done.stdout) == (code == 0)

@@ -70,6 +70,7 @@ def diagnose(
         found = diagnosis_of(calset, chosen, seed=job.seed, minutes=minutes, progress=say)
 
     after = answered(found.after)
+    usable = after.trusted and found.verdict != "unexplained"
 
     def files() -> Writers:
         job.tell("mapping the field", "mapping")
@@ -91,13 +92,13 @@ def diagnose(
         files,
         saved_as=DIAGNOSIS,
         warnings=found.after.warnings,
-        next=(f"walop-jax report {output}", f"walop-jax apply {output} STARS.fits -o OUT.fits")
-        if after.trusted
-        else (f"walop-jax report {output}",),
+        trusted=after.trusted,
+        next=(f"walop-jax report {output}", *[f"walop-jax apply {output} STARS.fits -o OUT.fits"] * usable),
     )
 
 
 def _with_answer(found: Diagnosis, after: FitResult) -> Display:
     """The findings, and how well stars are known with the extended model."""
     shown, known = found.display(), after.answer() if after.answer is not None and after.converged else None
-    return dataclasses.replace(shown, facts=(*shown.facts, *(known.facts() if known is not None else ())))
+    more = () if known is None else known.facts(complete=found.verdict != "unexplained")
+    return dataclasses.replace(shown, facts=(*shown.facts, *more))

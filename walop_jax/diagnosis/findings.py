@@ -15,7 +15,7 @@ from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.display import Display, Drawn
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.text import value_and_error
+from walop_jax.io.text import probability, value_and_error
 from walop_jax.model import legendre
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.change import Change
@@ -290,13 +290,13 @@ class Diagnosis(Drawn):
             entries: dict[str, Any] = {name: (value, 0.0, "") for name, value in step.choices.items()}
             for name, (value, sigma, unit) in (entries | step.parameters).items():
                 texts = value_and_error(value, sigma)
-                rows.append((step.effect, name, *texts, unit, f"{step.p_value:.1g}"))
+                rows.append((step.effect, name, *texts, unit, probability(step.p_value).removeprefix("= ")))
         before, after = (fit.chi2 / max(fit.dof, 1) for fit in (self.before, self.after))
         return Display(
             title=f"Diagnosis: {self.verdict}",
             facts=(
                 ("χ²/dof", f"{before:.4g} → {after:.4g}"),
-                ("p of the starting model", f"{self.p_value:.2g}"),
+                ("p of the starting model", probability(self.p_value).removeprefix("= ")),
                 ("field points", str(self.points)),
             ),
             head=("effect", "parameter", ">value", ">error", "unit", ">p"),
@@ -405,16 +405,18 @@ def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
         yield f"{name}: equally consistent with {other}"
     held = ""
     if step.get("heldout_before") is not None and step.get("heldout_after") is not None:
-        means = f"{step['heldout_before']:.4f} → {step['heldout_after']:.4f}"
-        held = f"; held out ({step.get('heldout_scheme', '')}) {means}"
+        means = f"{step['heldout_before']:.3g} → {step['heldout_after']:.3g}"
+        held = f"; mean squared residual of data left out ({step.get('heldout_scheme', '')}) {means}"
     yield f"{name}: χ² {step['chi2_before']:.1f} → {step['chi2_after']:.1f}{held}"
     if step.get("change_of_qu") is not None:
         size = f"{100 * step['change_of_qu']:.2g} %"
         yield f"{name} changes calibrated q and u by up to {size}{', which is negligible' * bool(step['negligible'])}"
-    if step.get("where"):
-        yield f"{name}: " + "; ".join(
-            f"{key.replace('_', ' ')}: {value}" for key, value in step["where"].items()
-        )
+    places = {
+        key: str(value) for key, value in step.get("where", {}).items() if not str(value).endswith(" 100%")
+    }
+    if places:
+        words = (f"{key}: {value}".replace("_", " ").replace("%", " %") for key, value in places.items())
+        yield f"{name} sits in: {'; '.join(words)}".replace("clp harmonic", "harmonic of the polariser angle")
     rivals = (*step.get("equivalent", ()), *step.get("nameless", ()))
     if rivals:
         yield f"{name}: these data cannot distinguish it from {', '.join(rivals)}"

@@ -128,7 +128,7 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         "figures": _figures(run, accuracy),
         "versions": summary["versions"],
         "accuracy": None if accuracy is None else _accuracy_in_words(accuracy),
-        "facts": [] if accuracy is None else accuracy.facts(),
+        "facts": [] if accuracy is None else accuracy.facts(complete=good),
         "next": _next(run, good),
         "data": [] if run.product is None else data_in_words(run.product),
         "limits": limits_in_words(run.limits),

@@ -93,12 +93,13 @@ class FieldAccuracy:
             "limited_by": self.limited_by, "hidden": self.hidden, "hidden_by": self.hidden_by,
         }  # fmt: skip
 
-    def facts(self) -> tuple[tuple[str, str], ...]:
-        """The answer in a few lines: how well, limited by what, and what could hide."""
+    def facts(self, *, complete: bool = True) -> tuple[tuple[str, str], ...]:
+        """The answer in a few lines: how well, limited by what, and what could hide; of a `complete` model or not."""
         if not self.trusted:
             return (("p of a star", "not known: the calibration is not trusted"),)
         known = f"{two_digits(100 * self.median)} % (median error for p ≤ 5 %)"
-        lines = [("p of a star", f"{known}; below 0.1 % over {100 * self.share:.0f} % of the field")]
+        known += f"; below 0.1 % over {100 * self.share:.0f} % of the field"
+        lines = [("p of a star", known if complete else f"{known}, if nothing were missing")]
         if self.limited_by:
             lines.append(("limited by", self.limited_by))
         if self.hidden > 0:
