@@ -38,6 +38,8 @@ from walop_jax.model.effects import EFFECTS, Described
 from walop_jax.model.specification import effect_context
 
 Examined = Callable[..., Examination]
+Spaces = dict[tuple[tuple[str, ...], tuple[str, ...]], ScoreSpace]
+"""Spaces of searches, by what was taken out of the catalogue and what was added."""
 
 SEPARABLE = 5.0  # σ between the truth and its nearest rival above which a name is asked for
 CONFOUNDED = 2.0  # below which a class is asked for
@@ -202,7 +204,7 @@ class Blind:
             [SINGLE_EXPOSURES], examination.common_mode
         )
         self.evidence = examination
-        self._spaces: dict[tuple[str, ...], ScoreSpace] = {}
+        self._spaces: Spaces = {}
         self.free = examination.space.free
         self.visible = sorted({p.effect.name for p in self.probes if examination.table[p.name].testable})
         self._testable = {p.name for p in self.probes if examination.table[p.name].testable}
@@ -338,18 +340,20 @@ class Blind:
 class Cached(Linear):
     """Steps of scenes are alike: their spaces are kept."""
 
-    def __init__(self, spaces: dict[tuple[str, ...], ScoreSpace], removed: tuple[str, ...]) -> None:
-        self.spaces, self.added = spaces, removed
+    def __init__(self, spaces: Spaces, removed: tuple[str, ...]) -> None:
+        self.spaces, self.removed = spaces, removed
+        self.added: tuple[str, ...] = ()
 
     def adopted(self, state: Evidence, trial: Trial) -> Evidence:
         """As `Linear`, with the space of another scene where it went the same way."""
         item = trial.item
         assert item is not None
         self.added = (*self.added, item.probe.name)
-        after = state.joined(item, self.spaces.get(self.added))
+        way = self.removed, self.added
+        after = state.joined(item, self.spaces.get(way))
         if len(self.spaces) > KEPT:
             self.spaces.clear()
-        self.spaces[self.added] = after.space
+        self.spaces[way] = after.space
         return after
 
 

@@ -341,9 +341,9 @@ class Together:
     @property
     def reference(self) -> Float[np.ndarray, "u n"]:
         """The values that every night was linearised at; the origin for what a night does not know."""
-        found = np.tile(self.origin, (len(self.nights), 1))
+        found, place = np.tile(self.origin, (len(self.nights), 1)), {n: k for k, n in enumerate(self.names)}
         for u, night in enumerate(self.nights):
-            found[u, [self.names.index(name) for name in night.names]] = night.reference
+            found[u, [place[name] for name in night.names]] = night.reference
         return found
 
     @property
