@@ -108,26 +108,34 @@ class _Maker:
             place = self.folder / f"night-{hashlib.sha256(named.encode()).hexdigest()[:16]}.fits"
             if place.exists():
                 return read_nights(place)
-        calset = data.read()
-        model = data.model or model_like(calset, self.like.model)
-        # Candidates depend on cameras, standards and the effects of the model alone: listing them takes a while.
-        key = (*model.names, *model.effect_names)
-        if key not in self.candidates:
-            self.candidates[key] = candidates_of(model, calset.exposures, model.catalogue)
+        calset, model = self._set_and_model(data)
         values = dict(zip(self.like.model.names, self.like.values.tolist(), strict=True))
-        found = night_equations(calset, model, values, self.candidates[key], own=True)
+        found = night_equations(calset, model, values, self._candidates(model, calset), own=True)
         if place is not None:
             place.parent.mkdir(parents=True, exist_ok=True)
             write_nights(place, found, overwrite=True)
         return found
 
-    def again(self, data: _Data, night: Night, values: Mapping[str, float]) -> Night:
-        """A night linearised at other values; its candidates follow (`with_candidates_of`)."""
+    def again(
+        self, data: _Data, night: Night, values: Mapping[str, float], *, candidates: bool = False
+    ) -> Night:
+        """A night linearised at other values; its candidates as well, or they follow (`with_candidates_of`)."""
+        calset, model = self._set_and_model(data)
+        known = self._candidates(model, calset) if candidates else {}
+        (made,) = night_equations(calset, model, values, known, number=night.number)
+        return with_candidates_of(made, night)
+
+    def _set_and_model(self, data: _Data) -> tuple[CalibrationSet, Model]:
         assert self.like is not None
         calset = data.read()
-        model = data.model or model_like(calset, self.like.model)
-        (made,) = night_equations(calset, model, values, {}, number=night.number)
-        return with_candidates_of(made, night)
+        return calset, data.model or model_like(calset, self.like.model)
+
+    def _candidates(self, model: Model, calset: CalibrationSet) -> Candidates:
+        # They depend on cameras, standards and the effects of the model alone: listing them takes a while.
+        key = (*model.names, *model.effect_names)
+        if key not in self.candidates:
+            self.candidates[key] = candidates_of(model, calset.exposures, model.catalogue)
+        return self.candidates[key]
 
 
 def stack(
@@ -182,6 +190,10 @@ def stack(
             found, chosen, _ = breaks_of(data, chosen, catalogue)
             breaks += found
         data, solution, settled = _settled(data, chosen, at_hand, maker)
+        if at_hand and any(law is not None for law in chosen[len(chosen) - data.candidates :]):
+            # What takes part in the solution is to be known there, not only what is left of it.
+            data = _with_candidates_anew(data, solution, at_hand, maker)
+            data, solution, settled = _settled(data, chosen, at_hand, maker)
     except UndeterminedError as error:
         raise _undetermined(data, error) from None
     if not settled:
@@ -332,6 +344,19 @@ def _settled(
                 if enough := bool(np.all(rest * np.abs(after - before) <= EXACT * sigma)):
                     break
     return data, solution, False
+
+
+def _with_candidates_anew(
+    data: Together, solution: Solution, at_hand: Mapping[tuple[str, int], _Data], maker: _Maker
+) -> Together:
+    """The nights linearised at the solution, with their candidates."""
+    values, _ = _in_units(data, solution)
+    nights = []
+    for night, own in zip(data.nights, values.tolist(), strict=True):
+        if (one := at_hand.get((night.sha256, night.number))) is not None:
+            night = maker.again(one, night, dict(zip(data.names, own, strict=True)), candidates=True)
+        nights.append(night)
+    return together(nights)
 
 
 def _in_units(
