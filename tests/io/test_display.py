@@ -48,6 +48,17 @@ def test_text_is_aligned():
     ]
 
 
+def test_numbers_have_minus_signs_and_names_keep_their_hyphens():
+    shown = Display(
+        "t", (("X", "-0.29 … +0.29° (-1)"), ("on", "2026-06-29, SDSS-r")), ("a",), (("-.5 deg-2",),), ("-1",)
+    )
+    for text in (shown.text(), shown.html()):
+        assert "−0.29 … +0.29° (−1)" in text
+        assert "2026-06-29, SDSS-r" in text
+        assert "−.5 deg-2" in text
+    assert shown.text().endswith("  -1")  # a note may be a command line
+
+
 def test_html_nests_and_escapes():
     assert Texts(SHOWN.html()).cells == ["a", "1", "long", "2 & 3", "name", "n", "x", "10", "yy", "5"]
     assert "A &lt;title&gt;" in SHOWN.html()

@@ -16,6 +16,7 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.settings import BUILTIN_FILTERS
 from walop_jax.fit.verdict import Quality
+from walop_jax.io.text import rounded
 
 MAP_TOLERANCE = 1e-7  # between maps in the file and maps of its parameters, on another machine
 DARKEST = 1e-4  # of the response to unpolarised light: what "less than no light" may be
@@ -89,7 +90,7 @@ def _covariance(product: Calibration) -> Check:
     lowest = float(np.linalg.eigvalsh(0.5 * (correlation + correlation.T))[0])
     lopsided = float(np.abs(correlation - correlation.T).max())
     good = lowest > -1e-8 and lopsided < 1e-10
-    found = f"smallest eigenvalue of the correlation {lowest:.1e}; made from {product.verdict.errors_from}"
+    found = f"smallest eigenvalue of the correlation {rounded(lowest, '.2g')}; made from {product.verdict.errors_from}"
     return Check("covariance", good, found)
 
 
@@ -118,7 +119,9 @@ def _maps(product: Calibration, calibration: Calibration) -> Check:
     off = float(np.abs(again.values - product.maps.values).max())
     errors = float(np.abs(again.errors / np.maximum(product.maps.errors, 1e-30) - 1.0).max())
     return Check(
-        "maps", off < MAP_TOLERANCE and errors < 1e-4, f"differ from those of the parameters by {off:.1e}"
+        "maps",
+        off < MAP_TOLERANCE and errors < 1e-4,
+        f"differ from those of the parameters by {rounded(off, '.2g')}",
     )
 
 
@@ -132,7 +135,8 @@ def _physics(calibration: Calibration) -> Check:
     least = np.min(1.0 - np.hypot(vectors[..., 1], vectors[..., 2]) / vectors[..., 0], axis=0)
     cameras = analysis.instrument.cameras
     found = ", ".join(
-        f"{'/'.join(cameras.names[k] for k in arm)} {least[list(arm)].min():.1e}" for arm in cameras.arms
+        f"{'/'.join(cameras.names[k] for k in arm)} {rounded(least[list(arm)].min(), '.2g')}"
+        for arm in cameras.arms
     )
     good = bool(np.all(vectors[..., 0] > 0)) and bool(np.all(least > -DARKEST))
     return Check(

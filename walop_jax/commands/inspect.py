@@ -10,6 +10,7 @@ from walop_jax.commands.command import Argument, Job, Outcome, command
 from walop_jax.commands.inputs import IN_MEMORY, SETS, Sets, paths_of
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError
+from walop_jax.io.text import rounded
 
 if TYPE_CHECKING:
     from walop_jax.data.inspection import Inspection
@@ -76,7 +77,7 @@ def _display(found: Inspection) -> Display:
             ("flagged", ", ".join(f"{count} {name}" for name, count in found.flags.items()) or "none"),
             (
                 "median counts",
-                f"{found.median_counts:.4g} electrons" if counted else "none: KIND flux throughout",
+                f"{rounded(found.median_counts)} electrons" if counted else "none: all KIND flux",
             ),
             ("errors", noise if counted else "as stated"),
             ("standards", ", ".join(found.sources) or "none"),

@@ -7,6 +7,7 @@ import dataclasses
 import html
 import importlib
 import os
+import re
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
@@ -35,13 +36,13 @@ class Display:
         yield self.title
         width = max((len(name) for name, _ in self.facts), default=0)
         for name, value in self.facts:
-            yield f"  {name:<{width}}  {value}"
+            yield f"  {name:<{width}}  {_signed(value)}"
         if self.rows:
             table = [tuple(name.removeprefix(">") for name in self.head), *self.rows]
             widths = [max(len(row[k]) for row in table) for k in range(len(self.head))]
             for row in table:
                 cells = (
-                    f"{cell:>{w}}" if name.startswith(">") else f"{cell:<{w}}"
+                    f"{_signed(cell):>{w}}" if name.startswith(">") else f"{_signed(cell):<{w}}"
                     for cell, w, name in zip(row, widths, self.head, strict=True)
                 )
                 yield ("  " + "  ".join(cells)).rstrip()
@@ -64,7 +65,7 @@ class Display:
         yield f"<div><p><strong>{html.escape(self.title)}</strong></p>"
         if self.facts:
             rows = (
-                f"<tr><th {_LEFT}>{html.escape(name)}</th><td {_LEFT}>{html.escape(value)}</td></tr>"
+                f"<tr><th {_LEFT}>{html.escape(name)}</th><td {_LEFT}>{html.escape(_signed(value))}</td></tr>"
                 for name, value in self.facts
             )
             yield f"<table>{''.join(rows)}</table>"
@@ -77,7 +78,8 @@ class Display:
             body = "".join(
                 "<tr>"
                 + "".join(
-                    f"<td {side}>{html.escape(cell)}</td>" for cell, side in zip(row, sides, strict=True)
+                    f"<td {side}>{html.escape(_signed(cell))}</td>"
+                    for cell, side in zip(row, sides, strict=True)
                 )
                 + "</tr>"
                 for row in self.rows
@@ -85,6 +87,11 @@ class Display:
             yield f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
         yield from (f"<p>{html.escape(note)}</p>" for note in self.notes)
         yield "</div>"
+
+
+def _signed(text: str) -> str:
+    """A fact or a cell with true minus signs; hyphens of names, dates and options stay."""
+    return re.sub(r"(?<![^\s(])-(?=\.?\d)", "−", text)
 
 
 _LEFT, _RIGHT = 'style="text-align: left"', 'style="text-align: right; font-variant-numeric: tabular-nums"'
