@@ -360,7 +360,7 @@ def other_descriptions(
 def _screened(
     result: FitResult, sentences: Iterable[str], context: Context
 ) -> Iterator[tuple[Choice, float, Vector]]:
-    """Each change with what it leaves at the better of two places, its gain in χ², and the place; but no idle ones."""
+    """Each change that is one, with what it leaves, its gain in χ² and its place: the better of two places."""
     every = max(1, limits.CHOICE_ROWS // max(len(result.calset.exposures), 1))
     calset = thinned(result.calset, every, neighbours=1)
     start = result.model.start.copy()  # but effects as they have been fitted

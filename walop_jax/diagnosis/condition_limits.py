@@ -1,4 +1,4 @@
-"""Errors of the conditions that a set states which its residuals do not show yet, and what they do to q and u.
+"""Largest errors of stated conditions that the residuals of a set do not show, and what they do to q and u.
 
 As in `detection_limits`: a number c that is wrong by h is found where h² G reaches the noncentrality of the test of
 `stated_conditions`, G the square of the derivative C of the residuals behind the projection. The fit takes up

@@ -210,7 +210,7 @@ class ScoreSpace:
         )
 
     def places(self) -> dict[str, slice]:
-        """Places of the amplitudes of each candidate."""
+        """Slices of the amplitudes, by candidate."""
         stop = np.cumsum(self.sizes)
         return {n: slice(int(b - k), int(b)) for n, k, b in zip(self.names, self.sizes, stop, strict=True)}
 

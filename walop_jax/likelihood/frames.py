@@ -206,7 +206,7 @@ def piece_of(cell: int) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class Cells:
-    """Cut of frames into square cells of `side` pixels, those at the far ends partly beyond the frame."""
+    """Division of frames into square cells of `side` pixels, those at the far ends partly beyond the frame."""
 
     grid: Grid
     side: int

@@ -275,7 +275,7 @@ def cores() -> int:
 
 @dataclasses.dataclass(frozen=True)
 class Runner:
-    """Means of passes: on how many threads, by which processes, who is told, and where finished slabs are kept."""
+    """Runner of passes: its threads and processes, who is told, and where finished slabs are kept."""
 
     threads: int = dataclasses.field(default_factory=usual_threads)
     processes: Processes = dataclasses.field(default_factory=Processes)

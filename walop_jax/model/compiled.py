@@ -60,7 +60,7 @@ def folder() -> Path | None:
 def program(
     here: Path, name: str, function: Callable[..., Any], args: tuple[Any, ...], options: dict[str, Any] | None
 ) -> Callable[..., Any] | None:
-    """Program that runs `function` on arguments like these: one that is kept, or is from now on.
+    """Program that runs `function` on arguments like these: a kept one, or one that is kept from now on.
 
     None where it cannot be kept.
     """
