@@ -75,16 +75,14 @@ def test_print_command_and_page_say_the_same(found: Diagnosis, call, calset_file
     assert "kind: clp" not in shown  # of one kind there is nothing to say
 
 
-@pytest.mark.parametrize(
-    ("verdict", "doubts", "code"), [("unexplained", [], 0), ("effect_found", ["odd"], 3)]
-)
+@pytest.mark.parametrize(("verdict", "doubts"), [("unexplained", []), ("effect_found", ["odd"])])
 def test_what_is_not_to_be_used_is_not_recommended(
-    verdict, doubts, code, found: Diagnosis, call, calset_file, tmp_path, monkeypatch
+    verdict, doubts, found: Diagnosis, call, calset_file, tmp_path, monkeypatch
 ):
     made = dataclasses.replace(found, verdict=verdict, after=small_fit().judged(doubts))
     comes_out(made, monkeypatch)
     done = call("diagnose", calset_file, "-o", tmp_path / "made")
-    assert done.exit_code == code
+    assert done.exit_code == 0  # whatever it finds, a diagnosis is done
     assert "walop-jax report" in done.stderr
     assert "walop-jax apply" not in done.stderr
-    assert ("if nothing were missing" in done.stdout) == (code == 0)
+    assert ("if nothing were missing" in done.stdout) == (not doubts)

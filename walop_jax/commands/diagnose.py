@@ -92,7 +92,6 @@ def diagnose(
         files,
         saved_as=DIAGNOSIS,
         warnings=found.after.warnings,
-        trusted=after.trusted,
         next=(f"walop-jax report {output}", *[f"walop-jax apply {output} STARS.fits -o OUT.fits"] * usable),
     )
 
