@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 
-from walop_jax.model.effects import cameras, numbers, optics, sources  # noqa: F401  the kinds of changes
+from walop_jax.model.effects import cameras, numbers, optics, sources
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.effects.catalogue import EFFECTS
 from walop_jax.model.effects.change import Change
@@ -33,16 +33,3 @@ def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
     """
     order = {effect.name: place for place, effect in enumerate((OtherDescription, *EFFECTS))}
     return tuple(sorted(effects, key=lambda effect: order.get(effect.name, len(order))))
-
-
-__all__ = [
-    "EFFECTS",
-    "Change",
-    "Context",
-    "Described",
-    "Effect",
-    "FreeForm",
-    "OtherDescription",
-    "effect_by_name",
-    "in_order",
-]

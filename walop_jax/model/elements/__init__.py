@@ -37,27 +37,3 @@ ELEMENTS: tuple[type[Element], ...] = (
     AnalysisVector,
     Analyser,
 )
-
-__all__ = [
-    "ELEMENTS",
-    "AddedPolarisation",
-    "AirGap",
-    "Analyser",
-    "AnalysisVector",
-    "Collimator",
-    "Depolariser",
-    "Diattenuator",
-    "Element",
-    "FieldDiattenuator",
-    "FieldShift",
-    "Layer",
-    "Mirror",
-    "Polariser",
-    "PupilMapping",
-    "RadialRetarder",
-    "Retarder",
-    "Rotator",
-    "SpectralElement",
-    "WavePlate",
-    "Wedge",
-]
