@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from frames_file import write_frames
 
 from walop_jax.calibration import read_calibration
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.residual_map import residual_map
 from walop_jax.commands.refit import refit
-from walop_jax.data import Grid, read_calibration_set, write_frames
+from walop_jax.data import Grid, read_calibration_set
 from walop_jax.data.records import CalibrationSet, Intensities
 from walop_jax.fit import search
 from walop_jax.likelihood import limits, runner

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
+from frames_file import write_frames
 
 from walop_jax.data import (
     Block,
@@ -17,7 +18,6 @@ from walop_jax.data import (
     TableIntensities,
     read_calibration_set,
     write_calibration_set,
-    write_frames,
 )
 
 GRID = Grid(7, 5, (4.0, 3.0), (0.01, -0.02), ((0.05, 0.004), (-0.003, 0.06)))
@@ -227,9 +227,3 @@ def test_frames_of_two_nights_and_a_table(scene, handmade, tmp_path):
     assert not np.any(block.used[:5, 7:14])
     assert not np.any(block.used[5:, :7])
     assert mixed.intensities.rows == 2 * int(whole.used.sum()) + 21
-
-
-def test_a_wrong_grid_is_refused(scene, tmp_path):
-    with pytest.raises(DataError, match="35 points for 7 × 6 pixels"):
-        write_frames(tmp_path / "frames.fits", scene, dataclasses.replace(GRID, height=6))
-    assert list(tmp_path.glob("frames*")) == []

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from astropy.io import fits
+from frames_file import write_frames
 from test_writing import columns as all_columns
 from test_writing import equal
 
@@ -19,7 +20,6 @@ from walop_jax.data import (
     TableIntensities,
     read_calibration_set,
     write_calibration_set,
-    write_frames,
 )
 from walop_jax.data.inspection import inspect
 

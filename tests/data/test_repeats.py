@@ -7,6 +7,7 @@ import functools
 
 import numpy as np
 import pytest
+from frames_file import write_frames
 from south_sets import CUTS, SouthSet
 
 from walop_jax.data import (
@@ -15,7 +16,6 @@ from walop_jax.data import (
     TableIntensities,
     read_calibration_set,
     write_calibration_set,
-    write_frames,
 )
 from walop_jax.data.merge import _Rows, _smallest_singular_value, check_repeats
 from walop_jax.data.records import CalibrationSet, Exposures, Points

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from frame_run import frame_run
+from frames_file import write_frames
 
 from walop_jax.calibration import residual_map
 from walop_jax.calibration.residual_map import residual_map_of_pixels
@@ -16,7 +17,6 @@ from walop_jax.data import (
     merge_calibration_sets,
     read_calibration_set,
     write_calibration_set,
-    write_frames,
 )
 from walop_jax.data.frames import RowReader, float64
 from walop_jax.data.merge import without_frames

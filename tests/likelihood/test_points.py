@@ -9,8 +9,9 @@ import jax
 import numpy as np
 import pytest
 from frame_run import frame_run
+from frames_file import write_frames
 
-from walop_jax.data import Grid, read_calibration_set, write_frames
+from walop_jax.data import Grid, read_calibration_set
 from walop_jax.data.records import Intensities
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit

@@ -29,12 +29,13 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "studies")]
 
 from frame_run import frame_run  # noqa: E402
+from frames_file import write_frames  # noqa: E402
 from small_run import SMALL  # noqa: E402
 from trust import with_block  # noqa: E402
 
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.calibration.matrix import sky_vectors  # noqa: E402
-from walop_jax.data import Grid, read_calibration_set, write_frames  # noqa: E402
+from walop_jax.data import Grid, read_calibration_set  # noqa: E402
 from walop_jax.data.catalogue import read_catalogue  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
 from walop_jax.data.settings import Settings  # noqa: E402

@@ -37,6 +37,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from commands.conftest import content  # noqa: E402
+from frames_file import write_frames  # noqa: E402
 from small_run import SEED, SMALL  # noqa: E402
 
 sampling = importlib.import_module("walop_jax.commands.sample")
@@ -46,7 +47,7 @@ from walop_jax.commands.compress import compress  # noqa: E402
 from walop_jax.commands.diagnose import diagnose  # noqa: E402
 from walop_jax.commands.refit import refit  # noqa: E402
 from walop_jax.commands.sample import sample  # noqa: E402
-from walop_jax.data import DataError, Grid, write_calibration_set, write_frames  # noqa: E402
+from walop_jax.data import DataError, Grid, write_calibration_set  # noqa: E402
 from walop_jax.likelihood import limits  # noqa: E402
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn  # noqa: E402
 from walop_jax.simulation.simulate import simulate  # noqa: E402

@@ -43,7 +43,7 @@ from walop_jax.data.checks import instrument_name, make_exposures, make_filters,
 from walop_jax.data.frames import Grid, read_grid
 from walop_jax.data.records import PREFIX, InputFile, Site
 from walop_jax.data.schema import Column, Place, column_names, read_table, table_rules
-from walop_jax.data.write import exposures_hdu, filter_columns, grid_cards, sign_and_write, table_hdu
+from walop_jax.data.write import filter_columns, grid_cards, set_table_hdu, sign_and_write, table_hdu
 from walop_jax.fit.verdict import STATED, Hidden, Structure, Verdict
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import DataError, errors_naming, fail
@@ -131,7 +131,7 @@ def _hdus(c: Calibration, path: object) -> list[Any]:
     if c.hidden is not None:
         images.append(_hidden_hdu(c.hidden))
     parameters, filters = made.pop("PARAMETERS"), made.pop("FILTERS")
-    exposures = exposures_hdu(c.exposures, version, path)
+    exposures = set_table_hdu("EXPOSURES", c.exposures.columns(), version, path)
     return [_primary(c, version), parameters, *images, filters, exposures, *made.values()]
 
 

@@ -10,7 +10,7 @@ from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.records import Block, CalibrationSet, DataFlag, Position, Site
 from walop_jax.data.settings import BUILTIN_FILTERS, builtin_filter
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.data.write import write_calibration_set, write_frames
+from walop_jax.data.write import write_calibration_set
 from walop_jax.data.zemax import import_transmissions
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import DataError

@@ -1,4 +1,4 @@
-"""Writing calibration sets: tables as the format has them, and whole frames slab by slab.
+"""Writing calibration sets as tables.
 
 The extension COMPRESSION says of a calibration set that stands for the pixels of whole frames, what they were.
 
@@ -18,27 +18,20 @@ from astropy.io import fits
 
 from walop_jax.data import schema
 from walop_jax.data.checks import instrument_name, oldest_version
-from walop_jax.data.frames import Grid, count_names, error_names
-from walop_jax.data.records import CalibrationSet, Compression, DataFlag, Exposures, FilterCurve, InputFile
+from walop_jax.data.frames import Grid
+from walop_jax.data.records import CalibrationSet, Compression, FilterCurve, InputFile
 from walop_jax.data.schema import Place
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.io.atomic import atomic_path
-from walop_jax.io.errors import fail
-from walop_jax.io.fits_reading import checksum_text, data_sum, padded
 
 EXTENSION = "COMPRESSION"
 
 
-def compression_hdu(found: Compression) -> fits.BinTableHDU:
+def compression_hdu(found: Compression, path: object) -> fits.BinTableHDU:
     """The extension of a record."""
-    names = np.array(list(found.values), dtype="U")
-    hdu = fits.BinTableHDU.from_columns(
-        [
-            fits.Column(name="NAME", format=f"{max(1, names.dtype.itemsize // 4)}A", array=names),
-            fits.Column(name="VALUE", format="D", array=np.array(list(found.values.values()))),
-        ],
-        name=EXTENSION,
-    )
+    columns = {"NAME": np.array(list(found.values), "U"), "VALUE": np.array(list(found.values.values()))}
+    rules = {"NAME": schema.Column("str"), "VALUE": schema.Column("float")}
+    hdu = table_hdu(EXTENSION, columns, path, rules)
     hdu.header["NPIXELS"] = (found.pixels, "pixels that the field points stand for")
     hdu.header["CHI2"] = (found.chi2, "chi-square of the pixels at these values")
     hdu.header["DOF"] = (found.dof, "its degrees of freedom")
@@ -94,10 +87,9 @@ def remark(found: Compression, points: int) -> str:
     )
 
 
-# ---------------------------------------------------------------------------------------------------- tables and frames
+# -------------------------------------------------------------------------------------------------- tables
 
 _CODES = {"int": "J", "float": "D", "bool": "L"}
-_SLAB = 1 << 18  # (exposure, pixel) pairs that are written at a time
 
 
 def write_calibration_set(
@@ -115,7 +107,13 @@ def write_calibration_set(
     >>> walop.write_calibration_set("copy.fits", calset)
     """
     with atomic_path(path, overwrite=overwrite) as temporary:
-        sign_and_write(_hdus(calset, set_tables(calset), path), temporary)
+        version = oldest_version(calset.instrument, calset.exposures, calset.cameras)
+        hdus: list[Any] = [_primary(calset, version, path)]
+        for name, columns in set_tables(calset).items():
+            hdus.append(set_table_hdu(name, columns, version, path))
+        if calset.compression is not None:
+            hdus.append(compression_hdu(calset.compression, path))
+        sign_and_write(hdus, temporary)
 
 
 def set_tables(calset: CalibrationSet) -> dict[str, dict[str, np.ndarray]]:
@@ -135,13 +133,8 @@ def set_tables(calset: CalibrationSet) -> dict[str, dict[str, np.ndarray]]:
             "FLAG": intensities.flag,
         },
     }
-    return tables | _optional_tables(calset)
-
-
-def _optional_tables(calset: CalibrationSet) -> dict[str, dict[str, np.ndarray]]:
-    tables = {}
-    if len(calset.sources):
-        tables["SOURCES"] = {name: getattr(calset.sources, name.lower()) for name in schema.SOURCES}
+    if len(sources):
+        tables["SOURCES"] = {name: getattr(sources, name.lower()) for name in schema.SOURCES}
     if calset.filters:
         tables["FILTERS"] = filter_columns(calset.filters)
     return tables
@@ -156,9 +149,8 @@ def sign_and_write(hdus: list[Any], path: Path) -> None:
 
 
 def _primary(calset: CalibrationSet, version: int, path: object) -> fits.PrimaryHDU:
-    primary = fits.PrimaryHDU()
-    site = calset.site
-    instrument_name(calset.instrument, version, schema.Place(path, "PRIMARY"))
+    primary, site, place = fits.PrimaryHDU(), calset.site, Place(path, "PRIMARY")
+    instrument_name(calset.instrument, version, place)
     cards = {
         "TELESCOP": (site.telescope, "telescope"),
         "INSTRUME": (calset.instrument, "instrument"),
@@ -170,28 +162,19 @@ def _primary(calset: CalibrationSet, version: int, path: object) -> fits.Primary
     }
     for name, (value, comment) in cards.items():
         if isinstance(value, str):
-            _ascii(value, f"PRIMARY] {name}", path)
+            _ascii(value, name, place)
         elif not np.isfinite(value):
             continue  # FITS headers know no NaN; a missing card is read as one
         primary.header[name] = (value, comment if not isinstance(value, str) else "")
     return primary
 
 
-def _hdus(calset: CalibrationSet, tables: Mapping[str, Mapping[str, np.ndarray]], path: object) -> list[Any]:
-    """The primary header of a set, some of its tables, and what it stands for."""
-    version = oldest_version(calset.instrument, calset.exposures, calset.cameras)
-    made: list[Any] = [_primary(calset, version, path)]
-    for name, columns in tables.items():
-        rules = schema.table_rules(name, version, list(columns), schema.Place(path, name))
-        made.append(table_hdu(name, columns, path, rules))
-    return made if calset.compression is None else [*made, compression_hdu(calset.compression)]
-
-
-def exposures_hdu(exposures: Exposures, version: int, path: object) -> fits.BinTableHDU:
-    """The EXPOSURES table in a version of the calibration set format."""
-    columns = exposures.columns()
-    rules = schema.table_rules("EXPOSURES", version, list(columns), schema.Place(path, "EXPOSURES"))
-    return table_hdu("EXPOSURES", columns, path, rules)
+def set_table_hdu(
+    name: str, columns: Mapping[str, np.ndarray], version: int, path: object
+) -> fits.BinTableHDU:
+    """A table of a calibration set in a version of its format."""
+    rules = schema.table_rules(name, version, list(columns), Place(path, name))
+    return table_hdu(name, columns, path, rules)
 
 
 def filter_columns(filters: Mapping[str, FilterCurve]) -> dict[str, np.ndarray]:
@@ -205,21 +188,18 @@ def filter_columns(filters: Mapping[str, FilterCurve]) -> dict[str, np.ndarray]:
 
 
 def table_hdu(
-    name: str,
-    columns: Mapping[str, np.ndarray],
-    path: object,
-    rules: Mapping[str, schema.Column] | None = None,
+    name: str, columns: Mapping[str, np.ndarray], path: object, rules: Mapping[str, schema.Column]
 ) -> fits.BinTableHDU:
-    """A binary table by its rules (default: those of the calibration set's table of that name).
+    """A binary table by its rules.
 
     Raises `DataError`, naming `path`, for text that is not plain ASCII.
     """
     made = []
-    for column, rule in (schema.TABLES[name] if rules is None else rules).items():
+    for column, rule in rules.items():
         values = columns[column]
         if rule.kind == "str":
             for value in np.unique(values):
-                _ascii(str(value), f"{name}] {column}", path)
+                _ascii(str(value), column, Place(path, name))
             code = f"{max(1, values.dtype.itemsize // 4)}A"
         else:
             width = 1 if values.ndim == 1 else values.shape[1]
@@ -230,62 +210,9 @@ def table_hdu(
     return fits.BinTableHDU.from_columns(made, name=name)
 
 
-def _ascii(value: str, where: str, path: object) -> None:
+def _ascii(value: str, column: str, place: Place) -> None:
     if not value.isascii() or not (value.isprintable() or not value):
-        extension, _, column = where.partition("] ")
-        raise fail(
-            f"{value!r} is not plain ASCII",
-            file=path,
-            extension=extension,
-            column=column,
-            advice="FITS knows no other letters: rename it",
-        )
-
-
-def write_frames(
-    path: str | os.PathLike[str],
-    calset: CalibrationSet,
-    grid: Grid,
-    *,
-    dtype: str = "f4",
-    overwrite: bool = False,
-) -> None:
-    """Write a calibration set as whole frames, never holding more than a slab of them in memory.
-
-    The points of `calset` must be the pixels of `grid`, row by row; its `intensities.block` is asked for some
-    image rows at a time. Pixels without a measurement get bit 2 (bad pixel) of the FLAG image. `dtype` is
-    `f4` or `f8`. The images carry checksums too.
-
-    Raises `DataError` as `write_calibration_set` does, and if points and grid differ in number.
-    """
-    if len(calset.points) != grid.pixels:
-        raise fail(
-            f"{len(calset.points)} points for {grid.width} × {grid.height} pixels",
-            file=path,
-            advice="one per pixel",
-        )
-    shape = (len(calset.exposures), grid.height, grid.width)
-    counts, errors = count_names(calset.cameras), error_names(calset.cameras)
-    kinds = dict.fromkeys((*counts, *errors), np.dtype(f">{dtype}")) | {"FLAG": np.dtype(">i2")}
-    with atomic_path(path, overwrite=overwrite) as temporary:
-        tables = {"EXPOSURES": calset.exposures.columns()} | _optional_tables(calset)
-        sign_and_write(_hdus(calset, tables, path), temporary)
-        cubes: dict[str, tuple[np.memmap[Any, Any], int]] = {}
-        for name, kind in kinds.items():
-            cubes[name] = _append_image(temporary, name, kind, shape, grid)
-        step = max(1, _SLAB // (shape[0] * grid.width))
-        for top in range(0, grid.height, step):
-            bottom = min(top + step, grid.height)
-            block = calset.intensities.block(top * grid.width, bottom * grid.width)
-            planes = (shape[0], bottom - top, grid.width)
-            for k in range(calset.cameras):
-                cubes[counts[k]][0][:, top:bottom] = block.counts[..., k].T.reshape(planes)
-                cubes[errors[k]][0][:, top:bottom] = block.sigma[..., k].T.reshape(planes)
-            flag = np.where(block.used.T, 0, DataFlag.BAD_PIXEL)
-            cubes["FLAG"][0][:, top:bottom] = flag.reshape(planes)
-        for cube, start in cubes.values():
-            cube.flush()
-            _sign_image(temporary, start, cube)
+        raise place.fail(f"{value!r} is not plain ASCII", column, "FITS knows no other letters: rename it")
 
 
 def grid_cards(grid: Grid) -> dict[str, str | float]:
@@ -296,39 +223,3 @@ def grid_cards(grid: Grid) -> dict[str, str | float]:
         cards |= {f"CRPIX{n + 1}": grid.reference[n], f"CRVAL{n + 1}": grid.value[n]}
         cards |= {f"CD{n + 1}_{m + 1}": grid.matrix[n][m] for m in range(2)}
     return cards
-
-
-def _append_image(
-    path: Path, name: str, kind: np.dtype[Any], shape: tuple[int, int, int], grid: Grid
-) -> tuple[np.memmap[Any, Any], int]:
-    """Add the header and the room of an image to a file; return the mapped room and the header's place."""
-    header = fits.Header()
-    header["XTENSION"] = "IMAGE"
-    header["BITPIX"] = 16 if kind.kind == "i" else -8 * kind.itemsize
-    header["NAXIS"] = 3
-    for axis, length in enumerate(reversed(shape), start=1):
-        header[f"NAXIS{axis}"] = length
-    header["PCOUNT"], header["GCOUNT"], header["EXTNAME"] = 0, 1, name
-    header.update(grid_cards(grid))
-    if name != "FLAG":
-        header["BUNIT"] = "electron"
-    header["CHECKSUM"], header["DATASUM"] = "0" * 16, "0".rjust(10)
-    text = header.tostring().encode("ascii")
-    start = path.stat().st_size
-    with path.open("r+b") as stream:
-        stream.seek(start)
-        stream.write(text)
-        stream.truncate(start + len(text) + padded(int(np.prod(shape)) * kind.itemsize))
-    return np.memmap(path, kind, mode="r+", offset=start + len(text), shape=shape), start
-
-
-def _sign_image(path: Path, start: int, cube: np.memmap[Any, Any]) -> None:
-    """Put the sums of an image into the cards that were kept free for them."""
-    total = data_sum(path, int(cube.offset), padded(cube.nbytes))
-    with path.open("r+b") as stream:
-        stream.seek(start)
-        header = fits.Header.fromstring(stream.read(int(cube.offset) - start).decode("ascii"))
-        header["DATASUM"] = str(total).rjust(10)
-        header["CHECKSUM"] = checksum_text(header.tostring().encode("ascii"), total)
-        stream.seek(start)
-        stream.write(header.tostring().encode("ascii"))

@@ -208,40 +208,6 @@ def _fold(total: int) -> int:
     return total
 
 
-def data_sum(path: Path, offset: int, length: int) -> int:
-    """Return the FITS data sum of a stretch of a file, for a writer of data larger than memory."""
-    with path.open("rb") as stream:
-        stream.seek(offset)
-        return _sum(stream, length, hashlib.sha256())
-
-
-def checksum_text(header: bytes, data: int) -> str:
-    """Return the CHECKSUM that completes a header in which it is `'0' * 16`, given the sum of the data.
-
-    FITS standard 4.0, appendix J.1: each byte of the complement is split over four letters, kept clear of
-    punctuation, and the string is turned by one because it starts at the twelfth byte of its card.
-    """
-    value = 0xFFFFFFFF ^ _fold(_sum(io.BytesIO(header), len(header), hashlib.sha256()) + data)
-    letters = [0] * 16
-    for place, byte in enumerate(value.to_bytes(4, "big")):
-        four = [byte // 4 + 48 + (byte % 4 if n == 0 else 0) for n in range(4)]
-        while any(_punctuation(letter) for letter in four):
-            for n in (0, 2):
-                if _punctuation(four[n]) or _punctuation(four[n + 1]):
-                    four[n], four[n + 1] = four[n] + 1, four[n + 1] - 1
-        letters[place::4] = four
-    return bytes(letters[-1:] + letters[:-1]).decode("ascii")
-
-
-def _punctuation(letter: int) -> bool:
-    return 0x3A <= letter <= 0x40 or 0x5B <= letter <= 0x60
-
-
-def padded(length: int) -> int:
-    """Round a number of bytes up to whole FITS blocks."""
-    return -(-length // BLOCK) * BLOCK
-
-
 BLOCK = 2880
 _CARD = 80
 _MOST_BLOCKS = 1000  # of one header: 36 000 cards
