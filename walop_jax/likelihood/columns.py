@@ -224,10 +224,14 @@ class _Laid:
 
 
 class Columns:
-    """The columns of any changes at one set of values of the parameters of a likelihood."""
+    """The columns of any changes at one set of values of the parameters of a likelihood.
 
-    def __init__(self, likelihood: Likelihood, values: Vector) -> None:
+    Those of many likelihoods, not `once`, come from a program that takes longer to compile and half the time to run.
+    """
+
+    def __init__(self, likelihood: Likelihood, values: Vector, *, once: bool = True) -> None:
         self.likelihood, self.instrument = likelihood, likelihood.model.instrument(values)
+        self.once = once
         self.plan = likelihood.plan
         self.patched = self.instrument.patched()
         planned = "temperature" in self.plan.conditions.planned
@@ -311,7 +315,7 @@ class _Block:
     def __init__(self, of: Columns, start: int, pieces: Sequence[Piece]) -> None:
         self.of, size = of, limits.RESPONSES_TOGETHER
         (data,) = of.reader.chunks(start, start + size, size)
-        found = _at_points(of.instrument, of.plan, data, once=True)
+        found = _at_points(of.instrument, of.plan, data, once=of.once)
         self.found: _AtPoint = jax.tree.map(np.asarray, found)
         self.x, self.y, weight, self.band, self.source = (
             np.asarray(getattr(data, name)) for name in ("x", "y", "weight", "band", "source")

@@ -178,7 +178,7 @@ def candidates_of(
 
 
 def with_candidates(
-    likelihood: Likelihood, values: Vector, changes: Sequence[Change]
+    likelihood: Likelihood, values: Vector, changes: Sequence[Change], *, once: bool = True
 ) -> tuple[float, Vector, Float[np.ndarray, "_ _"]]:
     """χ², gradient and matrix of the data of a table in free parameters and candidates (0: cannot be computed)."""
     instrument, select = likelihood.model.instrument(values), likelihood.model.selection()
@@ -189,7 +189,7 @@ def with_candidates(
         slopes.append(used_rows(slope, chunk) @ select)
     r, jacobian = np.concatenate(residuals), np.concatenate(slopes)
     if changes:
-        columns = Columns(likelihood, values)
+        columns = Columns(likelihood, values, once=once)
         there = [k for k, change in enumerate(changes) if columns.has(change)]
         added = np.zeros((len(r), len(changes)))
         added[:, there] = columns.of([changes[k] for k in there])
@@ -220,12 +220,14 @@ def night_equations(
     *,
     number: int | None = None,
     own: bool = False,
+    once: bool = True,
 ) -> list[Night]:
     """The nights of a set, linearised at values of the parameters: a full vector, or by name (others: start values).
 
     `changes` are the candidates (None: `candidates_of` each night), `number` the only night that is asked for. Nights
-    whose `own` minimum is farther from the values than noise explains are linearised closer to it. Of sets too large
-    for a table of derivatives no candidates are kept. Raises `DataError` as `split` does.
+    whose `own` minimum is farther from the values than noise explains are linearised closer to it. Programs are
+    compiled for a few nights (`once`) or for many. Of sets too large for a table of derivatives no candidates are kept.
+    Raises `DataError` as `split` does.
     """
     if isinstance(values, Mapping):
         values = np.array([values.get(p.name, p.start) for p in model.parameters])
@@ -244,7 +246,8 @@ def night_equations(
             known, census = {}, terms.census
         else:
             known = candidates_of(model, some.exposures, model.catalogue) if changes is None else changes
-            chi2, gradient, matrix = with_candidates(likelihood, there, [c for _, c in known.values()])
+            every = [change for _, change in known.values()]
+            chi2, gradient, matrix = with_candidates(likelihood, there, every, once=once)
             census = likelihood.census
         e = some.exposures
         found.append(

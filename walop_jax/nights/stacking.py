@@ -28,6 +28,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data import read_calibration_set
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.schema import EXPOSURES, Column, Place
+from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.user_tables import InputTable, in_memory, numeric_column, read_input_table
 from walop_jax.fit.model_file import model_like
 from walop_jax.fit.refit import FitResult
@@ -63,6 +64,7 @@ LONG = 60.0  # days without a night that are worth a remark
 FAR = 0.02  # standard errors from the solution up to which a night need not be linearised again
 EXACT = 1e-3  # standard errors by which linearising all nights again may move the solution at most
 ROUNDS = 6
+MANY = 20  # sets from which on programs are better compiled for longer
 REFERENCE = "reference.fits"
 TRACKS, SURVEY = "tracks.fits", "survey.json"
 FILES = (NIGHTS, REFERENCE, PRODUCT, TRACKS, SURVEY)
@@ -93,7 +95,9 @@ class _Maker:
 
     like: Calibration | None
     folder: Path | None
+    few: bool = True
     candidates: dict[tuple[str, ...], Candidates] = dataclasses.field(default_factory=dict)
+    sets: dict[str, tuple[CalibrationSet, Model]] = dataclasses.field(default_factory=dict)
 
     def nights(self, data: _Data) -> list[Night]:
         """The nights of data, as they are kept or linearised near their own minimum, from the values of `like` on."""
@@ -110,7 +114,8 @@ class _Maker:
                 return read_nights(place)
         calset, model = self._set_and_model(data)
         values = dict(zip(self.like.model.names, self.like.values.tolist(), strict=True))
-        found = night_equations(calset, model, values, self._candidates(model, calset), own=True)
+        known = self._candidates(model, calset)
+        found = night_equations(calset, model, values, known, own=True, once=self.few)
         if place is not None:
             place.parent.mkdir(parents=True, exist_ok=True)
             write_nights(place, found, overwrite=True)
@@ -122,13 +127,18 @@ class _Maker:
         """A night linearised at other values; its candidates as well, or they follow (`with_candidates_of`)."""
         calset, model = self._set_and_model(data)
         known = self._candidates(model, calset) if candidates else {}
-        (made,) = night_equations(calset, model, values, known, number=night.number)
+        (made,) = night_equations(calset, model, values, known, number=night.number, once=self.few)
         return with_candidates_of(made, night)
 
     def _set_and_model(self, data: _Data) -> tuple[CalibrationSet, Model]:
         assert self.like is not None
+        if (kept := self.sets.get(data.sha256)) is not None:
+            return kept
         calset = data.read()
-        return calset, data.model or model_like(calset, self.like.model)
+        made = calset, data.model or model_like(calset, self.like.model)
+        if isinstance(calset.intensities, TableIntensities):
+            self.sets[data.sha256] = made
+        return made
 
     def _candidates(self, model: Model, calset: CalibrationSet) -> Candidates:
         # They depend on cameras, standards and the effects of the model alone: listing them takes a while.
@@ -164,7 +174,7 @@ def stack(
     opened = [_opened(one, catalogue) for one in nights]
     fits = [one for one in (like, *(some.fit for some in opened)) if one is not None]
     held = [Calibration.from_fit(one) if isinstance(one, FitResult) else one for one in fits[:1]]
-    maker = _Maker(held[0].rebuilt() if held else None, partial)
+    maker = _Maker(held[0].rebuilt() if held else None, partial, len(opened) < MANY)
     made: list[Night] = []
     at_hand: dict[tuple[str, int], _Data] = {}
     for k, one in enumerate(opened):
