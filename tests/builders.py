@@ -149,7 +149,7 @@ def oracle_params(instrument: Instrument) -> dict[str, Any]:
 def _vectors(instrument: Instrument, plan: Plan, x: jax.Array, y: jax.Array) -> jax.Array:
     def one(px: jax.Array, py: jax.Array) -> jax.Array:
         rows = light.band_rows(instrument, plan, px, py)
-        return light.camera_vectors(instrument, rows, light.throughput_at(instrument, px, py), px, py)
+        return light.camera_vectors(instrument, rows, instrument.throughput.at(px, py), px, py)
 
     return jax.vmap(one)(x, y)
 
@@ -173,9 +173,7 @@ def _counts(
     band: jax.Array,
 ) -> jax.Array:
     rows = light.band_rows(instrument, plan, x, y)
-    return light.counts(
-        instrument, plan, rows, light.throughput_at(instrument, x, y), x, y, sky, source, band
-    )
+    return light.counts(instrument, plan, rows, instrument.throughput.at(x, y), x, y, sky, source, band)
 
 
 _compiled_counts = compiled(_counts)

@@ -25,11 +25,12 @@ from walop_jax.fit.model_file import model_without_data, render
 from walop_jax.fit.verdict import Verdict
 from walop_jax.io.text import in_ascii
 from walop_jax.model.effects import Context, Described
-from walop_jax.model.effects.optics import OPTICAL
+from walop_jax.model.effects.optics import AXES
 from walop_jax.model.specification import with_effects
 
 NAN = float("nan")
 STARS = [("HD_14069", 0.01, 0.02)]
+OPTICAL = (*(f"{kind} {axis}" for kind in ("retardance", "diattenuation") for axis in AXES), "depolarisation")
 HEADS = (
     *(f"{kind} behind half1.plate" for kind in OPTICAL),
     "turn of polariser",
@@ -51,6 +52,7 @@ HEADS = (
     "thickness of half1.plate.mgf2",
     "thermal of chwp",
 )
+
 FACTORS = (
     "x",
     "y",

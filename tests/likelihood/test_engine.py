@@ -79,7 +79,7 @@ def make_block(seed=3, noise=True, flux_known=True):
     flux = rng.uniform(0.5e6, 1.5e6, (POINTS, e, 1))
     if flux_known:
         flux[:, -1] = 1.0
-    counts = flux * np.asarray(engine.prediction(instrument, likelihood.plan, likelihood.points.chunk(0)))
+    counts = flux * np.asarray(engine.prediction(instrument, likelihood.plan, next(iter(likelihood.points))))
     sigma = sigma * np.where(flux == 1.0, 1e-6, 1.0)
     if noise:
         counts = counts + sigma * rng.standard_normal(counts.shape)
@@ -146,7 +146,7 @@ def kaufman(y, a, da, known):
 
 @pytest.fixture(scope="module")
 def plain(likelihood, values):
-    return jacobians(likelihood, values, likelihood.points.chunk(0))
+    return jacobians(likelihood, values, next(iter(likelihood.points)))
 
 
 def test_gradient_is_that_of_plain_derivatives(likelihood, values, plain):
@@ -154,7 +154,7 @@ def test_gradient_is_that_of_plain_derivatives(likelihood, values, plain):
     r, _, dr, _ = plain
     np.testing.assert_allclose(likelihood.residuals(values)[1], r, rtol=1e-9, atol=1e-9)
     normal = engine.normal_equations(
-        likelihood.model.instrument(values), likelihood.plan, likelihood.points.chunk(0)
+        likelihood.model.instrument(values), likelihood.plan, next(iter(likelihood.points))
     )
     assert float(normal.chi2) == pytest.approx(np.sum(r**2), rel=1e-10)
     expected = np.einsum("pek,pekn->n", r, dr)
@@ -165,7 +165,7 @@ def test_gradient_is_that_of_plain_derivatives(likelihood, values, plain):
 
 def test_matrix_is_kaufmans(likelihood, values, plain):
     _, a, _, da = plain
-    data = likelihood.points.chunk(0)
+    data = next(iter(likelihood.points))
     y = np.asarray(data.counts * data.weight)
     jacobian = kaufman(y, a, da, np.asarray(likelihood.plan.exposures.flux_known)).reshape(-1, len(values))
     expected = jacobian.T @ jacobian
@@ -181,7 +181,7 @@ def test_matrix_is_the_fisher_information_with_fluxes_marginalised():
     """Without noise and at the truth: Schur complement of the joint information of parameters and fluxes."""
     block, truth = make_block(noise=False)
     likelihood, values = likelihood_of(block), np.asarray(values_of(truth))
-    data = likelihood.points.chunk(0)
+    data = next(iter(likelihood.points))
     r, a, dr, da = jacobians(likelihood, values, data)
     np.testing.assert_allclose(r, 0.0, atol=1e-6)
     known = np.asarray(likelihood.plan.exposures.flux_known)
@@ -210,7 +210,7 @@ def test_posterior_adds_the_priors(likelihood, values):
     """χ² of the priors and half its derivative, by hand, on top of the data's."""
     found = likelihood.expand(values)
     normal = engine.dense_equations(
-        likelihood.model.instrument(values), likelihood.plan, likelihood.points.chunk(0)
+        likelihood.model.instrument(values), likelihood.plan, next(iter(likelihood.points))
     )
     gradient, matrix, chi2 = np.array(normal.gradient), np.array(normal.matrix), 0.0
     loose = 0.0
@@ -234,7 +234,7 @@ def test_posterior_adds_the_priors(likelihood, values):
 
 def test_equations_from_all_rows_are_the_normal_equations(likelihood, values):
     """Two programs of the same sums; counts of 10⁶ known to 10⁻³ leave 10⁻¹³ of a residual to rounding."""
-    arguments = likelihood.model.instrument(values), likelihood.plan, likelihood.points.chunk(0)
+    arguments = likelihood.model.instrument(values), likelihood.plan, next(iter(likelihood.points))
     dense, structured = engine.dense_equations(*arguments), engine.normal_equations(*arguments)
     size = np.sqrt(np.diag(dense.matrix))
     size[size == 0] = 1.0

@@ -109,7 +109,7 @@ def test_optimistix_on_residuals_in_memory_finds_the_same(made):
     """The reference: `optimistix.LevenbergMarquardt` on the residuals themselves, derivatives by JAX."""
     sample = thinned(made.calset, 20, neighbours=1)
     likelihood = Likelihood.of(sample, made.model)
-    model, chunk = likelihood.model, likelihood.points.chunk(0)
+    model, chunk = likelihood.model, next(iter(likelihood.points))
     scale = np.array([model.parameters[i].scale for i in model.free])
     select = model.selection() * scale
     to_instrument = with_values(model.instrument())

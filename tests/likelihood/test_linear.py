@@ -18,6 +18,7 @@ from walop_jax.model.effects import effect_by_name
 from walop_jax.model.effects.base import Context
 from walop_jax.model.parameters import leaves, values_of, with_values
 from walop_jax.model.planning import plan_for_settings
+from walop_jax.model.specification import series_indices
 
 X, Y = jnp.asarray(0.21), jnp.asarray(-0.13)
 # One acts in the optics, one at the telescope, one on the cameras, one in the optics and nowhere else.
@@ -52,7 +53,7 @@ def test_derivatives_are_those_of_forward_differentiation(instrument, plan):
 
     def whole(values):
         there = to_instrument(values)
-        value = matrix_of(there, light.band_rows(there, plan, X, Y), light.throughput_at(there, X, Y))
+        value = matrix_of(there, light.band_rows(there, plan, X, Y), there.throughput.at(X, Y))
         return value, value
 
     def quantity(rows, values, local):
@@ -61,7 +62,7 @@ def test_derivatives_are_those_of_forward_differentiation(instrument, plan):
     def pieces(values):
         there = to_instrument(values)
         rows, slopes = field_table.rows_and_slopes(there, plan, X, Y)
-        found = field_table.linearised(there, quantity, rows, slopes, light.throughput_at(there, X, Y))
+        found = field_table.linearised(there, quantity, rows, slopes, there.throughput.at(X, Y))
         basis = there.throughput.basis(X, Y)[None]
         return field_table.to_all(there, found.plain, found.local, basis), found.value
 
@@ -82,7 +83,7 @@ def test_derivatives_are_those_of_forward_differentiation(instrument, plan):
 
 
 def test_positions_are_all_parameters_once(instrument):
-    plain, series = field_table.plain_positions(instrument), field_table.series_positions(instrument)
+    plain, series = field_table.plain_positions(instrument), series_indices(instrument)
     assert sorted([*plain, *series]) == list(range(values_of(instrument).size))
     assert all(leaves(instrument)[i].name.startswith("throughput.n") for i in series)
 

@@ -16,7 +16,7 @@ from walop_jax.data.records import Intensities
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.layout import PointReader, PointsInMemory, StreamedPoints, bytes_per_point, thinned
+from walop_jax.likelihood.layout import MeasuredPoints, PointReader, bytes_per_point, thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.simulate import simulate
 from walop_jax.sky.moon import moon_sky
@@ -86,12 +86,10 @@ def equal(one, other):
 def test_what_is_read_is_what_is_kept(calset, streaming):
     layout = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16).layout
     reader = PointReader(calset, layout.plan)
-    kept, read = PointsInMemory(reader, layout), StreamedPoints(reader, layout)
+    kept, read = (MeasuredPoints(reader, dataclasses.replace(layout, kept=kept)) for kept in (True, False))
     assert (len(kept), len(read), layout.slabs) == (6, 6, 3)
-    for i, (one, other) in enumerate(zip(read, kept, strict=True)):
+    for one, other in zip(read, kept, strict=True):
         equal(one, other)
-        equal(read.chunk(i), other)
-        equal(kept.chunk(i), other)
     for points in (kept, read):
         assert [len(points.slab(n)) for n in range(3)] == [2, 2, 2]
         np.testing.assert_array_equal(points.gathered("x"), calset.points.x)
@@ -112,8 +110,8 @@ def test_every_pass_reads_every_slab_once(calset, streaming):
 def test_expansion_and_counts_agree(calset, streaming):
     one = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
     other = Likelihood.of(calset, base_model(calset, throughput_degree=2), points_per_chunk=16)
-    assert isinstance(one.points, StreamedPoints)
-    other = dataclasses.replace(other, points=PointsInMemory(other.points.reader, other.layout))
+    assert not one.layout.kept
+    assert other.layout.kept
     a, b = one.expand(one.model.start), other.expand(other.model.start)
     assert a.data == b.data
     np.testing.assert_array_equal(a.matrix, b.matrix)

@@ -44,7 +44,7 @@ from walop_jax.fit.refit import fit
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.compressed import compressed
 from walop_jax.likelihood.frames import PixelPosterior, frame_sums
-from walop_jax.likelihood.layout import StreamedPoints
+from walop_jax.likelihood.layout import MeasuredPoints
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.light import instrument_matrix
 from walop_jax.model.parameters import values_of
@@ -252,7 +252,7 @@ def test_work_per_point():
     calset = made(32)
     likelihood = Likelihood.of(calset, base_model(calset), points_per_chunk=256, interpolate=True)
     instrument = likelihood.model.instrument()
-    arguments = (instrument, likelihood.plan, likelihood.points.chunk(0), likelihood.nodes(instrument)[0])
+    arguments = (instrument, likelihood.plan, next(iter(likelihood.points)), likelihood.nodes(instrument)[0])
     function, n = engine.normal_equations, 256
     cost = jax.jit(function.__wrapped__).lower(*arguments).compile().cost_analysis()
     jax.block_until_ready(function(*arguments))
@@ -271,7 +271,7 @@ def test_reading_frames(tmp_path):
     write_frames(tmp_path / "frames.fits", made(side), raster(side))
     calset = read_calibration_set(tmp_path / "frames.fits")
     likelihood = Likelihood.of(calset, base_model(calset))
-    points = StreamedPoints(likelihood.points.reader, likelihood.layout)
+    points = MeasuredPoints(likelihood.points.reader, dataclasses.replace(likelihood.layout, kept=False))
     size = likelihood.layout.slab
     raw = seconds(lambda: [calset.intensities.block(n, n + size) for n in range(0, side**2, size)] and None)
     ready = seconds(lambda: [None for _ in points])

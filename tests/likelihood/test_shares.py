@@ -62,7 +62,7 @@ def made():
 def predicted(likelihood: Likelihood, instrument: Instrument | None = None) -> np.ndarray:
     """Counts of an instrument, by default that of the start values."""
     instrument = instrument or likelihood.model.instrument()
-    return np.array(engine.prediction(instrument, likelihood.plan, likelihood.points.chunk(0)))[:POINTS]
+    return np.array(engine.prediction(instrument, likelihood.plan, next(iter(likelihood.points))))[:POINTS]
 
 
 def shares() -> np.ndarray:

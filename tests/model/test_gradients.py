@@ -45,7 +45,7 @@ def model(values, x, y):
     instrument = with_values(TEMPLATE)(values)
     rows = light.band_rows(instrument, PLAN, x, y)
     band = jnp.asarray(PLAN.band_of)[jnp.arange(4), SOURCE + 1]
-    throughput = light.throughput_at(instrument, x, y)
+    throughput = instrument.throughput.at(x, y)
     return light.counts(instrument, PLAN, rows, throughput, x, y, SKY, SOURCE, band).ravel()
 
 

@@ -17,6 +17,7 @@ from walop_jax.model import fold, light
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations, leaves, values_of, with_values
+from walop_jax.model.ray import Ray
 
 PAULI = np.array([[[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, -1j], [1j, 0]]])
 ROUNDING = 1e-10
@@ -34,7 +35,8 @@ def matrices(instrument: Instrument, x: float, y: float, plate: float | None) ->
     """The Mueller matrix of every element of the train for light from a field point, by name."""
     layout = scenes.plan(instrument.effects)
     instrument = instrument.patched()
-    ray = light.ray_at(instrument, layout, jnp.asarray(x), jnp.asarray(y))
+    spectrum = (light.node_wavelengths(instrument, layout), layout.conditions)
+    ray = Ray.entering(jnp.asarray(x), jnp.asarray(y), spectrum)
     train = light.divided(instrument)
     common, ray = fold.stations((*train.leading, *train.banded), ray)
     arms = [station for arm in instrument.arms for station in fold.stations(tuple(arm.train()), ray)[0]]

@@ -57,7 +57,7 @@ def counts_of(instrument, sightline: Sightline) -> np.ndarray:
     x, y = jnp.asarray(sightline.x), jnp.asarray(sightline.y)
     rows = light.band_rows(instrument, plan, x, y)
     source, sky = jnp.asarray([1]), jnp.zeros((1, 2))
-    throughput = light.throughput_at(instrument, x, y)
+    throughput = instrument.throughput.at(x, y)
     return np.asarray(
         light.counts(instrument, plan, rows, throughput, x, y, sky, source, jnp.asarray([0]))[0]
     )

@@ -59,7 +59,7 @@ class Study:
         def matrix(values: jax.Array, plan: object, x: jax.Array, y: jax.Array) -> jax.Array:
             instrument = to_instrument(values)
             rows = light.band_rows(instrument, plan, x, y)  # pyright: ignore[reportArgumentType]
-            throughput = light.throughput_at(instrument, x, y)
+            throughput = instrument.throughput.at(x, y)
             vectors = light.camera_vectors(instrument, rows, throughput, x, y)[0]
             return light.instrument_matrix(vectors, instrument.cameras.pairs)
 

@@ -67,7 +67,7 @@ class Worlds:
             assert prior is not None
             truth[i] = rng.normal(*prior)
         flux = 4.0 * PLAN.electrons * rng.uniform(0.7, 1.0, self.block.used.shape)
-        chunk = self.likelihood.points.chunk(0)
+        chunk = next(iter(self.likelihood.points))
         unit = np.asarray(engine.prediction(self.model.instrument(truth), self.likelihood.plan, chunk))
         expected = flux[:, :, None] * unit
         sigma = NOISE.sigma(expected)

@@ -31,7 +31,6 @@ from walop_jax.likelihood.field_table import (
     linearised,
     plain_positions,
     rows_and_slopes,
-    series_positions,
     through_series,
 )
 from walop_jax.model import chebyshev, light
@@ -42,6 +41,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import with_values
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for_settings
+from walop_jax.model.specification import series_indices
 
 COLOURS = 12  # colour temperatures of the vectors
 DERIVATIVE_COLOURS = 3
@@ -90,7 +90,7 @@ def _derivatives(
         return (light.camera_vectors(there, rows, local, x, y) @ light.telescope(there, x, y))[..., :3]
 
     rows, slopes = rows_and_slopes(instrument, plan, x, y)
-    found = linearised(instrument, vectors, rows, slopes, light.throughput_at(instrument, x, y))
+    found = linearised(instrument, vectors, rows, slopes, instrument.throughput.at(x, y))
     return jnp.concatenate([found.plain, found.local])
 
 
@@ -111,7 +111,7 @@ class AnalysisVectors:
         self.half_width = min(self.instrument.field_limit, reach)
         self.cameras = len(self.instrument.cameras)
         self._tables: dict[tuple[object, ...], FieldTable] = {}
-        series, plain = series_positions(self.instrument), plain_positions(self.instrument)
+        series, plain = series_indices(self.instrument), plain_positions(self.instrument)
         self._uncertain: Int[np.ndarray, " o"] = np.flatnonzero(np.diag(calibration.covariance)[plain] > 0)
         self.parameters: Int[np.ndarray, " n"] = np.concatenate([plain[self._uncertain], series])
         value, vector = np.linalg.eigh(calibration.covariance[np.ix_(self.parameters, self.parameters)])

@@ -145,7 +145,7 @@ STARS, LARGEST_P = 100, 0.05
 
 def _point_vectors(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
     rows = light.band_rows(instrument, plan, x, y)
-    return light.camera_vectors(instrument, rows, light.throughput_at(instrument, x, y), x, y)
+    return light.camera_vectors(instrument, rows, instrument.throughput.at(x, y), x, y)
 
 
 def point_sky_vectors(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
@@ -167,7 +167,7 @@ def point_matrix(
         return light.instrument_matrix(vectors @ light.telescope(there, x, y), there.cameras.pairs)
 
     rows, slopes = rows_and_slopes(instrument, plan, x, y)
-    m, plain, local = linearised(instrument, matrix, rows, slopes, light.throughput_at(instrument, x, y))
+    m, plain, local = linearised(instrument, matrix, rows, slopes, instrument.throughput.at(x, y))
     return m, to_all(instrument, plain, local, instrument.throughput.basis(x, y)[None])
 
 

@@ -129,7 +129,7 @@ def checked(source: PathLike) -> CheckedInstrument:
 
     def camera_vectors(design: Instrument, plan: Any, x: Any, y: Any) -> Any:
         rows = light.band_rows(design, plan, x, y)
-        return light.camera_vectors(design, rows, light.throughput_at(design, x, y), x, y)
+        return light.camera_vectors(design, rows, design.throughput.at(x, y), x, y)
 
     design = Instrument.read(source)
     asked = needs(design)

@@ -42,8 +42,8 @@ from walop_jax.model.effects import Context, Described, Effect
 from walop_jax.model.effects.change import BAND, OPPOSITE, SKY
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.etalon import GAPS, QUARTER
-from walop_jax.model.effects.optics import Displacement
-from walop_jax.model.effects.sources import OfSource
+from walop_jax.model.effects.numbers import OF_SOURCES
+from walop_jax.model.effects.optics import DISPLACEMENTS
 from walop_jax.model.elements import Polariser, PupilMapping, WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations
@@ -424,14 +424,14 @@ def _of_field_and_band(instrument: Instrument, asked: _Asked) -> Iterator[tuple[
     yield (Sentence("shift", "of", BAND),)
     for element in instrument.train() if asked.over_field else ():
         if isinstance(element, PupilMapping):
-            moved = tuple(Sentence(kind, "ahead of", element.name) for kind in Displacement.names)
+            moved = tuple(Sentence(kind, "ahead of", element.name) for kind in DISPLACEMENTS)
             yield moved
             for factor in (*asked.slow(), *asked.hour_angle()):
                 yield _times(moved, factor)
 
 
 def _of_sources(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
-    own = tuple(Sentence(kind, "of", SKY) for kind in OfSource.names)
+    own = tuple(Sentence(kind, "of", SKY) for kind in OF_SOURCES)
     moon = np.flatnonzero((asked.exposures.kind == "moon") & ~asked.exposures.clp_in)
     if moon.size:
         yield own[2:]
@@ -441,7 +441,7 @@ def _of_sources(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentenc
         if len(each) > 1:
             yield tuple(itertools.chain(*each))
     for name in instrument.standard.names:
-        yield tuple(Sentence(kind, "of", name.replace(" ", "_")) for kind in OfSource.names[:2])
+        yield tuple(Sentence(kind, "of", name.replace(" ", "_")) for kind in OF_SOURCES[:2])
 
 
 def _together(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:

@@ -7,7 +7,7 @@ import enum
 import functools
 import operator
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -19,57 +19,44 @@ STATED = "N_ERR"
 
 
 class Quality(enum.IntFlag):
-    """Bits of QUALITY (of a product) and FLAG (of a row, star or pixel)."""
+    """Bits of QUALITY (of a product) and FLAG (of a row, star or pixel), each with its meaning."""
 
-    NOT_CONVERGED = 1
-    ILL_CONDITIONED = 2
-    AT_PRIOR_EDGE = 4
-    EXCESS_NOISE = 8
-    HIGH_CROSSTALK = 16
-    BEYOND_FIELD = 32
-    BEYOND_SETTINGS = 64
-    CAMERA_MISSING = 128
-    SATURATED = 256
-    FREE_FORM = 512
-    CLASS_ONLY = 1024
-    VALIDITY_FORCED = 2048
-    NON_PHYSICAL = 4096
-    UNEXPLAINED = 8192
-    NO_STOKES = 16384
-    DOUBTED = 32768
-    ERRORS_TOO_LARGE = 65536
-    DISAGREES = 131072
-    UNKNOWN_COLOUR = 262144
-    CATALOGUE = 524288
+    def __new__(cls, value: int, meaning: str = "") -> Self:
+        """A bit with its meaning in words."""
+        bit = int.__new__(cls, value)
+        bit._value_, bit.meaning = value, meaning
+        return bit
+
+    meaning: str
+
+    NOT_CONVERGED = 1, "not converged"
+    ILL_CONDITIONED = 2, "ill-conditioned"
+    AT_PRIOR_EDGE = 4, "a parameter lies at the edge of its prior"
+    EXCESS_NOISE = 8, "excess noise above 0.5 sigma"
+    HIGH_CROSSTALK = 16, "zone of high cross-talk (a local inverse has a condition number above 10)"
+    BEYOND_FIELD = 32, "extrapolated in the field"
+    BEYOND_SETTINGS = 64, "extrapolated in wavelength or temperature"
+    CAMERA_MISSING = 128, "a camera is missing"
+    SATURATED = 256, "saturated or non-linear data used"
+    FREE_FORM = 512, "unknown free-form term active"
+    CLASS_ONLY = 1024, "only a class of causes was named"
+    VALIDITY_FORCED = 2048, "validity forced"
+    NON_PHYSICAL = 4096, "non-physical Mueller matrix within tolerance"
+    UNEXPLAINED = 8192, "the model does not explain the data"
+    DOUBTED = 32768, "the residuals hold more than noise, or differ between parts of the data"
+    ERRORS_TOO_LARGE = 65536, "the stated errors are far larger than the scatter of the data"
+    DISAGREES = 131072, "the intensities disagree with the calibration by more than noise"
+    UNKNOWN_COLOUR = 262144, "no TEFF, and the colour is most of the error"
+    CATALOGUE = 524288, "the stars of the catalogue together say that calibration or errors do not hold"
+    NO_STOKES = (
+        16384,
+        "no Stokes parameters: too few cameras, too little light, or no u in the rows there are",
+    )
 
     @property
     def meanings(self) -> tuple[str, ...]:
         """Meanings of the bits that are set, in words."""
-        return tuple(text for bit, text in _MEANINGS.items() if bit & self)
-
-
-_MEANINGS = {
-    Quality.NOT_CONVERGED: "not converged",
-    Quality.ILL_CONDITIONED: "ill-conditioned",
-    Quality.AT_PRIOR_EDGE: "a parameter lies at the edge of its prior",
-    Quality.EXCESS_NOISE: "excess noise above 0.5 sigma",
-    Quality.HIGH_CROSSTALK: "zone of high cross-talk (a local inverse has a condition number above 10)",
-    Quality.BEYOND_FIELD: "extrapolated in the field",
-    Quality.BEYOND_SETTINGS: "extrapolated in wavelength or temperature",
-    Quality.CAMERA_MISSING: "a camera is missing",
-    Quality.SATURATED: "saturated or non-linear data used",
-    Quality.FREE_FORM: "unknown free-form term active",
-    Quality.CLASS_ONLY: "only a class of causes was named",
-    Quality.VALIDITY_FORCED: "validity forced",
-    Quality.NON_PHYSICAL: "non-physical Mueller matrix within tolerance",
-    Quality.UNEXPLAINED: "the model does not explain the data",
-    Quality.DOUBTED: "the residuals hold more than noise, or differ between parts of the data",
-    Quality.ERRORS_TOO_LARGE: "the stated errors are far larger than the scatter of the data",
-    Quality.DISAGREES: "the intensities disagree with the calibration by more than noise",
-    Quality.UNKNOWN_COLOUR: "no TEFF, and the colour is most of the error",
-    Quality.CATALOGUE: "the stars of the catalogue together say that calibration or errors do not hold",
-    Quality.NO_STOKES: "no Stokes parameters: too few cameras, too little light, or no u in the rows there are",
-}
+        return tuple(bit.meaning for bit in Quality if bit & self)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -74,7 +74,7 @@ def own_columns(
         if structure not in plans:
             plans[structure] = Likelihood.of(likelihood.calset, likelihood.model, (effect,))
         own = plans[structure]
-        instrument, once = own.model.instrument(values), own.is_small
+        instrument, once = own.model.instrument(values), own.pairs <= limits.COMPILED_ONCE
         parts = [
             used_rows(_own(instrument, own.plan, (effect,), chunk, once=once), chunk) for chunk in own.points
         ]
@@ -140,7 +140,7 @@ def _at_point(instrument: Instrument, plan: Plan, point: PointData) -> _AtPoint:
     if sites == 1:
         opposite = light.counts(
             instrument, plan, light.band_rows(instrument, plan, x[1], y[1]),
-            light.throughput_at(instrument, x[1], y[1]), x[1], y[1], sky[1], point.source, point.band,
+            instrument.throughput.at(x[1], y[1]), x[1], y[1], sky[1], point.source, point.band,
         )  # fmt: skip
     else:
         opposite = counts[1]

@@ -31,7 +31,6 @@ from walop_jax.likelihood.field_table import (
     linearised,
     plain_positions,
     rows_and_slopes,
-    series_positions,
     to_all,
 )
 from walop_jax.likelihood.flux import eliminate_flux, project_flux, sharing
@@ -40,6 +39,7 @@ from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import values_of, with_values
 from walop_jax.model.plan import Plan
+from walop_jax.model.specification import series_indices
 
 Vector = Float[Array, " n"]
 NEWTON_STEPS = 3  # each squares the share of the detectors' distortion that is missing from the flux
@@ -94,7 +94,7 @@ def _rows_and_slopes_at(
 
 
 def _throughput_at(instrument: Instrument, point: PointData) -> Float[Array, "m k"]:
-    return jax.vmap(light.throughput_at, (None, 0, 0))(instrument, *field_sites(instrument, point))
+    return jax.vmap(instrument.throughput.at)(*field_sites(instrument, point))
 
 
 def _unit_counts(
@@ -253,9 +253,7 @@ def _normal_equations(
 
 
 def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None) -> Normal:
-    size, series, plain = (
-        values_of(instrument).size, series_positions(instrument), plain_positions(instrument),
-    )  # fmt: skip
+    size, series, plain = values_of(instrument).size, series_indices(instrument), plain_positions(instrument)
     chi2, gradient, gram = jax.vmap(_point_normal, in_axes=(None, None, 0, None))(
         instrument, plan, data, nodes
     )

@@ -56,19 +56,9 @@ class LocalDerivatives(NamedTuple):
     local: Float[Array, "l ..."]
 
 
-def optical_positions(instrument: Instrument) -> Int[np.ndarray, " o"]:
-    """Positions of the parameters that enter before the band integral."""
-    return np.asarray(optical_indices(instrument), int)
-
-
-def series_positions(instrument: Instrument) -> Int[np.ndarray, " kt"]:
-    """Positions of the coefficients of the throughput series, camera by camera."""
-    return np.asarray(series_indices(instrument), int)
-
-
 def plain_positions(instrument: Instrument) -> Int[np.ndarray, " o"]:
-    """Positions of all other parameters."""
-    return np.setdiff1d(np.arange(values_of(instrument).size), series_positions(instrument))
+    """Positions of all parameters but the coefficients of the throughput series."""
+    return np.setdiff1d(np.arange(values_of(instrument).size), series_indices(instrument))
 
 
 def rows_and_slopes(
@@ -76,7 +66,7 @@ def rows_and_slopes(
 ) -> tuple[Float[Array, "b r 4"], Float[Array, "o b r 4"]]:
     """Band rows at a field position (deg) and their derivatives with respect to the optical parameters: exact."""
     values, to_instrument = values_of(instrument), with_values(instrument)
-    optical = optical_positions(instrument)
+    optical = optical_indices(instrument)
 
     def optics(optical_values: Float[Array, " o"]) -> Float[Array, "b r 4"]:
         return light.band_rows(to_instrument(values.at[optical].set(optical_values)), plan, x, y)
@@ -98,7 +88,7 @@ def linearised(
     `local` are the throughputs of the cameras there.
     """
     values = values_of(instrument)
-    optical, plain = optical_positions(instrument), plain_positions(instrument)
+    optical, plain = optical_indices(instrument), plain_positions(instrument)
     value, push = jax.linearize(quantity, rows, values, local)
     no_rows, no_values, no_local = jnp.zeros_like(rows), jnp.zeros_like(values), jnp.zeros_like(local)
     # Optical parameters carry their rows; those that act at other places as well do so at once.
@@ -133,7 +123,7 @@ def to_all(
     by_site = jnp.moveaxis(local, 0, -1).reshape(*local.shape[1:], -1, cameras)
     full = jnp.zeros((*plain.shape[1:], values_of(instrument).size))
     full = full.at[..., plain_positions(instrument)].set(jnp.moveaxis(plain, 0, -1))
-    return full.at[..., series_positions(instrument)].set(through_series(by_site, basis))
+    return full.at[..., series_indices(instrument)].set(through_series(by_site, basis))
 
 
 # --------------------------------------------------------------------------- functions of the field as Chebyshev series

@@ -81,15 +81,6 @@ class StripSums(NamedTuple):
     impossible: Int[Array, ""]
 
 
-class _Terms(NamedTuple):
-    weight: Float[Array, "k e w"]
-    pull: Float[Array, "k e w"]
-    power: Float[Array, "e w"]
-    chi2: Float[Array, "e w"]
-    used: Float[Array, "e w"]
-    impossible: Int[Array, " w"]
-
-
 def _terms(
     unit: Float[Array, "k e w"],
     counts: Float[Array, "k e w"],
@@ -97,8 +88,8 @@ def _terms(
     open_: Bool[Array, "e w"],
     known: Bool[Array, " e"],
     together: Float[Array, "k k"] | None,
-) -> _Terms:
-    """The terms of the pixels of a piece of an image row."""
+) -> tuple[CellSums, Int[Array, " w"]]:
+    """The terms of the pixels of a piece of an image row, each a cell by itself, and those with impossible errors."""
 
     def summed(values: Float[Array, "k e w"]) -> Float[Array, "f e w"]:
         if together is None:
@@ -116,14 +107,14 @@ def _terms(
     left = counts - flux * unit
     scaled = flux * weight
     pull = scaled * left
-    return _Terms(
+    found = CellSums(
         weight=flux * scaled,
         pull=pull,
         power=jnp.sum(flux**3 * light * unit, axis=0),
         chi2=jnp.sum(weight * left**2, axis=0),
         used=used.astype(float),
-        impossible=jnp.sum(wrong, axis=0),
     )
+    return found, jnp.sum(wrong, axis=0)
 
 
 def _strip_sums(
@@ -139,7 +130,7 @@ def _strip_sums(
     cell, piece = side.size, piece_of(side.size)
     by_row = jnp.einsum("hj,jike->hkei", along, series).reshape(height, cameras * exposures, -1)
 
-    def terms_at(row: Int[Array, ""], start: Int[Array, ""]) -> _Terms:
+    def terms_at(row: Int[Array, ""], start: Int[Array, ""]) -> tuple[CellSums, Int[Array, " w"]]:
         def cut(array: Array) -> Array:
             return jax.lax.dynamic_slice(array, (0, 0, row, start), (*array.shape[:2], 1, piece))[:, :, 0]
 
@@ -151,26 +142,20 @@ def _strip_sums(
     def one_piece(first: Int[Array, ""], start: Int[Array, ""]) -> StripSums:
         here = jax.lax.dynamic_slice_in_dim(across, start, piece, axis=1)
 
-        def add(
-            sums: tuple[_Terms, Float[Array, "j m i"]], row: Int[Array, ""]
-        ) -> tuple[tuple[_Terms, Float[Array, "j m i"]], None]:
+        def add(sums: tuple[Any, Float[Array, "j m i"]], row: Int[Array, ""]) -> tuple[Any, None]:
             terms = terms_at(row, start)
-            moments = terms.pull.reshape(-1, piece) @ here.T
-            return (
-                jax.tree.map(jnp.add, sums[0], terms),
-                sums[1] + along[row][:, None, None] * moments,
-            ), None
+            moments = along[row][:, None, None] * (terms[0].pull.reshape(-1, piece) @ here.T)
+            return (jax.tree.map(jnp.add, sums[0], terms), sums[1] + moments), None
 
         terms = jax.eval_shape(terms_at, first, start)
         nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), terms)
         no_moments = jnp.zeros((along.shape[1], cameras * exposures, len(across)))
-        (sums, moments), _ = jax.lax.scan(add, (nothing, no_moments), first + jnp.arange(cell))
+        ((sums, impossible), moments), _ = jax.lax.scan(add, (nothing, no_moments), first + jnp.arange(cell))
 
         def cells(values: Float[Array, "... w"]) -> Float[Array, "... c"]:
             return values.reshape(*values.shape[:-1], piece // cell, cell).sum(axis=-1)
 
-        found = CellSums(sums.weight, sums.pull, sums.power, sums.chi2, sums.used)
-        return StripSums(jax.tree.map(cells, found), moments, sums.impossible.sum())
+        return StripSums(jax.tree.map(cells, sums), moments, impossible.sum())
 
     def cell_row(first: Int[Array, ""]) -> StripSums:
         pieces = jax.lax.map(lambda start: one_piece(first, start), jnp.arange(0, width, piece))
@@ -392,10 +377,12 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
     # Beyond the frame there are no pixels: any place will do.
     s = np.minimum((np.arange(width) + 0.5) * cells.size[0] - 1.0, 1.0)
     across = jnp.asarray(chebyshev.polynomials(s, smooth.count).T)
-    series = _coefficients(smooth)[..., exposures]
+    unit = np.asarray(smooth.coefficients.unit)[..., exposures]
+    series = np.swapaxes(unit.reshape(smooth.count, smooth.count, *unit.shape[1:]), 0, 1)
     known = jnp.asarray(likelihood.flux_known[exposures])
     together = sharing(instrument, likelihood.plan).cameras
-    shapes = _shapes(likelihood.cameras, len(exposures), rows, columns)
+    of_all = (len(exposures), rows, columns)
+    shapes = [(likelihood.cameras, *of_all)] * 2 + [of_all] * 3
     read = RowReader(frames, height, width)
 
     def work(number: int) -> SlabSums:
@@ -455,23 +442,12 @@ def _series(
     return accurate_table(exact, FRAME, limits.NODES_PER_SIDE, TOLERANCE, error)
 
 
-def _coefficients(table: FieldTable) -> Float[np.ndarray, "j i k e"]:
-    unit = np.asarray(table.coefficients.unit)
-    return np.swapaxes(unit.reshape(table.count, table.count, *unit.shape[1:]), 0, 1)
-
-
-def _shapes(cameras: int, exposures: int, rows: int, columns: int) -> list[tuple[int, ...]]:
-    return [(cameras, exposures, rows, columns)] * 2 + [(exposures, rows, columns)] * 3
-
-
 def _assembled(parts: dict[int, Vector], shapes: list[tuple[int, ...]], height: int, every: int) -> CellSums:
     """All strips in their places; nothing where one was left out."""
     rows = shapes[0][-2]
     sizes = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]
-    found = []
     strips = -(-height // rows)
-    for shape in shapes:
-        found.append(np.zeros((*shape[:-2], strips * rows, shape[-1])))
+    found = [np.zeros((*shape[:-2], strips * rows, shape[-1])) for shape in shapes]
     for number, flat in parts.items():
         for array, shape, piece in zip(found, shapes, np.split(flat, sizes), strict=True):
             first = number * every * rows

@@ -7,7 +7,6 @@ there are.
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 import functools
 import math
@@ -228,10 +227,15 @@ class PointReader:
     floor: float = 0.0
 
     def chunks(self, start: int, stop: int, size: int) -> list[PointData]:
-        """The points `start:stop` in chunks of `size`, the last one padded with points of weight 0."""
+        """The points `start:stop` in chunks of `size`, the last one filled up with its last point, of weight 0."""
         block = self.calset.intensities.block(start, min(stop, len(self.calset.points)))
-        parts = (_part(block, n, n + size) for n in range(0, len(block.x), size))
-        return [self.point_data(_padded(part, size)) for part in parts]
+        chunks, last = [], len(block.x) - 1
+        for first in range(0, len(block.x), size):
+            rows = np.arange(first, first + size)
+            part = {f.name: getattr(block, f.name)[np.minimum(rows, last)] for f in dataclasses.fields(block)}
+            part["used"] &= (rows <= last)[:, None]
+            chunks.append(self.point_data(Block(**part)))
+        return chunks
 
     def point_data(self, block: Block) -> PointData:
         """A block of measurements as the engine wants it."""
@@ -271,19 +275,29 @@ class PointReader:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class MeasuredPoints(abc.ABC):
-    """The measurements of a set, chunk by chunk as `layout` cuts it; the last chunk is padded with weight 0."""
+class MeasuredPoints:
+    """The measurements of a set, chunk by chunk as `layout` cuts it; the last chunk is filled up with weight 0.
+
+    They are read once if the layout keeps them in memory, else anew whenever they are gone through.
+    """
 
     reader: PointReader
     layout: Layout
 
-    @abc.abstractmethod
-    def chunk(self, number: int) -> PointData:
-        """One chunk, counted from 0."""
-
-    @abc.abstractmethod
     def slab(self, number: int) -> list[PointData]:
         """The chunks of one slab, counted from 0."""
+        if not self.layout.kept:
+            return self._read(number)
+        each = self.layout.slab // self.layout.chunk
+        return self._all[number * each : (number + 1) * each]
+
+    def _read(self, number: int) -> list[PointData]:
+        size = self.layout.slab
+        return self.reader.chunks(number * size, (number + 1) * size, self.layout.chunk)
+
+    @cached_property
+    def _all(self) -> list[PointData]:
+        return [chunk for number in range(self.layout.slabs) for chunk in self._read(number)]
 
     def __len__(self) -> int:
         return self.layout.chunks
@@ -298,69 +312,7 @@ class MeasuredPoints(abc.ABC):
         return np.concatenate(parts)[: self.layout.points]
 
 
-class PointsInMemory(MeasuredPoints):
-    """Points that are read once and kept."""
-
-    def chunk(self, number: int) -> PointData:
-        """One chunk, counted from 0."""
-        return self._all[number]
-
-    def slab(self, number: int) -> list[PointData]:
-        """The chunks of one slab, counted from 0."""
-        each = self.layout.slab // self.layout.chunk
-        return self._all[number * each : (number + 1) * each]
-
-    @cached_property
-    def _all(self) -> list[PointData]:
-        cut = self.layout
-        starts = range(0, cut.points, cut.slab)
-        return [chunk for n in starts for chunk in self.reader.chunks(n, n + cut.slab, cut.chunk)]
-
-
-class StreamedPoints(MeasuredPoints):
-    """Points that are read anew whenever they are gone through."""
-
-    def chunk(self, number: int) -> PointData:
-        """One chunk, counted from 0."""
-        size = self.layout.chunk
-        return self.reader.chunks(number * size, (number + 1) * size, size)[0]
-
-    def slab(self, number: int) -> list[PointData]:
-        """The chunks of one slab, counted from 0."""
-        size = self.layout.slab
-        return self.reader.chunks(number * size, (number + 1) * size, self.layout.chunk)
-
-
 @functools.lru_cache(maxsize=32)
 def _moon_at(mjd: tuple[float, ...], site: Site) -> tuple[Vector, Vector]:
     """Direction of the Moon, kept: the same set is brought together with many models."""
     return moon_direction(np.array(mjd), site)
-
-
-def measured_points(calset: CalibrationSet, layout: Layout, floor: float = 0.0) -> MeasuredPoints:
-    """The measurements of a set, kept in memory or not as its layout says."""
-    reader = PointReader(calset, layout.plan, layout.mirrored, floor)
-    return (PointsInMemory if layout.kept else StreamedPoints)(reader, layout)
-
-
-def _part(block: Block, start: int, stop: int) -> Block:
-    return Block(
-        x=block.x[start:stop], y=block.y[start:stop], counts=block.counts[start:stop],
-        sigma=block.sigma[start:stop], used=block.used[start:stop], source=block.source[start:stop],
-    )  # fmt: skip
-
-
-def _padded(block: Block, size: int) -> Block:
-    missing = size - len(block.x)
-    if missing == 0:
-        return block
-
-    def pad(array: np.ndarray, value: float) -> np.ndarray:
-        return np.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1), constant_values=value)
-
-    # Positions of the first point: inside the field, where everything is finite.
-    return Block(
-        x=pad(block.x, block.x[0]), y=pad(block.y, block.y[0]),
-        counts=pad(block.counts, 0.0), sigma=pad(block.sigma, 1.0),
-        used=pad(block.used, False), source=pad(block.source, -1),
-    )  # fmt: skip

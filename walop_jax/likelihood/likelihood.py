@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from walop_jax.data.records import CalibrationSet
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.field_table import FieldTable, accurate_nodes
-from walop_jax.likelihood.layout import Layout, MeasuredPoints, measured_points
+from walop_jax.likelihood.layout import Layout, MeasuredPoints, PointReader
 from walop_jax.likelihood.runner import Runner, SlabSums
 from walop_jax.model.compiled import require_double_precision
 from walop_jax.model.dependence import optical_indices
@@ -196,8 +196,8 @@ class Likelihood:
             points_per_chunk=points_per_chunk,
             interpolate=interpolate,
         )
-        points = measured_points(calset, layout, model.template.cameras.floor)
-        return cls(layout, points, runner if layout.large else runner.alone(), model)
+        reader = PointReader(calset, layout.plan, layout.mirrored, model.template.cameras.floor)
+        return cls(layout, MeasuredPoints(reader, layout), runner if layout.large else runner.alone(), model)
 
     @property
     def calset(self) -> CalibrationSet:
@@ -242,7 +242,7 @@ class Likelihood:
         hint = None if near is None else near.optics.nodes_per_side
         if not self.layout.interpolated or (near is not None and hint is None):
             return None, OpticsUsed(None)
-        scale = np.array([p.scale for p in self.model.parameters])[list(optical_indices(instrument))]
+        scale = np.array([p.scale for p in self.model.parameters])[optical_indices(instrument)]
         nodes, error = accurate_nodes(instrument, self.plan, self.layout.rectangle, scale, hint)
         return (None, OpticsUsed(None)) if nodes is None else (nodes, OpticsUsed(nodes.count, error))
 
@@ -254,7 +254,7 @@ class Likelihood:
         `noise_scale` multiplies the errors of the data (not the priors'): above 1 it stands for what the
         model cannot explain. `near` is an earlier expansion at similar values, which saves the search for nodes.
         """
-        values = self._agreed(values)
+        values = self.runner.processes.agreed("values", np.asarray(values, float))
         terms, optics = self.data_terms(values, near)
         return self.posterior(values, terms, noise_scale, optics)
 
@@ -294,9 +294,6 @@ class Likelihood:
             dof=self._degrees_of_freedom(terms.census),
             optics=optics,
         )
-
-    def _agreed(self, values: Vector) -> Vector:
-        return self.runner.processes.agreed("values", np.asarray(values, float))
 
     def _degrees_of_freedom(self, census: Census) -> int:
         return (
@@ -377,11 +374,6 @@ class Likelihood:
             for c in self.points
         ]
         return np.concatenate(parts)
-
-    @property
-    def is_small(self) -> bool:
-        """True if columns that are asked for once or twice are compiled for longer than they are computed."""
-        return self.pairs <= limits.COMPILED_ONCE
 
     @property
     def pairs(self) -> int:

@@ -16,19 +16,18 @@ exposure changes; "reported gain", of the counts that detectors report.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from walop_jax.model import responses
-from walop_jax.model.effects.cameras import cameras_of
-from walop_jax.model.effects.change import BAND, OPPOSITE, SKY
+from walop_jax.model.effects.cameras import cameras_of, stage_of
+from walop_jax.model.effects.change import BAND, SKY
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.numbers import NUMBERS
-from walop_jax.model.elements import Element, WavePlate
+from walop_jax.model.elements import WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.responses import GENERATORS, LIGHT, TrainPlace
 
@@ -73,43 +72,24 @@ def _optical(kind: str) -> Iterator[tuple[str, float, tuple[str, ...]]]:
             yield f"{name} {element}", size, (factor,)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Resolver:
-    """Sentences of an instrument (`patched`) as pieces of its responses."""
+    """Sentences of an instrument (`patched`) as pieces of its responses; `thermal` are factors of thermal changes."""
 
-    instrument: Instrument
-    thermal: tuple[Any, ...]  # factors of thermal changes
-
-    @functools.cached_property
-    def _places(self) -> Mapping[TrainPlace, int]:
-        return responses.places(self.instrument)
-
-    @functools.cached_property
-    def _trains(self) -> tuple[tuple[Element, ...], ...]:
-        common, arms = responses.trains(self.instrument)
-        return common, *arms
-
-    @functools.cached_property
-    def _plates(self) -> dict[str, tuple[int, WavePlate]]:
-        found = {}
-        for number, (arm, i) in enumerate(responses.plates(self.instrument)):
+    def __init__(self, instrument: Instrument, thermal: tuple[str, ...]) -> None:
+        self.instrument, self.thermal = instrument, thermal
+        common, arms = responses.trains(instrument)
+        self._trains, self._places = (common, *arms), responses.places(instrument)
+        self._globally, self._numbers = (
+            responses.global_slots(instrument),
+            responses.plate_numbers(instrument),
+        )
+        self._polariser = None if instrument.polariser is None else instrument.polariser.name
+        self._plates: dict[str, tuple[int, WavePlate]] = {}
+        for number, (arm, i) in enumerate(responses.plates(instrument)):
             plate = self._trains[arm + 1][i]
             assert isinstance(plate, WavePlate)
-            name = plate.name if arm < 0 else f"{self.instrument.arms[arm].name}.{plate.name}"
-            found[name] = number, plate
-        return found
-
-    @functools.cached_property
-    def _globally(self) -> tuple[str, ...]:
-        return responses.global_slots(self.instrument)
-
-    @functools.cached_property
-    def _numbers(self) -> tuple[str, ...]:
-        return responses.plate_numbers(self.instrument)
-
-    @functools.cached_property
-    def _polariser(self) -> str | None:
-        return None if self.instrument.polariser is None else self.instrument.polariser.name
+            name = plate.name if arm < 0 else f"{instrument.arms[arm].name}.{plate.name}"
+            self._plates[name] = number, plate
 
     def _place(self, where: str, place: str) -> int:
         arm, _, name = place.rpartition(".")
@@ -166,12 +146,11 @@ class Resolver:
             if layer not in names:
                 raise NoColumnError(sentence.text)
             slot = f"{names.index(layer)}.{sentence.kind}"
-        slots = self._numbers
-        if slot not in slots:
+        if slot not in self._numbers:
             raise NoColumnError(sentence.text)
         if slot == "thermal":
             factors = (*factors, *self.thermal)
-        yield Piece("numbers", (number, slots.index(slot)), 1.0, factors)
+        yield Piece("numbers", (number, self._numbers.index(slot)), 1.0, factors)
 
     def _polarisation(self, sentence: Sentence, factors: tuple[Any, ...]) -> Iterator[Piece]:
         axis = sentence.kind.removeprefix("polarisation").strip()
@@ -184,26 +163,15 @@ class Resolver:
         yield Piece("light", (LIGHT.index(f"star {axis}"), names.index(sentence.place)), 1.0, factors)
 
     def _camera(self, sentence: Sentence, factors: tuple[Any, ...]) -> Iterator[Piece]:
-        cameras = np.array(cameras_of(self.instrument, sentence.place))
-        rest = tuple(f for f in factors if f != "counts")
-        if sentence.origin == OPPOSITE:
-            yield Piece("opposite", tuple(cameras), 1.0, factors)
-        elif sentence.kind == "light" and sentence.origin:
-            origin = int(np.argmax(cameras_of(self.instrument, sentence.origin)))
-            yield Piece("mixed", (int(np.argmax(cameras)), origin), 1.0, factors)
-        elif sentence.kind == "light":
-            yield Piece("median", tuple(cameras), 1.0, factors)
-        elif sentence.kind == "afterglow":
-            yield Piece("afterglow", tuple(cameras), 1.0, factors)
-        elif sentence.kind == "reported gain":
-            yield Piece("reported", tuple(cameras), 1.0, factors)
-        elif len(rest) < len(factors):
-            yield Piece("square", tuple(cameras), 1.0, rest)
-        elif sentence.kind == "gain" and sentence.exposure_factors:
-            yield Piece("counts", tuple(cameras), 1.0, factors)
-        else:
+        stage, cameras = stage_of(sentence), cameras_of(self.instrument, sentence.place)
+        if stage == "mixed":
+            origin = cameras_of(self.instrument, sentence.origin)
+            yield Piece("mixed", (int(np.argmax(cameras)), int(np.argmax(origin))), 1.0, factors)
+        elif stage == "throughput":
             for camera in np.flatnonzero(cameras):
                 yield Piece("throughput", (int(camera),), 1.0, factors)
+        else:
+            yield Piece(stage, cameras, 1.0, tuple(f for f in factors if stage != "square" or f != "counts"))
 
     def _optics(self, sentence: Sentence, factors: tuple[Any, ...]) -> Iterator[Piece]:
         colour = factors.count("colour")

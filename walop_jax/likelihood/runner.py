@@ -316,11 +316,12 @@ class Runner:
                 total = part if total is None else total.plus(part)
                 now = time.perf_counter()
                 if fresh and now - told > TOLD_EVERY:
-                    slab = layout.slab * self.processes.count
-                    self._tell_how_far(
-                        label, min(count * slab, layout.points), layout.points, fresh * slab / (now - began)
+                    slab, told = layout.slab * self.processes.count, now
+                    ready, rate = min(count * slab, layout.points), fresh * slab / (now - began)
+                    self.tell(
+                        f"{label}: {ready:,} of {layout.points:,} points, {rate:,.0f} points/s, "
+                        f"{(layout.points - ready) / rate:.0f} s left of this pass"
                     )
-                    told = now
         if total is None:
             raise ValueError(
                 f"{self.processes.count} processes for {layout.slabs} slabs of points: use fewer"
@@ -333,12 +334,6 @@ class Runner:
             )
         rows = self.processes.gather(f"{label} {key}", packed)
         return functools.reduce(SlabSums.plus, map(SlabSums.unpacked, rows))
-
-    def _tell_how_far(self, label: str, done: int, points: int, rate: float) -> None:
-        left = (points - done) / rate
-        self.tell(
-            f"{label}: {done:,} of {points:,} points, {rate:,.0f} points/s, {left:.0f} s left of this pass"
-        )
 
     def _each(self, numbers: list[int], work: Callable[[int], SlabSums]) -> Generator[SlabSums, None, None]:
         devices = jax.local_devices()

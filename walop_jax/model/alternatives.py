@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 
 from walop_jax.model import materials
-from walop_jax.model.elements import Analyser, Element, Layer, Polariser, WavePlate, Wedge
-from walop_jax.model.instrument import Arm, Instrument
+from walop_jax.model.elements import Analyser, Element, Polariser, WavePlate, Wedge
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import unknown_name
 
 Rearrangement = Callable[[Instrument], Instrument]
@@ -59,7 +60,7 @@ def changed(instrument: Instrument, sentence: str) -> Instrument:
 
 
 def _each_and_all(
-    places: tuple[str, ...], what: str, change: Callable[[Instrument, str], Instrument]
+    places: Sequence[str], what: str, change: Callable[[Instrument, str], Instrument]
 ) -> Iterator[Named]:
     """A change at each of the places, and at all of them together."""
     for place in places:
@@ -71,49 +72,36 @@ def _each_and_all(
                 instrument = change(instrument, place)
             return instrument
 
-        yield f"{_listed(places)} {what}", everywhere
+        yield f"{', '.join(places[:-1])} and {places[-1]} {what}", everywhere
 
 
-def _listed(places: tuple[str, ...]) -> str:
-    return f"{', '.join(places[:-1])} and {places[-1]}"
-
-
-def _used(instrument: Instrument, kind: type[Element]) -> tuple[str, ...]:
-    """Places of the elements of a class that light meets."""
+def _used(instrument: Instrument, kind: type[Element]) -> dict[str, Any]:
+    """The elements of a class that light meets, by place."""
     used = {*instrument.path, *(f"{arm.name}.{name}" for arm in instrument.arms for name in arm.path)}
-    return tuple(place for place in instrument.places(kind) if place in used)
+    return {place: instrument.element(place) for place in instrument.places(kind) if place in used}
 
 
-def _element(instrument: Instrument, place: str) -> Element:
-    arm, _, name = place.rpartition(".")
-    holder = next((one for one in instrument.arms if one.name == arm), None)
-    elements = instrument.elements if holder is None else holder.elements
-    return next(element for element in elements if element.name == name)
+def _paths(instrument: Instrument) -> Iterator[tuple[str, str, tuple[str, ...]]]:
+    """Of the common train and of every arm: its name, what its places begin with, its elements ahead of an analyser."""
+    yield "", "", instrument.path
+    yield from ((arm.name, f"{arm.name}.", arm.path[:-1]) for arm in instrument.arms)
 
 
 def _layers(instrument: Instrument) -> Iterator[Named]:
-    places = tuple(
-        place
-        for place in _used(instrument, WavePlate)
-        if isinstance(plate := _element(instrument, place), WavePlate) and len(plate.layers) > 1
-    )
     yield from _each_and_all(
-        places,
+        [place for place, plate in _used(instrument, WavePlate).items() if len(plate.layers) > 1],
         "with layers in the other order",
         lambda i, place: i.changed(place, layers=lambda own: own[::-1]),
     )
 
 
 def _turned_plates(instrument: Instrument) -> Iterator[Named]:
-    for place in _used(instrument, WavePlate):
-        yield (
-            f"{place} turned by 90 deg",
-            lambda i, place=place: i.changed(place, axis=lambda axis: axis + 90.0),
-        )
-        yield (
-            f"{place} turned the other way",
-            lambda i, place=place: i.changed(place, axis=lambda axis: -axis),
-        )
+    turns: tuple[tuple[str, Callable[[Any], Any]], ...] = (
+        ("turned by 90 deg", lambda axis: axis + 90.0),
+        ("turned the other way", lambda axis: -axis),
+    )
+    for place, (what, turn) in itertools.product(_used(instrument, WavePlate), turns):
+        yield f"{place} {what}", lambda i, place=place, turn=turn: i.changed(place, axis=turn)
 
 
 def _turned_wedges(instrument: Instrument) -> Iterator[Named]:
@@ -124,36 +112,27 @@ def _turned_wedges(instrument: Instrument) -> Iterator[Named]:
                 place, azimuth=lambda azimuth: jnp.asarray(turn) if azimuth is None else azimuth + turn
             )
 
-        yield from _each_and_all(_used(instrument, Wedge), f"turned by {turn:.0f} deg", turned)
+        yield from _each_and_all([*_used(instrument, Wedge)], f"turned by {turn:.0f} deg", turned)
 
 
 def _beams(instrument: Instrument) -> Iterator[Named]:
     arms = instrument.arms
     yield from _each_and_all(
-        tuple(f"{arm.name}.{arm.analyser.name}" for arm in arms if len(arm.analyser.cameras) > 1),
+        [f"{arm.name}.{arm.analyser.name}" for arm in arms if len(arm.analyser.cameras) > 1],
         "with exchanged beams",
-        lambda i, place: _with_cameras(i, {place.rpartition(".")[0]: _cameras(i, place)[::-1]}),
+        lambda i, place: _with_cameras(i, {place: _used(i, Analyser)[place].cameras[::-1]}),
     )
     for one, other in itertools.combinations(arms, 2):
-        yield (
-            f"{one.name} and {other.name} with exchanged cameras",
-            lambda i, one=one, other=other: _with_cameras(
-                i, {one.name: other.analyser.cameras, other.name: one.analyser.cameras}
-            ),
-        )
-
-
-def _cameras(instrument: Instrument, place: str) -> tuple[str, ...]:
-    analyser = _element(instrument, place)
-    assert isinstance(analyser, Analyser)
-    return analyser.cameras
+        places = [f"{arm.name}.{arm.analyser.name}" for arm in (one, other)]
+        seen = dict(zip(places, (other.analyser.cameras, one.analyser.cameras), strict=True))
+        what = f"{one.name} and {other.name} with exchanged cameras"
+        yield what, lambda i, seen=seen: _with_cameras(i, seen)
 
 
 def _with_cameras(instrument: Instrument, names: dict[str, tuple[str, ...]]) -> Instrument:
-    """The instrument with other cameras behind the analysers of some arms."""
-    for arm, cameras in names.items():
-        analyser = next(one for one in instrument.arms if one.name == arm).analyser
-        instrument = instrument.changed(f"{arm}.{analyser.name}", cameras=cameras)
+    """The instrument with other cameras behind the analysers at some places."""
+    for place, cameras in names.items():
+        instrument = instrument.changed(place, cameras=cameras)
     known = instrument.cameras.names
     arms = tuple(tuple(map(known.index, arm.analyser.cameras)) for arm in instrument.arms)
     return dataclasses.replace(instrument, cameras=dataclasses.replace(instrument.cameras, arms=arms))
@@ -162,38 +141,21 @@ def _with_cameras(instrument: Instrument, names: dict[str, tuple[str, ...]]) -> 
 def _order(instrument: Instrument) -> Iterator[Named]:
     """Neighbours exchanged, behind the polariser and ahead of the analysers."""
     front = next((n for n, e in enumerate(instrument.train(), start=1) if isinstance(e, Polariser)), 0)
-    parts: list[tuple[str, tuple[str, ...]]] = [("", instrument.path[front:])]
-    parts += [(arm.name, arm.path[:-1]) for arm in instrument.arms]
-    for holder, path in parts:
-        for first, second in itertools.pairwise(path):
-            places = tuple(f"{holder}.{name}" if holder else name for name in (first, second))
-            yield (
-                f"{places[0]} behind {places[1]}",
-                lambda i, holder=holder, first=first, second=second: _exchanged(i, holder, first, second),
-            )
+    for holder, prefix, path in _paths(instrument):
+        for first, second in itertools.pairwise(path if holder else path[front:]):
 
+            def exchanged(
+                instrument: Instrument, holder: str = holder, first: str = first, second: str = second
+            ) -> Instrument:
+                other = {first: second, second: first}
+                return instrument.changed(holder, path=lambda way: tuple(other.get(n, n) for n in way))
 
-def _exchanged(instrument: Instrument, holder: str, first: str, second: str) -> Instrument:
-    swapped = {first: second, second: first}
-    return _with_path(instrument, holder, lambda path: tuple(swapped.get(name, name) for name in path))
-
-
-def _with_path(
-    instrument: Instrument, holder: str, change: Callable[[tuple[str, ...]], tuple[str, ...]]
-) -> Instrument:
-    if not holder:
-        return dataclasses.replace(instrument, path=change(instrument.path))
-    arms: list[Arm] = [
-        dataclasses.replace(arm, path=change(arm.path)) if arm.name == holder else arm
-        for arm in instrument.arms
-    ]
-    return dataclasses.replace(instrument, arms=tuple(arms))
+            yield f"{prefix}{first} behind {prefix}{second}", exchanged
 
 
 def _in_or_out(instrument: Instrument) -> Iterator[Named]:
-    for place in _used(instrument, WavePlate):
-        plate = _element(instrument, place)
-        if isinstance(plate, WavePlate) and plate.moves:
+    for place, plate in _used(instrument, WavePlate).items():
+        if plate.moves:
             what = (
                 "out where the exposures say so"
                 if plate.always_in
@@ -203,27 +165,26 @@ def _in_or_out(instrument: Instrument) -> Iterator[Named]:
                 f"{place} {what}",
                 lambda i, place=place: i.changed(place, always_in=lambda always: not always),
             )
-    paths = [("", instrument.path), *((arm.name, arm.path[:-1]) for arm in instrument.arms)]
-    for holder, path in paths:
+    for holder, prefix, path in _paths(instrument):
         for name in path:
-            place = f"{holder}.{name}" if holder else name
-            element = _element(instrument, place)
+            element = instrument.element(prefix + name)
             bends = type(element).ray is not Element.ray  # without it everything behind would be elsewhere
-            if not isinstance(element, Polariser | Analyser) and not element.moves and not bends:
-                yield f"{place} left out", lambda i, holder=holder, name=name: _without(i, holder, name)
+            if isinstance(element, Polariser | Analyser) or element.moves or bends:
+                continue
 
+            def without(instrument: Instrument, holder: str = holder, out: str = name) -> Instrument:
+                return instrument.changed(holder, path=lambda way: tuple(n for n in way if n != out))
 
-def _without(instrument: Instrument, holder: str, left_out: str) -> Instrument:
-    return _with_path(instrument, holder, lambda path: tuple(name for name in path if name != left_out))
+            yield f"{prefix}{name} left out", without
 
 
 def _dispersion(instrument: Instrument) -> Iterator[Named]:
     """Every plate of a crystal with another published curve of it."""
-    places = _used(instrument, WavePlate)
+    plates = _used(instrument, WavePlate)
+    used = {layer.material for plate in plates.values() for layer in plate.layers}
     for crystal, others in materials.OTHER_CURVES.items():
         family = (crystal, *others)
         for material in family:
-            used = {layer.material for place in places for layer in _layers_of(instrument, place)}
             if material in used or not used & set(family):
                 continue
             source = others.get(material) or materials.CRYSTALS[material].source.split(",")[0]
@@ -231,17 +192,12 @@ def _dispersion(instrument: Instrument) -> Iterator[Named]:
             def changed_curve(
                 instrument: Instrument, material: str = material, family: tuple[str, ...] = family
             ) -> Instrument:
-                for place in places:
+                for place in plates:
                     layers = tuple(
                         dataclasses.replace(layer, material=material) if layer.material in family else layer
-                        for layer in _layers_of(instrument, place)
+                        for layer in _used(instrument, WavePlate)[place].layers
                     )
                     instrument = instrument.changed(place, layers=layers)
                 return instrument
 
             yield f"{crystal} with the dispersion of {source}", changed_curve
-
-
-def _layers_of(instrument: Instrument, place: str) -> tuple[Layer, ...]:
-    plate = _element(instrument, place)
-    return plate.layers if isinstance(plate, WavePlate) else ()

@@ -19,7 +19,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from walop_jax.model import light
 from walop_jax.model.cameras import DetectorPart
@@ -46,12 +47,12 @@ def needs(instrument: Instrument) -> Needs:
     return _followed(*shapes_of(instrument))[0]
 
 
-def optical_indices(instrument: Instrument) -> tuple[int, ...]:
+def optical_indices(instrument: Instrument) -> Int[np.ndarray, " o"]:
     """Positions of the parameters that enter before the band integral."""
     _, reached = _followed(*shapes_of(instrument))
     flags = [reached[place] for place, count in parameter_places(instrument) for _ in range(count)]
     assert len(flags) == len(leaves(instrument))
-    return tuple(i for i, flag in enumerate(flags) if flag)
+    return np.flatnonzero(flags)
 
 
 @functools.lru_cache(maxsize=256)
@@ -72,7 +73,7 @@ def _follow(structure: Any, shapes: Shapes) -> tuple[Needs, tuple[bool, ...]]:
         rows = light.band_rows(instrument, plan, x, y)
         each = jnp.zeros_like(plan.exposures.kind)
         counts = light.counts(
-            instrument, plan, rows, light.throughput_at(instrument, x, y), x, y,
+            instrument, plan, rows, instrument.throughput.at(x, y), x, y,
             jnp.zeros((*each.shape, 2)), each - 1, each,
         )  # fmt: skip
         return rows, light.detected(instrument, plan.exposures, counts)

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.model.elements import Analyser, Element
+from walop_jax.model.mueller import product
 from walop_jax.model.ray import Ray
 
 Station = tuple[Element, Ray]
@@ -73,11 +74,9 @@ def backward(
     keys = _distinct(states, known)
     number, parts = len(common), []
     for arm, analyser in zip(arms, analysers, strict=True):
-        matrix: Mueller | None = None
-        for i, (element, _) in enumerate(arm):
-            own = stacked(matrices, number + i, element, moving, keys)
-            if own is not None:
-                matrix = own if matrix is None else own @ matrix
+        matrix = product(
+            stacked(matrices, number + i, element, moving, keys) for i, (element, _) in enumerate(arm)
+        )
         number += len(arm)
         seen = analyser.seen(jnp.eye(4) if matrix is None else matrix)
         parts.append(jnp.broadcast_to(seen, (len(keys), nodes, *seen.shape[-2:])))

@@ -179,6 +179,12 @@ class Instrument(Component):
         """KINDs of exposures that it can look at."""
         return tuple(source.kind for source in self.sources)
 
+    def element(self, place: str) -> Element:
+        """An element by its place, as for `changed`. Raises `NoSuchPlaceError` where there is none."""
+        arm, _, name = place.rpartition(".")
+        holder = _member(self.arms, arm, "arm") if arm else self
+        return _member(holder.elements, name, "element")
+
     def places(self, kind: type[Element]) -> tuple[str, ...]:
         """Places, as for `changed`, of all elements of a class; arms first, then the common train."""
         arms = [

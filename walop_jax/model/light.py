@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from walop_jax.model import fold
+from walop_jax.model import fold, mueller
 from walop_jax.model.elements import Analyser, Element
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Shapes, of_shapes, shapes_of
@@ -81,27 +81,21 @@ def _leading(structure: Any, shapes: Shapes) -> int:
     return count
 
 
-def _product(elements: tuple[Element, ...], ray: Ray) -> Float[Array, "4 4"] | None:
-    """Mueller matrix of achromatic elements, None for the identity."""
-    matrix = None
-    for element in elements:
-        own = element.mueller(ray)
-        if own is not None:
-            matrix = own if matrix is None else own @ matrix
-        ray = element.ray(ray)
-    return matrix
+def _achromatic(elements: tuple[Element, ...], x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
+    """Mueller matrix of elements that do not ask for the wavelength."""
+    stations, _ = fold.stations(elements, Ray.entering(x, y))
+    matrix = mueller.product(element.mueller(ray) for element, ray in stations)
+    return jnp.eye(4) if matrix is None else matrix
 
 
 def telescope(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
     """Mueller matrix of what light from the sky, and no other, meets ahead of the polariser."""
-    matrix = _product(instrument.patched().telescope(), Ray.entering(x, y))
-    return jnp.eye(4) if matrix is None else matrix
+    return _achromatic(instrument.patched().telescope(), x, y)
 
 
 def upstream(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
     """Mueller matrix of the leading elements at a field point (see `divided`)."""
-    matrix = _product(divided(instrument.patched()).leading, Ray.entering(x, y))
-    return jnp.eye(4) if matrix is None else matrix
+    return _achromatic(divided(instrument.patched()).leading, x, y)
 
 
 # ------------------------------------------------------------------------------------ bands and cameras
@@ -131,11 +125,6 @@ def weights_at(plan: Plan, wavelength: Float[Array, " n"], teff: Float[Array, " 
     spectrum = jnp.where(hot[:, None], wavelength**-4 / jnp.expm1(exponent), 1.0)
     weight = plan.node_weight * spectrum
     return weight / weight.sum(axis=1, keepdims=True)
-
-
-def ray_at(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Ray:
-    """The ray from a field point at the wavelength nodes, as it enters the train."""
-    return Ray.entering(x, y, (node_wavelengths(instrument, plan), plan.conditions))
 
 
 def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b r 4"]:
@@ -198,11 +187,6 @@ def _node_rows(instrument: Instrument, plan: Plan, ray: Ray) -> Float[Array, "c 
     matrices = fold.solved([*common, *(station for arm in arms for station in arm)], plan.moving, states)
     analysers = [arm.analyser for arm in instrument.arms]
     return fold.backward(common, arms, analysers, matrices, plan.moving, states, len(plan.wavelength))
-
-
-def throughput_at(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, " k"]:
-    """Throughput series of the cameras at a field point."""
-    return instrument.throughput.at(x, y)
 
 
 def camera_vectors(

@@ -7,6 +7,7 @@ when written out.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -51,6 +52,19 @@ class Matrix2(NamedTuple):
         return Matrix2(factor * self.a, factor * self.b, factor * self.c, factor * self.d)
 
 
+def _matrix(*rows: tuple[Scalar, ...]) -> Float[Array, "... 4 4"]:
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def product(matrices: Iterable[Float[Array, "... 4 4"] | None]) -> Float[Array, "... 4 4"] | None:
+    """Product of Mueller matrices in the order light meets them; None: the identity."""
+    whole = None
+    for matrix in matrices:
+        if matrix is not None:
+            whole = matrix if whole is None else matrix @ whole
+    return whole
+
+
 def from_jones(jones: Matrix2) -> Float[Array, "... 4 4"]:
     """Mueller matrix of a Jones matrix.
 
@@ -66,32 +80,29 @@ def from_jones(jones: Matrix2) -> Float[Array, "... 4 4"]:
     ab, cd = a * jnp.conj(b), c * jnp.conj(d)
     ac, bd = a * jnp.conj(c), b * jnp.conj(d)
     ad, bc = a * jnp.conj(d), b * jnp.conj(c)
-    rows = (
+    return _matrix(
         (0.5 * (aa + bb + cc + dd), 0.5 * (aa - bb + cc - dd), (ab + cd).real, -(ab + cd).imag),
         (0.5 * (aa + bb - cc - dd), 0.5 * (aa - bb - cc + dd), (ab - cd).real, -(ab - cd).imag),
         ((ac + bd).real, (ac - bd).real, (ad + bc).real, -(ad - bc).imag),
         ((ac + bd).imag, (ac - bd).imag, (ad + bc).imag, (ad - bc).real),
     )
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def diattenuator(q: Scalar, u: Scalar) -> Float[Array, "... 4 4"]:
-    """Non-depolarising linear diattenuator of unit mean transmission with diattenuation vector (q, u).
+def diattenuator(q: Scalar, u: Scalar, v: Scalar | float = 0.0) -> Float[Array, "... 4 4"]:
+    """Non-depolarising diattenuator of unit mean transmission with diattenuation vector (q, u, v).
 
     M = [[1, Dᵀ], [D, √(1−D²) 1 + (1 − √(1−D²)) D̂D̂ᵀ]] (Lu & Chipman 1996, eq. 18); identity for D = 0. The
     factor (1 − √(1−D²))/D² is written 1/(1 + √(1−D²)), which has no singularity there.
     """
-    q, u = jnp.broadcast_arrays(q, u)
-    root = jnp.sqrt(1.0 - q**2 - u**2)
-    k = 1.0 / (1.0 + root)
-    one, zero = jnp.ones_like(q), jnp.zeros_like(q)
-    rows = (
-        (one, q, u, zero),
-        (q, root + k * q**2, k * q * u, zero),
-        (u, k * q * u, root + k * u**2, zero),
-        (zero, zero, zero, root),
+    q, u, v = jnp.broadcast_arrays(q, u, v)
+    root = jnp.sqrt(1.0 - q**2 - u**2 - v**2)
+    k, one = 1.0 / (1.0 + root), jnp.ones_like(root)
+    return _matrix(
+        (one, q, u, v),
+        (q, root + k * q**2, k * q * u, k * q * v),
+        (u, k * q * u, root + k * u**2, k * u * v),
+        (v, k * q * v, k * u * v, root + k * v**2),
     )
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def retarder(delta: Scalar, axis: Scalar) -> Float[Array, "... 4 4"]:
@@ -103,21 +114,21 @@ def retarder(delta: Scalar, axis: Scalar) -> Float[Array, "... 4 4"]:
     c2, s2 = jnp.cos(2 * axis), jnp.sin(2 * axis)
     cd, sd = jnp.cos(delta), jnp.sin(delta)
     one, zero = jnp.ones_like(delta), jnp.zeros_like(delta)
-    rows = (
+    return _matrix(
         (one, zero, zero, zero),
         (zero, c2**2 + s2**2 * cd, c2 * s2 * (1 - cd), -s2 * sd),
         (zero, c2 * s2 * (1 - cd), c2**2 * cd + s2**2, c2 * sd),
         (zero, s2 * sd, -c2 * sd, cd),
     )
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def rotation(angle: Scalar) -> Float[Array, "... 4 4"]:
     """Stokes parameters referred to axes turned by `angle` (rad): the matrix M_rot(angle) of Paper II."""
     c2, s2 = jnp.cos(2 * angle), jnp.sin(2 * angle)
     one, zero = jnp.ones_like(c2), jnp.zeros_like(c2)
-    rows = ((one, zero, zero, zero), (zero, c2, s2, zero), (zero, -s2, c2, zero), (zero, zero, zero, one))
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    return _matrix(
+        (one, zero, zero, zero), (zero, c2, s2, zero), (zero, -s2, c2, zero), (zero, zero, zero, one)
+    )
 
 
 def polarised(angle: Scalar, extinction: Scalar | float) -> Float[Array, "... 4"]:
@@ -130,12 +141,13 @@ def polarised(angle: Scalar, extinction: Scalar | float) -> Float[Array, "... 4"
     return jnp.stack([jnp.ones_like(two), c * jnp.cos(two), c * jnp.sin(two), jnp.zeros_like(two)], axis=-1)
 
 
-def general_retarder(q: Scalar, u: Scalar, v: Scalar) -> Float[Array, "... 4 4"]:
+def general_retarder(q: Scalar, u: Scalar, v: Scalar | float = 0.0) -> Float[Array, "... 4 4"]:
     """Elliptical retarder of retardance vector (q, u, v) (rad): the Poincaré sphere turned about it by its length.
 
     M = 1 + s A + c A², A the cross product with the vector r, s = sin Δ/Δ, c = (1 − cos Δ)/Δ², Δ = |r|; smooth at 0.
     A linear one at an axis α has (Δ cos 2α, Δ sin 2α, 0).
     """
+    q, u, v = jnp.broadcast_arrays(q, u, v)
     square = q**2 + u**2 + v**2
     small = square < 1e-6
     length = jnp.sqrt(jnp.where(small, 1.0, square))
@@ -143,23 +155,9 @@ def general_retarder(q: Scalar, u: Scalar, v: Scalar) -> Float[Array, "... 4 4"]
     half = jnp.sin(0.5 * length) / (0.5 * length)
     c = jnp.where(small, 0.5 - square / 24.0 + square**2 / 720.0, 0.5 * half**2)
     one, zero = jnp.ones_like(square), jnp.zeros_like(square)
-    rows = (
+    return _matrix(
         (one, zero, zero, zero),
         (zero, one - c * (u**2 + v**2), c * q * u + s * v, c * q * v - s * u),
         (zero, c * q * u - s * v, one - c * (q**2 + v**2), c * u * v + s * q),
         (zero, c * q * v + s * u, c * u * v - s * q, one - c * (q**2 + u**2)),
     )
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def general_diattenuator(q: Scalar, u: Scalar, v: Scalar) -> Float[Array, "... 4 4"]:
-    """`diattenuator` with a circular part v."""
-    root = jnp.sqrt(1.0 - q**2 - u**2 - v**2)
-    k, one = 1.0 / (1.0 + root), jnp.ones_like(root)
-    rows = (
-        (one, q, u, v),
-        (q, root + k * q**2, k * q * u, k * q * v),
-        (u, k * q * u, root + k * u**2, k * u * v),
-        (v, k * q * v, k * u * v, root + k * v**2),
-    )
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)

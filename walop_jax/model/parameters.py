@@ -139,8 +139,8 @@ class Component(eqx.Module):
         return (field,)
 
     def declarations(self) -> Mapping[str, Parameter]:
-        """Its parameters, by field."""
-        return field_declarations(type(self))
+        """Its parameters, by field: those of the class and those that the instrument has `declared`."""
+        return {**field_declarations(type(self)), **dict(getattr(self, "declared", ()))}
 
 
 Holder = tuple[str, ...]

@@ -21,11 +21,6 @@ from walop_jax.model.ray import CONDITIONS, Conditions
 from walop_jax.model.sources import ExposureArrays
 
 
-def equivalent_width(curve: FilterCurve) -> float:
-    """∫ THROUGHPUT dλ / max THROUGHPUT (µm); 0 for a monochromatic band."""
-    return float(np.trapezoid(curve.throughput, curve.wavelength) / curve.throughput.max())
-
-
 def plan_for(
     instrument: Instrument,
     exposures: Exposures,
@@ -95,14 +90,9 @@ def plan_for_settings(instrument: Instrument, settings: Settings, filters: Mappi
     return _plan(instrument, settings, np.zeros(len(settings)), filters, blank, lambda band: band[:, None])
 
 
-def _rule(curve: FilterCurve, path_difference: float) -> Rule:
-    """The nodes of a band and their weights."""
-    return _known_rule(tuple(curve.wavelength.tolist()), tuple(curve.throughput.tolist()), path_difference)
-
-
 @functools.lru_cache(maxsize=256)
-def _known_rule(wavelength: tuple[float, ...], throughput: tuple[float, ...], path_difference: float) -> Rule:
-    """Plans of one set are made for many models, most of which ask for the same nodes."""
+def _rule(wavelength: tuple[float, ...], throughput: tuple[float, ...], path_difference: float) -> Rule:
+    """Nodes of a band and their weights; plans of one set are made for many models, most of which ask for the same."""
     return band_rule(np.array(wavelength), np.array(throughput), path_difference=path_difference)
 
 
@@ -130,8 +120,15 @@ def _plan(
     index = {key: i for i, key in enumerate(bands)}
 
     groups = sorted({(name, moment) for _, name, moment, _ in bands})
-    rules = {name: _rule(filters[name], asked.path_difference) for name, _ in groups}
-    width = {name: equivalent_width(filters[name]) for name in rules}
+    curves = {name: filters[name] for name, _ in groups}
+    rules = {
+        name: _rule(tuple(c.wavelength.tolist()), tuple(c.throughput.tolist()), asked.path_difference)
+        for name, c in curves.items()
+    }
+    # Equivalent widths: 0 for a monochromatic band.
+    width = {
+        n: float(np.trapezoid(c.throughput, c.wavelength) / c.throughput.max()) for n, c in curves.items()
+    }
     offset, start = {}, 0
     for group in groups:
         offset[group] = start

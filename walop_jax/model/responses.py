@@ -186,7 +186,7 @@ def vector_responses(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -
     rows, inserted, numbers, globally = found
 
     mean, mean_slope = weights @ wavelength, weight_slopes @ wavelength + weights.sum(axis=1)
-    throughput = light.throughput_at(instrument, x, y)
+    throughput = instrument.throughput.at(x, y)
 
     def cameras(
         rows: Float[Array, "b r 4"], mean: Float[Array, " b"], throughput: Float[Array, " k"]
@@ -418,7 +418,7 @@ def fringe_responses(
     instrument = instrument.patched()
     wavelength = light.node_wavelengths(instrument, plan)
     weights = light.weights_at(plan, wavelength, plan.teff)
-    mean, throughput = weights @ wavelength, light.throughput_at(instrument, x, y)
+    mean, throughput = weights @ wavelength, instrument.throughput.at(x, y)
 
     def banded(wavelength: Float[Array, " n"]) -> tuple[Array, Array]:
         return _banded_fringes(instrument, plan, gaps, x, y, wavelength, weights)

@@ -130,9 +130,9 @@ class Model:
         return with_values(self.template)(np.asarray(self.start if values is None else values, float))
 
 
-def series_indices(instrument: Instrument) -> tuple[int, ...]:
+def series_indices(instrument: Instrument) -> Int[np.ndarray, " kt"]:
     """Positions of the throughput coefficients (cameras × terms, contiguous)."""
-    return tuple(i for i, leaf in enumerate(leaves(instrument)) if leaf.part == THROUGHPUT)
+    return np.array([i for i, leaf in enumerate(leaves(instrument)) if leaf.part == THROUGHPUT], int)
 
 
 def make_template(instrument: Instrument) -> Instrument:

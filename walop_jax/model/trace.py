@@ -113,7 +113,7 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
     )
     stages.append(_cameras(instrument, "analysers", "share of the light in each beam of its arm", beams))
 
-    throughput = light.throughput_at(instrument, x, y)
+    throughput = instrument.throughput.at(x, y)
     for part in instrument.cameras.transmission:
         throughput = throughput * part.factors(x, y)
     beams = throughput * beams

@@ -27,6 +27,7 @@ from walop_jax.model.elements import WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for_settings
+from walop_jax.model.ray import Ray
 from walop_jax.paper.polynomial import measured_qu, transmitted
 
 TEMPERATURES = (3500.0, 5000.0, 7000.0, 10000.0)
@@ -98,7 +99,7 @@ def plate_names(instrument: Instrument) -> tuple[str, ...]:
 def _plates(
     instrument: Instrument, plan: Plan, x: Float[Array, ""], y: Float[Array, ""]
 ) -> Float[Array, "w n 4 4"]:
-    ray = light.ray_at(instrument, plan, x, y)
+    ray = Ray.entering(x, y, (light.node_wavelengths(instrument, plan), plan.conditions))
     train = light.divided(instrument)
     _, ray = fold.stations((*train.leading, *train.banded), ray)
     arms = [fold.stations(tuple(arm.train()), ray)[0] for arm in instrument.arms]

@@ -73,7 +73,7 @@ def draw_instrument(model: Model, rng: np.random.Generator) -> Instrument:
     for i, p in enumerate(model.parameters):
         if p.tie is not None:
             values[i] = values[model.index(p.tie)]
-    values[list(series_indices(model.template))] = _throughput(model.template, rng).ravel()
+    values[series_indices(model.template)] = _throughput(model.template, rng).ravel()
     return jax.tree.map(_possible, model.instrument(values), is_leaf=lambda node: isinstance(node, Analyser))
 
 

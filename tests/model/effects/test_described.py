@@ -18,8 +18,10 @@ from walop_jax.model.dependence import left_behind
 from walop_jax.model.effects import Change, Described, effect_by_name
 from walop_jax.model.effects.change import AMPLITUDES, KINDS
 from walop_jax.model.effects.factors import PLAIN
-from walop_jax.model.effects.optics import OPTICAL
+from walop_jax.model.effects.optics import AXES
 from walop_jax.model.parameters import NAME
+
+OPTICAL = (*(f"{kind} {axis}" for kind in ("retardance", "diattenuation") for axis in AXES), "depolarisation")
 
 
 def said(*sentences, values):
@@ -249,7 +251,7 @@ def test_factors_grow_as_they_say():
 
 
 def test_general_matrices_are_those_of_one_axis():
-    delta, d, none = (jnp.asarray(value) for value in (0.3, 0.2, 0.0))
+    delta, none = jnp.asarray(0.3), jnp.asarray(0.0)
     for axis, at in (
         (0.0, (0.3, 0.0)),
         (np.pi / 4, (0.0, 0.3)),
@@ -261,8 +263,6 @@ def test_general_matrices_are_those_of_one_axis():
         )
     ours = mueller.general_retarder(none, none, delta)
     assert np.asarray(ours) == pytest.approx(np.asarray(mueller.rotation(delta / 2)), abs=1e-15)
-    ours, theirs = mueller.general_diattenuator(delta, d, none), mueller.diattenuator(delta, d)
-    assert np.asarray(ours) == pytest.approx(np.asarray(theirs), abs=1e-15)
 
 
 @pytest.mark.parametrize(

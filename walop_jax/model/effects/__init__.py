@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 
-from walop_jax.model.effects import cameras, numbers, optics, sources
+from walop_jax.model.effects import cameras, numbers, optics
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.effects.catalogue import EFFECTS
 from walop_jax.model.effects.change import Change

@@ -11,8 +11,8 @@ Symbols     a amplitude, f product of the factors; the place is a camera, or an 
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
-from typing import ClassVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from walop_jax.model.cameras import DetectorPart, ExposurePart, GhostPart, Mixing, Transmission
-from walop_jax.model.effects.change import OPPOSITE, AtPoint, Change, Kind, Scalar, Term, in_exposures
+from walop_jax.model.effects.change import KINDS, OPPOSITE, AtPoint, Change, Kind, Scalar, Term, in_exposures
 from walop_jax.model.effects.factors import COUNTS
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Component, unknown_name
@@ -38,10 +38,10 @@ class _Cameras(Component):
     cameras: tuple[Weights, ...] = eqx.field(static=True)
 
     @classmethod
-    def of(cls, instrument: Instrument, terms: Sequence[Term]) -> _Cameras:
+    def of(cls, instrument: Instrument, terms: Sequence[Term], **fixed: Any) -> _Cameras:
         """The changes of an instrument."""
         changes, amplitudes = (tuple(column) for column in zip(*terms, strict=True))
-        return cls(amplitudes, changes, tuple(cameras_of(instrument, change.place) for change in changes))
+        return cls(amplitudes, changes, tuple(cameras_of(instrument, c.place) for c in changes), **fixed)
 
     @property
     def sizes(self) -> Float[Array, "c k"]:
@@ -91,16 +91,29 @@ class Ghost(GhostPart):
         return jnp.where(extended[:, None], self.shares * opposite, 0.0)
 
 
-class OfDetectors(_Cameras, DetectorPart):
-    """Additions to counts as they arrive."""
+def _before(counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
+    """The counts of the exposure before."""
+    order = jnp.argsort(exposures.hours)
+    return jnp.zeros_like(counts).at[order[1:]].set(counts[order[:-1]])
 
-    def added(self, counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
-        """Addition by a change of amplitude 1 without factors."""
-        raise NotImplementedError
+
+ADDED: Mapping[str, Callable[[Float[Array, "e k"], ExposureArrays], Float[Array, "e k"]]] = {
+    "square": lambda counts, _: counts**2 / REFERENCE_COUNTS,
+    "reported": lambda counts, _: counts,
+    "median": lambda _, exposures: exposures.median,
+    "afterglow": _before,
+}
+"""Additions to counts as they arrive by a change of amplitude 1 without factors, by stage."""
+
+
+class OfDetectors(_Cameras, DetectorPart):
+    """Additions to counts as they arrive, of one stage of `ADDED`."""
+
+    stage: str = eqx.field(static=True, default="reported")
 
     def reported(self, counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
         """Counts with what is added."""
-        added, whole = self.added(counts, exposures), counts
+        added, whole = ADDED[self.stage](counts, exposures), counts
         for change, size in zip(self.changes, self.sizes, strict=True):
             if any(one.depends_on != COUNTS for one in change.grows_with):
                 whole = whole + size * added * in_exposures(change, exposures)[:, None]
@@ -109,132 +122,38 @@ class OfDetectors(_Cameras, DetectorPart):
         return whole
 
 
-class NonLinear(OfDetectors):
-    """A gain that grows with the counts."""
-
-    def added(self, counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
-        """The counts squared."""
-        del exposures
-        return counts**2 / REFERENCE_COUNTS
-
-
-class Scaled(OfDetectors):
-    """A gain behind the detector."""
-
-    def added(self, counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
-        """The counts."""
-        del exposures
-        return counts
+def stage_of(change: Change) -> str:
+    """Stage at which a change acts: a key of `ADDED`, "throughput", "counts", "mixed" or "opposite"."""
+    if change.kind == "light":
+        return "opposite" if change.origin == OPPOSITE else "mixed" if change.origin else "median"
+    if change.kind != "gain":
+        return {"reported gain": "reported", "afterglow": "afterglow", "shade": "throughput"}[change.kind]
+    return "square" if "counts" in change.factors else "counts" if change.exposure_factors else "throughput"
 
 
-class Diffuse(OfDetectors):
-    """Light whatever falls in."""
-
-    def added(self, counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
-        """The median counts of the exposure."""
-        del counts
-        return exposures.median
-
-
-class Left(OfDetectors):
-    """Remainder of the exposure before."""
-
-    def added(self, counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
-        """The counts of the exposure before."""
-        order = jnp.argsort(exposures.hours)
-        return jnp.zeros_like(counts).at[order[1:]].set(counts[order[:-1]])
+def _patch(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
+    """The instrument with changes that act at one stage."""
+    stage = stage_of(terms[0][0])
+    if stage in ADDED:
+        return instrument.with_part("detectors", OfDetectors.of(instrument, terms, stage=stage))
+    if stage == "throughput":
+        return instrument.with_part("transmission", Shade.of(instrument, terms))
+    if stage == "counts":
+        return instrument.with_part("exposures", GainOfExposures.of(instrument, terms))
+    if stage == "opposite":
+        shares = [size * np.array(cameras_of(instrument, change.place)) for change, size in terms]
+        return instrument.with_part("ghosts", Ghost(jnp.sum(jnp.stack(shares), axis=0)))
+    pairs = [tuple(cameras_of(instrument, p).index(1.0) for p in (c.place, c.origin)) for c, _ in terms]
+    return instrument.with_part("mixing", CrossTalk(tuple(size for _, size in terms), tuple(pairs)))
 
 
-class Gain(Kind):
-    """A gain of a camera, or of both cameras of an arm."""
-
-    names: ClassVar[tuple[str, ...]] = ("gain",)
-    parameter: ClassVar[str] = "share"
-    test: ClassVar[str] = "a lamp that does not change, seen by all cameras in turn"
-
-    @classmethod
-    def together(cls, change: Change) -> tuple[type[Kind], Hashable]:
-        """Those that act at one stage."""
-        return cls, cls.part(change)
-
-    @staticmethod
-    def part(change: Change) -> tuple[str, type[_Cameras]]:
-        """The slot of `Instrument.with_part`, and what goes there."""
-        if "counts" in change.factors:
-            return "detectors", NonLinear
-        return ("exposures", GainOfExposures) if change.exposure_factors else ("transmission", Shade)
-
-    @classmethod
-    def patch(cls, instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-        """Add to the cameras."""
-        slot, part = cls.part(terms[0][0])
-        return instrument.with_part(slot, part.of(instrument, terms))
-
-
-class ReportedGain(Kind):
-    """A gain of the counts as the detector reports them."""
-
-    names: ClassVar[tuple[str, ...]] = ("reported gain",)
-    parameter: ClassVar[str] = "share"
-    test: ClassVar[str] = Gain.test
-
-    @classmethod
-    def together(cls, change: Change) -> tuple[type[Kind], Hashable]:
-        """All of them."""
-        return cls, None
-
-    @classmethod
-    def patch(cls, instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-        """Add to the detectors."""
-        return instrument.with_part("detectors", Scaled.of(instrument, terms))
-
-
-class Afterglow(Kind):
-    """A share of the exposure before in a camera."""
-
-    names: ClassVar[tuple[str, ...]] = ("afterglow",)
-    parameter: ClassVar[str] = "share"
-    test: ClassVar[str] = "a dark exposure after a bright one"
-
-    @classmethod
-    def together(cls, change: Change) -> tuple[type[Kind], Hashable]:
-        """All of them."""
-        return cls, None
-
-    @classmethod
-    def patch(cls, instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-        """Add to the detectors."""
-        return instrument.with_part("detectors", Left.of(instrument, terms))
-
-
-class Light(Kind):
-    """Light in a camera that comes from elsewhere: scattered, of another camera, of the opposite field point."""
-
-    names: ClassVar[tuple[str, ...]] = ("light",)
-    parameter: ClassVar[str] = "share"
-    test: ClassVar[str] = "the same field points at another flux, and darks"
-
-    @classmethod
-    def together(cls, change: Change) -> tuple[type[Kind], Hashable]:
-        """Those that come from the same kind of place."""
-        return cls, OPPOSITE if change.origin == OPPOSITE else bool(change.origin)
-
-    @classmethod
-    def patch(cls, instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-        """Add to the cameras."""
-        if not terms[0][0].origin:
-            return instrument.with_part("detectors", Diffuse.of(instrument, terms))
-        if terms[0][0].origin == OPPOSITE:
-            shares = [size * np.array(cameras_of(instrument, change.place)) for change, size in terms]
-            return instrument.with_part("ghosts", Ghost(jnp.sum(jnp.stack(shares), axis=0)))
-        pairs = tuple(
-            (
-                cameras_of(instrument, change.place).index(1.0),
-                cameras_of(instrument, change.origin).index(1.0),
-            )
-            for change, _ in terms
-        )
-        return instrument.with_part("mixing", CrossTalk(tuple(size for _, size in terms), pairs))
+_OF_GAINS = "a lamp that does not change, seen by all cameras in turn"
+KINDS |= {
+    "gain": Kind("share", _patch, stage_of, _OF_GAINS),
+    "reported gain": Kind("share", _patch, stage_of, _OF_GAINS),
+    "afterglow": Kind("share", _patch, stage_of, "a dark exposure after a bright one"),
+    "light": Kind("share", _patch, stage_of, "the same field points at another flux, and darks"),
+}
 
 
 def cameras_of(instrument: Instrument, place: str) -> Weights:

@@ -8,19 +8,18 @@
     light of E1 in O1                           a share of the counts of one camera in another one
     polarisation q of HD_14069                  a star that is not what the catalogue says
 
-At an amplitude of 0 nothing happens. A kind is a class in a file of its family (`optics`, `numbers`, `cameras`,
-`sources`): it says what a change does to an instrument. Factors (`factors`) multiply each other; without one the
+At an amplitude of 0 nothing happens. A kind (`Kind`) stands in the file of its family (`optics`, `cameras`, `numbers`):
+it says what a change does to an instrument. Factors (`factors`) multiply each other; without one the
 amplitude is the same everywhere.
 """
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 import functools
 import re
-from collections.abc import Hashable, Iterable, Sequence
-from typing import Any, ClassVar, NamedTuple, Self
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from typing import Any, NamedTuple, Self
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -57,34 +56,22 @@ AMPLITUDES = {
 """Amplitudes of changes, by the parameter of `described` that holds them."""
 
 
-class Kind(abc.ABC):
-    """A kind of change. `names` begin the texts of its changes, `parameter` is one of `AMPLITUDES`; `test`: what would
-    show it."""
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """A kind of change: one of `AMPLITUDES`, what changes of some amplitudes make of an instrument, what would show it.
 
-    names: ClassVar[tuple[str, ...]]
-    parameter: ClassVar[str]
-    test: ClassVar[str] = ""
+    Changes for which `patch` and `together` are equal are patched together. `patch` raises `NoSuchPlaceError` where an
+    instrument has no such place, ValueError for a change that cannot be made.
+    """
 
-    def __init_subclass__(cls) -> None:
-        for name in vars(cls).get("names", ()):
-            KINDS[name] = cls
-
-    @classmethod
-    def together(cls, change: Change) -> tuple[type[Kind], Hashable]:
-        """Changes for which this is equal are patched together, by the class of it."""
-        return cls, change
-
-    @classmethod
-    @abc.abstractmethod
-    def patch(cls, instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-        """The instrument with changes of some amplitudes.
-
-        Raises `NoSuchPlaceError` where it has no such place, ValueError for a change that cannot be made.
-        """
+    parameter: str
+    patch: Callable[[Instrument, Sequence[Term]], Instrument]
+    together: Callable[[Change], Hashable] = lambda change: change
+    test: str = ""
 
 
-KINDS: dict[str, type[Kind]] = {}
-"""All kinds by their names, filled by their classes."""
+KINDS: dict[str, Kind] = {}
+"""All kinds by their names, which begin the texts of their changes; filled by the files of their families."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,11 +192,12 @@ def _pattern() -> re.Pattern[str]:
 
 def patched(instrument: Instrument, terms: Iterable[Term]) -> Instrument:
     """The instrument with changes of some amplitudes; those of one place that act together are combined."""
-    together: dict[tuple[type[Kind], Hashable], list[Term]] = {}
+    together: dict[tuple[Any, Hashable], list[Term]] = {}
     for change, size in terms:
-        together.setdefault(KINDS[change.kind].together(change), []).append((change, size))
-    for (kind, _), some in together.items():
-        instrument = kind.patch(instrument, some)
+        kind = KINDS[change.kind]
+        together.setdefault((kind.patch, kind.together(change)), []).append((change, size))
+    for (patch, _), some in together.items():
+        instrument = patch(instrument, some)
     return instrument
 
 

@@ -1,89 +1,81 @@
-"""Changes of a number that a part of the instrument has: what is found is added to it."""
+"""Changes of a number that a part of the instrument has, or of what is looked at: what is found is added to it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import ClassVar
+from collections.abc import Hashable, Sequence
 
-from walop_jax.model.effects.change import BAND, SKY, Kind, Term, add
-from walop_jax.model.instrument import Instrument
+import jax.numpy as jnp
+
+from walop_jax.model.effects.change import BAND, KINDS, SKY, Change, Kind, Term, add
+from walop_jax.model.instrument import Instrument, NoSuchPlaceError
 from walop_jax.model.parameters import unknown_name
+from walop_jax.model.sources import MoonPatches
+
+OF_SOURCES = ("polarisation q", "polarisation u", "polarisation")
 
 
-class Number(Kind):
-    """A number of the element, or of the layer, at the place; it has the name of the kind."""
-
-    @classmethod
-    def patch(cls, instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-        """Add to the number."""
-        for change, size in terms:
-            instrument = instrument.changed(change.place, **{change.kind: add(size)})
-        return instrument
+def _number(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
+    """Add to a number of the element, or of the layer, at the place; it has the name of the kind."""
+    for change, size in terms:
+        instrument = instrument.changed(change.place, **{change.kind: add(size)})
+    return instrument
 
 
-class Angle(Number):
-    """Axis of a wave plate, or of a layer of it; optic axis of a layer out of its surface (deg)."""
-
-    names: ClassVar[tuple[str, ...]] = ("axis", "cut")
-    parameter: ClassVar[str] = "angle"
-
-
-class Thickness(Number):
-    """Thickness of a layer of a wave plate (µm)."""
-
-    names: ClassVar[tuple[str, ...]] = ("thickness",)
-    parameter: ClassVar[str] = "length"
+def _of_instrument(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
+    """Add to a number of the instrument as a whole, at the only place that it has."""
+    for change, size in terms:
+        place, field = {"shift": (BAND, "filter_shift"), "rotator": (SKY, "rotator_zero")}[change.kind]
+        if change.place != place:
+            raise unknown_name(f"place of {change.kind}", change.place, (place,))
+        instrument = instrument.changed("", **{field: add(size)})
+    return instrument
 
 
-class Thermal(Number):
-    """Thermal change of the birefringence of a wave plate, in units of the published one."""
-
-    names: ClassVar[tuple[str, ...]] = ("thermal",)
-    parameter: ClassVar[str] = "number"
+def _patches(change: Change) -> Hashable:
+    """All patches of the sky together."""
+    return SKY if change.place == SKY and change.kind != "polarisation" else change
 
 
-class OfPolariser(Number):
-    """Extinction ratio of the polariser, and circular polarisation behind it."""
-
-    names: ClassVar[tuple[str, ...]] = ("extinction", "ellipticity")
-    parameter: ClassVar[str] = "share"
-
-
-class OfInstrument(Kind):
-    """A number of the instrument as a whole, at the only `place` that it has."""
-
-    place: ClassVar[str]
-    field: ClassVar[str]
-
-    @classmethod
-    def patch(cls, instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-        """Add to the number."""
-        for change, size in terms:
-            if change.place != cls.place:
-                raise unknown_name(f"place of {change.kind}", change.place, (cls.place,))
-            instrument = instrument.changed("", **{cls.field: add(size)})
-        return instrument
+def _polarised(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
+    """Of a star: Q + a, or U, in the equatorial frame; of the Moon sky: its degree; q or u in one exposure."""
+    change, size = terms[0]
+    if change.place != SKY:
+        return _of_star(instrument, terms)
+    if change.kind == "polarisation":
+        return instrument.changed("sky", missing=lambda p: -size if p is None else p - size)
+    positions = tuple(dict.fromkeys(one.number for one, _ in terms))
+    own = {axis: [jnp.zeros(())] * len(positions) for axis in "qu"}
+    for one, value in terms:
+        at = positions.index(one.number)
+        own[one.kind[-1]][at] = own[one.kind[-1]][at] + value
+    here = MoonPatches(jnp.stack(own["q"]), jnp.stack(own["u"]), positions)
+    return instrument.changed("sky", patches=lambda there: here if there is None else there.joined(here))
 
 
-class Shift(OfInstrument):
-    """The band displaced (µm): filters wider than `light.BROAD`."""
-
-    names: ClassVar[tuple[str, ...]] = ("shift",)
-    parameter: ClassVar[str] = "wavelength"
-    test: ClassVar[str] = "narrow bands beside the broad one"
-    place: ClassVar[str] = BAND
-    field: ClassVar[str] = "filter_shift"
-
-
-class RotatorZeroPoint(OfInstrument):
-    """True ROTATOR minus the header's (deg)."""
-
-    names: ClassVar[tuple[str, ...]] = ("rotator",)
-    parameter: ClassVar[str] = "angle"
-    test: ClassVar[str] = "a polariser aligned in the laboratory: an independent zero of the angle"
-    place: ClassVar[str] = SKY
-    field: ClassVar[str] = "rotator_zero"
+def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
+    names = [name.replace(" ", "_") for name in instrument.standard.names]
+    for change, size in terms:
+        axis = change.kind.removeprefix("polarisation").strip()
+        if change.place not in names or not axis:
+            known = [f"polarisation q of {name}" for name in names]
+            what = unknown_name("description", f"{change.kind} of {change.place}", known)
+            raise NoSuchPlaceError(str(what))
+        at = names.index(change.place)
+        instrument = instrument.changed(
+            "standard", **{axis: lambda value, at=at, size=size: value.at[at].add(size)}
+        )
+    return instrument
 
 
-NUMBERS = (*Angle.names, *Thickness.names, *Thermal.names)
-"""Kinds that are numbers of wave plates."""
+NUMBERS = {"axis": "angle", "cut": "angle", "thickness": "length", "thermal": "number"}
+"""Kinds that are numbers of wave plates, of layers of them (µm, deg), and their amplitudes."""
+KINDS |= {
+    name: Kind(amplitude, _number)
+    for name, amplitude in (NUMBERS | {"extinction": "share", "ellipticity": "share"}).items()
+}
+_OF_BAND = "narrow bands beside the broad one"  # filters wider than `light.BROAD` are displaced
+KINDS["shift"] = Kind("wavelength", _of_instrument, test=_OF_BAND)
+_OF_ROTATOR = "a polariser aligned in the laboratory: an independent zero of the angle"
+KINDS["rotator"] = Kind("angle", _of_instrument, test=_OF_ROTATOR)
+_OF_SOURCE = "the same patch or star again at another ROTATOR angle"
+KINDS |= {name: Kind("share", _polarised, _patches, _OF_SOURCE) for name in OF_SOURCES}

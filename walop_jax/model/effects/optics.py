@@ -11,20 +11,21 @@ Limits      exact for one kind at a place; which of several acts first is a matt
 from __future__ import annotations
 
 import dataclasses
+import operator
 from collections.abc import Hashable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.model import mueller
-from walop_jax.model.effects.change import AtPoint, Change, Kind, Scalar, Term, in_exposures
+from walop_jax.model.effects.change import KINDS, AtPoint, Change, Kind, Scalar, Term, in_exposures
 from walop_jax.model.effects.factors import PLAIN
 from walop_jax.model.elements import AddedPolarisation, AirGap
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.elements.simple import Film
-from walop_jax.model.instrument import Instrument, NoSuchPlaceError
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.ray import Ray
 from walop_jax.model.sources import ExposureArrays
 
@@ -32,53 +33,12 @@ SOURCE = "Lu & Chipman 1996, JOSA A 13, 1106"
 LARGEST_GAP = 60.0  # µm of air
 
 
-class Small(NamedTuple):
-    """Retardance (rad) and diattenuation along q, u, v, and the share of the polarisation that is lost."""
-
-    retardance: tuple[Any, ...] = (0.0, 0.0, 0.0)
-    diattenuation: tuple[Any, ...] = (0.0, 0.0, 0.0)
-    lost: Any = 0.0
-
-    def plus(self, other: Small) -> Small:
-        """Both of them."""
-        first, second = (
-            tuple(a + b for a, b in zip(*pair, strict=True)) for pair in zip(self[:2], other[:2], strict=True)
-        )
-        return Small(first, second, self.lost + other.lost)
+AXES = ("q", "u", "v", "radial", "diagonal")
+DISPLACEMENTS = ("displacement x", "displacement y")
 
 
-class Optical(Kind):
-    """A kind that is a Mueller matrix near the identity."""
-
-    @classmethod
-    def small(cls, change: Change, size: Any, x: Any, y: Any) -> Small:
-        """A change of a size (amplitude × factor) at a field point (deg)."""
-        raise NotImplementedError
-
-    @classmethod
-    def together(cls, change: Change) -> tuple[type[Kind], Hashable]:
-        """All that acts at one place."""
-        return Optical, (change.where, change.place)
-
-    @classmethod
-    def patch(cls, instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-        """One more element at the place; of an element that moves, or of the polariser: in the beam only when it is."""
-        changes, amplitudes = (tuple(column) for column in zip(*terms, strict=True))
-        where, place, polariser = changes[0].where, changes[0].place, instrument.polariser
-        if where == "of" and polariser is not None and place == polariser.name:
-            film = PolariserFilm(amplitudes, changes)
-            return instrument.changed(place, films=lambda films: (*films, film))
-        own = Terms(name="described", amplitudes=amplitudes, changes=changes)
-        if where != "of":
-            return instrument.inserted(
-                own, **({"before": place} if where == "ahead of" else {"after": place})
-            )
-        own = dataclasses.replace(own, moves=element_at(instrument, place).moves)
-        return instrument.inserted(own, after=place)
-
-
-def along(axis: str, size: Any, x: Any, y: Any) -> tuple[Any, ...]:
-    """The components along q, u and v of something with an axis: q, u, v, radial or diagonal."""
+def _along(axis: str, size: Any, x: Any, y: Any) -> tuple[Any, ...]:
+    """The components along q, u and v of something with one of the `AXES`."""
     if axis in ("q", "u", "v"):
         return tuple(size if axis == one else 0.0 for one in "quv")
     point = AtPoint(x, y)
@@ -88,76 +48,23 @@ def along(axis: str, size: Any, x: Any, y: Any) -> tuple[Any, ...]:
     return size * straight, size * across, 0.0
 
 
-class Retardance(Optical):
-    """A retarder (rad)."""
-
-    names: ClassVar[tuple[str, ...]] = tuple(f"retardance {a}" for a in ("q", "u", "v", "radial", "diagonal"))
-    parameter: ClassVar[str] = "retardance"
-
-    @classmethod
-    def small(cls, change: Change, size: Any, x: Any, y: Any) -> Small:
-        """Along its axis."""
-        return Small(retardance=along(change.kind.split()[1], size, x, y))
-
-
-class Diattenuation(Optical):
-    """A diattenuator."""
-
-    names: ClassVar[tuple[str, ...]] = tuple(
-        f"diattenuation {a}" for a in ("q", "u", "v", "radial", "diagonal")
-    )
-    parameter: ClassVar[str] = "share"
-
-    @classmethod
-    def small(cls, change: Change, size: Any, x: Any, y: Any) -> Small:
-        """Along its axis."""
-        return Small(diattenuation=along(change.kind.split()[1], size, x, y))
-
-
-class Depolarisation(Optical):
-    """A share of the polarisation is lost."""
-
-    names: ClassVar[tuple[str, ...]] = ("depolarisation",)
-    parameter: ClassVar[str] = "share"
-
-    @classmethod
-    def small(cls, change: Change, size: Any, x: Any, y: Any) -> Small:
-        """The share."""
-        del change, x, y
-        return Small(lost=size)
-
-
-class Turn(Optical):
-    """Light turned (deg): of the polariser, its axis minus its reading."""
-
-    names: ClassVar[tuple[str, ...]] = ("turn",)
-    parameter: ClassVar[str] = "angle"
-
-    @classmethod
-    def small(cls, change: Change, size: Any, x: Any, y: Any) -> Small:
-        """A circular retarder."""
-        del change, x, y
-        return Small(retardance=(0.0, 0.0, -2.0 * jnp.deg2rad(size)))
-
-
-KINDS_OF_OPTICS: tuple[type[Optical], ...] = (Retardance, Diattenuation, Depolarisation, Turn)
-OPTICAL = tuple(name for kind in KINDS_OF_OPTICS[:3] for name in kind.names)
-
-
 def matrix_of(terms: Sequence[tuple[Change, Any]], x: Any, y: Any) -> Mueller:
     """Mueller matrix of changes of given sizes (amplitude × factor; arrays) at a field point (deg)."""
-    whole = Small()
+    sums: dict[
+        str, tuple[Any, ...]
+    ] = {}  # along q, u, v: retardance (rad), diattenuation; the share that is lost
     for change, size in terms:
-        (kind,) = (one for one in KINDS_OF_OPTICS if change.kind in one.names)
-        whole = whole.plus(kind.small(change, size, x, y))
-    matrix, kinds = None, {next(k for k in KINDS_OF_OPTICS if c.kind in k.names) for c, _ in terms}
-    if Diattenuation in kinds:
-        matrix = mueller.general_diattenuator(*jnp.broadcast_arrays(*map(jnp.asarray, whole.diattenuation)))
-    if kinds & {Retardance, Turn}:
-        retarder = mueller.general_retarder(*jnp.broadcast_arrays(*map(jnp.asarray, whole.retardance)))
-        matrix = retarder if matrix is None else retarder @ matrix
-    if Depolarisation in kinds:
-        kept = 1.0 - jnp.asarray(whole.lost)[..., None, None] * jnp.array([[0.0], [1.0], [1.0], [1.0]])
+        what, _, axis = change.kind.partition(" ")
+        if what == "turn":  # a circular retarder
+            what, own = "retardance", (0.0, 0.0, -2.0 * jnp.deg2rad(size))
+        else:
+            own = (size,) if what == "depolarisation" else _along(axis, size, x, y)
+        sums[what] = tuple(map(operator.add, sums.get(what, (0.0,) * len(own)), own))
+    acting = (("diattenuation", mueller.diattenuator), ("retardance", mueller.general_retarder))
+    matrix = mueller.product(make(*map(jnp.asarray, sums[what])) for what, make in acting if what in sums)
+    if "depolarisation" in sums:
+        lost = jnp.asarray(*sums["depolarisation"])[..., None, None]
+        kept = 1.0 - lost * jnp.array([[0.0], [1.0], [1.0], [1.0]])
         matrix = kept * (jnp.eye(4) if matrix is None else matrix)
     assert matrix is not None
     return matrix
@@ -211,42 +118,6 @@ class PolariserFilm(Film):
         return jnp.einsum("est,et->es", matrix_of(sizes, x, y), light)
 
 
-def element_at(instrument: Instrument, place: str) -> Element:
-    """An element by the name that `inserted` takes. Raises `NoSuchPlaceError` where there is none."""
-    arm, _, name = place.rpartition(".")
-    trains = [one.train() for one in instrument.arms if one.name == arm] if arm else [instrument.train()]
-    for element in (element for train in trains for element in train):
-        if element.name == name:
-            return element
-    raise NoSuchPlaceError(f"the instrument has no element {place!r}")
-
-
-# ------------------------------------------------------------------------------- other elements of the train
-
-
-class Added(Kind):
-    """(0, q, u, 0) per unit of light added, as mirrors of a telescope do to weakly polarised light."""
-
-    names: ClassVar[tuple[str, ...]] = ("added polarisation q", "added polarisation u")
-    parameter: ClassVar[str] = "share"
-
-    @classmethod
-    def together(cls, change: Change) -> tuple[type[Kind], Hashable]:
-        """Both at one place."""
-        return cls, (change.where, change.place)
-
-    @classmethod
-    def patch(cls, instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-        """One more element."""
-        change, own = terms[0][0], {"q": jnp.zeros(()), "u": jnp.zeros(())}
-        for one, size in terms:
-            own[one.kind[-1]] = own[one.kind[-1]] + size
-        side = "before" if change.where == "ahead of" else "after"
-        return instrument.inserted(
-            AddedPolarisation(name="described", q=own["q"], u=own["u"]), **{side: change.place}
-        )
-
-
 class Displaced(Element):
     """A change of where the optics behind see the field point."""
 
@@ -264,42 +135,64 @@ class Displaced(Element):
         return ray.moved(*jnp.broadcast_arrays(x, y))
 
 
-class Displacement(Kind):
-    """The field displaced (deg), as the optics behind a place see it."""
-
-    names: ClassVar[tuple[str, ...]] = ("displacement x", "displacement y")
-    parameter: ClassVar[str] = "displacement"
-    test: ClassVar[str] = "the same angles at several hour angles, and a star at known pixels in each"
-
-    @classmethod
-    def together(cls, change: Change) -> tuple[type[Kind], Hashable]:
-        """Both directions."""
-        return cls, change.place
-
-    @classmethod
-    def patch(cls, instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-        """One more element."""
-        changes, amplitudes = (tuple(column) for column in zip(*terms, strict=True))
-        moved = Displaced(name="described", amplitudes=amplitudes, changes=changes)
-        return instrument.inserted(moved, before=changes[0].place)
-
-
-class Fringes(Kind):
-    """Fringes of an air gap ahead of a wave plate: D = a cos(4π gap cos ϑ / λ) along its fast axis."""
-
-    names: ClassVar[tuple[str, ...]] = ("fringes",)
-    parameter: ClassVar[str] = "share"
-    test: ClassVar[str] = "narrow bands a nanometre apart, or the same band at another temperature"
-
-    @classmethod
-    def patch(cls, instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-        """One more air gap ahead of the plate."""
-        for change, size in terms:
-            instrument = with_air_gap(instrument, change.place, size, jnp.asarray(change.gap))
-        return instrument
-
-
 def with_air_gap(instrument: Instrument, place: str, contrast: Scalar, gap: Scalar) -> Instrument:
     """The instrument with one more air gap (µm) ahead of a wave plate."""
     own = AirGap(contrast, gap, LARGEST_GAP)
     return instrument.changed(place, air_gaps=lambda gaps: (*gaps, own))
+
+
+# ------------------------------------------------------------------------------------------------------- the kinds
+
+
+def _at(change: Change) -> Hashable:
+    return change.where, change.place
+
+
+def _columns(terms: Sequence[Term]) -> dict[str, Any]:
+    changes, amplitudes = (tuple(column) for column in zip(*terms, strict=True))
+    return {"changes": changes, "amplitudes": amplitudes}
+
+
+def _beside(instrument: Instrument, element: Element, change: Change) -> Instrument:
+    """The instrument with one more element at the place of a change."""
+    return instrument.inserted(element, **{"before" if change.where == "ahead of" else "after": change.place})
+
+
+def _optics(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
+    """One more element at the place; of an element that moves, or of the polariser: in the beam only when it is."""
+    change, polariser = terms[0][0], instrument.polariser
+    if change.where == "of" and polariser is not None and change.place == polariser.name:
+        film = PolariserFilm(**_columns(terms))
+        return instrument.changed(change.place, films=lambda films: (*films, film))
+    moves = instrument.element(change.place).moves if change.where == "of" else None
+    return _beside(instrument, Terms(name="described", moves=moves, **_columns(terms)), change)
+
+
+def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
+    """(0, q, u, 0) per unit of light added, as mirrors of a telescope do to weakly polarised light."""
+    own = {"q": jnp.zeros(()), "u": jnp.zeros(())}
+    for one, size in terms:
+        own[one.kind[-1]] = own[one.kind[-1]] + size
+    return _beside(instrument, AddedPolarisation(name="described", **own), terms[0][0])
+
+
+def _displaced(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
+    return instrument.inserted(Displaced(name="described", **_columns(terms)), before=terms[0][0].place)
+
+
+def _fringes(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
+    for change, size in terms:
+        instrument = with_air_gap(instrument, change.place, size, jnp.asarray(change.gap))
+    return instrument
+
+
+KINDS |= {f"retardance {axis}": Kind("retardance", _optics, _at) for axis in AXES}
+KINDS |= {f"diattenuation {axis}": Kind("share", _optics, _at) for axis in AXES}
+KINDS |= {"depolarisation": Kind("share", _optics, _at), "turn": Kind("angle", _optics, _at)}
+KINDS |= {f"added polarisation {axis}": Kind("share", _added, _at) for axis in "qu"}
+_OF_FIELD = "the same angles at several hour angles, and a star at known pixels in each"
+KINDS |= {
+    name: Kind("displacement", _displaced, lambda change: change.place, _OF_FIELD) for name in DISPLACEMENTS
+}
+_OF_FRINGES = "narrow bands a nanometre apart, or the same band at another temperature"
+KINDS["fringes"] = Kind("share", _fringes, test=_OF_FRINGES)

@@ -7,7 +7,7 @@ An element is neutral when it is made without numbers. It may move: `moves` is t
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
@@ -34,10 +34,6 @@ class Element(Component):
 
     kind: ClassVar[str] = ""
     reference: ClassVar[str] = ""
-
-    def declarations(self) -> Mapping[str, Parameter]:
-        """Its parameters: those of the class and those that the instrument has declared."""
-        return {**super().declarations(), **dict(self.declared)}
 
     def ray(self, ray: Ray) -> Ray:
         """The ray behind the element."""

@@ -12,7 +12,6 @@ Limits      θ = 0: diag(1, 1, −1, −1), the frame of the reflected beam bein
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -20,15 +19,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.model import mueller
-from walop_jax.model.elements.base import Element, Mueller
-from walop_jax.model.elements.spectral import Curve, check_curve, spline
+from walop_jax.model.elements.base import Mueller
+from walop_jax.model.elements.spectral import Curve, WithCurves
 from walop_jax.model.parameters import number
 from walop_jax.model.ray import Ray
 
 Scalar = Float[Array, ""]
 
 
-class Mirror(Element):
+class Mirror(WithCurves):
     """A flat metal mirror; reflectance is part of the throughput."""
 
     n: Curve | None = number(unit="", about="index of refraction at `n_at`", default=None, several=True)
@@ -42,21 +41,14 @@ class Mirror(Element):
     reference: ClassVar[str] = "Born & Wolf 1999, Principles of Optics, 14.2"
 
     def __check_init__(self) -> None:
-        check_curve("n", self.n, self.n_at)
-        check_curve("k", self.k, self.k_at)
         if (self.n is None) != (self.k is None):
             raise ValueError(f"{'n' if self.n is None else 'k'} is missing: a metal has both")
-
-    def labels(self, field: str) -> Sequence[str]:
-        """Values of a curve are numbered from 1, by wavelength."""
-        knots = {"n": self.n_at, "k": self.k_at}.get(field)
-        return (field,) if knots is None else tuple(f"{field}{i + 1}" for i in range(len(knots)))
 
     def mueller(self, ray: Ray) -> Mueller | None:
         """The mirror at every wavelength, of unit mean reflectance; no metal: nothing."""
         if self.n is None or self.k is None:
             return None
-        index = spline(self.n_at, self.n, ray.wavelength) + 1j * spline(self.k_at, self.k, ray.wavelength)
+        index = self.curve("n", ray.wavelength) + 1j * self.curve("k", ray.wavelength)
         cos, sin = jnp.cos(jnp.deg2rad(self.incidence)), jnp.sin(jnp.deg2rad(self.incidence))
         inside = jnp.sqrt(index**2 - sin**2)
         s = (cos - inside) / (cos + inside)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from walop_jax.model import mueller
 from walop_jax.model.conventions import FIELD_SCALE, REFERENCE_WAVELENGTH
 from walop_jax.model.elements.base import Element, Mueller
-from walop_jax.model.elements.spectral import Curve, check_curve, spline
+from walop_jax.model.elements.spectral import Curve, WithCurves
 from walop_jax.model.parameters import Component, number
 from walop_jax.model.ray import Ray
 from walop_jax.model.sources import ExposureArrays
@@ -261,13 +261,13 @@ class RadialRetarder(Element):
         if self.bend is not None:
             delta = delta + self.bend * (ray.wavelength - REFERENCE_WAVELENGTH) ** 2
         k = 2.0 * jnp.pi * delta / FIELD_SCALE**2
-        return mueller.general_retarder(k * (x**2 - y**2), k * 2.0 * x * y, jnp.zeros_like(k * x))
+        return mueller.general_retarder(k * (x**2 - y**2), k * 2.0 * x * y)
 
 
 # ------------------------------------------------------------------------------------------------------------ analysers
 
 
-class Analyser(Element):
+class Analyser(WithCurves):
     """A polarising beam splitter: two beams, one for each of its cameras; with a single camera the first alone.
 
     Equation    beams of an arm ½ (1, ±η cos 2α, ±η sin 2α, 0), first camera +, with η ± ξ in the place of η
@@ -316,22 +316,13 @@ class Analyser(Element):
             analysed = jnp.cos(twice) * mueller[..., 1, :] + jnp.sin(twice) * mueller[..., 2, :]
         return jnp.stack([mueller[..., 0, :], analysed], axis=-2)
 
-    def __check_init__(self) -> None:
-        check_curve("balance", self.balance, self.balance_at)
-        check_curve("loss", self.loss, self.loss_at)
-
-    def labels(self, field: str) -> Sequence[str]:
-        """Values of a curve are numbered from 1, by wavelength."""
-        knots = {"balance": self.balance_at, "loss": self.loss_at}.get(field)
-        return (field,) if knots is None else tuple(f"{field}{i + 1}" for i in range(len(knots)))
-
     def in_band(self, rows: Float[Array, "b r 4"], wavelength: Float[Array, " b"]) -> Float[Array, "b r 4"]:
         """Band-integrated rows of `seen` (or of their slopes) with balance and loss, at mean wavelengths (µm)."""
         whole, analysed = rows[:, 0], rows[:, 1]
         if self.loss is not None:
-            analysed = (1.0 - spline(self.loss_at, self.loss, wavelength))[:, None] * analysed
+            analysed = (1.0 - self.curve("loss", wavelength))[:, None] * analysed
         if self.balance is not None:
-            g = spline(self.balance_at, self.balance, wavelength)[:, None]
+            g = self.curve("balance", wavelength)[:, None]
             whole, analysed = whole + g * analysed, analysed + g * whole
         return jnp.stack([whole, analysed], axis=1)
 

@@ -17,8 +17,9 @@ Limits      no values: the identity. A spline with as many knots as bands takes 
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -34,8 +35,26 @@ from walop_jax.model.ray import Ray
 
 Scalar = Float[Array, ""]
 Curve = Float[Array, " k"]
-CURVES = ("delta", "diattenuation", "rotation", "loss", "spread")
 FIELD_TERMS = {f"p{i}{j}": n for n, (i, j) in enumerate(legendre.terms(2))}
+
+
+class WithCurves(Element):
+    """An element with curves over wavelength: values of a number at the wavelengths (µm) of that number with `_at`."""
+
+    def __check_init__(self) -> None:
+        for knots in dataclasses.fields(self):
+            if knots.name.endswith("_at"):
+                name = knots.name.removesuffix("_at")
+                check_curve(name, getattr(self, name), getattr(self, knots.name))
+
+    def labels(self, field: str) -> Sequence[str]:
+        """Values of a curve are numbered from 1, by wavelength."""
+        knots = getattr(self, f"{field}_at", None)
+        return (field,) if knots is None else tuple(f"{field}{i + 1}" for i in range(len(knots)))
+
+    def curve(self, name: str, wavelength: Float[Array, " n"]) -> Float[Array, " n"]:
+        """One of the curves that there are, at wavelengths (µm)."""
+        return spline(getattr(self, f"{name}_at"), getattr(self, name), wavelength)
 
 
 def check_curve(name: str, values: Curve | None, knots: Sequence[float]) -> None:
@@ -79,7 +98,7 @@ def _bends(x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
     return np.linalg.solve(left, right)
 
 
-class SpectralElement(Element):
+class SpectralElement(WithCurves):
     """A retarder, diattenuator and depolariser on one axis, each a smooth curve over wavelength."""
 
     delta: Curve | None = number(unit="rad", about="retardance at `delta_at`", default=None, several=True)
@@ -105,47 +124,26 @@ class SpectralElement(Element):
     kind: ClassVar[str] = "spectral"
     reference: ClassVar[str] = "van Harten, Snik & Keller 2009, PASP 121, 377"
 
-    def __check_init__(self) -> None:
-        for name in CURVES:
-            check_curve(name, getattr(self, name), getattr(self, f"{name}_at"))
-
-    def labels(self, field: str) -> Sequence[str]:
-        """Values of a curve are numbered from 1, by wavelength."""
-        if field not in CURVES:
-            return (field,)
-        return tuple(f"{field}{i + 1}" for i in range(len(getattr(self, f"{field}_at"))))
-
-    def curve(self, name: str, wavelength: Float[Array, " n"]) -> Float[Array, " n"]:
-        """One of the curves at wavelengths (µm), 0 where there is none."""
-        values = getattr(self, name)
-        return (
-            jnp.zeros_like(wavelength)
-            if values is None
-            else spline(getattr(self, f"{name}_at"), values, wavelength)
-        )
-
     def mueller(self, ray: Ray) -> Mueller | None:
         """The element at every wavelength."""
-        matrix, axis = None, jnp.deg2rad(self.axis)
+        return mueller.product(self._parts(ray))
+
+    def _parts(self, ray: Ray) -> Iterator[Mueller]:
+        axis = jnp.deg2rad(self.axis)
         if self.delta is not None:
-            matrix = mueller.retarder(self.curve("delta", ray.wavelength), axis)
+            yield mueller.retarder(self.curve("delta", ray.wavelength), axis)
         if self.spread is not None:
             kept, one = 1.0 - self.curve("spread", ray.wavelength), jnp.ones_like(ray.wavelength)
             own = jnp.stack([one, one, kept, kept], axis=-1)[:, :, None] * jnp.eye(4)
-            own = mueller.rotation(-axis) @ own @ mueller.rotation(axis)
-            matrix = own if matrix is None else own @ matrix
+            yield mueller.rotation(-axis) @ own @ mueller.rotation(axis)
         if self.diattenuation is not None:
             d = self.curve("diattenuation", ray.wavelength)
-            own = mueller.diattenuator(d * jnp.cos(2.0 * axis), d * jnp.sin(2.0 * axis))
-            matrix = own if matrix is None else own @ matrix
+            yield mueller.diattenuator(d * jnp.cos(2.0 * axis), d * jnp.sin(2.0 * axis))
         if self.rotation is not None:
-            own = mueller.rotation(-jnp.deg2rad(self.curve("rotation", ray.wavelength)))
-            matrix = own if matrix is None else own @ matrix
+            yield mueller.rotation(-jnp.deg2rad(self.curve("rotation", ray.wavelength)))
         if self.loss is not None:
             kept = 1.0 - self.curve("loss", ray.wavelength)
-            own = jnp.stack([jnp.ones_like(kept), kept, kept, kept], axis=-1)[:, :, None] * jnp.eye(4)
-            matrix = own if matrix is None else own @ matrix
-        return matrix
+            yield jnp.stack([jnp.ones_like(kept), kept, kept, kept], axis=-1)[:, :, None] * jnp.eye(4)
 
 
 class FieldDiattenuator(Element):

@@ -12,7 +12,7 @@ Limits      a plate without layers does nothing.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -52,10 +52,6 @@ class Layer(Component):
             raise ValueError(
                 f"there is no crystal {self.material!r}; {nearest(self.material, materials.CRYSTALS)}"
             )
-
-    def declarations(self) -> Mapping[str, Parameter]:
-        """Declarations of the instrument."""
-        return dict(self.declared)
 
     def labels(self, field: str) -> tuple[str, ...]:
         """The thickness has the name of the layer."""
