@@ -407,15 +407,18 @@ def p_errors(
     return np.sqrt(np.mean(variance, axis=1))
 
 
-def p_forms(matrix: Float[np.ndarray, "p 6"], stars: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "p n 6"]:
-    """δp = −e · M⁻¹ · (δm s) of every star as a linear form of the six elements."""
+def p_forms(
+    matrix: Float[np.ndarray, "p 6"], stars: Float[np.ndarray, "*b n 2"]
+) -> Float[np.ndarray, "p n 6"]:
+    """δp = −e · M⁻¹ · (δm s) of every star as a linear form of the six elements; the same stars (q, u), or of each."""
+    stars = np.broadcast_to(stars, (len(matrix), *stars.shape[-2:]))
     with np.errstate(divide="ignore", invalid="ignore"):
         (a, b), (c, d) = matrix[:, 1:3].T, matrix[:, 4:].T
         inverse = np.stack([np.stack([d, -b], -1), np.stack([-c, a], -1)], 1) / (a * d - b * c)[:, None, None]
-        along = stars / np.hypot(*stars.T)[:, None]
-        s = np.concatenate([np.ones((len(stars), 1)), stars], axis=1)
-        left = np.einsum("nc,pcr->pnr", along, inverse)
-        return np.einsum("pnr,ns->pnrs", left, s).reshape(len(matrix), len(stars), 6)
+        along = stars / np.hypot(stars[..., :1], stars[..., 1:])
+        s = np.concatenate([np.ones((*stars.shape[:2], 1)), stars], axis=2)
+        left = np.einsum("pnc,pcr->pnr", along, inverse)
+        return np.einsum("pnr,pns->pnrs", left, s).reshape(*stars.shape[:2], 6)
 
 
 def effect_slopes(

@@ -14,6 +14,10 @@ Protection  A calibration without the effect takes up a part of it: δθ = (Jᵀ
             largest error of q and u that the effect can make without being noticed. The level over all effects has a
             tenth on top (`SECOND_ORDER`): scattered light that is just detected does up to 8 % more than this.
 
+Conditions  A number c that the set states of itself and that is wrong by h is found where h² G reaches the
+            noncentrality of the test of `stated_conditions`. Stars are calibrated with a matrix that is off by
+            δθ ∂m/∂θ − h ∂m/∂c; the second term is there only where they are seen under the same condition (a filter).
+
 Symbols     J, C derivatives of the whitened residuals with respect to parameters and amplitude; m instrument matrix;
             z the normal quantile of `PROBABILITY`.
 Sources     Baarda 1968 (reliability: what a test finds, and what an error that it misses does to the result); Teunissen
@@ -33,11 +37,18 @@ from scipy import special
 from walop_jax.calibration.matrix import change_of_qu, effect_slopes, first_setting, matrix_slopes
 from walop_jax.diagnosis.candidates import Probe, applicable
 from walop_jax.diagnosis.candidates import probes as all_probes
-from walop_jax.diagnosis.condition_limits import condition_limits
-from walop_jax.diagnosis.examination import Examination, examine, most_points
-from walop_jax.diagnosis.limits_found import PROBABILITY, DetectionLimit, DetectionLimits, over_field
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.examination import ALARM, Examination, examine, most_points
+from walop_jax.diagnosis.limits_found import (
+    PROBABILITY,
+    ConditionLimit,
+    DetectionLimit,
+    DetectionLimits,
+    over_field,
+)
 from walop_jax.diagnosis.policy import POLICY
-from walop_jax.diagnosis.score import ScoreSpace, noncentrality, separations
+from walop_jax.diagnosis.score import ScoreSpace, local_p, noncentrality, separations
+from walop_jax.diagnosis.stated_conditions import STEP, condition_scores
 from walop_jax.diagnosis.trust import sampled
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.stand_in import on_field_points
@@ -219,3 +230,36 @@ def _nearest(columns: Sequence[_Column]) -> dict[str, float]:
         for name, value in column.rivals.items():
             found[name] = min(value, found.get(name, np.inf))
     return found
+
+
+# --------------------------------------------------------------------------------------------------- stated conditions
+
+
+def condition_limits(design: Design) -> tuple[ConditionLimit, ...]:
+    """A limit for every number that the set behind a fit states of itself."""
+    scored = condition_scores(design)
+    tried = sum(one.score.testable for one in scored)
+    if not tried:
+        return ()
+    result = design.fit
+    instrument, calset = result.model.instrument(result.values), result.calset
+    setting, x, y = first_setting(calset, instrument), calset.points.x, calset.points.y
+    matrix, slopes = matrix_slopes(instrument, setting, calset.filters, x, y)
+    taken_up = design.taken_up(np.column_stack([one.column for one in scored]))
+    off = slopes @ (result.model.selection() @ taken_up)
+    least = noncentrality(local_p(ALARM, tried), 1, PROBABILITY)
+    found = []
+    for number, (stated, score, _, square) in enumerate(scored):
+        slope = off[..., number]
+        if stated.seen_by_stars:
+            step = STEP * stated.width
+            above, below = (
+                matrix_slopes(instrument, setting, stated.changed(h).filters, x, y)[0] for h in (step, -step)
+            )
+            slope = slope - (above - below) / (2.0 * step)
+        # Of errors as stated, not of the residuals: a plan has none.
+        detected = float(np.sqrt(least / square)) if score.testable else np.inf
+        size = min(detected, stated.width)
+        error = over_field(change_of_qu(matrix, matrix + size * slope)[None])
+        found.append(ConditionLimit(stated.what, stated.unit, detected, size, error))
+    return tuple(found)

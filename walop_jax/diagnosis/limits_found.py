@@ -123,18 +123,7 @@ class DetectionLimits(Displayed):
         """Inverse of `document`. Raises KeyError or TypeError for one that it has not made."""
         protection = document["protection"]
         return cls(
-            limits=tuple(
-                DetectionLimit(
-                    effect=entry["effect"],
-                    parameter=entry["parameter"],
-                    unit=entry["unit"],
-                    detected=(float(entry["detected"][0]), float(entry["detected"][1])),
-                    named=np.inf if entry["named"] is None else float(entry["named"]),
-                    taken_for=tuple(entry["taken_for"]),
-                    error_of_qu=(_number(entry["error_of_qu"][0]), _number(entry["error_of_qu"][1])),
-                )
-                for entry in document["limits"]
-            ),
+            limits=_records(DetectionLimit, document["limits"], "named"),
             effects=tuple(document["effects"]),
             separation=np.array(document["separation"], float).reshape(2 * (len(document["effects"]),)),
             x=np.array(protection["x"], float),
@@ -142,16 +131,7 @@ class DetectionLimits(Displayed):
             protection=np.array(protection["error_of_qu"], float),
             caused_by=tuple(protection["caused_by"]),
             untestable=tuple(document["untestable"]),
-            conditions=tuple(
-                ConditionLimit(
-                    entry["what"],
-                    entry["unit"],
-                    np.inf if entry["detected"] is None else float(entry["detected"]),
-                    float(entry["size"]),
-                    (_number(entry["error_of_qu"][0]), _number(entry["error_of_qu"][1])),
-                )
-                for entry in document.get("conditions", ())
-            ),
+            conditions=_records(ConditionLimit, document.get("conditions", ()), "detected"),
         )
 
     def display(self) -> Display:
@@ -210,8 +190,16 @@ class DetectionLimits(Displayed):
         return int(np.nanargmax(self.protection)) if np.isfinite(self.protection).any() else None
 
 
-def _number(value: float | None) -> float:
-    return np.nan if value is None else float(value)
+def _records(kind: Any, entries: Any, endless: str) -> tuple[Any, ...]:
+    """Records from plain data, where numbers that are not finite are null: ∞ in the field `endless`, NaN in others."""
+
+    def value(name: str, found: Any) -> Any:
+        if isinstance(found, list):
+            return tuple(value(name, one) for one in found)
+        return (np.inf if name == endless else np.nan) if found is None else found
+
+    names = [field.name for field in dataclasses.fields(kind)]
+    return tuple(kind(**{name: value(name, entry[name]) for name in names}) for entry in entries)
 
 
 def over_field(errors: Float[np.ndarray, "c p"]) -> tuple[float, float]:

@@ -23,6 +23,7 @@ Limits      What the free parameters take up whole is told by no residual: with 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -48,7 +49,7 @@ from walop_jax.diagnosis.score import (
 )
 from walop_jax.fit.refit import NEARLY
 from walop_jax.fit.verdict import Hidden
-from walop_jax.io.text import value_and_error
+from walop_jax.io.text import with_error
 from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
@@ -276,9 +277,8 @@ def _priors(design: Design) -> Iterator[_Single]:
         texts = []
         for number, i in enumerate(elements[score.name]):
             p, mean, width = parameters[rows.index[i]], float(rows.mean[i]), float(rows.width[i])
-            sigma = float(np.sqrt(score.covariance[number, number])) * width
-            value, error = value_and_error(mean + float(score.amplitudes[number]) * width, sigma)
-            texts.append(f"{p.name} {value} ± {error} {p.unit}".rstrip() + f", not {mean:g} ± {width:g}")
+            found = _told(p.name, score, number, p.unit, mean, width)
+            texts.append(f"{found}, not {mean:g} ± {width:g}")
         return " with ".join(texts) + " (check what the model file knows of it)"
 
     for name, members in elements.items():
@@ -302,12 +302,9 @@ def _of_cameras(design: Design) -> Iterator[_Single]:
         column = project_flux(cube * measured.weight, measured.model, measured.known, measured.shared)
         rows = design.stacked([-column[measured.used].reshape(-1, 1)])
 
-        def said(score: Score) -> str:
-            size, sigma = float(score.amplitudes[0]), float(np.sqrt(score.covariance[0, 0]))
-            value, error = value_and_error(size, sigma)
-            return f"{words.format(names[k])} of {value} ± {error} {unit}".rstrip()
-
-        return _Single(Candidate(words.format(names[k]), rows, np.array([width])), said, width, unit)
+        name = words.format(names[k])
+        said = functools.partial(_told, f"{name} of", unit=unit)
+        return _Single(Candidate(name, rows, np.array([width])), said, width, unit)
 
     if not measured.used.any():
         return
@@ -349,18 +346,23 @@ def _effect_in_words(probe: Probe, score: Score, cameras: Sequence[str]) -> str:
     texts = [f"{n} {cameras[value] if n == 'camera' else value}" for n, value in choices.items()]
     sigmas = dict(zip(probe.parameters, np.sqrt(np.diag(score.covariance)), strict=True))
     for name, sigma in sigmas.items():
-        value, error = value_and_error(float(getattr(effect, name)), float(sigma))
-        texts.append(f"{name} {value} ± {error} {declared[name].unit}".rstrip())
+        value = with_error(float(getattr(effect, name)), float(sigma))
+        texts.append(f"{name} {value} {declared[name].unit}".rstrip())
     return f"{effect.name}, {', '.join(texts)}"
 
 
+def _told(
+    what: str, score: Score, number: int = 0, unit: str = "", start: float = 0.0, width: float = 1.0
+) -> str:
+    """An amplitude of a score in words, counted from `start` in units of `width`, with its standard error."""
+    sigma = float(np.sqrt(score.covariance[number, number])) * width
+    return f"{what} {with_error(start + float(score.amplitudes[number]) * width, sigma)} {unit}".rstrip()
+
+
 def _in_words(stated: _Stated, score: Score) -> str:
-    size, sigma = float(score.amplitudes[0]), float(np.sqrt(score.covariance[0, 0]))
     if stated.value is None:
-        value, error = value_and_error(size, sigma)
-        return f"{stated.what} changed by {value} ± {error} {stated.unit}".rstrip() + f" ({stated.remedy})"
-    value, error = value_and_error(stated.value + size, sigma)
-    found = f"{stated.what} {value} ± {error} {stated.unit}".rstrip()
+        return f"{_told(f'{stated.what} changed by', score, unit=stated.unit)} ({stated.remedy})"
+    found = _told(stated.what, score, unit=stated.unit, start=stated.value)
     return f"{found}, not {stated.value:g} ({stated.remedy})"
 
 
@@ -424,95 +426,65 @@ def _stated(calset: CalibrationSet) -> Iterator[_Stated]:
     if len(calset.points) > 1:
         yield from _of_field(calset)
     for name in calset.filters:
-        yield _Stated(
-            f"the wavelengths of filter {name}",
-            "um",
-            "check its curve, and what the polariser exposures were taken through",
-            0.05,
-            lambda step, name=name: _with_wavelength(calset, name, step),
-            seen_by_stars=True,
-        )
+        remedy = "check its curve, and what the polariser exposures were taken through"
+        moved = functools.partial(_with_wavelength, calset, name)
+        yield _Stated(f"the wavelengths of filter {name}", "um", remedy, 0.05, moved, seen_by_stars=True)
     e = calset.exposures
     for kind in np.unique(e.kind):
         chosen = (e.kind == kind) & np.isfinite(e.teff)
-        if not chosen.any():
-            continue
-        typical = float(np.median(e.teff[chosen]))
-        yield _Stated(
-            f"TEFF of exposures of kind {kind}",
-            "K",
-            "check the colour temperature of their light",
-            typical,
-            lambda step, chosen=chosen, typical=typical: with_exposures(
-                lambda e: dataclasses.replace(e, teff=e.teff * np.where(chosen, 1.0 + step / typical, 1.0))
-            )(calset),
-            typical if np.ptp(e.teff[chosen]) == 0.0 else None,
-        )
+        if chosen.any():
+            typical, remedy = float(np.median(e.teff[chosen])), "check the colour temperature of their light"
+            warmer = functools.partial(_moved, calset, chosen, "teff", e.teff / typical)
+            stated = typical if np.ptp(e.teff[chosen]) == 0.0 else None
+            yield _Stated(f"TEFF of exposures of kind {kind}", "K", remedy, typical, warmer, stated)
     yield from _of_sky(calset)
+
+
+def _moved(
+    calset: CalibrationSet, chosen: np.ndarray, column: str, by: float | np.ndarray, step: float
+) -> CalibrationSet:
+    """The set with a multiple of something added to a column of some of its exposures."""
+    values = getattr(calset.exposures, column)
+    values = np.where(chosen, values + step * by, values)
+    return with_exposures(lambda e: dataclasses.replace(e, **{column: values}))(calset)
 
 
 def _of_sky(calset: CalibrationSet) -> Iterator[_Stated]:
     """Mistakes in the place and the time of the sky, as the exposures and the site state them."""
     e, site = calset.exposures, calset.site
     moon = (e.kind == "moon") & np.isfinite(e.ra) & np.isfinite(e.dec)
-
-    def changed(**columns: np.ndarray) -> CalibrationSet:
-        return with_exposures(lambda e: dataclasses.replace(e, **columns))(calset)
-
     if moon.any():
-        at = "check RA and DEC: ICRS, of the centre of the field (docs: conventions)"
         by_year, across = _PRECESSION
-        along_ra = by_year + across * np.sin(np.deg2rad(e.ra)) * np.tan(
-            np.deg2rad(np.clip(e.dec, -80.0, 80.0))
-        )
+        north = np.tan(np.deg2rad(np.clip(e.dec, -80.0, 80.0)))
+        along_ra = by_year + across * np.sin(np.deg2rad(e.ra)) * north
         along_dec = across * np.cos(np.deg2rad(e.ra))
-        yield _Stated(
-            "the equinox of RA and DEC",
-            "",
-            "they are to be ICRS, not coordinates of date",
-            100.0,
-            lambda h: changed(
-                ra=np.where(moon, e.ra - h * along_ra, e.ra), dec=np.where(moon, e.dec - h * along_dec, e.dec)
-            ),
-            2000.0,
-        )
-        yield _Stated(
-            "RA of sky exposures",
-            "deg",
-            at,
-            5.0,
-            lambda h: changed(ra=np.where(moon, e.ra + h, e.ra)),
-        )
-        yield _Stated(
-            "DEC of sky exposures", "deg", at, 5.0, lambda h: changed(dec=np.where(moon, e.dec + h, e.dec))
-        )
-        yield _Stated(
-            "MJD of sky exposures",
-            "d",
-            "check the clock and the time zone: UTC at mid-exposure",
-            1.0,
-            lambda h: changed(mjd=np.where(moon, e.mjd + h, e.mjd)),
-        )
+
+        def of_date(step: float) -> CalibrationSet:
+            return _moved(_moved(calset, moon, "ra", -along_ra, step), moon, "dec", -along_dec, step)
+
+        remedy = "they are to be ICRS, not coordinates of date"
+        yield _Stated("the equinox of RA and DEC", "", remedy, 100.0, of_date, 2000.0)
+        at = "check RA and DEC: ICRS, of the centre of the field (docs: conventions)"
+        when = "check the clock and the time zone: UTC at mid-exposure"
+        for name, unit, width, remedy in (
+            ("RA", "deg", 5.0, at),
+            ("DEC", "deg", 5.0, at),
+            ("MJD", "d", 1.0, when),
+        ):
+            moved = functools.partial(_moved, calset, moon, name.lower(), 1.0)
+            yield _Stated(f"{name} of sky exposures", unit, remedy, width, moved)
         for name, width in (("longitude", 180.0), ("latitude", 90.0)):
-            yield _Stated(
-                f"the {name} of the site",
-                "deg",
-                "check the site in the header",
-                width,
-                lambda h, name=name: dataclasses.replace(
-                    calset, site=dataclasses.replace(site, **{name: getattr(site, name) + h})
-                ),
-                float(getattr(site, name)),
-            )
+            there = float(getattr(site, name))
+
+            def elsewhere(step: float, name: str = name, there: float = there) -> CalibrationSet:
+                return dataclasses.replace(calset, site=dataclasses.replace(site, **{name: there + step}))
+
+            remedy = "check the site in the header"
+            yield _Stated(f"the {name} of the site", "deg", remedy, width, elsewhere, there)
     for kind in np.unique(e.kind[np.isfinite(e.rotator)]):
-        chosen = e.kind == kind
-        yield _Stated(
-            f"ROTATOR of exposures of kind {kind}",
-            "deg",
-            "check its zero and its sense (docs: conventions)",
-            45.0,
-            lambda h, chosen=chosen: changed(rotator=np.where(chosen, e.rotator + h, e.rotator)),
-        )
+        remedy = "check its zero and its sense (docs: conventions)"
+        moved = functools.partial(_moved, calset, e.kind == kind, "rotator", 1.0)
+        yield _Stated(f"ROTATOR of exposures of kind {kind}", "deg", remedy, 45.0, moved)
 
 
 def _of_field(calset: CalibrationSet) -> Iterator[_Stated]:
@@ -525,14 +497,12 @@ def _of_field(calset: CalibrationSet) -> Iterator[_Stated]:
         ("the scale of X and Y", "", 1.0, (x, y)),
         ("the angle of the field", "rad", 1.0, (-y, x)),
     ):
-        yield _Stated(
-            what,
-            unit,
-            check,
-            width,
-            lambda h, a=along: with_places(lambda x, y: (x + h * a[0], y + h * a[1]))(calset),
-            along=along,
-        )
+        moved = functools.partial(_displaced, calset, along)
+        yield _Stated(what, unit, check, width, moved, along=along)
+
+
+def _displaced(calset: CalibrationSet, along: tuple[np.ndarray, np.ndarray], step: float) -> CalibrationSet:
+    return with_places(lambda x, y: (x + step * along[0], y + step * along[1]))(calset)
 
 
 def _with_wavelength(calset: CalibrationSet, name: str, step: float) -> CalibrationSet:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Set
 from typing import Any, NamedTuple
 
 import jax
@@ -61,39 +61,40 @@ def _followed(structure: Any, shapes: Shapes) -> tuple[Needs, tuple[bool, ...]]:
     return answer("light_path", structure, shapes, lambda: _follow(structure, shapes))
 
 
-def _follow(structure: Any, shapes: Shapes) -> tuple[Needs, tuple[bool, ...]]:
+def _asking(run: Callable[[Set[str]], Any]) -> tuple[Any, set[str]]:
+    """Result of a computation for which all is there that it asks for, and what that is."""
     asked: set[str] = set()
-    median = False
-
-    def run(*arrays: Array) -> tuple[Array, Array]:
-        instrument = jax.tree_util.tree_unflatten(structure, arrays)
-        plan = blank_plan(instrument, asked, median)
-        # Off the axis and at an odd place: a dependence must not vanish by symmetry in the operations that are written.
-        x, y = jnp.asarray(0.11), jnp.asarray(0.07)
-        rows = light.band_rows(instrument, plan, x, y)
-        each = jnp.zeros_like(plan.exposures.kind)
-        counts = light.counts(
-            instrument, plan, rows, instrument.throughput.at(x, y), x, y,
-            jnp.zeros((*each.shape, 2)), each - 1, each,
-        )  # fmt: skip
-        return rows, light.detected(instrument, plan.exposures, counts)
-
     while True:
         try:
-            program = jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(s, d) for s, d in shapes))
-            break
+            return run(asked), asked
         except NotPlannedError as missing:
-            if missing.quantity in asked or (missing.quantity == "median" and median):
+            if missing.quantity in asked:
                 raise
-            if missing.quantity == "median":
-                median = True
-            else:
-                asked.add(missing.quantity)
+            asked.add(missing.quantity)
+
+
+def _follow(structure: Any, shapes: Shapes) -> tuple[Needs, tuple[bool, ...]]:
+    def traced(asked: Set[str]) -> Any:
+        def run(*arrays: Array) -> tuple[Array, Array]:
+            instrument = jax.tree_util.tree_unflatten(structure, arrays)
+            plan = blank_plan(instrument, asked - {"median"}, "median" in asked)
+            # Off the axis and at an odd place: a dependence must not vanish by symmetry in the operations that are
+            # written.
+            x, y = jnp.asarray(0.11), jnp.asarray(0.07)
+            rows = light.band_rows(instrument, plan, x, y)
+            each = jnp.zeros_like(plan.exposures.kind)
+            throughput, sky = instrument.throughput.at(x, y), jnp.zeros((*each.shape, 2))
+            counts = light.counts(instrument, plan, rows, throughput, x, y, sky, each - 1, each)
+            return rows, light.detected(instrument, plan.exposures, counts)
+
+        return jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(s, d) for s, d in shapes))
+
+    program, asked = _asking(traced)
     patched = jax.eval_shape(lambda i: i.patched(), of_shapes(structure, shapes))
     parts = [*patched.elements, *(element for arm in patched.arms for element in arm.elements)]
     longest = max((part.path_difference for part in parts), default=0.0)
     rows, _ = program.jaxpr.outvars
-    return Needs(frozenset(asked), median, longest), _reaching(program, rows)
+    return Needs(frozenset(asked - {"median"}), "median" in asked, longest), _reaching(program, rows)
 
 
 def changed_elements(bare: Instrument, effect: Effect) -> tuple[Element, ...]:
@@ -107,8 +108,7 @@ def changed_elements(bare: Instrument, effect: Effect) -> tuple[Element, ...]:
 
 
 def _behind_polariser(instrument: Instrument) -> Iterator[Element]:
-    train = list(instrument.train())
-    yield from train[len(instrument.telescope()) + (instrument.polariser is not None) :]
+    yield from instrument.behind_polariser()
     for arm in instrument.arms:
         yield from (*arm.train(), arm.analyser)
 
@@ -125,22 +125,16 @@ def conditions_of_effect(bare: Instrument, effect: Effect) -> frozenset[str]:
 
 @functools.lru_cache(maxsize=1024)
 def _conditions_asked(structure: Any, shapes: Shapes) -> frozenset[str]:
-    asked: set[str] = set()
+    def evaluated(asked: Set[str]) -> Any:
+        def run(element: Element) -> tuple[Any, Any]:
+            one, zero = jnp.ones(1), jnp.zeros(())
+            conditions = Conditions(band_width=0.1 * one, planned=dict.fromkeys(asked, one))
+            ray = Ray.entering(zero, zero, (0.62 * one, conditions))
+            return element.ray(ray), element.mueller(ray)
 
-    def run(element: Element) -> tuple[Any, Any]:
-        one, zero = jnp.ones(1), jnp.zeros(())
-        conditions = Conditions(band_width=0.1 * one, planned=dict.fromkeys(asked, one))
-        ray = Ray.entering(zero, zero, (0.62 * one, conditions))
-        return element.ray(ray), element.mueller(ray)
+        return jax.eval_shape(run, of_shapes(structure, shapes))
 
-    while True:
-        try:
-            jax.eval_shape(run, of_shapes(structure, shapes))
-            return frozenset(asked)
-        except NotPlannedError as missing:
-            if missing.quantity in asked:
-                raise
-            asked.add(missing.quantity)
+    return frozenset(_asking(evaluated)[1])
 
 
 def _reaching(program: Any, result: Any) -> tuple[bool, ...]:

@@ -47,7 +47,7 @@ def page(topic: str, name: str) -> str:
             raise ValueError(f"there is no {topic} {name!r}; did you mean {meant}? ({every})")
         raise ValueError(f"{unknown_name(topic, name, known)} ({every})")
     made = _effect(known[name]) if topic == "effect" else _element(known[name])
-    return "\n".join(made).rstrip() + "\n"
+    return "\n\n".join(made) + "\n"
 
 
 def listed(topic: str) -> str:
@@ -94,11 +94,8 @@ def _about(kind: type[Any]) -> str:
 
 
 def _effect(effect: type[Effect]) -> Iterator[str]:
-    yield f"# {effect.name}"
-    yield ""
-    yield f"{_about(effect)}."
-    yield ""
-    yield from _indented(effect.head())
+    """The paragraphs of the page of an effect."""
+    yield from (f"# {effect.name}", f"{_about(effect)}.", *_indented(effect.head()))
     yield from _table(
         ("parameter", "unit", "usual size", "what it is"),
         [
@@ -109,21 +106,18 @@ def _effect(effect: type[Effect]) -> Iterator[str]:
     said = f"\n{effect.head()}"
     if effect.revealed_by and "\nRevealed" not in said:
         yield f"**Revealed by** {effect.revealed_by}."
-        yield ""
     found = numbers()
     one = found["effects"].get(effect.name)
     if one is not None:
         yield from _maps(one)
     yield "## How small it may be, and what it looks like"
-    yield ""
     if one is None:
         yield f"Not shown by the exposures of the example ({found['plan']}), or without an amplitude."
-        yield ""
     else:
-        yield from _sizes(one, found["plan"])
+        yield f"In a run of {found['plan']}:"
+        yield "\n".join(_sizes(one))
     if effect.separated_by:
         yield f"**Told apart by** {effect.separated_by}."
-        yield ""
     if effect.reference and "\nSource" not in said:
         yield f"Source: {effect.reference}."
 
@@ -131,21 +125,15 @@ def _effect(effect: type[Effect]) -> Iterator[str]:
 def _maps(one: Mapping[str, Any]) -> Iterator[str]:
     """Changes of the maps of the instrument matrix, at its usual size."""
     yield "## What it does to the maps"
-    yield ""
     size = f"{one['parameter']} = {one['usual']:g}{_unit(one)}"
-    seen = {name: value for name, value in one["maps"].items() if value >= _NOTHING}
-    if seen:
+    if any(value >= _NOTHING for value in one["maps"].values()):
         yield f"At {size} the elements of the instrument matrix change by (rms over the field, per cent)"
-        yield ""
         yield from _table(tuple(one["maps"]), [tuple(f"{value:.2g}" for value in one["maps"].values())])
     else:
         yield f"Nothing: at {size} it disturbs the calibration data, not the light of the stars."
-        yield ""
 
 
-def _sizes(one: Mapping[str, Any], plan: str) -> Iterator[str]:
-    yield f"In a run of {plan}:"
-    yield ""
+def _sizes(one: Mapping[str, Any]) -> Iterator[str]:
     least, most = one["found"]
     seldom = f", {most:.2g} in the shape that shows least" if most > 1.05 * least else ""
     yield f"- found, 99 times in 100, from {one['parameter']} = {least:.2g}{_unit(one)} on{seldom}"
@@ -157,7 +145,6 @@ def _sizes(one: Mapping[str, Any], plan: str) -> Iterator[str]:
     for rival, separation in one["rivals"]:
         verdict = "can be mistaken for" if separation < _UNSEEN else f"{separation:.1f} σ away from"
         yield f"- at the size from which it is found, {verdict} `{rival}`"
-    yield ""
 
 
 def _unit(one: Mapping[str, Any]) -> str:
@@ -165,19 +152,16 @@ def _unit(one: Mapping[str, Any]) -> str:
 
 
 def _element(kind: type[Element]) -> Iterator[str]:
-    yield f"# {kind.kind}"
-    yield ""
-    yield f"{_about(kind)}."
-    yield ""
-    yield from _indented(_head_text(kind).partition("\n")[2].strip("\n"))
+    """The paragraphs of the page of a kind of elements."""
+    head = _head_text(kind)
+    yield from (f"# {kind.kind}", f"{_about(kind)}.", *_indented(head.partition("\n")[2].strip("\n")))
     yield from _table(
         ("number", "unit", "what it is"), [(n, d.unit, d.about) for n, d in numbers_of(kind).items()]
     )
     changed = [effect.name for effect in EFFECTS if kind.kind and kind.kind in effect.head().lower()]
     if changed:
         yield f"Effects that speak of it: {', '.join(f'`{name}`' for name in changed)}."
-        yield ""
-    if kind.reference and "\nSource" not in _head_text(kind):
+    if kind.reference and "\nSource" not in head:
         yield f"Source: {kind.reference}."
 
 
@@ -190,13 +174,10 @@ def _head_text(kind: type[Any]) -> str:
 def _indented(head: str) -> Iterator[str]:
     """Equation and symbols, as they stand in the head of a file."""
     if head:
-        yield from (f"    {line}".rstrip() for line in head.splitlines())
-        yield ""
+        yield "\n".join(f"    {line}".rstrip() for line in head.splitlines())
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[str]:
     if rows:
-        yield f"| {' | '.join(head)} |"
-        yield f"|{' --- |' * len(head)}"
-        yield from (f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in rows)
-        yield ""
+        listed = [f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in rows]
+        yield "\n".join((f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}", *listed))

@@ -156,6 +156,10 @@ class Instrument(Component):
                 )
         return elements
 
+    def behind_polariser(self) -> tuple[Element, ...]:
+        """The elements behind the polariser, all where there is none."""
+        return tuple(self.train())[len(self.telescope()) + (self.polariser is not None) :]
+
     def source(self, name: str) -> Source:
         """A source by name; ValueError with the nearest names when there is none."""
         return _member(self.sources, name, "source")

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.model import fold, mueller
 from walop_jax.model.elements import Analyser, Element
@@ -53,10 +53,9 @@ def divided(instrument: Instrument) -> Train:
     Leading are the elements behind the polariser up to the first that moves, or that asks for the wavelength or for
     anything else that differs between exposures; which those are is found by asking them.
     """
-    elements, telescope = tuple(instrument.train()), instrument.telescope()
-    start = len(telescope) + (instrument.polariser is not None)
-    stop = start + _leading(*shapes_of(elements[start:]))
-    return Train(telescope, elements[start:stop], elements[stop:])
+    behind = instrument.behind_polariser()
+    count = _leading(*shapes_of(behind))
+    return Train(instrument.telescope(), behind[:count], behind[count:])
 
 
 @functools.lru_cache(maxsize=256)
@@ -256,22 +255,26 @@ def stokes(
     """
     instrument = instrument.patched()
     sight = _sight(instrument, Sight(exposures, sky, source, x, y))
-    nothing = jnp.zeros(exposures.kind.shape, bool)
-    qu, taken, indoors = jnp.zeros((*nothing.shape, 2)), nothing, nothing
+    taken = jnp.zeros(exposures.kind.shape, bool)
+    qu = jnp.zeros((*taken.shape, 2))
     for one in instrument.sources:
-        if not one.from_sky:
-            indoors = indoors | one.shines(sight)
         if type(one).polarisation is not Source.polarisation:
             seen = one.shines(sight) & ~taken
             qu, taken = jnp.where(seen[:, None], one.polarisation(sight), qu), taken | seen
     one, zero = jnp.ones_like(exposures.clp_angle), jnp.zeros_like(exposures.clp_angle)
     light = jnp.stack([one, qu[:, 0], qu[:, 1], zero], axis=-1)
     if instrument.telescope():
-        light = jnp.where(indoors[:, None], light, light @ telescope(instrument, x, y).T)
+        light = jnp.where(indoors(instrument, sight)[:, None], light, light @ telescope(instrument, x, y).T)
     polariser = instrument.polariser
     if polariser is None:
         return light
     return jnp.where(exposures.clp_in[:, None], polariser.light(exposures, x, y), light)
+
+
+def indoors(instrument: Instrument, sight: Sight) -> Bool[Array, " e"]:
+    """True for light that enters behind the telescope."""
+    sources = (source.shines(sight) for source in instrument.sources if not source.from_sky)
+    return functools.reduce(jnp.logical_or, sources, jnp.zeros(sight.source.shape, bool))
 
 
 def _sight(instrument: Instrument, sight: Sight) -> Sight:

@@ -81,9 +81,7 @@ class TrainPlace(NamedTuple):
 
 def trains(instrument: Instrument) -> tuple[tuple[Element, ...], tuple[tuple[Element, ...], ...]]:
     """The elements behind the polariser, and those of the arms, of an instrument without effects (`patched`)."""
-    elements = tuple(instrument.train())
-    start = len(instrument.telescope()) + (instrument.polariser is not None)
-    return elements[start:], tuple(tuple(arm.train()) for arm in instrument.arms)
+    return instrument.behind_polariser(), tuple(tuple(arm.train()) for arm in instrument.arms)
 
 
 def places(instrument: Instrument) -> dict[TrainPlace, int]:
@@ -524,10 +522,6 @@ def light_responses(
 
     value, push = jax.linearize(stokes, jnp.zeros(len(LIGHT)))
     sight = Sight(exposures, sky, source, x, y)
-    indoors = jnp.zeros(count, bool)
-    for one in instrument.sources:
-        if not one.from_sky:
-            indoors = indoors | one.shines(sight)
     through = exposures.clp_in if instrument.polariser is not None else jnp.zeros(count, bool)
     factor, share = jnp.ones((count, len(instrument.cameras))), jnp.zeros((count, len(instrument.cameras)))
     for part in instrument.cameras.exposures:
@@ -535,7 +529,11 @@ def light_responses(
         factor, share = factor * own, share * own + part.share(exposures, x, y)
     taken = (factor[..., None] * value[:, None]).at[..., 0].add(share)
     return LightResponses(
-        value, jax.vmap(push)(jnp.eye(len(LIGHT))), jnp.where(indoors | through, 0.0, 1.0), taken, factor
+        value,
+        jax.vmap(push)(jnp.eye(len(LIGHT))),
+        jnp.where(light.indoors(instrument, sight) | through, 0.0, 1.0),
+        taken,
+        factor,
     )
 
 

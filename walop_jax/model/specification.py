@@ -135,11 +135,6 @@ def series_indices(instrument: Instrument) -> Int[np.ndarray, " kt"]:
     return np.array([i for i, leaf in enumerate(leaves(instrument)) if leaf.part == THROUGHPUT], int)
 
 
-def make_template(instrument: Instrument) -> Instrument:
-    """The instrument with nothing but arrays in its tree."""
-    return jax.tree.map(jnp.asarray, instrument)
-
-
 def make_model(
     name: str,
     instrument: Instrument,
@@ -161,7 +156,7 @@ def make_model(
         raise unknown_name("parameter to tie to", master, names)
     for missing in [*priors, *(f for f in frozen if f not in names)]:
         raise unknown_name("parameter", missing, names)
-    return Model(name=name, template=make_template(instrument), parameters=tuple(parameters))
+    return Model(name=name, template=jax.tree.map(jnp.asarray, instrument), parameters=tuple(parameters))
 
 
 def effect_context(instrument: Instrument, exposures: Exposures) -> Context:
@@ -211,4 +206,6 @@ def with_effects(model: Model, effects: Sequence[str | type[Effect] | Effect], c
             prior = None if p.prior is None else (neutral, p.prior[1])
             known[p.name] = dataclasses.replace(p, start=start, prior=prior)
         parameters.append(known[p.name])
-    return dataclasses.replace(model, template=make_template(instrument), parameters=tuple(parameters))
+    return dataclasses.replace(
+        model, template=jax.tree.map(jnp.asarray, instrument), parameters=tuple(parameters)
+    )

@@ -33,9 +33,17 @@ from walop_jax.model.parameters import unknown_name
 from walop_jax.simulation.observing_plan import EXPOSED, OUT, ObservingPlan, Stop, is_plan, plan_of
 from walop_jax.sky.moon import altitude, body_direction
 
+Direction = Float[np.ndarray, "2 *e"] | tuple[Any, Any]
 DARK = -12.0  # altitude of the Sun (deg) below which the sky is dark enough for Moon and stars
 _FULL = 120.0  # distance of Moon and Sun (deg) from which the Moon is as good as full
 _SEARCHED, _STEP = 60.0, 1.0 / 24.0  # days in which a better time is looked for, and its steps
+
+
+def separation(one: Direction, other: Direction) -> Float[np.ndarray, "*e"]:
+    """Angle (deg) between directions: right ascension and declination (deg)."""
+    (a, d), (b, e) = np.deg2rad(one), np.deg2rad(other)
+    cosine = np.sin(d) * np.sin(e) + np.cos(d) * np.cos(e) * np.cos(a - b)
+    return np.asarray(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,10 +195,6 @@ class Could:
         seconds = {kind: tuple(np.atleast_1d(v).tolist()) for kind, v in content.pop("seconds", {}).items()}
         return cls(plan_of(content, folder), Costs(**costs), seconds, **own)
 
-    def without_angles(self) -> ObservingPlan:
-        """The plan with as little of the polariser as may be."""
-        return dataclasses.replace(self.plan, polariser_angles=(0.0,), plate=self.plan.plate[:1])
-
     def choices(self) -> tuple[tuple[CandidateExposure, ...], tuple[str, ...]]:
         """All choices, and in words what had to be left out, with what would do."""
         plan, notes = self.plan, []
@@ -250,8 +254,6 @@ class Could:
         mjd = self.plan.start + np.arange(0.0, _SEARCHED, _STEP)
         site = self.plan.site
         moon, sun = body_direction("moon", mjd, site), body_direction("sun", mjd, site)
-        (a, d), (b, c) = np.deg2rad(moon), np.deg2rad(sun)
-        apart = np.rad2deg(np.arccos(np.sin(d) * np.sin(c) + np.cos(d) * np.cos(c) * np.cos(a - b)))
         high = altitude(mjd, *moon, site) >= self.altitude + self.plan.separations[1]
-        good = np.flatnonzero(high & (altitude(mjd, *sun, site) < DARK) & (apart > _FULL))
+        good = np.flatnonzero(high & (altitude(mjd, *sun, site) < DARK) & (separation(moon, sun) > _FULL))
         return f"; mjd = {mjd[good[0]]:.2f} would do" if len(good) else "; choose another night (mjd)"

@@ -25,7 +25,7 @@ from walop_jax.data.user_tables import InputTable
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import rounded as digits
 from walop_jax.model.effects import Effect
-from walop_jax.plans.could import Could, Place
+from walop_jax.plans.could import Could, Place, separation
 from walop_jax.plans.exposures import DRAWS, Candidates, candidates, information_of
 from walop_jax.plans.optimal import (
     GAP,
@@ -460,7 +460,7 @@ def _ordered(found: Candidates, plan: Allocation) -> list[Line]:
     while sky:
         same = [line for line in sky if key(line) == key(sky[0])]
         last = done[-1] if done and done[-1] in where else same[0]
-        after = min(same, key=lambda line: _distance(where[last], where[line]))
+        after = min(same, key=lambda line: float(separation(where[last], where[line])))
         done.append(after)
         sky.remove(after)
     return done
@@ -475,13 +475,6 @@ def _pointings(found: Candidates, lines: list[Line]) -> list[tuple[float, float]
     return list(zip(exposures.ra.tolist(), exposures.dec.tolist(), strict=True))
 
 
-def _distance(one: tuple[float, float], other: tuple[float, float]) -> float:
-    """Angle (deg) between directions (deg)."""
-    (a, d), (b, e) = np.deg2rad(one), np.deg2rad(other)
-    cosine = np.sin(d) * np.sin(e) + np.cos(d) * np.cos(e) * np.cos(a - b)
-    return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
-
-
 def _changes(found: Candidates, lines: list[Line]) -> Iterator[float]:
     """Time (s) of what must be changed ahead of each line; what stands at the beginning is set up beforehand."""
     costs = found.could.costs
@@ -494,7 +487,7 @@ def _changes(found: Candidates, lines: list[Line]) -> Iterator[float]:
             time += costs.position * sum(choice.positions[p] != a for p, a in last.positions.items())
         if choice.kind in ("moon", "standard"):
             (here,) = _pointings(found, [line])
-            time += 0.0 if there is None else costs.slew * _distance(there, here)
+            time += 0.0 if there is None else costs.slew * float(separation(there, here))
             there = here
         last = choice
         yield time

@@ -3,7 +3,7 @@
 Error of p   of stars behind the calibration alone: δ(q, u) = −M⁻¹ (δm₁ + δM (q, u)), hence δp = −e · M⁻¹ δm s, linear
              in the six elements of δm and so in the parameters (`science.field_accuracy`). Mean square over stars with
              p ≤ 5 %, at points of the field, through every filter, for stars of some colours. Where |det M| is below
-             `LEAST_DETERMINANT` one exposure holds no u, and no plan of calibrations brings it back.
+             `SMALLEST_DETERMINANT` one exposure holds no u, and no plan of calibrations brings it back.
 Parameter    its variance, e.g. `collimator.curvature`.
 Stars        the error of p of the stars of a table.
 Apart        effects, whichever is there told from every other. Truth i of a known size, rival j with sizes and shapes
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from walop_jax.calibration.matrix import matrix_slopes
+from walop_jax.calibration.matrix import SMALLEST_DETERMINANT, matrix_slopes, p_forms, sample_stars
 from walop_jax.data.schema import Column
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import InputTable, numeric_column
@@ -29,11 +29,8 @@ from walop_jax.diagnosis.policy import POLICY
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.parameters import unknown_name
 from walop_jax.plans.exposures import Candidates
-from walop_jax.science.star_errors import sample_stars
-from walop_jax.simulation.observing_plan import ObservingPlan
 
 WORST, MEAN, APART = "worst", "mean", "apart"
-LEAST_DETERMINANT = 0.1
 _SURE = 1.645  # standard deviations above which 95 % of a normal distribution lie, below zero
 NAMED = _SURE + float(np.sqrt(_SURE**2 + 2.0 * POLICY.improbable))
 """Distance d (σ) from a rival of as many numbers at which a diagnosis names an effect in 95 of 100 sets: 5.7.
@@ -76,15 +73,13 @@ class FieldErrors:
     """Points of the field, filters and colours at which p is to be known, and how it depends on the parameters.
 
     `slopes` (draw, point, element, parameter) are the derivatives of the matrix, `forms` (draw, point, 6, 6) the
-    quadratic form that makes the mean square error of p of them, 0 where one exposure holds no u; `determinant`
-    (draw, point) is that of the matrix.
+    quadratic form that makes the mean square error of p of them, 0 where one exposure holds no u.
     """
 
     x: Float[np.ndarray, " p"]
     y: Float[np.ndarray, " p"]
     slopes: Float[np.ndarray, "r p 6 f"]
     forms: Float[np.ndarray, "r p 6 6"]
-    determinant: Float[np.ndarray, "r p"]
 
     @property
     def seen(self) -> Bool[np.ndarray, " p"]:
@@ -116,18 +111,13 @@ def field_errors(
     `stars` (q, u) are those over which the square is averaged, at all points or at each: those with p ≤ 5 %.
     """
     plan = found.could.plan
-    x, y = _grid(plan) if points is None else points
+    edge = np.linspace(-plan.field, plan.field, TARGET_GRID)
+    x, y = (np.tile(edge, TARGET_GRID), np.repeat(edge, TARGET_GRID)) if points is None else points
     light = sample_stars() if stars is None else stars
     parts = [_at(found, values, x, y, light, colours) for values in found.values]
-    slopes, forms, determinant = (np.stack(part) for part in zip(*parts, strict=True))
+    slopes, forms = (np.stack(part) for part in zip(*parts, strict=True))
     repeated = len(colours) * len(plan.filters)
-    return FieldErrors(np.tile(x, repeated), np.tile(y, repeated), slopes, forms, determinant)
-
-
-def _grid(plan: ObservingPlan) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    edge = np.linspace(-plan.field, plan.field, TARGET_GRID)
-    y, x = (a.ravel() for a in np.meshgrid(edge, edge, indexing="ij"))
-    return x, y
+    return FieldErrors(np.tile(x, repeated), np.tile(y, repeated), slopes, forms)
 
 
 def _at(
@@ -137,13 +127,10 @@ def _at(
     y: Float[np.ndarray, " p"],
     stars: Float[np.ndarray, "*b m 2"],
     colours: Sequence[float],
-) -> tuple[Float[np.ndarray, "t 6 f"], Float[np.ndarray, "t 6 6"], Float[np.ndarray, " t"]]:
+) -> tuple[Float[np.ndarray, "t 6 f"], Float[np.ndarray, "t 6 6"]]:
     model, plan = found.model, found.could.plan
     instrument, select = model.instrument(values), model.selection()
-    each = np.broadcast_to(stars, (len(x), *stars.shape[-2:]))
-    along = each / np.linalg.norm(each, axis=2, keepdims=True)
-    light = np.concatenate([np.ones((*each.shape[:2], 1)), each], axis=2)
-    slopes, forms, determinants = [], [], []
+    slopes, forms = [], []
     for name in plan.filters:
         for teff in colours:
             setting = dataclasses.replace(Settings.default(1, name), teff=np.array([teff]))
@@ -153,16 +140,12 @@ def _at(
                     f"{plan.name} does not measure q and u in one exposure: the error of p depends on how stars are "
                     "observed; plan for a parameter instead"
                 )
-            local = m[:, :, 1:]
-            determinant = np.linalg.det(local)
-            blind = np.abs(determinant) < LEAST_DETERMINANT
-            inverse = np.linalg.inv(np.where(blind[:, None, None], np.eye(2), local))
-            form = np.einsum("pnc,pcr,pns->pnrs", along, inverse, light).reshape(*each.shape[:2], 6)
-            square = np.einsum("pni,pnj->pij", form, form) / each.shape[1]
+            blind = np.abs(np.linalg.det(m[:, :, 1:])) < SMALLEST_DETERMINANT
+            form = p_forms(m.reshape(len(x), 6), stars)
+            square = np.einsum("pni,pnj->pij", form, form) / form.shape[1]
             forms.append(np.where(blind[:, None, None], 0.0, square))
             slopes.append(slope.reshape(len(x), 6, -1) @ select)
-            determinants.append(determinant)
-    return np.concatenate(slopes), np.concatenate(forms), np.concatenate(determinants)
+    return np.concatenate(slopes), np.concatenate(forms)
 
 
 def wanted(found: Candidates, field: FieldErrors | None, criterion: str | InputTable) -> Wanted:

@@ -28,7 +28,7 @@ from walop_jax.model.instrument import Instrument, adapted
 from walop_jax.model.parameters import field_declarations, leaves, unknown_name, values_of
 from walop_jax.model.plan import with_median
 from walop_jax.model.sources import Standards
-from walop_jax.model.specification import Model, make_model, make_template, series_indices
+from walop_jax.model.specification import Model, make_model, series_indices
 from walop_jax.simulation.observing_plan import EXPOSED, ObservingPlan
 
 Cube = Float[np.ndarray, "p e k"]
@@ -179,7 +179,7 @@ def simulate(
         nominal = adapted(plan.design, throughput_degree=plan.throughput_degree, throughput=LEVEL)
         instrument = draw_instrument(make_model(plan.name, nominal), build)
     active = in_order((*instrument.effects, *effects))
-    truth = make_template(dataclasses.replace(instrument.with_source(standards), effects=active))
+    truth = jax.tree.map(jnp.asarray, dataclasses.replace(instrument.with_source(standards), effects=active))
     blank = _without_light(plan, sources, seed, len(truth.cameras))
     expected = _expected(blank, truth, fluxes(plan, None if steady else sky))
     detector = PhotonNoise(plan.read_noise)

@@ -79,13 +79,9 @@ PARAMETER_KEYS = (
 EACH = ("camera", "moon exposure")
 
 
-def _analysers(instrument: Instrument) -> Iterator[str]:
-    return (f"{arm.name}.{arm.path[-1]}" for arm in instrument.arms)
-
-
-EVERY: Mapping[str, Callable[[Instrument], Iterator[str] | Sequence[str]]] = {
+EVERY: Mapping[str, Callable[[Instrument], Sequence[str]]] = {
     "camera": lambda instrument: instrument.cameras.names,
-    "analyser": _analysers,
+    "analyser": lambda instrument: [f"{arm.name}.{arm.path[-1]}" for arm in instrument.arms],
     "wave_plate": lambda instrument: instrument.places(WavePlate),
 }
 """Places that `every` stands for."""
