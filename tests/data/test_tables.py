@@ -9,7 +9,8 @@ from astropy.table import MaskedColumn, Table
 
 from walop_jax.data import DataError
 from walop_jax.data.catalogue import field_points
-from walop_jax.data.user_tables import read_input_table, write_output_table
+from walop_jax.data.user_tables import extended, read_input_table
+from walop_jax.io.plain_tables import write_table
 from walop_jax.model.instrument import nominal_instrument
 
 SOUTH = nominal_instrument("WALOP-SOUTH")
@@ -100,11 +101,11 @@ def test_columns_are_added(tmp_path, name):
     table["mag"] = MaskedColumn([12.0, 13.0], mask=[True, False])
     table.write(tmp_path / "p.fits")
     source = read_input_table(tmp_path / "p.fits")
-    write_output_table(tmp_path / name, source, {"M22": (np.array([1.0, np.nan]), "element")})
+    write_table(tmp_path / name, extended(source, {"M22": (np.array([1.0, np.nan]), "element")}))
     back = read_input_table(tmp_path / name)
     assert back.names == ("X", "Y", "MAG", "M22")
     np.testing.assert_array_equal(np.ma.filled(back.table["M22"], np.nan), [1.0, np.nan])
     with pytest.raises(DataError, match="exists already"):
-        write_output_table(tmp_path / name, source, {})
-    write_output_table(tmp_path / name, source, {}, overwrite=True)
+        write_table(tmp_path / name, extended(source, {}))
+    write_table(tmp_path / name, extended(source, {}), overwrite=True)
     assert "M22" in read_input_table(tmp_path / name).names

@@ -15,7 +15,7 @@ from walop_jax.calibration.matrix import matrices, matrix_draws
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.io.errors import DataError
-from walop_jax.io.plain_tables import write_columns
+from walop_jax.io.plain_tables import astropy_table, write_table
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.posterior import (
     Options,
@@ -147,7 +147,7 @@ def test_posterior_file_table_and_report(posterior: PosteriorSample, tmp_path: P
     assert (high - low) / (4 * sigma) == pytest.approx(1.0, abs=0.1)
     assert low < middle < high
     for name in ("posterior.fits", "posterior.ecsv"):
-        write_columns(tmp_path / name, columns, {"TRUSTED": True})
+        write_table(tmp_path / name, astropy_table(columns, {"TRUSTED": True}))
         table = read_input_table(tmp_path / name)
         assert {"NAME", "MEDIAN", "LOW68", "HIGH68", "LOW95", "HIGH95"} <= set(table.names)
     assert posterior.document()["trusted"] is True

@@ -11,7 +11,7 @@ import pytest
 from html_page import Page
 
 from walop_jax.io.errors import DataError
-from walop_jax.io.plain_tables import write_columns
+from walop_jax.io.plain_tables import astropy_table, write_table
 from walop_jax.io.text import probability, value_and_error, with_error
 from walop_jax.reports.page import render
 from walop_jax.reports.run import read_run
@@ -263,7 +263,7 @@ def test_a_sampled_run_shows_its_posterior(tmp_path):
     columns = {"NAME": (np.array(["pupil.magnification", "throughput.n0.p00"]), "", "")}
     columns |= {"UNIT": (np.array(["", "deg"]), "", "")}
     columns |= {name: (values, "", "") for name, values in zip(names, numbers.T, strict=True)}
-    write_columns(run / "posterior.ecsv", columns)
+    write_table(run / "posterior.ecsv", astropy_table(columns))
     page = Page(render(read_run(run)))
     shown = ["pupil.magnification", "15.751", "0.021", "", "15.709", "15.793", "812"]
     assert shown in page.rows

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from walop_jax.science.estimate import calibration_shift, estimate, estimate_by_arm
+from walop_jax.model.cameras import Cameras
+from walop_jax.science.estimate import calibration_shift, estimate
 
 # An ideal four-camera polarimeter, N_k = ½ F (1 ± q) and ½ F (1 ± u) per half, and one that holds no u.
 IDEAL = 0.25 * np.array([[1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1]], float)
@@ -157,9 +158,9 @@ def test_scale_and_order_do_not_matter():
 
 def test_arms_with_fluxes_of_their_own():
     """Whatever share of the light an arm gets, q is (N0 − N1)/(N0 + N1) and u is (N2 − N3)/(N2 + N3)."""
-    pairs = ((0, 1), (2, 3))
+    pairs = Cameras(("O1", "E1", "O2", "E2"), arms=((0, 1), (2, 3)), split=True)
     counts = np.array([[110.0, 90.0, 9500.0, 10500.0]])
-    found = estimate_by_arm(IDEAL[None], counts, np.full((1, 4), 3.0), np.zeros(1, int), pairs)
+    found = estimate(IDEAL[None], counts, np.full((1, 4), 3.0), np.zeros(1, int), pairs)
     np.testing.assert_allclose(found.qu, [[0.1, -0.05]], rtol=1e-9)
     assert found.dof.tolist() == [0]
     # For equal σ of N0 and N1: σ(q)² = 2 (1 + q²) σ² / (N0 + N1)².
@@ -170,11 +171,11 @@ def test_arms_with_fluxes_of_their_own():
     a = vectors(rng, 3)
     counts, sigma = observe(a, star, qu, rng.uniform(1e4, 1e6, 3))
     shares = np.repeat(rng.uniform(0.5, 2.0, (3, 2)), 2, axis=1)
-    found = estimate_by_arm(a, counts * shares, sigma, star, pairs)
+    found = estimate(a, counts * shares, sigma, star, pairs)
     np.testing.assert_allclose(found.qu, qu, atol=1e-10)
     # The gain is the shift of (q, u) for a change of the model: by a finite difference.
     change = 1e-6 * rng.standard_normal(a.shape)
-    moved = estimate_by_arm(a + change, counts * shares, sigma, star, pairs)
+    moved = estimate(a + change, counts * shares, sigma, star, pairs)
     s = np.concatenate([np.ones((3, 1)), qu[star]], axis=1)
     shift = calibration_shift(found.gain, np.einsum("rks,rs->rk", change, s)[..., None], star)[..., 0]
     np.testing.assert_allclose(moved.qu - found.qu, shift, rtol=0, atol=1e-10)

@@ -23,7 +23,7 @@ from walop_jax.fit.model_file import model_for
 from walop_jax.fit.refit import refit
 from walop_jax.fit.verdict import Doubt, Quality
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.science.epoch import chi2_of_change, epoch, fit_like, largest_change
+from walop_jax.science.epoch import MeasuredChange, epoch, fit_like
 from walop_jax.simulation.simulate import simulate
 
 
@@ -121,7 +121,8 @@ def test_certify_from_the_command_line(product, tmp_path):
 def test_departure_by_hand():
     """3-4-5: Δ = (3, 4) with unit errors, and a third parameter that nobody measured."""
     change, covariance = np.array([3.0, 4.0, 0.0]), np.diag([1.0, 1.0, 0.0])
-    assert chi2_of_change(change, covariance, np.array([1.0, 1.0, 1.0])) == (pytest.approx(25.0), 2)
+    found = MeasuredChange.of("abc", change, covariance, np.array([1.0, 1.0, 1.0]))
+    assert (found.chi2, found.directions) == (pytest.approx(25.0), 2)
 
 
 def test_an_instrument_that_has_not_changed_still_fits(first):
@@ -186,13 +187,13 @@ def test_one_number_that_has_changed_by_five_standard_errors_is_not_hidden_by_al
 def test_of_many_changes_the_largest_is_held_to_their_number():
     """By hand: of three independent changes 3 standard errors have p = 0.0027, and six are asked for."""
     unit = np.eye(3)
-    found = largest_change(["a", "b", "c"], np.array([0.5, -3.0, 1.0]), unit, np.ones(3))
+    found = MeasuredChange.of(["a", "b", "c"], np.array([0.5, -3.0, 1.0]), unit, np.ones(3)).largest()
     assert (found.name, found.asked) == ("b", 6)
     assert found.z == pytest.approx(-3.0)
     assert found.p_value == pytest.approx(1.0 - (1.0 - 0.0026998) ** 6, rel=1e-3)
     # Of two that hang together by 0.8 the one that has changed alone stands out further than it does by itself.
     pair = np.array([[1.0, 0.8], [0.8, 1.0]])
-    alone = largest_change(["a", "b"], np.array([3.0, 0.0]), pair, np.ones(2))
+    alone = MeasuredChange.of(["a", "b"], np.array([3.0, 0.0]), pair, np.ones(2)).largest()
     assert (alone.name, alone.alone) == ("a", True)
     assert alone.z == pytest.approx(3.0 / 0.6)
 

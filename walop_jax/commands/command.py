@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from walop_jax.commands import door
-from walop_jax.io.progress import Stage
+from walop_jax.io.progress import Stage, repeated
 
 if TYPE_CHECKING:
     from walop_jax.io.folder import OutputFolder
@@ -95,13 +95,9 @@ class Job:
         """The time since the command began."""
         return time.perf_counter() - self.began
 
-    @contextlib.contextmanager
-    def repeated(self) -> Iterator[Tell]:
+    def repeated(self) -> contextlib.AbstractContextManager[Tell]:
         """`progress`, told again where nothing new can be said for long."""
-        from walop_jax.io.progress import repeated
-
-        with repeated(self.progress) as say:
-            yield say
+        return repeated(self.progress)
 
     @contextlib.contextmanager
     def reserved(self, output: str | os.PathLike[str] | None, names: Sequence[str]) -> Iterator[Job]:
@@ -113,12 +109,6 @@ class Job:
 
         with output_folder(output, names, overwrite=self.overwrite) as folder:
             yield dataclasses.replace(self, folder=folder)
-
-    @property
-    def out(self) -> OutputFolder:
-        """The reserved folder, where there must be one."""
-        assert self.folder is not None
-        return self.folder
 
     def use_jax(self) -> None:
         """Switch JAX on, for commands that most often do without it."""
@@ -136,10 +126,6 @@ def figure_file(figure: Any) -> Callable[[Path], object]:
     return lambda path: figure.savefig(path, dpi=130)
 
 
-def _nothing() -> Writers:
-    return {}
-
-
 @dataclasses.dataclass(frozen=True)
 class Outcome(Generic[T]):
     """Result of a command: `value` for Python; the rest is worked out when it is asked for.
@@ -155,7 +141,7 @@ class Outcome(Generic[T]):
     value: T
     document: Callable[[], Any] | None = None
     text: Callable[[], str] | None = None
-    files: Callable[[], Writers] = _nothing
+    files: Callable[[], Writers] = dict
     saved_as: str = ""
     warnings: Sequence[str] = ()
     failure: str = ""
@@ -197,23 +183,26 @@ OLDER = {"catalogue": "effects", "estimator": "debias", "filter_name": "filter"}
 """Names that arguments have had, and have still."""
 
 
+@dataclasses.dataclass
 class Command(Generic[T]):
-    """A command: `function` is the Python function, `run` is what the program calls."""
+    """A command: `function` is the Python function, `run` is what the program calls.
 
-    def __init__(
-        self,
-        body: Callable[..., Outcome[T]],
-        stages: Sequence[str],
-        writes: Sequence[str] | Literal["file"] | None,
-        random: bool,
-        jax: bool,
-        given: Given | None,
-    ) -> None:
-        self.name, self.body = body.__name__, body
-        self.stages, self.writes, self.random, self.jax, self.given = stages, writes, random, jax, given
-        self.own = tuple(inspect.signature(body).parameters.values())[1:]
-        annotations = {p.name: door.annotation(body, p) for p in self.own}
-        notes = {name: getattr(found, "__metadata__", ()) for name, found in annotations.items()}
+    `stages` are those that its progress goes through, in their order; `writes` the files of its output folder, or
+    "file" if `output` is a single file; () if the body looks after its outputs itself. `random`: its seed matters.
+    `jax`: it computes. `given` may rearrange the arguments of a call in Python.
+    """
+
+    body: Callable[..., Outcome[T]]
+    stages: Sequence[str] = ()
+    writes: Sequence[str] | Literal["file"] | None = None
+    random: bool = False
+    jax: bool = True
+    given: Given | None = None
+
+    def __post_init__(self) -> None:
+        self.name = self.body.__name__
+        self.own = tuple(inspect.signature(self.body).parameters.values())[1:]
+        notes = {p.name: getattr(door.annotation(self.body, p), "__metadata__", ()) for p in self.own}
         self.options = {
             name: note for name, found in notes.items() for note in found if isinstance(note, Option)
         }
@@ -281,21 +270,12 @@ class Command(Generic[T]):
         return found
 
 
-def command(
-    *,
-    stages: Sequence[str] = (),
-    writes: Sequence[str] | Literal["file"] | None = None,
-    random: bool = False,
-    jax: bool = True,
-    given: Given | None = None,
-) -> Callable[[Callable[..., Outcome[T]]], Callable[..., T]]:
+def command(**options: Any) -> Callable[[Callable[..., Outcome[T]]], Callable[..., T]]:
     """Make a command of a body `(job, …) -> Outcome`: the Python function, with the command as its `command`.
 
-    `stages` are those that its progress goes through, in their order; `writes` the files of its output folder, or
-    "file" if `output` is a single file; () if the body looks after its outputs itself. `random`: its seed matters.
-    `jax`: it computes. `given` may rearrange the arguments of a call in Python.
+    `options` are the fields of `Command`.
     """
-    return lambda body: Command(body, stages, writes, random, jax, given).function
+    return lambda body: Command(body, **options).function
 
 
 def command_of(function: Callable[..., T]) -> Command[T]:

@@ -62,7 +62,7 @@ def compare(
     from walop_jax.data.catalogue import true_matrices
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.refit import refit
-    from walop_jax.io.plain_tables import write_columns
+    from walop_jax.io.plain_tables import astropy_table, write_table
     from walop_jax.paper.comparison import compare as comparison_of
     from walop_jax.reports import paper_figures
     from walop_jax.science.star_errors import Truth
@@ -92,8 +92,9 @@ def compare(
     def files() -> Writers:
         drawn = {name: getattr(paper_figures, f"{name}_figure")(found) for name in FIGURES}
         columns = {name: (values, "", about) for name, (values, about) in found.columns().items()}
+        table = astropy_table(columns, left_out_cards(lost))
         return {
-            TABLE: lambda path: write_columns(path, columns, left_out_cards(lost)),
+            TABLE: lambda path: write_table(path, table),
             **{f"comparison_{name}.png": figure_file(figure) for name, figure in drawn.items()},
         }
 

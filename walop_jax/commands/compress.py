@@ -15,7 +15,6 @@ from walop_jax.commands.inputs import (
     SetFile,
     Sets,
     in_bytes,
-    path_text,
     set_and_model,
 )
 from walop_jax.io.errors import fail
@@ -77,7 +76,7 @@ def compress(
     return Outcome(
         found,
         lambda: {
-            "output": path_text(output),
+            "output": output,
             "points": points,
             "pixels": record.pixels,
             "chi2": record.chi2,

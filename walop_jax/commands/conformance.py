@@ -106,13 +106,14 @@ def conformance(
 
 def _make(job: Job, folder: PathLike) -> int:
     """Write the questions, and a table of results to be filled in; return how many questions there are."""
+    from walop_jax.io.folder import output_folder
     from walop_jax.science.conformance import cases
 
     found = list(cases())
     given = [(c.name, key, NUMBER.format(v)) for c in found for key, v in c.given.items()]
     answers = [(c.name, key, NUMBER.format(v)) for c in found for key, v in c.answers.items()]
     head = ("CASE", "QUANTITY", "VALUE")
-    with job.reserved(folder, OUTPUTS) as reserved, reserved.out.filled() as there:
+    with output_folder(folder, OUTPUTS, overwrite=job.overwrite) as out, out.filled() as there:
         _write(there / CASES, ("CASE", "TOPIC", "QUESTION"), ((c.name, c.topic, c.question) for c in found))
         _write(there / GIVEN, head, given)
         _write(there / ANSWERS, head, answers)

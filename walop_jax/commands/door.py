@@ -46,10 +46,13 @@ WORDS = {
 class _Names(dict[str, Any]):
     """The names that an annotation may use: of its module, of Python, and the public ones, loaded when asked for.
 
-    Those that are imported for type checkers only, and are not public, stand for anything.
+    Those that are imported for type checkers only, and are not public, stand for anything; all do where `load` is not
+    wanted.
     """
 
-    load = True
+    def __init__(self, names: Mapping[str, Any], load: bool = True) -> None:
+        super().__init__(names)
+        self.load = load
 
     def __missing__(self, name: str) -> Any:
         import walop_jax
@@ -59,16 +62,11 @@ class _Names(dict[str, Any]):
         return getattr(walop_jax, name, Any) if self.load else Any
 
 
-class _Light(_Names):
-    """The same without loading anything."""
-
-    load = False
-
-
 def annotation(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
     """The annotation of a parameter, evaluated as far as it can be without loading anything heavy."""
     text = parameter.annotation
-    return eval(text, {}, _Light(vars(sys.modules[function.__module__]))) if isinstance(text, str) else text
+    names = _Names(vars(sys.modules[function.__module__]), load=False)
+    return eval(text, {}, names) if isinstance(text, str) else text
 
 
 def kind_in_short(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
@@ -102,23 +100,14 @@ def bound(
     try:
         found = signature.bind(*args, **kwargs)
     except TypeError as error:
-        raise TypeError(f"{name}: {error}; the arguments are {_listed(signature)}") from None
+        raise TypeError(f"{name}: {error}; the arguments are {', '.join(parameters)}") from None
     hints = {key: _kind(function, p) for key, p in parameters.items() if key in found.arguments}
-    several = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
-    wrong = {
-        key: value
-        for key, value in found.arguments.items()
-        if parameters[key].kind not in several
-        and value is not parameters[key].default
-        and not _fits(value, hints[key])
-    }
-    wrong |= {
-        key: value
-        for key in hints
-        if parameters[key].kind is inspect.Parameter.VAR_POSITIONAL
-        for value in found.arguments[key]
-        if not _fits(value, hints[key])
-    }
+    wrong = {}
+    for key, value in found.arguments.items():
+        p = parameters[key]
+        if p.kind is not inspect.Parameter.VAR_KEYWORD and value is not p.default:
+            several = value if p.kind is inspect.Parameter.VAR_POSITIONAL else (value,)
+            wrong.update((key, one) for one in several if not _fits(one, hints[key]))
     for key, value in wrong.items():
         swapped = [other for other in wrong if other != key and _fits(value, hints[other])]
         advice = f"; exchange {key} and {swapped[0]}" if swapped else ""
@@ -140,10 +129,6 @@ def checked(function: Callable[..., Any], name: str) -> Callable[..., Any]:
     return run
 
 
-def _listed(signature: inspect.Signature) -> str:
-    return ", ".join(signature.parameters)
-
-
 def _kind(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
     """The kind of argument that a parameter asks for; Any where that cannot be told."""
     found = parameter.annotation
@@ -163,8 +148,6 @@ def _fits(value: Any, kind: Any) -> bool:
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if kind is Any:
         return True
-    if origin is typing.Annotated:
-        return _fits(value, inner[0])
     if isinstance(kind, typing.ForwardRef):
         return True
     if origin in (typing.Union, types.UnionType):
@@ -211,8 +194,6 @@ def _described(value: Any) -> str:
 def _wanted(kind: Any) -> str:
     """A kind as a message names it."""
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
-    if origin is typing.Annotated:
-        return _wanted(inner[0])
     if origin in (typing.Union, types.UnionType):
         words = list(dict.fromkeys(_wanted(one) for one in inner if one is not types.NoneType))
         if "a path" in words and "a text" in words:

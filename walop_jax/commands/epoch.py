@@ -13,7 +13,6 @@ from walop_jax.commands.inputs import (
     PathLike,
     calibration_of,
     catalogue_of,
-    path_text,
     set_of,
 )
 from walop_jax.io.errors import errors_naming
@@ -95,7 +94,7 @@ def epoch(
         lambda: (
             {
                 "old": held.content_hash(),
-                "old_file": path_text(held.path),
+                "old_file": held.path,
                 "old_date": held.date,
                 "new": [entry.sha256 for entry in calset.inputs],
                 "new_files": [str(entry.path) for entry in calset.inputs],

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import PathLike, SetFile, path_text
+from walop_jax.commands.inputs import PathLike, SetFile
 from walop_jax.io.errors import nearest
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def import_zemax(
     if output is not None:
         write_calibration_set(output, made, overwrite=job.overwrite)
     document = {
-        "output": path_text(output),
+        "output": output,
         "instrument": made.instrument,
         "wavelengths": [float(curve.wavelength[0]) for curve in made.filters.values()],
         "exposures": len(made.exposures),

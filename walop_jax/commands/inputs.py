@@ -313,14 +313,16 @@ def table_outcome(
     `flag` are the bits of its rows: those `told` have a warning each, those `untold` are counted only. `lost` are the
     effects that could not be carried over, `more` goes into the document, `text` is given the counts.
     """
-    from walop_jax.data.user_tables import extended, write_output_table
+    from walop_jax.data.user_tables import extended
+    from walop_jax.io.plain_tables import write_table
 
     cards = {**cards, **left_out_cards(lost)}
+    made = extended(table, columns, cards)
     if output is not None:
-        write_output_table(output, table, columns, overwrite=job.overwrite, header=cards)
+        write_table(output, made, overwrite=job.overwrite)
     counts = {bit: int((flag & bit > 0).sum()) for bit in sorted((*told, *untold))}
     document = {
-        "output": path_text(output),
+        "output": output,
         "rows": table.rows,
         "trusted": held.verdict.trusted,
         "flags": {str(int(bit)): count for bit, count in counts.items()},
@@ -329,7 +331,7 @@ def table_outcome(
         **(more or {}),
     }
     return Outcome(
-        extended(table, columns, cards),
+        made,
         lambda: document,
         lambda: text(counts),
         warnings=(
@@ -339,8 +341,3 @@ def table_outcome(
             *(f"{table.path}: {counts[bit]} {sentence}" for bit, sentence in told.items() if counts[bit]),
         ),
     )
-
-
-def path_text(output: PathLike | None) -> str | None:
-    """A path as documents hold it; None where nothing is written."""
-    return None if output is None else str(output)

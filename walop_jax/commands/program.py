@@ -97,12 +97,9 @@ app = typer.Typer(
 
 def _show_version(wanted: bool) -> bool:
     if wanted:
-        from importlib.metadata import PackageNotFoundError, version
+        from walop_jax.io.code import versions_of
 
-        try:
-            typer.echo(version("walop-jax"))
-        except PackageNotFoundError:
-            typer.echo("unknown")
+        typer.echo(versions_of(["walop-jax"])["walop-jax"])
         raise typer.Exit
     return wanted
 

@@ -136,18 +136,19 @@ def _sampled_run(
 def _writers(product: Calibration, posterior: PosteriorSample) -> Writers:
     """The files of a sampled run."""
     from walop_jax.calibration import PRODUCT, write_calibration
-    from walop_jax.io.plain_tables import write_columns
+    from walop_jax.io.plain_tables import astropy_table, write_table
     from walop_jax.io.text import json_text
     from walop_jax.posterior import write_posterior
     from walop_jax.reports.named import FigureSource, draw
     from walop_jax.reports.posterior_figures import save_figure
 
     notes = {"TRUSTED": posterior.trusted, "STEPS": posterior.convergence.steps}
+    intervals = astropy_table(posterior.intervals(), notes)
     figures = FigureSource.of(posterior)
     writers: dict[str, Any] = {
         "posterior.nc": lambda path: write_posterior(path, posterior),
-        "posterior.fits": lambda path: write_columns(path, posterior.intervals(), notes),
-        "posterior.ecsv": lambda path: write_columns(path, posterior.intervals(), notes),
+        "posterior.fits": lambda path: write_table(path, intervals),
+        "posterior.ecsv": lambda path: write_table(path, intervals),
         "posterior_corner.png": lambda path: save_figure(path, draw("corner", figures)),
         "posterior_trace.png": lambda path: save_figure(path, draw("trace", figures)),
         "sample.json": lambda path: path.write_text(json_text(posterior.document()), encoding="utf-8"),

@@ -18,7 +18,6 @@ from walop_jax.commands.inputs import (
     SetFile,
     catalogue_of,
     design_of,
-    path_text,
 )
 from walop_jax.io.text import json_text
 
@@ -124,14 +123,14 @@ def simulate(
         if output is not None:
             write_calibration_set(output, made.calset, overwrite=job.overwrite)
     document = {
-        "output": path_text(output),
+        "output": output,
         "instrument": plan.name,
         "seed": job.seed,
         "exposures": len(made.calset.exposures),
         "points": len(made.calset.points),
         "rows": made.calset.intensities.rows,
         "effects": [one.name for one in hidden],
-        "truth": path_text(truth),
+        "truth": truth,
     }
     return Outcome(
         made,

@@ -208,7 +208,19 @@ def doubts_about(instrument: str, site: Site, exposures: Exposures, place: Place
     """
     if instrument in shipped():
         yield from _about_site(instrument, site, place)
-    yield from _about_dates(exposures, place)
+    where = f"{place.file} [EXPOSURES] MJD"
+    given = np.flatnonzero(np.isfinite(exposures.mjd))
+    if not len(given):
+        return
+    mjd = exposures.mjd[given]
+    if np.any(old := mjd < _OLDEST):
+        yield f"{where}: is before 1990 in {rows_text(given[old])}; write NaN where the time is not known"
+    middle = np.median(mjd)
+    if np.any(far := np.abs(mjd - middle) > _CAMPAIGN):
+        yield (
+            f"{where}: is more than {_CAMPAIGN:g} days from the median, {middle:.1f}, in {rows_text(given[far])}; "
+            "correct it, or calibrate the epochs one by one"
+        )
 
 
 def _about_site(instrument: str, site: Site, place: Place) -> Iterator[str]:
@@ -226,19 +238,3 @@ def _about_site(instrument: str, site: Site, place: Place) -> Iterator[str]:
                 f"{place.file} [PRIMARY] {card}: is {value:g}{unit}, {instrument} stands at {known:g}{unit}; "
                 "correct the card if the instrument has not been moved"
             )
-
-
-def _about_dates(exposures: Exposures, place: Place) -> Iterator[str]:
-    where = f"{place.file} [EXPOSURES] MJD"
-    given = np.flatnonzero(np.isfinite(exposures.mjd))
-    if not len(given):
-        return
-    mjd = exposures.mjd[given]
-    if np.any(old := mjd < _OLDEST):
-        yield f"{where}: is before 1990 in {rows_text(given[old])}; write NaN where the time is not known"
-    middle = np.median(mjd)
-    if np.any(far := np.abs(mjd - middle) > _CAMPAIGN):
-        yield (
-            f"{where}: is more than {_CAMPAIGN:g} days from the median, {middle:.1f}, in {rows_text(given[far])}; "
-            "correct it, or calibrate the epochs one by one"
-        )

@@ -71,52 +71,42 @@ class Column:
 
 _NAN = float("nan")
 _IDENTIFIER = Column("int", rules=(UNIQUE,))
-_TEFF = Column(
-    "float",
-    "K",
-    _NAN,
-    rules=(
-        Rule(
-            lambda teff: ~np.isnan(teff) & ~((teff >= 500) & (teff < 1e6)),
-            "is not a temperature of a source",
-            "in kelvin; NaN means a flat photon spectrum, as an empty cell of a text does",
-        ),
-    ),
+_OF_A_SOURCE = Rule(
+    lambda teff: ~np.isnan(teff) & ~((teff >= 500) & (teff < 1e6)),
+    "is not a temperature of a source",
+    "in kelvin; NaN means a flat photon spectrum, as an empty cell of a text does",
 )
-_ANGLE = Column(
-    "float", "deg", _NAN, rules=(within(36000.0, "encoder readings are in degrees: are these steps?"),)
+_TIME = Rule(lambda time: (time < 0) | np.isinf(time), "is not a time", "seconds; NaN where it is not known")
+_POSITIVE = Rule(
+    lambda error: ~(error > 0) | np.isinf(error),
+    "is not a positive number",
+    "it is the width of a prior: give the error of the catalogue",
 )
+_NUMBERED = Rule(lambda number: number < 0, "is negative", "−1 means no source; number from 0")
+
+
+def _number(unit: str, *rules: Rule) -> Column:
+    """A number for each exposure, NaN where it is not known."""
+    return Column("float", unit, _NAN, rules=rules)
+
+
+_TEFF = _number("K", _OF_A_SOURCE)
+_ANGLE = _number("deg", within(36000.0, "encoder readings are in degrees: are these steps?"))
 EXPOSURES: Mapping[str, Column] = {
     "EXPOSURE": _IDENTIFIER,
     "KIND": Column("str"),
-    "MJD": Column("float", "d", _NAN),
-    "EXPTIME": Column(
-        "float",
-        "s",
-        _NAN,
-        rules=(
-            Rule(
-                lambda time: (time < 0) | np.isinf(time),
-                "is not a time",
-                "seconds; NaN where it is not known",
-            ),
-        ),
-    ),
+    "MJD": _number("d"),
+    "EXPTIME": _number("s", _TIME),
     "FILTER": Column("str", missing="SDSS-r"),
     "CLP_IN": Column("bool"),
     "CLP_ANGLE": _ANGLE,
     "CHWP_IN": Column("bool", missing=False),
     "CHWP_ANGLE": _ANGLE,
-    "TEMP": Column(
-        "float",
-        "Celsius",
-        _NAN,
-        rules=(within(150.0, "temperatures are in degrees Celsius: are these kelvin?"),),
-    ),
-    "HA": Column("float", "h", _NAN, rules=(within(24.0, "hour angles are in hours: are these degrees?"),)),
-    "RA": Column("float", "deg", _NAN, rules=(within(360.0, "right ascensions are in degrees"),)),
-    "DEC": Column("float", "deg", _NAN, rules=(within(90.0, "declinations are in degrees"),)),
-    "ROTATOR": Column("float", "deg", _NAN, rules=(within(3600.0, "position angles are in degrees"),)),
+    "TEMP": _number("Celsius", within(150.0, "temperatures are in degrees Celsius: are these kelvin?")),
+    "HA": _number("h", within(24.0, "hour angles are in hours: are these degrees?")),
+    "RA": _number("deg", within(360.0, "right ascensions are in degrees")),
+    "DEC": _number("deg", within(90.0, "declinations are in degrees")),
+    "ROTATOR": _number("deg", within(3600.0, "position angles are in degrees")),
     "TEFF": _TEFF,
 }
 _COORDINATE = Column("float", "deg", rules=(finite("remove these points"),))
@@ -130,31 +120,11 @@ INTENSITIES: Mapping[str, Column] = {
     "N_ERR": _COUNTS,
     "FLAG": Column("int", missing=0),
 }
-_FRACTION = Column(
-    "float",
-    rules=(
-        finite("remove the source"),
-        within(1.0, "fractions are wanted: are these per cent?", "exceeds 1"),
-    ),
-)
-_ERROR = Column(
-    "float",
-    rules=(
-        Rule(
-            lambda error: ~(error > 0) | np.isinf(error),
-            "is not a positive number",
-            "it is the width of a prior: give the error of the catalogue",
-        ),
-    ),
-)
+_SHARE = within(1.0, "fractions are wanted: are these per cent?", "exceeds 1")
+_FRACTION = Column("float", rules=(finite("remove the source"), _SHARE))
+_ERROR = Column("float", rules=(_POSITIVE,))
 SOURCES: Mapping[str, Column] = {
-    "SOURCE": Column(
-        "int",
-        rules=(
-            UNIQUE,
-            Rule(lambda number: number < 0, "is negative", "−1 means no source; number from 0"),
-        ),
-    ),
+    "SOURCE": Column("int", rules=(UNIQUE, _NUMBERED)),
     "NAME": Column("str"),
     "Q": _FRACTION,
     "U": _FRACTION,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 from typing import Any
 
 import numpy as np
@@ -19,33 +21,30 @@ _SPOILT = 0.2
 """Above this share of unusable rows the set is refused, not masked."""
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
 class TableIntensities(Intensities):
     """One row per (exposure, point), in the order of the file.
 
-    `exposure`, `point` and `source` are rows of the calibration set's tables (`source` −1: none), `counts`
-    and `sigma` electrons as in the file, `flag` its bits, `used` which rows take part.
+    `exposures` is their number in the set; `exposure`, `point` and `source` are rows of its tables (`source` −1: none),
+    `counts` and `sigma` electrons as in the file, `flag` its bits, `used` which rows take part.
     """
 
-    def __init__(
-        self,
-        exposures: int,
-        points: Points,
-        *,
-        exposure: Int[np.ndarray, " r"],
-        point: Int[np.ndarray, " r"],
-        source: Int[np.ndarray, " r"],
-        counts: Float[np.ndarray, "r k"],
-        sigma: Float[np.ndarray, "r k"],
-        flag: Int[np.ndarray, " r"],
-        used: Bool[np.ndarray, " r"],
-    ) -> None:
-        self.exposures = exposures
-        self.points = points
-        self.exposure, self.point, self.source = exposure, point, source
-        self.counts, self.sigma, self.flag, self.used = counts, sigma, flag, used
-        good = np.flatnonzero(used)
-        self._order = good[np.argsort(point[good], kind="stable")]
-        self._bounds = np.searchsorted(point[self._order], np.arange(len(points) + 1))
+    exposures: int
+    points: Points
+    exposure: Int[np.ndarray, " r"]
+    point: Int[np.ndarray, " r"]
+    source: Int[np.ndarray, " r"]
+    counts: Float[np.ndarray, "r k"]
+    sigma: Float[np.ndarray, "r k"]
+    flag: Int[np.ndarray, " r"]
+    used: Bool[np.ndarray, " r"]
+
+    @functools.cached_property
+    def _by_point(self) -> tuple[Int[np.ndarray, " u"], Int[np.ndarray, " b"]]:
+        """Used rows in the order of the points, and where each point begins among them."""
+        good = np.flatnonzero(self.used)
+        order = good[np.argsort(self.point[good], kind="stable")]
+        return order, np.searchsorted(self.point[order], np.arange(len(self.points) + 1))
 
     @classmethod
     def dense(cls, points: Points, block: Block) -> TableIntensities:
@@ -66,32 +65,18 @@ class TableIntensities(Intensities):
     @classmethod
     def of(cls, intensities: Intensities, points: Points) -> TableIntensities:
         """The intensities of all `points` as a table: as they are, or the used part of any others."""
-        return (
-            intensities
-            if isinstance(intensities, cls)
-            else cls.dense(points, intensities.block(0, len(points)))
-        )
+        if isinstance(intensities, cls):
+            return intensities
+        return cls.dense(points, intensities.block(0, len(points)))
 
     def using(self, used: Bool[np.ndarray, " r"]) -> TableIntensities:
         """Return the same rows with another choice of which take part."""
-        return self._with(self.flag, used)
+        return dataclasses.replace(self, used=used)
 
     def flagged(self, rows: Bool[np.ndarray, " r"], flag: DataFlag) -> TableIntensities:
         """Return the same rows, of which some have a further flag and take no part."""
-        return self._with(self.flag | np.where(rows, int(flag), 0), self.used & ~rows)
-
-    def _with(self, flag: Int[np.ndarray, " r"], used: Bool[np.ndarray, " r"]) -> TableIntensities:
-        return TableIntensities(
-            self.exposures,
-            self.points,
-            exposure=self.exposure,
-            point=self.point,
-            source=self.source,
-            counts=self.counts,
-            sigma=self.sigma,
-            flag=flag,
-            used=used,
-        )
+        flags = self.flag | np.where(rows, int(flag), 0)
+        return dataclasses.replace(self, flag=flags, used=self.used & ~rows)
 
     @property
     def cameras(self) -> int:
@@ -101,13 +86,14 @@ class TableIntensities(Intensities):
     @property
     def rows(self) -> int:
         """Number of used rows."""
-        return len(self._order)
+        return len(self._by_point[0])
 
     def block(self, start: int, stop: int) -> Block:
         """Return the data of the field points `start:stop`, dense in the exposures."""
         start, stop, _ = slice(start, stop).indices(len(self.points))
         stop = max(start, stop)
-        rows = self._order[self._bounds[start] : self._bounds[stop]]
+        order, bounds = self._by_point
+        rows = order[bounds[start] : bounds[stop]]
         x, y = self.points.x[start:stop], self.points.y[start:stop]
         block = empty_block(x, y, self.exposures, self.cameras)
         at = (self.point[rows] - start, self.exposure[rows])

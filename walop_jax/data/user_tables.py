@@ -19,7 +19,7 @@ from jaxtyping import Float
 from walop_jax.data.schema import Column, Place, converted, distinct
 from walop_jax.io.errors import DataError, fail, rows_text
 from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits
-from walop_jax.io.plain_tables import table_format, write_table
+from walop_jax.io.plain_tables import table_format
 from walop_jax.io.text import check_input
 
 _TRUTH = dict.fromkeys(("true", "t", "1", "1.0", "yes"), 1.0) | dict.fromkeys(
@@ -185,25 +185,12 @@ def _from_text(text: np.ndarray, truth: bool, name: str, place: Place) -> Float[
     return numbers
 
 
-def write_output_table(
-    path: str | os.PathLike[str],
-    source: InputTable,
-    added: Mapping[str, Any],
-    *,
-    overwrite: bool = False,
-    header: Mapping[str, Any] | None = None,
-) -> None:
-    """Write a table with columns added (an old column of that name is replaced), in the format of the name.
+def extended(source: InputTable, added: Mapping[str, Any], header: Mapping[str, Any] | None = None) -> Any:
+    """A copy of a table with columns added (an old column of that name is replaced), an astropy table.
 
     A value of `added` is an array, alone or with its description and its unit; `header` adds to the header of
-    the table (CSV has none). The file appears whole or not at all. Raises `DataError` as `atomic_path` does, and
-    for an unknown extension.
+    the table (CSV has none).
     """
-    write_table(path, extended(source, added, header), overwrite=overwrite)
-
-
-def extended(source: InputTable, added: Mapping[str, Any], header: Mapping[str, Any] | None = None) -> Any:
-    """A copy of a table with columns added as for `write_output_table`, an astropy table."""
     table = source.table.copy(copy_data=False)
     for key in [key for key in table.meta if key.upper() in ("CHECKSUM", "DATASUM", "EXTNAME")]:
         del table.meta[key]

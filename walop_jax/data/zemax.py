@@ -39,7 +39,7 @@ from walop_jax.data import schema
 from walop_jax.data.calset import assembled
 from walop_jax.data.records import CalibrationSet, DataFlag, Site
 from walop_jax.instruments.description import described, shipped
-from walop_jax.io.errors import DataError, fail, nearest
+from walop_jax.io.errors import DataError, fail
 from walop_jax.io.text import check_input
 
 HEADING = "Polarization Transmission Data"
@@ -248,15 +248,11 @@ def import_transmissions(
     camera are left out, exposures and points without any row too. MJD has no meaning, but tells exposures apart.
     N_ERR is the share `error` of N, at least the rounding of what is printed. `remarks` say what was left out.
 
-    `instrument` is by default the one that the titles of the exports name; `configurations` are those of the
-    cameras O1, E1, O2, E2; `tell` is told of the progress. Each file is read once.
+    `instrument` is a shipped one, by default that which the titles of the exports name; `configurations` are those of
+    the four cameras O1, E1, O2, E2; `tell` is told of the progress. Each file is read once.
 
     Raises `DataError` as `read_export` does, for data that are there twice, and if nothing can be made of them.
     """
-    if len(set(configurations)) != 4:
-        raise fail(
-            f"{list(configurations)} are not four cameras", advice="give the configurations of O1, E1, O2, E2"
-        )
     exports, remarks = _exports(Path(folder), tell)
     instrument = _instrument(exports, instrument, Path(folder), remarks)
     angles = np.array(sorted({export.angle for export in exports}))
@@ -338,8 +334,6 @@ def _instrument(
     if wanted is None:
         raise fail(f"the titles name {len(named)} instruments ({', '.join(titles)})", file=folder,
                    advice=f"say which it is: --instrument {' or '.join(shipped())}")  # fmt: skip
-    if wanted.upper() not in shipped():
-        raise fail(f"there is no instrument {wanted!r}", advice=nearest(wanted, shipped()))
     if named - {wanted.upper()}:
         remarks.append(
             f"{folder}: the titles name {', '.join(sorted(named))}, {wanted.upper()} was asked for"

@@ -89,20 +89,6 @@ def astropy_table(
     )
 
 
-def write_columns(
-    path: str | os.PathLike[str],
-    columns: Mapping[str, tuple[np.ndarray, str, str]],
-    notes: Mapping[str, str | int | float | bool] | None = None,
-    *,
-    overwrite: bool = False,
-) -> None:
-    """Write columns given as (values, unit, description), with notes in the header; whole or not at all.
-
-    The format follows the name. Raises `DataError` as `atomic_path` does, and for an unknown extension.
-    """
-    write_table(path, astropy_table(columns, notes), overwrite=overwrite)
-
-
 def write_table(path: str | os.PathLike[str], table: Table, *, overwrite: bool = False) -> None:
     """Write an astropy table in the format of the name; whole or not at all.
 

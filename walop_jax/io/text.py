@@ -75,15 +75,11 @@ def probability(p: float | None) -> str:
     if p is None or not math.isfinite(p):
         return "unknown"
     if p < _TINY:
-        return f"< {_power(_TINY)}"
+        return "< 10⁻¹⁵"
     if p >= 1e-3:
         return f"= {p:.2g}"
     mantissa, exponent = f"{p:.1e}".split("e")
     return f"= {mantissa} × 10{str(int(exponent)).translate(RAISED)}"
-
-
-def _power(value: float) -> str:
-    return "10" + str(round(math.log10(value))).translate(RAISED)
 
 
 # ---------------------------------------------------------------------------------------------------------------- files
@@ -139,14 +135,17 @@ def json_text(value: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """The value with mappings as dicts, sequences as lists, numbers that are not finite as None, texts `printable`."""
+    """The value with mappings as dicts, sequences as lists, numbers that are not finite as None, texts `printable`.
+
+    Paths are texts.
+    """
     if isinstance(value, dict):
         return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [plain(entry) for entry in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    return printable(value) if isinstance(value, str) else value
+    return printable(os.fspath(value)) if isinstance(value, str | os.PathLike) else value
 
 
 def printable(text: str) -> str:

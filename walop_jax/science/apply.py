@@ -29,7 +29,7 @@ from walop_jax.model import light
 from walop_jax.model.dependence import reported
 from walop_jax.model.parameters import with_values
 from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, check_catalogue
-from walop_jax.science.estimate import Estimate, calibration_shift, estimate_with
+from walop_jax.science.estimate import Estimate, calibration_shift, estimate
 from walop_jax.science.star_residuals import StarResiduals
 
 MOST_SETTINGS = 200
@@ -164,7 +164,7 @@ class _Application:
         there = np.einsum("rc,rcks->rks", colour_weights(teff, COLOURS), spectra)
         used = np.where(outside[:, None], np.nan, counts)
         on_sky = _vectors_on_sky(there, turn)
-        found = estimate_with(vectors.instrument.cameras, on_sky, used, sigma, star)
+        found = estimate(on_sky, used, sigma, star, vectors.instrument.cameras)
 
         s = _instrument_stokes(found.qu[star], turn)
         # Of the model per unit flux, to the plain parameters and to the throughputs.

@@ -33,6 +33,7 @@ from walop_jax.science.star_residuals import (
     StarResiduals,
     chance_of_scale,
     eliminated,
+    inverse_root,
     is_off,
     noise_scale,
     normal_matrix,
@@ -363,12 +364,8 @@ class _Search:
         """Residuals behind changes of all columns."""
         if not sizes.any():
             return self.stars.residual
-        amounts, out = self.mixing @ sizes, []
-        first = self.stars.first
-        for here, part in self.stars.blocks():
-            rows = slice(first[here.start], first[here.start] + len(part))
-            out.append(self.stars.residual[rows] - part.left(self._columns(part) @ amounts))
-        return np.concatenate(out)
+        amounts = self.mixing @ sizes
+        return self.stars.behind(self.stars.residual, lambda part, _: self._columns(part) @ amounts)
 
     def _looked(self, sizes: Float[np.ndarray, " c"]) -> _Look:
         """Scales, Q and g (priors included) with these changes taken away."""
@@ -447,7 +444,8 @@ class _Search:
         fitted = np.array([*chosen, *range(self.asked, len(sizes))])
         for _ in range(_ROUNDS):
             matrix = look.matrix[np.ix_(fitted, fitted)]
-            step = _solved(matrix, look.score[fitted])
+            root = inverse_root(matrix)
+            step = root @ (root.T @ look.score[fitted])
             if step @ matrix @ step < _SETTLED**2:
                 break
             sizes = sizes.copy()
@@ -512,11 +510,3 @@ def _chance_beside(rows: Scale, noise: Scale) -> float:
     if rows.worth <= 0 or noise.worth <= 0:
         return 1.0
     return float(special.fdtrc(rows.worth, noise.worth, rows.value / noise.value))
-
-
-def _solved(matrix: Float[np.ndarray, "c c"], score: Float[np.ndarray, " c"]) -> Float[np.ndarray, " c"]:
-    scale = np.sqrt(np.clip(np.diag(matrix), 1e-300, None))
-    value, vector = np.linalg.eigh(matrix / np.outer(scale, scale))
-    good = value > 1e-10 * value[-1]
-    along = vector[:, good]
-    return along @ ((along.T @ (score / scale)) / value[good]) / scale

@@ -186,8 +186,8 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
     both = before @ (after / width[:, None] ** 2)
     covariance = before + after - both - both.T
     sigma = np.sqrt(np.diag(before + after))
-    test, directions = chi2_of_change(change, covariance, sigma)
-    largest = largest_change(names, change, covariance, sigma)
+    measured = MeasuredChange.of(names, change, covariance, sigma)
+    test, directions, largest = measured.chi2, measured.directions, measured.largest()
     values = new.values.copy()
     values[b] = old.values[a]
     error = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
@@ -222,49 +222,44 @@ def shared_parameters(old: Model, new: Model) -> list[str]:
     return [name for name in new.names if name in free[0] & free[1] and new[name].part not in SKY_AND_STARS]
 
 
-class _Measured(NamedTuple):
-    """A change in units of `sigma`, for the parameters that were known at all, and V⁻¹ over what was measured of it."""
+class MeasuredChange(NamedTuple):
+    """A change in units of `sigma`, for the parameters that were known at all, and V⁻¹ over what was measured of it.
 
+    `directions` is the number of those that were measured.
+    """
+
+    names: tuple[str, ...]
     change: Float[np.ndarray, " k"]
     covariance: Float[np.ndarray, "k k"]
     inverse: Float[np.ndarray, "k k"]
     directions: int
 
     @classmethod
-    def of(cls, change: Vector, covariance: Matrix, sigma: Vector) -> _Measured:
-        scaled = covariance / np.outer(sigma, sigma)
+    def of(cls, names: Sequence[str], change: Vector, covariance: Matrix, sigma: Vector) -> MeasuredChange:
+        """The change of parameters, each in units of its `sigma`; those with none are not known."""
+        known = np.flatnonzero(sigma > 0)
+        unit = sigma[known]
+        scaled = covariance[np.ix_(known, known)] / np.outer(unit, unit)
         value, vector = np.linalg.eigh(scaled)
         good = value > _KNOWN * value[-1]
         inverse = (vector[:, good] / value[good]) @ vector[:, good].T
-        return cls(change / sigma, scaled, inverse, int(good.sum()))
+        return cls(tuple(names[k] for k in known), change[known] / unit, scaled, inverse, int(good.sum()))
 
+    @property
+    def chi2(self) -> float:
+        """Δᵀ V⁻¹ Δ over the directions that were measured."""
+        return float(self.change @ self.inverse @ self.change)
 
-def chi2_of_change(change: Vector, covariance: Matrix, sigma: Vector) -> tuple[float, int]:
-    """Δᵀ V⁻¹ Δ over the directions that were measured, and their number; `sigma` sets the scale of each parameter."""
-    known = sigma > 0
-    found = _Measured.of(change[known], covariance[np.ix_(known, known)], sigma[known])
-    return float(found.change @ found.inverse @ found.change), found.directions
-
-
-def largest_change(names: Sequence[str], change: Vector, covariance: Matrix, sigma: Vector) -> LargestChange:
-    """The largest of the changes of single parameters, each by itself and as if nothing else had changed."""
-    known = sigma > 0
-    found = _Measured.of(change[known], covariance[np.ix_(known, known)], sigma[known])
-    each, alone = np.diag(found.covariance), np.diag(found.inverse)
-    z = np.stack(
-        [
-            np.where(each > _LEANS, found.change / np.sqrt(np.where(each > _LEANS, each, 1.0)), 0.0),
-            np.where(
-                alone > 0, (found.inverse @ found.change) / np.sqrt(np.where(alone > 0, alone, 1.0)), 0.0
-            ),
-        ]
-    )
-    way, i = np.unravel_index(np.abs(z).argmax(), z.shape)
-    asked = int((each > _LEANS).sum() + (alone > 0).sum())
-    p = float(special.chdtrc(1, z[way, i] ** 2))
-    corrected = float(-np.expm1(asked * np.log1p(-p))) if p < 1.0 else 1.0
-    name = np.asarray(names)[known][i]
-    return LargestChange(str(name), float(z[way, i]), bool(way), asked, corrected)
+    def largest(self) -> LargestChange:
+        """The largest of the changes of single parameters, each by itself and as if nothing else had changed."""
+        each, alone = np.diag(self.covariance), np.diag(self.inverse)
+        width = np.sqrt(np.stack([np.where(each > _LEANS, each, np.inf), np.where(alone > 0, alone, np.inf)]))
+        z = np.stack([self.change, self.inverse @ self.change]) / width
+        way, i = np.unravel_index(np.abs(z).argmax(), z.shape)
+        asked = int(np.isfinite(width).sum())
+        p = float(special.chdtrc(1, z[way, i] ** 2))
+        corrected = float(-np.expm1(asked * np.log1p(-p))) if p < 1.0 else 1.0
+        return LargestChange(self.names[i], float(z[way, i]), bool(way), asked, corrected)
 
 
 def _visible(changed: Calibration) -> dict[str, float]:

@@ -21,7 +21,6 @@ Bias        Of order 1/N, as for any ratio: below 1e-5 from 10⁵ electrons a ca
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -60,15 +59,27 @@ def estimate(
     counts: Float[np.ndarray, "r k"],
     sigma: Float[np.ndarray, "r k"],
     star: Int[np.ndarray, " r"],
+    cameras: Cameras | None = None,
 ) -> Estimate:
     """Stokes parameters of stars from rows of intensities.
 
-    A row of two cameras holds one combination of q and u: such a star needs several settings, or is NaN.
+    A row of two cameras holds one combination of q and u: such a star needs several settings, or is NaN. Where the
+    shares of the arms in the light are not known (`cameras.split`), each arm has a flux of its own in every row; the
+    flux of a row is then the mean of those of its arms.
 
     `vectors` (row, camera, Stokes) are the analysis vectors in the frame that (q, u) are wanted in; counts that
     are not finite, or whose `sigma` is not finite and above 0, are not used. `star` numbers the stars from 0
     in ascending order: the rows of a star follow each other.
     """
+    if cameras is not None and cameras.split:
+        count, arms = counts.shape[1], len(cameras.arms)
+        mine = np.array([np.isin(np.arange(count), own) for own in cameras.arms])
+        seen = np.where(mine, counts[:, None], np.nan).reshape(-1, count)
+        row = np.repeat(np.arange(len(counts)), arms)
+        found = estimate(vectors[row], seen, sigma[row], star[row])
+        flux = found.flux.reshape(-1, arms).mean(axis=1)
+        gain = found.gain.reshape(-1, arms, 2, count).sum(axis=1)
+        return dataclasses.replace(found, flux=flux, gain=gain)
     used = np.isfinite(counts) & np.isfinite(sigma) & (sigma > 0)
     weight = np.where(used, 1.0 / np.where(used, sigma, 1.0) ** 2, 0.0)
     data = np.where(used, counts, 0.0)
@@ -97,44 +108,6 @@ def estimate(
         dof=np.add.reduceat(used.sum(axis=1) - rows_used, first) - 2,
         flux=flux,
         gain=gain,
-    )
-
-
-def estimate_with(
-    cameras: Cameras,
-    vectors: Float[np.ndarray, "r k 3"],
-    counts: Float[np.ndarray, "r k"],
-    sigma: Float[np.ndarray, "r k"],
-    star: Int[np.ndarray, " r"],
-) -> Estimate:
-    """As `estimate`, by arm where the shares of the arms in the light are not known."""
-    if cameras.split:
-        return estimate_by_arm(vectors, counts, sigma, star, cameras.arms)
-    return estimate(vectors, counts, sigma, star)
-
-
-def estimate_by_arm(
-    vectors: Float[np.ndarray, "r k 3"],
-    counts: Float[np.ndarray, "r k"],
-    sigma: Float[np.ndarray, "r k"],
-    star: Int[np.ndarray, " r"],
-    arms_cameras: Sequence[Sequence[int]],
-) -> Estimate:
-    """As `estimate`, with a flux of its own in every row for each arm; `arms_cameras` are the cameras of the arms.
-
-    The flux of a row is then the mean of those of its arms.
-    """
-    arms, cameras = len(arms_cameras), counts.shape[1]
-    mine = np.zeros((arms, cameras), bool)
-    for arm, own in enumerate(arms_cameras):
-        mine[arm, list(own)] = True
-    seen = np.where(mine, counts[:, None], np.nan).reshape(-1, cameras)
-    row = np.repeat(np.arange(len(counts)), arms)
-    found = estimate(vectors[row], seen, sigma[row], star[row])
-    return dataclasses.replace(
-        found,
-        flux=found.flux.reshape(-1, arms).mean(axis=1),
-        gain=found.gain.reshape(-1, arms, 2, cameras).sum(axis=1),
     )
 
 

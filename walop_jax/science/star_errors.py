@@ -18,7 +18,7 @@ from walop_jax.calibration.matrix import LARGEST_P as LARGEST_P
 from walop_jax.calibration.matrix import STARS as STARS
 from walop_jax.calibration.matrix import sample_stars as sample_stars
 from walop_jax.data.settings import Settings
-from walop_jax.science.estimate import estimate, estimate_with
+from walop_jax.science.estimate import estimate
 
 GOAL = 0.001
 QUANTITIES = ("q", "u", "p")
@@ -75,7 +75,7 @@ def promised_errors(
     counts = _ELECTRONS * transmitted(vectors, stars)
     n, rows = len(stars), counts.reshape(-1, counts.shape[-1])
     seen, star = np.repeat(vectors, n, axis=0), np.arange(len(rows))
-    found = estimate_with(analysis.instrument.cameras, seen, rows, np.sqrt(rows), star)
+    found = estimate(seen, rows, np.sqrt(rows), star, analysis.instrument.cameras)
     local = analysis.derivatives(setting, x, y, np.full(len(x), np.nan))
     gain = found.gain.reshape(len(x), n, 2, -1)
     s = np.concatenate([np.ones((n, 1)), stars], axis=1)
@@ -103,7 +103,7 @@ def plate_errors(
     rows = np.stack([analysis.exact(s, x, y)[:, 0] for s in settings], axis=1)
     counts = _ELECTRONS * rows[..., 0]
     each, star = counts.reshape(n * r, -1), np.repeat(np.arange(n), r)
-    found = estimate_with(analysis.instrument.cameras, rows.reshape(n * r, -1, 3), each, np.sqrt(each), star)
+    found = estimate(rows.reshape(n * r, -1, 3), each, np.sqrt(each), star, analysis.instrument.cameras)
     worst = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(found.photon, nan=np.inf))[:, 1])
     # q from a normalised difference with half of the electrons: σ² = 2 / all electrons.
     return worst / np.sqrt(2.0 / counts.sum(axis=(1, 2)))
@@ -159,18 +159,14 @@ class MethodErrors:
         return out
 
 
-def truth_vectors(
-    joint: Vectors, matrix: Float[np.ndarray, "p m"], pairs: CameraPairs | None = None
-) -> Vectors:
+def truth_vectors(joint: Vectors, matrix: Float[np.ndarray, "p m"]) -> Vectors:
     """Analysis vectors with true matrices (m21, m22, …) and, what these do not hold, the sums of the joint model.
 
-    a± = ½ (S ± S₀ m) with S the sum of a pair of cameras; an error of S is second order in p. `pairs` as for
-    `determinant`.
+    a± = ½ (S ± S₀ m) with S the sum of a pair of cameras, which follow each other; an error of S is second order in p.
     """
     found = np.empty_like(joint)
-    for (i, j), row in zip(
-        pairs or _two_by_two(joint), matrix.reshape(len(matrix), -1, 3).swapaxes(0, 1), strict=True
-    ):
+    rows = matrix.reshape(len(matrix), -1, 3).swapaxes(0, 1)
+    for (i, j), row in zip(_two_by_two(joint), rows, strict=True):
         total = joint[:, i] + joint[:, j]
         difference = total[:, :1] * row
         found[:, i], found[:, j] = 0.5 * (total + difference), 0.5 * (total - difference)

@@ -115,14 +115,15 @@ class StarResiduals:
             star=self.star[rows] - start, photon=self.photon[stars], together=self.together, **cut
         )
 
-    def blocks(self) -> Iterator[tuple[slice, StarResiduals]]:
-        """Slices of stars of some `limits.CHECKED_ROWS` rows, each with its rows."""
+    def blocks(self) -> Iterator[tuple[slice, slice, StarResiduals]]:
+        """Slices of stars and of rows, some `limits.CHECKED_ROWS` of these, each with what it holds."""
         first = self.first
         cuts = np.searchsorted(first, np.arange(0, len(self), limits.CHECKED_ROWS))
         for start, stop in zip(cuts, [*cuts[1:], len(first)], strict=True):
             if stop > start:
                 stars = slice(int(start), int(stop))
-                yield stars, self.part(stars)
+                part = self.part(stars)
+                yield stars, slice(first[start], first[start] + len(part)), part
 
     def parameters(self) -> Float[np.ndarray, "r k n"]:
         """Derivatives of the model over σ to all parameters: plain ones, then the throughput series."""
@@ -142,6 +143,16 @@ class StarResiduals:
         free, along = self.projected(change[..., None])
         moved = np.einsum("sij,sjc->sic", self.photon, along)[self.star, :, 0]
         return np.where(self.root > 0, free[0] - np.einsum("rik,ri->rk", self.tangent, moved), 0.0)
+
+    def behind(
+        self,
+        residual: Float[np.ndarray, "r k"],
+        change: Callable[[StarResiduals, slice], Float[np.ndarray, "r k"]],
+    ) -> Float[np.ndarray, "r k"]:
+        """Residuals behind a change of the counts over σ, which `change` gives for some stars and their rows."""
+        return np.concatenate(
+            [residual[rows] - part.left(change(part, rows)) for _, rows, part in self.blocks()]
+        )
 
 
 def own_variance(stars: StarResiduals) -> Float[np.ndarray, " s"]:
@@ -170,15 +181,13 @@ def normal_matrix(
 
     `residual` is that of `stars` or what is left of it behind changes; `share` is κ.
     """
-    first = stars.first
     matrix, score = np.zeros((0, 0)), np.zeros(0)
-    for here, part in stars.blocks():
+    for here, rows, part in stars.blocks():
         values = columns(part)
         free, along = part.projected(values)
         count = len(free)
         if not score.size:
             matrix, score = np.zeros((count, count)), np.zeros(count)
-        rows = slice(first[here.start], first[here.start] + len(part))
         w, k = weight[here], share[here]
         scaled = np.sqrt(w * k)
         flat = (free * scaled[part.star, None]).reshape(count, -1)
@@ -193,14 +202,18 @@ def eliminated(
     matrix: Matrix, score: Float[np.ndarray, " c"], kept: int
 ) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, " k"]]:
     """Q and g of the first `kept` columns with all others fitted (these have their priors in Q and g)."""
-    other = matrix[kept:, kept:]
-    if not len(other):
+    if kept == len(matrix):
         return matrix, score
-    scale = np.sqrt(np.clip(np.diag(other), 1e-300, None))
-    weight, vector = np.linalg.eigh(other / np.outer(scale, scale))
-    root = vector / scale[:, None] * np.where(weight > 1e-10 * weight[-1], weight, np.inf) ** -0.5
+    root = inverse_root(matrix[kept:, kept:])
     cross = matrix[:kept, kept:] @ root
     return matrix[:kept, :kept] - cross @ cross.T, score[:kept] - cross @ (root.T @ score[kept:])
+
+
+def inverse_root(matrix: Matrix) -> Matrix:
+    """R with R Rᵀ the inverse of a symmetric matrix; directions in which it is singular are left out."""
+    scale = np.sqrt(np.clip(np.diag(matrix), 1e-300, None))
+    weight, vector = np.linalg.eigh(matrix / np.outer(scale, scale))
+    return vector / scale[:, None] * np.where(weight > 1e-10 * weight[-1], weight, np.inf) ** -0.5
 
 
 # -------------------------------------------------------------------------------------------- noise, robustly
@@ -271,8 +284,7 @@ def shared_by_rows(
     if not several.any():
         return None
     value, dof = np.full(len(several), np.nan), np.zeros(len(several))
-    first = stars.first
-    for here, part in stars.blocks():
+    for here, rows, part in stars.blocks():
         cameras = part.model.shape[1]
         same = np.eye(cameras) * (part.root > 0)[:, :, None]
         free, along = part.projected(same)
@@ -280,7 +292,6 @@ def shared_by_rows(
         left = np.add.reduceat(each, part.first) - np.einsum(
             "sia,sij,sjb->sab", along, part.photon, along, optimize=True
         )
-        rows = slice(first[here.start], first[here.start] + len(part))
         total = np.add.reduceat(residual[rows], part.first)
         trace, square = np.trace(left, axis1=1, axis2=2), np.sum(left**2, axis=(1, 2))
         good = several[here] & (trace > 1e-9 * part.rows)

@@ -55,21 +55,15 @@ def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) ->
     return {name: (values[star], about, units.get(name, "")) for name, (values, about) in columns.items()}
 
 
-def header(
-    product: str, estimator: str, on_sky: float, check: CatalogueCheck | None = None
-) -> dict[str, Any]:
+def header(product: str, estimator: str, on_sky: float, check: CatalogueCheck) -> dict[str, Any]:
     """Cards of the output: the calibration (hash of its content), estimator, frame, colours, and the check."""
     frame = {0.0: "instrument", 1.0: "sky"}.get(on_sky, "sky where ROTATOR is given, else instrument")
-    cards = {
+    factors = np.sqrt(check.scale)
+    return {
         "CALHASH": product,
         "PESTIM": "Plaszczynski et al. 2014" if estimator == "MAS" else "Wardle and Kronberg 1974",
         "QUFRAME": frame,
         "COLOURS": f"without TEFF: half the difference of {COOL:g} and {HOT:g} K",
-    }
-    if check is None:
-        return cards
-    factors = np.sqrt(check.scale)
-    return cards | {
         "HOLDS": check.holds,
         "CHI2DOF": round(check.noise, 6),
         "PHOTFAC1": round(float(factors[0]), 6),

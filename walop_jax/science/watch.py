@@ -211,9 +211,7 @@ class _Watching:
         gains = np.zeros((groups * count, groups * count))
         cross, nuisance = np.zeros((groups * count, known)), np.eye(known)
         score, pull = np.zeros(groups * count), np.zeros(known)
-        first = stars.first
-        for here, part in stars.blocks():
-            rows = slice(first[here.start], first[here.start] + len(part))
+        for here, rows, part in stars.blocks():
             group, w, k = self.group[rows], weight[here], share[here]
             values = np.concatenate([self._changes(part), self._errors(part)], axis=-1)
             free, along = part.projected(values)
@@ -309,13 +307,9 @@ class _Watching:
         self, residual: Float[np.ndarray, "r k"], change: Suspect, size: float
     ) -> Float[np.ndarray, "r k"]:
         """Residuals behind a change."""
-        grown, first = change.history.over(self.time)[self.group] * size, self.stars.first
-        names, out = [*self.cameras, *(name for name, _ in self.optics)], []
-        for here, part in self.stars.blocks():
-            rows = slice(first[here.start], first[here.start] + len(part))
-            column = self._changes(part)[..., names.index(change.name)]
-            out.append(residual[rows] - part.left(column * grown[rows, None]))
-        return np.concatenate(out)
+        grown = change.history.over(self.time)[self.group, None] * size
+        column = [*self.cameras, *(name for name, _ in self.optics)].index(change.name)
+        return self.stars.behind(residual, lambda part, rows: self._changes(part)[..., column] * grown[rows])
 
     # --------------------------------------------------------------------------------------------- asking
 
