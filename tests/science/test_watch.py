@@ -7,7 +7,7 @@ import pytest
 from studies import watch as study
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
-from walop_jax.reports.watch_figures import watch_figure
+from walop_jax.reports.survey_figures import watch_figure
 from walop_jax.science.star_residuals import noise_scale
 from walop_jax.science.watch import grouped, with_rivals
 

@@ -13,7 +13,6 @@ from walop_jax.io.display import Display, Displayed
 
 if TYPE_CHECKING:
     from walop_jax import FitResult, Run
-    from walop_jax.reports.run import RunContents
 
 PAGE = "report.html"
 GENERATOR = '<meta name="generator" content="walop-jax'
@@ -86,7 +85,7 @@ def report(
         job.tell("working out the accuracy of p")
         accuracy, lacking = _accuracy(found)
         job.tell("drawing", "drawing")
-        missing = (*found.missing, *_residuals(found), *lacking)
+        missing = (*found.missing, *lacking)
         text = render(dataclasses.replace(found, missing=missing), accuracy)
     text = printable(text)
     with atomic_path(target, overwrite=overwrite) as temporary:
@@ -102,19 +101,6 @@ def _is_page(path: Path) -> bool:
             return GENERATOR in stream.read(1000)
     except (OSError, UnicodeDecodeError):
         return False
-
-
-def _residuals(run: RunContents) -> tuple[str, ...]:
-    """Why the page of a fit shows no residuals, in words; nothing where it does."""
-    from walop_jax import Run
-
-    if run.product is None or run.diagnosis is not None:
-        return ()
-    try:
-        Run(run.folder, data=run.data).calset  # noqa: B018
-    except (ValueError, OSError) as error:
-        return (f"Residuals are not drawn: {error}.",)
-    return ()
 
 
 def _accuracy(run: Any) -> tuple[Any, tuple[str, ...]]:

@@ -43,7 +43,7 @@ def watch(
     """
     from walop_jax.data.catalogue import read_catalogue
     from walop_jax.io.errors import errors_naming
-    from walop_jax.reports.watch_figures import watch_figure
+    from walop_jax.reports.survey_figures import watch_figure
     from walop_jax.science.watch import watch as watched
 
     job.begin("reading")

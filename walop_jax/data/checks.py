@@ -70,35 +70,25 @@ def make_filters(table: dict[str, Any], place: Place) -> dict[str, FilterCurve]:
     if wavelengths.shape != throughputs.shape:
         raise place.fail("has not as many values as WAVELENGTH", "THROUGHPUT", "pad both with NaN")
     for row, name in enumerate(table["FILTER"].tolist()):
-        at = np.array([row])
-        if name in curves:
-            raise place.fail(f"{name!r} is there twice, again in {rows_text(at)}", "FILTER", "rename one")
+        here = np.arange(len(wavelengths)) == row
+        place.refuse(here & (name in curves), f"{name!r} is there twice, again", "FILTER", "rename one")
         wavelength, throughput = wavelengths[row], throughputs[row]
         given = np.isfinite(wavelength)
-        if not np.any(given) or not np.all(np.isfinite(throughput[given])):
-            raise place.fail(
-                f"{name!r} has no value where WAVELENGTH has one, in {rows_text(at)}",
-                "THROUGHPUT",
-                "pad both columns with NaN in the same places",
-            )
+        gap = not np.any(given) or not np.all(np.isfinite(throughput[given]))
+        what, advice = "has no value where WAVELENGTH has one", "pad both columns with NaN in the same places"
+        place.refuse(here & gap, f"{name!r} {what},", "THROUGHPUT", advice)
         wavelength, throughput = wavelength[given], throughput[given]
-        if wavelength.min() < _WAVELENGTH[0] or wavelength.max() > _WAVELENGTH[1]:
-            raise place.fail(
-                f"{name!r} reaches from {wavelength.min():g} to {wavelength.max():g} µm, outside {_WAVELENGTH[0]:g} … "
-                f"{_WAVELENGTH[1]:g}, in {rows_text(at)}",
-                "WAVELENGTH",
-                "wavelengths are in µm: are these nm or Angstrom?",
-            )
+        (low, high), (first, last) = _WAVELENGTH, (wavelength.min(), wavelength.max())
+        what = f"{name!r} reaches from {first:g} to {last:g} µm, outside {low:g} … {high:g},"
+        advice = "wavelengths are in µm: are these nm or Angstrom?"
+        place.refuse(here & ((first < low) | (last > high)), what, "WAVELENGTH", advice)
         if len(wavelength) > 1 and wavelength[0] > wavelength[-1]:
             wavelength, throughput = wavelength[::-1].copy(), throughput[::-1].copy()
-        if np.any(np.diff(wavelength) <= 0):
-            raise place.fail(f"{name!r} is not sorted, in {rows_text(at)}", "WAVELENGTH", "sort the curve")
-        if np.any(throughput < 0) or not np.any(throughput > 0):
-            raise place.fail(
-                f"{name!r} is negative or zero throughout, in {rows_text(at)}",
-                "THROUGHPUT",
-                "correct the curve",
-            )
+        unsorted = np.any(np.diff(wavelength) <= 0)
+        place.refuse(here & unsorted, f"{name!r} is not sorted,", "WAVELENGTH", "sort the curve")
+        dark = np.any(throughput < 0) or not np.any(throughput > 0)
+        what = f"{name!r} is negative or zero throughout,"
+        place.refuse(here & dark, what, "THROUGHPUT", "correct the curve")
         curves[name] = FilterCurve(name, wavelength, throughput)
     return curves
 

@@ -157,12 +157,7 @@ def table_intensities(
         )
     counts, sigma, flag = table["N"], table["N_ERR"], table["FLAG"]
     used, spoilt, impossible = usable(counts, sigma, flag)
-    if np.any(impossible):
-        raise place.fail(
-            f"is zero or negative in {rows_text(np.flatnonzero(impossible))}",
-            "N_ERR",
-            "give the true error, or set FLAG",
-        )
+    place.refuse(impossible, "is zero or negative", "N_ERR", "give the true error, or set FLAG")
     remarks = _judge(counts, used, spoilt, place)
     source, more = _source_rows(table["SOURCE"], exposures, exposure, sources, used, place)
     intensities = TableIntensities(
@@ -220,13 +215,10 @@ def _rows_of(ids: np.ndarray, known: np.ndarray, column: str, table: str, place:
     at = np.minimum(np.searchsorted(known[order], ids), len(known) - 1)
     rows = order[at]
     if np.any(absent := known[rows] != ids):
-        bad = np.flatnonzero(absent)
-        near = known[np.argmin(np.abs(known - ids[bad[0]]))]
-        raise place.fail(
-            f"{column} {ids[bad[0]]} does not exist in {table}, asked for in {rows_text(bad)}",
-            column,
-            f"the nearest is {near}; add it there or correct it here",
-        )
+        first = ids[np.argmax(absent)]
+        near = known[np.argmin(np.abs(known - first))]
+        what = f"{column} {first} does not exist in {table}, asked for"
+        place.refuse(absent, what, column, f"the nearest is {near}; add it there or correct it here")
     return rows
 
 
@@ -246,20 +238,11 @@ def _source_rows(
         rows = np.where((sources.source[at] == ids) & (ids >= 0), at, -1)
     standard = ((exposures.kind == "standard") & ~exposures.clp_in)[exposure] & used
     if np.any(bad := standard & (rows < 0)):
-        first = np.flatnonzero(bad)
         known = ", ".join(str(entry) for entry in sources.source[:10]) or "none"
-        raise place.fail(
-            f"a standard star needs a row of SOURCES; {ids[first[0]]} is not one, in {rows_text(first)}",
-            "SOURCE",
-            f"SOURCES has {known}",
-        )
+        what = f"a standard star needs a row of SOURCES; {ids[np.argmax(bad)]} is not one,"
+        place.refuse(bad, what, "SOURCE", f"SOURCES has {known}")
     lamp = (exposures.kind == "lamp")[exposure] & used & (ids >= 0)
-    if np.any(lamp):
-        raise place.fail(
-            f"a lamp is no source of the sky, in {rows_text(np.flatnonzero(lamp))}",
-            "SOURCE",
-            "write −1, or another KIND",
-        )
+    place.refuse(lamp, "a lamp is no source of the sky,", "SOURCE", "write −1, or another KIND")
     lost = np.flatnonzero(used & (ids >= 0) & (rows < 0))
     remark = f"{place.file} [{place.extension}] SOURCE: not in SOURCES, taken as unknown in {rows_text(lost)}"
     return rows, [remark] if len(lost) else []

@@ -17,7 +17,7 @@ import itertools
 import math
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -45,17 +45,12 @@ Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "n n"]
 Given = FitResult | CalibrationSet | Night | str | os.PathLike[str]
 """Sources of nights: a fit, a set, a night, or the path of nights that were written."""
-Again = Callable[[Mapping[str, float]], Night]
-"""Linearises a night at other values."""
 
 HALF_A_DAY = 0.5
 SHARE = 0.95  # of the field that must know p to half of the goal
 GRID = 13  # points along each axis of the field at which that is asked
 STARS = 20
 SUSPECT = 5.0  # excess of χ² of a night over its expectation, in its own standard deviations
-LONG = 60.0  # days without a night that are worth a remark
-SETTLED = 1e-3  # standard errors that parameters may still move when nights are linearised again
-ROUNDS = 6
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.interpolate import RegularGridInterpolator
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
@@ -55,6 +56,13 @@ def polynomial_terms(measured: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, 
     return np.stack([np.ones_like(q), q, u, q**2, u**2], axis=-1)
 
 
+def polynomial(
+    coefficients: Float[np.ndarray, "p 2 5"], measured: Float[np.ndarray, "p n 2"]
+) -> Float[np.ndarray, "p n 2"]:
+    """(q_i, u_i) of measurements at points with their coefficients."""
+    return np.einsum("pnt,pct->pnc", polynomial_terms(measured), coefficients)
+
+
 @dataclasses.dataclass(frozen=True)
 class PaperCalibration:
     """Paper II's calibration at grid points `x`, `y` (deg), for one filter with the calibration plate out.
@@ -74,7 +82,7 @@ class PaperCalibration:
 
     def recover(self, measured: Float[np.ndarray, "p n 2"]) -> Float[np.ndarray, "p n 2"]:
         """(q_i, u_i) − (Δq, Δu) of measurements at the grid points."""
-        return np.einsum("pnt,pct->pnc", polynomial_terms(measured), self.coefficients) - self.delta[:, None]
+        return polynomial(self.coefficients, measured) - self.delta[:, None]
 
     def between(self, x: Float[np.ndarray, " m"], y: Float[np.ndarray, " m"]) -> PaperCalibration:
         """Coefficients and Δ interpolated bilinearly to other positions: what the paper says cannot be done.
@@ -85,16 +93,10 @@ class PaperCalibration:
         if len(across) * len(along) != len(self.x) or min(len(across), len(along)) < 2:
             raise ValueError("the points with polariser exposures are no regular grid: nothing between them")
         order = np.lexsort((self.x, self.y)).reshape(len(along), len(across))
-        i = np.clip(np.searchsorted(across, x) - 1, 0, len(across) - 2)
-        j = np.clip(np.searchsorted(along, y) - 1, 0, len(along) - 2)
-        s = (x - across[i]) / (across[i + 1] - across[i])
-        t = (y - along[j]) / (along[j + 1] - along[j])
-        corners = [((1 - s) * (1 - t), 0, 0), (s * (1 - t), 0, 1), ((1 - s) * t, 1, 0), (s * t, 1, 1)]
 
         def mixed(values: np.ndarray) -> np.ndarray:
-            shape = (-1,) + (1,) * (values.ndim - 1)
-            parts = [w.reshape(shape) * values[order[j + b, i + a]] for w, b, a in corners]
-            return np.sum(parts, axis=0)
+            beyond: Any = {"bounds_error": False, "fill_value": None}  # linear there as well
+            return RegularGridInterpolator((along, across), values[order], **beyond)(np.stack([y, x], axis=1))
 
         fields = ("coefficients", "transmission", "delta", "spread", "condition")
         return PaperCalibration(x, y, *(mixed(getattr(self, name)) for name in fields))
@@ -145,10 +147,7 @@ def with_test_stars(
 ) -> PaperCalibration:
     """Step 2: Δ and σ of the test stars (default: `sample_stars()`) seen through the transmissions."""
     stars = sample_stars() if stars is None else stars
-    found = np.einsum(
-        "pnt,pct->pnc", polynomial_terms(measured_qu(transmitted(transmission, stars))), coefficients
-    )
-    error = found - stars
+    error = polynomial(coefficients, measured_qu(transmitted(transmission, stars))) - stars
     return PaperCalibration(
         x, y, coefficients, transmission, error.mean(axis=1), error.std(axis=1, ddof=1), condition
     )
@@ -340,12 +339,12 @@ def full_moon_scheme(
     # Standards: Δ at the centres, where the polynomials are interpolated.
     local = paper.between(centre_x, centre_y).coefficients
     true = _catalogue(calset, block, standard)
-    found = _polynomial(local, measured_qu(block.counts[middle][:, standard]))
+    found = polynomial(local, measured_qu(block.counts[middle][:, standard]))
     known = block.used[middle][:, standard]
     delta_centre = _mean(found - true[middle], known[..., None], axis=1)
 
     # Moon: the patch is measured where the polynomials are closest to a centre, and is the same in all the box.
-    seen = _polynomial(paper.coefficients, measured_qu(block.counts[grid][:, moon]))
+    seen = polynomial(paper.coefficients, measured_qu(block.counts[grid][:, moon]))
     box = box_number(paper.x, paper.y)
     delta = np.empty_like(paper.delta)
     for b in range(BOXES_ALONG * BOXES_ALONG):
@@ -364,12 +363,6 @@ def _positions(block: Block, x: Float[np.ndarray, " k"], y: Float[np.ndarray, " 
     distance = np.hypot(block.x[:, None] - x, block.y[:, None] - y)
     nearest = distance.argmin(axis=0)
     return np.where(distance[nearest, np.arange(len(x))] < 1e-3, nearest, -1)
-
-
-def _polynomial(
-    coefficients: Float[np.ndarray, "p 2 5"], measured: Float[np.ndarray, "p e 2"]
-) -> Float[np.ndarray, "p e 2"]:
-    return np.einsum("pet,pct->pec", polynomial_terms(measured), coefficients)
 
 
 def _catalogue(

@@ -41,17 +41,19 @@ def efficiencies(
     calibration: Calibration, x: float, y: float, wavelength: Float[np.ndarray, " w"]
 ) -> Float[np.ndarray, "w 2 3"]:
     """Instrument matrix (wavelength, q_m or u_m, 1 q u) in monochromatic light (µm) at a field point (deg)."""
-    names = [f"line {k:05d}" for k in range(len(wavelength))]
-    curves = {
-        name: FilterCurve(name, np.array([w]), np.ones(1)) for name, w in zip(names, wavelength, strict=True)
-    }
-    n = len(names)
-    settings = dataclasses.replace(Settings.default(n), filter=np.array(names))
     instrument = calibration.model.instrument(calibration.values)
-    plan = plan_for_settings(instrument, settings, curves)
+    plan = _monochromatic(instrument, wavelength)
     a = analysis_vectors(instrument, plan, np.array([x]), np.array([y]))[0][np.asarray(plan.band_of)[:, 0]]
     rows = [(a[:, i] - a[:, i + 1]) / (a[:, i] + a[:, i + 1])[:, :1] for i in (0, 2)]
     return np.stack(rows, axis=1)[..., :3]
+
+
+def _monochromatic(instrument: Instrument, wavelength: Float[np.ndarray, " w"]) -> Plan:
+    """Plan of a computation in monochromatic light of each wavelength (µm)."""
+    names = [f"line {k:05d}" for k in range(len(wavelength))]
+    curves = {n: FilterCurve(n, np.array([w]), np.ones(1)) for n, w in zip(names, wavelength, strict=True)}
+    settings = dataclasses.replace(Settings.default(len(names)), filter=np.array(names))
+    return plan_for_settings(instrument, settings, curves)
 
 
 def colour_spread(
@@ -81,9 +83,6 @@ def spread_document(spread: Float[np.ndarray, "p 2"]) -> dict[str, Any]:
         }
         for name, values in zip(("q", "u"), spread.T, strict=True)
     }
-
-
-LINE = "line"
 
 
 def plate_names(instrument: Instrument) -> tuple[str, ...]:
@@ -132,10 +131,7 @@ def plate_retardances(
     """Retardance (deg, modulo 360) about the first optic axis of every plate of `plate_names` at wavelengths (µm,
     ascending) and field positions."""
     there = instrument.patched()
-    names = [f"{LINE}{k:04d}" for k in range(len(wavelength))]
-    curves = {n: FilterCurve(n, np.array([w]), np.ones(1)) for n, w in zip(names, wavelength, strict=True)}
-    settings = dataclasses.replace(Settings.default(len(names)), filter=np.array(names))
-    plan = plan_for_settings(there, settings, curves)
+    plan = _monochromatic(there, wavelength)
     mueller = np.asarray(_all_plates(there, plan, jnp.asarray(x), jnp.asarray(y)))
     plates = [e for arm in there.arms for e in arm.train() if isinstance(e, WavePlate)]
     found = []

@@ -347,6 +347,13 @@ class Run(Result):
         """The calibration."""
         return read_calibration(self.folder, self.catalogue) if PRODUCT in self else None
 
+    @property
+    def rebuilt(self) -> Calibration:
+        """The calibration; `DataError` where there is none."""
+        self.wanted(PRODUCT, "give the RUN of walop-jax refit or diagnose")
+        assert self.calibration is not None
+        return self.calibration
+
     @functools.cached_property
     def documents(self) -> dict[str, dict[str, Any]]:
         """The JSON documents of the run by name: summary, diagnosis, sample, comparison, epoch, limits."""
@@ -391,9 +398,7 @@ class Run(Result):
         does not come out as the calibration says (another model, or another version of the physics). Errors are made as
         those of the calibration were, and the verdict is its verdict.
         """
-        self.wanted(PRODUCT, "give the RUN of walop-jax refit or diagnose")
-        calset, calibration = self.calset, self.calibration
-        assert calibration is not None
+        calibration, calset = self.rebuilt, self.calset
         text = "\n".join(calibration.model_lines) if model_text is None else model_text
         model = model_for(calset, text, calibration.design, self.catalogue)
         if model.names != calibration.model.names:
@@ -426,9 +431,7 @@ class Run(Result):
 
     def __getitem__(self, name: str) -> ParameterValue:
         """A parameter of the calibration by name, with its error; `DataError` where there is no calibration."""
-        self.wanted(PRODUCT, "give the RUN of walop-jax refit or diagnose")
-        assert self.calibration is not None
-        return self.calibration[name]
+        return self.rebuilt[name]
 
     def display(self) -> Display:
         """The files, and the calibration if there is one."""

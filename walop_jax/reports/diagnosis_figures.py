@@ -70,27 +70,18 @@ def effect_figure(data: DiagnosisFigureData, number: int = 1, on: Canvas = PAGE)
 
 
 def rms_figure(data: DiagnosisFigureData, on: Canvas = PAGE) -> AnyFigure:
-    """Rms residuals of the starting and the final model over the field.
+    """Rms residuals of the starting and the final model over the field, rows and scale as in `residual_maps`.
 
     Several effects need not show in one combination of the exposures: rms over all of them. Standards lie between the
-    other points and are measured in other exposures: left out, if need be.
+    other points and are measured in other exposures: left out, if need be. Noise alone gives √(1 − 1/K) with K cameras
+    and a free flux: 0.87 of four.
     """
     whole = data.comparisons[0]
     there = np.isfinite(whole.before)
     rms = (np.where(there, values, np.nan) for values in (whole.rms_before, whole.rms_after))
-    return rms_maps(data.points, dict(zip(_MODELS, rms, strict=True)), data.cameras, on)
-
-
-def rms_maps(
-    points: Points, maps: Mapping[str, PointMap], cameras: Sequence[str], on: Canvas = PAGE
-) -> AnyFigure:
-    """Rms residual of every field point in the cameras, rows and scale as in `residual_maps`.
-
-    It shows all that is wrong at once, whatever exposures it sits in; noise alone gives √(1 − 1/K) with K cameras and
-    a free flux: 0.87 of four.
-    """
-    far = max(largest_size(*maps.values()), 1.5)
-    return _maps(points, maps, cameras, Normalize(0.5, far), "magma_r", "rms residual (σ)", False, on)
+    maps: dict[str, PointMap] = dict(zip(_MODELS, rms, strict=True))
+    norm = Normalize(0.5, max(largest_size(*maps.values()), 1.5))
+    return _maps(data.points, maps, data.cameras, norm, "magma_r", "rms residual (σ)", False, on)
 
 
 def _maps(
@@ -144,14 +135,11 @@ def signature_figure(
     position, label = _abscissa(exposures, angular)
     for k, camera in enumerate(cameras):
         known = np.isfinite(position) & np.isfinite(comparison.curve_before[:, k])
-        columns = (
-            comparison.curve_before,
-            comparison.curve_error,
-            comparison.curve_explained,
-            comparison.curve_after,
+        c = comparison
+        columns = (c.curve_before, c.curve_error, c.curve_explained, c.curve_after)
+        x, before, error, explained, after = _binned(
+            position[known], *(column[known, k] for column in columns)
         )
-        before, error, explained, after = (column[known, k] for column in columns)
-        x, before, error, explained, after = _binned(position[known], before, error, explained, after)
         for axis, dots in ((upper[k], before), (lower[k], after)):
             axis.axhline(0.0, color=QUIET, lw=0.8, zorder=0)
             axis.errorbar(x, dots, error, fmt="o", ms=3, lw=0.8, color="0.15", label="data", zorder=3)
@@ -172,23 +160,17 @@ def _against_angle(comparison: ResidualComparison, exposures: Table) -> bool:
     behind = np.isfinite(exposures["CLP_ANGLE"])
     if comparison.harmonic >= 0 or not behind.any():
         return comparison.harmonic >= 0
-    power = np.nansum(
-        np.where(comparison.curve_explained != 0, comparison.curve_explained, comparison.curve_before) ** 2,
-        axis=1,
-    )
+    explained = comparison.curve_explained
+    power = np.nansum(np.where(explained != 0, explained, comparison.curve_before) ** 2, axis=1)
     return bool(power[behind].sum() > 0.5 * power.sum())
 
 
 def _abscissa(exposures: Table, angular: bool) -> tuple[Float[np.ndarray, " e"], str]:
     if angular:
         return exposures["CLP_ANGLE"], "polariser angle (deg)"
-    hours = (
-        24.0 * (exposures["MJD"] - np.nanmin(exposures["MJD"]))
-        if np.isfinite(exposures["MJD"]).any()
-        else exposures["MJD"]
-    )
-    if np.isfinite(hours).all() and np.ptp(hours) > 0:
-        return hours, "time since the first exposure (h)"
+    mjd = exposures["MJD"]
+    if np.isfinite(mjd).all() and np.ptp(mjd) > 0:
+        return 24.0 * (mjd - mjd.min()), "time since the first exposure (h)"
     return exposures["EXPOSURE"].astype(float), "exposure"
 
 
@@ -246,9 +228,7 @@ def shares_figure(shares: Table, on: Canvas = PAGE) -> AnyFigure:
     widths = [float(np.count_nonzero(shares["GROUP"] == g) + 1) for g in groups]
     widths.append(max(12.0, sum(widths)))
     figure, axes = on.panels(8.6, 2.7, 1, len(widths), width_ratios=widths, sharey=True)
-    before, after = (
-        values / np.maximum(shares["EXPECTED"], 1e-300) for values in (shares["BEFORE"], shares["AFTER"])
-    )
+    before, after = (shares[when] / np.maximum(shares["EXPECTED"], 1e-300) for when in ("BEFORE", "AFTER"))
     for axis, group in zip(axes, [*groups, "exposure"], strict=True):
         rows = np.flatnonzero(shares["GROUP"] == group)
         place = np.arange(len(rows))
@@ -261,14 +241,7 @@ def shares_figure(shares: Table, on: Canvas = PAGE) -> AnyFigure:
             axis.set_xlim(-0.6, len(rows) - 0.4)
         axis.axhline(1.0, color="0.5", lw=0.8, zorder=0)
         size = 5 if group != "exposure" else 3.5
-        axis.vlines(
-            place,
-            np.minimum(before, after)[rows],
-            np.maximum(before, after)[rows],
-            color=QUIET,
-            lw=1,
-            zorder=1,
-        )
+        axis.vlines(place, before[rows], after[rows], color=QUIET, lw=1, zorder=1)
         axis.plot(place, before[rows], "o", color=BEFORE, ms=size, mfc="white", label="starting model")
         axis.plot(place, after[rows], "s", color=AFTER, ms=size - 0.5, label="final model")
         axis.set_xlabel(group, fontsize=FONT)

@@ -127,13 +127,6 @@ class FigureSource(Run):
         return self.product
 
     @property
-    def rebuilt(self) -> Calibration:
-        """The calibration with its model."""
-        self.wanted(PRODUCT, "give the RUN of walop-jax refit or diagnose")
-        assert self.calibration is not None
-        return self.calibration
-
-    @property
     def limits(self) -> DetectionLimits:
         """The detection limits of the data."""
         return read_limits(self.wanted(LIMITS, "run walop-jax limits -o RUN first"))

@@ -16,7 +16,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from walop_jax.calibration import read_calibration
+from walop_jax.calibration import SUMMARY, read_calibration
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.findings import sentences
 from walop_jax.diagnosis.limits_found import DetectionLimits
@@ -33,10 +33,11 @@ from walop_jax.io.text import (
 )
 from walop_jax.nights.stacking import SURVEY, TRACKS
 from walop_jax.plans.plan import PLANNED
+from walop_jax.posterior.files import COMPARISON, EPOCH, LIMITS
 from walop_jax.reports import diagnosis_figures, figures, survey_figures
 from walop_jax.reports.named import FigureSource, draw
 from walop_jax.reports.posterior_figures import unit_in_words
-from walop_jax.reports.run import COMPARISON, EPOCH, LIMITS, SUMMARY, RunContents, read_limits
+from walop_jax.reports.run import RunContents, read_limits
 from walop_jax.reports.wording import (
     UNNAMED,
     data_in_words,
@@ -315,8 +316,8 @@ PROTECTION = (
     "The largest error of q and u that a single effect can make at each field point without being detected."
 )
 SEPARATION = (
-    "Standard deviations between an effect at its detection limit (row) and another fitted to imitate it (column)."
-    ""
+    "Standard deviations between an effect at its detection limit (row) and another fitted to imitate it "
+    "(column)."
 )
 
 Picture = tuple[str, str, str]

@@ -166,15 +166,8 @@ def trace_figure(
         if np.isfinite(tau[i]):
             bottom = axes.get_ylim()[0]
             axes.plot([0, tau[i]], [bottom, bottom], color="k", linewidth=3, solid_capstyle="butt")
-            axes.text(
-                1.0,
-                1.0,
-                f"autocorrelation time (bar) {tau[i]:.1f} steps",
-                transform=axes.transAxes,
-                fontsize=SMALL,
-                ha="right",
-                va="bottom",
-            )
+            said = f"autocorrelation time (bar) {tau[i]:.1f} steps"
+            axes.text(1.0, 1.0, said, transform=axes.transAxes, fontsize=SMALL, ha="right", va="bottom")
         axes.set_ylabel(label(names[i], units[i]), fontsize=SMALL, rotation=0, ha="right", va="center")
         axes.tick_params(labelsize=SMALL - 1)
         axes.yaxis.set_major_locator(MaxNLocator(3))

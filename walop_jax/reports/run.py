@@ -15,20 +15,8 @@ from walop_jax.diagnosis.figure_data import FIGURE_DATA, UNNAMED, DiagnosisFigur
 from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.text import read_json
-from walop_jax.posterior.files import (
-    COMMISSIONING,
-    COMPARISON,
-    CORNER,
-    DIAGNOSIS,
-    EPOCH,
-    INTERVALS,
-    LIMITS,
-    POSTERIOR,
-    SAMPLE,
-    Run,
-)
-
-__all__ = ["COMPARISON", "CORNER", "EPOCH", "INTERVALS", "LIMITS", "POSTERIOR", "SAMPLE", "SUMMARY"]
+from walop_jax.posterior import files
+from walop_jax.posterior.files import DIAGNOSIS, Run
 
 SUMMARY_KEYS = ("chi2", "dof", "n_data", "parameters", "converged", "message", "versions", "inputs")
 DIAGNOSIS_KEYS = ("verdict", "steps", "candidates", "unexplained")
@@ -103,25 +91,26 @@ def read_run(run: Run | Path) -> RunContents:
             missing.append(
                 f"{DIAGNOSIS} is of another fit than {SUMMARY}: this folder was written to again since."
             )
-    sampled = POSTERIOR in run
-    return RunContents(
-        folder=folder,
-        summary=summary,
-        product=product,
-        diagnosis=diagnosis,
-        figure_data=figure_data,
-        sample=optional(SAMPLE, lambda path: _document(path, ()), "no verdict on the sampling", sampled),
-        intervals=optional(INTERVALS, _intervals, "no table of the posterior", sampled) or (),
-        corner=optional(CORNER, Path.read_bytes, "no corner plot", sampled),
-        limits=optional(LIMITS, lambda path: _limits(path, summary), "no protection level", wanted=False),
-        missing=tuple(missing),
-        data=tuple(map(Path, run.data)),
-        commissioning=optional(
-            COMMISSIONING,
-            lambda path: _document(path, ("go", "requirements")),
-            "no go or no-go",
-            wanted=False,
+    sampled = files.POSTERIOR in run
+    rest = {
+        "sample": optional(
+            files.SAMPLE, lambda path: _document(path, ()), "no verdict on the sampling", sampled
         ),
+        "intervals": optional(files.INTERVALS, _intervals, "no table of the posterior", sampled) or (),
+        "corner": optional(files.CORNER, Path.read_bytes, "no corner plot", sampled),
+        "limits": optional(files.LIMITS, lambda path: _limits(path, summary), "no protection level", False),
+        "commissioning": optional(
+            files.COMMISSIONING, lambda path: _document(path, ("go", "requirements")), "no go or no-go", False
+        ),
+    }
+    if product is not None and diagnosis is None:
+        try:
+            run.calset  # noqa: B018
+        except (ValueError, OSError) as error:
+            missing.append(f"Residuals are not drawn: {error}.")
+    data = tuple(map(Path, run.data))
+    return RunContents(
+        folder, summary, product, diagnosis, figure_data, missing=tuple(missing), data=data, **rest
     )
 
 

@@ -243,7 +243,7 @@ class MeasuredChange(NamedTuple):
         value, vector = np.linalg.eigh(scaled)
         good = value > _KNOWN * value[-1]
         inverse = (vector[:, good] / value[good]) @ vector[:, good].T
-        return cls(tuple(names[k] for k in known), change[known] / unit, scaled, inverse, int(good.sum()))
+        return cls(tuple(names[k] for k in known.tolist()), change[known] / unit, scaled, inverse, int(good.sum()))
 
     @property
     def chi2(self) -> float:
@@ -259,7 +259,7 @@ class MeasuredChange(NamedTuple):
         asked = int(np.isfinite(width).sum())
         p = float(special.chdtrc(1, z[way, i] ** 2))
         corrected = float(-np.expm1(asked * np.log1p(-p))) if p < 1.0 else 1.0
-        return LargestChange(self.names[i], float(z[way, i]), bool(way), asked, corrected)
+        return LargestChange(self.names[int(i)], float(z[way, i]), bool(way), asked, corrected)
 
 
 def _visible(changed: Calibration) -> dict[str, float]:

@@ -43,7 +43,6 @@ from walop_jax.science.star_residuals import (
     eliminated,
     is_off,
     noise_scale,
-    normal_matrix,
     own_variance,
 )
 from walop_jax.science.watch_found import History, Suspect, Watch, WatchedChange
@@ -64,6 +63,7 @@ RIVALS = (
     "filter_shift",
 )
 """Effects of the optics that may be what has changed, beside the parameters of the model."""
+Answers = Float[np.ndarray, "h c"]  # history, camera or number of the optics
 _CERTAIN = 1e-9  # in their units: nothing is left to them as an error of the calibration
 _FEW = 4  # stars: fewer have no scale of their own
 _MOST_CHANGES = 4
@@ -275,32 +275,17 @@ class _Watching:
     def _errors(self, part: StarResiduals) -> Float[np.ndarray, "r k n"]:
         return np.concatenate([part.parameters() @ self.root, part.colour], axis=-1)
 
-    def suspects(self, residual: Any, weight: Any, share: Any, histories: list[History]) -> list[Suspect]:
-        """Every camera and every number of the optics with each of a few histories, alone, most significant first."""
-        count, plain = len(self.cameras), len(self.optics)
-        shapes = np.stack([h.over(self.time) for h in histories], axis=1)
-        stars = dataclasses.replace(self.stars, time=self.group.astype(float))
-
-        def columns(part: StarResiduals) -> Float[np.ndarray, "r k c"]:
-            grown = shapes[part.time.astype(int)]
-            asked = np.einsum("rkc,rh->rkhc", self._changes(part), grown).reshape(*part.model.shape, -1)
-            return np.concatenate([asked, self._errors(part)], axis=-1)
-
-        matrix, score = normal_matrix(stars, residual, columns, weight, share)
-        asked = len(histories) * (count + plain)
-        known = len(score) - asked
-        matrix[asked:, asked:] += np.eye(known)
-        left, along = eliminated(matrix, score, asked)
-        found = []
-        for n, (information, slope) in enumerate(zip(np.diag(left), along, strict=True)):
-            history, which = histories[n // (count + plain)], n % (count + plain)
-            if not information > 1e-9 * matrix[n, n]:
-                continue
-            camera = which < count
-            name, unit = (self.cameras[which], "") if camera else self.optics[which - count]
-            found.append(
-                Suspect(name, camera, history, float(slope / information), float(information**-0.5), unit)
+    def suspects(self, size: Answers, error: Answers) -> list[Suspect]:
+        """Every camera and every number of the optics with the histories compared, the most significant first."""
+        asked = [*((name, "") for name in self.cameras), *self.optics]
+        found = [
+            Suspect(
+                name, k < len(self.cameras), self.histories[n], float(size[n, k]), float(error[n, k]), unit
             )
+            for n in self.near(size / error)
+            for k, (name, unit) in enumerate(asked)
+            if np.isfinite(error[n, k])
+        ]
         return sorted(found, key=lambda entry: -abs(entry.sigma))
 
     def without(
@@ -319,33 +304,30 @@ class _Watching:
         weight, share, whole = self.weights(residual)
         matrix, score = self.scan(residual, weight, share)
         while len(changes) < _MOST_CHANGES:
-            z = self.significance(matrix, score)
-            if not np.abs(z).max() > self.alarm:
+            size, error = self.answers(matrix, score)
+            if not np.abs(size / error).max() > self.alarm:
                 break
-            found, residual = self.settled(residual, z)
+            found, residual = self.settled(residual, size, error)
             changes.append(found)
             weight, share, whole = self.weights(residual)
             matrix, score = self.scan(residual, weight, share)
         return self.told(changes, matrix, score, whole)
 
-    def significance(self, matrix: Any, score: Any) -> Float[np.ndarray, "h c"]:
-        """z of every history of every camera and number of the optics."""
+    def answers(self, matrix: Any, score: Any) -> tuple[Answers, Answers]:
+        """Sizes and standard errors of every history of every camera and number of the optics, each alone."""
         groups, count = len(self.time), len(self.cameras) + len(self.optics)
-        z = np.zeros((len(self.histories), count))
+        size, error = np.zeros((len(self.histories), count)), np.full((len(self.histories), count), np.inf)
         blocks, slopes = matrix.reshape(groups, count, groups, count), score.reshape(groups, count)
         for k in range(count):
             own = blocks[:, k, :, k]
             information = np.einsum("gh,gf,fh->h", self.shapes, own, self.shapes, optimize=True)
-            floor = 1e-9 * np.trace(own)
-            z[:, k] = np.where(
-                information > floor,
-                self.shapes.T @ slopes[:, k] / np.sqrt(np.maximum(information, 1e-300)),
-                0.0,
-            )
-        return z
+            seen = information > 1e-9 * np.trace(own)
+            size[seen, k] = self.shapes.T[seen] @ slopes[:, k] / information[seen]
+            error[seen, k] = information[seen] ** -0.5
+        return size, error
 
     def settled(
-        self, residual: Float[np.ndarray, "r k"], z: Float[np.ndarray, "h c"]
+        self, residual: Float[np.ndarray, "r k"], size: Answers, error: Answers
     ) -> tuple[WatchedChange, Float[np.ndarray, "r k"]]:
         """A change with its rivals, and what is left behind it.
 
@@ -355,12 +337,10 @@ class _Watching:
         best: Suspect | None = None
         total, left, alike = 0.0, residual, []
         for _ in range(_ROUNDS):
-            weight, share, _ = self.weights(left)
             if best is not None:
-                z = self.significance(*self.scan(self.without(left, best, -total), weight, share))
-            near = self.near(z)
-            full = residual if best is None else self.without(left, best, -total)
-            ranked = self.suspects(full, weight, share, near)
+                weight, share, _ = self.weights(left)
+                size, error = self.answers(*self.scan(self.without(left, best, -total), weight, share))
+            ranked = self.suspects(size, error)
             before, best = best, ranked[0]
             alike = [entry for entry in ranked if entry.sigma**2 > best.sigma**2 - RIVAL]
             moved = abs(best.size - total) / best.error
@@ -373,21 +353,16 @@ class _Watching:
         when = float(self.time[best.history.start]), (float(began.min()), float(began.max()))
         return WatchedChange(best, tuple(alike), *when), left
 
-    def near(self, z: Float[np.ndarray, "h c"]) -> list[History]:
+    def near(self, z: Answers) -> list[int]:
         """The best history of each kind, whatever has changed, and its neighbours in time."""
         strength = np.max(np.abs(z), axis=1)
-        chosen: list[History] = []
+        chosen: list[int] = []
         for kind in ("step", "drift", "once"):
             mine = [n for n, h in enumerate(self.histories) if h.kind == kind]
             if not mine:
                 continue
             top = max(mine, key=lambda n: strength[n])
-            starts = [self.histories[n].start for n in mine]
-            chosen += [
-                History(kind, start)
-                for start in (self.histories[top].start + d for d in (-1, 0, 1))
-                if start in starts
-            ]
+            chosen += [n for n in (top - 1, top, top + 1) if n in mine]
         return chosen
 
     def told(

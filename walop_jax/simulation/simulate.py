@@ -189,7 +189,10 @@ def simulate(
         # A generator for each point: a last digit that another machine computes differently stays where it is.
         drawn = [detector.draw(*pair) for pair in zip(noise.spawn(len(expected)), expected, strict=True)]
         counts, sigma = (np.stack(part) for part in zip(*drawn, strict=True))
-    return Simulated(_with_counts(plan, blank, counts, sigma), truth)
+    table = TableIntensities.of(blank.intensities, blank.points)
+    at = table.point, table.exposure
+    measured = dataclasses.replace(table, counts=counts[at], sigma=sigma[at])
+    return Simulated(dataclasses.replace(blank, intensities=measured), truth)
 
 
 def as_planned(plan: ObservingPlan) -> CalibrationSet:
@@ -213,13 +216,6 @@ def _without_light(plan: ObservingPlan, sources: Sources, seed: int, cameras: in
         filters=plan.curves(),
         intensities=TableIntensities.dense(points, block),
     )
-
-
-def _with_counts(plan: ObservingPlan, blank: CalibrationSet, counts: Cube, sigma: Cube) -> CalibrationSet:
-    points = blank.points
-    used, source = plan.layout()
-    block = Block(x=points.x, y=points.y, counts=counts, sigma=sigma, used=used, source=source)
-    return dataclasses.replace(blank, intensities=TableIntensities.dense(points, block))
 
 
 def fluxes(plan: ObservingPlan, rng: np.random.Generator | None) -> Float[np.ndarray, "p e"]:
