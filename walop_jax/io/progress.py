@@ -72,8 +72,8 @@ PATIENCE = 1.5  # s
 
 
 @contextlib.contextmanager
-def interrupts_answered(end: Callable[[], int], patience: float = PATIENCE) -> Iterator[None]:
-    """Within it an interrupt that is not answered in `patience` s ends the process with the code that `end` returns.
+def interrupts_answered(end: Callable[[], int]) -> Iterator[None]:
+    """Within it an interrupt that is not answered in `PATIENCE` s ends the process with the code that `end` returns.
 
     `end` is called from another thread, to say so. Outside of the main thread nothing is changed.
     """
@@ -86,7 +86,7 @@ def interrupts_answered(end: Callable[[], int], patience: float = PATIENCE) -> I
 
     def listen() -> None:
         while not over.is_set():
-            if signal.SIGINT in hears.recv(64) and not over.wait(patience):
+            if signal.SIGINT in hears.recv(64) and not over.wait(PATIENCE):
                 os._exit(end())
 
     thread = threading.Thread(target=listen, daemon=True)

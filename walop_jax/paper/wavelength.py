@@ -62,11 +62,10 @@ def colour_spread(
     y: Float[np.ndarray, " p"],
     temperatures: tuple[float, ...] = TEMPERATURES,
     filter_name: str = DEFAULT_FILTER,
-    degree: float = DEGREE,
 ) -> Float[np.ndarray, "p 2"]:
     """Δq_m, Δu_m at every point between stars of the given temperatures (K), largest over position angles."""
     angle = np.arange(ANGLES) * np.pi / ANGLES
-    stars = degree * np.stack([np.cos(2 * angle), np.sin(2 * angle)], axis=1)
+    stars = DEGREE * np.stack([np.cos(2 * angle), np.sin(2 * angle)], axis=1)
     vectors = AnalysisVectors(calibration).exact(Settings.default(1, filter_name), x, y, temperatures)
     seen = np.stack([measured_qu(transmitted(vectors[:, k], stars)) for k in range(len(temperatures))])
     return np.ptp(seen, axis=0).max(axis=1)

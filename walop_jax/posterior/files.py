@@ -78,9 +78,7 @@ def digest_of_fit(inputs: Sequence[InputFile], names: Sequence[str], values: np.
 # ------------------------------------------------------------------------------------------- posterior.nc
 
 
-def write_posterior(
-    path: str | os.PathLike[str], sample: PosteriorSample, *, overwrite: bool = False
-) -> None:
+def write_posterior(path: str | os.PathLike[str], sample: PosteriorSample) -> None:
     """Write `posterior.nc` (netCDF 4), a group for each of ArviZ's.
 
     It appears whole or not at all. Raises `DataError` as `atomic_path` does.
@@ -96,15 +94,15 @@ def write_posterior(
             for group in data.groups():
                 data[group].dump_to_store(H5NetCDFStore(content, group=group, mode="a"))
 
-    _write_hdf5(path, fill, overwrite=overwrite)
+    _write_hdf5(path, fill)
 
 
-def _write_hdf5(path: str | os.PathLike[str], fill: Callable[[h5py.File], None], *, overwrite: bool) -> None:
+def _write_hdf5(path: str | os.PathLike[str], fill: Callable[[h5py.File], None]) -> None:
     """Write an HDF5 file that `fill` fills, in memory first: HDF5 does not survive a disk that is full."""
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
         fill(file)
-    with atomic_path(path, overwrite=overwrite) as temporary:
+    with atomic_path(path) as temporary:
         temporary.write_bytes(buffer.getbuffer())
 
 
@@ -148,15 +146,13 @@ def read_draws(
     return np.stack([held.get(name, np.full(count, fixed.get(name, np.nan))) for name in names], axis=1)
 
 
-def with_draws(
-    calibration: Calibration, path: str | os.PathLike[str], count: int = DRAWS, seed: int = 0
-) -> Calibration:
+def with_draws(calibration: Calibration, path: str | os.PathLike[str], count: int = DRAWS) -> Calibration:
     """The calibration with `count` draws of a `posterior.nc`, over which its matrices are averaged.
 
     `DataError` for a file of another model or another fit, or not trusted.
     """
     draws = _draws_of(calibration, path)
-    chosen = np.random.default_rng(seed).permutation(len(draws))[:count]
+    chosen = np.random.default_rng(0).permutation(len(draws))[:count]
     return dataclasses.replace(calibration, draws=draws[chosen])
 
 
@@ -263,7 +259,7 @@ class Checkpoints:
             for name, value in arrays.items():
                 file.create_dataset(name, data=value)
 
-        _write_hdf5(path, fill, overwrite=False)
+        _write_hdf5(path, fill)
 
     def _read(self, path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         try:

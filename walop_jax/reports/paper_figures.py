@@ -38,22 +38,23 @@ from walop_jax.reports.wording import PLATES
 from walop_jax.science.star_errors import GOAL, QUANTITIES, plate_errors
 
 _PIXELS, _LINES = 31, 41
+_WAVELENGTH, _WAVELENGTHS = 0.62, (0.5, 0.75)  # µm
 COEFFICIENTS = ("$1$", "$q_m$", "$u_m$", "$q_m^2$", "$u_m^2$")
 
 
-def retardance_figure(calibration: Calibration, wavelength: float = 0.62, on: Canvas = PAGE) -> AnyFigure:
-    """Maps of the retardance of every half-wave plate over the field at one wavelength (µm), in degrees modulo 360."""
+def retardance_figure(calibration: Calibration, on: Canvas = PAGE) -> AnyFigure:
+    """Maps of the retardance of every half-wave plate over the field at one wavelength, in degrees modulo 360."""
     instrument = calibration.model.instrument(calibration.values)
     names = plate_names(instrument)
     low_x, high_x, low_y, high_y = calibration.field
     x, y = np.meshgrid(np.linspace(low_x, high_x, _PIXELS), np.linspace(low_y, high_y, _PIXELS))
-    found = plate_retardances(instrument, np.array([wavelength]), x.ravel(), y.ravel())[..., 0]
+    found = plate_retardances(instrument, np.array([_WAVELENGTH]), x.ravel(), y.ravel())[..., 0]
     figure, axes = on.panels(3.9 * len(names), 3.3, 1, len(names), squeeze=False)
     for name, axis, values in zip(names, axes[0], found, strict=True):
         # Unwrapped: a map that jumps by 360° would show the jump and nothing else.
         whole = np.unwrap(np.unwrap(values.reshape(x.shape), axis=1, period=360.0), axis=0, period=360.0)
         whole -= 360.0 * np.floor(whole[_PIXELS // 2, _PIXELS // 2] / 360.0)
-        field_axes(axis, f"retardance of {PLATES.get(name, name)} at {1e3 * wavelength:.0f} nm (deg)")
+        field_axes(axis, f"retardance of {PLATES.get(name, name)} at {1e3 * _WAVELENGTH:.0f} nm (deg)")
         norm = Normalize(float(whole.min()), float(whole.max()))
         colour_bar(figure, pixel_map(axis, whole, calibration.field, norm, SEQUENTIAL), axis)
         lines = axis.contour(
@@ -64,13 +65,11 @@ def retardance_figure(calibration: Calibration, wavelength: float = 0.62, on: Ca
     return figure
 
 
-def retardance_wavelength_figure(
-    calibration: Calibration, wavelengths: tuple[float, float] = (0.5, 0.75), on: Canvas = PAGE
-) -> AnyFigure:
-    """Retardance of every half-wave plate against wavelength (µm) at the centre and at the edges of the field."""
+def retardance_wavelength_figure(calibration: Calibration, on: Canvas = PAGE) -> AnyFigure:
+    """Retardance of every half-wave plate against wavelength at the centre and at the edges of the field."""
     instrument = calibration.model.instrument(calibration.values)
     names = plate_names(instrument)
-    line = np.linspace(*wavelengths, _LINES)
+    line = np.linspace(*_WAVELENGTHS, _LINES)
     low_x, high_x, low_y, high_y = calibration.field
     places = {"centre": (0.5 * (low_x + high_x), 0.5 * (low_y + high_y))}
     places |= {with_minus_sign(f"X = {x:+.2f}°"): (x, 0.0) for x in (low_x, high_x)}

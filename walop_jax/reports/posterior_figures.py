@@ -176,9 +176,7 @@ def trace_figure(
     return figure
 
 
-def save_figure(
-    path: str | os.PathLike[str], figure: Figure, *, overwrite: bool = False, dpi: int = 200
-) -> None:
+def save_figure(path: str | os.PathLike[str], figure: Figure, *, overwrite: bool = False) -> None:
     """Write a figure (format by the name); it appears whole or not at all."""
     with atomic_path(path, overwrite=overwrite) as temporary:
-        figure.savefig(temporary, dpi=dpi, bbox_inches="tight")
+        figure.savefig(temporary, dpi=200, bbox_inches="tight")

@@ -243,7 +243,9 @@ class MeasuredChange(NamedTuple):
         value, vector = np.linalg.eigh(scaled)
         good = value > _KNOWN * value[-1]
         inverse = (vector[:, good] / value[good]) @ vector[:, good].T
-        return cls(tuple(names[k] for k in known.tolist()), change[known] / unit, scaled, inverse, int(good.sum()))
+        return cls(
+            tuple(names[k] for k in known.tolist()), change[known] / unit, scaled, inverse, int(good.sum())
+        )
 
     @property
     def chi2(self) -> float:
