@@ -136,14 +136,13 @@ def _sampled_run(
 def _writers(product: Calibration, posterior: PosteriorSample) -> Writers:
     """The files of a sampled run."""
     from walop_jax.calibration import PRODUCT, write_calibration
-    from walop_jax.io.plain_tables import astropy_table, write_table
+    from walop_jax.io.plain_tables import write_table
     from walop_jax.io.text import json_text
     from walop_jax.posterior import write_posterior
     from walop_jax.reports.named import FigureSource, draw
     from walop_jax.reports.posterior_figures import save_figure
 
-    notes = {"TRUSTED": posterior.trusted, "STEPS": posterior.convergence.steps}
-    intervals = astropy_table(posterior.intervals(), notes)
+    intervals = posterior.to_table()
     figures = FigureSource.of(posterior)
     writers: dict[str, Any] = {
         "posterior.nc": lambda path: write_posterior(path, posterior),

@@ -82,14 +82,8 @@ class Offsets:
         """Sizes in per cent, and the share of the variance of Δ that the weakest direction explains."""
 
         def size(values: Float[np.ndarray, "p 2"]) -> dict[str, float]:
-            rms = np.sqrt(np.mean(values**2, axis=0)).tolist()
-            most = np.abs(values).max(axis=0).tolist()
-            return {
-                "rms_q": 100 * rms[0],
-                "rms_u": 100 * rms[1],
-                "max_q": 100 * most[0],
-                "max_u": 100 * most[1],
-            }
+            sizes = np.append(np.sqrt(np.mean(values**2, axis=0)), np.abs(values).max(axis=0))
+            return dict(zip(("rms_q", "rms_u", "max_q", "max_u"), (100 * sizes).tolist(), strict=True))
 
         def explained(values: Float[np.ndarray, "p 2"]) -> dict[str, float]:
             left = np.sum((self.found - values) ** 2, axis=0) / np.sum(self.found**2, axis=0)
@@ -170,7 +164,7 @@ class Comparison(Displayed):
 
     def document(self) -> dict[str, Any]:
         """Everything as numbers in per cent; errors are rms over the stars, statistics over the field."""
-        spread = 100.0 * self.paper.spread
+        spread, most = 100.0 * self.paper.spread, 100.0 * np.abs(self.paper.delta).max(axis=0)
         return {
             "filter": self.filter,
             "teff": self.teff,
@@ -182,9 +176,7 @@ class Comparison(Displayed):
                 "sigma_q": _summary(spread[:, 0]),
                 "sigma_u": _summary(spread[:, 1]),
                 "share_sigma_u_below_goal": float(np.mean(spread[:, 1] < 100.0 * GOAL)),
-                "delta_max": dict(
-                    zip("qu", (100.0 * np.abs(self.paper.delta).max(axis=0)).tolist(), strict=True)
-                ),
+                "delta_max": dict(zip("qu", most.tolist(), strict=True)),
             },
             "on_grid": self.grid.document(),
             "between": self.between.document(),

@@ -169,6 +169,15 @@ def arviz_of_fit(result: FitResult, draws: int, seed: int) -> Any:
     return data
 
 
+def interval_in_words(row: Any) -> dict[str, str]:
+    """A row of `PosteriorSample.intervals` as texts: median, half the 68 % interval, ends of that of 95 %."""
+    half = 0.5 * float(row["HIGH68"] - row["LOW68"])
+    low, high = (value_and_error(float(row[f"{end}95"]), half)[0] for end in ("LOW", "HIGH"))
+    median, sigma = value_and_error(float(row["MEDIAN"]), half)
+    names = {"name": str(row["NAME"]), "unit": str(row["UNIT"]), "ess": f"{float(row['ESS']):.0f}"}
+    return names | {"low": low, "high": high, "median": median, "sigma": sigma}
+
+
 def assess(chains: Chains, names: tuple[str, ...], thin: int = 1) -> Convergence:
     """Apply the rules to chains stored every `thin` steps, burn-in taken off."""
     n, k = chains.shape[1], chains.shape[-1]
@@ -408,7 +417,8 @@ class PosteriorSample(Drawn):
 
     def to_table(self) -> Any:
         """The columns of `intervals` as an astropy table."""
-        return astropy_table(self.intervals(), {"TRUSTED": self.trusted})
+        notes = {"TRUSTED": self.trusted, "STEPS": self.convergence.steps}
+        return astropy_table(self.intervals(), notes)
 
     def log_likelihood(self) -> Float[np.ndarray, "e d r"]:
         """ln p of every used row (point, exposure) at every draw, for `arviz.loo`.
@@ -492,12 +502,11 @@ class PosteriorSample(Drawn):
     def display(self) -> Display:
         """The verdict on the chains and the sampled coefficients."""
         table = self.to_table()
-        rows = []
-        for row in table[np.isin(np.asarray(table["NAME"]), self.sampled)]:
-            half = 0.5 * float(row["HIGH68"] - row["LOW68"])
-            ends = [value_and_error(float(row[f"{side}95"]), half)[0] for side in ("LOW", "HIGH")]
-            texts = value_and_error(float(row["MEDIAN"]), half)
-            rows.append((str(row["NAME"]), *texts, str(row["UNIT"]), " … ".join(ends), f"{row['ESS']:.0f}"))
+        told = map(interval_in_words, table[np.isin(np.asarray(table["NAME"]), self.sampled)])
+        rows = [
+            (t["name"], t["median"], t["sigma"], t["unit"], f"{t['low']} … {t['high']}", t["ess"])
+            for t in told
+        ]
         return Display(
             title=f"Posterior: {'trusted' if self.trusted else 'not converged, or not exact enough'}",
             facts=(("sampler", self.sampler), ("chains", self.convergence.message())),

@@ -34,6 +34,7 @@ from walop_jax.io.text import (
 from walop_jax.nights.stacking import SURVEY, TRACKS
 from walop_jax.plans.plan import PLANNED
 from walop_jax.posterior.files import COMPARISON, EPOCH, LIMITS
+from walop_jax.posterior.result import interval_in_words
 from walop_jax.reports import diagnosis_figures, figures, survey_figures
 from walop_jax.reports.named import FigureSource, draw
 from walop_jax.reports.posterior_figures import unit_in_words
@@ -125,7 +126,7 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         "parameters": main,
         "other_parameters": rest,
         "many": MANY,
-        "intervals": [_interval(row) for row in run.intervals],
+        "intervals": [interval_in_words(row) for row in run.intervals],
         "figures": _figures(run, accuracy),
         "versions": summary["versions"],
         "accuracy": None if accuracy is None else _accuracy_in_words(accuracy),
@@ -224,15 +225,6 @@ def _pulls(run: RunContents) -> list[dict[str, Any]]:
         }
         for p, prior, value, sigma, pull in sorted(pulls, key=lambda row: -abs(row[-1]))[:MOST_PULLS]
     ]
-
-
-def _interval(row: Mapping[str, Any]) -> dict[str, str]:
-    median, low, high = (float(row[name]) for name in ("MEDIAN", "LOW68", "HIGH68"))
-    half = 0.5 * (high - low)
-    ends = {end.lower(): value_and_error(float(row[f"{end}95"]), half)[0] for end in ("LOW", "HIGH")}
-    value, sigma = value_and_error(median, half)
-    names = {"name": str(row["NAME"]), "unit": str(row["UNIT"]), "ess": f"{float(row['ESS']):.0f}"}
-    return names | ends | {"median": value, "sigma": sigma}
 
 
 def _figures(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, str]:

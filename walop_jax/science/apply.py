@@ -153,7 +153,7 @@ class _Application:
         points, sigma, counts = catalogue.points, catalogue.sigma[rows], self.counts[rows]
         _, star = np.unique(catalogue.star[rows], return_inverse=True)
         first = np.flatnonzero(np.diff(star, prepend=-1))
-        outside = _outside(vectors, catalogue, rows)
+        outside = self.outside(rows)
         x, y = (np.where(outside, 0.0, values[rows]) for values in (points.x, points.y))
         teff, sky = points.settings.teff[rows], np.isfinite(catalogue.rotator[rows])
         turn = 2.0 * np.where(sky, np.deg2rad(catalogue.rotator[rows]) + self.offset, 0.0)
@@ -210,8 +210,7 @@ class _Application:
             colour = np.stack([change_of(weights) for weights in _unknown_colour(teff)], axis=-1)
             mean, width = (shift(colour[..., n]) for n in range(2))
             spectrum = mean[:, :, None] * mean[:, None] + width[:, :, None] * width[:, None]
-        disagree = _disagree(found.chi2, found.dof, np.maximum.reduceat(_brightness(used, sigma), first))
-        flag = _flags(vectors, catalogue, rows, used, first, found.qu, found.condition, disagree)
+        flag = self.flags(rows, used, first, found)
         others = np.trace(found.photon + calibration, axis1=1, axis2=2)
         flag[np.trace(spectrum, axis1=1, axis2=2) > others] |= Quality.UNKNOWN_COLOUR
         stars = Stars(
@@ -228,6 +227,38 @@ class _Application:
             flag=flag,
         )
         return _Block(rows, star, stars, found, on_sky, sigma, plain, throughput, colour, derivative)
+
+    def outside(self, rows: Int[np.ndarray, " r"]) -> Bool[np.ndarray, " r"]:
+        """Rows beyond the field of the instrument, or too far beyond that of the calibration to mean anything."""
+        points = self.catalogue.points
+        return points.outside[rows] | (
+            np.maximum(np.abs(points.x[rows]), np.abs(points.y[rows])) > self.vectors.half_width
+        )
+
+    def flags(
+        self,
+        rows: Int[np.ndarray, " r"],
+        counts: Float[np.ndarray, "r k"],
+        first: Int[np.ndarray, " s"],
+        found: Estimate,
+    ) -> Int[np.ndarray, " s"]:
+        """Quality bits of every star: those of its rows and of the calibration, and three that need all of its rows."""
+        points, sigma = self.catalogue.points, self.catalogue.sigma[rows]
+        settings, calibration = points.settings[rows], self.vectors.calibration
+        bits = calibration.flags(points.x[rows], points.y[rows], settings)
+        bits[bits & Quality.BEYOND_SETTINGS > 0] |= Quality.VALIDITY_FORCED
+        bits[self.outside(rows)] |= Quality.BEYOND_FIELD
+        bits[settings.teff < COOLEST] |= Quality.BEYOND_SETTINGS
+        bits[~np.isfinite(counts * sigma).all(axis=1)] |= Quality.CAMERA_MISSING
+        bits[self.catalogue.spoilt[rows]] |= Quality.SATURATED
+        flag = np.bitwise_or.reduceat(bits, first) | calibration.verdict.quality
+        flag[~(found.condition < ILL_POSED)] |= Quality.HIGH_CROSSTALK
+        flag[~np.isfinite(found.qu).all(axis=1)] |= Quality.NO_STOKES
+        # The largest signal-to-noise ratio of a camera.
+        good = np.isfinite(counts) & np.isfinite(sigma) & (sigma > 0)
+        bright = np.where(good, counts / np.where(good, sigma, 1.0), 0.0).max(axis=1)
+        flag[_disagree(found.chi2, found.dof, np.maximum.reduceat(bright, first))] |= Quality.DISAGREES
+        return flag
 
     # ------------------------------------------------------------------------------ the catalogue as a whole
 
@@ -337,15 +368,6 @@ def _slices_of_stars(star: Int[np.ndarray, " n"]) -> Iterator[tuple[int, slice]]
         start = end
 
 
-def _outside(
-    vectors: AnalysisVectors, catalogue: Catalogue, rows: Int[np.ndarray, " r"]
-) -> Bool[np.ndarray, " r"]:
-    """Rows beyond the field of the instrument, or too far beyond that of the calibration to mean anything."""
-    points = catalogue.points
-    far = np.maximum(np.abs(points.x[rows]), np.abs(points.y[rows])) > vectors.half_width
-    return points.outside[rows] | far
-
-
 def _rows_by_setting(setting_of: Int[np.ndarray, " r"]) -> Iterator[tuple[int, Int[np.ndarray, " w"]]]:
     for k in np.unique(setting_of):
         yield int(k), np.flatnonzero(setting_of == k)
@@ -437,12 +459,6 @@ def _settings(vectors: AnalysisVectors, catalogue: Catalogue) -> tuple[list[Sett
     return [setting for setting, _ in found], of
 
 
-def _brightness(counts: Float[np.ndarray, "r k"], sigma: Float[np.ndarray, "r k"]) -> Float[np.ndarray, " r"]:
-    """Largest signal-to-noise ratio of a camera in every row; 0 where there is none."""
-    good = np.isfinite(counts) & np.isfinite(sigma) & (sigma > 0)
-    return np.where(good, counts / np.where(good, sigma, 1.0), 0.0).max(axis=1)
-
-
 def _disagree(
     chi2: Float[np.ndarray, " s"], dof: Int[np.ndarray, " s"], brightness: Float[np.ndarray, " s"]
 ) -> Bool[np.ndarray, " s"]:
@@ -452,32 +468,6 @@ def _disagree(
     for k in np.unique(dof[dof > 0]).tolist():
         found |= (dof == k) & (chi2 > special.chdtri(k, IMPROBABLE))
     return found
-
-
-def _flags(
-    vectors: AnalysisVectors,
-    catalogue: Catalogue,
-    rows: Int[np.ndarray, " r"],
-    counts: Float[np.ndarray, "r k"],
-    first: Int[np.ndarray, " s"],
-    qu: Float[np.ndarray, "s 2"],
-    condition: Float[np.ndarray, " s"],
-    disagree: Bool[np.ndarray, " s"],
-) -> Int[np.ndarray, " s"]:
-    """Quality bits of every star: those of its rows and of the calibration, and three that need all of its rows."""
-    points = catalogue.points
-    settings = points.settings[rows]
-    bits = vectors.calibration.flags(points.x[rows], points.y[rows], settings)
-    bits[bits & Quality.BEYOND_SETTINGS > 0] |= Quality.VALIDITY_FORCED
-    bits[_outside(vectors, catalogue, rows)] |= Quality.BEYOND_FIELD
-    bits[settings.teff < COOLEST] |= Quality.BEYOND_SETTINGS
-    bits[~np.isfinite(counts * catalogue.sigma[rows]).all(axis=1)] |= Quality.CAMERA_MISSING
-    bits[catalogue.spoilt[rows]] |= Quality.SATURATED
-    flag = np.bitwise_or.reduceat(bits, first) | vectors.calibration.verdict.quality
-    flag[~(condition < ILL_POSED)] |= Quality.HIGH_CROSSTALK
-    flag[~np.isfinite(qu).all(axis=1)] |= Quality.NO_STOKES
-    flag[disagree] |= Quality.DISAGREES
-    return flag
 
 
 # ---------------------------------------------------------------------------------- effects beyond the optics

@@ -228,19 +228,18 @@ class CatalogueCheck(Displayed):
 
     def to_table(self) -> Any:
         """All questions with their first answers, as an astropy table."""
-        columns = {
-            "KIND": (
-                np.array([t.question.kind for t in self.tests]),
-                "",
-                "gain, x, y, time, flux, light, or optics",
-            ),
-            "NAME": (np.array([t.question.name for t in self.tests]), "", "camera or parameter"),
-            "SIZE": (np.array([t.size for t in self.tests]), "", "change, this one alone"),
-            "ERROR": (np.array([t.error for t in self.tests]), "", "standard error, calibration included"),
-            "SIGMA": (np.array([t.sigma for t in self.tests]), "", "SIZE / ERROR"),
-            "UNIT": (np.array([t.question.unit for t in self.tests]), "", "unit of SIZE"),
+        about = {
+            "KIND": "gain, x, y, time, flux, light, or optics",
+            "NAME": "camera or parameter",
+            "SIZE": "change, this one alone",
+            "ERROR": "standard error, calibration included",
+            "SIGMA": "SIZE / ERROR",
+            "UNIT": "unit of SIZE",
         }
-        return astropy_table(columns)
+        rows = [t.question._asdict() | t._asdict() for t in self.tests]
+        return astropy_table(
+            {name: (np.array([row[name.lower()] for row in rows]), "", text) for name, text in about.items()}
+        )
 
     def display(self) -> Display:
         """The verdict, the noise, and the answers for every camera."""
