@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import importlib
+import inspect
 import json
 import re
 import tomllib
@@ -304,10 +305,43 @@ def test_example_of_a_model_file():
 # -------------------------------------------------------------------------------------- model and effects
 
 
+def catalogue_tables() -> str:
+    """The tables of all effects in docs: effects, as Markdown, from the catalogue."""
+    from walop_jax.model.effects import EFFECTS
+    from walop_jax.model.parameters import field_declarations
+
+    lines: list[str] = []
+    entries = tomllib.loads((ROOT / "walop_jax" / "model" / "effects" / "catalogue.toml").read_text())
+    for effect in EFFECTS:
+        if part := entries[effect.name].get("part"):
+            lines += ["", f"### {part}", ""]
+            lines += ["| effect | parameter | unit | width | what it is |", "| --- | --- | --- | --- | --- |"]
+        choices = [f.name for f in dataclasses.fields(effect) if f.metadata.get("static")]
+        choices = [name for name in choices if name not in ("positions", "ids")]
+        equation = effect.head().partition("Equation")[2].partition("\nSymbols")[0]
+        told = [
+            inspect.cleandoc(effect.__doc__ or "").splitlines()[0].rstrip("."),
+            *(f"choice: `{name}`" for name in choices),
+            " ".join(equation.split()),
+        ]
+        declared = field_declarations(effect)
+        for name, d in declared.items() or [("none", None)]:
+            width = "" if d is None or d.width is None else f"{d.width:g}"
+            what = "" if d is None else d.about + ("" if d.width else " (shape)")
+            cells = (
+                effect.name if told else "",
+                name,
+                d.unit if d else "",
+                width,
+                "; ".join((*told, what)).rstrip("; "),
+            )
+            lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |".replace("|  |", "| |"))
+            told = []
+    return re.sub(r"\|  (?=\|)", "| ", "\n".join(lines).strip()) + "\n"
+
+
 def test_tables_of_effects_are_those_of_the_catalogue():
     """Generated: what the page should say is what the assertion shows."""
-    from walop_jax.model.gallery import catalogue_tables
-
     page = section("effects", "The catalogue of effects")
     start, stop = page.index("### Sky and stars"), page.index("`free_form` is not an effect")
     assert page[start:stop].strip() == catalogue_tables().strip()

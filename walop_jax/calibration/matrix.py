@@ -391,10 +391,10 @@ def change_of_qu(
     return found
 
 
-def sample_stars(count: int = STARS, largest: float = LARGEST_P, seed: int = 0) -> Float[np.ndarray, "n 2"]:
-    """(q, u) of sources with p evenly up to `largest` and any angle."""
+def sample_stars(count: int = STARS, seed: int = 0) -> Float[np.ndarray, "n 2"]:
+    """(q, u) of sources with p evenly up to `LARGEST_P` and any angle."""
     rng = np.random.default_rng(seed)
-    p, angle = rng.uniform(0.0, largest, count), rng.uniform(0.0, np.pi, count)
+    p, angle = rng.uniform(0.0, LARGEST_P, count), rng.uniform(0.0, np.pi, count)
     return np.stack([p * np.cos(2 * angle), p * np.sin(2 * angle)], axis=1)
 
 

@@ -175,7 +175,9 @@ def _readings(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
         yield Alternative(
             "the calibration polariser was not in the beam",
             "set CLP_IN to F and CLP_ANGLE to NaN, or observe again",
-            with_exposures(_without_polariser),
+            with_exposures(
+                lambda e: dataclasses.replace(e, clp_in=e.clp_in & False, clp_angle=e.clp_angle * np.nan)
+            ),
         )
 
 
@@ -291,10 +293,6 @@ def _with_angle(prefix: str, turned: Callable[[np.ndarray], np.ndarray]) -> Chan
         return dataclasses.replace(e, moving={**e.moving, prefix: there})
 
     return with_exposures(change)
-
-
-def _without_polariser(e: Exposures) -> Exposures:
-    return dataclasses.replace(e, clp_in=np.zeros(len(e), bool), clp_angle=np.full(len(e), np.nan))
 
 
 def with_exposures(change: Callable[[Exposures], Exposures]) -> Change:

@@ -88,14 +88,6 @@ def rank(table: ScoreTable, probes: Sequence[Probe], policy: Policy = POLICY) ->
     return sorted(ranked, key=lambda item: -item.log_bayes)
 
 
-def rank_sentences(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
-    """Sentences by evidence, best first; all of them share the prior of one name."""
-    price = float(np.log(max(len(probes), 1)))
-    scored = [(probe, table[probe.name]) for probe in probes]
-    found = [Ranked(Described, p, score, score.log_bayes - price) for p, score in scored if score.testable]
-    return sorted(found, key=lambda item: -item.log_bayes)
-
-
 def leaders(ranked: Sequence[Ranked], policy: Policy = POLICY) -> list[Ranked]:
     """Candidates whose linear evidence is too close to the best to leave them out."""
     if not ranked:
@@ -188,7 +180,12 @@ class Evidence:
     @cached_property
     def told(self) -> list[Ranked]:
         """Sentences in order of evidence, each less what it pays for being one of so many."""
-        return rank_sentences(self.table, self.sentences)
+        price = float(np.log(max(len(self.sentences), 1)))  # all of them share the prior of one name
+        scored = [(probe, self.table[probe.name]) for probe in self.sentences]
+        found = [
+            Ranked(Described, p, score, score.log_bayes - price) for p, score in scored if score.testable
+        ]
+        return sorted(found, key=lambda item: -item.log_bayes)
 
     @cached_property
     def significant(self) -> list[Ranked]:

@@ -374,7 +374,10 @@ def _in_words(cube: Cube, used: Used, exposures: Exposures) -> Iterator[_Combina
     angle = np.deg2rad(np.where(through, exposures.clp_angle, 0.0))
     for harmonic in HARMONICS[1:]:
         waves = [np.where(through, wave(harmonic * angle), 0.0) for wave in (np.cos, np.sin)]
-        phase = _best_phase(cube, waves)
+        # The phase at which cos φ · (cosine part) + sin φ · (sine part) has the largest power.
+        cosine, sine = (np.einsum("pek,e->pk", cube, wave) for wave in waves)
+        power = np.sum(cosine**2) - np.sum(sine**2)
+        phase = 0.5 * float(np.arctan2(2.0 * np.sum(cosine * sine), power))
         weight = waves[0] * np.cos(phase) + waves[1] * np.sin(phase)
         if np.linalg.norm(weight) > 1e-6:
             words = f"cos({harmonic} theta - {np.rad2deg(phase) % 360:.0f} deg), theta the polariser angle"
@@ -385,12 +388,6 @@ def _in_words(cube: Cube, used: Used, exposures: Exposures) -> Iterator[_Combina
     hours = np.where(measured, exposures.mjd - exposures.mjd[measured].mean(), 0.0)
     if np.all(np.isfinite(hours)) and np.any(hours):
         yield _Combination("trend with time", hours / np.linalg.norm(hours))
-
-
-def _best_phase(cube: Cube, waves: list[Weight]) -> float:
-    """The phase φ at which cos φ · (cosine part) + sin φ · (sine part) has the largest power."""
-    cosine, sine = (np.einsum("pek,e->pk", cube, wave) for wave in waves)
-    return 0.5 * float(np.arctan2(2.0 * np.sum(cosine * sine), np.sum(cosine**2) - np.sum(sine**2)))
 
 
 def _ladder(diagnosis: Diagnosis) -> Table:

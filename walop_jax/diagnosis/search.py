@@ -60,11 +60,6 @@ class Trial:
     rivals: tuple[str, ...] = ()
     nameless: tuple[str, ...] = ()
 
-    @classmethod
-    def of_fit(cls, effect: type[Effect], fit: FitResult, evidence: float) -> Trial:
-        """A trial without a linear step."""
-        return cls(effect, evidence, fit.chi2, fit.explains_data, fit=fit)
-
     @property
     def instance(self) -> Effect:
         """The effect at its fitted values, in standard form."""
@@ -128,7 +123,7 @@ def try_model(
         worth=base.posterior.objective,
     )
     bayes = log_evidence_ratio(base, result) - (float(np.log(prior_shapes)) if prior_shapes > 1 else 0.0)
-    return Trial.of_fit(effect, result, bayes)
+    return Trial(effect, bayes, result.chi2, result.explains_data, fit=result)
 
 
 def try_shapes(base: FitResult, item: Ranked, context: Context, shapes: int, policy: Policy) -> Trial:

@@ -348,7 +348,9 @@ class Refit(Linear):
         if nameless is not None or len(self.said) <= self.policy.most_sentences:
             return state, nameless
         # Something that no sentence holds looks like several that are there.
-        nameless, said = too_many_sentences(state, self.said), [first.said[name] for name in self.said]
+        text = f"{len(self.said)} descriptions were needed: they say where it sits, no single one of them what it is"
+        nameless = Unexplained(state.table.p_global, f"{text} ({' | '.join(self.said)})", ())
+        said = [first.said[name] for name in self.said]
         if predicts_unseen(first.design, said, self.policy.useful):
             return state, nameless
         self._without(Described.name)
@@ -502,9 +504,3 @@ _LEFT_OUT = (
 
 def _and(found: Unexplained, text: str) -> Unexplained:
     return dataclasses.replace(found, description=f"{found.description}. {text}")
-
-
-def too_many_sentences(state: Examination, said: Sequence[str]) -> Unexplained:
-    """Remainder where so many sentences were needed that none of them is the thing itself."""
-    text = f"{len(said)} descriptions were needed: they say where it sits, no single one of them what it is"
-    return Unexplained(state.table.p_global, f"{text} ({' | '.join(said)})", ())

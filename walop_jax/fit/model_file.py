@@ -238,7 +238,11 @@ def base_model(
     """
     names = standard_names(calset.sources)
     sources = calset.sources
-    level = _throughput_level(calset) if has_known_flux(calset) else LEVEL
+    level = LEVEL
+    if has_known_flux(calset):  # a camera gets half of the unpolarised light: N = T/2
+        block = calset.intensities.block(0, min(limits.LEVEL_POINTS, len(calset.points)))
+        rows = block.used & (calset.exposures.kind == "flux")
+        level = float(2.0 * block.counts[rows].mean())
     instrument = as_designed(instrument or instrument_of(calset))
     if instrument.name != calset.instrument:
         raise ValueError(
@@ -307,13 +311,6 @@ def standard_names(sources: Sources) -> tuple[str, ...]:
 def has_known_flux(calset: CalibrationSet) -> bool:
     """True if any exposure is of KIND `flux`, so that the overall scale of the throughput is measured."""
     return bool((calset.exposures.kind == "flux").any())
-
-
-def _throughput_level(calset: CalibrationSet) -> float:
-    # A camera gets half of the unpolarised light: N = T/2.
-    block = calset.intensities.block(0, min(limits.LEVEL_POINTS, len(calset.points)))
-    rows = block.used & (calset.exposures.kind == "flux")
-    return float(2.0 * block.counts[rows].mean())
 
 
 def model_for(

@@ -53,11 +53,9 @@ class Clipped:
         return self.share > MOST
 
 
-def outlying(
-    likelihood: Likelihood, residual: Float[np.ndarray, "p e k"], beyond: float = BEYOND
-) -> Bool[np.ndarray, "p e"]:
-    """Used rows of which a camera lies more than `beyond` standard errors off, of the normalised residuals."""
-    return _distance(likelihood, residual) > beyond
+def outlying(likelihood: Likelihood, residual: Float[np.ndarray, "p e k"]) -> Bool[np.ndarray, "p e"]:
+    """Used rows of which a camera lies more than `BEYOND` standard errors off, of the normalised residuals."""
+    return _distance(likelihood, residual) > BEYOND
 
 
 def clipped(calset: CalibrationSet, model: Model | None = None, beyond: float = BEYOND) -> Clipped:

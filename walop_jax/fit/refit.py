@@ -405,16 +405,13 @@ def refit(
     are those of `with_honest_errors`. Raises what `fit` raises.
     """
     model, crew = model or base_model(calset), processes or Processes()
-    journal = None if folder is None else _journal(Path(folder), calset, model, crew)
+    journal = None
+    if folder is not None:  # named by all that the fit depends on: data, model, software, and who does it
+        texts = [fingerprint(calset), render(model), f"{crew.index}/{crew.count}"]
+        texts += [f"{name} {version}" for name, version in software_versions().items()]
+        journal = Journal(Path(folder), hashlib.sha256("\n".join(texts).encode()).hexdigest())
     runner = Runner(processes=crew, progress=progress, journal=journal)
     likelihood = Likelihood.of(calset, model, memory=memory, runner=runner)
     size = likelihood.layout.memory / 1e9
     runner.tell(Stage(f"preparing the fit{f' of {size:.2g} GB of data' if size > 0.1 else ''}", "fitting"))
     return with_honest_errors(fit(likelihood))
-
-
-def _journal(folder: Path, calset: CalibrationSet, model: Model, processes: Processes) -> Journal:
-    """Journal of one fit, named by all that it depends on: data, model, software, and who does it."""
-    texts = [fingerprint(calset), render(model), f"{processes.index}/{processes.count}"]
-    texts += [f"{name} {version}" for name, version in software_versions().items()]
-    return Journal(folder, hashlib.sha256("\n".join(texts).encode()).hexdigest())

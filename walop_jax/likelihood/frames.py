@@ -44,7 +44,6 @@ from walop_jax.data.table_intensities import NEGATIVE
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.field_table import TOLERANCE, FieldTable, accurate_table, in_batches
 from walop_jax.likelihood.flux import sharing
-from walop_jax.likelihood.layout import PointReader
 from walop_jax.likelihood.likelihood import Census, DataTerms, Likelihood, OpticsUsed, Posterior
 from walop_jax.likelihood.runner import SlabSums
 from walop_jax.model import chebyshev, light
@@ -261,11 +260,6 @@ _solve = compiled(jax.vmap(_smooth, in_axes=(None, None, 0)))
 _slopes = compiled(jax.vmap(engine.unit_slopes, in_axes=(None, None, 0)))
 
 
-def smooth_at(likelihood: Likelihood, instrument: Instrument, x: Vector, y: Vector) -> Smooth:
-    """Smooth quantities of the frame, at field positions (deg): exact. First axis: positions."""
-    return _at(_solve, likelihood, instrument, x, y)
-
-
 def unit_slopes_at(
     likelihood: Likelihood, instrument: Instrument, x: Vector, y: Vector
 ) -> Float[np.ndarray, "p e k a"]:
@@ -274,15 +268,16 @@ def unit_slopes_at(
 
 
 def _at(solve: Any, likelihood: Likelihood, instrument: Instrument, x: Vector, y: Vector) -> Any:
-    reader = likelihood.points.reader
-    return in_batches(lambda x, y: solve(instrument, likelihood.plan, blank_points(reader, x, y)), x, y)
+    """What a program gives at field positions (deg): exact. First axis: positions."""
 
+    def solved(x: Vector, y: Vector) -> Any:
+        # Points with counts and errors of one in every exposure.
+        shape = (len(x), len(likelihood.flux_known))
+        ones = np.ones((*shape, likelihood.cameras))
+        block = Block(x, y, ones, ones, np.ones(shape, bool), np.full(shape, -1))
+        return solve(instrument, likelihood.plan, likelihood.points.reader.point_data(block))
 
-def blank_points(reader: PointReader, x: Vector, y: Vector) -> engine.PointData:
-    """Field points (deg) with counts and errors of one in every exposure."""
-    shape = (len(x), len(reader.calset.exposures))
-    ones = np.ones((*shape, reader.calset.cameras))
-    return reader.point_data(Block(x, y, ones, ones, np.ones(shape, bool), np.full(shape, -1)))
+    return in_batches(solved, x, y)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -426,7 +421,7 @@ def _series(
     """The series of everything, accurate for these exposures, and how accurate."""
 
     def exact(s: Vector, t: Vector) -> Smooth:
-        return smooth_at(likelihood, instrument, *cells.field(s, t))
+        return _at(_solve, likelihood, instrument, *cells.field(s, t))
 
     def error(found: Smooth, truth: Smooth) -> float:
         off = [

@@ -143,11 +143,6 @@ class Processes:
     index: int = 0
     count: int = 1
 
-    @classmethod
-    def present(cls) -> Processes:
-        """Those that `jax.distributed` knows of."""
-        return cls(jax.process_index(), jax.process_count())
-
     def share(self, count: int) -> range:
         """Share of this process in `count` pieces of work."""
         return range(self.index, count, self.count)
@@ -209,7 +204,7 @@ def join(place: str) -> Processes:
         raise LostProcessError(
             f"the processes did not find each other at {place}: {_first_line(error)}"
         ) from error
-    here = Processes.present()
+    here = Processes(jax.process_index(), jax.process_count())
     here.gather("joined", np.zeros(1))  # whoever cannot be reached is missed now
     return here
 

@@ -90,12 +90,10 @@ class ExposurePart(Component):
 
     def factors(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"] | float:
         """Factors of the counts, exposure by exposure."""
-        del exposures, x, y
         return 1.0
 
     def share(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"] | float:
         """The share, exposure by exposure."""
-        del exposures, x, y
         return 0.0
 
 

@@ -71,7 +71,7 @@ def backward(
     """Rows that the analysers see in every state, of light ahead of the common train."""
     in_arms = [element.moves for arm in arms for element, _ in arm if element.moves is not None]
     known = {moving.index(prefix) for prefix in in_arms}
-    keys = _distinct(states, known)
+    keys = list(dict.fromkeys(_restricted(state, known) for state in states))
     number, parts = len(common), []
     for arm, analyser in zip(arms, analysers, strict=True):
         matrix = product(
@@ -94,10 +94,6 @@ def backward(
 
 def _restricted(state: State, known: set[int]) -> State:
     return tuple(position if i in known else None for i, position in enumerate(state))
-
-
-def _distinct(states: Sequence[State], known: set[int]) -> list[State]:
-    return list(dict.fromkeys(_restricted(state, known) for state in states))
 
 
 def _branched(

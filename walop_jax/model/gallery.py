@@ -3,7 +3,6 @@ pages."""
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import json
 import re
@@ -13,7 +12,6 @@ from importlib.resources import files
 from typing import Any
 
 from walop_jax.model.effects import EFFECTS, Effect
-from walop_jax.model.effects.catalogue import PARTS
 from walop_jax.model.elements import ELEMENTS
 from walop_jax.model.elements.base import Element
 from walop_jax.model.parameters import field_declarations, numbers_of, unknown_name
@@ -54,33 +52,6 @@ def listed(topic: str) -> str:
     """All effects, or all kinds of elements, each with a few words."""
     width = max(map(len, TOPICS[topic]))
     return "\n".join(f"{name:<{width}}  {_about(kind)}" for name, kind in TOPICS[topic].items()) + "\n"
-
-
-def catalogue_tables() -> str:
-    """The tables of all effects in docs: effects, as Markdown, from the catalogue."""
-    lines: list[str] = []
-    for effect in EFFECTS:
-        if effect.name in PARTS:
-            lines += ["", f"### {PARTS[effect.name]}", ""]
-            lines += ["| effect | parameter | unit | width | what it is |", "| --- | --- | --- | --- | --- |"]
-        choices = [f.name for f in dataclasses.fields(effect) if f.metadata.get("static")]
-        choices = [name for name in choices if name not in ("positions", "ids")]
-        equation = effect.head().partition("Equation")[2].partition("\nSymbols")[0]
-        told = [_about(effect), *(f"choice: `{name}`" for name in choices), " ".join(equation.split())]
-        declared = field_declarations(effect)
-        for name, d in declared.items() or [("none", None)]:
-            width = "" if d is None or d.width is None else f"{d.width:g}"
-            what = "" if d is None else d.about + ("" if d.width else " (shape)")
-            cells = (
-                effect.name if told else "",
-                name,
-                d.unit if d else "",
-                width,
-                "; ".join((*told, what)).rstrip("; "),
-            )
-            lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |".replace("|  |", "| |"))
-            told = []
-    return re.sub(r"\|  (?=\|)", "| ", "\n".join(lines).strip()) + "\n"
 
 
 def numbers() -> dict[str, Any]:

@@ -43,10 +43,6 @@ class Matrix2(NamedTuple):
             self.d / determinant, -self.b / determinant, -self.c / determinant, self.a / determinant
         )
 
-    def scaled_rows(self, first: Inexact[Array, ...], second: Inexact[Array, ...]) -> Matrix2:
-        """The matrix diag(first, second) times this one."""
-        return Matrix2(first * self.a, first * self.b, second * self.c, second * self.d)
-
     def times(self, factor: Inexact[Array, ...] | float) -> Matrix2:
         """Every element times a scalar."""
         return Matrix2(factor * self.a, factor * self.b, factor * self.c, factor * self.d)

@@ -66,10 +66,6 @@ class Parameter:
         """Standard deviation of the prior, None where there is none."""
         return None if self.prior is None else self.prior[1]
 
-    def is_of(self, place: str) -> bool:
-        """True if it belongs to a part of the instrument, or to a part of that."""
-        return f"{self.part}.".startswith(f"{place}.")
-
     def at(self, value: float, prior: tuple[float, float] | None = None) -> Parameter:
         """A declared parameter at a value; `prior` replaces what is declared."""
         if prior is None and self.prior is not None:

@@ -42,11 +42,6 @@ class Plan(eqx.Module):
     settings: tuple[tuple[State, int, int], ...] = eqx.field(static=True)
     moving: tuple[str, ...] = eqx.field(static=True)
 
-    @property
-    def bands(self) -> int:
-        """Number of bands."""
-        return self.node_weight.shape[0]
-
 
 def hours_of(exposures: Exposures) -> Float[np.ndarray, " e"]:
     """Time since the first exposure (h), 0 where MJD is missing."""

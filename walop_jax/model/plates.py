@@ -154,12 +154,12 @@ def _stack(
     jones = face(media[0], media[1])
     for before, after, phase in zip(media[1:-1], media[2:], phases, strict=True):
         turn = jnp.exp(2j * jnp.pi * phase)
-        jones = face(before, after) @ jones.scaled_rows(jnp.ones_like(turn), turn)
+        jones = face(before, after) @ Matrix2(jones.a, jones.b, turn * jones.c, turn * jones.d)
     return jones
 
 
-def stack_jones(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real) -> Matrix2:
-    """Jones matrix of plates in contact, in air, for rays of direction (sx, sy, √(1 − s²)).
+def stack_mueller(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real) -> Float[Array, "... 4 4"]:
+    """Mueller matrix of plates in contact, in air, for rays of direction (sx, sy, √(1 − s²)).
 
     Referred to the carried axes on both sides, Fresnel losses of every face included. All arguments
     broadcast; `wavelength` in µm.
@@ -177,12 +177,7 @@ def stack_jones(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real)
         inside = [_crystal(sx, sy, plate) for plate in plates]
         media, face = [air, *inside, air], _face
     phases = [p.thickness * w.phase / wavelength for p, w in zip(plates, inside, strict=True)]
-    return _stack(media, phases, face)
-
-
-def stack_mueller(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real) -> Float[Array, "... 4 4"]:
-    """Mueller matrix of plates in contact, in air (see `stack_jones`)."""
-    return from_jones(stack_jones(sx, sy, plates, wavelength))
+    return from_jones(_stack(media, phases, face))
 
 
 def fixed_axis_mueller(

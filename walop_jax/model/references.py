@@ -96,7 +96,8 @@ def bibtex(found: Sequence[Reference], version: str, *, sampled: bool = False) -
                     part,
                     plain["year"],
                 )
-                fields = zip(("author", "note", "year"), map(_escaped, lines), strict=True)
+                lines = (line.replace("&", r"\&").replace("_", r"\_") for line in lines)
+                fields = zip(("author", "note", "year"), lines, strict=True)
                 listed = ",\n".join(f"  {name:<6} = {{{value}}}" for name, value in fields)
                 entries[key] = f"@misc{{{key},\n{listed}\n}}"
     entries |= {key: known[key] for key in (*_SOFTWARE, *(_OF_SAMPLES if sampled else ()))}
@@ -112,7 +113,3 @@ def _key(work: str) -> str:
     if found:
         return name + found["year"]
     return next((key for key in _library() if key.rstrip("0123456789") == name), name)
-
-
-def _escaped(text: str) -> str:
-    return text.replace("&", r"\&").replace("_", r"\_")

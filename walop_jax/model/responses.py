@@ -138,14 +138,10 @@ def plate_numbers(instrument: Instrument) -> tuple[str, ...]:
     return ("axis", "thermal", *(f"{i}.{name}" for i in range(most) for name in LAYER_NUMBERS))
 
 
-def mappings(instrument: Instrument) -> tuple[str, ...]:
-    """Names of the mappings to the pupil of the common train."""
-    return tuple(e.name for e in trains(instrument)[0] if isinstance(e, PupilMapping))
-
-
 def global_slots(instrument: Instrument) -> tuple[str, ...]:
-    """Slots that act on many elements, in the order of `globally`: "x pupil" displaces what stands behind it."""
-    return (*(f"{axis} {name}" for name in mappings(instrument) for axis in "xy"), "wavelength")
+    """Slots that act on many elements, in the order of `globally`: "x pupil" displaces what that mapping sees."""
+    pupils = [element.name for element in trains(instrument)[0] if isinstance(element, PupilMapping)]
+    return (*(f"{axis} {name}" for name in pupils for axis in "xy"), "wavelength")
 
 
 # ------------------------------------------------------------------------------------------------ what comes of it

@@ -48,16 +48,6 @@ class ExposureArrays(eqx.Module):
     moving: Mapping[str, Float[Array, " e"]] = dataclasses.field(default_factory=dict)
     kinds: tuple[str, ...] = eqx.field(static=True, default=())
 
-    def of_kind(self, kind: str) -> Bool[Array, " e"]:
-        """The exposures of a KIND."""
-        if kind not in self.kinds:
-            return jnp.zeros(self.kind.shape, bool)
-        return self.kind == self.kinds.index(kind)
-
-    def rotated(self, offset: Scalar) -> ExposureArrays:
-        """The exposures with an angle (rad) added to ROTATOR."""
-        return eqx.tree_at(lambda e: e.rotator, self, self.rotator + offset)
-
     @property
     def median(self) -> Float[Array, "e k"]:
         """Median counts over the field of every camera."""
@@ -97,7 +87,8 @@ class Source(Component):
 
     def shines(self, sight: Sight) -> Bool[Array, " e"]:
         """The exposures that see it."""
-        return sight.exposures.of_kind(self.kind)
+        e = sight.exposures
+        return e.kind == e.kinds.index(self.kind) if self.kind in e.kinds else jnp.zeros(e.kind.shape, bool)
 
     def polarisation(self, sight: Sight) -> Float[Array, "e 2"]:
         """(q, u) in the instrument frame; unpolarised unless a source says otherwise."""

@@ -86,7 +86,8 @@ class Model:
 
     def positions(self, component: str) -> Int[np.ndarray, " _"]:
         """Positions of the parameters of a part or an effect, in tree order; none where the model has none."""
-        return np.array([i for i, p in enumerate(self.parameters) if p.is_of(component)], int)
+        parts = (f"{p.part}." for p in self.parameters)
+        return np.array([i for i, part in enumerate(parts) if part.startswith(f"{component}.")], int)
 
     def change(self, name: str, **changes: Any) -> Model:
         """The model with fields of one parameter replaced."""

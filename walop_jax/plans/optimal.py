@@ -62,6 +62,7 @@ _TRIED = 60  # exchanges, most promising first, of which the first that lowers t
 _SHARPNESS = 20  # power of the variances by which targets share the slope of an exchange
 _BUDGETS = 8  # tried until a criterion is met
 _SMALL = 1e-3  # of the budget: what is known reaches the criterion already
+_TOPS = 8  # candidates of each family that may join in a round
 _PATIENCE = 4  # rounds without a better bound or value after which the search ends
 
 
@@ -371,21 +372,20 @@ def optimise(
     experiment: Experiment,
     *,
     gap: float = GAP,
-    most: int = 8,
     progress: Callable[[str], None] | None = None,
 ) -> Allocation:
     """The plan with the least criterion, to a proven relative `gap`, and the proof.
 
-    At most `most` candidates of each family join in a round; `progress` is told value, bound and gap of every round.
+    `progress` is told value, bound and gap of every round.
     Raises NotEstimableError for a target that nothing informs about, ValueError for a budget that is not positive. The
     gap that was reached is `Allocation.gap`: larger than asked for only if rounding errors end the search.
     """
     if not experiment.budget > 0:
         raise ValueError(f"the budget is {experiment.budget:g}: nothing can be done with it")
-    return _best(experiment.reduced(), gap, most, progress)
+    return _best(experiment.reduced(), gap, progress)
 
 
-def _best(problem: Experiment, gap: float, most: int, progress: Callable[[str], None] | None) -> Allocation:
+def _best(problem: Experiment, gap: float, progress: Callable[[str], None] | None = None) -> Allocation:
     """As `optimise`, for a problem in the coordinates of `Experiment.reduced`."""
     chosen = [(number, place) for number, f in enumerate(problem.families) for place in f.spread()]
     some = _Some(problem, chosen)
@@ -394,7 +394,7 @@ def _best(problem: Experiment, gap: float, most: int, progress: Callable[[str], 
     for turn in range(1, _ROUNDS + 1):
         weight, shares = some.solve(weight, accuracy)
         value = some.value(weight)
-        proof = lower_bound(problem, some.covariance(weight), shares, most)
+        proof = lower_bound(problem, some.covariance(weight), shares)
         bound = proof.value(problem.budget)
         best = proof if best is None or bound > best_bound else best
         better = (
@@ -447,7 +447,6 @@ def lower_bound(
     experiment: Experiment,
     covariance: Float[np.ndarray, "r n n"],
     shares: Float[np.ndarray, "r k"],
-    most: int = 8,
 ) -> Bound:
     """The least criterion that any plan can have (see the module).
 
@@ -463,15 +462,13 @@ def lower_bound(
     known = float((g * experiment.known).sum()) / groups
     tops, ratio = [], 0.0
     for number, family in enumerate(experiment.families):
-        places, largest = family.best(g / groups, most)
+        places, largest = family.best(g / groups, _TOPS)
         ratio = max(ratio, largest)
         tops += [(number, place) for place in places]
     return Bound(here, known, ratio, tuple(tops))
 
 
-def least_budget(
-    experiment: Experiment, value: float, *, gap: float = GAP, progress: Callable[[str], None] | None = None
-) -> tuple[Allocation, float]:
+def least_budget(experiment: Experiment, value: float, *, gap: float = GAP) -> tuple[Allocation, float]:
     """The plan of the least budget that reaches a criterion, to `gap`, and a budget that none can reach it below.
 
     The budget of the plan is Σ weight · cost. Raises as `optimise`.
@@ -480,7 +477,7 @@ def least_budget(
     problem = experiment.reduced()
 
     def best(budget: float) -> Allocation:
-        return _best(dataclasses.replace(problem, budget=budget), 0.5 * gap, 8, progress)
+        return _best(dataclasses.replace(problem, budget=budget), 0.5 * gap)
 
     budget = experiment.budget
     plan = best(budget)
@@ -495,7 +492,7 @@ def least_budget(
     return plan, least
 
 
-def rounded(experiment: Experiment, plan: Allocation, *, most: int = 8) -> Allocation:
+def rounded(experiment: Experiment, plan: Allocation) -> Allocation:
     """A plan of whole numbers within the budget, and its proven distance from the best plan of any weights.
 
     Weights are rounded down, what is left of the budget goes where it lowers the criterion most for its cost, then
@@ -516,7 +513,7 @@ def rounded(experiment: Experiment, plan: Allocation, *, most: int = 8) -> Alloc
             "targets: raise it"
         )
     for _ in range(_EXCHANGES):
-        some, count, better = _exchanged(some, count, most)
+        some, count, better = _exchanged(some, count)
         if not better:
             break
     used = np.flatnonzero(count)
@@ -560,16 +557,14 @@ def _filled(
         count = count + (np.arange(len(count)) == can[int(np.argmax(gain))])
 
 
-def _exchanged(
-    some: _Some, count: Float[np.ndarray, " s"], most: int
-) -> tuple[_Some, Float[np.ndarray, " _"], bool]:
+def _exchanged(some: _Some, count: Float[np.ndarray, " s"]) -> tuple[_Some, Float[np.ndarray, " _"], bool]:
     """One exchange that lowers the criterion, if there is one: the most promising by their slopes are tried."""
     problem, here = some.experiment, some.value(count)
     covariance = some.covariance(count)
     phi = some.variances(covariance)
     # The worst targets, smoothly: the slope of the maximum alone would forget the next one.
     shares = problem.of_one(problem.relative(phi) ** _SHARPNESS)
-    promising = lower_bound(problem, covariance, shares, most).tops
+    promising = lower_bound(problem, covariance, shares).tops
     new = [top for top in promising if not any(_same(top, there) for there in some.chosen)]
     kept = np.flatnonzero(count)
     some = _Some(problem, [*(some.chosen[i] for i in kept), *new])

@@ -39,7 +39,7 @@ from walop_jax.plans.optimal import (
 )
 from walop_jax.plans.wanted import APART, NAMED, WORST, FieldErrors, Wanted, field_errors, wanted
 from walop_jax.science.star_errors import GOAL
-from walop_jax.simulation.observing_plan import ObservingPlan, Stop, polariser_turn
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 
 PLANNED = "plan.json"
 _NOTHING = 1e-6  # of what is known: less of it makes no plan
@@ -316,7 +316,12 @@ def plan_from(
         before=_errors(found, field, covariance(experiment.known)),
         after=_errors(found, field, covariance(total)),
         beside=dict(_beside(found, whole, want)),
-        observing_plan=_as_observed(some, lines),
+        observing_plan=dataclasses.replace(
+            some.could.plan,
+            stops=tuple(some.choices[line.choice].stop(line.place, line.times) for line in lines),
+            patches=(),
+            stars=(),
+        ),
         notes=found.notes,
         any_plate=found.could.any_plate,
     )
@@ -491,11 +496,6 @@ def _changes(found: Candidates, lines: list[Line]) -> Iterator[float]:
             there = here
         last = choice
         yield time
-
-
-def _as_observed(found: Candidates, lines: list[Line]) -> ObservingPlan:
-    stops: tuple[Stop, ...] = tuple(found.choices[line.choice].stop(line.place, line.times) for line in lines)
-    return dataclasses.replace(found.could.plan, stops=stops, patches=(), stars=())
 
 
 # -------------------------------------------------------------------------------------------------- what it is worth

@@ -71,7 +71,6 @@ class Effect(Patch):
     @classmethod
     def neutral(cls, context: Context) -> Self:
         """The effect with values that change nothing."""
-        del context
         return cls()
 
     @classmethod
@@ -136,17 +135,11 @@ class Effect(Patch):
 
     def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
         """Descriptions of the changes that the effect is in an instrument: to first order it is a sum of theirs."""
-        del instrument
         return self.said
 
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
         """For each amplitude the changes whose sum, with their coefficients, it is to first order; none: not known."""
-        del instrument
         return ()
-
-    def survives(self, wavelength: Float[np.ndarray, " n"], weight: Float[np.ndarray, "b n"]) -> float:
-        """Share of the effect that the band integrals leave of it; 1 unless it oscillates with wavelength."""
-        return 1.0
 
     def at_neutral(self, context: Context) -> Self:
         """The same effect, discrete choices included, with values that change nothing."""

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 
 from walop_jax.model.cameras import DetectorPart, ExposurePart, GhostPart, Mixing, Transmission
 from walop_jax.model.effects.change import KINDS, OPPOSITE, AtPoint, Change, Kind, Scalar, Term, in_exposures
-from walop_jax.model.effects.factors import COUNTS
+from walop_jax.model.effects.factors import COUNTS, FIELD, WAVELENGTH
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Component, unknown_name
 from walop_jax.model.sources import ExposureArrays
@@ -75,7 +75,6 @@ class CrossTalk(Mixing):
 
     def vectors(self, vectors: Float[Array, "b k 4"], x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
         """Mix the analysis vectors."""
-        del x, y
         targets, origins = (np.array(column) for column in zip(*self.pairs, strict=True))
         shares = jnp.stack(self.amplitudes)[:, None]
         return vectors.at[:, targets].add(shares * vectors[:, origins])
@@ -128,7 +127,10 @@ def stage_of(change: Change) -> str:
         return "opposite" if change.origin == OPPOSITE else "mixed" if change.origin else "median"
     if change.kind != "gain":
         return {"reported gain": "reported", "afterglow": "afterglow", "shade": "throughput"}[change.kind]
-    return "square" if "counts" in change.factors else "counts" if change.exposure_factors else "throughput"
+    if "counts" in change.factors:
+        return "square"
+    still = all(one.depends_on in (FIELD, WAVELENGTH) for one in change.grows_with)
+    return "throughput" if still else "counts"
 
 
 def _patch(instrument: Instrument, terms: Sequence[Term]) -> Instrument:

@@ -438,13 +438,8 @@ def own_entries(path: str | os.PathLike[str]) -> tuple[type[Effect], ...]:
         raise fail(str(error), file=path, advice="see walop-jax docs adding-an-effect") from None
 
 
-_TEXT = (files("walop_jax.model.effects") / FILE).read_text(encoding="utf-8")
-EFFECTS = entries(parse_toml(_TEXT), __name__)
+EFFECTS = entries(parse_toml((files("walop_jax.model.effects") / FILE).read_text(encoding="utf-8")), __name__)
 """All effects, in the order in which light meets them."""
-PARTS: Mapping[str, str] = {
-    name: table["part"] for name, table in parse_toml(_TEXT).items() if "part" in table
-}
-"""Parts of the page of effects, by the effect that each begins with."""
 
 
 def is_own(effect: Effect) -> TypeGuard[Entry]:

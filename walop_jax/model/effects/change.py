@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.data.records import POLARISER
-from walop_jax.model.effects.factors import FIELD, WAVELENGTH, Factor, factor
+from walop_jax.model.effects.factors import Factor, factor
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.ray import NotPlannedError
 from walop_jax.model.sources import ExposureArrays
@@ -130,11 +130,6 @@ class Change:
         if len(found) != 1:
             raise ValueError(f"{self.text!r}: say {what}, as in '{self.kind} of {self.place} * {example}'")
         return found[0]
-
-    @property
-    def exposure_factors(self) -> tuple[str, ...]:
-        """Factors that depend on the exposure."""
-        return tuple(f.text for f in self.grows_with if f.depends_on not in (FIELD, WAVELENGTH))
 
     def factor(self, at: Any) -> Any:
         """Product of its factors (`Factor.value`), 1 without any."""

@@ -12,7 +12,7 @@ Revealed by data that no name explains as well
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
@@ -55,6 +55,9 @@ class Described(Effect):
     sentences: tuple[str, ...] = eqx.field(static=True, default=(), converter=tuple)
 
     name: ClassVar[str] = "described"
+    starts: ClassVar[
+        tuple[tuple[Mapping[str, Any], ...], ...]
+    ] = ()  # changes are found by `diagnosis.candidates`
     reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = "data that no name explains as well"
     separated_by: ClassVar[str] = "exposures in which its dependence differs from that of the others"
@@ -67,7 +70,6 @@ class Described(Effect):
     @classmethod
     def of(cls, context: Context, **values: Any) -> Self:
         """The descriptions given, zero but for values given. Raises ValueError for what is no description."""
-        del context
         sentences = tuple(values.pop("sentences", ()))
         held = [Change.parsed(text).parameter for text in sentences]
         for name in values:
@@ -80,12 +82,6 @@ class Described(Effect):
             for name in AMPLITUDES
         }
         return cls(**arrays, sentences=sentences)
-
-    @classmethod
-    def probes(cls, context: Context) -> tuple[tuple[Self, ...], ...]:
-        """None: changes are found by `diagnosis.grammar`."""
-        del context
-        return ()
 
     @classmethod
     def combine(cls, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
@@ -119,7 +115,6 @@ class Described(Effect):
 
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
         """Each amplitude is a change."""
-        del instrument
         changes = [Change.parsed(text) for text in self.sentences]
         return tuple(((1.0, one),) for name in AMPLITUDES for one in changes if one.parameter == name)
 

@@ -63,11 +63,6 @@ class Etalon(Effect):
         "do not oscillate"
     )
 
-    def survives(self, wavelength: Float[np.ndarray, " n"], weight: Float[np.ndarray, "b n"]) -> float:
-        """Visibility |Σ w exp(4πi gap / λ)| of the fringe in the band that blurs it least."""
-        phase = 4.0 * np.pi * float(self.gap) / np.asarray(wavelength)
-        return float(np.max(np.abs(weight @ np.exp(1j * phase))))
-
     @classmethod
     def combine(cls, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
         """Contrast and gap from cosine and sine at the pair's gap."""

@@ -17,7 +17,7 @@ Revealed by any data that no model explains
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
@@ -108,6 +108,9 @@ class FreeForm(Effect):
     blocks: tuple[str, ...] = eqx.field(static=True, default=(), converter=tuple)
 
     name: ClassVar[str] = "free_form"
+    starts: ClassVar[
+        tuple[tuple[Mapping[str, Any], ...], ...]
+    ] = ()  # a pattern is found by its own score test
     revealed_by: ClassVar[str] = "any data that no model explains"
     separated_by: ClassVar[str] = "a physical effect that explains the same pattern with fewer numbers"
 
@@ -133,12 +136,6 @@ class FreeForm(Effect):
             name: jnp.zeros(shape if name in blocks else (0, *shape[1:])) for name, shape in shapes.items()
         }
         return dataclasses.replace(cls(**zeros, blocks=blocks), **values)
-
-    @classmethod
-    def probes(cls, context: Context) -> tuple[tuple[Self, ...], ...]:
-        """None: a pattern is found by its own score test."""
-        del context
-        return ()
 
     def labels(self, field: str) -> Sequence[str]:
         """Names such as "vectors.n0.q.p12"; "harmonics.n3.4theta.sin.p10"; "exposures.7.n1" counts positions."""

@@ -24,8 +24,8 @@ from walop_jax.model.effects.change import KINDS, AtPoint, Change, Kind, Scalar,
 from walop_jax.model.effects.factors import PLAIN
 from walop_jax.model.elements import AddedPolarisation, AirGap
 from walop_jax.model.elements.base import Element, Mueller
-from walop_jax.model.elements.simple import Film
 from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import Component
 from walop_jax.model.ray import Ray
 from walop_jax.model.sources import ExposureArrays
 
@@ -83,7 +83,6 @@ class _InTrain:
 
     def angle(self, prefix: str) -> Any:
         """That of the element itself."""
-        del prefix
         return jnp.deg2rad(self.axis)
 
 
@@ -103,8 +102,8 @@ class Terms(Element):
         return matrix_of([(change, size * change.factor(at)) for change, size in terms], ray.x, ray.y)
 
 
-class PolariserFilm(Film):
-    """Changes of the polariser: what the light behind it meets when it is in."""
+class PolariserFilm(Component):
+    """Changes of the polariser: a layer directly behind it, at its angle and only when it is in."""
 
     amplitudes: tuple[Scalar, ...]
     changes: tuple[Change, ...] = eqx.field(static=True)
@@ -112,7 +111,7 @@ class PolariserFilm(Film):
     def through(
         self, light: Float[Array, "e 4"], exposures: ExposureArrays, x: Scalar, y: Scalar
     ) -> Float[Array, "e 4"]:
-        """All of them."""
+        """Stokes vectors behind it at a field point, one per exposure."""
         terms = zip(self.changes, self.amplitudes, strict=True)
         sizes = [(change, size * in_exposures(change, exposures, x, y)) for change, size in terms]
         return jnp.einsum("est,et->es", matrix_of(sizes, x, y), light)

@@ -44,7 +44,6 @@ class Element(Component):
 
         It has a leading axis where it depends on wavelength.
         """
-        del ray
         return None
 
     @classmethod

@@ -7,9 +7,8 @@ Limits      all are the identity at their neutral numbers.
 
 from __future__ import annotations
 
-import abc
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,7 +18,7 @@ from walop_jax.model import mueller
 from walop_jax.model.conventions import FIELD_SCALE, REFERENCE_WAVELENGTH
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.elements.spectral import Curve, WithCurves
-from walop_jax.model.parameters import Component, number
+from walop_jax.model.parameters import number
 from walop_jax.model.ray import Ray
 from walop_jax.model.sources import ExposureArrays
 
@@ -75,7 +74,6 @@ class Diattenuator(Element):
 
     def mueller(self, ray: Ray) -> Mueller:
         """The diattenuator."""
-        del ray
         twice = 2.0 * jnp.deg2rad(self.axis)
         cos, sin = jnp.cos(twice), jnp.sin(twice)
         return mueller.diattenuator(self.q * cos - self.u * sin, self.q * sin + self.u * cos)
@@ -92,7 +90,6 @@ class Depolariser(Element):
 
     def mueller(self, ray: Ray) -> Mueller:
         """The depolariser."""
-        del ray
         kept = 1.0 - self.linear
         return jnp.diag(jnp.stack([jnp.ones_like(kept), kept, kept, 1.0 - self.circular]))
 
@@ -108,7 +105,6 @@ class AddedPolarisation(Element):
 
     def mueller(self, ray: Ray) -> Mueller:
         """[[1, 0], [(q, u, 0)ᵀ, 1]]: not a physical Mueller matrix beyond first order in q and u."""
-        del ray
         return jnp.eye(4).at[1, 0].add(self.q).at[2, 0].add(self.u)
 
 
@@ -142,7 +138,6 @@ class AnalysisVector(Element):
 
     def mueller(self, ray: Ray) -> Mueller:
         """The row, and nothing polarised behind it."""
-        del ray
         row, angle = jnp.stack([jnp.ones_like(self.q), self.q, self.u, self.v]), jnp.deg2rad(self.axis)
         for name in FOLLOWING:
             if (change := getattr(self, name)) is not None:
@@ -162,18 +157,6 @@ class AnalysisVector(Element):
 
 # -------------------------------------------------------------------------------------------- the calibration polariser
 
-Angles = Float[Array, " e"]
-
-
-class Film(Component):
-    """Layer directly behind the polariser, at its angle and only when it is in."""
-
-    @abc.abstractmethod
-    def through(
-        self, light: Float[Array, "e 4"], exposures: ExposureArrays, x: Scalar, y: Scalar
-    ) -> Float[Array, "e 4"]:
-        """Stokes vectors behind it at a field point, one per exposure."""
-
 
 class Polariser(Element):
     """A polariser whose axis is read from an encoder: light behind it forgets its past.
@@ -189,18 +172,15 @@ class Polariser(Element):
     extinction: Scalar = number(unit="", about="ε, unwanted over wanted transmission")
     zero: Scalar | None = number(unit="deg", about="added to the encoder reading", default=None)
     ellipticity: Scalar | None = number(unit="", about="circular polarisation behind it", default=None)
-    films: tuple[Film, ...] = ()
+    films: tuple[Any, ...] = ()  # layers behind it (`effects.optics.PolariserFilm`)
 
     kind: ClassVar[str] = "polariser"
     reference: ClassVar[str] = "Goldstein 2003, Polarized Light, ch. 9"
 
-    def axis_of(self, reading: Angles) -> Angles:
-        """Transmission axis (rad) from the encoder reading (rad)."""
-        return reading if self.zero is None else reading + jnp.deg2rad(self.zero)
-
     def light(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e 4"]:
         """Stokes vectors behind it at a field point, per unit of transmitted light, one per exposure."""
-        behind = mueller.polarised(self.axis_of(exposures.clp_angle), self.extinction)
+        angle = exposures.clp_angle if self.zero is None else exposures.clp_angle + jnp.deg2rad(self.zero)
+        behind = mueller.polarised(angle, self.extinction)
         if self.ellipticity is not None:
             behind = behind.at[:, 3].add(self.ellipticity)
         for film in self.films:

@@ -143,15 +143,14 @@ def _solved_together(cases: Sequence[tuple[WavePlate, Ray]], model: str) -> Floa
     known: Known = {}
     stacks = [plate.crystals(ray, known) for plate, ray in cases]
     if any(crystal.cut is not None for stack in stacks for crystal in stack):
-        stacks = [tuple(_with_cut(crystal) for crystal in stack) for stack in stacks]
+        stacks = [
+            tuple(c if c.cut is not None else c._replace(cut=jnp.zeros(())) for c in stack)
+            for stack in stacks
+        ]
     kx, ky = together(*(ray.kx for _, ray in cases)), together(*(ray.ky for _, ray in cases))
     return MODELS[model](
         kx, ky, jax.tree.map(together, *stacks), together(*(ray.wavelength for _, ray in cases))
     )
-
-
-def _with_cut(crystal: plates.Plate) -> plates.Plate:
-    return crystal if crystal.cut is not None else crystal._replace(cut=jnp.zeros(()))
 
 
 def _behind_gap(plate: WavePlate, ray: Ray, matrix: Mueller) -> Mueller:
