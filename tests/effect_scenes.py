@@ -80,4 +80,6 @@ def observe(*effects: Effect, plan_of: Sequence[Effect] | None = None) -> np.nda
     layout = plan(effects if plan_of is None else plan_of)
     device = instrument(*effects)
     data = points(layout)
-    return np.asarray(engine.detected(device, layout, FLUX * engine.prediction(device, layout, data)))
+    return np.asarray(
+        engine.detected(device, layout.exposures, FLUX * engine.prediction(device, layout, data))
+    )

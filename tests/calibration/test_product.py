@@ -96,7 +96,14 @@ def product(handmade) -> Calibration:
         origin=calset.origin,
         date="2026-11-21T10:00:00",
         verdict=Verdict.recorded(
-            1.0 / 3.0 * 1e5, 33000, 44000, 1.0, True, False, 8192, ("chi2/dof = 1.5", "look at it")
+            chi2=1.0 / 3.0 * 1e5,
+            dof=33000,
+            n_data=44000,
+            noise_scale=1.0,
+            converged=True,
+            trusted=False,
+            quality=8192,
+            warnings=("chi2/dof = 1.5", "look at it"),
         ),
         covariance=covariance,
         field=(-0.29, 0.29, -1.0 / 3.0, 0.25),

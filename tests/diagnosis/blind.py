@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from linear_judge import Linear
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import candidates
@@ -30,7 +31,7 @@ from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Measured
 from walop_jax.diagnosis.examination import Evidence, Examination, Ranked, examine
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.score import ScoreSpace, separations, whitening
-from walop_jax.diagnosis.search import Linear, Trial, search
+from walop_jax.diagnosis.search import Trial, search
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood

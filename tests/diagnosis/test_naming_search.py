@@ -4,12 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+from linear_judge import Linear
 
 from walop_jax.diagnosis.candidates import Probe
 from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.score import Projector, ScoreSpace
-from walop_jax.diagnosis.search import Linear, search
+from walop_jax.diagnosis.search import search
 from walop_jax.model.effects import Context, effect_by_name
 
 ROWS, PATTERN = 400, "a pattern without a name"

@@ -168,7 +168,16 @@ def test_adding_a_doubt_never_makes_trusted(doubts, data):
     assert worse.trusted == (verdict.trusted and not more.blocking)
     assert worse.quality == verdict.quality | more.bit
     assert set(verdict.warnings) <= set(worse.warnings)
-    again = Verdict.recorded(1.0, 1, 16, 1.0, True, worse.trusted, int(worse.quality), worse.warnings)
+    again = Verdict.recorded(
+        chi2=1.0,
+        dof=1,
+        n_data=16,
+        noise_scale=1.0,
+        converged=True,
+        trusted=worse.trusted,
+        quality=int(worse.quality),
+        warnings=worse.warnings,
+    )
     assert (again.trusted, again.quality, again.warnings) == (worse.trusted, worse.quality, worse.warnings)
 
 

@@ -62,7 +62,7 @@ def star_counts(*effects: Effect) -> np.ndarray:
         source=jnp.asarray(np.broadcast_to(SOURCE, (n, e))),
         band=jnp.asarray(np.broadcast_to(plan.band_of[np.arange(e), SOURCE + 1], (n, e))), opposite_sky=sky,
     )  # fmt: skip
-    return np.asarray(engine.detected(device, plan, FLUX * engine.prediction(device, plan, data)))
+    return np.asarray(engine.detected(device, plan.exposures, FLUX * engine.prediction(device, plan, data)))
 
 
 def matrix_of_counts(counts: np.ndarray) -> np.ndarray:

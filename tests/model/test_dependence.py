@@ -77,7 +77,9 @@ def measured(*effects: Effect) -> tuple[Instrument, object, engine.PointData]:
     data, rng = scenes.points(layout), np.random.default_rng(2)
     flux = rng.uniform(2e5, 6e5, (2, 9, 1))
     flux[:, 8] = 1.0
-    counts = np.asarray(engine.detected(device, layout, flux * engine.prediction(device, layout, data)))
+    counts = np.asarray(
+        engine.detected(device, layout.exposures, flux * engine.prediction(device, layout, data))
+    )
     counts = counts * (1.0 + 0.01 * rng.standard_normal(counts.shape))
     weight = 1.0 / np.sqrt(counts + 900.0)
     weight[1, 3] = 0.0  # a row that is not used

@@ -42,18 +42,12 @@ from walop_jax.data.settings import (
     single_wavelength,
 )
 from walop_jax.fit.model_file import model_without_data, render, standard_names
-from walop_jax.fit.parameter_table import (
-    HEAD,
-    ParameterValue,
-    parameter_notes,
-    parameter_rows,
-    parameter_table,
-)
+from walop_jax.fit.parameter_table import HEAD, Fitted, parameter_notes, parameter_rows
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import STATED, Hidden, Quality, Verdict
 from walop_jax.instruments.description import parsed
 from walop_jax.io.code import software_versions
-from walop_jax.io.display import Display, Result
+from walop_jax.io.display import Display
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.text import in_ascii
 from walop_jax.model.dependence import left_behind, needs
@@ -101,7 +95,7 @@ class ListedModel(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Calibration(Result):
+class Calibration(Fitted):
     """An instrument as fitted: model, values and covariance of all parameters, and where they come from.
 
     `field` is (smallest x, largest x, smallest y, largest y) in degrees of the points that were used. `residuals` is
@@ -249,11 +243,6 @@ class Calibration(Result):
         return _lines(self.model.template.description)
 
     @property
-    def sigma(self) -> Vector:
-        """Standard errors of all parameters."""
-        return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
-
-    @property
     def prior_width(self) -> dict[str, float]:
         """Standard deviations of the priors by parameter, NaN where there is none."""
         return {p.name: np.nan if p.prior is None else p.prior[1] for p in self.fitted.parameters}
@@ -273,15 +262,6 @@ class Calibration(Result):
         from walop_jax.calibration.product import read_calibration
 
         return read_calibration(path)
-
-    def __getitem__(self, name: str) -> ParameterValue:
-        """A parameter by name: value, standard error and unit; ValueError with the nearest names if there is none."""
-        at = self.model.index(name)
-        return ParameterValue(float(self.values[at]), float(self.sigma[at]), self.model.parameters[at].unit)
-
-    def to_table(self) -> Any:
-        """All parameters as an astropy table: value, error, unit, start, prior, and whether it was free."""
-        return parameter_table(self.model, self.values, self.sigma)
 
     def display(self) -> Display:
         """The range of the calibration, its verdict and its parameters."""

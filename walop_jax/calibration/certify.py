@@ -14,13 +14,15 @@ from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.data.settings import BUILTIN_FILTERS
+from walop_jax.data.settings import BUILTIN_FILTERS, Settings
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import rounded
 
 MAP_TOLERANCE = 1e-7  # between maps in the file and maps of its parameters, on another machine
 DARKEST = 1e-4  # of the response to unpolarised light: what "less than no light" may be
 _POINTS = 64
+
+Vector = Float[np.ndarray, " p"]
 
 
 class Check(NamedTuple):
@@ -125,11 +127,16 @@ def _maps(product: Calibration, calibration: Calibration) -> Check:
     )
 
 
-def _physics(calibration: Calibration) -> Check:
-    """In no arm does a camera see less than no light, whatever the polarisation: a₀ ≥ √(a₁² + a₂²)."""
+def _places(calibration: Calibration) -> tuple[Settings, Vector, Vector]:
+    """The usual setting, and places over the field (deg)."""
     limit = min(calibration.model.template.field_limit, float(np.abs(calibration.field).max()))
     x, y = np.random.default_rng(0).uniform(-limit, limit, (2, _POINTS))
-    setting = calibration.usual_settings(filter_name=str(np.unique(calibration.exposures.filter)[0]))
+    return calibration.usual_settings(filter_name=str(np.unique(calibration.exposures.filter)[0])), x, y
+
+
+def _physics(calibration: Calibration) -> Check:
+    """In no arm does a camera see less than no light, whatever the polarisation: a₀ ≥ √(a₁² + a₂²)."""
+    setting, x, y = _places(calibration)
     analysis = AnalysisVectors(calibration)
     vectors = analysis.exact(setting, x, y)[:, 0]
     least = np.min(1.0 - np.hypot(vectors[..., 1], vectors[..., 2]) / vectors[..., 0], axis=0)
@@ -148,9 +155,7 @@ def _protection(calibration: Calibration) -> Check:
     """A statement of the mistakes that could hide; it never fails, as it is as large as the data leave it."""
     if calibration.hidden is None:
         return Check("protection", True, "nobody asked what could hide")
-    limit = min(calibration.model.template.field_limit, float(np.abs(calibration.field).max()))
-    x, y = np.random.default_rng(0).uniform(-limit, limit, (2, _POINTS))
-    setting = calibration.usual_settings(filter_name=str(np.unique(calibration.exposures.filter)[0]))
+    setting, x, y = _places(calibration)
     errors, name = calibration.protection(x, y, setting)
     if not np.isfinite(errors).any() or not name:
         return Check("protection", True, "no single mistake would move q and u by more than their errors")

@@ -160,7 +160,7 @@ def _crew(processes: Processes | str | None) -> Iterator[Processes]:
 
     When one that was joined here fails it ends at once, with its line of error: the others notice that it has gone.
     """
-    from walop_jax.likelihood.runner import Processes, join, leave_at_once
+    from walop_jax.likelihood.runner import Processes, join
 
     if not isinstance(processes, str):
         yield processes or Processes()
@@ -175,7 +175,7 @@ def _crew(processes: Processes | str | None) -> Iterator[Processes]:
 
         complain(f"process {crew.index} of {crew.count}: {error or type(error).__name__}")
         sys.stderr.flush()
-        leave_at_once(1)
+        os._exit(1)  # without waiting for the others, which may have gone
 
 
 @contextlib.contextmanager

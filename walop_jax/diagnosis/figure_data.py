@@ -1,23 +1,11 @@
 """Data of the figures of a diagnosis, `diagnosis.fits` (DIAGVERS = 1): small arrays, no data set.
 
-    LADDER       MODEL, CHI2, DOF: the starting model and every model after it, a row for each
-    SHARES       GROUP (camera, kind, filter or exposure), MEMBER, EXPECTED, BEFORE, AFTER: sums of squared
-                 residuals of the starting and the final model, and what noise alone gives
-    COMPARISONS  COMPARISON, EFFECT, COMBINATION, HARMONIC: row 0 compares the starting with the final model
-                 (no EFFECT), the others a model without and with one effect. COMBINATION says in words which
-                 combination of the exposures shows the difference best; HARMONIC is that of the polariser
-                 angle, -1 where the combination is none
-    FIELD        COMPARISON, POINT, X, Y (deg); BEFORE, AFTER: the residuals in that combination;
-                 EXPLAINED: their difference, what the effect makes once all other parameters have followed;
-                 MEAN_BEFORE, MEAN_AFTER, RMS_BEFORE, RMS_AFTER: over all exposures of the point
-    CURVES       COMPARISON, EXPOSURE, KIND, MJD (d), CLP_ANGLE (deg; NaN: out); BEFORE, AFTER, EXPLAINED:
-                 mean over the field, with the field pattern of EXPLAINED in that camera as weight (rms 1);
-                 ERROR: standard error of BEFORE and AFTER, from the scatter over the field
-
-Columns of FIELD and CURVES without a unit are (data - model) in standard deviations of one intensity as N_ERR
-gives them, one value for each camera, in the order of SHARES. NaN where there are no data. Values of FIELD in a
-combination, BEFORE and AFTER, have standard deviation 1 (where the flux is free √(1 − 1/K) with K cameras, 0.87 of
-four) if there is noise alone.
+Its tables are those of `_TABLES`: the models one after the other, the shares of the data in χ², and comparisons, of the
+starting with the final model (row 0) and of a model without and with one effect, over the field and the exposures.
+EXPLAINED is what the effect makes once all other parameters have followed. Columns of FIELD and CURVES without a unit
+are (data - model) in standard deviations of one intensity as N_ERR gives them, one value for each camera, in the order
+of SHARES; NaN where there are no data. Values of FIELD in a combination, BEFORE and AFTER, have standard deviation 1
+(where the flux is free √(1 − 1/K) with K cameras, 0.87 of four) if there is noise alone.
 
 _Combination  r_pk = Σ_e w_e r_pek / (Σ_e w_e² over the used ones)^½ keeps unit noise. The weights w are those of what
              can be said in words (a harmonic of the polariser angle at its best phase, the mean of a kind of

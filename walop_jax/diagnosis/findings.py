@@ -26,15 +26,12 @@ FIELD_WORDS = ("uniform", "gradient", "quadratic", "cubic", "fourth order")
 SHARE = 0.2  # a group is mentioned when it carries this share of the largest
 
 
-def _shares(groups: dict[str, float]) -> dict[str, float]:
-    total = sum(groups.values()) or 1.0
-    return {name: round(value / total, 3) for name, value in sorted(groups.items(), key=lambda g: -g[1])}
-
-
 def _named(groups: dict[str, float]) -> str:
-    shares = _shares(groups)
-    top = max(shares.values(), default=0.0)
-    return ", ".join(f"{name} {100 * share:.0f}%" for name, share in shares.items() if share >= SHARE * top)
+    total, most = sum(groups.values()) or 1.0, max(groups.values(), default=0.0)
+    order = sorted(groups.items(), key=lambda group: -group[1])
+    shares = ((name, round(value / total, 3)) for name, value in order)
+    least = SHARE * round(most / total, 3)
+    return ", ".join(f"{name} {100 * share:.0f}%" for name, share in shares if share >= least)
 
 
 def _harmonics(

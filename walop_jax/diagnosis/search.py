@@ -4,9 +4,9 @@ Evidence       Laplace: ln B = ½ (O_base − O_g) − ½ (ln det H_g − ln det
                data and priors), H half its Hessian and w the prior widths of the added parameters.
 
 Names are added by evidence, one after the other, by the same rules for every judge. A *judge* says what an addition is
-worth. `Linear` takes its linear step (a Schur complement of the score space): no model is computed, and the blind study
-(`tests/diagnosis/blind.py`) runs thousands of scenes through the rules below. `workflow.Refit` fits it, but only what
-may be added:
+worth. That of the blind study (`tests/diagnosis/blind.py`) takes its linear step (a Schur complement of the score
+space): no model is computed, and thousands of scenes run through the rules below. `workflow.Refit` fits it, but only
+what may be added:
 
 1. Candidates are ordered by their linear evidence. What linear algebra finds not worth telling is not tried.
 2. The best is fitted. If it leaves nothing but noise, no rival can be better. If its evidence differs from that of its
@@ -365,36 +365,7 @@ def _predictions(
 State = TypeVar("State", bound=Evidence)
 
 
-class Linear:
-    """Judge of trials by their linear steps; nothing is held out and no time runs. `workflow.Refit` fits instead."""
-
-    def time_left(self) -> bool:
-        """True if another trial may begin."""
-        return True
-
-    def fitted(self, state: Any, trial: Trial) -> Trial | None:
-        """A linear trial as the judge finds it; None where nothing comes of it."""
-        return trial
-
-    def others(self, state: Any) -> Iterator[Trial]:
-        """Trials of what has no linear step."""
-        return iter(())
-
-    def decided(self, trials: list[Trial]) -> list[Trial]:
-        """Trials, best first, with those of even odds in their order."""
-        return trials
-
-    def confirmed(self, state: Any, trial: Trial) -> bool:
-        """True, for want of data that took no part in a trial: a score space has no rows."""
-        return True
-
-    def adopted(self, state: Any, trial: Trial) -> Any:
-        """The evidence of what is left once a trial has joined the model."""
-        assert trial.item is not None
-        return state.joined(trial.item)
-
-
-def search(state: State, judge: Linear, policy: Policy) -> Iterator[tuple[Trial, State, State]]:
+def search(state: State, judge: Any, policy: Policy) -> Iterator[tuple[Trial, State, State]]:
     """Additions until nothing is missing or none is found, each with the evidence before and after."""
     for _ in range(policy.most_steps):
         if not (state.alarm and judge.time_left()):
@@ -448,7 +419,7 @@ def _promising(state: Evidence, trial: Trial, policy: Policy) -> bool:
     return _worth(state, dataclasses.replace(trial, evidence=more * trial.evidence, left=left))
 
 
-def _next(state: State, judge: Linear, policy: Policy) -> Trial | None:
+def _next(state: Evidence, judge: Any, policy: Policy) -> Trial | None:
     """The addition with the highest evidence that is worth telling and confirmed; None where there is none."""
     waiting = [trial for trial in linear_trials(state, policy) if _promising(state, trial, policy)]
     tried, ready = list(waiting), []

@@ -32,7 +32,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from scipy import special
 
 from walop_jax.diagnosis.alternatives import refuse_mixups
@@ -63,8 +63,6 @@ UNEVEN = 1.25
 NOISELESS = 1e-6
 """Squared residuals, beyond what the parameters can make, of data that hold no noise: rounding, and second order."""
 _SHOWN = 3
-
-Cube = Float[np.ndarray, "p e k"]
 
 
 def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> FitResult:

@@ -38,7 +38,6 @@ from walop_jax.diagnosis.examination import (
 from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexplained, describe, told
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.search import (
-    Linear,
     Trial,
     before_and_after,
     beyond_prior,
@@ -165,7 +164,7 @@ def _promise(choice: Choice) -> tuple[float, float]:
 
 
 @dataclasses.dataclass
-class Refit(Linear):
+class Refit:
     """The judge that fits: the current fit of a diagnosis, and the steps so far.
 
     `wanted` are the probes of `catalogue`, `sentences` and `parts` what else can be said (`candidates`). `choices` are

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.io.display import Result
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import value_and_error, with_error, with_minus_sign
 from walop_jax.model.parameters import Parameter
@@ -31,6 +32,32 @@ class ParameterValue(NamedTuple):
         return f"{with_error(self.value, self.sigma)} {self.unit}".rstrip()
 
     __repr__ = __str__
+
+
+class Fitted(Result):
+    """A model with values and a covariance of all its parameters, and what these say by name and as a table."""
+
+    values: Vector
+    covariance: Float[np.ndarray, "n n"]
+
+    @property
+    def model(self) -> Model:
+        """The model."""
+        raise NotImplementedError
+
+    @property
+    def sigma(self) -> Vector:
+        """Standard errors of all parameters."""
+        return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
+
+    def __getitem__(self, name: str) -> ParameterValue:
+        """A parameter by name: value, standard error and unit; ValueError with the nearest names if there is none."""
+        at = self.model.index(name)
+        return ParameterValue(float(self.values[at]), float(self.sigma[at]), self.model.parameters[at].unit)
+
+    def to_table(self) -> Any:
+        """All parameters as an astropy table: value, error, unit, start, prior, and whether it was free."""
+        return parameter_table(self.model, self.values, self.sigma)
 
 
 def unconstrained(model: Model, sigma: Vector) -> tuple[str, ...]:

@@ -17,18 +17,12 @@ from jaxtyping import Float
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.minimise import Minimum
 from walop_jax.fit.model_file import base_model, render
-from walop_jax.fit.parameter_table import (
-    HEAD,
-    ParameterValue,
-    parameter_notes,
-    parameter_rows,
-    parameter_table,
-)
+from walop_jax.fit.parameter_table import HEAD, Fitted, parameter_notes, parameter_rows
 from walop_jax.fit.robust import robust_errors
 from walop_jax.fit.search import find_minimum, free_scales
 from walop_jax.fit.verdict import NO_STRUCTURE, STATED, Doubt, Hidden, Quality, Structure, Verdict
 from walop_jax.io.code import software_versions
-from walop_jax.io.display import Display, Result
+from walop_jax.io.display import Display
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.likelihood import Likelihood, Posterior
 from walop_jax.likelihood.runner import Journal, Processes, Progress, Runner, fingerprint
@@ -48,7 +42,7 @@ ILL_CONDITIONED = (
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class FitResult(Result):
+class FitResult(Fitted):
     """A fit, the likelihood that it maximises, and the verdict on it.
 
     `values` and `covariance` are of all parameters in tree order, frozen ones with zero variance. `verdict` is None
@@ -98,11 +92,6 @@ class FitResult(Result):
     def chi2(self) -> float:
         """χ² of data and priors."""
         return self.posterior.chi2
-
-    @property
-    def sigma(self) -> Vector:
-        """Standard errors of all parameters."""
-        return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
 
     @property
     def excess(self) -> float:
@@ -195,18 +184,9 @@ class FitResult(Result):
             doubt.sentence for doubt in _against(self, (), examined=False, noiseless=False) if doubt.sentence
         )
 
-    def __getitem__(self, name: str) -> ParameterValue:
-        """A parameter by name: value, standard error and unit; ValueError with the nearest names if there is none."""
-        return ParameterValue(*self.value(name), self.model[name].unit)
-
     def value(self, name: str) -> tuple[float, float]:
         """Value and standard error of a parameter."""
-        i = self.model.index(name)
-        return float(self.values[i]), float(self.sigma[i])
-
-    def to_table(self) -> Any:
-        """All parameters as an astropy table: value, error, unit, start, prior, and whether it was free."""
-        return parameter_table(self.model, self.values, self.sigma)
+        return self[name][:2]
 
     def to_arviz(self, draws: int = 1000, seed: int = 0) -> Any:
         """ArviZ InferenceData of the parameters that vary: 4 chains of independent draws from values and covariance.

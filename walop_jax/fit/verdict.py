@@ -139,22 +139,11 @@ class Verdict:
     structure: Structure = NO_STRUCTURE
 
     @classmethod
-    def recorded(
-        cls,
-        chi2: float,
-        dof: int,
-        n_data: int,
-        noise_scale: float,
-        converged: bool,
-        trusted: bool,
-        quality: int,
-        warnings: Sequence[str] = (),
-        **others: Any,
-    ) -> Verdict:
+    def recorded(cls, *, trusted: bool, quality: int, warnings: Sequence[str] = (), **others: Any) -> Verdict:
         """The verdict that a file states; it does not say which sentence belongs to which bit."""
         remarks = tuple(Doubt(Quality(0), text, blocking=False) for text in warnings)
         bits = (Doubt(Quality(quality), "", blocking=not trusted),) if quality or not trusted else ()
-        return cls(chi2, dof, n_data, noise_scale, converged, (*bits, *remarks), **others)
+        return cls(**others, against=(*bits, *remarks))
 
     @property
     def trusted(self) -> bool:

@@ -327,8 +327,4 @@ residuals = compiled(_residuals, kept_as="residuals")
 prediction = compiled(_prediction, kept_as="prediction")
 
 
-def _detected(instrument: Instrument, plan: Plan, counts: Float[Array, "p e k"]) -> Float[Array, "p e k"]:
-    return jax.vmap(light.detected, (None, None, 0))(instrument, plan.exposures, counts)
-
-
-detected = compiled(_detected, kept_as="detected")
+detected = compiled(jax.vmap(light.detected, (None, None, 0)), kept_as="detected")

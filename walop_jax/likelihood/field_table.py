@@ -214,7 +214,10 @@ def accurate_table(
         x, y = chebyshev.grid(rectangle, count)
         if truth is None:
             both = exact(np.append(x, other_x), np.append(y, other_y))
-            values, truth = (jax.tree.map(lambda leaf, cut=cut: leaf[cut], both) for cut in _parts(len(x)))
+            values, truth = (
+                jax.tree.map(lambda leaf, cut=cut: leaf[cut], both)
+                for cut in (slice(0, len(x)), slice(len(x), None))
+            )
         else:
             values = exact(x, y)
         table = FieldTable.through(rectangle, count, values, total=total)
@@ -222,10 +225,6 @@ def accurate_table(
         if off <= tolerance or not np.isfinite(off):
             return table, off
     return None, off
-
-
-def _parts(first: int) -> tuple[slice, slice]:
-    return slice(0, first), slice(first, None)
 
 
 # ----------------------------------------------------------------------------------- the optics of a large set

@@ -209,11 +209,6 @@ def join(place: str) -> Processes:
     return here
 
 
-def leave_at_once(code: int) -> None:
-    """End this process without waiting for the others, which may have gone."""
-    os._exit(code)
-
-
 # --------------------------------------------------------------------------------------------- passes over the points
 
 Progress = Callable[[str], None]

@@ -6,14 +6,13 @@ effects change, and everything that asks for light asks the patched one.
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 import functools
 import itertools
 import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -73,16 +72,6 @@ class Arm(Component):
         if not isinstance(last, Analyser):
             raise ValueError(f"arm {self.name}: its path must end with an analyser, not with {last.name!r}")
         return last
-
-
-class Patch(Component):
-    """Change of an instrument: an effect."""
-
-    name: ClassVar[str] = ""
-
-    @abc.abstractmethod
-    def patch(self, instrument: Instrument) -> Instrument:
-        """The instrument with the effect. Raises `NoSuchPlaceError` where it has no element that the effect acts on."""
 
 
 class Instrument(Component):

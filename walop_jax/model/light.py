@@ -14,10 +14,10 @@ Units       counts per unit of unpolarised light at unit throughput; angles rad;
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -283,7 +283,7 @@ def _sight(instrument: Instrument, sight: Sight) -> Sight:
     if instrument.rotator_zero is None:
         return sight
     offset = jnp.deg2rad(instrument.rotator_zero)
-    exposures = dataclasses.replace(sight.exposures, rotator=sight.exposures.rotator + offset)
+    exposures = eqx.tree_at(lambda e: e.rotator, sight.exposures, sight.exposures.rotator + offset)
     sky = turned(sight.sky, jnp.broadcast_to(offset, exposures.rotator.shape))
     return sight._replace(exposures=exposures, sky=sky)
 

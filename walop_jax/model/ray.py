@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 Real = Float[Array, "..."]
 
 CONDITIONS = {"temperature": "TEMP", "hour_angle": "HA", "hours": "MJD"}
-"""Conditions on which the optics may depend from exposure to exposure, and their columns of EXPOSURES."""
+"""Conditions on which the optics may depend from exposure to exposure (Celsius; hours; hours since the first one), and
+their columns of EXPOSURES."""
 
 
 class NotPlannedError(ValueError):
@@ -30,7 +31,7 @@ class NotPlannedError(ValueError):
 
 
 class Conditions(eqx.Module):
-    """Conditions of an exposure at every wavelength node; only those that the optics have asked for are there.
+    """Conditions of an exposure at every wavelength node; of `CONDITIONS` only those that the optics have asked for.
 
     `band_width` is the equivalent width (µm) of the filter that a node belongs to.
     """
@@ -38,25 +39,12 @@ class Conditions(eqx.Module):
     band_width: Real
     planned: Mapping[str, Real]
 
-    def _get(self, name: str) -> Real:
+    def __getattr__(self, name: str) -> Real:
+        if name not in CONDITIONS:
+            raise AttributeError(name)
         if name not in self.planned:
             raise NotPlannedError(name)
         return self.planned[name]
-
-    @property
-    def temperature(self) -> Real:
-        """Temperature of the instrument (Celsius)."""
-        return self._get("temperature")
-
-    @property
-    def hour_angle(self) -> Real:
-        """Hour angle (h)."""
-        return self._get("hour_angle")
-
-    @property
-    def hours(self) -> Real:
-        """Time since the first exposure (h)."""
-        return self._get("hours")
 
 
 class Ray(eqx.Module):

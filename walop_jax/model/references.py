@@ -11,7 +11,6 @@ from importlib.resources import files
 
 from walop_jax.model import legendre, quadrature
 from walop_jax.model.elements import WavePlate, Wedge
-from walop_jax.model.elements.base import Element
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.materials import CRYSTALS, GLASSES
 from walop_jax.model.specification import Model
@@ -31,14 +30,6 @@ class Reference:
     source: str
 
 
-def _materials(element: Element) -> Iterator[Reference]:
-    if isinstance(element, Wedge):
-        yield Reference(element.material, GLASSES[element.material].source)
-    if isinstance(element, WavePlate):
-        for layer in element.layers:
-            yield Reference(layer.material, CRYSTALS[layer.material].source)
-
-
 def _optics(instrument: Instrument) -> Iterator[Reference]:
     behind = [element for arm in instrument.arms for element in (*arm.train(), arm.analyser)]
     elements = [*instrument.train(), *behind]
@@ -46,7 +37,10 @@ def _optics(instrument: Instrument) -> Iterator[Reference]:
         if element.reference:
             yield Reference(element.kind.replace("_", " "), element.reference)
     for element in elements:
-        yield from _materials(element)
+        if isinstance(element, Wedge):
+            yield Reference(element.material, GLASSES[element.material].source)
+        for layer in element.layers if isinstance(element, WavePlate) else ():
+            yield Reference(layer.material, CRYSTALS[layer.material].source)
 
 
 def references(model: Model) -> tuple[Reference, ...]:

@@ -250,7 +250,7 @@ def _expected(blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, 
     for _ in range(_MEDIAN_ROUNDS if needs(truth).median else 1):
         seen = np.where(likelihood.used[:, :, None], counts, np.nan)
         plan = with_median(likelihood.plan, np.nanmedian(seen, axis=0))
-        counts = np.asarray(engine.detected(truth, plan, jnp.asarray(light_counts)))
+        counts = np.asarray(engine.detected(truth, plan.exposures, jnp.asarray(light_counts)))
     return counts
 
 

@@ -104,7 +104,7 @@ def measured(*effects) -> tuple[engine.PointData, object]:
     device = scenes.instrument(*effects)
     flux = np.random.default_rng(2).uniform(2e5, 6e5, (2, 9, 1))
     flux[:, 8] = 1.0
-    counts = engine.detected(device, layout, flux * engine.prediction(device, layout, data))
+    counts = engine.detected(device, layout.exposures, flux * engine.prediction(device, layout, data))
     weight = 1.0 / jnp.sqrt(counts + 900.0)
     return data._replace(counts=counts, weight=weight), layout
 

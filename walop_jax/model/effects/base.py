@@ -7,6 +7,7 @@ not active is not in the tree and costs nothing.
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import inspect
 import sys
@@ -20,8 +21,8 @@ from jaxtyping import Array, Float
 
 from walop_jax.model.conventions import EXTINCTION
 from walop_jax.model.effects.change import Change
-from walop_jax.model.instrument import Instrument, NoSuchPlaceError, Patch
-from walop_jax.model.parameters import field_declarations, unknown_name
+from walop_jax.model.instrument import Instrument, NoSuchPlaceError
+from walop_jax.model.parameters import Component, field_declarations, unknown_name
 
 Scalar = Float[Array, ""]
 
@@ -42,7 +43,7 @@ class Context(NamedTuple):
     extinction: float = EXTINCTION
 
 
-class Effect(Patch):
+class Effect(Component):
     """A physical effect beyond the base model.
 
     Its parameters are the `param` fields; static fields are its discrete choices (which camera, which
@@ -57,6 +58,7 @@ class Effect(Patch):
     True
     """
 
+    name: ClassVar[str] = ""
     shape: ClassVar[tuple[str, ...]] = ()
     starts: ClassVar[tuple[tuple[Mapping[str, Any], ...], ...]] = (({},),)
     one_sided: ClassVar[tuple[str, ...]] = ()
@@ -65,6 +67,10 @@ class Effect(Patch):
     separated_by: ClassVar[str] = ""
     reference: ClassVar[str] = ""
     said: ClassVar[tuple[str, ...]] = ()
+
+    @abc.abstractmethod
+    def patch(self, instrument: Instrument) -> Instrument:
+        """The instrument with the effect. Raises `NoSuchPlaceError` where it has no element that the effect acts on."""
 
     # ---------------------------------------------------------------------------------- making and describing
 

@@ -145,8 +145,12 @@ def _patch(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     if stage == "opposite":
         shares = [size * np.array(cameras_of(instrument, change.place)) for change, size in terms]
         return instrument.with_part("ghosts", Ghost(jnp.sum(jnp.stack(shares), axis=0)))
-    pairs = [tuple(cameras_of(instrument, p).index(1.0) for p in (c.place, c.origin)) for c, _ in terms]
-    return instrument.with_part("mixing", CrossTalk(tuple(size for _, size in terms), tuple(pairs)))
+    targets, origins = (
+        [cameras_of(instrument, place).index(1.0) for place in places]
+        for places in zip(*((change.place, change.origin) for change, _ in terms), strict=True)
+    )
+    pairs = tuple(zip(targets, origins, strict=True))
+    return instrument.with_part("mixing", CrossTalk(tuple(size for _, size in terms), pairs))
 
 
 _OF_GAINS = "a lamp that does not change, seen by all cameras in turn"

@@ -169,7 +169,7 @@ def _optics(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 
 def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """(0, q, u, 0) per unit of light added, as mirrors of a telescope do to weakly polarised light."""
-    own = {"q": jnp.zeros(()), "u": jnp.zeros(())}
+    own: dict[str, Any] = {"q": jnp.zeros(()), "u": jnp.zeros(())}
     for one, size in terms:
         own[one.kind[-1]] = own[one.kind[-1]] + size
     return _beside(instrument, AddedPolarisation(name="described", **own), terms[0][0])
