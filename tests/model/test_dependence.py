@@ -89,7 +89,9 @@ def measured(*effects: Effect) -> tuple[Instrument, object, engine.PointData]:
 def formula(template: Instrument, values, flux, layout, data):
     """Counts (point, exposure, camera) from parameters and fluxes, as they are defined."""
     device = with_values(template)(values)
-    return engine._detected(device, layout, flux[..., None] * engine._prediction(device, layout, data))
+    return engine.detected(
+        device, layout.exposures, flux[..., None] * engine._prediction(device, layout, data)
+    )
 
 
 @compiled
