@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from walop_jax.likelihood import engine
-from walop_jax.model import mueller
+from walop_jax.model import light, mueller
 from walop_jax.model.compiled import compiled
 from walop_jax.model.dependence import needs, optical_indices
 from walop_jax.model.effects import EFFECTS, FreeForm, effect_by_name
@@ -89,9 +89,8 @@ def measured(*effects: Effect) -> tuple[Instrument, object, engine.PointData]:
 def formula(template: Instrument, values, flux, layout, data):
     """Counts (point, exposure, camera) from parameters and fluxes, as they are defined."""
     device = with_values(template)(values)
-    return engine.detected(
-        device, layout.exposures, flux[..., None] * engine._prediction(device, layout, data)
-    )
+    electrons = flux[..., None] * engine._prediction(device, layout, data)
+    return jax.vmap(light.detected, (None, None, 0))(device, layout.exposures, electrons)
 
 
 @compiled
