@@ -197,7 +197,7 @@ class Blind:
         }
         for name, shape in outside(examination.design.measured, single):
             column = examination.design.projector(examination.design.stacked([shape[:, None]])[:, 0])
-            along = self._whitening.T @ (examination.columns.T @ column)
+            along = self._whitening.T @ examination.products(column)
             self.outside[name] = along, max(float(column @ column - along @ along), 0.0)
         explained = {*self.effect_of, *(probe.name for probe in self.sentences)}
         self.patterns = [name for name in self.space.names if name not in explained]

@@ -27,8 +27,8 @@ def evidence(amplitudes, seed=1):
     residual = rng.standard_normal(ROWS) - columns[:, : len(amplitudes)] @ amplitudes
     projector = Projector(base)
     residual = projector(residual)
-    columns = np.asfortranarray(columns)
-    space = ScoreSpace.projected(projector, [*NAMES, PATTERN], [np.full(1, 10.0)] * 4, columns)
+    names, each = [*NAMES, PATTERN], np.split(columns, 4, axis=1)
+    space = ScoreSpace.projected(projector, names, [np.full(1, 10.0)] * 4, each)
     scores, square = columns.T @ residual, float(residual @ residual)
     kinds = [effect_by_name(name) for name in NAMES]
     return Evidence(

@@ -20,9 +20,10 @@ class Scoring:
 
     def __init__(self, projector, candidates, rng):
         self.projector = projector
-        self.columns = np.column_stack([c.columns for c in candidates])
+        each = [c.columns for c in candidates]
+        self.columns = projector(np.column_stack(each))
         names, widths = [c.name for c in candidates], [c.widths for c in candidates]
-        self.space = ScoreSpace.projected(projector, names, widths, self.columns)
+        self.space = ScoreSpace.projected(projector, names, widths, each)
         self.smallest = self.space.smallest_p(rng)
 
     def __call__(self, residual):

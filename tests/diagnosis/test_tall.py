@@ -11,16 +11,12 @@ from walop_jax.likelihood import limits
 @pytest.mark.parametrize("count", [1, 7, 8, 30])
 def test_pieces_make_the_whole(order, count, monkeypatch):
     monkeypatch.setattr(limits, "COLUMNS_TOGETHER", 7)
-    monkeypatch.setattr(limits, "PROJECTED_COLUMNS", 7)
     columns = np.asarray(np.random.default_rng(count).standard_normal((50, count)), order=order)
     found = score.gram(columns)
     np.testing.assert_allclose(found, columns.T @ columns, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(found, found.T)
     monkeypatch.setattr(score, "cores", lambda: 1)
     np.testing.assert_array_equal(score.gram(columns), found)
-    changed = columns.copy(order="K")
-    score.change_in_place(lambda some: 2.0 * some, changed)
-    np.testing.assert_array_equal(changed, 2.0 * columns)
 
 
 @pytest.mark.parametrize("exact", [0, 5, 12, 30])
@@ -34,9 +30,16 @@ def test_columns_that_are_not_exact_take_part_in_single_precision(exact, monkeyp
     assert (np.max(off) > 1e-9) == (exact < 30)
 
 
-def test_an_error_in_a_piece_is_an_error():
-    def refuse(some):
-        raise ValueError("not these")
-
-    with pytest.raises(ValueError, match="not these"):
-        score.change_in_place(refuse, np.ones((3, 2)))
+@pytest.mark.parametrize("priors", [0, 6])
+def test_a_space_is_that_of_projected_columns(priors, monkeypatch):
+    """Rows of priors, in which no candidate has a part, are behind the projection like all others."""
+    monkeypatch.setattr(limits, "PRODUCT_ROWS", 7)
+    rng = np.random.default_rng(priors)
+    jacobian, data = rng.standard_normal((50, 4)), 50 - priors
+    columns = [rng.standard_normal((data, count)) for count in (3, 1, 5)]
+    widths = [np.ones(own.shape[1]) for own in columns]
+    space = score.ScoreSpace.projected(score.Projector(jacobian), "abc", widths, columns, scale=2.0)
+    whole = np.pad(np.hstack(columns), ((0, priors), (0, 0))) / 2.0
+    left = whole - jacobian @ np.linalg.lstsq(jacobian, whole)[0]
+    np.testing.assert_allclose(space.gram, left.T @ left, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(space.before, np.sum(whole**2, axis=0), rtol=1e-12)

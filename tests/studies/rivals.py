@@ -129,11 +129,10 @@ def search(bench: Bench) -> Callable[[int], Answer]:
     from generate import Layout
 
     blind = Layout(1).blind
-    columns = blind.evidence.columns
 
     def answer(scene: int) -> Answer:
         r = bench.residual(scene)
-        along = blind._whitening.T @ (columns.T @ r)
+        along = blind._whitening.T @ blind.evidence.products(r)
         seen = Scene("", (), 0.0, along, float(r @ r - along @ along), removed=(str(bench.without[scene]),))
         start = blind.start(seen)
         verdict, left = blind.judged(seen, start)

@@ -128,7 +128,7 @@ def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Pr
 def all_candidates(
     likelihood: Likelihood, values: Vector, effects: Sequence[Probe], sentences: Sequence[Probe]
 ) -> tuple[dict[str, Candidate], dict[str, Candidate]]:
-    """Columns of effects and of sentences at the fit `values` of a model, by name.
+    """Columns of effects and, in single precision, of sentences at the fit `values` of a model, by name.
 
     Without effects that the set cannot show, and without fringes that the bands blur away.
     """
@@ -148,19 +148,21 @@ def all_candidates(
         if not all(survives[sentence.gap] for change in some for sentence in _fringes(change))
     }
     kept = {number: some for number, some in changes.items() if number not in blurred}
-    found = columns.of([change for some in kept.values() for change in some])
+    exact = sum(len(some) for number, some in kept.items() if number < len(shown))
+    found = columns.rounded([change for some in kept.values() for change in some], exact)
     named: dict[str, Candidate] = {}
     said: dict[str, Candidate] = {}
-    first = 0
+    first = [0, 0]
     for number, probe in enumerate([*shown, *sentences]):
+        of_sentence = number >= len(shown)
         if number in kept:
-            own = found[:, first : first + len(probe.widths)]
-            first += len(probe.widths)
+            own = found[of_sentence][:, first[of_sentence] : first[of_sentence] + len(probe.widths)]
+            first[of_sentence] += len(probe.widths)
         elif number in blurred:
             continue
         else:
             own = own_columns(likelihood, values, probe.group)
-        into = named if number < len(shown) else said
+        into = said if of_sentence else named
         into[probe.name] = Candidate(probe.name, own, probe.widths)
     return named, said
 

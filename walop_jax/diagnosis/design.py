@@ -330,19 +330,16 @@ class Design:
         own = rest(self.jacobian[:, of_effect])
         return rest, own @ whitening(own.T @ own)
 
-    def stacked(self, columns: list[Float[np.ndarray, "_ _"]]) -> Float[np.ndarray, "_ _"]:
-        """Columns of data rows side by side, with zeros for the priors; the list is emptied.
+    def stacked(self, columns: Sequence[Float[np.ndarray, "_ _"]]) -> Float[np.ndarray, "_ _"]:
+        """Columns of data rows side by side, in units of the noise, with zeros for the priors."""
+        whole = np.concatenate(columns, axis=1, dtype=float) / self.fit.noise_scale
+        return np.pad(whole, ((0, len(self.residual) - self.rows), (0, 0)))
 
-        Column by column in memory, and one piece after the other: of a large set there is room for one copy only.
-        """
-        count = sum(piece.shape[1] for piece in columns)
-        whole = np.zeros((len(self.residual), count), order="F")
-        first = 0
-        while columns:
-            piece = columns.pop(0)
-            np.divide(piece, self.fit.noise_scale, out=whole[: self.rows, first : first + piece.shape[1]])
-            first += piece.shape[1]
-        return whole
+    def products(
+        self, columns: Sequence[Float[np.ndarray, "_ _"]], rows: Float[np.ndarray, "_ ..."]
+    ) -> Float[np.ndarray, "_ ..."]:
+        """Cᵀ times rows, of the columns C that `stacked` puts side by side."""
+        return np.concatenate([own.T @ rows[: self.rows] for own in columns]) / self.fit.noise_scale
 
     def cube(self, rows: Vector) -> Float[np.ndarray, "p e k"]:
         """Data rows put back into (point, exposure, camera); 0 where unused."""
@@ -447,11 +444,11 @@ def pattern_scores(design: Design, seed: int = 0) -> ScoreTable:
 
 def _from_columns(design: Design, found: list[_Stratum]) -> tuple[ScoreSpace, Vector, float]:
     """Space, C̃ᵀr and r·r from columns of all intensities."""
-    columns = design.stacked([design.measured.candidate(stratum).columns for stratum in found])
+    columns = [design.measured.candidate(stratum).columns for stratum in found]
     names, widths = [stratum.name for stratum in found], [stratum.widths for stratum in found]
-    space = ScoreSpace.projected(design.projector, names, widths, columns)
+    space = ScoreSpace.projected(design.projector, names, widths, columns, scale=design.fit.noise_scale)
     residual = design.projector(design.residual)
-    return space, columns.T @ residual, float(residual @ residual)
+    return space, design.products(columns, residual), float(residual @ residual)
 
 
 def _from_rows(design: Design, found: list[_Stratum]) -> tuple[ScoreSpace, Vector, float]:

@@ -432,9 +432,9 @@ class _Absorbed:
 class Examination(Evidence):
     """The evidence of one fit, and where it comes from.
 
-    `named` and `said` are the columns of effects and of sentences ahead of any projection, `bare` and `columns` those
-    of all candidates behind it, ahead of the nuisance of single exposures with prior widths `common_mode`. `blocks`
-    are the blocks of the free-form term that can take candidates up.
+    `named` and `said` are the columns of effects and of sentences, `columns` those of all candidates, ahead of any
+    projection; `bare` is their space ahead of the nuisance of single exposures with prior widths `common_mode`.
+    `blocks` are the blocks of the free-form term that can take candidates up.
     """
 
     result: FitResult
@@ -443,7 +443,7 @@ class Examination(Evidence):
     said: Mapping[str, Candidate]
     blocks: Mapping[str, str | None]
     bare: ScoreSpace
-    columns: Matrix
+    columns: Sequence[Matrix]
     common_mode: Vector
     absorbed: Mapping[str, _Absorbed]
 
@@ -466,9 +466,13 @@ class Examination(Evidence):
         whole = np.pad(change, (0, len(self.design.residual) - len(change)))
         projected = own.rest(whole)
         space = dataclasses.replace(self.bare, gram=self.bare.gram + own.columns.T @ own.columns)
-        scores = self.columns.T @ projected + own.columns.T @ (own.basis.T @ projected)
+        scores = self.products(projected) + own.columns.T @ (own.basis.T @ projected)
         found = self.nearest(separations(space, scores, float(projected @ projected)))
         return {rival: apart / self.floor for rival, apart in found.items()}
+
+    def products(self, rows: Vector) -> Vector:
+        """Products of the projected columns of all candidates with rows."""
+        return self.design.products(self.columns, self.design.projector(rows))
 
     def is_like(self, design: Design) -> bool:
         """True if another fit expects so nearly the same counts that its columns may serve again."""
@@ -504,7 +508,10 @@ def examine(
         for probe, effects in parts
         if probe.name in said
     ]
-    patterns = [design.measured.candidate(stratum) for stratum in strata(design.measured)]
+    patterns = [
+        dataclasses.replace(one, columns=one.columns.astype(np.float32))
+        for one in map(design.measured.candidate, strata(design.measured))
+    ]
     candidates = [
         *(named[probe.name] for probe in probes),
         *(said[probe.name] for probe in sentences),
@@ -513,15 +520,16 @@ def examine(
     ]
     blocks = {candidate.name: candidate.block for candidate in candidates}
     names, widths = [c.name for c in candidates], [c.widths for c in candidates]
-    columns = design.stacked([candidates.pop(0).columns for _ in names])
+    columns = [candidate.columns for candidate in candidates]
     absorbed = {}
     for name in active:
         rest, basis = design.without(name)
-        absorbed[name] = _Absorbed(rest, basis, basis.T @ columns)
+        absorbed[name] = _Absorbed(rest, basis, design.products(columns, basis).T)
     exact = sum(len(probe.widths) for probe in probes)  # rivals may be the same to the last digit
-    bare = ScoreSpace.projected(design.projector, names, widths, columns, exact)
+    scale = result.noise_scale
+    bare = ScoreSpace.projected(design.projector, names, widths, columns, scale=scale, exact=exact)
     r = design.projector(design.residual)
-    space, scores, square, common_mode = bare, columns.T @ r, float(r @ r), np.zeros(0)
+    space, scores, square, common_mode = bare, design.products(columns, r), float(r @ r), np.zeros(0)
     if SINGLE_EXPOSURES in names:
         common_mode = _common_mode(bare, design, policy.common_mode)
         space, reduce = bare.with_base([SINGLE_EXPOSURES], common_mode)

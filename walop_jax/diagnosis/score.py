@@ -185,24 +185,39 @@ class ScoreSpace:
         projector: Projector,
         names: Sequence[str],
         widths: Sequence[Vector],
-        columns: Matrix,
+        columns: Sequence[Matrix],
+        *,
+        scale: float = 1.0,
         exact: int | None = None,
     ) -> ScoreSpace:
-        """The space of candidates whose columns stand side by side; these are projected in place.
+        """The space of candidates, from the columns of each ahead of the projection, in units of `scale`.
 
-        Products of different candidates beyond the first `exact` columns are taken in single precision: 10⁻⁷ of the
-        lengths of two columns, where a part of 10⁻³ counts.
+        Rows beyond those of the columns, of priors, are 0. Products of different candidates beyond the first `exact`
+        amplitudes are taken in single precision: 10⁻⁷ of the lengths of two columns, where a part of 10⁻³ counts. The
+        projected columns of all rows are never there at once.
         """
-        before = np.einsum("dk,dk->k", columns, columns)
-        change_in_place(projector, columns)
-        products, first = gram(columns, exact), 0
-        for size in (len(w) for w in widths):
-            own = columns[:, first : first + size]
-            products[first : first + size, first : first + size] = own.T @ own
-            first += size
+        sizes = [own.shape[1] for own in columns]
+        stop = np.cumsum([0, *sizes])
+        places = [slice(first, last) for first, last in itertools.pairwise(stop.tolist())]
+        basis, count = projector.basis, int(stop[-1])
+        before, along = np.empty(count), np.empty((basis.shape[1], count))
+        for at, own in zip(places, columns, strict=True):
+            before[at] = np.einsum("dk,dk->k", own, own, dtype=float) / scale**2
+            along[:, at] = basis[: len(own)].T @ own / scale
+        products, alone = np.zeros((count, count)), [np.zeros((size, size)) for size in sizes]
+        for first in range(0, len(basis), limits.PRODUCT_ROWS):
+            rows = slice(first, first + limits.PRODUCT_ROWS)
+            left = basis[rows] @ -along
+            for at, own, square in zip(places, columns, alone, strict=True):
+                here = own[rows]
+                left[: len(here), at] += here / scale
+                square += left[:, at].T @ left[:, at]
+            products += gram(left, exact)
+        for at, square in zip(places, alone, strict=True):
+            products[at, at] = square
         return cls(
             names=tuple(names),
-            sizes=tuple(len(w) for w in widths),
+            sizes=tuple(sizes),
             widths=np.concatenate(widths),
             before=before,
             gram=products,
@@ -405,16 +420,6 @@ def gram(columns: Float[np.ndarray, "d n"], exact: int | None = None) -> Float[n
 
     _on_all_cores(product, [(one, other) for i, one in enumerate(pieces) for other in pieces[i:]])
     return found
-
-
-def change_in_place(function: Callable[[Matrix], Matrix], columns: Float[np.ndarray, "d n"]) -> None:
-    """Replace columns by what a function of some of them gives."""
-
-    def change(first: int) -> None:
-        some = columns[:, first : first + limits.PROJECTED_COLUMNS]
-        some[:] = function(some)
-
-    _on_all_cores(change, range(0, columns.shape[1], limits.PROJECTED_COLUMNS))
 
 
 def _on_all_cores(work: Callable[..., None], pieces: Iterable[object]) -> None:

@@ -373,7 +373,7 @@ def condition_scores(design: Design) -> list[_Scored]:
         return []
     names = [str(number) for number in range(len(asked))]
     widths = [np.array([one.width]) for one in asked]
-    table, square = _table(design, names, widths, columns.copy())
+    table, square = _table(design, names, widths, columns)
     return [
         _Scored(one, table[name], column, float(length))
         for one, name, column, length in zip(asked, names, columns.T, square, strict=True)
@@ -393,8 +393,9 @@ def _asked(design: Design) -> tuple[list[_Stated], Float[np.ndarray, "d c"]]:
 def _table(
     design: Design, names: Sequence[str], widths: Sequence[np.ndarray], columns: Float[np.ndarray, "d c"]
 ) -> tuple[ScoreTable, Float[np.ndarray, " c"]]:
-    """Scores of columns, which are projected in place, and what is left of their squares."""
-    space = ScoreSpace.projected(design.projector, names, widths, columns)
+    """Scores of columns, and what the parameters leave of their squares."""
+    each = np.split(columns, np.cumsum([len(own) for own in widths])[:-1], axis=1)
+    space = ScoreSpace.projected(design.projector, names, widths, each)
     residual = design.projector(design.residual)
     table = space.table(columns.T @ residual, float(residual @ residual))
     return table, np.diag(space.gram)

@@ -293,16 +293,28 @@ class Columns:
 
     def of(self, changes: Sequence[Change]) -> Float[np.ndarray, "d a"]:
         """The columns of changes: rows run over points, then exposures, then cameras, used ones only."""
+        return self.rounded(changes, len(changes))[0]
+
+    def rounded(
+        self, changes: Sequence[Change], exact: int
+    ) -> tuple[Float[np.ndarray, "d a"], Float[np.ndarray, "d b"]]:
+        """The columns of the first, `exact` changes, and those of the others in single precision."""
         pieces = [self._pieces(change) for change in changes]
         likelihood, size = self.likelihood, limits.RESPONSES_TOGETHER
         used, cameras = likelihood.used, len(self.patched.cameras)
-        found = np.empty((len(changes), cameras * int(used.sum())))
+        length = cameras * int(used.sum())
+        parts = (
+            (pieces[:exact], np.empty((exact, length))),
+            (pieces[exact:], np.empty((len(changes) - exact, length), np.float32)),
+        )
         every, first = [piece for each in pieces for piece in each], 0
         for start in range(0, len(used), size):
             rows = cameras * int(used[start : start + size].sum())
-            _Block(self, start, every).fill(pieces, found[:, first : first + rows])
+            block = _Block(self, start, every)
+            for some, found in parts:
+                block.fill(some, found[:, first : first + rows])
             first += rows
-        return found.T
+        return parts[0][1].T, parts[1][1].T
 
 
 class _Block:

@@ -109,8 +109,8 @@ MANY_POINTS = 4
 nearly as many gains as data."""
 FREE_EXPOSURES = 100
 """Exposures of a set up to which a free-form term may have a number for each camera in each of them."""
-PROJECTED_COLUMNS = 128
-"""Columns that are projected together: a copy of them is small beside all."""
+PRODUCT_ROWS = 4096
+"""Rows of columns that are projected and multiplied together: a copy of them is small beside all."""
 COLUMNS_TOGETHER = 256
 """Columns that are multiplied together: large enough for the full speed of a core, small enough to share them out."""
 AMPLITUDES_AT_ONCE = 32
