@@ -24,7 +24,6 @@ from walop_jax.sky.moon import (
     offset_direction,
     rayleigh_sky,
     sky_to_instrument,
-    standard_rotation,
 )
 
 CENTRE = (np.zeros(1), np.zeros(1))
@@ -126,9 +125,6 @@ def test_turn_to_the_instrument():
     # a vector at position angle 30° in an instrument whose +X lies at 30° is along +X
     q, u_ = sky_to_instrument(*(np.array([f(np.pi / 3)]) for f in (np.cos, np.sin)), np.array([30.0]))
     np.testing.assert_allclose([q[0], u_[0]], [1, 0], atol=1e-15)
-    np.testing.assert_allclose(
-        standard_rotation(np.array([15.0, 45.0]))[0], [np.cos(np.pi / 6), 0], atol=1e-15
-    )
 
 
 SITE = Site("SAAO 1-m", -32.3795, 20.8107, 1798.0)

@@ -369,6 +369,18 @@ class Calibration(Fitted):
         return settings
 
     @property
+    def usual_filter(self) -> str:
+        """SDSS-r, or the first filter of the exposures where they do not use that."""
+        used = [str(name) for name in np.unique(self.exposures.filter)]
+        return DEFAULT_FILTER if DEFAULT_FILTER in used or not used else used[0]
+
+    def raster(self, size: int) -> Float[np.ndarray, "2 p"]:
+        """X and Y (deg) of size × size places over the field, row by row."""
+        low_x, high_x, low_y, high_y = self.field
+        x, y = np.meshgrid(np.linspace(low_x, high_x, size), np.linspace(low_y, high_y, size))
+        return np.stack([x.ravel(), y.ravel()])
+
+    @property
     def always_in(self) -> tuple[str, ...]:
         """Column prefixes of the moving elements, calibration plate apart, that were in the beam in all exposures."""
         moving = (p for p in self.model.template.patched().moving() if p != CALIBRATION_PLATE)
@@ -425,10 +437,9 @@ class Calibration(Fitted):
     def new_maps(self, size: int = MAP_SIZE) -> MatrixMaps:
         """The matrix over the field on a regular grid, computed anew, for a look at it.
 
-        In `usual_settings`, through SDSS-r or the first filter of the exposures where they do not use that.
+        In `usual_settings`, through the `usual_filter`.
         """
-        used = [str(name) for name in np.unique(self.exposures.filter)]
-        name = DEFAULT_FILTER if DEFAULT_FILTER in used or not used else used[0]
+        name = self.usual_filter
         half = float(np.ceil(np.max(np.abs(self.field)) * 50.0) / 50.0) or 0.3
         step = 2.0 * half / (size - 1)
         centre = 0.5 * (size + 1)

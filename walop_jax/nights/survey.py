@@ -162,9 +162,7 @@ class Survey(Displayed):
             product = self._product(self.last)
         except DataError:  # `at` says why there is none
             return None
-        low_x, high_x, low_y, high_y = product.field
-        grid = np.meshgrid(np.linspace(low_x, high_x, GRID), np.linspace(low_y, high_y, GRID))
-        x, y = (part.ravel() for part in grid)
+        x, y = product.raster(GRID)
         name = str(np.unique(product.exposures.filter)[0])
         instrument, curves = product.model.instrument(product.values), {name: product.filter_curve(name)}
         matrix, slopes = matrix_slopes(instrument, product.usual_settings(1, name), curves, x, y)

@@ -38,7 +38,7 @@ from walop_jax.io.errors import DataError
 from walop_jax.model.conventions import EXTINCTION
 from walop_jax.science.estimate import estimate
 from walop_jax.science.star_errors import QuPairs, sample_stars, transmitted
-from walop_jax.sky.moon import moon_sky
+from walop_jax.sky.moon import moon_sky, sky_to_instrument
 
 TERMS = ("1", "qm", "um", "qm^2", "um^2")
 _ROUNDS = 300  # of alternating least squares for transmissions and fluxes; 40 are enough
@@ -369,10 +369,9 @@ def _catalogue(
     calset: CalibrationSet, block: Block, standard: Int[np.ndarray, " e"]
 ) -> Float[np.ndarray, "p e 2"]:
     """(q, u) of the standards in the instrument frame: (q + iu) exp(−2i ROTATOR)."""
-    sources = calset.sources
-    light = (sources.q + 1j * sources.u)[block.source[:, standard]]
-    seen = light * np.exp(-2j * np.deg2rad(calset.exposures.rotator[standard]))
-    return np.stack([seen.real, seen.imag], axis=-1)
+    star, sources = block.source[:, standard], calset.sources
+    turned = sky_to_instrument(sources.q[star], sources.u[star], calset.exposures.rotator[standard])
+    return np.stack(turned, axis=-1)
 
 
 def _mean(values: np.ndarray, used: np.ndarray, axis: int) -> np.ndarray:

@@ -46,13 +46,13 @@ def retardance_figure(calibration: Calibration, on: Canvas = PAGE) -> AnyFigure:
     """Maps of the retardance of every half-wave plate over the field at one wavelength, in degrees modulo 360."""
     instrument = calibration.model.instrument(calibration.values)
     names = plate_names(instrument)
-    low_x, high_x, low_y, high_y = calibration.field
-    x, y = np.meshgrid(np.linspace(low_x, high_x, _PIXELS), np.linspace(low_y, high_y, _PIXELS))
-    found = plate_retardances(instrument, np.array([_WAVELENGTH]), x.ravel(), y.ravel())[..., 0]
+    found = plate_retardances(instrument, np.array([_WAVELENGTH]), *calibration.raster(_PIXELS))[..., 0]
     figure, axes = on.panels(3.9 * len(names), 3.3, 1, len(names), squeeze=False)
     for name, axis, values in zip(names, axes[0], found, strict=True):
         # Unwrapped: a map that jumps by 360° would show the jump and nothing else.
-        whole = np.unwrap(np.unwrap(values.reshape(x.shape), axis=1, period=360.0), axis=0, period=360.0)
+        whole = np.unwrap(
+            np.unwrap(values.reshape(_PIXELS, _PIXELS), axis=1, period=360.0), axis=0, period=360.0
+        )
         whole -= 360.0 * np.floor(whole[_PIXELS // 2, _PIXELS // 2] / 360.0)
         field_axes(axis, f"retardance of {PLATES.get(name, name)} at {1e3 * _WAVELENGTH:.0f} nm (deg)")
         norm = Normalize(float(whole.min()), float(whole.max()))
@@ -261,13 +261,12 @@ def plate_figure(calibration: Calibration, combinations: Sequence[Sequence[float
     in the worse direction.
     """
     analysis = AnalysisVectors(calibration)
-    low_x, high_x, low_y, high_y = calibration.field
-    x, y = np.meshgrid(np.linspace(low_x, high_x, _PLATE_PIXELS), np.linspace(low_y, high_y, _PLATE_PIXELS))
+    x, y = calibration.raster(_PLATE_PIXELS)
     count, norm, shown = len(combinations), LogNorm(1.0, 100.0), None
     figure, axes = PAGE.panels(2.6 * count + 0.9, 2.9, 1, count, sharey=True, squeeze=False)
     for axis, plates in zip(axes[0], combinations, strict=True):
         settings = [Settings.default(1).at(CHWP=plate) for plate in plates]
-        worst = plate_errors(analysis, settings, x.ravel(), y.ravel()).reshape(x.shape)
+        worst = plate_errors(analysis, settings, x, y).reshape(_PLATE_PIXELS, _PLATE_PIXELS)
         shown = pixel_map(axis, np.clip(worst, 1.0, 100.0), calibration.field, norm, "magma_r")
         names = ["out" if plate is None else f"{plate:g}°" for plate in plates]
         field_axes(axis, "plate " + " and ".join(names))

@@ -266,11 +266,7 @@ class MeasuredChange(NamedTuple):
 
 def _visible(changed: Calibration) -> dict[str, float]:
     """`SURE` errors of each matrix element, median over the field, per cent; the covariance is that of the change."""
-    (low_x, high_x, low_y, high_y), side = changed.field, 4
-    x, y = (
-        part.ravel()
-        for part in np.meshgrid(np.linspace(low_x, high_x, side), np.linspace(low_y, high_y, side))
-    )
+    x, y = changed.raster(4)
     name = str(np.unique(changed.exposures.filter)[-1])
     _, covariance = changed.matrix(x, y, changed.usual_settings(1, name))
     error = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))

@@ -120,12 +120,8 @@ def field_accuracy(calibration: Calibration, size: int = SIZE) -> FieldAccuracy 
     """The map for an instrument with two arms, in the usual settings; None for others: they need several exposures."""
     if len(calibration.model.template.cameras.pairs) != 2:
         return None
-    used = [str(name) for name in np.unique(calibration.exposures.filter)]
-    settings = calibration.usual_settings()
-    if str(settings.filter[0]) not in used:
-        settings = calibration.usual_settings(filter_name=used[0])
-    fine, coarse = _grid(calibration, size), _grid(calibration, COARSE)
-    x, y = np.concatenate([fine, coarse], axis=1)
+    settings = calibration.usual_settings(filter_name=calibration.usual_filter)
+    x, y = np.concatenate([calibration.raster(size), calibration.raster(COARSE)], axis=1)
     matrix, covariance, slopes = calibration.over_field(x, y, settings, NODES, TOLERANCE)
     error = p_errors(matrix[: size**2], covariance[: size**2], sample_stars()).reshape(size, size)
     determinant = np.abs(np.linalg.det(matrix.reshape(-1, 2, 3)[: size**2, :, 1:]))
@@ -140,7 +136,7 @@ def field_accuracy(calibration: Calibration, size: int = SIZE) -> FieldAccuracy 
     return FieldAccuracy(
         error,
         calibration.field,
-        str(settings.filter[0]),
+        calibration.usual_filter,
         limited_by=_limited_by(calibration, matrix, slopes),
         hidden=float(np.median(known)) if known.size else np.nan,
         hidden_by=_with_size(calibration, worst),
@@ -156,12 +152,6 @@ def _with_size(calibration: Calibration, name: str) -> str:
         return ""
     at = hidden.names.index(name)
     return f"{name} (wrong by {rounded(hidden.sizes[at], '.2g')} {hidden.units[at]}".rstrip() + ")"
-
-
-def _grid(calibration: Calibration, size: int) -> Float[np.ndarray, "2 p"]:
-    low_x, high_x, low_y, high_y = calibration.field
-    x, y = np.meshgrid(np.linspace(low_x, high_x, size), np.linspace(low_y, high_y, size))
-    return np.stack([x.ravel(), y.ravel()])
 
 
 def _limited_by(

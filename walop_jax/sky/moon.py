@@ -218,24 +218,14 @@ def rayleigh_sky(
     return sky_to_instrument(weight * (a**2 - b**2), weight * (2.0 * a * b), rotator)
 
 
-def standard_rotation(
-    rotator: Float[np.ndarray, "*n"],
-) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-    """Return cos 2R and sin 2R of the position angle R (degrees) of +X: what turns sky into instrument.
-
-    EVPA in the instrument frame = position angle on the sky − R, hence
-    q = Q cos 2R + U sin 2R and u = U cos 2R − Q sin 2R.
-    """
-    angle = np.deg2rad(2.0 * np.asarray(rotator, dtype=np.float64))
-    return np.cos(angle), np.sin(angle)
-
-
 def sky_to_instrument(
     q: Float[np.ndarray, ...], u: Float[np.ndarray, ...], rotator: Float[np.ndarray, ...]
 ) -> tuple[Float[np.ndarray, ...], Float[np.ndarray, ...]]:
     """Turn equatorial Stokes parameters (position angle north through east) into the instrument frame.
 
-    `rotator` in degrees, broadcast against q and u. The inverse is the same with −`rotator`.
+    EVPA in the instrument frame = position angle on the sky − R, hence q = Q cos 2R + U sin 2R and
+    u = U cos 2R − Q sin 2R. `rotator`, R, in degrees, broadcast against q and u. The inverse is the same with −R.
     """
-    cos_2r, sin_2r = standard_rotation(rotator)
+    angle = np.deg2rad(2.0 * np.asarray(rotator, dtype=np.float64))
+    cos_2r, sin_2r = np.cos(angle), np.sin(angle)
     return q * cos_2r + u * sin_2r, u * cos_2r - q * sin_2r
