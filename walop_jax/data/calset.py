@@ -245,13 +245,9 @@ def _frames(
 ) -> tuple[Intensities, Points]:
     """Describe frames, and look at a few rows of pixels for what is wrong everywhere."""
     if np.any(bad := (exposures.kind == "standard") & ~exposures.clp_in):
-        raise fail(
-            f"EXPOSURE {exposures.exposure[bad][0]} is a standard, and a pixel of a frame has no SOURCE",
-            file=path,
-            extension="EXPOSURES",
-            column="KIND",
-            advice="give standards in a table, in another file",
-        )
+        what = f"EXPOSURE {exposures.exposure[bad][0]} is a standard, and a pixel of a frame has no SOURCE"
+        advice = "give standards in a table, in another file"
+        raise Place(path, "EXPOSURES").fail(what, "KIND", advice)
     grid, stack = frame_stack(images, len(exposures), path, 4 if version == 1 else None)
     width, total = grid.width, grid.pixels
     corners = (0, width - 1, total - width, total - 1)

@@ -62,10 +62,10 @@ class Grid:
 
 @dataclasses.dataclass(frozen=True)
 class Cube:
-    """Place of the values of an image extension (exposures, rows, columns) in its file, and their reader."""
+    """Values of an image extension (exposures, rows, columns): where they lie in its file, and their reader."""
 
+    place: Place
     path: Path
-    extension: str
     offset: int
     dtype: np.dtype[Any]
     shape: tuple[int, int, int]
@@ -84,7 +84,7 @@ class Cube:
             # Mapped anew each time: no open file to keep, and pages are given back after the slab.
             raw = np.memmap(self.path, self.dtype, mode="r", offset=self.offset, shape=self.shape)
         except OSError as error:
-            raise fail(f"cannot be read: {error}", file=self.path, extension=self.extension) from error
+            raise self.place.fail(f"cannot be read: {error}") from error
         return np.asarray(raw[:, start:stop])
 
     def read_into(self, planes: np.ndarray, start: int) -> None:
@@ -100,18 +100,13 @@ class Cube:
                 file.seek(self.offset + (number * height + start) * row)
                 target = memoryview(plane).cast("B")
                 if file.readinto(target) != len(target):
-                    raise fail(
-                        "the file is truncated",
-                        file=self.path,
-                        extension=self.extension,
-                        advice="read it again",
-                    )
+                    raise self.place.fail("the file is truncated", advice="read it again")
 
     def _check_stamp(self) -> None:
         try:
             now = self.path.stat()
         except OSError as error:
-            raise fail(f"cannot be read: {error}", file=self.path, extension=self.extension) from error
+            raise self.place.fail(f"cannot be read: {error}") from error
         if (now.st_size, now.st_mtime_ns) != self.stamp:
             raise fail("the file has changed since it was opened", file=self.path, advice="read it again")
 
@@ -194,13 +189,10 @@ class FrameIntensities(Intensities):
                 pixel, plane = (int(entry[0]) for entry in np.nonzero(impossible))
                 row, column = divmod(start + pixel, self.grid.width)
                 camera = int(np.argmax(sigma[pixel, plane] <= 0))
-                raise fail(
-                    f"is zero or negative in plane {plane}, row {row}, column {column} (counted from 0), and "
-                    f"{int(impossible.sum())} pixel(s) in all",
-                    file=stack.sigma[camera].path,
-                    extension=stack.sigma[camera].extension,
-                    advice="give the true error, or set the FLAG image",
-                )
+                where = f"plane {plane}, row {row}, column {column} (counted from 0)"
+                what = f"is zero or negative in {where}, and {int(impossible.sum())} pixel(s) in all"
+                advice = "give the true error, or set the FLAG image"
+                raise stack.sigma[camera].place.fail(what, advice=advice)
             block.used[:, here] = used
             block.counts[:, here] = np.where(used[..., None], counts, 0.0)
             block.sigma[:, here] = np.where(used[..., None], sigma, 1.0)
@@ -277,13 +269,14 @@ def _cube(hdu: Any, exposures: int, place: Place) -> Cube:
             f"has shape {shape} where ({exposures}, ny, nx) is needed",
             advice="one plane per row of EXPOSURES",
         )
-    info, stat = hdu.fileinfo(), Path(str(place.file)).stat()
+    path = Path(str(place.file)).absolute()
+    info, stat = hdu.fileinfo(), path.stat()
     kinds = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
     bitpix = int(header["BITPIX"])
     blank = header.get("BLANK")
     return Cube(
-        path=Path(str(place.file)).absolute(),
-        extension=place.extension,
+        place=Place(path, place.extension),
+        path=path,
         offset=int(info["datLoc"]),
         dtype=np.dtype(kinds[bitpix]),
         shape=(shape[0], shape[1], shape[2]),

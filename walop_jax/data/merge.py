@@ -36,6 +36,7 @@ from walop_jax.data.records import (
     Site,
     Sources,
 )
+from walop_jax.data.schema import Place
 from walop_jax.data.table_intensities import TableIntensities, empty_block, mask_repeats
 from walop_jax.io.errors import DataError, fail, rows_text
 
@@ -79,12 +80,9 @@ def check_repeats(
     texts = [_sentence(rows, pair, exposures, points) for pair in pairs]
     if noise:
         more = f", and {len(texts) - 1} pairs more" if len(texts) > 1 else ""
-        raise fail(
-            f"{texts[0]}{more}: independent measurements never agree within {_CLOSE} σ",
-            file=file,
-            extension="INTENSITIES",
-            advice="remove one of them: repeated data would shrink the errors",
-        )
+        what = f"{texts[0]}{more}: independent measurements never agree within {_CLOSE} σ"
+        advice = "remove one of them: repeated data would shrink the errors"
+        raise Place(file, "INTENSITIES").fail(what, advice=advice)
     alike = [
         text for text, (a, b) in zip(texts, pairs, strict=True) if a == b or _same_settings(exposures, a, b)
     ]

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from walop_jax.data.records import Block, DataFlag, Exposures, Intensities, Points, Sources
 from walop_jax.data.schema import Place
-from walop_jax.io.errors import fail, rows_text
+from walop_jax.io.errors import rows_text
 
 ONE_CAMERA = ("flux", "steady")  # KINDs of which a single camera says something
 NEGATIVE = 5.0
@@ -271,14 +271,9 @@ def mask_repeats(
             ids = f"exposures {exposures.exposure[first]} and {exposures.exposure[other]}"
             if not _same_data(intensities, first, other):
                 if fine and _share_points(intensities, first, other):
-                    raise fail(
-                        f"{ids} (rows {first} and {other}, counted from 0) have the same time and settings but "
-                        "different counts",
-                        file=file,
-                        extension="EXPOSURES",
-                        column="MJD",
-                        advice="no camera takes two exposures at once: correct the times, or write NaN",
-                    )
+                    what = f"{ids} (rows {first} and {other}, counted from 0) have the same time and settings but"
+                    advice = "no camera takes two exposures at once: correct the times, or write NaN"
+                    raise Place(file, "EXPOSURES").fail(f"{what} different counts", "MJD", advice)
                 alike.append(ids)
                 continue
             remarks.append(f"{ids} are the same to the last bit, the second is not used")

@@ -48,7 +48,7 @@ def read_compression(hdu: Any, path: Path) -> Compression:
     """The record of an extension; `DataError` for one that lacks something."""
     place, header = Place(path, EXTENSION), hdu.header
     for name in ("NPIXELS", "CHI2", "DOF"):
-        if not isinstance(header.get(name), int | float) or isinstance(header.get(name), bool):
+        if _asked(header, name) is None:
             raise place.fail("is missing or no number", name, "compress the frames again")
     names = [name.upper() for name in getattr(getattr(hdu, "columns", None), "names", [])]
     if sorted(names) != ["NAME", "VALUE"]:
