@@ -9,7 +9,7 @@ import numpy as np
 from astropy.io import fits
 
 from walop_jax.data import CalibrationSet, DataFlag, Grid, TableIntensities, write_calibration_set
-from walop_jax.data.frames import count_names, error_names
+from walop_jax.data.frames import image_names
 from walop_jax.data.records import Points
 from walop_jax.data.write import grid_cards
 
@@ -32,7 +32,7 @@ def write_frames(
         del hdus["POINTS"], hdus["INTENSITIES"]
         hdus.writeto(path, overwrite=True)
     shape = (len(calset.exposures), grid.height, grid.width)
-    counts, errors = count_names(calset.cameras), error_names(calset.cameras)
+    counts, errors = image_names(calset.cameras)
     kinds = dict.fromkeys((*counts, *errors), np.dtype(f">{dtype}")) | {"FLAG": np.dtype(">i2")}
     cubes = {name: _room(path, name, kind, shape, grid) for name, kind in kinds.items()}
     step = max(1, SLAB // (shape[0] * grid.width))

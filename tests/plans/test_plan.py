@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import matrix_slopes
+from walop_jax.calibration.matrix import matrix_slopes, sample_stars
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import in_memory
 from walop_jax.diagnosis.trust import examined
@@ -24,7 +24,6 @@ from walop_jax.plans.plan import PLANNED, plan_from
 from walop_jax.plans.wanted import FieldErrors, field_errors, wanted
 from walop_jax.reports.page import kind_of_run, render_other
 from walop_jax.science.field_accuracy import p_errors
-from walop_jax.science.star_errors import sample_stars
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, plan_text, read_plan
 from walop_jax.simulation.simulate import PhotonNoise, effect_from_text, simulate
 

@@ -8,9 +8,9 @@ import numpy as np
 from small_run import small_fit
 
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.matrix import sample_stars
 from walop_jax.fit.verdict import Hidden
 from walop_jax.science.field_accuracy import GROUPS, field_accuracy, p_errors
-from walop_jax.science.star_errors import sample_stars
 
 IDEAL = np.array([[0.0, 1.0, 0.0, 0.0, 0.0, 1.0]])
 

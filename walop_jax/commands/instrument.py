@@ -44,13 +44,8 @@ class CheckedInstrument(Displayed):
             "conditions": list(self.conditions),
             "field_limit": self.instrument.field_limit,
             "parameters": {
-                p.name: {
-                    "start": p.start,
-                    "unit": p.unit,
-                    "prior": None if p.prior is None else list(p.prior),
-                    "source": p.source,
-                    "optical": p.name in self.optical,
-                }
+                p.name: {key: getattr(p, key) for key in ("start", "unit", "prior", "source")}
+                | {"optical": p.name in self.optical}
                 for p in self.model.parameters
             },
         }

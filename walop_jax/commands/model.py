@@ -34,14 +34,7 @@ class ModelFile(Displayed):
             "effects": list(self.model.effect_names),
             "output": None if self.path is None else str(self.path),
             "parameters": {
-                p.name: {
-                    "start": p.start,
-                    "unit": p.unit,
-                    "prior": None if p.prior is None else list(p.prior),
-                    "free": p.free,
-                    "tie": p.tie,
-                    "about": p.about,
-                }
+                p.name: {key: getattr(p, key) for key in ("start", "unit", "prior", "free", "tie", "about")}
                 for p in self.model.parameters
             },
         }

@@ -205,7 +205,7 @@ def _header(header: Any, path: Path) -> tuple[int, str, Site]:
 
 def _extensions(opened: OpenFile, version: int, remarks: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Sort the extensions of a file by name into tables and images."""
-    four = image_names(4)
+    four = [name for names in image_names(4) for name in names] + ["FLAG"]
     tables: dict[str, Any] = {}
     images: dict[str, Any] = {}
     for number, hdu in enumerate(opened.hdus[1:], start=1):

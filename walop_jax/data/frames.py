@@ -124,19 +124,9 @@ class Cube:
         return values
 
 
-def count_names(cameras: int) -> tuple[str, ...]:
-    """Names of the image extensions of counts: N0, N1, …"""
-    return tuple(f"N{k}" for k in range(cameras))
-
-
-def error_names(cameras: int) -> tuple[str, ...]:
-    """Names of the image extensions of errors: E0, E1, …"""
-    return tuple(f"E{k}" for k in range(cameras))
-
-
-def image_names(cameras: int) -> tuple[str, ...]:
-    """Names of all image extensions that whole frames may have."""
-    return (*count_names(cameras), *error_names(cameras), "FLAG")
+def image_names(cameras: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the image extensions of counts and of errors: N0, N1, …, and E0, E1, …; FLAG may be there too."""
+    return tuple(f"N{k}" for k in range(cameras)), tuple(f"E{k}" for k in range(cameras))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,28 +139,29 @@ class FrameStack:
     flag: Cube | None
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
 class FrameIntensities(Intensities):
     """Frames of one or several files on the same grid of pixels, exposures one after the other."""
 
-    def __init__(self, grid: Grid, stacks: tuple[FrameStack, ...]) -> None:
-        self.grid = grid
-        self.stacks = stacks
-        self.exposures = sum(stack.exposures for stack in stacks)
-        self._rows: int | None = None
+    grid: Grid
+    stacks: tuple[FrameStack, ...]
+
+    @functools.cached_property
+    def exposures(self) -> int:
+        """Number of exposures."""
+        return sum(stack.exposures for stack in self.stacks)
 
     @property
     def cameras(self) -> int:
         """Number of cameras; nothing is read."""
         return len(self.stacks[0].counts)
 
-    @property
-    def rows(self) -> int:
+    @functools.cached_property
+    def rows(self) -> int:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Number of used (exposure, pixel) pairs; the first call reads all frames, slab by slab."""
-        if self._rows is None:
-            step = max(1, _SLAB // max(1, self.exposures))
-            starts = range(0, self.grid.pixels, step)
-            self._rows = sum(int(np.count_nonzero(self.block(start, start + step).used)) for start in starts)
-        return self._rows
+        step = max(1, _SLAB // max(1, self.exposures))
+        starts = range(0, self.grid.pixels, step)
+        return sum(int(np.count_nonzero(self.block(start, start + step).used)) for start in starts)
 
     def block(self, start: int, stop: int) -> Block:
         """Return the data of the pixels `start:stop`, dense in the exposures.
@@ -231,7 +222,7 @@ def frame_stack(
     cubes: dict[str, Cube] = {}
     if cameras is None:
         cameras = max([2, *(int(name[1:]) + 1 for name in images if name != "FLAG")])
-    counts, errors = count_names(cameras), error_names(cameras)
+    counts, errors = image_names(cameras)
     for name in (*counts, *errors, *(("FLAG",) if "FLAG" in images else ())):
         place = Place(path, name)
         if name not in images:

@@ -33,7 +33,6 @@ from walop_jax.data.records import (
     Intensities,
     Points,
     Position,
-    Site,
     Sources,
 )
 from walop_jax.data.schema import Place
@@ -215,16 +214,15 @@ def _sentence(rows: _Rows, pair: tuple[int, int], exposures: Exposures, points: 
 # --------------------------------------------------------------------------------------------------------- several sets
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
 class JoinedIntensities(Intensities):
     """Parts with field points of their own, one after the other: frames, and a table beside them.
 
-    A part is its intensities, its field points, the rows that its exposures have in the whole, and the rows
-    that its sources have.
+    A part is its intensities, its field points, and the rows that its exposures have in the whole.
     """
 
-    def __init__(self, parts: tuple[tuple[Intensities, Points, np.ndarray], ...], exposures: int) -> None:
-        self.parts = parts
-        self.exposures = exposures
+    parts: tuple[tuple[Intensities, Points, np.ndarray], ...]
+    exposures: int
 
     @property
     def cameras(self) -> int:
@@ -324,7 +322,9 @@ def _refuse_another_instrument(first: CalibrationSet, other: CalibrationSet) -> 
     if other.cameras != first.cameras:
         what = f"has {other.cameras} cameras, {_name(first)} has {first.cameras}"
         raise _conflict(what, other, "N", "these are not sets of one instrument")
-    if not _same_site(first.site, other.site):
+    # To a thousandth of a degree, and ten metres.
+    one, two = ([site.latitude, site.longitude, site.elevation] for site in (first.site, other.site))
+    if not np.isclose(one, two, rtol=0, atol=[1e-3, 1e-3, 10.0], equal_nan=True).all():
         what = f"is another site than that of {_name(first)}"
         raise _conflict(what, other, "SITELAT, SITELONG, SITEELEV")
 
@@ -365,15 +365,6 @@ def _conflict(
     what: str, calset: CalibrationSet, column: str, advice: str = "merge only what fits"
 ) -> DataError:
     return fail(what, file=_name(calset), column=column, advice=advice)
-
-
-def _same_site(one: Site, other: Site) -> bool:
-    """True if two sites agree: to a thousandth of a degree, and ten metres."""
-    fields = ("latitude", "longitude", "elevation")
-    return all(
-        np.isclose(getattr(one, name), getattr(other, name), rtol=0, atol=atol, equal_nan=True)
-        for name, atol in zip(fields, (1e-3, 1e-3, 10.0), strict=True)
-    )
 
 
 def _join_exposures(sets: tuple[CalibrationSet, ...]) -> tuple[Exposures, list[str]]:

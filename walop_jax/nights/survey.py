@@ -15,7 +15,6 @@ import dataclasses
 import functools
 import itertools
 import math
-import os
 import re
 from collections.abc import Sequence
 from typing import Any
@@ -25,8 +24,6 @@ from jaxtyping import Float
 
 from walop_jax.calibration.calibration import HIGH_CROSSTALK, Calibration
 from walop_jax.calibration.matrix import matrix_slopes, p_forms, sample_stars
-from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, fail
@@ -38,13 +35,11 @@ from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.nights.algebra import Solution
 from walop_jax.nights.breaks import Break, part_of, shape_of
 from walop_jax.nights.changes import scan
-from walop_jax.nights.equations import Night, Together, night_numbers
+from walop_jax.nights.equations import Together, night_numbers
 from walop_jax.science.star_errors import GOAL
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "n n"]
-Given = FitResult | CalibrationSet | Night | str | os.PathLike[str]
-"""Sources of nights: a fit, a set, a night, or the path of nights that were written."""
 
 HALF_A_DAY = 0.5
 SHARE = 0.95  # of the field that must know p to half of the goal

@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import SMALLEST_DETERMINANT
+from walop_jax.calibration.matrix import LARGEST_P, SMALLEST_DETERMINANT, STARS, sample_stars
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import DEFAULT_FILTER, Settings
 from walop_jax.io.display import Display, Displayed
@@ -43,16 +43,13 @@ from walop_jax.paper.polynomial import (
 from walop_jax.paper.wavelength import DEGREE, TEMPERATURES, colour_spread, efficiencies, spread_document
 from walop_jax.science.star_errors import (
     GOAL,
-    LARGEST_P,
     QUANTITIES,
-    STARS,
     MethodErrors,
     Truth,
     Vectors,
     determinant,
     joint_errors,
     promised_errors,
-    sample_stars,
     star_errors,
     statistics,
     transmitted,

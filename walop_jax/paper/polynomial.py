@@ -32,12 +32,13 @@ from scipy.interpolate import RegularGridInterpolator
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.matrix import sample_stars
 from walop_jax.data.records import Block, CalibrationSet
 from walop_jax.data.settings import DEFAULT_FILTER, Settings
 from walop_jax.io.errors import DataError
 from walop_jax.model.conventions import EXTINCTION
 from walop_jax.science.estimate import estimate
-from walop_jax.science.star_errors import QuPairs, sample_stars, transmitted
+from walop_jax.science.star_errors import QuPairs, transmitted
 from walop_jax.sky.moon import moon_sky, sky_to_instrument
 
 TERMS = ("1", "qm", "um", "qm^2", "um^2")

@@ -41,7 +41,6 @@ from walop_jax.reports.style import (
 
 SIGN_BEYOND = 3.0  # σ beyond which a tile carries its sign
 MOST_MARKED = 400  # points above which signs would run into each other
-MOST_VECTOR = 2000  # points above which tiles are drawn as pixels
 MOST_BINS = 48  # of polariser angle
 _MODELS = ("starting\nmodel", "final\nmodel")
 EXPLAINS = 5.0  # standard deviations of χ² within which a model counts as explaining the data

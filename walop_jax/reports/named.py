@@ -222,10 +222,6 @@ class NamedFigure:
     possible: Callable[[FigureSource], bool] = lambda source: True
 
 
-def _two_arms(source: FigureSource) -> bool:
-    return source.maps.arms > 1
-
-
 def _small(source: FigureSource) -> bool:
     return source.stored.residuals is None  # which comes with whole frames
 
@@ -248,7 +244,9 @@ def _angles(fewest: int) -> Callable[[FigureSource], bool]:
 
 
 FIGURES: Mapping[str, NamedFigure] = {
-    "accuracy": NamedFigure("error of p over the field: map and histogram", _accuracy, possible=_two_arms),
+    "accuracy": NamedFigure(
+        "error of p over the field: map and histogram", _accuracy, possible=lambda s: s.maps.arms > 1
+    ),
     "calibration": NamedFigure(
         "the instrument matrix, and residuals before and after the fit",
         lambda s: _residuals(s, whole=True),

@@ -98,6 +98,7 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
     if run.commissioning is not None:
         label = f"{'Go' if run.commissioning['go'] else 'No-go'} – {label[:1].lower()}{label[1:]}"
     main, rest = _parameters(run)
+    found_steps = [] if diagnosis is None else diagnosis["steps"]
     quality = Quality(int(summary.get("quality", 0)))
     return {
         "run": run,
@@ -114,8 +115,8 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         "trusted": trusted,
         "quality": quality.meanings,
         "hidden": hidden_in_words(summary),
-        "steps": [] if diagnosis is None else _steps(run),
-        "unnamed": None if diagnosis is None else _drawn(run, len(diagnosis["steps"]) + 1),
+        "steps": [dict(step) | _drawn(run, number) for number, step in enumerate(found_steps, start=1)],
+        "unnamed": None if diagnosis is None else _drawn(run, len(found_steps) + 1),
         "unnamed_term": UNNAMED,
         "shown_candidates": SHOWN_CANDIDATES,
         "ladder": _ladder(run),
@@ -161,12 +162,6 @@ def _accuracy_in_words(accuracy: FieldAccuracy) -> dict[str, str]:
         "hidden_by": accuracy.hidden_by,
         "remedy": accuracy.remedy,
     }
-
-
-def _steps(run: RunContents) -> list[dict[str, Any]]:
-    """The steps of a diagnosis, each with its figures and its combination in words."""
-    assert run.diagnosis is not None
-    return [dict(step) | _drawn(run, number) for number, step in enumerate(run.diagnosis["steps"], start=1)]
 
 
 def _drawn(run: RunContents, number: int) -> dict[str, str]:

@@ -33,11 +33,7 @@ def effect_in_words(effect: str) -> str:
     known = next((entry for entry in EFFECTS if entry.name == effect), None)
     if known is None:
         return ""
-    return in_a_sentence((known.__doc__ or "").strip().splitlines()[0].rstrip("."))
-
-
-def in_a_sentence(text: str) -> str:
-    """A heading as it stands inside a sentence: its first letter small, unless it begins with a name."""
+    text = (known.__doc__ or "").strip().splitlines()[0].rstrip(".")
     return text if text.startswith(_PROPER) else text[:1].lower() + text[1:]
 
 

@@ -341,13 +341,9 @@ class _Application:
             for entry in change.alike:
                 question = entry.question
                 if question.of_camera:
-                    grown = (
-                        check.growth(question, *place, counts)[:, None]
-                        * np.eye(counts.shape[1])[question.camera]
-                    )
-                    shift = calibration_shift(found.gain, (grown / lit[:, None])[..., None], block.star)[
-                        ..., 0
-                    ]
+                    grown, k = np.zeros_like(counts), question.camera
+                    grown[:, k] = check.growth.electrons(question.kind, *place, counts[:, k]) / lit
+                    shift = calibration_shift(found.gain, grown[..., None], block.star)[..., 0]
                 else:
                     shift = block.derivative[:, :, question.parameter]
                 largest = np.maximum(largest, np.abs(entry.size * np.nan_to_num(shift)))

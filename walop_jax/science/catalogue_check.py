@@ -51,6 +51,7 @@ _SETTLED = 0.05  # standard errors
 _REFERENCE = 1e6  # electron
 _SEEN = 2.33  # one-sided 99 %
 
+Vector = Float[np.ndarray, " r"]  # a number for each row
 CAMERA_KINDS = ("gain", "x", "y", "time", "flux", "light")
 
 
@@ -121,6 +122,28 @@ class InstrumentChange:
         return found.question.words(found.size, found.error)
 
 
+class Growth(NamedTuple):
+    """Units in which changes of a camera grow: `edge` of the field (deg), middle and half of the time covered (d)."""
+
+    edge: float = 1.0
+    middle: float = 0.0
+    half: float = 0.0
+
+    def electrons(
+        self, kind: str, x: Vector, y: Vector, time: Vector, counts: Vector
+    ) -> Float[np.ndarray, " r"]:
+        """Electrons that a change of one of `CAMERA_KINDS`, of unit size, adds to `counts` of its camera."""
+        if kind == "light":
+            return np.ones_like(counts)
+        if kind == "flux":
+            return counts**2 / _REFERENCE
+        since = np.nan_to_num(time - self.middle) / (self.half or 1.0)
+        return counts * {"x": x / self.edge, "y": y / self.edge, "time": since}.get(kind, 1.0)
+
+
+IN_UNITS = Growth()
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class CatalogueCheck(Displayed):
     """Findings from the stars of a catalogue together.
@@ -130,8 +153,7 @@ class CatalogueCheck(Displayed):
     one row, and `rows_p` its chance beside `noise`. `scale` are the factors on the photon covariance of stars of one
     row and of several: 1 unless errors are off. `tests` are the `asked` questions in their first answer; `smallest` is
     the gain change of the camera seen best that would be found in 99 % of cases (nan: none). `stars` and `rows_used`
-    count what was looked at; `edge` (deg) and `times` (middle and half of the time covered, d) are the units of X, Y
-    and time.
+    count what was looked at; `growth` holds the units of X, Y and time.
     """
 
     stars: int
@@ -145,19 +167,7 @@ class CatalogueCheck(Displayed):
     tests: tuple[FoundChange, ...]
     changes: tuple[InstrumentChange, ...]
     smallest: float
-    edge: float = 1.0
-    times: tuple[float, float] = (0.0, 0.0)
-
-    def growth(
-        self,
-        question: ChangeQuestion,
-        x: Float[np.ndarray, " r"],
-        y: Float[np.ndarray, " r"],
-        time: Float[np.ndarray, " r"],
-        counts: Float[np.ndarray, "r k"],
-    ) -> Float[np.ndarray, " r"]:
-        """Electrons that a change of unit size adds to the counts of its camera in every row."""
-        return _growth(question.kind, x, y, time, counts[:, question.camera], self.edge, self.times)
+    growth: Growth = IN_UNITS
 
     @property
     def alarm(self) -> float:
@@ -285,25 +295,6 @@ NOTHING_TO_SPARE = CatalogueCheck(0, 0, 0, 1.0, 1.0, None, 1.0, (1.0, 1.0), (), 
 """Of a catalogue in which no row has a camera to spare."""
 
 
-def _growth(
-    kind: str,
-    x: Float[np.ndarray, " r"],
-    y: Float[np.ndarray, " r"],
-    time: Float[np.ndarray, " r"],
-    counts: Float[np.ndarray, " r"],
-    edge: float,
-    times: tuple[float, float],
-) -> Float[np.ndarray, " r"]:
-    """Electrons that a change of one of `CAMERA_KINDS`, of unit size, adds to `counts` of its camera."""
-    if kind == "light":
-        return np.ones_like(counts)
-    if kind == "flux":
-        return counts**2 / _REFERENCE
-    middle, half = times
-    with_place = {"x": x / edge, "y": y / edge, "time": np.nan_to_num(time - middle) / (half or 1.0)}
-    return counts * with_place.get(kind, 1.0)
-
-
 class _Search:
     """The columns of all questions, then of the errors of the calibration; what has been found so far."""
 
@@ -318,12 +309,12 @@ class _Search:
         self.variance = own_variance(stars)
         self.crowded = bool(np.median(self.variance) > CROWDED)
         self.root = root[:, np.abs(root).max(axis=0, initial=0.0) > 0]
-        self.edge = max(float(np.abs(np.concatenate([stars.x, stars.y])).max()), 1e-9)
+        self.growth = Growth(max(float(np.abs(np.concatenate([stars.x, stars.y])).max()), 1e-9))
         times = stars.time[np.isfinite(stars.time)]
-        self.times = (0.0, 0.0)
         if times.size and np.ptp(times) > 0:
-            self.times = 0.5 * float(times.min() + times.max()), 0.5 * float(np.ptp(times))
-        kinds = [kind for kind in CAMERA_KINDS if kind != "time" or self.times[1] > 0]
+            middle, half = 0.5 * float(times.min() + times.max()), 0.5 * float(np.ptp(times))
+            self.growth = self.growth._replace(middle=middle, half=half)
+        kinds = [kind for kind in CAMERA_KINDS if kind != "time" or self.growth.half > 0]
         self.kinds = kinds
         units = {"flux": "per 1e6 electron", "light": "electron"}
         self.questions = [
@@ -353,7 +344,7 @@ class _Search:
         seen = np.where(part.root > 0, part.model / np.where(part.root > 0, part.root, 1.0), 0.0)
         for n, kind in enumerate(self.kinds):
             for k in range(cameras):
-                grown = _growth(kind, *place, seen[:, k], self.edge, self.times)
+                grown = self.growth.electrons(kind, *place, seen[:, k])
                 values[:, k, n * cameras + k] = grown * part.root[:, k]
         values[..., len(self.kinds) * cameras : -2] = part.parameters()
         values[..., -2:] = part.colour
@@ -417,8 +408,7 @@ class _Search:
             tests=tuple(tests),
             changes=changes,
             smallest=smallest,
-            edge=self.edge,
-            times=self.times,
+            growth=self.growth,
         )
         # χ² of rows that repeat each other says nothing of N_ERR: what they share does.
         single = noise.value if found.noise_is_off else 1.0

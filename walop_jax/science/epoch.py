@@ -28,7 +28,7 @@ from scipy import special
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import SMALLEST_DETERMINANT
+from walop_jax.calibration.matrix import SMALLEST_DETERMINANT, sample_stars
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_file import SKY_AND_STARS, model_like
@@ -39,7 +39,7 @@ from walop_jax.io.text import probability, two_digits, value_and_error, with_min
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.conventions import matrix_elements
 from walop_jax.model.specification import Model
-from walop_jax.science.star_errors import determinant, joint_errors, sample_stars, statistics
+from walop_jax.science.star_errors import determinant, joint_errors, statistics
 
 Vector = Float[np.ndarray, " k"]
 Matrix = Float[np.ndarray, "k k"]

@@ -14,9 +14,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
-from walop_jax.calibration.matrix import LARGEST_P as LARGEST_P
-from walop_jax.calibration.matrix import STARS as STARS
-from walop_jax.calibration.matrix import sample_stars as sample_stars
 from walop_jax.data.settings import Settings
 from walop_jax.science.estimate import estimate
 

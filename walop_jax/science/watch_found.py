@@ -10,8 +10,8 @@ from jaxtyping import Float, Int
 
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.text import two_digits, with_error, with_minus_sign
-from walop_jax.science.catalogue_check import NOISE_MATTERS
+from walop_jax.io.text import two_digits, with_minus_sign
+from walop_jax.science.catalogue_check import NOISE_MATTERS, ChangeQuestion
 
 _DATE = 1e3  # times above are dates, not numbers of groups
 
@@ -88,11 +88,8 @@ class WatchedChange:
 
 
 def _words(entry: Suspect) -> str:
-    if entry.camera:
-        more = ("brighter", "fainter")[entry.size < 0]
-        return f"{entry.name} {more} by {with_error(100 * abs(entry.size), 100 * entry.error)} %"
-    larger = ("larger", "smaller")[entry.size < 0]
-    return f"{entry.name} {larger} by {with_error(abs(entry.size), entry.error)} {entry.unit}".rstrip()
+    kind, camera = ("gain", 0) if entry.camera else ("optics", -1)
+    return ChangeQuestion(kind, entry.name, entry.unit, camera).words(entry.size, entry.error)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -137,16 +134,8 @@ class Watch(Displayed):
         """Everything as plain data."""
 
         def plain(entry: Suspect) -> dict[str, Any]:
-            return {
-                "name": entry.name,
-                "camera": entry.camera,
-                "history": entry.history.kind,
-                "start": float(self.time[entry.history.start]),
-                "size": entry.size,
-                "error": entry.error,
-                "sigma": entry.sigma,
-                "unit": entry.unit,
-            }
+            start = float(self.time[entry.history.start])
+            return entry._asdict() | {"history": entry.history.kind, "start": start, "sigma": entry.sigma}
 
         found = [
             {
