@@ -200,12 +200,12 @@ def _judge(counts: np.ndarray, used: np.ndarray, spoilt: np.ndarray, place: Plac
     values = counts[used]
     if np.count_nonzero(used) > 1 and np.all(values == values[0, 0]):
         raise place.fail(f"all counts are equal ({values[0, 0]:g})", "N", "these are not measurements")
-    where = f"{place.file} [{place.extension}]"
     remarks = []
     if len(bad):
-        remarks.append(f"{where} N, N_ERR: not finite or below −5 sigma in {rows_text(bad)}, not used")
+        what = f"not finite or below −5 sigma in {rows_text(bad)}, not used"
+        remarks.append(place.remark(what, "N, N_ERR"))
     if flagged := len(used) - np.count_nonzero(used) - len(bad):
-        remarks.append(f"{where} FLAG: set in {flagged} of {len(used)} rows, not used")
+        remarks.append(place.remark(f"set in {flagged} of {len(used)} rows, not used", "FLAG"))
     return remarks
 
 

@@ -220,18 +220,17 @@ class Patches:
 
     def document(self, numbers: Int[np.ndarray, " e"]) -> dict[str, Any]:
         """The verdicts as plain data; `numbers` are the EXPOSURE numbers of the set."""
-        rows = zip(
-            numbers[self.exposure].tolist(),
-            self.scale.tolist(),
-            self.flatness.tolist(),
-            (100.0 * self.departure).tolist(),
-            self.weight.tolist(),
-            strict=True,
-        )
-        names = ("exposure", "scale", "chi2_per_dof", "departure_percent", "weight")
+        columns = {
+            "exposure": numbers[self.exposure],
+            "scale": self.scale,
+            "chi2_per_dof": self.flatness,
+            "departure_percent": 100.0 * self.departure,
+            "weight": self.weight,
+        }
+        rows = zip(*(values.tolist() for values in columns.values()), strict=True)
         return {
             "depolarisation": self.depolarisation,
-            "patches": [dict(zip(names, row, strict=True)) for row in rows],
+            "patches": [dict(zip(columns, row, strict=True)) for row in rows],
             "doubted": numbers[self.exposure[self.doubted]].tolist(),
         }
 

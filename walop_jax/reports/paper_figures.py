@@ -35,7 +35,7 @@ from walop_jax.reports.style import (
     point_map,
 )
 from walop_jax.reports.wording import PLATES
-from walop_jax.science.star_errors import GOAL, QUANTITIES, plate_errors
+from walop_jax.science.star_errors import GOAL, QUANTITIES, plate_errors, transmitted
 
 _PIXELS, _LINES = 31, 41
 _WAVELENGTH, _WAVELENGTHS = 0.62, (0.5, 0.75)  # µm
@@ -130,18 +130,11 @@ def transmission_figure(
     block = calset.intensities.block(0, len(calset.points))
     whole = np.flatnonzero(block.used[:, rows].all(axis=1))
     point = whole[np.argmin(np.hypot(block.x[whole] - place[0], block.y[whole] - place[1]))]
-    angle, counts, sigma = (
-        calset.exposures.clp_angle[rows],
-        block.counts[point][rows],
-        block.sigma[point][rows],
-    )
+    angle, counts, sigma = e.clp_angle[rows], block.counts[point, rows], block.sigma[point, rows]
     total = counts.sum(axis=1, keepdims=True)
-    states = polariser_states(angle)
-    terms = np.concatenate([np.ones((len(states), 1)), states], axis=1)
-    model = fit_transmissions(counts[None], states)[0]
-    fitted = terms @ model.T
+    model = fit_transmissions(counts[None], polariser_states(angle))
     fine = np.linspace(angle.min(), angle.max(), 181)
-    curve = np.concatenate([np.ones((181, 1)), polariser_states(fine)], axis=1) @ model.T
+    fitted, curve = (transmitted(model, polariser_states(angles))[0] for angles in (angle, fine))
     names = instrument_of(calset).cameras.names
     figure, (above, below) = on.panels(6.6, 4.2, 2, 1, sharex=True, height_ratios=(2.2, 1.0))
     for k in range(counts.shape[1]):
