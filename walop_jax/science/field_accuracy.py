@@ -151,7 +151,12 @@ def _with_size(calibration: Calibration, name: str) -> str:
     if hidden is None or name not in hidden.names:
         return ""
     at = hidden.names.index(name)
-    return f"{name} (wrong by {rounded(hidden.sizes[at], '.2g')} {hidden.units[at]}".rstrip() + ")"
+    size, unit = hidden.sizes[at], hidden.units[at]
+    return (
+        f"{name} (wrong by {rounded(size, '.2g')} {unit})"
+        if unit
+        else f"{name} (wrong by {100 * size:.2g} %)"
+    )
 
 
 def _limited_by(
