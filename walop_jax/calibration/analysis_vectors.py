@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -236,10 +236,7 @@ class AnalysisVectors:
             return float(np.abs(between - truth).max() / truth.max())
 
         truth = self.exact(setting, *held_out(self._rectangle), BETWEEN)
-        return _accurate(
-            accurate_table(exact, self._rectangle, NODES, TOLERANCE, error, truth=truth, total=True),
-            TOLERANCE,
-        )
+        return self._accurate(exact, NODES, TOLERANCE, error, truth)
 
     def _derivative_table(self, setting: Settings) -> FieldTable:
         plan, bands = self._plan(setting, [np.nan, *colour_nodes(DERIVATIVE_COLOURS).tolist()])
@@ -256,17 +253,15 @@ class AnalysisVectors:
             largest = np.abs(truth).max(axis=0)
             return float(np.max(np.abs(found - truth).max(axis=0) / np.where(largest > 0, largest, 1.0)))
 
-        return _accurate(
-            accurate_table(exact, self._rectangle, DERIVATIVE_NODES, DERIVATIVE_TOLERANCE, error, total=True),
-            DERIVATIVE_TOLERANCE,
-        )
+        return self._accurate(exact, DERIVATIVE_NODES, DERIVATIVE_TOLERANCE, error)
 
-
-def _accurate(found: tuple[FieldTable | None, float], tolerance: float) -> FieldTable:
-    table, error = found
-    if table is None or not error <= tolerance:
-        raise RuntimeError(
-            f"the optics vary too fast over the field to be interpolated (error {error:.1e}, {tolerance:g} is needed); "
-            "an effect of the model has a very small scale"
-        )
-    return table
+    def _accurate(
+        self, exact: Any, counts: Sequence[int], tolerance: float, error: Any, truth: Any = None
+    ) -> FieldTable:
+        table, off = accurate_table(exact, self._rectangle, counts, tolerance, error, truth=truth, total=True)
+        if table is None or not off <= tolerance:
+            raise RuntimeError(
+                f"the optics vary too fast over the field to be interpolated (error {off:.1e}, {tolerance:g} is "
+                "needed); an effect of the model has a very small scale"
+            )
+        return table

@@ -43,7 +43,7 @@ from walop_jax.data.settings import (
 )
 from walop_jax.fit.model_file import model_without_data, render, standard_names
 from walop_jax.fit.parameter_table import HEAD, Fitted, parameter_notes, parameter_rows
-from walop_jax.fit.refit import FitResult
+from walop_jax.fit.refit import FitResult, Matrix, Vector
 from walop_jax.fit.verdict import STATED, Hidden, Quality, Verdict
 from walop_jax.instruments.description import parsed
 from walop_jax.io.code import software_versions
@@ -57,8 +57,6 @@ from walop_jax.model.parameters import Parameter
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import Model, effect_context
 
-Vector = Float[np.ndarray, " n"]
-Matrix = Float[np.ndarray, "n n"]
 Columns = dict[str, tuple[np.ndarray, str]]  # values, description
 
 MAP_SIZE = 31  # pixels along each axis of the maps: 0.02° over ±0.3°

@@ -27,13 +27,13 @@ from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import Hidden, Structure
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.field_table import accurate_table, linearised, rows_and_slopes, to_all
+from walop_jax.likelihood.field_table import Vector, accurate_table, linearised, rows_and_slopes, to_all
 from walop_jax.likelihood.runner import usual_threads
 from walop_jax.model import light
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import array, compiled
 from walop_jax.model.effects.base import Effect, with_amplitudes
-from walop_jax.model.instrument import Instrument
+from walop_jax.model.instrument import Instrument, Scalar
 from walop_jax.model.parameters import values_of, with_values
 from walop_jax.model.plan import Plan, with_numbers
 from walop_jax.model.planning import plan_for_settings
@@ -137,8 +137,6 @@ class ResidualMap:
 
 # ----------------------------------------------------------------------------------------------------------- the matrix
 
-Scalar = Float[Array, ""]
-Vector = Float[np.ndarray, " p"]
 
 STARS, LARGEST_P = 100, 0.05
 

@@ -25,7 +25,7 @@ from walop_jax.calibration.matrix import ResidualMap, residual_names
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import CALIBRATION_PLATE
 from walop_jax.data.settings import Settings
-from walop_jax.fit.refit import FitResult
+from walop_jax.fit.refit import FitResult, Vector
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.flux import project_flux, sharing
@@ -36,8 +36,6 @@ from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
-
-Vector = Float[np.ndarray, " n"]
 
 
 def _point_sums(

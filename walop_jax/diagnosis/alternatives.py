@@ -33,7 +33,6 @@ import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, CalibrationSet, Exposures, Points
 from walop_jax.data.table_intensities import TableIntensities
@@ -42,7 +41,7 @@ from walop_jax.diagnosis.findings import Choice
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.search import Trial, model_without, try_model
 from walop_jax.fit.model_file import base_model
-from walop_jax.fit.refit import FitResult
+from walop_jax.fit.refit import FitResult, Vector
 from walop_jax.fit.search import FAR_OFF
 from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
@@ -303,7 +302,6 @@ def with_exposures(change: Callable[[Exposures], Exposures]) -> Change:
 # --------------------------------------------------------------------------------- other descriptions of the instrument
 
 NO_DIFFERENCE = 1e-6  # change of the residuals, in standard deviations, that is none
-Vector = Float[np.ndarray, " n"]
 
 
 def described_otherwise(model: Model, sentence: str, context: Context) -> Model:

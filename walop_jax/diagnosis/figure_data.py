@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float, Shaped
 from walop_jax.data.records import Exposures, Points
 from walop_jax.data.schema import Column, Place, read_table
 from walop_jax.data.write import sign_and_write, table_hdu
-from walop_jax.diagnosis.findings import HARMONICS, Diagnosis
+from walop_jax.diagnosis.findings import HARMONICS, Cube, Diagnosis
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits
@@ -248,7 +248,6 @@ def _figure_data(tables: Mapping[str, Mapping[str, Any]]) -> DiagnosisFigureData
 
 # ------------------------------------------------------------------------------------------------ made from a diagnosis
 
-Cube = Float[np.ndarray, "p e k"]
 Weight = Float[np.ndarray, " e"]
 Used = Bool[np.ndarray, "p e"]
 

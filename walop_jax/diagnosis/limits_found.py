@@ -9,16 +9,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.diagnosis.examination import ALARM
+from walop_jax.diagnosis.examination import ALARM, Matrix, Vector
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import two_digits, two_digits_range, with_minus_sign
 
 NO_LEVEL = "q and u cannot both be measured with one exposure"
 PROBABILITY = 0.99
-
-Vector = Float[np.ndarray, " _"]
-Matrix = Float[np.ndarray, "_ _"]
 
 
 @dataclasses.dataclass(frozen=True)

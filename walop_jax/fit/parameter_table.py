@@ -11,9 +11,8 @@ from walop_jax.io.display import Result
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import value_and_error, with_error, with_minus_sign
 from walop_jax.model.parameters import Parameter
-from walop_jax.model.specification import THROUGHPUT, Model
+from walop_jax.model.specification import THROUGHPUT, Model, Vector
 
-Vector = Float[np.ndarray, " n"]
 Columns = dict[str, tuple[np.ndarray, str, str]]
 
 PRIOR_ONLY = 0.99  # of the prior width: an error above it owes nothing to the data

@@ -24,12 +24,9 @@ from jaxtyping import Float, Int
 from walop_jax.data.records import CalibrationSet
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.compressed import compressed
-from walop_jax.likelihood.frames import PixelPosterior
+from walop_jax.likelihood.frames import PixelPosterior, Vector
 from walop_jax.likelihood.layout import thinned
-from walop_jax.likelihood.likelihood import Likelihood, Posterior
-
-Vector = Float[np.ndarray, " n"]
-Matrix = Float[np.ndarray, "n n"]
+from walop_jax.likelihood.likelihood import Likelihood, Matrix, Posterior
 
 FEWEST_BLOCKS = 8
 CELLS = 6  # of the field along a side

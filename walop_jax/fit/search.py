@@ -22,9 +22,8 @@ from walop_jax.likelihood.frames import expand_pixels, stands_for_pixels, strips
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood, Posterior
 from walop_jax.model import materials
-from walop_jax.model.specification import Model
+from walop_jax.model.specification import Model, Vector
 
-Vector = Float[np.ndarray, " n"]
 Expand = Callable[[Vector, float, Posterior | None], Posterior]
 
 FAR_OFF = 25.0  # χ²/dof above which other orders are tried and the errors scaled
@@ -46,8 +45,7 @@ class FoundMinimum:
     @property
     def posterior(self) -> Posterior:
         """The expansion at the minimum."""
-        if not isinstance(self.minimum.expansion, Posterior):
-            raise TypeError("a fit needs a Posterior expansion")
+        assert isinstance(self.minimum.expansion, Posterior)
         return self.minimum.expansion
 
     @property

@@ -29,7 +29,7 @@ from walop_jax.likelihood import limits
 from walop_jax.likelihood.engine import PointData, best_flux, point_prediction, real_counts
 from walop_jax.likelihood.flux import Sharing, project_flux, sharing
 from walop_jax.likelihood.layout import PointReader, median_counts
-from walop_jax.likelihood.likelihood import Likelihood, used_rows
+from walop_jax.likelihood.likelihood import Likelihood, Vector, used_rows
 from walop_jax.likelihood.pieces import NoColumnError, Piece, Resolver
 from walop_jax.model import light, responses
 from walop_jax.model.compiled import compiled
@@ -44,7 +44,6 @@ from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for
 from walop_jax.model.responses import GENERATORS, LightResponses, Responses
 
-Vector = Float[np.ndarray, " n"]
 Change = Sequence[tuple[float, Sentence]]
 """A sum of sentences with their coefficients; a factor of a sentence may be a function of what `_Laid` has."""
 

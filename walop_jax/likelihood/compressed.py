@@ -27,12 +27,11 @@ from walop_jax.likelihood import limits
 from walop_jax.likelihood.frames import (
     FrameSums,
     PixelPosterior,
+    Vector,
     half_gradient,
     information_of,
     unit_slopes_at,
 )
-
-Vector = Float[np.ndarray, " n"]
 
 SINGULAR = 1e-12  # of the largest eigenvalue: directions of the parameters that the data say nothing of
 

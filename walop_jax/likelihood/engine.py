@@ -37,11 +37,10 @@ from walop_jax.likelihood.flux import eliminate_flux, project_flux, sharing
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import values_of, with_values
+from walop_jax.model.parameters import Vector, values_of, with_values
 from walop_jax.model.plan import Plan
 from walop_jax.model.specification import series_indices
 
-Vector = Float[Array, " n"]
 NEWTON_STEPS = 3  # each squares the share of the detectors' distortion that is missing from the flux
 
 

@@ -44,7 +44,7 @@ from walop_jax.data.table_intensities import NEGATIVE
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.field_table import TOLERANCE, FieldTable, accurate_table, in_batches
 from walop_jax.likelihood.flux import sharing
-from walop_jax.likelihood.likelihood import Census, DataTerms, Likelihood, OpticsUsed, Posterior
+from walop_jax.likelihood.likelihood import Census, DataTerms, Likelihood, Matrix, OpticsUsed, Posterior
 from walop_jax.likelihood.runner import SlabSums
 from walop_jax.model import chebyshev, light
 from walop_jax.model.chebyshev import Rectangle
@@ -52,7 +52,6 @@ from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
 
 Vector = Float[np.ndarray, " n"]
-Matrix = Float[np.ndarray, "n n"]
 FRAME = Rectangle(np.array([-1.0, -1.0]), np.array([1.0, 1.0]))
 
 
@@ -268,7 +267,7 @@ def unit_slopes_at(
 
 
 def _at(solve: Any, likelihood: Likelihood, instrument: Instrument, x: Vector, y: Vector) -> Any:
-    """What a program gives at field positions (deg): exact. First axis: positions."""
+    """Results of a program at field positions (deg): exact. First axis: positions."""
 
     def solved(x: Vector, y: Vector) -> Any:
         # Points with counts and errors of one in every exposure.

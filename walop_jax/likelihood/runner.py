@@ -36,10 +36,7 @@ from jaxtyping import Float
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.layout import Layout, thinned
-
-Vector = Float[np.ndarray, " n"]
-
+from walop_jax.likelihood.layout import Layout, Vector, thinned
 
 # ------------------------------------------------------------------------------------------------------------ journal
 

@@ -25,9 +25,7 @@ from jaxtyping import Array, Bool, Float
 from walop_jax.model import legendre
 from walop_jax.model.conventions import FIELD_SCALE
 from walop_jax.model.parameters import Component, Parameter
-from walop_jax.model.sources import ExposureArrays
-
-Scalar = Float[Array, ""]
+from walop_jax.model.sources import ExposureArrays, Scalar
 
 
 class Throughput(Component):

@@ -36,7 +36,7 @@ from walop_jax.model.elements import Analyser, Element, Polariser, WavePlate
 from walop_jax.model.elements.wave_plate import MODELS
 from walop_jax.model.parameters import Component, leaves, number, unknown_name
 from walop_jax.model.ray import NotPlannedError, Ray
-from walop_jax.model.sources import SOURCES, MoonSky, Source, Standards
+from walop_jax.model.sources import SOURCES, Source, Standards
 
 Scalar = Float[Array, ""]
 AnyPart = TypeVar("AnyPart", bound=Component)
@@ -149,21 +149,10 @@ class Instrument(Component):
         """The elements behind the polariser, all where there is none."""
         return tuple(self.train())[len(self.telescope()) + (self.polariser is not None) :]
 
-    def source(self, name: str) -> Source:
-        """A source by name; ValueError with the nearest names when there is none."""
-        return _member(self.sources, name, "source")
-
-    @property
-    def sky(self) -> MoonSky:
-        """The moonlit sky."""
-        found = self.source(MoonSky.name)
-        assert isinstance(found, MoonSky)
-        return found
-
     @property
     def standard(self) -> Standards:
         """The standard stars."""
-        found = self.source(Standards.name)
+        found = _member(self.sources, Standards.name, "source")
         assert isinstance(found, Standards)
         return found
 

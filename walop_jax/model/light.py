@@ -25,13 +25,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.model import fold, mueller
 from walop_jax.model.elements import Analyser, Element
-from walop_jax.model.instrument import Instrument
+from walop_jax.model.instrument import Instrument, Scalar
 from walop_jax.model.parameters import Shapes, of_shapes, shapes_of
 from walop_jax.model.plan import Plan
 from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import ExposureArrays, Sight, Source, turned
 
-Scalar = Float[Array, ""]
 FEW_BANDS = 3
 FEW_SETTINGS = 4  # up to which band integrals are done one by one
 BROAD = 0.05  # µm: equivalent width from which a filter is displaced by `Instrument.filter_shift`

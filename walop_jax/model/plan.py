@@ -8,14 +8,14 @@ exposure. Angles of the polariser never meet wavelengths. Plans are made by `pla
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from walop_jax.data.records import CALIBRATION_PLATE, Exposures, Position
+from walop_jax.data.records import CALIBRATION_PLATE, Exposures
 from walop_jax.model.compiled import array
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.ray import Conditions
@@ -69,7 +69,11 @@ def exposure_arrays(
         hours=array(hours_of(exposures)),
         temperature=array(exposures.temp),
         hour_angle=array(np.nan_to_num(exposures.ha)),
-        moving=_angles({CALIBRATION_PLATE: exposures.position(CALIBRATION_PLATE), **exposures.moving}),
+        moving={  # NaN where they are out
+            prefix: array(np.deg2rad(np.where(at.inside, at.angle, np.nan)))
+            for prefix in (CALIBRATION_PLATE, *exposures.moving)
+            if (at := exposures.position(prefix)).inside.any()
+        },
         kinds=known,
     )
 
@@ -82,15 +86,6 @@ def blank_exposures(instrument: Instrument, count: int) -> ExposureArrays:
         temperature=zero, hour_angle=zero, moving=dict.fromkeys(instrument.patched().moving(), zero),
         kinds=instrument.kinds,
     )  # fmt: skip
-
-
-def _angles(positions: Mapping[str, Position]) -> dict[str, Float[Array, " e"]]:
-    """Angles (rad) of elements that move, NaN where they are out."""
-    return {
-        prefix: array(np.deg2rad(np.where(one.inside, one.angle, np.nan)))
-        for prefix, one in positions.items()
-        if one.inside.any()
-    }
 
 
 def blank_plan(instrument: Instrument, asked: Collection[str] = (), median: bool = False) -> Plan:

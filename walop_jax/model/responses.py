@@ -37,14 +37,13 @@ from jaxtyping import Array, Float, Int
 from walop_jax.model import fold, light
 from walop_jax.model.compiled import array
 from walop_jax.model.elements import Element, PupilMapping, WavePlate
-from walop_jax.model.instrument import Instrument
+from walop_jax.model.instrument import Instrument, Scalar
 from walop_jax.model.materials import REFERENCE_TEMPERATURE
 from walop_jax.model.parameters import shapes_of
 from walop_jax.model.plan import Plan
 from walop_jax.model.ray import CONDITIONS, Conditions, Ray
 from walop_jax.model.sources import ExposureArrays, MoonPatches, MoonSky, Sight
 
-Scalar = Float[Array, ""]
 REFERENCE_WAVELENGTH = 0.62  # µm
 LAYER_NUMBERS = ("thickness", "axis", "cut")
 

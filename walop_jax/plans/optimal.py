@@ -308,7 +308,7 @@ class _Some:
             # of the draws, which are much alike, is enough to step by.
             pushed = y[some] * np.repeat(push[some], self.per_target[1], axis=1)[:, None]
             left = np.linalg.cholesky(covariance[some]).swapaxes(1, 2)
-            right = _root(pushed @ np.swapaxes(y[some], 1, 2), _MAIN)
+            right = root_of(pushed @ np.swapaxes(y[some], 1, 2), _MAIN)
             flat = np.moveaxis(left[:, None] @ (self.matrices[some] @ right[:, None]), 1, 0).reshape(s, -1)
             alike = push.sum() / push[some].sum()
             hessian = np.zeros((s + r, s + r))
@@ -350,8 +350,8 @@ def _nearest(relative: Float[np.ndarray, "r k"]) -> Int[np.ndarray, "r l"]:
     return np.argsort(-relative, axis=1)[:, :most]
 
 
-def _root(matrices: Float[np.ndarray, "r n n"], least: float = 0.0) -> Float[np.ndarray, "r n b"]:
-    """B with B Bᵀ the matrices, without eigenvalues below a share `least` of the largest."""
+def root_of(matrices: Float[np.ndarray, "r n n"], least: float = 0.0) -> Float[np.ndarray, "r n b"]:
+    """B with B Bᵀ the matrices, without eigenvalues below a share `least` of the largest (none: as many columns)."""
     value, vector = np.linalg.eigh(matrices)
     kept = int((value > least * value[:, -1:]).sum(axis=1).max())
     return vector[:, :, -kept:] * np.sqrt(np.clip(value[:, None, -kept:], 0.0, None))
@@ -402,7 +402,8 @@ def _best(problem: Experiment, gap: float, progress: Callable[[str], None] | Non
         )
         idle = 0 if better else idle + 1
         best_bound = max(best_bound, bound)
-        plan = _plan(some, weight, value, best_bound, best, turn)
+        least = _LEAST_WEIGHT * problem.budget
+        plan = _plan(some, weight, least, value, best_bound, best, turn)
         if progress is not None:
             progress(
                 f"round {turn}: criterion {value:.6g}, bound {best_bound:.6g}, gap {100 * plan.gap:.2g} %"
@@ -410,7 +411,7 @@ def _best(problem: Experiment, gap: float, progress: Callable[[str], None] | Non
         exact = accuracy <= 0.5 * gap
         if plan.gap <= gap or (exact and idle >= _PATIENCE):
             break
-        used = weight * some.costs > _LEAST_WEIGHT * problem.budget
+        used = weight * some.costs > least
         kept = [c for c, keep in zip(some.chosen, used, strict=True) if keep]
         new = [top for top in proof.tops if not any(_same(top, there) for there in kept)]
         if exact and not new and turn > 3:
@@ -429,18 +430,18 @@ def _same(one: tuple[int, Float[np.ndarray, " d"]], other: tuple[int, Float[np.n
 
 
 def _plan(
-    some: _Some, weight: Float[np.ndarray, " s"], value: float, bound: float, proof: Bound, rounds: int
+    some: _Some,
+    weight: Float[np.ndarray, " s"],
+    least: float,
+    value: float,
+    bound: float,
+    proof: Bound,
+    rounds: int,
 ) -> Allocation:
-    used = np.flatnonzero(weight * some.costs > _LEAST_WEIGHT * some.experiment.budget)
-    return Allocation(
-        np.array([some.chosen[i][0] for i in used]),
-        [some.chosen[i][1] for i in used],
-        weight[used],
-        value,
-        bound,
-        proof,
-        rounds,
-    )
+    """The candidates that cost more than `least` with their weights."""
+    used = np.flatnonzero(weight * some.costs > least)
+    family, place = np.array([some.chosen[i][0] for i in used]), [some.chosen[i][1] for i in used]
+    return Allocation(family, place, weight[used], value, bound, proof, rounds)
 
 
 def lower_bound(
@@ -516,16 +517,7 @@ def rounded(experiment: Experiment, plan: Allocation) -> Allocation:
         some, count, better = _exchanged(some, count)
         if not better:
             break
-    used = np.flatnonzero(count)
-    return Allocation(
-        np.array([some.chosen[i][0] for i in used]),
-        [some.chosen[i][1] for i in used],
-        count[used],
-        some.value(count),
-        plan.bound,
-        plan.proof,
-        plan.rounds,
-    )
+    return _plan(some, count, 0.0, some.value(count), plan.bound, plan.proof, plan.rounds)
 
 
 def worth(

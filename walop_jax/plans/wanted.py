@@ -29,6 +29,7 @@ from walop_jax.diagnosis.policy import POLICY
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.parameters import unknown_name
 from walop_jax.plans.exposures import Candidates
+from walop_jax.plans.optimal import root_of
 
 WORST, MEAN, APART = "worst", "mean", "apart"
 _SURE = 1.645  # standard deviations above which 95 % of a normal distribution lie, below zero
@@ -161,7 +162,7 @@ def wanted(found: Candidates, field: FieldErrors | None, criterion: str | InputT
         if criterion == WORST:
             return Wanted(WORST, "error of p at the worst point and colour", "%", targets)
         whole = np.einsum("rkfi,rkgi->rfg", targets, targets, optimize=True) / targets.shape[1]
-        return Wanted(MEAN, "error of p, rms over the field", "%", _root(whole)[:, None])
+        return Wanted(MEAN, "error of p, rms over the field", "%", root_of(whole)[:, None])
     if criterion == APART:
         return _apart(found)
     if criterion not in found.names:
@@ -221,8 +222,3 @@ def _apart(found: Candidates) -> Wanted:
     targets[:, 0, len(base)] = 1.0
     what = f"least distance of {', '.join(effects)}"
     return Wanted(APART, what, "σ", targets, inverse=True, blocks=np.stack(blocks))
-
-
-def _root(squares: Float[np.ndarray, "r f f"]) -> Float[np.ndarray, "r f f"]:
-    value, vector = np.linalg.eigh(squares)
-    return vector * np.sqrt(np.clip(value, 0.0, None))[:, None, :]

@@ -31,7 +31,7 @@ def fit(path, *names: str, start=()):
     sigma = np.zeros(len(values))
     sigma[free] = np.sqrt(np.diag(np.linalg.inv(here.matrix)))
     found = {name: (values[i], sigma[i]) for i, name in enumerate(model.names)}
-    return found, here.chi2, likelihood.dof
+    return found, here.chi2, here.dof
 
 
 @pytest.mark.long

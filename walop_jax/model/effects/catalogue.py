@@ -447,16 +447,14 @@ def is_own(effect: Effect) -> TypeGuard[Entry]:
     return isinstance(effect, Entry) and type(effect) not in EFFECTS
 
 
-def catalogue_with(
-    own: str | os.PathLike[str] | None, catalogue: Sequence[type[Effect]] = EFFECTS
-) -> tuple[type[Effect], ...]:
+def catalogue_with(own: str | os.PathLike[str] | None) -> tuple[type[Effect], ...]:
     """The catalogue followed by the effects of a file (None: nothing more): entries of a TOML file, classes of Python.
 
     A Python file is run. Raises `DataError` if it cannot be, defines no effect, or one without a name or with that of
     another.
     """
     if own is None:
-        return tuple(catalogue)
+        return EFFECTS
     if os.fspath(own).endswith(".toml"):
         found = {effect.name: effect for effect in own_entries(own)}
     else:
@@ -468,10 +466,10 @@ def catalogue_with(
         found = {name: effect for name, effect in found.items() if not inspect.isabstract(effect)}
     if not found:
         raise fail("defines no effect", file=own, advice="see walop-jax docs adding-an-effect")
-    taken = {effect.name for effect in catalogue}
+    taken = {effect.name for effect in EFFECTS}
     for class_name, effect in found.items():
         if not effect.name or effect.name in taken:
             what = f"{class_name} has {'the name of another effect' if effect.name else 'no name'}"
             raise fail(what, file=own, advice="give it a name of its own")
         taken.add(effect.name)
-    return (*catalogue, *found.values())
+    return (*EFFECTS, *found.values())

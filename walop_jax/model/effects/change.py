@@ -26,11 +26,10 @@ from jaxtyping import Array, Float
 
 from walop_jax.data.records import POLARISER
 from walop_jax.model.effects.factors import Factor, factor
-from walop_jax.model.instrument import Instrument
+from walop_jax.model.instrument import Instrument, Scalar
 from walop_jax.model.ray import NotPlannedError
 from walop_jax.model.sources import ExposureArrays
 
-Scalar = Float[Array, ""]
 Term = tuple["Change", Scalar]
 OPPOSITE = "opposite"  # the field point, as an origin of light
 SKY, BAND = "sky", "band"  # places that are no element

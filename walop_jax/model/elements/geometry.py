@@ -27,9 +27,7 @@ from walop_jax.io.errors import nearest
 from walop_jax.model import materials, mueller
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.parameters import number
-from walop_jax.model.ray import Ray
-
-Real = Float[Array, "..."]
+from walop_jax.model.ray import Ray, Real
 
 
 def pupil_direction(

@@ -16,15 +16,12 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from walop_jax.model import mueller
 from walop_jax.model.elements.base import Mueller
-from walop_jax.model.elements.spectral import Curve, WithCurves
+from walop_jax.model.elements.spectral import Curve, Scalar, WithCurves
 from walop_jax.model.parameters import number
 from walop_jax.model.ray import Ray
-
-Scalar = Float[Array, ""]
 
 
 class Mirror(WithCurves):

@@ -17,12 +17,10 @@ from jaxtyping import Array, Float
 from walop_jax.model import mueller
 from walop_jax.model.conventions import FIELD_SCALE, REFERENCE_WAVELENGTH
 from walop_jax.model.elements.base import Element, Mueller
-from walop_jax.model.elements.spectral import Curve, WithCurves
+from walop_jax.model.elements.spectral import Curve, Scalar, WithCurves
 from walop_jax.model.parameters import number
 from walop_jax.model.ray import Ray
 from walop_jax.model.sources import ExposureArrays
-
-Scalar = Float[Array, ""]
 
 
 class Retarder(Element):

@@ -25,10 +25,9 @@ from walop_jax.model import materials, mueller, plates
 from walop_jax.model.conventions import REFERENCE_WAVELENGTH
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.parameters import Component, Parameter, number
-from walop_jax.model.ray import Ray
+from walop_jax.model.ray import Ray, Real
 
 Scalar = Float[Array, ""]
-Real = Float[Array, "..."]
 Known = dict[tuple[str, int], tuple[Real, Real]]
 """Ordinary and extraordinary indices by crystal and array of wavelengths (its `id`, while the rays live)."""
 MODELS = {"waves": plates.stack_mueller, "fixed_axis": plates.fixed_axis_mueller}
