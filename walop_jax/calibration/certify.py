@@ -64,24 +64,14 @@ def certify(product: Calibration) -> list[Check]:
 
 
 def _verdict(product: Calibration) -> list[Check]:
-    v = product.verdict
+    v, bits = product.verdict, product.verdict.quality
+    unexplained, ill = bool(bits & Quality.UNEXPLAINED), bool(bits & Quality.ILL_CONDITIONED)
+    reached = "the minimum was reached" if v.converged else "no"
+    found = (f"χ²/dof = {v.chi2 / max(v.dof, 1):.4g}", *(() if unexplained else v.doubts[:1]))
     return [
-        Check(
-            "converged",
-            v.converged and not v.quality & Quality.NOT_CONVERGED,
-            "the minimum was reached" if v.converged else "no",
-        ),
-        Check(
-            "explains the data",
-            v.trusted and not v.quality & Quality.UNEXPLAINED,
-            f"χ²/dof = {v.chi2 / max(v.dof, 1):.4g}"
-            + (f"; {v.doubts[0]}" if v.doubts and not v.quality & Quality.UNEXPLAINED else ""),
-        ),
-        Check(
-            "conditioned",
-            not v.quality & Quality.ILL_CONDITIONED,
-            "ill-conditioned" if v.quality & Quality.ILL_CONDITIONED else "yes",
-        ),
+        Check("converged", v.converged and not bits & Quality.NOT_CONVERGED, reached),
+        Check("explains the data", v.trusted and not unexplained, "; ".join(found)),
+        Check("conditioned", not ill, "ill-conditioned" if ill else "yes"),
     ]
 
 

@@ -236,8 +236,7 @@ def _residual_hdus(residuals: ResidualMap) -> list[fits.ImageHDU]:
 def _hidden_hdu(hidden: Hidden) -> fits.ImageHDU:
     """An image (mistake, parameter) of what each mistake does to the parameters; no data where there is none."""
     hdu = fits.ImageHDU(hidden.changes if len(hidden) else None, name="HIDDEN")
-    mistakes = zip(hidden.names, hidden.sizes, hidden.units, strict=True)
-    for number, (name, size, unit) in enumerate(mistakes, start=1):
+    for number, (name, size, unit) in enumerate(hidden.each(), start=1):
         hdu.header[f"HIDE{number}"] = in_ascii(name)
         hdu.header[f"SIZE{number}"] = size
         hdu.header[f"UNIT{number}"] = in_ascii(unit)

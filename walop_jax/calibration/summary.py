@@ -49,12 +49,7 @@ def summary(
         "structure": dataclasses.asdict(verdict.structure),
         "hidden": None
         if result.hidden is None
-        else [
-            {"name": name, "size": size, "unit": unit}
-            for name, size, unit in zip(
-                result.hidden.names, result.hidden.sizes, result.hidden.units, strict=True
-            )
-        ],
+        else [dict(zip(("name", "size", "unit"), one, strict=True)) for one in result.hidden.each()],
         "accuracy_of_p": None if known is None else known.document(),
         "instrument": result.model.name,
         "effects": list(result.model.effect_names),

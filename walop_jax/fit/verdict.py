@@ -6,7 +6,7 @@ import dataclasses
 import enum
 import functools
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -107,12 +107,13 @@ class Hidden:
     def __len__(self) -> int:
         return len(self.names)
 
+    def each(self) -> Iterator[tuple[str, float, str]]:
+        """Name, size and unit of each."""
+        return zip(self.names, self.sizes, self.units, strict=True)
+
     def in_words(self, most: int = 1) -> str:
         """The worst of them in a sentence."""
-        sizes = [
-            f"{name} of {rounded(size, '.2g')} {unit}".rstrip()
-            for name, size, unit in zip(self.names, self.sizes, self.units, strict=True)
-        ]
+        sizes = [f"{name} of {rounded(size, '.2g')} {unit}".rstrip() for name, size, unit in self.each()]
         more = f" and {len(sizes) - most} more" if len(sizes) > most else ""
         listed = ", ".join(sizes[:most]) + more
         return f"too small to be detected, yet larger than the errors: {listed}"

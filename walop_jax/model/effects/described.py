@@ -12,7 +12,7 @@ Revealed by data that no name explains as well
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
@@ -55,9 +55,7 @@ class Described(Effect):
     sentences: tuple[str, ...] = eqx.field(static=True, default=(), converter=tuple)
 
     name: ClassVar[str] = "described"
-    starts: ClassVar[
-        tuple[tuple[Mapping[str, Any], ...], ...]
-    ] = ()  # changes are found by `diagnosis.candidates`
+    starts = ()  # changes are found by `diagnosis.candidates`
     reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = "data that no name explains as well"
     separated_by: ClassVar[str] = "exposures in which its dependence differs from that of the others"

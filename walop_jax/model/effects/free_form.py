@@ -17,7 +17,7 @@ Revealed by any data that no model explains
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
@@ -108,9 +108,7 @@ class FreeForm(Effect):
     blocks: tuple[str, ...] = eqx.field(static=True, default=(), converter=tuple)
 
     name: ClassVar[str] = "free_form"
-    starts: ClassVar[
-        tuple[tuple[Mapping[str, Any], ...], ...]
-    ] = ()  # a pattern is found by its own score test
+    starts = ()  # a pattern is found by its own score test
     revealed_by: ClassVar[str] = "any data that no model explains"
     separated_by: ClassVar[str] = "a physical effect that explains the same pattern with fewer numbers"
 

@@ -2,7 +2,6 @@
 
 from walop_jax.model.elements.base import Element
 from walop_jax.model.elements.geometry import FieldShift, PupilMapping, Wedge
-from walop_jax.model.elements.mirror import Mirror
 from walop_jax.model.elements.simple import (
     AddedPolarisation,
     Analyser,
@@ -15,7 +14,7 @@ from walop_jax.model.elements.simple import (
     Retarder,
     Rotator,
 )
-from walop_jax.model.elements.spectral import FieldDiattenuator, SpectralElement
+from walop_jax.model.elements.spectral import FieldDiattenuator, Mirror, SpectralElement
 from walop_jax.model.elements.wave_plate import AirGap, Layer, WavePlate
 
 ELEMENTS: tuple[type[Element], ...] = (
