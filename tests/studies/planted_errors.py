@@ -169,8 +169,7 @@ ERRORS = (
     planted("diagnosis/alternatives.py", "sign * a + offset", "sign * a - offset", "diagnosis/test_mixups.py"),
     # paper
     planted("paper/polynomial.py", "- self.delta[:, None]", "+ self.delta[:, None]", "paper/test_polynomial.py"),
-    planted("paper/polynomial.py", "(s * (1 - t), 0, 1), ((1 - s) * t, 1, 0)",
-            "(s * (1 - t), 1, 0), ((1 - s) * t, 0, 1)", "paper/test_polynomial.py"),
+    planted("paper/polynomial.py", "np.stack([y, x], axis=1)", "np.stack([x, y], axis=1)", "paper/test_polynomial.py"),
     # plans
     planted("plans/optimal.py", "return self.here**2 / (self.known", "return self.here**2 / (0.0 * self.known",
             "plans/test_optimal.py"),
