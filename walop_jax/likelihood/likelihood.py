@@ -334,6 +334,11 @@ class Likelihood:
         """Count of what is used of the set: a pass of its own; an expansion brings its own census with it."""
         return self._total("counting", "census", lambda _: (), ())[1]
 
+    @property
+    def dof(self) -> int:
+        """Per used row its independent data (`data_per_row`), one per prior, less the free parameters."""
+        return self._degrees_of_freedom(self.census)
+
     @cached_property
     def used(self) -> Bool[np.ndarray, "p e"]:
         """True where the intensities of a (point, exposure) are used."""
