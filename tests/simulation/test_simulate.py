@@ -35,7 +35,7 @@ from walop_jax.simulation.observing_plan import (
     polariser_turn,
 )
 from walop_jax.simulation.simulate import Simulated, draw_instrument, simulate, truth_values
-from walop_jax.sky.moon import moon_direction
+from walop_jax.sky.moon import body_direction
 
 FITS_DATA = Path(__file__).resolve().parents[2] / "fits_data"
 SMALL = ObservingPlan(
@@ -92,7 +92,7 @@ def test_patches_lie_around_the_moon_wherever_it_is(instrument: str, mjd: float 
     plan = ObservingPlan(instrument, mjd=mjd)
     e = plan.exposures()
     moon = e.kind == "moon"
-    ra, dec = (np.deg2rad(a) for a in moon_direction(e.mjd[moon], plan.site))
+    ra, dec = (np.deg2rad(a) for a in body_direction("moon", e.mjd[moon], plan.site))
     field_ra, field_dec = np.deg2rad(e.ra[moon]), np.deg2rad(e.dec[moon])
     # Haversine form, exact for small angles too.
     chord = (

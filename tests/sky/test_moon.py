@@ -17,9 +17,9 @@ from science.truth import TrueInstrument
 
 from walop_jax.data import DataError, Site, read_calibration_set
 from walop_jax.sky.moon import (
+    body_direction,
     earth_rotation,
     local_sidereal_time,
-    moon_direction,
     moon_sky,
     offset_direction,
     rayleigh_sky,
@@ -134,13 +134,13 @@ def test_the_moon_is_where_the_almanac_has_it():
     """Full Moon of 3 January 2026, 10:03 UT (published): opposite to the Sun; parallax of a degree."""
     mjd = np.array([61043.0 + (10 + 3 / 60) / 24])
     centre = Site("", 0.0, 0.0, -6378137.0)  # the centre of the Earth
-    ra, dec = moon_direction(mjd, centre)
+    ra, dec = body_direction("moon", mjd, centre)
     # Sun at that moment: RA 18h 54.1m, Dec −22.8°; the Moon at full stands within 5.2° of the opposite point
     moon = SkyCoord(ra[0] * u.deg, dec[0] * u.deg)
     opposite = SkyCoord("6h54.1m", "22.8d")
     assert moon.separation(opposite).deg < 5.3
     assert abs((moon.geocentrictrueecliptic.lon - opposite.geocentrictrueecliptic.lon).deg) < 0.3
-    shift = moon.separation(SkyCoord(*moon_direction(mjd, SITE), unit="deg")).deg[0]
+    shift = moon.separation(SkyCoord(*body_direction("moon", mjd, SITE), unit="deg")).deg[0]
     assert 0.05 < shift < 1.03
 
 
@@ -151,7 +151,7 @@ def test_nothing_is_downloaded(monkeypatch):
     monkeypatch.setattr(socket.socket, "connect", refuse)
     monkeypatch.setattr(socket, "getaddrinfo", refuse)
     # times before, inside and beyond the tables of Earth rotation
-    ra, dec = moon_direction(np.array([40000.0, 61043.85, 75000.0]), SITE)
+    ra, dec = body_direction("moon", np.array([40000.0, 61043.85, 75000.0]), SITE)
     assert np.all(np.isfinite([ra, dec]))
 
 
@@ -168,9 +168,9 @@ def test_earth_rotation_is_that_of_the_library():
 def test_bad_skies_are_refused():
     good = np.array([61043.85])
     with pytest.raises(DataError, match="MJD: times must be Modified"):
-        moon_direction(np.array([2461044.35]), SITE)
+        body_direction("moon", np.array([2461044.35]), SITE)
     with pytest.raises(DataError, match="SITELAT"):
-        moon_direction(good, dataclasses.replace(SITE, latitude=float("nan")))
+        body_direction("moon", good, dataclasses.replace(SITE, latitude=float("nan")))
     with pytest.raises(DataError, match="DEC: is not finite"):
         moon_sky(good, good, np.array([np.nan]), good, SITE, *CENTRE)
 

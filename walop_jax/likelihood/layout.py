@@ -29,7 +29,7 @@ from walop_jax.model.effects.base import Effect
 from walop_jax.model.plan import Plan, with_median
 from walop_jax.model.planning import plan_for
 from walop_jax.model.specification import Model
-from walop_jax.sky.moon import moon_direction, rayleigh_sky
+from walop_jax.sky.moon import body_direction, rayleigh_sky
 
 THINNEST = 1e-3  # deg: shortest side of a rectangle with nodes
 
@@ -315,4 +315,4 @@ class MeasuredPoints:
 @functools.lru_cache(maxsize=32)
 def _moon_at(mjd: tuple[float, ...], site: Site) -> tuple[Vector, Vector]:
     """Direction of the Moon, kept: the same set is brought together with many models."""
-    return moon_direction(np.array(mjd), site)
+    return body_direction("moon", np.array(mjd), site)

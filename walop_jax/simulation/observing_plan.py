@@ -43,7 +43,7 @@ from walop_jax.io.text import parse_toml, read_text
 from walop_jax.model.effects.base import Context
 from walop_jax.model.instrument import Instrument, as_designed, nominal_instrument
 from walop_jax.model.parameters import unknown_name
-from walop_jax.sky.moon import local_sidereal_time, moon_direction, offset_direction
+from walop_jax.sky.moon import body_direction, local_sidereal_time, offset_direction
 
 NAN = float("nan")
 _SOME_NIGHT = 61041.9  # MJD
@@ -357,7 +357,7 @@ class ObservingPlan:
         """Field centres (deg) around the Moon: separations and position angles spread evenly."""
         near, far = self.separations
         separation = near + (far - near) * np.mod(0.5 + order * _GOLDEN, 1.0)
-        return offset_direction(*moon_direction(mjd, self.site), 360.0 * _GOLDEN * order, separation)
+        return offset_direction(*body_direction("moon", mjd, self.site), 360.0 * _GOLDEN * order, separation)
 
     def layout(self) -> tuple[Bool[np.ndarray, "p e"], np.ndarray]:
         """True for the (point, exposure) pairs that are measured, and the row of the star in each (−1: none)."""

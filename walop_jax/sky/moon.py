@@ -50,18 +50,17 @@ def moon_sky(
 
     `mjd` UTC days at mid-exposure; `ra`, `dec` the field centre and `rotator` the position angle of +X,
     degrees; `x`, `y` degrees in the instrument frame. Memory is about ten arrays of points × exposures:
-    for whole frames call it with a slab of the points at a time, after `moon_direction`.
+    for whole frames call it with a slab of the points at a time, after `body_direction`.
 
     Raises `DataError` if an input is not finite or the site or time is unusable.
     """
-    moon_ra, moon_dec = moon_direction(mjd, site)
-    return rayleigh_sky(moon_ra, moon_dec, ra, dec, rotator, x, y)
+    return rayleigh_sky(*body_direction("moon", mjd, site), ra, dec, rotator, x, y)
 
 
-def moon_direction(
-    mjd: Float[np.ndarray, " e"], site: Site
+def body_direction(
+    name: str, mjd: Float[np.ndarray, " e"], site: Site
 ) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
-    """Return right ascension and declination (degrees, GCRS axes) of the Moon as seen from the site.
+    """Return right ascension and declination (degrees, GCRS axes) of the Moon, or the Sun, as seen from the site.
 
     The Moon is 60 Earth radii away: its parallax of up to a degree makes the site matter. `mjd` in UTC days.
     Astropy's `get_body` with the built-in ephemeris; nothing is ever downloaded, so Earth rotation comes
@@ -69,13 +68,6 @@ def moon_direction(
 
     Raises `DataError` for a time outside the ephemeris and for a site that is not finite.
     """
-    return body_direction("moon", mjd, site)
-
-
-def body_direction(
-    name: str, mjd: Float[np.ndarray, " e"], site: Site
-) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
-    """The same for any body of the ephemeris, by its name: "sun"."""
     mjd = np.asarray(mjd, dtype=np.float64)
     low, high = EPHEMERIS_MJD
     if not np.all((mjd >= low) & (mjd <= high)):
