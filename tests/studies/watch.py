@@ -33,7 +33,7 @@ from walop_jax.data.settings import Settings  # noqa: E402
 from walop_jax.data.user_tables import in_memory  # noqa: E402
 from walop_jax.science.apply import residuals_of  # noqa: E402
 from walop_jax.science.star_residuals import StarResiduals  # noqa: E402
-from walop_jax.science.watch import watch_stars, with_rivals  # noqa: E402
+from walop_jax.science.watch import Watching, with_rivals  # noqa: E402
 from walop_jax.science.watch_found import Watch  # noqa: E402
 
 NIGHTS, START = 10, 6
@@ -99,7 +99,7 @@ def watched(
     calibration = v.calibration
     catalogue = read_catalogue(table, calibration.model.template.patched(), always_in=calibration.always_in)
     left = StarResiduals.joined(residuals_of(v, catalogue, 10**9))
-    return watch_stars(left, v.instrument.cameras.names, v.named, v.root)
+    return Watching(left, v.instrument.cameras.names, v.named, v.root).watch()
 
 
 def step(size: float, camera: int = 0) -> Gains:

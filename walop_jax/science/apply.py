@@ -28,7 +28,7 @@ from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
 from walop_jax.model import light
 from walop_jax.model.dependence import reported
 from walop_jax.model.parameters import with_values
-from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, check_catalogue
+from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, CatalogueSearch
 from walop_jax.science.estimate import Estimate, calibration_shift, estimate
 from walop_jax.science.star_residuals import StarResiduals
 
@@ -314,7 +314,7 @@ class _Application:
             return NOTHING_TO_SPARE
         vectors = self.vectors
         cameras = vectors.instrument.cameras.names
-        return check_catalogue(StarResiduals.joined(watched), cameras, vectors.named, vectors.root)
+        return CatalogueSearch(StarResiduals.joined(watched), cameras, vectors.named, vectors.root).answer()
 
     def together(self, stars: Stars, check: CatalogueCheck) -> Stars:
         """The stars with errors, and a bit of FLAG, that hold what all of them say together."""

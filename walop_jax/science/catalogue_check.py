@@ -277,26 +277,16 @@ class CatalogueCheck(Displayed):
         return Display(title, facts, ("camera", "grows with", "change", ">σ"), rows, self.warnings())
 
 
-def check_catalogue(
-    stars: StarResiduals,
-    cameras: Sequence[str],
-    parameters: Sequence[tuple[str, str]],
-    root: Float[np.ndarray, "n n"],
-) -> CatalogueCheck:
-    """Ask the stars of a catalogue all questions.
-
-    `cameras` are names; `parameters` names and units of those of `stars.parameters()`, of which the first, as many as
-    `stars.plain` has, are asked as well; `root` is a square root of their covariance, C = root rootᵀ.
-    """
-    return _Search(stars, cameras, parameters, root).answer()
-
-
 NOTHING_TO_SPARE = CatalogueCheck(0, 0, 0, 1.0, 1.0, None, 1.0, (1.0, 1.0), (), (), np.nan)
 """Of a catalogue in which no row has a camera to spare."""
 
 
-class _Search:
-    """The columns of all questions, then of the errors of the calibration; what has been found so far."""
+class CatalogueSearch:
+    """The columns of all questions, then of the errors of the calibration; what has been found so far.
+
+    `cameras` are names; `parameters` names and units of those of `stars.parameters()`, of which the first, as many as
+    `stars.plain` has, are asked as well; `root` is a square root of their covariance, C = root rootᵀ.
+    """
 
     def __init__(
         self,

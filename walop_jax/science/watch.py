@@ -95,7 +95,7 @@ def watch(
     if not parts:
         raise DataError("N: no star has a camera to spare beside flux, q and u; add rows at other settings")
     stars = StarResiduals.joined(parts)
-    return watch_stars(stars, vectors.instrument.cameras.names, vectors.named, vectors.root)
+    return Watching(stars, vectors.instrument.cameras.names, vectors.named, vectors.root).watch()
 
 
 def with_rivals(calibration: Calibration) -> Calibration:
@@ -119,20 +119,6 @@ def with_rivals(calibration: Calibration) -> Calibration:
     return dataclasses.replace(calibration, fitted=model, values=values, covariance=covariance, hidden=None)
 
 
-def watch_stars(
-    stars: StarResiduals,
-    cameras: Sequence[str],
-    parameters: Sequence[tuple[str, str]],
-    root: Float[np.ndarray, "n n"],
-) -> Watch:
-    """Look for the histories at the head of this file in the residuals of stars.
-
-    `stars.time` is an MJD, or the number of the exposure group; rows of equal time are one group. `cameras` are names,
-    `parameters` names and units of `stars.parameters()`, `root` a square root of their covariance.
-    """
-    return _Watching(stars, cameras, parameters, root).watch()
-
-
 def grouped(
     time: Float[np.ndarray, " r"], most: int = MOST_GROUPS
 ) -> tuple[Float[np.ndarray, " g"], Int[np.ndarray, " r"]]:
@@ -149,7 +135,13 @@ def grouped(
     return times, group.reshape(-1)
 
 
-class _Watching:
+class Watching:
+    """The histories at the head of this file, looked for in the residuals of stars.
+
+    `stars.time` is an MJD, or the number of the exposure group; rows of equal time are one group. `cameras` are names,
+    `parameters` names and units of `stars.parameters()`, `root` a square root of their covariance.
+    """
+
     def __init__(
         self,
         stars: StarResiduals,
