@@ -7,9 +7,9 @@ import contextlib
 import io
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jinja2
 import matplotlib
@@ -285,14 +285,6 @@ def limits_in_words(found: DetectionLimits | None) -> dict[str, Any] | None:
 
 
 SHOWN = 24  # parameters that have moved
-KINDS = {"comparison": COMPARISON, "epoch": EPOCH, "plan": PLANNED, "limits": LIMITS, "survey": SURVEY}
-NEEDED = {
-    "comparison": ("on_grid", "between"),
-    "epoch": ("fits", "moved", "star_errors"),
-    "plan": ("exposures", "bound", "value", "beside"),
-    "limits": ("probability",),
-    "survey": ("breaks", "events", "by_night", "advice"),
-}
 PICTURES = {
     "comparison_histogram.png": "Errors of q, u and p over the field, on the grid points and between them.",
     "comparison_map.png": "Maps of the errors of q and u of both methods.",
@@ -307,14 +299,15 @@ SEPARATION = (
     "(column)."
 )
 
-Picture = tuple[str, str, str]
+Pictures = tuple[list[tuple[str, str, str]], tuple[str, ...]]
+"""Images with a text in their place and a caption, and what is missing in words."""
 
 
 def kind_of_run(folder: Path) -> str:
-    """One of `KINDS` for a folder that holds such a document and no fit to report; else `fit`."""
+    """One of `OTHERS` for a folder that holds such a document and no fit to report; else `fit`."""
     if (folder / SUMMARY).exists():
         return "fit"
-    return next((kind for kind, file in KINDS.items() if (folder / file).exists()), "fit")
+    return next((kind for kind, other in OTHERS.items() if (folder / other.file).exists()), "fit")
 
 
 def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
@@ -322,57 +315,45 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
 
     Raises `DataError` for a document that cannot be read or lacks what the page shows.
     """
-    path = folder / KINDS[kind]
-    document: dict[str, Any] = read_json(path)
-    for key in NEEDED[kind]:
+    file, needed, drawn = OTHERS[kind]
+    document: dict[str, Any] = read_json(folder / file)
+    for key in needed:
         if key not in document:
-            raise fail(f"has no {key!r}", file=path, advice="run the command that made it again")
-    words, pictures, missing, rows = None, list[Picture](), (), []
-    if kind == "comparison":
-        pictures, missing = _of_comparison(folder)
-    elif kind == "survey":
-        rows = sorted(
-            [*document["breaks"], *document["events"]], key=lambda row: row.get("mjd", row.get("night"))
-        )
-        pictures, missing = _of_survey(folder, document)
-    elif kind == "epoch":
-        pictures, missing = _of_epoch(folder, document)
-    elif kind == "plan":
-        pictures, missing = _of_plan(document)
-        if (folder / LIMITS).exists():
-            words = limits_in_words(read_limits(folder / LIMITS))
-    elif kind == "limits":
-        found = read_limits(path)
-        words = limits_in_words(found)
-        drawn = {PROTECTION: diagnosis_figures.protection_figure(found)} if found.worst is not None else {}
-        pictures = [
-            (embedded(figure), caption, caption)
-            for caption, figure in (drawn | {SEPARATION: diagnosis_figures.separation_figure(found)}).items()
-        ]
+            raise fail(f"has no {key!r}", file=folder / file, advice="run the command that made it again")
+    pictures, missing = drawn(folder, document)
+    words = None
+    if kind in ("plan", "limits") and (folder / LIMITS).exists():
+        words = limits_in_words(read_limits(folder / LIMITS))
+    changes = [*document.get("breaks", []), *document.get("events", [])]
     text = filled(
         f"{kind}.html", document=document, name=folder.resolve().name, versions={}, pictures=pictures, missing=missing,
-        shown=SHOWN, percent=two_digits, words=words, rows=rows,
+        shown=SHOWN, percent=two_digits, words=words,
+        rows=sorted(changes, key=lambda row: row.get("mjd", row.get("night"))),
     )  # fmt: skip
     return text, missing
 
 
-def _of_plan(document: Mapping[str, Any]) -> tuple[list[Picture], tuple[str, ...]]:
+def _of_plan(folder: Path, document: Mapping[str, Any]) -> Pictures:
     """Maps of the error of p, if the plan is one of an instrument that measures it, and what each exposure is worth."""
-    found, missing = [], ()
-    if "field" in document:
-        caption = (
-            "Error of p (%) before and after the plan: median over the instruments drawn, largest of all filters and "
-            "colours. Crosses: one exposure holds no u there."
-        )
-        found.append(
-            (embedded(figures.planned_figure(document["field"])), "Error of p over the field", caption)
-        )
-    else:
-        missing = ("No map: what this plan is for is no error of p.",)
-    return found, missing
+    if "field" not in document:
+        return [], ("No map: what this plan is for is no error of p.",)
+    caption = (
+        "Error of p (%) before and after the plan: median over the instruments drawn, largest of all filters and "
+        "colours. Crosses: one exposure holds no u there."
+    )
+    drawn = embedded(figures.planned_figure(document["field"]))
+    return [(drawn, "Error of p over the field", caption)], ()
 
 
-def _of_epoch(folder: Path, document: Mapping[str, Any]) -> tuple[list[Picture], tuple[str, ...]]:
+def _of_limits(folder: Path, document: Mapping[str, Any]) -> Pictures:
+    """Protection, where an exposure gives q and u, and separation."""
+    found = read_limits(folder / LIMITS)
+    drawn = {PROTECTION: diagnosis_figures.protection_figure(found)} if found.worst is not None else {}
+    drawn |= {SEPARATION: diagnosis_figures.separation_figure(found)}
+    return [(embedded(figure), caption, caption) for caption, figure in drawn.items()], ()
+
+
+def _of_epoch(folder: Path, document: Mapping[str, Any]) -> Pictures:
     """Maps of what has changed of the instrument matrix, if both calibrations are there."""
     try:
         old, new = (
@@ -385,7 +366,7 @@ def _of_epoch(folder: Path, document: Mapping[str, Any]) -> tuple[list[Picture],
     return [(embedded(drawn), "Maps of the change of the instrument matrix", caption)], ()
 
 
-def _of_survey(folder: Path, document: Mapping[str, Any]) -> tuple[list[Picture], tuple[str, ...]]:
+def _of_survey(folder: Path, document: Mapping[str, Any]) -> Pictures:
     """Parameters against time, if they are there, and χ² of every night."""
     found, missing = [], ()
     try:
@@ -403,7 +384,7 @@ def _of_survey(folder: Path, document: Mapping[str, Any]) -> tuple[list[Picture]
     return [*found, (embedded(survey_figures.nights_figure(document)), "χ² night by night", caption)], missing
 
 
-def _of_comparison(folder: Path) -> tuple[list[Picture], tuple[str, ...]]:
+def _of_comparison(folder: Path, document: Mapping[str, Any]) -> Pictures:
     """The figures that the command has drawn, and those that are not there."""
     found, missing = [], []
     for name, caption in PICTURES.items():
@@ -413,3 +394,20 @@ def _of_comparison(folder: Path) -> tuple[list[Picture], tuple[str, ...]]:
         data = base64.b64encode((folder / name).read_bytes()).decode("ascii")
         found.append((f"data:image/png;base64,{data}", caption, caption))
     return found, tuple(missing)
+
+
+class OtherPage(NamedTuple):
+    """A page about no fit: the document it is about, keys that this must have, and its pictures."""
+
+    file: str
+    needed: tuple[str, ...]
+    drawn: Callable[[Path, Mapping[str, Any]], Pictures]
+
+
+OTHERS = {
+    "comparison": OtherPage(COMPARISON, ("on_grid", "between"), _of_comparison),
+    "epoch": OtherPage(EPOCH, ("fits", "moved", "star_errors"), _of_epoch),
+    "plan": OtherPage(PLANNED, ("exposures", "bound", "value", "beside"), _of_plan),
+    "limits": OtherPage(LIMITS, ("probability",), _of_limits),
+    "survey": OtherPage(SURVEY, ("breaks", "events", "by_night", "advice"), _of_survey),
+}
