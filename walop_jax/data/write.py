@@ -152,20 +152,20 @@ def _primary(calset: CalibrationSet, version: int, path: object) -> fits.Primary
     primary, site, place = fits.PrimaryHDU(), calset.site, Place(path, "PRIMARY")
     instrument_name(calset.instrument, version, place)
     cards = {
-        "TELESCOP": (site.telescope, "telescope"),
-        "INSTRUME": (calset.instrument, "instrument"),
+        "TELESCOP": (site.telescope, ""),
+        "INSTRUME": (calset.instrument, ""),
         "CALVERS": (version, "version of the calibration set format"),
         "SITELAT": (site.latitude, "[deg] latitude"),
         "SITELONG": (site.longitude, "[deg] longitude, east positive"),
         "SITEELEV": (site.elevation, "[m] elevation"),
-        "ORIGIN": (calset.origin, "who made these data"),
+        "ORIGIN": (calset.origin, ""),
     }
     for name, (value, comment) in cards.items():
         if isinstance(value, str):
             _ascii(value, name, place)
         elif not np.isfinite(value):
             continue  # FITS headers know no NaN; a missing card is read as one
-        primary.header[name] = (value, comment if not isinstance(value, str) else "")
+        primary.header[name] = (value, comment)
     return primary
 
 

@@ -24,7 +24,6 @@ import struct
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -172,34 +171,16 @@ def _verify(path: Path, hdus: list[Any], stream: io.BufferedIOBase) -> str:
 
 def _sum(stream: io.BufferedIOBase, length: int, digest: Any) -> int:
     """Add up big-endian 32-bit words in ones' complement (carries come back in at the bottom)."""
-    if length <= _CHUNK:
-        chunk = _chunk(stream, length)
-        digest.update(chunk)
-        return _fold(_words(chunk))
     total = 0
-    # Much is hashed in another thread while it is added up here.
-    with ThreadPoolExecutor(1) as other:
-        hashed = other.submit(digest.update, b"")
-        while length > 0:
-            chunk = _chunk(stream, min(length, _CHUNK))
-            hashed.result()
-            hashed = other.submit(digest.update, chunk)
-            total += _words(chunk)
-            length -= len(chunk)
-        hashed.result()
+    while length > 0:
+        chunk = stream.read(min(length, _CHUNK))
+        if not chunk:
+            raise EOFError("unexpected end of file")
+        digest.update(chunk)
+        # All chunks are whole blocks.
+        total += int(np.frombuffer(chunk, ">u4").sum(dtype=np.uint64))
+        length -= len(chunk)
     return _fold(total)
-
-
-def _chunk(stream: io.BufferedIOBase, length: int) -> bytes:
-    chunk = stream.read(length)
-    if len(chunk) < length:
-        raise EOFError("unexpected end of file")
-    return chunk
-
-
-def _words(chunk: bytes) -> int:
-    """The sum of a chunk's big-endian 32-bit words, the last one filled up with zeros."""
-    return int(np.frombuffer(chunk.ljust(-(-len(chunk) // 4) * 4, b"\0"), ">u4").sum(dtype=np.uint64))
 
 
 def _fold(total: int) -> int:

@@ -47,17 +47,16 @@ class Deviation:
 
 def judge(answers: Mapping[tuple[str, str], float | None]) -> tuple[Deviation, ...]:
     """Hold answers, by case and quantity, against the right ones."""
-    return tuple(
-        Deviation(case.name, quantity, answer, expected, _mistake(case, quantity, answer))
-        for case in cases()
-        for quantity, expected in case.answers.items()
-        if not _same(quantity, answer := answers.get((case.name, quantity)), expected)
-    )
-
-
-def _mistake(case: Case, quantity: str, answer: float | None) -> str:
-    likely = (text for text, wrong in case.mistakes.items() if _same(quantity, answer, wrong[quantity]))
-    return next(likely, "")
+    found = []
+    for case in cases():
+        for quantity, expected in case.answers.items():
+            answer = answers.get((case.name, quantity))
+            if not _same(quantity, answer, expected):
+                likely = (
+                    text for text, wrong in case.mistakes.items() if _same(quantity, answer, wrong[quantity])
+                )
+                found.append(Deviation(case.name, quantity, answer, expected, next(likely, "")))
+    return tuple(found)
 
 
 def _same(quantity: str, answer: float | None, expected: float) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from walop_jax.science.apply import COOL, HOT, Stars
 from walop_jax.science.catalogue_check import CatalogueCheck
@@ -23,28 +23,24 @@ def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) ->
     light = polarisation(stars.qu, covariance, estimator)
     error = np.sqrt(np.einsum("sii->si", covariance))
     photon = np.sqrt(np.einsum("sii->si", stars.photon))
+
+    def pair(end: str, values: Float[np.ndarray, "s 2"], about: str) -> dict[str, tuple[np.ndarray, str]]:
+        return {f"{name}{end}": (values[:, k], about.format(name)) for k, name in enumerate("QU")}
+
     columns = {
         "Q": (stars.qu[:, 0], "q of the star: on the sky where ROTATOR is given"),
         "U": (stars.qu[:, 1], "u of the star: on the sky where ROTATOR is given"),
-        "Q_ERR": (error[:, 0], "standard error of Q: photons, calibration, unknown colour"),
-        "U_ERR": (error[:, 1], "standard error of U: photons, calibration, unknown colour"),
+        **pair("_ERR", error, "standard error of {}: photons, calibration, unknown colour"),
         "QU_COV": (covariance[:, 0, 1], "covariance of Q and U"),
         "P": (light.degree, "degree of polarisation"),
         "P_DEBIASED": (light.debiased, f"degree of polarisation without its bias, {estimator}"),
         "P_ERR": (light.degree_error, "standard error of P"),
         "EVPA": (light.angle, "electric vector angle: north to east, or from +X"),
         "EVPA_ERR": (light.angle_error, "standard error of EVPA"),
-        "Q_PHOTON": (photon[:, 0], "the share of the photons in Q_ERR"),
-        "U_PHOTON": (photon[:, 1], "the share of the photons in U_ERR"),
-        "Q_COLOUR": (stars.colour[:, 0], "error of Q if TEFF is ignored"),
-        "U_COLOUR": (stars.colour[:, 1], "error of U if TEFF is ignored"),
-        "Q_HIDDEN": (
-            stars.hidden[:, 0],
-            "largest shift of Q by a mistake that calibration data would not show",
-        ),
-        "U_HIDDEN": (
-            stars.hidden[:, 1],
-            "largest shift of U by a mistake that calibration data would not show",
+        **pair("_PHOTON", photon, "the share of the photons in {}_ERR"),
+        **pair("_COLOUR", stars.colour, "error of {} if TEFF is ignored"),
+        **pair(
+            "_HIDDEN", stars.hidden, "largest shift of {} by a mistake that calibration data would not show"
         ),
         "CHI2": (stars.chi2, "chi squared of the rows of the star"),
         "DOF": (stars.dof.astype(np.int32), "degrees of freedom of CHI2"),
