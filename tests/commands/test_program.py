@@ -61,7 +61,7 @@ def _seconds(*args: object) -> float:
 
 def test_wrong_usage_and_errors_have_their_exit_codes(tmp_path):
     assert program("refit").returncode == 2
-    failed = program("inspect", tmp_path / "none.fits")
+    failed = program("inspect", tmp_path / "none.fits", "--quiet")
     assert failed.returncode == 1
     assert failed.stdout == ""
     assert re.fullmatch(r"walop-jax: error: .*none\.fits.*\n", failed.stderr)
