@@ -17,6 +17,7 @@ from walop_jax.model.effects import effect_by_name
 from walop_jax.model.effects.base import Context
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.planning import plan_for
+from walop_jax.model.sources import Sight
 from walop_jax.model.trace import STOKES, LightStage, Sightline, trace
 
 
@@ -56,11 +57,9 @@ def counts_of(instrument, sightline: Sightline) -> np.ndarray:
     plan = plan_for(instrument, builders.exposures(row), {band.name: band})
     x, y = jnp.asarray(sightline.x), jnp.asarray(sightline.y)
     rows = light.band_rows(instrument, plan, x, y)
-    source, sky = jnp.asarray([1]), jnp.zeros((1, 2))
+    sight = Sight(plan.exposures, jnp.zeros((1, 2)), jnp.asarray([1]), x, y)
     throughput = instrument.throughput.at(x, y)
-    return np.asarray(
-        light.counts(instrument, plan, rows, throughput, x, y, sky, source, jnp.asarray([0]))[0]
-    )
+    return np.asarray(light.counts(instrument, rows, throughput, sight, jnp.asarray([0]))[0])
 
 
 def named(stages: tuple[LightStage, ...], name: str) -> np.ndarray:

@@ -48,7 +48,7 @@ def _point_sums(
     flux, residual = engine.point_residuals(instrument, plan, point, nodes)
     unit = engine.point_prediction(instrument, plan, point, nodes)
     vectors = engine.vectors_at(instrument, plan, point, nodes)[point.band]
-    stokes = light.stokes(instrument, plan.exposures, point.sky, point.source, point.x, point.y)
+    stokes = light.stokes(instrument, point.sight(plan))
     stokes = stokes[:, :3]
     # One row of signs for each arm: first camera minus second.
     pairs = np.array(instrument.cameras.pairs)

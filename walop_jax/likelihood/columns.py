@@ -43,6 +43,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for
 from walop_jax.model.responses import GENERATORS, LightResponses, Responses
+from walop_jax.model.sources import Sight
 
 Change = Sequence[tuple[float, Sentence]]
 """A sum of sentences with their coefficients; a factor of a sentence may be a function of what `_Laid` has."""
@@ -127,20 +128,23 @@ class _AtPoint(NamedTuple):
 def _at_point(instrument: Instrument, plan: Plan, point: PointData) -> _AtPoint:
     assert point.opposite_sky is not None
     x, y = jnp.stack([point.x, -point.x]), jnp.stack([point.y, -point.y])
-    sky = jnp.stack([point.sky, point.opposite_sky])
+    sights = Sight(plan.exposures, jnp.stack([point.sky, point.opposite_sky]), point.source, x, y)
     sites = 2 if light.has_ghosts(instrument) else 1
     vectors = jax.vmap(responses.vector_responses, (None, None, 0, 0))(instrument, plan, x[:sites], y[:sites])
-    lights = jax.vmap(responses.light_responses, (None, None, 0, None, 0, 0))(
-        instrument, plan.exposures, sky[:sites], point.source, x[:sites], y[:sites]
+    lights = jax.vmap(responses.light_responses, (None, Sight(None, 0, None, 0, 0)))(
+        instrument, sights._replace(sky=sights.sky[:sites], x=x[:sites], y=y[:sites])
     )
     counts = jax.vmap(lambda v, taken: jnp.einsum("eks,eks->ek", v[point.band], taken))(
         vectors.vectors, lights.taken
     )
     if sites == 1:
         opposite = light.counts(
-            instrument, plan, light.band_rows(instrument, plan, x[1], y[1]),
-            instrument.throughput.at(x[1], y[1]), x[1], y[1], sky[1], point.source, point.band,
-        )  # fmt: skip
+            instrument,
+            light.band_rows(instrument, plan, x[1], y[1]),
+            instrument.throughput.at(x[1], y[1]),
+            sights._replace(sky=point.opposite_sky, x=x[1], y=y[1]),
+            point.band,
+        )
     else:
         opposite = counts[1]
     unit = light.with_ghosts(instrument, counts[0], opposite, point.source)

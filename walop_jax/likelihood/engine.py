@@ -39,6 +39,7 @@ from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Vector, values_of, with_values
 from walop_jax.model.plan import Plan
+from walop_jax.model.sources import Sight
 from walop_jax.model.specification import series_indices
 
 NEWTON_STEPS = 3  # each squares the share of the detectors' distortion that is missing from the flux
@@ -55,6 +56,10 @@ class PointData(NamedTuple):
     source: Int[Array, "p e"]
     band: Int[Array, "p e"]
     opposite_sky: Float[Array, "p e 2"] | None = None  # the sky at (−X, −Y), only where an effect asks for it
+
+    def sight(self, plan: Plan) -> Sight:
+        """What the model asks of one point."""
+        return Sight(plan.exposures, self.sky, self.source, self.x, self.y)
 
 
 class Normal(NamedTuple):
@@ -105,14 +110,12 @@ def _unit_counts(
 ) -> Float[Array, "e k"]:
     """Counts for light of unit flux, ahead of the detectors."""
     x, y = field_sites(instrument, point)
-    counts = light.counts(
-        instrument, plan, rows[0], throughput[0], x[0], y[0], point.sky, point.source, point.band
-    )
+    sight = point.sight(plan)
+    counts = light.counts(instrument, rows[0], throughput[0], sight, point.band)
     if point.opposite_sky is None or len(x) == 1:
         return counts
-    opposite = light.counts(
-        instrument, plan, rows[1], throughput[1], x[1], y[1], point.opposite_sky, point.source, point.band
-    )
+    sight = sight._replace(sky=point.opposite_sky, x=x[1], y=y[1])
+    opposite = light.counts(instrument, rows[1], throughput[1], sight, point.band)
     return light.with_ghosts(instrument, counts, opposite, point.source)
 
 
@@ -312,9 +315,7 @@ def dense_equations(instrument: Instrument, plan: Plan, data: PointData) -> Norm
 
 def _incoming(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p e 4"]:
     """Stokes vectors that enter the collimator."""
-    return jax.vmap(light.stokes, (None, None, 0, 0, 0, 0))(
-        instrument, plan.exposures, data.sky, data.source, data.x, data.y
-    )
+    return jax.vmap(lambda point: light.stokes(instrument, point.sight(plan)))(data)
 
 
 incoming = compiled(_incoming, kept_as="incoming")

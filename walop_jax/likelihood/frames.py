@@ -251,7 +251,7 @@ def _smooth(instrument: Instrument, plan: Any, point: engine.PointData) -> Smoot
     return Smooth(
         unit=engine.point_prediction(instrument, plan, point).T,
         vectors=engine.vectors_at(instrument, plan, point),
-        stokes=light.stokes(instrument, plan.exposures, point.sky, point.source, point.x, point.y),
+        stokes=light.stokes(instrument, point.sight(plan)),
     )
 
 

@@ -31,7 +31,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Shapes, leaves, of_shapes, parameter_places, shapes_of
 from walop_jax.model.plan import blank_plan
 from walop_jax.model.ray import Conditions, NotPlannedError, Ray
-from walop_jax.model.sources import ExposureArrays
+from walop_jax.model.sources import ExposureArrays, Sight
 
 
 class Needs(NamedTuple):
@@ -83,8 +83,8 @@ def _follow(structure: Any, shapes: Shapes) -> tuple[Needs, tuple[bool, ...]]:
             x, y = jnp.asarray(0.11), jnp.asarray(0.07)
             rows = light.band_rows(instrument, plan, x, y)
             each = jnp.zeros_like(plan.exposures.kind)
-            throughput, sky = instrument.throughput.at(x, y), jnp.zeros((*each.shape, 2))
-            counts = light.counts(instrument, plan, rows, throughput, x, y, sky, each - 1, each)
+            sight = Sight(plan.exposures, jnp.zeros((*each.shape, 2)), each - 1, x, y)
+            counts = light.counts(instrument, rows, instrument.throughput.at(x, y), sight, each)
             return rows, light.detected(instrument, plan.exposures, counts)
 
         return jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(s, d) for s, d in shapes))

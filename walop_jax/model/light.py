@@ -240,21 +240,14 @@ def _beams(instrument: Instrument) -> tuple[Int[np.ndarray, "k j"], Float[Array,
 # ----------------------------------------------------------------------------------------- light and counts
 
 
-def stokes(
-    instrument: Instrument,
-    exposures: ExposureArrays,
-    sky: Float[Array, "e 2"],
-    source: Int[Array, " e"],
-    x: Scalar,
-    y: Scalar,
-) -> Float[Array, "e 4"]:
+def stokes(instrument: Instrument, sight: Sight) -> Float[Array, "e 4"]:
     """Stokes vectors behind the place of the polariser, one per exposure, at a field point.
 
-    `sky` is (q, u) of the Moon sky for δ = 1 in the ICS, `source` the row of the standard star or −1. Light
-    through the polariser forgets its past; what does not come from the sky does not meet the telescope.
+    Light through the polariser forgets its past; what does not come from the sky does not meet the telescope.
     """
     instrument = instrument.patched()
-    sight = _sight(instrument, Sight(exposures, sky, source, x, y))
+    exposures, x, y = sight.exposures, sight.x, sight.y
+    sight = _turned(instrument, sight)
     taken = jnp.zeros(exposures.kind.shape, bool)
     qu = jnp.zeros((*taken.shape, 2))
     for one in instrument.sources:
@@ -277,7 +270,7 @@ def indoors(instrument: Instrument, sight: Sight) -> Bool[Array, " e"]:
     return functools.reduce(jnp.logical_or, sources, jnp.zeros(sight.source.shape, bool))
 
 
-def _sight(instrument: Instrument, sight: Sight) -> Sight:
+def _turned(instrument: Instrument, sight: Sight) -> Sight:
     """Sight with the true position angle of the instrument."""
     if instrument.rotator_zero is None:
         return sight
@@ -289,19 +282,16 @@ def _sight(instrument: Instrument, sight: Sight) -> Sight:
 
 def counts(
     instrument: Instrument,
-    plan: Plan,
     rows: Float[Array, "b r 4"],
     throughput: Float[Array, " k"],
-    x: Scalar,
-    y: Scalar,
-    sky: Float[Array, "e 2"],
-    source: Int[Array, " e"],
+    sight: Sight,
     band: Int[Array, " e"],
 ) -> Float[Array, "e k"]:
     """Counts of the cameras in every exposure at a field point, for light of unit flux and no ghosts."""
     instrument = instrument.patched()
+    exposures, x, y = sight.exposures, sight.x, sight.y
     vectors = camera_vectors(instrument, rows, throughput, x, y)
-    light = stokes(instrument, plan.exposures, sky, source, x, y)
+    light = stokes(instrument, sight)
     if (
         len(vectors) <= FEW_BANDS
     ):  # a product of matrices, where picking vectors would copy them for every exposure
@@ -310,8 +300,8 @@ def counts(
     else:
         result = jnp.einsum("eks,es->ek", vectors[band], light)
     for part in instrument.cameras.exposures:
-        result = result * part.factors(plan.exposures, x, y)
-        result = result + vectors[band, :, 0] * part.share(plan.exposures, x, y)
+        result = result * part.factors(exposures, x, y)
+        result = result + vectors[band, :, 0] * part.share(exposures, x, y)
     return result
 
 

@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from walop_jax.model import fold, light
 from walop_jax.model.compiled import array
@@ -42,7 +42,7 @@ from walop_jax.model.materials import REFERENCE_TEMPERATURE
 from walop_jax.model.parameters import shapes_of
 from walop_jax.model.plan import Plan
 from walop_jax.model.ray import CONDITIONS, Conditions, Ray
-from walop_jax.model.sources import ExposureArrays, MoonPatches, MoonSky, Sight
+from walop_jax.model.sources import MoonPatches, MoonSky, Sight
 
 REFERENCE_WAVELENGTH = 0.62  # µm
 LAYER_NUMBERS = ("thickness", "axis", "cut")
@@ -498,25 +498,18 @@ class LightResponses(NamedTuple):
     factor: Float[Array, "e k"]
 
 
-def light_responses(
-    instrument: Instrument,
-    exposures: ExposureArrays,
-    sky: Float[Array, "e 2"],
-    source: Int[Array, " e"],
-    x: Scalar,
-    y: Scalar,
-) -> LightResponses:
+def light_responses(instrument: Instrument, sight: Sight) -> LightResponses:
     """Changes of the light at a field point by: zero of the polariser (deg), its extinction, its ellipticity, the
     rotator (deg), degree of polarisation of the sky, q and u of the sky and of stars."""
     instrument = instrument.patched()
+    exposures, x, y = sight.exposures, sight.x, sight.y
     count = exposures.kind.shape[0]
 
     def stokes(change: Float[Array, " l"]) -> Float[Array, "e 4"]:
         own = dict(zip(LIGHT, change, strict=True))
-        return light.stokes(_lit(instrument, own, count), exposures, sky, source, x, y)  # pyright: ignore[reportArgumentType]
+        return light.stokes(_lit(instrument, own, count), sight)  # pyright: ignore[reportArgumentType]
 
     value, push = jax.linearize(stokes, jnp.zeros(len(LIGHT)))
-    sight = Sight(exposures, sky, source, x, y)
     through = exposures.clp_in if instrument.polariser is not None else jnp.zeros(count, bool)
     factor, share = jnp.ones((count, len(instrument.cameras))), jnp.zeros((count, len(instrument.cameras)))
     for part in instrument.cameras.exposures:
