@@ -4,7 +4,7 @@
 
 The vectors of one optical setting (filter, moving elements, temperature, hour angle) are computed at a few hundred
 field points and colours and interpolated between them; every table is checked against vectors computed where it has
-no node (`model/field_table.py`). A setting has one table, whatever the catalogue that asks for it.
+no node (`likelihood/field_table.py`). A setting has one table, whatever the catalogue that asks for it.
 
 The derivatives have the structure of the fit (`likelihood/field_table.py`): plain parameters act directly, the
 throughput series only through its local values.

@@ -58,7 +58,7 @@ class PointData(NamedTuple):
     opposite_sky: Float[Array, "p e 2"] | None = None  # the sky at (−X, −Y), only where an effect asks for it
 
     def sight(self, plan: Plan) -> Sight:
-        """What the model asks of one point."""
+        """Quantities of a field point that the model asks for."""
         return Sight(plan.exposures, self.sky, self.source, self.x, self.y)
 
 
