@@ -32,6 +32,7 @@ from walop_jax.commands.trace import trace as trace
 from walop_jax.commands.watch import watch as watch
 from walop_jax.data.calset import from_arrays as from_arrays
 from walop_jax.data.records import CalibrationSet as CalibrationSet
+from walop_jax.data.records import FilterCurve as FilterCurve
 from walop_jax.data.settings import Settings as Settings
 from walop_jax.data.write import write_calibration_set as write_calibration_set
 from walop_jax.fit.model_file import base_model as base_model

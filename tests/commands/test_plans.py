@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from walop_jax.commands.limits import limits
+from walop_jax.data import read_calibration_set, write_calibration_set
+from walop_jax.data.records import FilterCurve
 from walop_jax.diagnosis.detection_limits import detection_limits
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model.effects import effect_by_name
-from walop_jax.simulation.observing_plan import read_plan
+from walop_jax.simulation.observing_plan import ObservingPlan, plan_text, read_plan
 from walop_jax.simulation.simulate import simulate
 
 # As many exposures and points as `small_run.SMALL`: compiled for one, compiled for both.
@@ -44,9 +46,40 @@ def test_a_plan_says_what_it_says(plan):
     assert read_plan(plan, "WALOP-NORTH").polariser_angles == (0, 30, 75)
 
 
+OWN_FILTERS = """
+[filters.SDSS-r]
+[filters.V]
+wavelength = [0.60, 0.55, 0.50]
+throughput = [0.1, 0.8, 0.3]
+"""
+
+
+def test_filters_of_ones_own_are_tables(plan, tmp_path):
+    plan.write_text(TEXT + OWN_FILTERS)
+    again = tmp_path / "again.toml"
+    again.write_text(plan_text(read_plan(plan)))
+    curve = FilterCurve("V", np.array([0.50, 0.55, 0.60]), np.array([0.3, 0.8, 0.1]))
+    given = {"grid": 3, "polariser_angles": (0.0, 45.0, 90.0), "moon_patches": 0, "standards": 0}
+    for found in (read_plan(again), ObservingPlan(filters=("SDSS-r", curve), **given)):
+        assert found.filter_names == ("SDSS-r", "V")
+        assert list(found.curves()["V"].wavelength) == [0.50, 0.55, 0.60]
+        assert list(found.curves()["V"].throughput) == [0.3, 0.8, 0.1]
+    made = simulate(ObservingPlan(filters={"V": curve}, **given)).calset
+    write_calibration_set(tmp_path / "set.fits", made)
+    assert read_calibration_set(tmp_path / "set.fits").filters["V"].throughput.tolist() == [0.3, 0.8, 0.1]
+    assert set(made.exposures.filter) == {"V"}
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ('filters = ["B"]', r"no filter 'B'; known: .*NB-660.*\[filters.B\] with wavelength \(um\)"),
+        ("[filters.V]\nwavelength = [550, 600]\nthroughput = [1, 1]", r"\[filters.V\] .* are these nm"),
+        (
+            "[filters.V]\nwavelength = [0.5, 0.6]\nthroughput = [1]",
+            r"\[filters.V\]: has 1 values of throughput",
+        ),
+        ("[filters.V]\nwavelength = [0.5, 0.6]", r"\[filters.V\]: needs wavelength \(um\) and throughput"),
         ("grids = 4", "did you mean 'grid'"),
         ("grid = 0", "must be at least 1"),
         ('filters = ["SDSS-x"]', "SDSS-x"),

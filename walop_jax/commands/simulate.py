@@ -93,6 +93,9 @@ def simulate(
 
     asked = {name: value for name, value in locals().items() if name in OF_A_PLAN}
     catalogue = catalogue_of(effects)
+    true = instrument if isinstance(instrument, Instrument) else None
+    if isinstance(plan, str | os.PathLike):
+        plan = read_plan(plan, None if true else instrument)  # pyright: ignore[reportArgumentType]
     try:
         if plan is None:
             plan, true = _plan(design_of(instrument), **asked), None
@@ -101,9 +104,6 @@ def simulate(
             idle = [name for name, value in asked.items() if value != defaults[name]]
             if idle:
                 raise UsageError(f"the plan says all of that: leave {', '.join(idle)} out", idle[0])
-            true = instrument if isinstance(instrument, Instrument) else None
-            if isinstance(plan, str | os.PathLike):
-                plan = read_plan(plan, None if true else instrument)  # pyright: ignore[reportArgumentType]
         context = plan.context()
         hidden = [
             effect_from_text(one, context, catalogue) if isinstance(one, str) else one

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from walop_jax.data.records import KINDS, Exposures, FilterCurve, Points, Site, Sources
 from walop_jax.data.schema import EXPOSURES, POINTS, SOURCES, Place, check
@@ -70,27 +71,44 @@ def make_filters(table: dict[str, Any], place: Place) -> dict[str, FilterCurve]:
     if wavelengths.shape != throughputs.shape:
         raise place.fail("has not as many values as WAVELENGTH", "THROUGHPUT", "pad both with NaN")
     for row, name in enumerate(table["FILTER"].tolist()):
-        here = np.arange(len(wavelengths)) == row
-        place.refuse(here & (name in curves), f"{name!r} is there twice, again", "FILTER", "rename one")
-        wavelength, throughput = wavelengths[row], throughputs[row]
-        given = np.isfinite(wavelength)
-        gap = not np.any(given) or not np.all(np.isfinite(throughput[given]))
-        what, advice = "has no value where WAVELENGTH has one", "pad both columns with NaN in the same places"
-        place.refuse(here & gap, f"{name!r} {what},", "THROUGHPUT", advice)
-        wavelength, throughput = wavelength[given], throughput[given]
-        (low, high), (first, last) = _WAVELENGTH, (wavelength.min(), wavelength.max())
-        what = f"{name!r} reaches from {first:g} to {last:g} µm, outside {low:g} … {high:g},"
-        advice = "wavelengths are in µm: are these nm or Angstrom?"
-        place.refuse(here & ((first < low) | (last > high)), what, "WAVELENGTH", advice)
-        if len(wavelength) > 1 and wavelength[0] > wavelength[-1]:
-            wavelength, throughput = wavelength[::-1].copy(), throughput[::-1].copy()
-        unsorted = np.any(np.diff(wavelength) <= 0)
-        place.refuse(here & unsorted, f"{name!r} is not sorted,", "WAVELENGTH", "sort the curve")
-        dark = np.any(throughput < 0) or not np.any(throughput > 0)
-        what = f"{name!r} is negative or zero throughout,"
-        place.refuse(here & dark, what, "THROUGHPUT", "correct the curve")
-        curves[name] = FilterCurve(name, wavelength, throughput)
+        where = f" in {rows_text([row])}"
+        if name in curves:
+            raise place.fail(f"{name!r} is there twice, again{where}", "FILTER", "rename one")
+        curves[name] = checked_curve(name, wavelengths[row], throughputs[row], place, where)
     return curves
+
+
+def checked_curve(
+    name: str,
+    wavelength: Float[np.ndarray, " n"],
+    throughput: Float[np.ndarray, " n"],
+    place: Place,
+    where: str = "",
+) -> FilterCurve:
+    """The curve of a filter (µm), its NaN padding stripped, turned round where it descends.
+
+    Raises `DataError`, naming `place` and `where` in it, for a curve that no filter has.
+    """
+
+    def refuse(bad: Any, what: str, column: str, advice: str) -> None:
+        if bad:
+            raise place.fail(f"{name!r} {what}{where}", column, advice)
+
+    given = np.isfinite(wavelength)
+    gap = not np.any(given) or not np.all(np.isfinite(throughput[given]))
+    advice = "pad both columns with NaN in the same places"
+    refuse(gap, "has no value where WAVELENGTH has one,", "THROUGHPUT", advice)
+    wavelength, throughput = wavelength[given], throughput[given]
+    (low, high), (first, last) = _WAVELENGTH, (wavelength.min(), wavelength.max())
+    what = f"reaches from {first:g} to {last:g} µm, outside {low:g} … {high:g},"
+    advice = "wavelengths are in µm: are these nm or Angstrom?"
+    refuse((first < low) | (last > high), what, "WAVELENGTH", advice)
+    if len(wavelength) > 1 and wavelength[0] > wavelength[-1]:
+        wavelength, throughput = wavelength[::-1].copy(), throughput[::-1].copy()
+    refuse(np.any(np.diff(wavelength) <= 0), "is not sorted,", "WAVELENGTH", "sort the curve")
+    dark = np.any(throughput < 0) or not np.any(throughput > 0)
+    refuse(dark, "is negative or zero throughout,", "THROUGHPUT", "correct the curve")
+    return FilterCurve(name, wavelength, throughput)
 
 
 def make_sources(table: dict[str, Any], place: Place) -> Sources:

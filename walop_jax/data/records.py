@@ -57,11 +57,18 @@ class Site:
 
 @dataclasses.dataclass(frozen=True)
 class FilterCurve:
-    """Throughput of a filter against wavelength (µm, ascending); one wavelength means monochromatic."""
+    """Throughput of a filter against wavelength (µm, ascending); one wavelength means monochromatic.
+
+    >>> walop.FilterCurve("V", np.array([0.50, 0.55, 0.60]), np.array([0.1, 0.8, 0.1]))
+    FilterCurve('V', 0.5 to 0.6 µm)
+    """
 
     name: str
     wavelength: Float[np.ndarray, " n"]
     throughput: Float[np.ndarray, " n"]
+
+    def __repr__(self) -> str:
+        return f"FilterCurve({self.name!r}, {np.min(self.wavelength):g} to {np.max(self.wavelength):g} µm)"
 
 
 @dataclasses.dataclass(frozen=True)

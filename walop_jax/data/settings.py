@@ -46,7 +46,7 @@ def builtin_filter(name: str) -> FilterCurve:
     if name not in _TABLES:
         raise fail(
             f"no built-in filter is called {name!r}",
-            advice=nearest(name, BUILTIN_FILTERS) + " Otherwise add it to the FILTERS table",
+            advice=f"add it to the FILTERS table; {nearest(name, (*BUILTIN_FILTERS, 'MONO-6500'))}",
         )
     table = Path(__file__).with_name(_TABLES[name])
     wavelength, throughput = np.loadtxt(table, delimiter=",", unpack=True, encoding="utf-8")

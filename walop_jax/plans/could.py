@@ -204,7 +204,7 @@ class Could:
             notes += said
         found = []
         positions = {CALIBRATION_PLATE: plan.plate, **plan.moving}
-        for name, stops in itertools.product(plan.filters, itertools.product(*positions.values())):
+        for name, stops in itertools.product(plan.filter_names, itertools.product(*positions.values())):
             where = dict(zip(positions, stops, strict=True))
             moving = {prefix: a for prefix, a in where.items() if prefix != CALIBRATION_PLATE}
             for kind in EXPOSED:
@@ -236,7 +236,7 @@ class Could:
         plan = self.plan
         e = dataclasses.replace(
             plan,
-            stops=tuple(Stop(None, plan.filters[0], kind=kind, number=i) for i in range(total)),
+            stops=tuple(Stop(None, plan.filter_names[0], kind=kind, number=i) for i in range(total)),
             patches=(),
             stars=(),
         ).exposures()

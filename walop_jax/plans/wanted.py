@@ -132,7 +132,7 @@ def _at(
     model, plan = found.model, found.could.plan
     instrument, select = model.instrument(values), model.selection()
     slopes, forms = [], []
-    for name in plan.filters:
+    for name in plan.filter_names:
         for teff in colours:
             setting = dataclasses.replace(Settings.default(1, name), teff=np.array([teff]))
             m, slope = matrix_slopes(instrument, setting, plan.curves(), x, y)

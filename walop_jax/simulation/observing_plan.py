@@ -27,7 +27,7 @@ import dataclasses
 import functools
 import itertools
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +35,12 @@ import numpy as np
 import tomlkit
 from jaxtyping import Bool, Float, Int
 
+from walop_jax.data.checks import checked_curve
 from walop_jax.data.records import Exposures, FilterCurve, Points, Position, Site
-from walop_jax.data.settings import DEFAULT_FILTER, builtin_filter
+from walop_jax.data.schema import Place
+from walop_jax.data.settings import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter, single_wavelength
 from walop_jax.instruments.description import default_name, described, shipped
-from walop_jax.io.errors import errors_naming, fail
+from walop_jax.io.errors import errors_naming, fail, nearest
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.model.effects.base import Context
 from walop_jax.model.instrument import Instrument, as_designed, nominal_instrument
@@ -107,8 +109,9 @@ class ObservingPlan:
     `standard_grid` × `standard_grid` places of the standards; where the instrument's raster is a line the points are
     `grid` steps of X from 0 to `field` (the tilts of a plate on a bench). NaN: as far out as its description says.
     The polariser goes through `polariser_angles` (deg) for each of `filters` and each setting of the calibration
-    plate in `plate` (deg, None: out); Moon patches and standards take the settings in turn, in the first filter. The
-    Moon is observed from `mjd` (UTC) on, at `separations` (deg), the polariser before and the standards after.
+    plate in `plate` (deg, None: out); Moon patches and standards take the settings in turn, in the first filter.
+    `filters` are names of those that are built in, and `FilterCurve`s; also a dict of curves by name. The Moon is
+    observed from `mjd` (UTC) on, at `separations` (deg), the polariser before and the standards after.
     `electrons` is the level of a camera in unpolarised light of full transparency, ahead of reflections.
 
     `instrument` is one that comes with the package, by name, or any other; None: the first of the family. `moving`
@@ -133,7 +136,7 @@ class ObservingPlan:
     standards: int = 8
     unpolarised: int = 2
     catalogue_error: float = 2e-4
-    filters: tuple[str, ...] = (DEFAULT_FILTER,)
+    filters: Sequence[str | FilterCurve] | Mapping[str, Any] = (DEFAULT_FILTER,)
     plate: tuple[float | None, ...] = (None,)
     electrons: float = 1e6
     read_noise: float = 30.0
@@ -179,11 +182,13 @@ class ObservingPlan:
             raise ValueError(f"polariser_angles: {self.name} has no polariser")
         elif not (self.lamps or self.stops or self.moon_patches or self.standards):
             raise ValueError("no exposures: give lamps, Moon patches or standards")
-        for name in self.filters:
-            filter_curve(name)
+        if isinstance(self.filters, Mapping):
+            object.__setattr__(self, "filters", tuple(_own_filter(*each) for each in self.filters.items()))
+        if len(self.curves()) < len(self.filters):
+            raise ValueError("filters: one is there twice; give each a name of its own")
         for stop in self.stops:
-            if stop.filter not in self.filters:
-                raise unknown_name("filter of a stop", stop.filter, self.filters)
+            if stop.filter not in self.filter_names:
+                raise unknown_name("filter of a stop", stop.filter, self.filter_names)
             for prefix in stop.moving:
                 if prefix not in self.moving:
                     raise unknown_name("moving element of a stop", prefix, tuple(self.moving))
@@ -230,6 +235,8 @@ class ObservingPlan:
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         degree = self.design.throughput.degree if self.throughput_degree is None else self.throughput_degree
         fields |= {"instrument": self.name, "throughput_degree": degree, "moving": dict(self.moving)}
+        if any(isinstance(one, FilterCurve) for one in self.filters):
+            fields["filters"] = {_name_of(one): _curve_document(one) for one in self.filters}
         # Named only where there are any: plans of other instruments read as they always did.
         fields["stops"] = [stop.document() for stop in self.stops]
         later = {"moving": {}, "lamps": 0, "stops": [], "patches": None, "stars": None}
@@ -268,9 +275,14 @@ class ObservingPlan:
             x, y = np.append(x, star_x), np.append(y, star_y)
         return Points(point=np.arange(len(x)), x=x, y=y)
 
+    @property
+    def filter_names(self) -> tuple[str, ...]:
+        """Names of the filters in their order."""
+        return tuple(map(_name_of, self.filters))
+
     def curves(self) -> dict[str, FilterCurve]:
-        """The filters with their curves."""
-        return {name: filter_curve(name) for name in self.filters}
+        """The filters with their curves. Raises ValueError for a name that is not known and a curve that is none."""
+        return {_name_of(one): filter_curve(one) for one in self.filters}
 
     @property
     def _angles(self) -> tuple[float, ...]:
@@ -284,7 +296,7 @@ class ObservingPlan:
         angles = (*self._angles, *(None for _ in range(self.lamps)))
         indoors = [dataclasses.replace(stop, times=1) for stop in self.stops for _ in range(stop.times)] or [
             Stop(a, f, p, m, kind="lamp" if a is None else "clp")
-            for f in self.filters
+            for f in self.filter_names
             for p in self.plate
             for m in further
             for a in angles
@@ -293,7 +305,7 @@ class ObservingPlan:
         plates = self.plate[:1] if self.stops else self.plate
         said = {stop.kind for stop in self.stops}
         sky = [
-            Stop(None, self.filters[0], plates[i % len(plates)], further[0], kind=kind, number=number)
+            Stop(None, self.filter_names[0], plates[i % len(plates)], further[0], kind=kind, number=number)
             for kind, numbers, total in (
                 ("moon", self.patches, self.moon_patches),
                 ("standard", self.stars, self.standards),
@@ -383,12 +395,54 @@ class ObservingPlan:
         )
 
 
-def filter_curve(name: str) -> FilterCurve:
-    """A built-in filter, or one of the narrow bands of `NARROW_BANDS` (flat-topped, 15 nm wide)."""
-    if name not in NARROW_BANDS:
-        return builtin_filter(name)
-    offset = np.linspace(-0.015, 0.015, 61)
-    return FilterCurve(name, NARROW_BANDS[name] + offset, np.exp(-np.log(2.0) * (offset / 0.0075) ** 6))
+def filter_curve(given: str | FilterCurve) -> FilterCurve:
+    """A built-in filter, one of the narrow bands of `NARROW_BANDS` (flat-topped, 15 nm wide), or a curve, checked."""
+    if isinstance(given, FilterCurve):
+        return _own_filter(given.name, given)
+    if given in NARROW_BANDS:
+        offset = np.linspace(-0.015, 0.015, 61)
+        throughput = np.exp(-np.log(2.0) * (offset / 0.0075) ** 6)
+        return FilterCurve(given, NARROW_BANDS[given] + offset, throughput)
+    if given in BUILTIN_FILTERS or single_wavelength(given) is not None:
+        return builtin_filter(given)
+    known = nearest(given, (*BUILTIN_FILTERS, *NARROW_BANDS, "MONO-6500"))
+    raise ValueError(
+        f"filters: there is no filter {given!r}; {known}; a filter of your own is a table [filters.{given}] with "
+        "wavelength (um) and throughput, in Python a FilterCurve"
+    )
+
+
+def _own_filter(name: str, given: Any) -> str | FilterCurve:
+    """The curve of a table with wavelength and throughput, or of a `FilterCurve`; of an empty table the name."""
+    place = Place("", f"filters.{name}")
+    table = _curve_document(given) if isinstance(given, FilterCurve) else given
+    if not isinstance(table, Mapping) or table.keys() not in ({"wavelength", "throughput"}, set()):
+        raise place.fail("needs wavelength (um) and throughput; nothing at all for a filter that is built in")
+    if not table:
+        return name
+    try:
+        wavelength, throughput = (
+            np.atleast_1d(np.asarray(table[key], float)) for key in ("wavelength", "throughput")
+        )
+    except (TypeError, ValueError):
+        raise place.fail("wavelength and throughput are lists of numbers") from None
+    if wavelength.shape != throughput.shape:
+        raise place.fail(f"has {throughput.size} values of throughput for {wavelength.size} of wavelength")
+    return checked_curve(name, wavelength, throughput, place)
+
+
+def _name_of(given: str | FilterCurve) -> str:
+    return given.name if isinstance(given, FilterCurve) else given
+
+
+def _curve_document(given: str | FilterCurve) -> dict[str, Any]:
+    """The table of a filter in a plan: nothing for one that is built in."""
+    if isinstance(given, str):
+        return {}
+    return {
+        "wavelength": np.asarray(given.wavelength).tolist(),
+        "throughput": np.asarray(given.throughput).tolist(),
+    }
 
 
 # ------------------------------------------------------------------------------------------------------- plans as files
