@@ -28,6 +28,7 @@ Limits      One effect at a time, to first order in its amplitude, for the shape
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -54,7 +55,9 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.fit.stand_in import on_field_points
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood import limits
+from walop_jax.model.dependence import needs
 from walop_jax.model.effects import Effect
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations
 from walop_jax.model.specification import effect_context
 
@@ -142,9 +145,19 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
     matrix, slopes = matrix_slopes(instrument, setting, calset.filters, x, y)
     slopes = slopes @ result.model.selection()
     chosen = _representative(columns)
-    probes = [probe for probe in examination.probes if probe.name in chosen]
-    members = tuple(member for probe in probes for member in probe.group)
-    changes = effect_slopes(instrument, setting, calset.filters, x, y, members)
+    probes, changes = [], [np.zeros((*matrix.shape, 0))]
+    # Effects that need more wavelength nodes than the others (fringes) have a program of their own.
+    by_nodes = sorted(
+        (_path_difference(instrument, probe), number, probe)
+        for number, probe in enumerate(examination.probes)
+        if probe.name in chosen
+    )
+    for _, group in itertools.groupby(by_nodes, key=lambda item: item[0]):
+        some = [probe for _, _, probe in group]
+        members = tuple(member for probe in some for member in probe.group)
+        changes.append(effect_slopes(instrument, setting, calset.filters, x, y, members))
+        probes += some
+    change = np.concatenate(changes, axis=-1)
     starts = np.cumsum([0, *(len(probe.widths) for probe in probes)])
     place = {probe.name: int(start) for probe, start in zip(probes, starts, strict=False)}
     found = np.full((len(columns), len(x)), np.nan)
@@ -156,9 +169,14 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
     ]
     for i, taken_up in zip(looked_at, design.taken_up(design.stacked(raw)).T, strict=True):
         column = columns[i]
-        own = changes[..., place[column.probe.name] + column.number]
+        own = change[..., place[column.probe.name] + column.number]
         found[i] = change_of_qu(matrix, matrix + column.detected * (own - slopes @ taken_up))
     return found
+
+
+def _path_difference(instrument: Instrument, probe: Probe) -> float:
+    """Path difference (µm) that the wavelength nodes must follow with the effect of a probe in the light path."""
+    return needs(dataclasses.replace(instrument, effects=(*instrument.effects, *probe.group))).path_difference
 
 
 def _representative(columns: Sequence[_Column]) -> set[str]:

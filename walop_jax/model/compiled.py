@@ -96,8 +96,8 @@ def answer(name: str, tree: Any, kinds: Sequence[Any], find: Callable[[], Any]) 
 
 def kind(leaf: Any) -> tuple[Any, ...]:
     """Kind of a number, as far as a program depends on it."""
-    seen = jax.typeof(leaf)
-    return seen.shape, str(seen.dtype), bool(seen.weak_type)
+    seen = leaf.aval if isinstance(leaf, jax.Array) else jax.typeof(leaf)
+    return seen.shape, seen.dtype, bool(seen.weak_type)
 
 
 def _traced(function: Callable[..., Any], tree: Any, leaves: Sequence[Any]) -> tuple[bytearray, Any]:
