@@ -65,6 +65,20 @@ def test_a_few_nights_of_few_stars_see_a_gross_change():
     assert not study.watched(100, 3, study.step(0.05)).holds
 
 
+@pytest.mark.parametrize("stars", [60, 120])
+def test_a_step_that_stars_of_a_night_share_is_no_noise_of_theirs(stars):
+    """Six or twelve stars a night: χ²/dof of 100 about zero, of 1 about the gain that they share."""
+    (change,) = study.watched(stars, 5, study.step(0.02), plates=(None,)).changes
+    assert change.time == 60000.0 + study.START
+    assert abs(change.best.size) == pytest.approx(0.02, rel=0.05)
+
+
+def test_scatter_beyond_n_err_is_no_change_and_says_nothing_for_the_calibration():
+    found = [study.watched(120, seed, plates=(None,), scatter=3.0) for seed in range(8)]
+    assert not any(watch.changes or watch.holds for watch in found)
+    assert "CANNOT SAY" in found[0].display().text()
+
+
 def test_a_camera_that_drifts_is_told_as_that():
     watch = study.watched(600, 1, study.drift(0.01))
     (change,) = watch.changes

@@ -67,8 +67,12 @@ def watched(
     gains: Gains | None = None,
     turned: tuple[str, float] | None = None,
     plates: tuple[float | None, ...] = PLATES,
+    scatter: float = 1.0,
 ) -> Watch:
-    """The watch of one catalogue: `gains` of the cameras by night, or a parameter `turned` from `START` on."""
+    """The watch of one catalogue: `gains` of the cameras by night, or a parameter `turned` from `START` on.
+
+    `scatter` is the noise over what N_ERR says.
+    """
     rng, v = np.random.default_rng([stars, seed]), vectors()
     off = v.root @ rng.standard_normal(v.root.shape[1])
     rows: list[dict[str, np.ndarray]] = []
@@ -90,7 +94,7 @@ def watched(
             "ID": np.arange(stars),
             "X": x,
             "Y": y,
-            "N": counts + error * rng.standard_normal(counts.shape),
+            "N": counts + scatter * error * rng.standard_normal(counts.shape),
         }
         there |= {"N_ERR": error, "TEFF": np.full(stars, 5500.0), "MJD": 60000.0 + night}
         there["CHWP_ANGLE"] = np.full(stars, np.nan if plate is None else plate)

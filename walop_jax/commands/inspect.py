@@ -54,6 +54,7 @@ class InspectedSets(Displayed):
 def _display(found: Inspection) -> Display:
     low_x, high_x, low_y, high_y = found.field
     counted = math.isfinite(found.median_counts)
+    apart = "; standards are measured at places of their own" if found.sources else ""
     some = f" at {found.looked_at} points looked at" if found.looked_at < found.points else ""
     noise = f"{found.noise_ratio**0.5:.4g} × the photon noise √N (median)"
     return Display(
@@ -72,7 +73,7 @@ def _display(found: Inspection) -> Display:
             ),
             (
                 "used",
-                f"{found.rows} of {found.possible} (exposure, point) pairs{some}; standards lie elsewhere",
+                f"{found.rows} of {found.possible} (exposure, point) pairs{some}{apart}",
             ),
             ("flagged", ", ".join(f"{count} {name}" for name, count in found.flags.items()) or "none"),
             (

@@ -119,7 +119,8 @@ def _program(
 def _paragraphs(function: Callable[..., Any]) -> str:
     """The docstring of a command without its line ends: the terminal wraps paragraphs, not the source."""
     text = inspect.cleandoc(function.__doc__ or "").partition("\n\nIn Python:")[0]
-    return "\n\n".join(" ".join(part.split()) for part in text.split("\n\n"))
+    parts = (part for part in text.split("\n\n") if not part.startswith(">>>"))
+    return "\n\n".join(" ".join(part.split()) for part in parts)
 
 
 def _parameter(name: str, option: Option, default: Any, hidden: bool = False) -> inspect.Parameter:

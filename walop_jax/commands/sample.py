@@ -91,7 +91,6 @@ def sample(
         posterior = _sampled_run(job, run, options, tell, model, resume)
     return Outcome(
         posterior,
-        text=lambda: f"{posterior.display().text()}\n{posterior.seconds:.0f} s",
         warnings=posterior.warnings,
         failure=""
         if posterior.sampled_well

@@ -205,7 +205,7 @@ def _flags(calset: CalibrationSet) -> dict[str, int]:
 
 def _findings(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
     if not calset.exposures.moving:
-        yield from _about_angles(calset, made)
+        yield from _about_angles(made)
     if made.points < 2:
         # What another instrument needs its own description says.
         severity = "fault" if calset.instrument in shipped() else "note"
@@ -222,13 +222,7 @@ def _findings(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
             f"the errors are {np.sqrt(made.noise_ratio):.3g} times the photon noise sqrt(N)",
             "are N and N_ERR in electrons, or in counts (multiply by the gain)?",
         )
-    e = calset.exposures
-    if not np.any(((e.kind == "moon") | (e.kind == "standard")) & ~e.clp_in):
-        yield Finding(
-            "note",
-            "no light of known polarisation but through the polariser (neither Moon sky nor standards)",
-            "the zero of the polariser and a polarising telescope cannot be seen without",
-        )
+    yield from about_exposures(calset.exposures)
     if (saturated := made.flags.get(DataFlag.SATURATED.meaning, 0)) > _MUCH * made.possible:
         yield Finding("doubt", f"{saturated} rows are saturated", "expose for a shorter time")
     if unknown := made.flags.get("other", 0):
@@ -247,8 +241,8 @@ def _about_cameras(noise_ratio: np.ndarray) -> Iterator[Finding]:
         )
 
 
-def _about_angles(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
-    e, number, span = calset.exposures, len(made.angles), 180.0 - made.widest_gap
+def _about_angles(made: Inspection) -> Iterator[Finding]:
+    number, span = len(made.angles), 180.0 - made.widest_gap
     if number < 3:
         yield Finding(
             "fault",
@@ -264,11 +258,22 @@ def _about_angles(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]
             f"only {number} polariser angles",
             "with fewer than 8, polariser errors cannot be told from instrument errors",
         )
-    if np.ptp(np.mod(e.clp_angle[e.clp_in], 360.0)) < 180.0:
+
+
+def about_exposures(exposures: Exposures) -> Iterator[Finding]:
+    """What exposures, taken or planned, cannot show whatever their counts are."""
+    e = exposures
+    if e.clp_in.any() and not e.moving and np.ptp(np.mod(e.clp_angle[e.clp_in], 360.0)) < 180.0:
         yield Finding(
             "note",
-            "the polariser was turned through half a turn only",
+            "the polariser turns through half a turn only",
             "a full turn tells a wobble of its rotation from the instrument",
+        )
+    if not np.any(((e.kind == "moon") | (e.kind == "standard")) & ~e.clp_in):
+        yield Finding(
+            "note",
+            "no light of known polarisation but through the polariser (neither Moon sky nor standards)",
+            "the zero of the polariser and a polarising telescope cannot be seen without",
         )
 
 

@@ -289,8 +289,9 @@ class Diagnosis(Drawn):
                 texts = value_and_error(value, sigma)
                 rows.append((step.effect, name, *texts, unit, probability(step.p_value).removeprefix("= ")))
         before, after = (fit.chi2 / max(fit.dof, 1) for fit in (self.before, self.after))
+        verdict = "not examined" if self.after.verdict is None else self.after.verdict.words
         return Display(
-            title=f"Diagnosis: {self.verdict}",
+            title=f"Diagnosis: {self.verdict}; fit {verdict}",
             facts=(
                 ("χ²/dof", f"{before:.4g} → {after:.4g}"),
                 ("p of the starting model", probability(self.p_value).removeprefix("= ")),
@@ -384,11 +385,11 @@ def sentences(found: Mapping[str, Any]) -> Iterator[str]:
         yield f"{one['change']}: χ² {sense} by {abs(one['better_by']):.4g}"
     for alike in found.get("classes", ()):
         yield (
-            f"these data cannot distinguish {alike['effect']} from {', '.join(alike['equivalent'])}; what would: "
-            f"{alike['separated_by']}"
+            f"not found, but {alike['effect']} would look like {', '.join(alike['equivalent'])} in these data; what "
+            f"would tell them apart: {alike['separated_by']}"
         )
     if found.get("cannot_be_tested"):
-        yield f"cannot be tested with these data: {', '.join(found['cannot_be_tested'])}"
+        yield f"not tested, since these data cannot show it: {', '.join(found['cannot_be_tested'])}"
     if found.get("caution"):
         yield found["caution"]
 

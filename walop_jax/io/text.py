@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import stat
 import tomllib
 from pathlib import Path
@@ -18,7 +19,9 @@ from walop_jax.io.errors import fail
 _MOST_PLACES = 8
 _WRITTEN_OUT = 1e7
 _TINY = 1e-15  # probabilities below are not to be taken at their word
-RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_SUPERSCRIPTS = "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"
+RAISED = str.maketrans("-0123456789", _SUPERSCRIPTS)
+_LOWERED = str.maketrans(_SUPERSCRIPTS, "-0123456789")
 
 
 def with_error(value: float, sigma: float) -> str:
@@ -154,7 +157,7 @@ def printable(text: str) -> str:
 
 
 _SPELT = {
-    "χ²": "chi2", "²": "^2", "⁻": "^-", "×": "x", "·": "*", "°": " deg", "±": "+-", "−": "-", "–": "-",
+    "χ²": "chi2", "×": "x", "·": "*", "°": " deg", "±": "+-", "−": "-", "–": "-",
     "—": "-", "…": "...", "µ": "u", "σ": "sigma", "δ": "delta", "η": "eta", "κ": "kappa", "λ": "lambda",
     "φ": "phi", "ε": "epsilon", "θ": "theta", "α": "alpha", "γ": "gamma", "π": "pi", "Δ": "Delta",
     "√": "sqrt", "½": "1/2", "′": "'", "→": "->", "≥": ">=", "≤": "<=",
@@ -165,6 +168,7 @@ def in_ascii(text: str) -> str:
     """The text on one line in ASCII: signs spelt out where that is usual, escaped (\\u00e9) otherwise."""
     for sign, word in _SPELT.items():
         text = text.replace(sign, word)
+    text = re.sub(f"[{_SUPERSCRIPTS}]+", lambda found: f"^{found[0].translate(_LOWERED)}", text)
     return " ".join(text.encode("ascii", "backslashreplace").decode("ascii").split())
 
 

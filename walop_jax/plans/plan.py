@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.data.inspection import about_exposures
 from walop_jax.data.user_tables import InputTable
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import rounded as digits
@@ -97,8 +98,9 @@ class ExposurePlan(Displayed):
     tells them (% for errors of p). `needed` are the minutes in which the best plan reaches `goal`, and those in which
     none can.
     `before` and `after` (draw, point) are errors of p (fraction) at `x`, `y` (deg), NaN where one exposure holds no u.
-    `beside` are other plans of the same time: their criterion, told likewise; `notes` what had to be left out. The
-    bound holds for all angles of the polariser, and of the calibration plate behind it if `any_plate`.
+    `beside` are other plans of the same time: their criterion, told likewise; `notes` what had to be left out, and
+    what these exposures alone cannot show. The bound holds for all angles of the polariser, and of the calibration
+    plate behind it if `any_plate`.
     """
 
     minutes: float
@@ -181,10 +183,11 @@ class ExposurePlan(Displayed):
             "proof": f"no plan of this time gets {better} {digits(self.bound, '.3g')}{unit}",
         }
         if self.share is not None:
-            middle = np.median(self.after[:, np.isfinite(self.after).all(axis=0)])
+            seen = np.isfinite(self.after).all(axis=0)
+            without, middle = (100.0 * np.median(errors[:, seen]) for errors in (self.before, self.after))
             facts["over the field"] = (
-                f"error of p {100 * middle:.3g} % in the median, below 0.1 % in {100 * self.share:.0f} % of the field "
-                "that holds u in one exposure"
+                f"error of p {middle:.3g} % in the median ({without:.3g} % without them), below 0.1 % in "
+                f"{100 * self.share:.0f} % of the field that holds u in one exposure"
             )
         if self.needed is not None:
             facts[f"{digits(self.goal, '.3g')}{unit} takes"] = (
@@ -301,6 +304,14 @@ def plan_from(
         cheapest, least = least_budget(whole, want.variance(goal), gap=gap)
         needed = (_cost(whole, cheapest) / 60.0, least / 60.0)
     total = _total(experiment, best)
+    plan = dataclasses.replace(
+        some.could.plan,
+        stops=tuple(some.choices[line.choice].stop(line.place, line.times) for line in lines),
+        patches=(),
+        stars=(),
+    )
+    # What was measured before shows what these need not.
+    unseen = () if known is not None else tuple(map(str, about_exposures(plan.exposures())))
     return ExposurePlan(
         minutes=minutes,
         lines=tuple(_described(some, experiment, lines, best)),
@@ -316,13 +327,8 @@ def plan_from(
         before=_errors(found, field, covariance(experiment.known)),
         after=_errors(found, field, covariance(total)),
         beside=dict(_beside(found, whole, want)),
-        observing_plan=dataclasses.replace(
-            some.could.plan,
-            stops=tuple(some.choices[line.choice].stop(line.place, line.times) for line in lines),
-            patches=(),
-            stars=(),
-        ),
-        notes=found.notes,
+        observing_plan=plan,
+        notes=(*found.notes, *unseen),
         any_plate=found.could.any_plate,
     )
 

@@ -27,16 +27,20 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import with_error, with_minus_sign
 from walop_jax.science.star_residuals import (
+    ABOUT_GAINS,
     CROWDED,
+    FEW,
     NO_NOISE,
     Scale,
     StarResiduals,
+    beside_fitted,
     chance_of_scale,
     eliminated,
     inverse_root,
     is_off,
     noise_scale,
     normal_matrix,
+    of_few,
     own_variance,
     shared_by_rows,
 )
@@ -349,21 +353,44 @@ class CatalogueSearch:
 
     def _looked(self, sizes: Float[np.ndarray, " c"]) -> _Look:
         """Scales, Q and g (priors included) with these changes taken away."""
-        stars = self.stars
+        stars, dof = self.stars, self.stars.dof.astype(float)
+
+        def scale_of(residual: Float[np.ndarray, "r k"]) -> Scale:
+            return noise_scale(np.add.reduceat(np.sum(residual**2, axis=1), stars.first) / self.variance, dof)
+
         residual = self._left(sizes)
-        chi2 = np.add.reduceat(np.sum(residual**2, axis=1), stars.first)
-        noise = noise_scale(chi2 / self.variance, stars.dof.astype(float))
-        rows = shared_by_rows(stars, residual, self.variance)
-        known = self.asked + 2
-        alarm = ALARM / known
-        single = noise.value if noise.value > 1 or (is_off(noise, alarm) and not self.crowded) else 1.0
-        several = single
-        if rows is not None and _chance_beside(rows, noise) < alarm:
-            several = max(single, rows.value)
-        each = self.variance * np.where(stars.rows > 1, several, single)
-        matrix, score = normal_matrix(stars, residual, self._columns, noise.kept / each, noise.share)
-        matrix = self.mixing.T @ matrix @ self.mixing + np.diag(self.prior)
-        return _Look(noise, rows, matrix, self.mixing.T @ score - self.prior * sizes)
+        noise, rows = scale_of(residual), shared_by_rows(stars, residual, self.variance)
+
+        def look(scale: Scale, heavier: float = 1.0) -> _Look:
+            off = is_off(scale, self._alarm) and not self.crowded
+            single = scale.value * heavier if scale.value > 1 or off else 1.0
+            several = single
+            if rows is not None and _chance_beside(rows, noise) < self._alarm:
+                several = max(single, rows.value)
+            each = self.variance * np.where(stars.rows > 1, several, single)
+            matrix, score = normal_matrix(stars, residual, self._columns, scale.kept / each, scale.share)
+            matrix = self.mixing.T @ matrix @ self.mixing + np.diag(self.prior)
+            return _Look(noise, rows, matrix, self.mixing.T @ score - self.prior * sizes)
+
+        found = look(noise)
+        # What all stars have in common is no noise: weights come from the scatter about the gains that fit them best.
+        for _ in range(ABOUT_GAINS if is_off(noise, self._alarm) else 0):
+            gains, fitted = self._gains(found)
+            about = beside_fitted(scale_of(self._left(sizes + gains)), dof, fitted)
+            if about.worth < FEW:
+                break
+            found = look(about, of_few(about, threshold(self._alarm)) if is_off(about, self._alarm) else 1.0)
+        return found
+
+    def _gains(self, look: _Look) -> tuple[Float[np.ndarray, " c"], int]:
+        """The gains of the cameras that fit the stars best, among all sizes, and how many numbers these are."""
+        cameras = sum(question.kind == "gain" for question in self.questions)
+        order = [*range(cameras), *range(self.asked, len(look.score))]
+        found = np.zeros_like(look.score)
+        matrix, score = eliminated(look.matrix[np.ix_(order, order)], look.score[order], cameras)
+        root = inverse_root(matrix)
+        found[:cameras] = root @ (root.T @ score)
+        return found, int(np.count_nonzero(root.any(axis=0)))
 
     def answer(self) -> CatalogueCheck:
         """All questions, then again behind what was found."""

@@ -153,9 +153,9 @@ def _with_size(calibration: Calibration, name: str) -> str:
     at = hidden.names.index(name)
     size, unit = hidden.sizes[at], hidden.units[at]
     return (
-        f"{name} (wrong by {rounded(size, '.2g')} {unit})"
+        f"{name} (if wrong by {rounded(size, '.2g')} {unit})"
         if unit
-        else f"{name} (wrong by {100 * size:.2g} %)"
+        else f"{name} (if wrong by {100 * size:.2g} %)"
     )
 
 

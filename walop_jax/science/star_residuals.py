@@ -36,7 +36,10 @@ CROWDED = 1.5
 NO_NOISE = 1e-4
 """χ² per degree of freedom below which counts hold no noise at all: they were computed, not measured."""
 _ROUNDS = 50
-_FEW = 4.0  # degrees of freedom: of fewer a single star may be the scale
+FEW = 4
+"""Stars, or degrees of freedom: of fewer a single star may be the scale."""
+ABOUT_GAINS = 2
+"""Rounds in which the scale of stars is found about the gains that fit them best, and these with that scale."""
 Matrix = Float[np.ndarray, "c c"]
 
 
@@ -259,9 +262,21 @@ def noise_scale(chi2: Float[np.ndarray, " s"], dof: Float[np.ndarray, " s"]) -> 
     return Scale(scale, worth, kept, inside[of])
 
 
+def beside_fitted(scale: Scale, dof: Float[np.ndarray, " s"], fitted: float) -> Scale:
+    """The scale of χ² from which some fitted numbers have taken their part: of the degrees of freedom that are left."""
+    number = float(dof[scale.kept].sum())
+    left = max(1.0 - fitted / max(number, 1.0), 0.0)
+    return scale._replace(value=scale.value / max(left, 1e-12), worth=scale.worth * left)
+
+
+def of_few(scale: Scale, sigma: float) -> float:
+    """Factor on a variance that is known from few stars: an alarm at `sigma` is then that of Student's t."""
+    return float(special.stdtrit(scale.worth, special.ndtr(-sigma)) / sigma) ** 2
+
+
 def chance_of_scale(scale: Scale) -> float:
     """Probability, both sides, of a scale as far from 1 by noise alone."""
-    if scale.worth < _FEW:
+    if scale.worth < FEW:
         return 1.0
     value = scale.value * scale.worth
     return float(min(1.0, 2.0 * min(special.chdtr(scale.worth, value), special.chdtrc(scale.worth, value))))

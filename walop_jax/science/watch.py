@@ -37,12 +37,17 @@ from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.science.apply import residuals_of
 from walop_jax.science.catalogue_check import ALARM, RIVAL, threshold
 from walop_jax.science.star_residuals import (
+    ABOUT_GAINS,
     CROWDED,
+    FEW,
     Scale,
     StarResiduals,
+    beside_fitted,
     eliminated,
+    inverse_root,
     is_off,
     noise_scale,
+    of_few,
     own_variance,
 )
 from walop_jax.science.watch_found import History, Suspect, Watch, WatchedChange
@@ -65,7 +70,6 @@ RIVALS = (
 """Effects of the optics that may be what has changed, beside the parameters of the model."""
 Answers = Float[np.ndarray, "h c"]  # history, camera or number of the optics
 _CERTAIN = 1e-9  # in their units: nothing is left to them as an error of the calibration
-_FEW = 4  # stars: fewer have no scale of their own
 _MOST_CHANGES = 4
 _ROUNDS = 6
 _SETTLED = 0.1  # standard errors
@@ -169,25 +173,64 @@ class Watching:
 
     # --------------------------------------------------------------------------------------------- noise
 
+    def _chi2(self, residual: Float[np.ndarray, "r k"]) -> Float[np.ndarray, " s"]:
+        return np.add.reduceat(np.sum(residual**2, axis=1), self.stars.first) / self.variance
+
     def weights(
         self, residual: Float[np.ndarray, "r k"]
     ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Scale]:
-        """1/variance of every star (0: left out), κ, and the scale of all of them."""
-        chi2 = np.add.reduceat(np.sum(residual**2, axis=1), self.stars.first) / self.variance
-        dof = self.stars.dof.astype(float)
-        alarm = ALARM / (len(self.time) + 1)
-        whole = noise_scale(chi2, dof)
+        """1/variance of every star (0: left out), κ, and the scale of all of them.
+
+        A change that stars of a night have in common is no noise: where χ² is not what N_ERR says, weights come from
+        the scatter about the gains that fit each group best, if there are stars enough to know it.
+        """
+        weight, share, whole, off = self._scaled(self._chi2(residual), np.zeros(len(self.time)))
+        for _ in range(ABOUT_GAINS if off else 0):
+            left, fitted = self._behind_gains(residual, weight, share)
+            found = self._scaled(self._chi2(left), fitted)
+            if found[2].worth < FEW:
+                break
+            weight, share = found[:2]
+        return weight, share, whole
+
+    def _scaled(
+        self, chi2: Float[np.ndarray, " s"], fitted: Float[np.ndarray, " g"]
+    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Scale, bool]:
+        """Weights from χ² of stars, numbers fitted in every group; last, True if any scale is not that of N_ERR."""
+        dof, alarm = self.stars.dof.astype(float), ALARM / (len(self.time) + 1)
         least = 1.0 if np.median(self.variance) > CROWDED else 0.0
-        common = max(whole.value, least) if is_off(whole, alarm) else 1.0
-        weight, share = np.where(whole.kept, 1.0 / common, 0.0), whole.share.copy()
+        whole = beside_fitted(noise_scale(chi2, dof), dof, fitted.sum())
+        off = is_off(whole, alarm)
+        common = max(whole.value, least) * of_few(whole, self.alarm) if off else 1.0
+        weight, share, several = np.where(whole.kept, 1.0 / common, 0.0), whole.share.copy(), off
         for pool in np.unique(self.pool):
             here = np.flatnonzero(self.pool == pool)
-            own = noise_scale(chi2[here], dof[here])
-            if len(here) >= _FEW and is_off(own, alarm):
-                weight[here], share[here] = np.where(own.kept, 1.0 / max(own.value, least), 0.0), own.share
-            elif len(here) >= _FEW:
-                weight[here], share[here] = np.where(own.kept, 1.0 / common, 0.0), own.share
-        return weight / self.variance, share, whole
+            if len(here) < FEW:
+                continue
+            taken = fitted[pool] if pool < len(fitted) else fitted.sum()
+            own = beside_fitted(noise_scale(chi2[here], dof[here]), dof[here], taken)
+            mine, several = is_off(own, alarm), several or is_off(own, alarm)
+            variance = max(own.value, least) * of_few(own, self.alarm) if mine else common
+            weight[here], share[here] = np.where(own.kept, 1.0 / variance, 0.0), own.share
+        return weight / self.variance, share, whole, several
+
+    def _behind_gains(
+        self,
+        residual: Float[np.ndarray, "r k"],
+        weight: Float[np.ndarray, " s"],
+        share: Float[np.ndarray, " s"],
+    ) -> tuple[Float[np.ndarray, "r k"], Float[np.ndarray, " g"]]:
+        """Residuals behind the gains of the cameras that fit each group best, and how many numbers these are."""
+        groups, count, cameras = len(self.time), len(self.cameras) + len(self.optics), len(self.cameras)
+        matrix, score = self.scan(residual, weight, share)
+        blocks, slopes = matrix.reshape(groups, count, groups, count), score.reshape(groups, count)
+        gain, fitted = np.zeros((groups, cameras)), np.zeros(groups)
+        for g in range(groups):
+            root = inverse_root(blocks[g, :cameras, g, :cameras])
+            gain[g] = root @ (root.T @ slopes[g, :cameras])
+            fitted[g] = np.count_nonzero(np.abs(root).max(axis=0))
+        left = self.stars.behind(residual, lambda part, rows: part.model * gain[self.group[rows]])
+        return left, fitted
 
     # -------------------------------------------------------------------------------------------- columns
 

@@ -13,6 +13,8 @@ from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import two_digits, with_minus_sign
 from walop_jax.science.catalogue_check import NOISE_MATTERS, ChangeQuestion
 
+SCATTERED = 4.0
+"""χ² per degree of freedom from which stars in which no change is found do not say that a calibration holds."""
 _DATE = 1e3  # times above are dates, not numbers of groups
 
 
@@ -78,13 +80,13 @@ class WatchedChange:
         }
         when = how[self.best.history.kind].format(date)
         spread = f"; it began between {ends[0]} and {ends[1]}" if ends[0] != ends[1] else ""
-        text = f"{_words(self.best)} {when} ({abs(self.best.sigma):.0f} σ{spread})"
+        significance = f"({abs(self.best.sigma):.0f} σ{spread})"
         others = {entry.name: entry for entry in self.alike if entry.name != self.best.name}
         if not others:
-            return text
-        told = [_words(entry) for entry in list(others.values())[:4]]
-        more = f", and {len(others) - 4} more" if len(others) > 4 else ""
-        return f"{text}. These stars cannot distinguish it from {', '.join(told)}{more}"
+            return f"{_words(self.best)} {when} {significance}"
+        told = [_words(entry) for entry in (self.best, *list(others.values())[:4])]
+        more = f" or {len(others) - 4} more" if len(others) > 4 else ""
+        return f"{when} {significance}, one of these, which the stars cannot tell apart: {' or '.join(told)}{more}"
 
 
 def _words(entry: Suspect) -> str:
@@ -116,8 +118,8 @@ class Watch(Displayed):
 
     @property
     def holds(self) -> bool:
-        """True if the calibration still holds."""
-        return not self.changes
+        """True if the calibration still holds: nothing has changed, and scatter is not beyond twice N_ERR."""
+        return bool(not self.changes and self.noise < SCATTERED)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -203,7 +205,11 @@ class Watch(Displayed):
         )
         seen = two_digits(percent * float(np.min(self.smallest)))
         return Display(
-            title="The calibration holds" if self.holds else "The calibration HAS CEASED TO HOLD",
+            title="The calibration holds"
+            if self.holds
+            else "The calibration HAS CEASED TO HOLD"
+            if self.changes
+            else "The stars CANNOT SAY whether the calibration holds",
             facts=(
                 ("exposure groups", f"{len(self.time)}"),
                 ("smallest step seen", f"{seen} % of one camera, in 99 % of cases"),

@@ -516,8 +516,13 @@ def plan_text(plan: ObservingPlan) -> str:
 
     An instrument of one's own goes by its name: set `instrument` to its description file.
     """
+    unused = {"polariser_angles"} if plan.stops else set()  # every exposure says its own
     return tomlkit.dumps(
-        {name: _written(value) for name, value in plan.document().items() if value is not None}
+        {
+            name: _written(value)
+            for name, value in plan.document().items()
+            if value is not None and name not in unused
+        }
     )
 
 
