@@ -32,7 +32,7 @@ def test_limits_at_no_signal():
     found = polarisation(np.array([[1e-9, 0.0], [0.0, 0.0]]), np.repeat(ROUND, 2, 0))
     assert found.debiased[0] == pytest.approx(0.5e-9, rel=1e-6)  # MAS → p/2
     assert found.debiased[1] == 0
-    np.testing.assert_allclose(found.angle_error, NO_ANGLE)
+    np.testing.assert_allclose(found.angle_error, NO_ANGLE, rtol=1e-4)
     assert polarisation(np.array([[1e-9, 0.0]]), ROUND, "WK").debiased[0] == 0
     nothing = polarisation(np.full((1, 2), np.nan), np.full((1, 2, 2), np.nan))
     assert np.isnan(nothing).all()
@@ -48,6 +48,25 @@ def test_axes_do_not_matter():
         for name in ("degree", "debiased", "degree_error", "angle_error"):
             np.testing.assert_allclose(getattr(other, name), getattr(one, name), rtol=1e-10)
         assert np.mod(other.angle - one.angle, 180.0)[0] == pytest.approx(np.rad2deg(angle) / 2)
+
+
+@pytest.mark.parametrize(
+    ("qu", "covariance"),
+    [
+        ([0.004, -0.040], [[1e-6, 0.0], [0.0, 1e-3]]),  # u hardly known: the angle may lie 90° away
+        ([0.004, 0.002], [[1e-12, 0.0], [0.0, 1e-4]]),
+        ([1e-5, 0.002], [[1e-12, 0.0], [0.0, 1e-4]]),
+        ([0.002, 0.001], [[1e-6, 5e-7], [5e-7, 2e-6]]),
+        ([0.0, 0.0045], [[1e-6, 0.0], [0.0, 1e-6]]),
+    ],
+)
+def test_angles_of_weak_light_scatter_as_drawn_ones(qu, covariance):
+    qu, covariance = np.array([qu]), np.array([covariance])
+    found = polarisation(qu, covariance)
+    drawn = np.random.default_rng(1).multivariate_normal(qu[0], covariance[0], 400_000)
+    away = np.rad2deg(0.5 * np.arctan2(drawn[:, 1], drawn[:, 0])) - found.angle[0]
+    rms = np.sqrt(np.mean((np.mod(away + 90.0, 180.0) - 90.0) ** 2))
+    assert found.angle_error[0] == pytest.approx(rms, rel=0.01)
 
 
 @pytest.mark.parametrize("estimator", ["MAS", "WK"])

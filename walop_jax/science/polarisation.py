@@ -3,7 +3,11 @@
     p = √(q² + u²),    EVPA = ½ arctan2(u, q),    n = (q, u)/p,    t = (−u, q)/p
 
 Errors      σ_p² = nᵀ C n;  σ_EVPA = σ_t / 2p with σ_t² = tᵀ C t, and no more than 180°/√12, what a uniform
-            distribution has.
+            distribution has. Where p < 5 σ_p, (q, u) may as well lie on the other side of 0: there σ_EVPA is the rms
+            distance, within half a turn, of the angles of a normal distribution about (q, u) from EVPA. Where C = 1 and
+            m = |(q, u)|, the angle φ of the vectors from that of their mean has the density
+            f(φ) = (φ(m) + b Φ(b) φ(m)/φ(b)) / √(2π), b = m cos φ, φ(·) and Φ the normal density and its integral
+            (Mardia 1972, Statistics of Directional Data, 3.4); C^½ takes it to any other C
 Bias        Noise across the direction of (q, u) only ever lengthens the vector: <p> ≈ p₀ + σ_t²/2p₀. Two
             estimators of p₀ are offered, both with b = σ_t, which is σ where C = σ² 1:
 
@@ -18,9 +22,11 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy import special
 
 Vector = Float[np.ndarray, " s"]
 ESTIMATORS = ("MAS", "WK")
+_CERTAIN, _ANGLES, _TOGETHER = 5.0, 128, 4096
 NO_ANGLE = 180.0 / np.sqrt(12.0)
 """Standard deviation (deg) of an angle of which nothing is known."""
 
@@ -59,6 +65,9 @@ def polarisation(
         else:
             debiased = np.sqrt(np.maximum(p**2 - across, 0.0))
         error = np.minimum(np.rad2deg(np.sqrt(across) / (2.0 * p)), NO_ANGLE)
+    weak = np.flatnonzero((p**2 < (1.0 - 1e-9) * _CERTAIN**2 * along) & (qq * uu > qu_**2))
+    for some in np.array_split(weak, len(weak) // _TOGETHER + 1):
+        error[some] = _spread_of_angles(qu[some], covariance[some])
     return Polarisation(
         degree=p,
         debiased=debiased,
@@ -66,3 +75,22 @@ def polarisation(
         angle=np.mod(np.rad2deg(0.5 * np.arctan2(u, q)), 180.0),
         angle_error=error,
     )
+
+
+def _spread_of_angles(qu: Float[np.ndarray, "s 2"], covariance: Float[np.ndarray, "s 2 2"]) -> Vector:
+    """The rms distance (deg, within half a turn) of the angles of normal distributions from that of their means."""
+    root = np.linalg.cholesky(covariance)
+    mean = np.linalg.solve(root, qu[..., None])[..., 0]
+    m = np.hypot(*mean.T)[:, None]
+    # Angles are the closer to that of the mean the narrower their distribution, of width 1/m.
+    tangent = np.tan(0.5 * ((np.arange(_ANGLES) + 0.5) * 2.0 * np.pi / _ANGLES - np.pi))
+    narrow = 1.0 / (1.0 + m)
+    away = 2.0 * np.arctan(narrow * tangent)
+    step = narrow * (1.0 + tangent**2) / (1.0 + (narrow * tangent) ** 2)
+    b = m * np.cos(away)
+    integral = np.sqrt(2.0 * np.pi) * b * special.ndtr(b) * np.exp(0.5 * (b**2 - m**2))
+    weight = step * (np.exp(-0.5 * m**2) + integral)
+    phi = np.arctan2(mean[:, 1], mean[:, 0])[:, None] + away
+    x, y = np.einsum("sij,jsa->isa", root, np.stack([np.cos(phi), np.sin(phi)]))
+    turned = np.angle((x + 1j * y) * np.exp(-1j * np.arctan2(qu[:, 1], qu[:, 0]))[:, None])
+    return np.rad2deg(0.5 * np.sqrt((weight * turned**2).sum(axis=1) / weight.sum(axis=1)))
