@@ -72,7 +72,7 @@ def instrument(*effects: Effect) -> Instrument:
 def counts(instrument: Instrument, plan: Plan, data: engine.PointData) -> jax.Array:
     """Electrons that the cameras report for light of flux `FLUX`; not compiled."""
     unit = engine.prediction.__wrapped__(instrument, plan, data)
-    return engine.detected.__wrapped__(instrument, plan, FLUX * unit)
+    return engine.detected.__wrapped__(instrument, plan.exposures, FLUX * unit)
 
 
 def observe(*effects: Effect, plan_of: Sequence[Effect] | None = None) -> np.ndarray:

@@ -27,6 +27,7 @@ SCRIPTS = {
 }
 SAID = {
     "The posterior of two thicknesses": "half1.plate.mgf2",
+    "p of my stars": "P_DEBIASED",
     "Freeze the wedge": "fixed",
     "An effect of my own": "Diagnosis: ",
     "Compare two nights": "HAS CHANGED",
@@ -58,8 +59,8 @@ def folder(tmp_path_factory) -> Path:
     return path
 
 
-def test_there_are_seven_of_at_most_six_lines():
-    assert len(SCRIPTS) == 7
+def test_there_are_eight_of_at_most_six_lines():
+    assert len(SCRIPTS) == 8
     for title, script in SCRIPTS.items():
         lines = [line for line in script.splitlines() if line.strip()]
         assert 0 < len(lines) <= MOST_LINES, title

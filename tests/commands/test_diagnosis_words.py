@@ -65,8 +65,9 @@ def test_print_command_and_page_say_the_same(found: Diagnosis, call, calset_file
         "what would: a polarised standard",
         "equally consistent with camera = 2",
         "added as a free-form term (gain): χ² 1000.0 → 900.0",
-        "these data cannot distinguish hwp1_axis from hwp2_axis; what would: stars in the other half",
-        "cannot be tested with these data: etalon",
+        "before anything was added hwp1_axis was significant too; these data cannot distinguish it from hwp2_axis; "
+        "what would: stars in the other half",
+        "not tested, since these data cannot show it: etalon",
         "χ² 2000.0 → 1000.0",
     ):
         for said in (repr(found), shown, page):

@@ -180,6 +180,22 @@ def test_outside_the_nights_only_by_force(quiet):
         assert any("outside the validity" in text for text in quiet.at(mjd, force=True).verdict.warnings)
 
 
+def test_data_that_are_there_twice_are_known_by_their_noise(quiet, single, sets):
+    """A night again at other times, and stars that have other values in one of the catalogues."""
+    later = dataclasses.replace(sets[0].exposures, mjd=sets[0].exposures.mjd + 20.0)
+    with pytest.raises(DataError, match=r"100 % of its measurements are in .* as well"):
+        stack([sets[0], sets[1], dataclasses.replace(sets[0], exposures=later)], like=single)
+    one, two, _ = quiet.data.nights
+    others = tuple(
+        dataclasses.replace(p, prior=(p.prior[0] + 0.001, p.prior[1]))
+        if p.name.startswith("standard.")
+        else p
+        for p in two.parameters
+    )
+    with pytest.raises(DataError, match=r"SOURCES.*other values of STD"):
+        stack([one, dataclasses.replace(two, parameters=others)])
+
+
 def test_bad_input(quiet, single):
     one, two, three = quiet.data.nights
     with pytest.raises(DataError, match=r"there is twice|is there twice"):

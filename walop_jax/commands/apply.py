@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -94,11 +95,12 @@ def apply(
     alone = len(set(rows.star.tolist())) == len(rows.star) and len(used.model.template.arms) == 1
     settings = ": with one arm a star needs rows at several settings, of one ID" if alone else ""
     on_the_sky = sum(map(math.isfinite, rows.rotator)) / max(len(rows.rotator), 1)
+    columns = stokes_columns(stars, rows.star, debias)
     return table_outcome(
         job,
         held,
         table,
-        stokes_columns(stars, rows.star, debias),
+        columns,
         header(held.content_hash(), debias, on_the_sky, stars.check),
         output,
         flag=stars.flag,
@@ -123,6 +125,25 @@ def apply(
             "estimator": debias,
             "catalogue": stars.check.document(),
         },
-        text=lambda n: f"{output}: {table.rows} rows, {len(stars.qu)} stars, {job.seconds:.1f} s",
+        text=lambda n: (
+            f"{output}: {table.rows} rows, {len(stars.qu)} stars, {job.seconds:.1f} s{_errors(columns)}"
+            + f"; {n[Quality.HIGH_CROSSTALK]} in zones of high cross-talk (FLAG 16)"
+            * (n[Quality.HIGH_CROSSTALK] > 0)
+        ),
         warnings=[f"{text} (FLAG {Quality.CATALOGUE:d})" for text in stars.check.warnings()],
+    )
+
+
+def _errors(columns: Mapping[str, tuple[Any, ...]]) -> str:
+    """The median error of p, and how much of it is noise of photons; empty where no star has one."""
+    import numpy as np
+
+    error, q, u, *photons = (columns[name][0] for name in ("P_ERR", "Q_ERR", "U_ERR", "Q_PHOTON", "U_PHOTON"))
+    known = error > 0
+    if not known.any():
+        return ""
+    share = sum(values[known] ** 2 for values in photons) / (q[known] ** 2 + u[known] ** 2)
+    return (
+        f"; error of p {100 * float(np.median(error[known])):.2g} % (median), photons make "
+        f"{100 * float(np.median(share)):.0f} % of its variance"
     )

@@ -29,7 +29,8 @@ OUT = Option("Table to write (.fits, .csv, .ecsv); needed with --points.", "OUT"
 def _table_first(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
     """A table may stand in the place of x."""
     x = args[1] if len(args) > 1 else kwargs.get("x")
-    if x is not None and len(args) < 3 and "y" not in kwargs and "points" not in kwargs:
+    alone = x is not None and len(args) < 3 and "y" not in kwargs and "points" not in kwargs
+    if alone and not isinstance(x, int | float):
         args, kwargs = args[:1], {k: v for k, v in kwargs.items() if k != "x"} | {"points": x}
     return args, kwargs
 

@@ -89,7 +89,8 @@ def in_memory(columns: Any, name: str = "the table") -> InputTable:
         else:
             arrays = {str(key): np.atleast_1d(values) for key, values in dict(columns).items()}
             rows = max((len(values) for values in arrays.values()), default=0)
-            table = Table({k: np.repeat(v, rows, axis=0) if len(v) == 1 else v for k, v in arrays.items()})
+            single = {key for key, values in dict(columns).items() if np.ndim(values) == 0}
+            table = Table({k: np.repeat(v, rows, axis=0) if k in single else v for k, v in arrays.items()})
     except (TypeError, ValueError) as error:
         raise fail(
             f"is no table: {one_line(error)}", file=name, advice="give columns of one length"

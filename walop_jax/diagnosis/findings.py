@@ -385,8 +385,8 @@ def sentences(found: Mapping[str, Any]) -> Iterator[str]:
         yield f"{one['change']}: χ² {sense} by {abs(one['better_by']):.4g}"
     for alike in found.get("classes", ()):
         yield (
-            f"not found, but {alike['effect']} would look like {', '.join(alike['equivalent'])} in these data; what "
-            f"would tell them apart: {alike['separated_by']}"
+            f"before anything was added {alike['effect']} was significant too; these data cannot distinguish it from "
+            f"{', '.join(alike['equivalent'])}; what would: {alike['separated_by']}"
         )
     if found.get("cannot_be_tested"):
         yield f"not tested, since these data cannot show it: {', '.join(found['cannot_be_tested'])}"

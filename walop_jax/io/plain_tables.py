@@ -36,17 +36,27 @@ class MatrixTable(Table):
     FEW = 4
 
     def __str__(self) -> str:
-        return "\n".join(map(self._block, range(len(self)))) if len(self) <= self.FEW else super().__str__()
+        whole = {"X", "Y"} <= set(self.colnames) and self._elements()
+        return (
+            "\n".join(map(self._block, range(len(self))))
+            if whole and len(self) <= self.FEW
+            else super().__str__()
+        )
 
     __repr__ = __str__
 
+    def _elements(self) -> list[str]:
+        return [name for name in self.colnames if f"{name}_ERR" in self.colnames and name.startswith("M")]
+
     def _block(self, row: int) -> str:
         def number(name: str) -> float:
-            return float(np.asarray(self[name])[row])
+            of_user = self[name].unit is not None and name in ("X", "Y")
+            return float((self[name].quantity.to_value("deg") if of_user else np.asarray(self[name]))[row])
 
         x, y = (with_minus_sign(f"{number(name):+.3f}°") for name in ("X", "Y"))
-        names = [name for name in self.colnames if f"{name}_ERR" in self.colnames and name.startswith("M")]
-        cells = [f"{name.lower()} {with_error(number(name), number(f'{name}_ERR'))}" for name in names]
+        cells = [
+            f"{name.lower()} {with_error(number(name), number(f'{name}_ERR'))}" for name in self._elements()
+        ]
         width = max(map(len, cells)) + 3
         # `matrix` itself writes both columns; those of a user's table may be texts, or masked.
         inside = [name[:-3] for name in self.colnames if name.endswith("_IN") and self[name][row] is np.True_]

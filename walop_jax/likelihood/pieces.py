@@ -141,6 +141,8 @@ class Resolver:
     def _number(self, sentence: Sentence, factors: tuple[Any, ...]) -> Iterator[Piece]:
         number, plate, layer = self._plate(sentence.place)
         slot = sentence.kind
+        if "colour" in factors:
+            raise NoColumnError(sentence.text)
         if layer:
             names = [one.name for one in plate.layers]
             if layer not in names:

@@ -412,6 +412,9 @@ def _numbers(nights: Sequence[Night]) -> Int[np.ndarray, " u"]:
     return np.unique([night.number for night in nights], return_inverse=True)[1].astype(int)
 
 
+_ONE_STAR = "correct one of them, or give it another NAME"
+
+
 def check_together(nights: Sequence[Night]) -> None:
     """Raise `DataError` for nights of other instruments or models, and for data that are there twice."""
     first = nights[0]
@@ -424,6 +427,14 @@ def check_together(nights: Sequence[Night]) -> None:
             if getattr(night, name) != getattr(first, name):
                 one, other = (f"{getattr(entry, name)[:12]} ({entry.source})" for entry in (first, night))
                 raise fail(f"the nights are of two {name}s, {one} and {other}", advice=remedy)
+    stars: dict[str, tuple[Parameter, Night]] = {}
+    for night in nights:
+        for p in night.parameters:
+            one, other = stars.setdefault(p.name, (p, night))
+            if p.name.startswith("standard.") and p.prior != one.prior:
+                star = p.name.split(".")[1]
+                what = f"the catalogue has other values of {star} in {night.source} than in {other.source}"
+                raise fail(what, extension="SOURCES", advice=_ONE_STAR)
     seen: dict[Any, Night] = {}
     for night in nights:
         for key in ((night.sha256, night.number), (night.begin, night.end)):

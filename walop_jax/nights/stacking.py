@@ -16,6 +16,7 @@ import dataclasses
 import hashlib
 import math
 import os
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
@@ -64,6 +65,10 @@ LONG = 60.0  # days without a night that are worth a remark
 FAR = 0.02  # standard errors from the solution up to which a night need not be linearised again
 EXACT = 1e-3  # standard errors by which linearising all nights again may move the solution at most
 ROUNDS = 6
+SKETCH, COPIED = (
+    512,
+    0.02,
+)  # measurements by which sets are compared, and their share that no two have by chance
 MANY = 20  # sets from which on programs are better compiled for longer
 REFERENCE = "reference.fits"
 TRACKS, SURVEY = "tracks.fits", "survey.json"
@@ -98,6 +103,7 @@ class _Maker:
     few: bool = True
     candidates: dict[tuple[str, ...], Candidates] = dataclasses.field(default_factory=dict)
     sets: dict[str, tuple[CalibrationSet, Model]] = dataclasses.field(default_factory=dict)
+    noise: dict[int, str] = dataclasses.field(default_factory=dict)
 
     def nights(self, data: _Data) -> list[Night]:
         """The nights of data, as they are kept or linearised near their own minimum, from the values of `like` on."""
@@ -137,8 +143,30 @@ class _Maker:
         calset = data.read()
         made = calset, data.model or model_like(calset, self.like.model)
         if isinstance(calset.intensities, TableIntensities):
+            self._refuse_copies(calset, calset.intensities)
             self.sets[data.sha256] = made
         return made
+
+    def _refuse_copies(self, calset: CalibrationSet, table: TableIntensities) -> None:
+        """Refuse a set that has measurements of an earlier one, whatever times they bear.
+
+        Held against each other are the smallest of the numbers that hashes of (X, Y, counts) are: the same ones of the
+        same measurements (MinHash, Broder 1997).
+        """
+        rows = table.used & (calset.exposures.kind != "flux")[table.exposure]
+        point = table.point[rows]
+        places = np.column_stack([calset.points.x[point], calset.points.y[point], table.counts[rows]])
+        hashes = np.zeros(len(places), np.uint64)
+        for bits in np.ascontiguousarray(places).view(np.uint64).T:
+            hashes = (hashes ^ bits) * np.uint64(0x9E3779B97F4A7C15)
+            hashes ^= hashes >> np.uint64(29)
+        smallest = np.unique(hashes)[:SKETCH].tolist()
+        here = str(calset.inputs[0].path) if calset.inputs else calset.origin
+        seen = Counter(self.noise[one] for one in smallest if one in self.noise)
+        if seen and (number := seen.most_common(1)[0])[1] > COPIED * len(smallest):
+            share = f"{100 * number[1] / len(smallest):.0f} % of its measurements are in {number[0]} as well"
+            raise fail(share, file=here, advice="leave one out: repeated data would shrink the errors")
+        self.noise |= dict.fromkeys(smallest, here)
 
     def _candidates(self, model: Model, calset: CalibrationSet) -> Candidates:
         # They depend on cameras, standards and the effects of the model alone: listing them takes a while.

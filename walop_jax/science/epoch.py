@@ -19,7 +19,7 @@ independent measurements; where neither has measured anything V vanishes, and su
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,6 +45,7 @@ Vector = Float[np.ndarray, " k"]
 Matrix = Float[np.ndarray, "k k"]
 
 CHANCE = 0.01
+COPIES = 1e-12  # chance of so small a χ² from which two sets are taken for one
 _SHOWN = 8  # parameters
 SURE = 5.0  # standard errors
 _KNOWN = 1e-7  # share of the largest eigenvalue below which a direction was measured by neither
@@ -212,8 +213,17 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
         moved=tuple(sorted(moved, key=lambda entry: -abs(entry.z))),
         star_errors=_star_errors(old, new),
         new_trusted=result.trusted,
-        warnings=result.warnings,
+        warnings=(*result.warnings, *_too_alike(test, directions)),
     )
+
+
+def _too_alike(test: float, directions: int) -> Iterator[str]:
+    """A sentence where two sets agree better than independent ones ever do."""
+    if special.chdtr(directions, test) < COPIES:
+        yield (
+            f"old and new agree better than independent data do (χ² = {test:.2g} in {directions} directions): are they "
+            "the same measurements, at other times?"
+        )
 
 
 def shared_parameters(old: Model, new: Model) -> list[str]:

@@ -19,6 +19,7 @@ from walop_jax.model.effects import Change, Described, effect_by_name
 from walop_jax.model.effects.change import AMPLITUDES, KINDS
 from walop_jax.model.effects.factors import PLAIN
 from walop_jax.model.effects.optics import AXES
+from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.parameters import NAME
 
 OPTICAL = (*(f"{kind} {axis}" for kind in ("retardance", "diattenuation") for axis in AXES), "depolarisation")
@@ -99,6 +100,33 @@ SAME = {
 
 EVERY_SENTENCE = tuple(dict.fromkeys(sentence for sentences, *_ in SAME.values() for sentence in sentences))
 EVERY_NAME = {name: parameters for *_, (name, parameters) in SAME.values()}
+
+
+IN_VAIN = (
+    ("axis of half1.plate", "sin 2 CHWP"),  # not an element whose angle it knows
+    ("axis of chwp", "exposure 3"),
+    ("retardance q behind collimator", "cos 2 CLP"),
+    ("retardance q behind collimator", "counts"),
+    ("turn of polariser", "colour"),
+    ("displacement x ahead of pupil", "sin 1 CLP"),
+    ("extinction of polariser", "x"),
+    ("shift of band", "hours"),
+    ("rotator of sky", "hours"),
+    ("polarisation of sky", "x"),
+    ("fringes of half1.plate * gap 10", "hours"),
+    ("light of E1 in O1", "x"),
+    ("light of opposite in O1", "hours"),
+    ("light in O1", "x"),
+    ("afterglow in O1", "counts"),
+    ("gain of O1 * counts", "x"),
+    ("reported gain of O1", "x"),
+)
+
+
+@pytest.mark.parametrize(("change", "factor"), IN_VAIN)
+def test_factors_that_would_be_left_out_are_refused(change, factor):
+    with pytest.raises(ValueError, match=f"cannot grow with '{factor}'"):
+        said(f"{change} * {factor}", values=[0.1]).patch(nominal_instrument())
 
 
 def in_company(case):

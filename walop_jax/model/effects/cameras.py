@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 
 from walop_jax.model.cameras import DetectorPart, ExposurePart, GhostPart, Mixing, Transmission
 from walop_jax.model.effects.change import KINDS, OPPOSITE, AtPoint, Change, Kind, Scalar, Term, in_exposures
-from walop_jax.model.effects.factors import COUNTS, FIELD, WAVELENGTH
+from walop_jax.model.effects.factors import COUNTS, EXPOSURE, FIELD, WAVELENGTH
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Component, unknown_name
 from walop_jax.model.sources import ExposureArrays
@@ -136,6 +136,8 @@ def stage_of(change: Change) -> str:
 def _patch(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """The instrument with changes that act at one stage."""
     stage = stage_of(terms[0][0])
+    for change, _ in terms:
+        change.grows_only(*_GROWS.get(stage, ()), angle=None)
     if stage in ADDED:
         return instrument.with_part("detectors", OfDetectors.of(instrument, terms, stage=stage))
     if stage == "throughput":
@@ -153,6 +155,14 @@ def _patch(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     return instrument.with_part("mixing", CrossTalk(tuple(size for _, size in terms), pairs))
 
 
+_GROWS: Mapping[str, tuple[str, ...]] = {
+    "square": (COUNTS, EXPOSURE),
+    "reported": (EXPOSURE,),
+    "median": (EXPOSURE,),
+    "afterglow": (EXPOSURE,),
+    "throughput": (FIELD,),
+    "counts": (FIELD, EXPOSURE),
+}
 _OF_GAINS = "a lamp that does not change, seen by all cameras in turn"
 KINDS |= {
     "gain": Kind("share", _patch, stage_of, _OF_GAINS),

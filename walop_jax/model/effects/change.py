@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 from walop_jax.data.records import POLARISER
 from walop_jax.model.effects.factors import Factor, factor
 from walop_jax.model.instrument import Instrument, Scalar
-from walop_jax.model.ray import NotPlannedError
+from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import ExposureArrays
 
 Term = tuple["Change", Scalar]
@@ -137,6 +137,25 @@ class Change:
             product = product * each.value(at)
         return product
 
+    def in_train(self, ray: Ray, angle: Any) -> Any:
+        """Product of its factors for a ray, in an element that stands at `angle` (deg)."""
+        return self.factor(_InTrain(ray, angle))
+
+    def grows_only(self, *allowed: str, angle: str | None = "") -> None:
+        """Raise ValueError for a factor that would be left out: one that depends on nothing of `allowed` (`Factor`).
+
+        Of harmonics those of another element than `angle` (None: of any) would be; of single exposures those where
+        `angle` is not None, since the optics know no exposures.
+        """
+        for one in self.grows_with:
+            known = angle is None or (one.form in ("cos", "sin") and one.given[-1] == angle)
+            single = one.form in ("cos", "sin", "exposure")
+            if one.depends_on not in allowed or (single and not known):
+                takes = ", ".join(allowed) or "nothing"
+                only = f"; of angles that of {angle} alone" if angle else ""
+                what = f"{self.kind} {self.where} {self.place} cannot grow with {one.text!r}"
+                raise ValueError(f"{self.text!r}: {what}, only with {takes}{only}")
+
     def in_words(self) -> str:
         """Kind, place and dependence, to be read by people."""
         origin = "the opposite field point" if self.origin == OPPOSITE else self.origin
@@ -201,6 +220,22 @@ def add(size: Scalar) -> Any:
 
 
 # ---------------------------------------------------------------------------- what factors may ask for
+
+
+@dataclasses.dataclass(frozen=True)
+class _InTrain:
+    """Quantities of a ray; `axis` (deg) is where the element stands that moves."""
+
+    ray: Ray
+    axis: Any
+
+    def __getattr__(self, name: str) -> Any:
+        known = self.ray if name in ("x", "y", "wavelength") else self.ray.conditions
+        return getattr(known, name)
+
+    def angle(self, prefix: str) -> Any:
+        """That of the element itself, the only one that the optics know (`Change.grows_only`)."""
+        return jnp.deg2rad(self.axis)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,7 +10,6 @@ Limits      exact for one kind at a place; which of several acts first is a matt
 
 from __future__ import annotations
 
-import dataclasses
 import operator
 from collections.abc import Hashable, Sequence
 from typing import Any, ClassVar
@@ -21,7 +20,7 @@ from jaxtyping import Array, Float
 
 from walop_jax.model import mueller
 from walop_jax.model.effects.change import KINDS, AtPoint, Change, Kind, Scalar, Term, in_exposures
-from walop_jax.model.effects.factors import PLAIN
+from walop_jax.model.effects.factors import EXPOSURE, FIELD, PLAIN, SHAPE, WAVELENGTH
 from walop_jax.model.elements import AddedPolarisation, AirGap
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.instrument import Instrument
@@ -70,22 +69,6 @@ def matrix_of(terms: Sequence[tuple[Change, Any]], x: Any, y: Any) -> Mueller:
     return matrix
 
 
-@dataclasses.dataclass(frozen=True)
-class _InTrain:
-    """Quantities of a ray; `axis` (deg) is where the element stands that moves."""
-
-    ray: Ray
-    axis: Any
-
-    def __getattr__(self, name: str) -> Any:
-        known = self.ray if name in ("x", "y", "wavelength") else self.ray.conditions
-        return getattr(known, name)
-
-    def angle(self, prefix: str) -> Any:
-        """That of the element itself."""
-        return jnp.deg2rad(self.axis)
-
-
 class Terms(Element):
     """Changes at one place of the train."""
 
@@ -97,9 +80,9 @@ class Terms(Element):
 
     def mueller(self, ray: Ray) -> Mueller:
         """All of them."""
-        at = _InTrain(ray, self.axis)
         terms = zip(self.changes, self.amplitudes, strict=True)
-        return matrix_of([(change, size * change.factor(at)) for change, size in terms], ray.x, ray.y)
+        sizes = [(change, size * change.in_train(ray, self.axis)) for change, size in terms]
+        return matrix_of(sizes, ray.x, ray.y)
 
 
 class PolariserFilm(Component):
@@ -127,9 +110,9 @@ class Displaced(Element):
 
     def ray(self, ray: Ray) -> Ray:
         """The ray from the place that the optics behind see."""
-        x, y, at = ray.x, ray.y, _InTrain(ray, 0.0)
+        x, y = ray.x, ray.y
         for change, size in zip(self.changes, self.amplitudes, strict=True):
-            by = size * change.factor(at)
+            by = size * change.in_train(ray, 0.0)
             x, y = (x + by, y) if change.kind.endswith("x") else (x, y + by)
         return ray.moved(*jnp.broadcast_arrays(x, y))
 
@@ -161,9 +144,13 @@ def _optics(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """One more element at the place; of an element that moves, or of the polariser: in the beam only when it is."""
     change, polariser = terms[0][0], instrument.polariser
     if change.where == "of" and polariser is not None and change.place == polariser.name:
+        for one, _ in terms:
+            one.grows_only(FIELD, EXPOSURE, angle=None)
         film = PolariserFilm(**_columns(terms))
         return instrument.changed(change.place, films=lambda films: (*films, film))
     moves = instrument.element(change.place).moves if change.where == "of" else None
+    for one, _ in terms:
+        one.grows_only(FIELD, WAVELENGTH, EXPOSURE, angle=moves or "")
     return _beside(instrument, Terms(name="described", moves=moves, **_columns(terms)), change)
 
 
@@ -171,16 +158,20 @@ def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """(0, q, u, 0) per unit of light added, as mirrors of a telescope do to weakly polarised light."""
     own: dict[str, Any] = {"q": jnp.zeros(()), "u": jnp.zeros(())}
     for one, size in terms:
+        one.grows_only()
         own[one.kind[-1]] = own[one.kind[-1]] + size
     return _beside(instrument, AddedPolarisation(name="described", **own), terms[0][0])
 
 
 def _displaced(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
+    for change, _ in terms:
+        change.grows_only(FIELD, EXPOSURE)
     return instrument.inserted(Displaced(name="described", **_columns(terms)), before=terms[0][0].place)
 
 
 def _fringes(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     for change, size in terms:
+        change.grows_only(SHAPE)
         instrument = with_air_gap(instrument, change.place, size, jnp.asarray(change.gap))
     return instrument
 

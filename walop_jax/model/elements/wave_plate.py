@@ -12,8 +12,9 @@ Limits      a plate without layers does nothing.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -33,6 +34,17 @@ Known = dict[tuple[str, int], tuple[Real, Real]]
 MODELS = {"waves": plates.stack_mueller, "fixed_axis": plates.fixed_axis_mueller}
 
 
+class Grown(Component):
+    """A change of a number by `size` × what `change` grows with, which says which number (`kind`).
+
+    `reading` is the angle (deg) of an element that moves.
+    """
+
+    size: Scalar
+    reading: Scalar
+    change: Any = eqx.field(static=True)
+
+
 class Layer(Component):
     """One crystal of a plate."""
 
@@ -44,6 +56,7 @@ class Layer(Component):
     slope: Scalar | None = number(unit="um-1", about="dispersion: a of n_e − n_o", default=None)
     bend: Scalar | None = number(unit="um-2", about="dispersion: b of n_e − n_o", default=None)
     twist: Scalar | None = number(unit="um-3", about="dispersion: c of n_e − n_o", default=None)
+    grown: tuple[Grown, ...] = ()
     declared: tuple[tuple[str, Parameter], ...] = eqx.field(static=True, default=())
 
     def __check_init__(self) -> None:
@@ -74,11 +87,20 @@ class WavePlate(Element):
     axis: Scalar = number(unit="deg", about="fast axis, from +X toward +Y")
     thermal: Scalar | None = number(unit="", about="thermal change, 1 as published", default=None)
     air_gaps: tuple[AirGap, ...] = ()
+    grown: tuple[Grown, ...] = ()
     model: str = eqx.field(static=True, default="waves")
     always_in: bool = eqx.field(static=True, default=False)
 
     kind: ClassVar[str] = "wave_plate"
     reference: ClassVar[str] = "Born & Wolf, Principles of Optics, ch. 15; Yeh 1980, Surf. Sci. 96, 41"
+
+    def turned(self, angle: float) -> Self:
+        """The plate turned, and with it the readings that its numbers grow with."""
+        plate = super().turned(angle)
+        if not any(part.grown for part in (self, *self.layers)):
+            return plate
+        layers = tuple(dataclasses.replace(layer, grown=_read_at(layer, angle)) for layer in self.layers)
+        return dataclasses.replace(plate, grown=_read_at(self, angle), layers=layers)
 
     def position(self, angle: float | None) -> float | None:
         """At 0° where it always stands in the beam and the exposure says that it is out."""
@@ -105,12 +127,14 @@ class WavePlate(Element):
                 u = ray.wavelength - REFERENCE_WAVELENGTH
                 factor = 1.0 + sum(c * u**k for k, c in enumerate(changes, start=1) if c is not None)
                 extraordinary = ordinary + (extraordinary - ordinary) * factor
-            if self.thermal is not None:
-                warmer = self.thermal * (ray.conditions.temperature - materials.REFERENCE_TEMPERATURE)
+            thermal = _number(self, "thermal", ray)
+            if thermal is not None:
+                warmer = thermal * (ray.conditions.temperature - materials.REFERENCE_TEMPERATURE)
                 extraordinary = ordinary + (extraordinary - ordinary) * (1.0 - crystal.thermal * warmer)
-            axis = jnp.deg2rad(self.axis + layer.axis)
-            cut = None if layer.cut is None else jnp.deg2rad(layer.cut)
-            made.append(plates.Plate(layer.thickness, ordinary, extraordinary, axis, cut))
+            axis = jnp.deg2rad(_number(self, "axis", ray) + _number(layer, "axis", ray))
+            cut = _number(layer, "cut", ray)
+            cut = None if cut is None else jnp.deg2rad(cut)
+            made.append(plates.Plate(_number(layer, "thickness", ray), ordinary, extraordinary, axis, cut))
         return tuple(made)
 
     def mueller(self, ray: Ray) -> Mueller | None:
@@ -131,6 +155,20 @@ class WavePlate(Element):
                 plate, ray = cases[i]
                 result[i] = _behind_gap(plate, ray, matrix)
         return result
+
+
+def _number(part: WavePlate | Layer, name: str, ray: Ray) -> Any:
+    """A number of a plate or a layer for a ray; None where it has none."""
+    value = getattr(part, name)
+    for one in part.grown:
+        if one.change.kind == name:
+            by = one.size * one.change.in_train(ray, one.reading)
+            value = by if value is None else value + by
+    return value
+
+
+def _read_at(part: WavePlate | Layer, angle: float) -> tuple[Grown, ...]:
+    return tuple(dataclasses.replace(one, reading=one.reading + angle) for one in part.grown)
 
 
 def _solved_together(cases: Sequence[tuple[WavePlate, Ray]], model: str) -> Float[Array, "c n 4 4"]:
@@ -154,7 +192,7 @@ def _solved_together(cases: Sequence[tuple[WavePlate, Ray]], model: str) -> Floa
 
 def _behind_gap(plate: WavePlate, ray: Ray, matrix: Mueller) -> Mueller:
     for gap in plate.air_gaps:
-        axis = jnp.deg2rad(plate.axis + plate.layers[0].axis)
+        axis = jnp.deg2rad(_number(plate, "axis", ray) + _number(plate.layers[0], "axis", ray))
         d = gap.contrast * jnp.cos(4.0 * jnp.pi * gap.gap * ray.kz / ray.wavelength)
         matrix = matrix @ mueller.diattenuator(d * jnp.cos(2.0 * axis), d * jnp.sin(2.0 * axis))
     return matrix
