@@ -347,6 +347,22 @@ def test_tables_of_effects_are_those_of_the_catalogue():
     assert page[start:stop].strip() == catalogue_tables().strip()
 
 
+def test_kinds_and_factors_of_descriptions_are_in_their_tables():
+    from walop_jax.model.effects.change import KINDS
+    from walop_jax.model.effects.factors import FORMS, PLAIN
+
+    page = section("effects", "Descriptions")
+    kinds = {row[0] for row in rows(page)}
+    said = {
+        f"{one.split(', ')[0].rpartition(' ')[0]} {axis}".strip()
+        for one in kinds
+        for axis in re.findall(r"\b[quvxy]\b|radial|diagonal", one)
+    }
+    said |= {kind for one in kinds for kind in one.split(", ")}
+    assert set(KINDS) - said - {"shade"} == set()
+    assert [one for one in (*PLAIN, *", ".join(FORMS).split(", ")) if f"`{one}`" not in page] == []
+
+
 def test_effects_with_parameters_units_and_widths():
     from walop_jax.model.effects import EFFECTS
     from walop_jax.model.parameters import field_declarations

@@ -9,6 +9,7 @@ import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from astropy.table import Column as AstropyColumn
@@ -50,8 +51,9 @@ class MatrixTable(Table):
 
     def _block(self, row: int) -> str:
         def number(name: str) -> float:
-            of_user = self[name].unit is not None and name in ("X", "Y")
-            return float((self[name].quantity.to_value("deg") if of_user else np.asarray(self[name]))[row])
+            column: Any = self[name]
+            given = name in ("X", "Y") and column.unit is not None  # in a unit of the user's
+            return float((column.quantity.to_value("deg") if given else np.asarray(column))[row])
 
         x, y = (with_minus_sign(f"{number(name):+.3f}°") for name in ("X", "Y"))
         cells = [

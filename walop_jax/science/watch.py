@@ -199,7 +199,7 @@ class Watching:
         """Weights from χ² of stars, numbers fitted in every group; last, True if any scale is not that of N_ERR."""
         dof, alarm = self.stars.dof.astype(float), ALARM / (len(self.time) + 1)
         least = 1.0 if np.median(self.variance) > CROWDED else 0.0
-        whole = beside_fitted(noise_scale(chi2, dof), dof, fitted.sum())
+        whole = beside_fitted(noise_scale(chi2, dof), dof, float(fitted.sum()))
         off = is_off(whole, alarm)
         common = max(whole.value, least) * of_few(whole, self.alarm) if off else 1.0
         weight, share, several = np.where(whole.kept, 1.0 / common, 0.0), whole.share.copy(), off
@@ -208,7 +208,7 @@ class Watching:
             if len(here) < FEW:
                 continue
             taken = fitted[pool] if pool < len(fitted) else fitted.sum()
-            own = beside_fitted(noise_scale(chi2[here], dof[here]), dof[here], taken)
+            own = beside_fitted(noise_scale(chi2[here], dof[here]), dof[here], float(taken))
             mine, several = is_off(own, alarm), several or is_off(own, alarm)
             variance = max(own.value, least) * of_few(own, self.alarm) if mine else common
             weight[here], share[here] = np.where(own.kept, 1.0 / variance, 0.0), own.share
