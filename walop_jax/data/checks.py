@@ -144,7 +144,9 @@ def make_exposures(
     for prefix in moving:
         angle, inside = table[f"{prefix}_ANGLE"], table[f"{prefix}_IN"]
         advice = f"give the encoder reading, or set {prefix}_IN false"
-        place.refuse(inside & ~np.isfinite(angle), "is not finite", f"{prefix}_ANGLE", advice)
+        absent = inside.any() and not np.isfinite(angle[inside]).any()
+        what = "is missing, or not finite" if absent else "is not finite"
+        place.refuse(inside & ~np.isfinite(angle), what, f"{prefix}_ANGLE", advice)
         # Out of the beam an element has no angle, whatever the header remembers.
         table[f"{prefix}_ANGLE"] = np.where(inside, angle, np.nan)
     angles = np.unique(table["CLP_ANGLE"][clp_in])
