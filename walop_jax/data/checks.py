@@ -144,7 +144,7 @@ def make_exposures(
     for prefix in moving:
         angle, inside = table[f"{prefix}_ANGLE"], table[f"{prefix}_IN"]
         advice = f"give the encoder reading, or set {prefix}_IN false"
-        absent = inside.any() and not np.isfinite(angle[inside]).any()
+        absent = inside.sum() > 1 and not np.isfinite(angle[inside]).any()
         what = "is not finite, or missing," if absent else "is not finite"
         place.refuse(inside & ~np.isfinite(angle), what, f"{prefix}_ANGLE", advice)
         # Out of the beam an element has no angle, whatever the header remembers.
