@@ -1,9 +1,12 @@
 """An observing plan as a file: what it says, what is wrong with it, and what it is worth before any data."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.io import fits
+from own_instrument import OWN
 
 from walop_jax.commands.limits import limits
 from walop_jax.data import read_calibration_set, write_calibration_set
@@ -46,6 +49,33 @@ def test_a_plan_says_what_it_says(plan):
     assert read_plan(plan, "WALOP-NORTH").polariser_angles == (0, 30, 75)
 
 
+def test_a_plan_for_an_instrument_of_ones_own(call, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("own.toml").write_text(OWN)
+    Path("plan.toml").write_text(
+        'instrument = "own.toml"\ngrid = 2\npolariser_angles = 4\nmoving = { WIN = [0, 45] }\n'
+        "moon_patches = 0\nstandards = 0\n"
+    )
+    made = call("simulate", "plan.toml", "-o", "set.fits")
+    assert "Next: walop-jax refit set.fits --instrument own.toml -o RUN" in made.stderr
+    seen = call("inspect", "set.fits")
+    assert "Next: walop-jax refit CALSET --instrument FILE.toml -o RUN" in seen.stderr
+    assert "places of their own" not in seen.stdout
+    with fits.open("set.fits") as hdus:
+        kept = [c for c in hdus["EXPOSURES"].columns if c.name not in ("MJD", "TEMP", "HA")]
+        hdus["EXPOSURES"] = fits.BinTableHDU.from_columns(kept, name="EXPOSURES")
+        hdus.writeto("bare.fits")
+    (note,) = [line for line in call("inspect", "bare.fits").stdout.splitlines() if "missing" in line]
+    assert "[EXPOSURES] MJD, TEMP, HA: columns missing; using nan" in note
+    told = call(
+        "simulate", "--instrument", "own.toml", "-o", "no.fits", "--moon-patches", 0, "--standards", 0
+    )
+    assert "no moving element 'WIN'" in told.stderr
+    assert "moving = { WIN = [0, 22.5, 45] }" in told.stderr
+    assert "did you mean" not in told.stderr
+    assert limits("plan.toml", effects=CATALOGUE[:1]).limits
+
+
 OWN_FILTERS = """
 [filters.SDSS-r]
 [filters.V]
@@ -81,6 +111,7 @@ def test_filters_of_ones_own_are_tables(plan, tmp_path):
         ),
         ("[filters.V]\nwavelength = [0.5, 0.6]", r"\[filters.V\]: needs wavelength \(um\) and throughput"),
         ("grids = 4", "did you mean 'grid'"),
+        ("field = 5", r"field = 5 deg must be between 0 and 0.\d+, the field of WALOP-SOUTH"),
         ("grid = 0", "must be at least 1"),
         ('filters = ["SDSS-x"]', "SDSS-x"),
         ('instrument = "WALOP-EAST"', "WALOP-EAST"),

@@ -7,7 +7,9 @@ import json
 
 import numpy as np
 import pytest
+from own_instrument import OWN
 
+import walop_jax as walop
 from walop_jax.calibration import read_calibration
 from walop_jax.data import builtin_filter
 from walop_jax.data.settings import Settings
@@ -67,3 +69,15 @@ def test_a_run_that_is_not_there(call, tmp_path):
     result = call("trace", tmp_path / "RUN")
     assert result.exit_code == 1
     assert "RUN" in result.stderr
+
+
+def test_an_instrument_tells_what_its_plates_do(tmp_path):
+    """Light arrives whatever a plate does to it: a thickness in mm shows in its retardance alone."""
+    path = tmp_path / "own.toml"
+    path.write_text(OWN.replace('moves = "WIN"\n', "").replace('moves = "CLP"\n', ""))
+    found = walop.instrument(path)
+    # n_e − n_o at 0.62 µm of quartz, 0.00907, and of MgF2, 0.0118 (handbooks), the crystals crossed.
+    assert found.retardance["main.plate"] == pytest.approx((51.0 * 0.00907 - 30.0 * 0.0118) / 0.62, abs=0.005)
+    assert found.retardance["window"] == pytest.approx(0.1 / (2 * np.pi))
+    assert "retards by 0.016 waves at 0.62 um" in str(found)
+    assert any(line.split() == ["moves", "nothing"] for line in str(found).splitlines())

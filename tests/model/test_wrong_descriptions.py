@@ -42,10 +42,6 @@ WRONG = {
         r"\[elements\.window\] there is no kind of element 'retardr'.*retarder",
     ),
     "no kind": (('kind = "retarder"\n', ""), r"\[elements\.window\] has no kind"),
-    "unit": (
-        ('unit = "rad"', 'unit = "deg"'),
-        r"\[elements\.window\] delta is in 'rad', not in 'deg'; convert",
-    ),
     "crystal": (
         ('"mgf2"', '"calcite"'),
         r"\[arms\.main\.elements\.plate\.layers\.second\] there is no crystal 'calcite'",
@@ -59,6 +55,31 @@ WRONG = {
     ),
     "no value": (("{ value = 0.1, sigma", "{ sigma"), r"\[elements\.window\.delta\] has no value"),
     "no thickness": (("thickness = 30.0\n", ""), r"layers\.second\] needs a thickness"),
+    "thickness of 0": (
+        ("thickness = 30.0", "thickness = 0.0"),
+        r"second\] needs a thickness .*; leave a layer of none",
+    ),
+    "degrees for radians": (
+        ('value = 0.1, sigma = 0.02, unit = "rad",', "value = 180.0,"),
+        r"\[elements\.window\] delta = 180 rad is 28\.6 waves; in degrees\? write 3\.14159, or say unit",
+    ),
+    "a unit that can be converted": (
+        ('value = 0.1, sigma = 0.02, unit = "rad",', 'value = 180.0, sigma = 9, unit = "deg",'),
+        r"not in 'deg'; write value = 3\.14159\d+, sigma = 0\.15707",
+    ),
+    "a unit that cannot": (('unit = "rad"', 'unit = "mag"'), r"delta is in 'rad', not in 'mag'; convert it"),
+    "nm for um": (
+        ("axis = 10.0", "axis = 10.0\nwavelength = 550"),
+        r"\[elements\.window\] wavelength = 550 um is not light .* in nm\? write 0\.55",
+    ),
+    "Angstrom for um": (
+        (WINDOW, 'kind = "spectral"\ndelta_at = [4400, 5500]'),
+        r"\[elements\.window\] delta_at = 4400 um is not light .* in Angstrom\? write 0\.44",
+    ),
+    "per cent": (
+        ("efficiency = { value = 0.99", "efficiency = { value = 99.8"),
+        r"analyser\] efficiency = 99\.8 must be between 0 and 1 \(a share, not per cent\)",
+    ),
     "no layers": ((WINDOW, 'kind = "wave_plate"'), r"\[elements\.window\] a wave plate needs layers"),
     "sigma of 0": (
         ("sigma = 0.02", "sigma = 0.0"),
@@ -113,7 +134,7 @@ WRONG = {
         ('cameras = ["right", "left"]', 'cameras = "right"'),
         r"analyser\] cameras = 'right' must be a list",
     ),
-    "no name": (('name = "OWN"\n', ""), r"name is missing"),
+    "no name": (('name = "OWN"\n', ""), r"name is missing; walop-jax docs"),
     "empty name": (('name = "OWN"', 'name = " "'), r"name = ' ' must be a text"),
     "no arms": ((OWN[OWN.index("[arms.main]") :], "[arms]\n"), r"\[arms\] needs one arm"),
     "arms not a table": ((OWN[OWN.index("[arms.main]") :], ""), r"arms is missing"),

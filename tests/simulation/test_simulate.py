@@ -47,6 +47,14 @@ def block_of(simulated: Simulated):
     return simulated.calset.intensities.block(0, len(simulated.calset.points))
 
 
+def test_standards_lie_within_the_field():
+    """A pattern of places that was made for one field would lie outside another, where nothing is calibrated."""
+    assert ObservingPlan(grid=2).points().x[-1] == 0.232
+    small = ObservingPlan(grid=4, field=0.09, standard_grid=3).points()
+    assert np.abs(small.x).max() == np.abs(small.y).max() == 0.09
+    assert np.abs(small.x[-9:]).max() == pytest.approx(0.072)
+
+
 def at_truth(simulated: Simulated) -> tuple[Likelihood, np.ndarray]:
     """The base model of a set, with the effects that are in it, at the true values."""
     model = base_model(simulated.calset)

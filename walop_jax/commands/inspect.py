@@ -56,11 +56,12 @@ def _display(found: Inspection) -> Display:
     counted = math.isfinite(found.median_counts)
     apart = "; standards are measured at places of their own" if found.sources else ""
     some = f" at {found.looked_at} points looked at" if found.looked_at < found.points else ""
+    place = (found.instrument, found.telescope)
     noise = f"{found.noise_ratio**0.5:.4g} × the photon noise √N (median)"
     return Display(
         title=", ".join(found.files) or IN_MEMORY,
         facts=(
-            ("instrument", f"{found.instrument}, {found.telescope} ({found.origin or 'origin not stated'})"),
+            ("instrument", f"{', '.join(filter(None, place))} ({found.origin or 'origin not stated'})"),
             (
                 "field points",
                 f"{found.points}, X {low_x:+.3f} … {high_x:+.3f}°, Y {low_y:+.3f} … {high_y:+.3f}°",
@@ -119,6 +120,7 @@ def inspect(
     from walop_jax import CalibrationSet
     from walop_jax.data import read_calibration_set
     from walop_jax.data.inspection import inspect as inspection_of
+    from walop_jax.instruments.description import shipped
 
     if isinstance(data, CalibrationSet):
         one = inspection_of(data)
@@ -138,6 +140,7 @@ def inspect(
             continue
         faults += [f"{path}: {entry}" for entry in one.findings if entry.severity == "fault"]
         sets.append((str(path), one))
+    strange = [one for _, one in sets if not isinstance(one, DataError) and one.instrument not in shipped()]
     joint = inspection_of(read_calibration_set(*paths)) if len(paths) > 1 and not faults else None
     found = InspectedSets(tuple(sets), joint, tuple(faults))
     return Outcome(
@@ -145,4 +148,5 @@ def inspect(
         found.document,
         lambda: "\n".join(one.text() for one in found.displays()),
         failure="; ".join(faults),
+        next=("walop-jax refit CALSET --instrument FILE.toml -o RUN",) if strange else (),
     )

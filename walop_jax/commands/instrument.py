@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command
 from walop_jax.commands.inputs import PathLike
 from walop_jax.io.display import Display, Displayed
+from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
     from walop_jax import Instrument, Model
+    from walop_jax.model.plan import Plan
 
 SOURCE = Argument("A shipped instrument or a description file; none: list them.", "[NAME|FILE.toml]", str)
 TEXT = Option("Print the description itself, to start one's own from.")
@@ -22,7 +24,8 @@ LARGEST_FIELD = 0.3  # deg: beyond, a description says nothing of the optics
 class CheckedInstrument(Displayed):
     """An instrument with the model of its parameters; `train` and `arms` name elements in the order light meets them.
 
-    `optical` are the parameters that enter the band integral, `conditions` what the optics ask of an exposure.
+    `optical` are the parameters that enter the band integral, `conditions` what the optics ask of an exposure,
+    `retardance` is that of every plate by its place (waves, folded to 0 … ½), for 0.62 µm along the normal.
     """
 
     instrument: Instrument
@@ -32,6 +35,7 @@ class CheckedInstrument(Displayed):
     moving: tuple[str, ...]
     optical: tuple[str, ...]
     conditions: tuple[str, ...]
+    retardance: dict[str, float]
 
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
@@ -42,6 +46,7 @@ class CheckedInstrument(Displayed):
             "arms": {name: list(path) for name, path in self.arms.items()},
             "moving": list(self.moving),
             "conditions": list(self.conditions),
+            "retardance": self.retardance,
             "field_limit": self.instrument.field_limit,
             "parameters": {
                 p.name: {key: getattr(p, key) for key in ("start", "unit", "prior", "source")}
@@ -58,8 +63,11 @@ class CheckedInstrument(Displayed):
         shown = [p for p in self.model.parameters if p.part != THROUGHPUT]
         path = [("light path", " > ".join((*self.train, *(("arms",) if len(self.arms) > 1 else ()))))]
         path += [(f"  {name}", " > ".join(elements)) for name, elements in self.arms.items()]
-        if self.moving:
-            path.append(("moves", ", ".join(f"{prefix}_IN, {prefix}_ANGLE" for prefix in self.moving)))
+        moving = ", ".join(f"{prefix}_IN, {prefix}_ANGLE" for prefix in self.moving)
+        path.append(("moves", moving or "nothing"))
+        path += [
+            (place, f"retards by {waves:.3f} waves at 0.62 um") for place, waves in self.retardance.items()
+        ]
         return Display(
             title=f"{design.name}: {len(design.cameras)} cameras ({', '.join(design.cameras.names)})",
             facts=(*path, ("field", f"to {design.field_limit:g} deg")),
@@ -106,7 +114,8 @@ def instrument(
         own = read_description(source).text
         return Outcome(own, lambda: {"name": str(source), "text": own}, lambda: own)
     job.use_jax()
-    found = checked(source)
+    with errors_naming(source):
+        found = checked(source)
     return Outcome(found)
 
 
@@ -146,4 +155,23 @@ def checked(source: PathLike) -> CheckedInstrument:
         moving=design.moving(),
         optical=tuple(model.names[i] for i in optical_indices(model.template)),
         conditions=tuple(sorted(asked.conditions)),
+        retardance=_retardance(design, plan),
     )
+
+
+def _retardance(design: Instrument, plan: Plan) -> dict[str, float]:
+    """Of all plates, in waves: as the circular part of their Mueller matrix has it, whatever they turn or dim."""
+    import jax.numpy as jnp
+    import numpy as np
+
+    from walop_jax.model.elements import Retarder, SpectralElement, WavePlate
+    from walop_jax.model.ray import Ray
+
+    axis, found = jnp.zeros(()), {}
+    ray = Ray.entering(axis, axis, (plan.wavelength, plan.conditions))
+    for kind in (Retarder, SpectralElement, WavePlate):
+        for place in design.places(kind):
+            if (matrix := design.element(place).mueller(ray)) is not None:
+                row = np.reshape(matrix, (-1, 4, 4))[0, 3]
+                found[place] = float(np.arctan2(np.hypot(row[1], row[2]), row[3]) / (2.0 * np.pi))
+    return found

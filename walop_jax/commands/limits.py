@@ -77,7 +77,8 @@ def limits(
         result = data
     else:
         planned = data if plan is None else as_planned(plan)
-        calset, chosen = set_and_model(planned, model, instrument, effects)  # pyright: ignore[reportArgumentType]
+        design = instrument if plan is None else plan.design
+        calset, chosen = set_and_model(planned, model, design, effects)  # pyright: ignore[reportArgumentType]
         result = examined(refit(calset, chosen, progress=job.progress))
     if not result.converged:
         raise ValueError(f"the fit did not converge ({result.minimum.message})")

@@ -19,7 +19,7 @@ from walop_jax.commands.inputs import (
     catalogue_of,
     design_of,
 )
-from walop_jax.io.text import json_text
+from walop_jax.io.text import json_text, parse_toml, read_text
 
 if TYPE_CHECKING:
     from walop_jax import Effect, Instrument, ObservingPlan
@@ -87,14 +87,16 @@ def simulate(
     from walop_jax import Instrument
     from walop_jax.data.write import write_calibration_set
     from walop_jax.io.atomic import atomic_path, check_output
-    from walop_jax.simulation.observing_plan import read_plan
+    from walop_jax.simulation.observing_plan import instrument_named, read_plan
     from walop_jax.simulation.simulate import effect_from_text
     from walop_jax.simulation.simulate import simulate as simulated
 
     asked = {name: value for name, value in locals().items() if name in OF_A_PLAN}
     catalogue = catalogue_of(effects)
     true = instrument if isinstance(instrument, Instrument) else None
+    file = instrument
     if isinstance(plan, str | os.PathLike):
+        file = file or instrument_named(parse_toml(read_text(plan)), Path(plan).parent)
         plan = read_plan(plan, None if true else instrument)  # pyright: ignore[reportArgumentType]
     try:
         if plan is None:
@@ -139,6 +141,7 @@ def simulate(
             f"{output}: {plan.name}, {document['exposures']} exposures of {document['points']} points; "
             f"{', '.join(document['effects']) or 'nothing'} beyond the base model"
         ),
+        next=(f"walop-jax refit {output} --instrument {file} -o RUN",) if plan.design.description else (),
     )
 
 

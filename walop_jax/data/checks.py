@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.records import KINDS, Exposures, FilterCurve, Points, Site, Sources
+from walop_jax.data.records import KINDS, WAVELENGTHS, Exposures, FilterCurve, Points, Site, Sources
 from walop_jax.data.schema import EXPOSURES, POINTS, SOURCES, Place, check
 from walop_jax.data.settings import BUILTIN_FILTERS
 from walop_jax.instruments.description import described, shipped
@@ -20,8 +20,6 @@ _FIRST_KINDS = ("clp", "moon", "standard", "flux")  # of version 1
 
 EPHEMERIS_MJD = (15020.0, 88069.0)
 """Range of astropy's built-in ephemeris (ERFA `moon98`, the years 1900 to 2100)."""
-
-_WAVELENGTH = (0.2, 20.0)  # µm, from the ultraviolet to the thermal infrared
 
 
 def field_limit(instrument: str) -> float:
@@ -99,7 +97,7 @@ def checked_curve(
     advice = "pad both columns with NaN in the same places"
     refuse(gap, "has no value where WAVELENGTH has one,", "THROUGHPUT", advice)
     wavelength, throughput = wavelength[given], throughput[given]
-    (low, high), (first, last) = _WAVELENGTH, (wavelength.min(), wavelength.max())
+    (low, high), (first, last) = WAVELENGTHS, (wavelength.min(), wavelength.max())
     what = f"reaches from {first:g} to {last:g} µm, outside {low:g} … {high:g},"
     advice = "wavelengths are in µm: are these nm or Angstrom?"
     refuse((first < low) | (last > high), what, "WAVELENGTH", advice)

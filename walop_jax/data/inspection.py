@@ -209,7 +209,11 @@ def _findings(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
     if made.points < 2:
         # What another instrument needs its own description says.
         severity = "fault" if calset.instrument in shipped() else "note"
-        yield Finding(severity, "a single field point", "a joint fit over the field needs several")
+        yield Finding(
+            severity,
+            "a single field point",
+            "the throughput over the field needs several, unless degree = 0 under [throughput] of the instrument file",
+        )
     elif made.points < _FEW_POINTS:
         yield Finding(
             "doubt",

@@ -55,6 +55,10 @@ class Site:
     elevation: float
 
 
+WAVELENGTHS = (0.2, 20.0)
+"""Light of a camera (µm), from the ultraviolet to the thermal infrared."""
+
+
 @dataclasses.dataclass(frozen=True)
 class FilterCurve:
     """Throughput of a filter against wavelength (µm, ascending); one wavelength means monochromatic.
@@ -152,11 +156,9 @@ class Exposures:
             return Position(self.chwp_in, self.chwp_angle)
         if prefix in self.moving:
             return self.moving[prefix]
-        known = (POLARISER, CALIBRATION_PLATE, *self.moving)
-        advice = f"give {prefix}_IN and {prefix}_ANGLE, in an observing plan its positions (moving)"
-        raise ValueError(
-            f"the exposures have no moving element {prefix!r}: {advice}; {nearest(prefix, known)}"
-        )
+        advice = f"give {prefix}_IN and {prefix}_ANGLE, in an observing plan moving = {{ {prefix} = [0, 22.5, 45] }}"
+        like = f"; {nearest(prefix, self.moving)}" if self.moving else ""
+        raise ValueError(f"the exposures have no moving element {prefix!r}: {advice}{like}")
 
     def columns(self) -> dict[str, np.ndarray]:
         """All columns by their names in EXPOSURES, further moving elements last."""

@@ -264,6 +264,7 @@ def read_table(hdu: Any, columns: Mapping[str, Column], place: Place) -> tuple[d
         if name not in columns
     ]
     table: dict[str, Any] = {}
+    absent: dict[str, list[str]] = {}
     for name, column in columns.items():
         if name in names:
             index = names.index(name)
@@ -276,7 +277,10 @@ def read_table(hdu: Any, columns: Mapping[str, Column], place: Place) -> tuple[d
         else:
             table[name] = np.full(rows, column.missing)
             if column.remarked:
-                remarks.append(place.remark(f"column missing; using {column.missing}", name))
+                absent.setdefault(str(column.missing), []).append(name)
+    for missing, left_out in absent.items():
+        what = f"column{'s' if len(left_out) > 1 else ''} missing; using {missing}"
+        remarks.append(place.remark(what, ", ".join(left_out)))
     return table, remarks
 
 

@@ -266,7 +266,8 @@ def check_identifiable(likelihood: Likelihood) -> None:
             "a single field point",
             file=inputs,
             extension="POINTS",
-            advice="the joint fit over the field needs several",
+            advice="the throughput over the field needs several; write degree = 0 under [throughput] of the instrument "
+            "file, or give more points",
         )
 
 

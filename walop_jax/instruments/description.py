@@ -226,7 +226,7 @@ def _description(read: Reader, table: Table, text: str) -> Description:
     read.known(table, KEYS, "")
     for key in REQUIRED:
         if key not in table:
-            raise read.fault("", f"{key} is missing")
+            raise read.fault("", f"{key} is missing; walop-jax docs adding-an-instrument has an example")
     parts = ("site", "field", "throughput", "cameras", "elements", "arms")
     site, field, series, cameras, elements, arms = (
         read.table(table.get(key, {}), "", f"{key} = ") for key in parts

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from walop_jax.data.records import POLARISER, PREFIX
+from walop_jax.data.records import POLARISER, PREFIX, WAVELENGTHS
 from walop_jax.instruments.description import Description, Reader, Table, is_named
 from walop_jax.io.errors import nearest
 from walop_jax.model import legendre
@@ -21,6 +21,9 @@ OWN = ("name", "moves", "declared", "model")  # what a file says otherwise, or n
 NUMBER_KEYS = ("value", "sigma", "unit", "source", "name", "scale", "loose", "tie")
 SERIES = "Legendre coefficient P_i(x/h) P_j(y/h)"
 FREE = "smooth vignetting and coatings: free"
+SHARES = ("efficiency", "extinction", "linear", "circular")
+LARGEST_ANGLE = 4.0 * np.pi  # rad, of a number without a unit: two waves
+NANOMETRES = 3000.0  # above, wavelengths are thought to be in Angstrom
 
 Arm = tuple[str, tuple[Element, ...], tuple[str, ...]]
 Declared = tuple[tuple[str, Parameter], ...]
@@ -157,8 +160,8 @@ class _Maker:
             name = self.read.name(table["name"], f"{place}.layers")
             here = f"{place}.layers.{name}"
             fields, declared = self.fields(Layer, {k: v for k, v in table.items() if k != "name"}, here)
-            if not fields.get("thickness", -1.0) >= 0.0:
-                raise self.read.fault(here, "needs a thickness (um) that is not below 0")
+            if not fields.get("thickness", 0.0) > 0.0:
+                raise self.read.fault(here, "needs a thickness (um) above 0; leave a layer of none out")
             yield self.made(Layer, here, name=name, declared=declared, **fields)
 
     def fields(self, kind: type[Component], table: Table, place: str) -> tuple[dict[str, Any], Declared]:
@@ -174,10 +177,17 @@ class _Maker:
         for key, value in table.items():
             if key in plain:
                 values[key] = self.choice(value, plain[key], key, place)
+                if (key == "at" or key.endswith("_at")) and values[key] != plain[key]:
+                    self.check_wavelengths(values[key], key, place)
             elif key in known:
                 values[key], said = self.number(value, known[key], is_row(kind, key), key, place)
                 if said is not None:
                     declared[key] = said
+                if key == "wavelength":
+                    self.check_wavelengths(values[key], key, place)
+                if key in SHARES and np.max(np.abs(values[key])) > 1.0:
+                    what = f"{key} = {values[key]:g} must be between 0 and 1 (a share, not per cent)"
+                    raise self.read.fault(place, what)
             else:
                 raise self.read.fault(place, str(unknown_name("key", key, [*known, *plain])))
         # In the order of the class, as the tree is flattened.
@@ -189,14 +199,16 @@ class _Maker:
         """The value of a number, or of a row of them; the parameter that it is where more is said than its value."""
         several = self.read.numbers if row else self.read.number
         if not isinstance(given, Mapping):
-            return several(given, key, place), None
+            value = several(given, key, place)
+            self.check_angle(value, known.unit, key, place)
+            return value, None
         here = f"{place}.{key}"
         self.read.known(given, NUMBER_KEYS, here)
         if "value" not in given:
             raise self.read.fault(here, "has no value")
         if given.get("unit", known.unit) != known.unit:
-            what = f"{key} is in {known.unit!r}, not in {given['unit']!r}; convert it"
-            raise self.read.fault(place, what)
+            what = f"{key} is in {known.unit!r}, not in {given['unit']!r}; "
+            raise self.read.fault(place, what + _converted(given, known.unit))
         advice = "; leave it out where there is none"
         widths = {
             k: self.read.positive(given[k], k, here, advice)
@@ -213,7 +225,28 @@ class _Maker:
             loose=widths.get("loose"),
             tie=texts.get("tie"),
         )
-        return several(given["value"], "value", here), declared
+        value = several(given["value"], "value", here)
+        if "unit" not in given:
+            self.check_angle(value, known.unit, key, place)
+        return value, declared
+
+    def check_angle(self, value: float | tuple[float, ...], unit: str, key: str, place: str) -> None:
+        """Raise `DataError` for an angle (rad) without a unit that looks like degrees."""
+        largest = float(np.max(np.abs(value)))
+        if unit == "rad" and largest > LARGEST_ANGLE:
+            what = f"{key} = {largest:g} rad is {largest / (2.0 * np.pi):.1f} waves; in degrees? write "
+            what += f'{np.deg2rad(largest):g}, or say unit = "rad"'
+            raise self.read.fault(place, what)
+
+    def check_wavelengths(self, value: float | tuple[float, ...], key: str, place: str) -> None:
+        """Raise `DataError` for wavelengths (µm) that no camera sees."""
+        low, high = WAVELENGTHS
+        for one in np.atleast_1d(value).tolist():
+            if not low <= one <= high:
+                unit, size = ("nm", 1e-3) if one < NANOMETRES else ("Angstrom", 1e-4)
+                advice = f"; in {unit}? write {one * size:g}" if low <= one * size <= high else ""
+                what = f"{key} = {one:g} um is not light of a camera ({low:g} to {high:g} um){advice}"
+                raise self.read.fault(place, what)
 
     def choice(self, value: Any, default: Any, key: str, place: str) -> Any:
         """A choice that is no parameter, of the type of its default."""
@@ -233,3 +266,18 @@ class _Maker:
             raise self.read.fault(place, f"{key} = {value!r} must be a list")
         texts = bool(value) and isinstance(value[0], str)
         return self.read.words(value, key, place) if texts else self.read.numbers(value, key, place)
+
+
+def _converted(given: Table, unit: str) -> str:
+    """Advice on numbers in another unit than theirs: what to write, where that can be told."""
+    from walop_jax.data.schema import Place, convert_unit
+
+    try:
+        written = {
+            key: convert_unit(np.asarray(given[key], float), str(given["unit"]), unit, key, Place("", ""))
+            for key in ("value", "sigma")
+            if key in given
+        }
+    except (TypeError, ValueError):
+        return "convert it"
+    return "write " + ", ".join(f"{key} = {np.round(value, 9).tolist()}" for key, value in written.items())

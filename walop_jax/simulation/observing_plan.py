@@ -52,7 +52,7 @@ _SOME_NIGHT = 61041.9  # MJD
 NARROW_BANDS: Mapping[str, float] = {"NB-580": 0.580, "NB-660": 0.660}  # centre, µm
 _SPACING = 0.004  # d between exposures
 _GOLDEN = 0.5 * (3.0 - np.sqrt(5.0))  # of a turn: spreads any number of angles evenly
-_STANDARD_EDGE = 0.232  # deg: 5 × 5 centres of boxes of 0.116°
+_STANDARD_EDGE = 0.8  # of the field: 5 × 5 centres of boxes that fill it
 EXPOSED: Mapping[str, float] = {"clp": 30.0, "lamp": 30.0, "moon": 60.0, "standard": 60.0}
 """The usual exposure time (s) of each kind, in which a camera sees `ObservingPlan.electrons`."""
 _MOON_ROTATOR, _STAR_ROTATOR = (0.0, 40.0, 90.0, 135.0), (0.0, 30.0, 75.0, 120.0)
@@ -106,8 +106,9 @@ class ObservingPlan:
     """A calibration run: where, when, through what.
 
     Field points are a `grid` × `grid` raster over ±`field` degrees, on which polariser and Moon sky are measured, and
-    `standard_grid` × `standard_grid` places of the standards; where the instrument's raster is a line the points are
-    `grid` steps of X from 0 to `field` (the tilts of a plate on a bench). NaN: as far out as its description says.
+    `standard_grid` × `standard_grid` places of the standards out to 4/5 of it; where the instrument's raster is a line
+    the points are `grid` steps of X from 0 to `field` (the tilts of a plate on a bench). NaN: as far out as its
+    description says.
     The polariser goes through `polariser_angles` (deg) for each of `filters` and each setting of the calibration
     plate in `plate` (deg, None: out); Moon patches and standards take the settings in turn, in the first filter.
     `filters` are names of those that are built in, and `FilterCurve`s; also a dict of curves by name. The Moon is
@@ -169,6 +170,11 @@ class ObservingPlan:
         for name in ("grid", "standard_grid"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} = {getattr(self, name)} must be at least 1")
+        limit = self.design.field_limit
+        if not 0.0 <= self.field <= limit:
+            raise ValueError(
+                f"field = {self.field:g} deg must be between 0 and {limit:g}, the field of {self.name}"
+            )
         if min(self.moon_patches, self.standards, self.unpolarised) < 0:
             raise ValueError("numbers of Moon patches and standards cannot be negative")
         if not self.electrons > 0:
@@ -270,7 +276,8 @@ class ObservingPlan:
             y, x = (a.ravel() for a in np.meshgrid(edge, edge, indexing="ij"))
         if self.standards:
             n = self.standard_grid
-            edge = np.linspace(-_STANDARD_EDGE, _STANDARD_EDGE, n) if n > 1 else np.zeros(1)
+            last = round(_STANDARD_EDGE * self.field, 9)
+            edge = np.linspace(-last, last, n) if n > 1 else np.zeros(1)
             star_y, star_x = (a.ravel() for a in np.meshgrid(edge, edge, indexing="ij"))
             x, y = np.append(x, star_x), np.append(y, star_y)
         return Points(point=np.arange(len(x)), x=x, y=y)
@@ -478,10 +485,9 @@ def plan_of(
     for name in content:
         if name not in _KNOWN:
             raise unknown_name("entry of a plan", name, _KNOWN)
-    own = content.pop("instrument", None)
-    if instrument is None and own is not None:
-        beside = folder / str(own)
-        instrument = beside if beside.suffix == ".toml" else str(own)
+    own = instrument_named(content, folder)
+    content.pop("instrument", None)
+    instrument = own if instrument is None else instrument
     full_turn, angles = content.pop(FULL_TURN, None), content.get("polariser_angles", _ANGLES)
     if isinstance(angles, int):
         content["polariser_angles"] = polariser_turn(angles, full_turn=bool(full_turn))
@@ -500,6 +506,14 @@ def plan_of(
         return ObservingPlan(None if instrument is None else Instrument.read(instrument), **values)
     except TypeError as error:  # text where a number belongs
         raise fail(str(error), advice="see `walop-jax docs files` for a plan") from None
+
+
+def instrument_named(content: Mapping[str, Any], folder: Path) -> str | Path | None:
+    """The instrument that a plan in `folder` names: that of the package, or the description file beside it."""
+    if (own := content.get("instrument")) is None:
+        return None
+    beside = folder / str(own)
+    return beside if beside.suffix == ".toml" else str(own)
 
 
 def _value(value: Any) -> Any:
