@@ -8,6 +8,7 @@ import pytest
 from astropy.io import fits
 from own_instrument import OWN
 
+from walop_jax.commands.inputs import design_of
 from walop_jax.commands.limits import limits
 from walop_jax.data import read_calibration_set, write_calibration_set
 from walop_jax.data.records import FilterCurve
@@ -74,6 +75,15 @@ def test_a_plan_for_an_instrument_of_ones_own(call, tmp_path, monkeypatch):
     assert "moving = { WIN = [0, 22.5, 45] }" in told.stderr
     assert "did you mean" not in told.stderr
     assert limits("plan.toml", effects=CATALOGUE[:1]).limits
+    call("refit", "set.fits", "--instrument", "own.toml", "-o", "RUN")
+    assert call("plot", "RUN", "modulation", "-o", "angles.png").exit_code == 0
+    assert design_of("RUN").description.strip() == OWN.strip()
+    told = call("plan", "RUN", "--minutes", 20, "--criterion", "window.axis", "-o", "P").stderr
+    assert "where WIN may stand is not known; say moving = { WIN = [0, 22.5, 45] } in a plan" in told
+    told = call("compare", "set.fits", "--instrument", "RUN", "-o", "C").stderr
+    assert "Paper II has a method for two arms of two cameras, which OWN is not" in told
+    call("plan", "plan.toml", "--minutes", 20, "--criterion", "window.delta", "-o", "P")
+    assert read_plan("P/plan.toml").design.description.strip() == OWN.strip()
 
 
 OWN_FILTERS = """
@@ -111,6 +121,21 @@ def test_filters_of_ones_own_are_tables(plan, tmp_path):
         ),
         ("[filters.V]\nwavelength = [0.5, 0.6]", r"\[filters.V\]: needs wavelength \(um\) and throughput"),
         ("grids = 4", "did you mean 'grid'"),
+        ('grid = "4"', "grid = '4' must be a whole number"),
+        ("grid = [4, 4]", r"grid = \[4, 4\] must be a whole number"),
+        ("standards = 3.5", "standards = 3.5 must be a whole number"),
+        ("moving = { HWP = 45 }", r"\[moving\] HWP = 45 must be a list of numbers"),
+        ('moving = { HWP = ["22,5"] }', r"\[moving\] HWP = '22,5' must be a finite number"),
+        ("moving = { CHWP = [] }", "CHWP has no positions; list its angles"),
+        ("polariser_angles = 0", "polariser_angles = 0 must be at least 1, or a list"),
+        ("temperature = [4]", r"temperature = \[4\] must be a list of two numbers"),
+        ('filters = "V"', r"filters = 'V' must be a list of names, or tables \[filters.NAME\]"),
+        ('[[stops]]\npolariser_angle = "x"', r"\[stops\] polariser_angle = 'x' must be a finite number"),
+        ("[[stops]]\nHWP = 22.5", "where an element stands is moving = { HWP = 22.5 }"),
+        (
+            "[[stops]]\npolariser_angle = 5\nmoving = { CHWP = 45 }",
+            r"a stop has a position of CHWP: list all of them in the plan as well, moving = \{ CHWP = \[0",
+        ),
         ("field = 5", r"field = 5 deg must be between 0 and 0.\d+, the field of WALOP-SOUTH"),
         ("grid = 0", "must be at least 1"),
         ('filters = ["SDSS-x"]', "SDSS-x"),

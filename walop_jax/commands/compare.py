@@ -62,6 +62,7 @@ def compare(
     from walop_jax.data.catalogue import true_matrices
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.refit import refit
+    from walop_jax.io.errors import fail
     from walop_jax.io.plain_tables import astropy_table, write_table
     from walop_jax.paper.comparison import compare as comparison_of
     from walop_jax.reports import paper_figures
@@ -75,6 +76,10 @@ def compare(
         calset, chosen = set_and_model(data, model, instrument, effects, output=output)
     else:
         calset, chosen = set_of(data), held.model
+    if [len(arm.analyser.cameras) for arm in chosen.template.arms] != [2, 2]:
+        raise fail(
+            f"Paper II has a method for two arms of two cameras, which {chosen.name} is not; refit and diagnose"
+        )
     if isinstance(truth, str | os.PathLike):
         truth = Truth(*true_matrices(truth, chosen.template.patched()))
     if held is None:

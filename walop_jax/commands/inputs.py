@@ -125,9 +125,13 @@ def catalogue_of(effects: Effects) -> tuple[type[Effect], ...]:
 
 
 def design_of(instrument: InstrumentLike) -> Instrument | None:
-    """The instrument as designed: as given, or read; None if nothing was given."""
+    """The instrument as designed: as given, or read, also from a run or a product; None if nothing was given."""
     from walop_jax import Instrument
 
+    if isinstance(instrument, str | os.PathLike):
+        path = Path(instrument)
+        if path.is_dir() or path.suffix == ".fits":
+            return calibration_of(path).design
     return Instrument.read(instrument) if isinstance(instrument, str | os.PathLike) else instrument
 
 

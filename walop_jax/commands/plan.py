@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from walop_jax import Calibration, ObservingPlan
     from walop_jax.plans.plan import ExposurePlan
 
-PLAN = "plan.toml"
+PLAN, INSTRUMENT = "plan.toml", "instrument.toml"
 
 FOLDER = Option(f"Folder for {PLAN} and plan.json; without it the plan is printed only.", "RUN", Path, "-o")
 What = Annotated[
@@ -58,7 +58,7 @@ Draws = Annotated[
 ]
 
 
-@command(stages=("information", "searching"), writes=(PLAN, "plan.json"), random=True)
+@command(stages=("information", "searching"), writes=(PLAN, INSTRUMENT, "plan.json"), random=True)
 def plan(
     job: Job,
     could: What,
@@ -84,6 +84,8 @@ def plan(
 
     >>> walop.plan(walop.ObservingPlan(grid=3), minutes=20.0)  # doctest: +SKIP
     """
+    from walop_jax import ObservingPlan
+    from walop_jax.data.records import CALIBRATION_PLATE
     from walop_jax.data.user_tables import read_input_table
     from walop_jax.plans.could import Could
     from walop_jax.plans.plan import PLANNED, plan_exposures
@@ -100,7 +102,13 @@ def plan(
     if candidates is not None:
         could = candidates
     elif could == "" and known is not None:
-        could = known.model.template.name
+        further = [one for one in known.design.moving() if one != CALIBRATION_PLATE]
+        if further:
+            raise fail(
+                f"where {' and '.join(further)} may stand is not known",
+                advice=f"say moving = {{ {further[0]} = [0, 22.5, 45] }} in a plan, and give --candidates PLAN.toml",
+            )
+        could = ObservingPlan(known.design) if known.design.description else known.instrument
     if not minutes > 0:
         raise fail("nothing can be observed in no time", advice="give --minutes")
     wanted = (
@@ -123,7 +131,9 @@ def plan(
         )
 
     def files() -> Writers:
-        return {PLAN: text_file(plan_text(found.observing_plan))}
+        described = found.observing_plan.design.description
+        text = plan_text(found.observing_plan, INSTRUMENT if described else None)
+        return {PLAN: text_file(text)} | ({INSTRUMENT: text_file(described)} if described else {})
 
     return Outcome(
         found,

@@ -160,13 +160,14 @@ def is_named(value: Any) -> TypeGuard[list[Table]]:
 
 @dataclasses.dataclass(frozen=True)
 class Reader:
-    """Values of a description, checked one by one; `where` begins every message, `place` is the table."""
+    """Values of a file, checked one by one; `where` (if any) begins every message, `place` is the table."""
 
     where: str
 
     def fault(self, place: str, what: str) -> DataError:
         """The error for something that is wrong in a table."""
-        return DataError(f"{self.where}: [{place}] {what}" if place else f"{self.where}: {what}")
+        text = f"[{place}] {what}" if place else what
+        return DataError(f"{self.where}: {text}" if self.where else text)
 
     def known(self, table: Table, keys: Iterable[str], place: str) -> None:
         """Raise `DataError` for a key that is none of those known."""

@@ -138,16 +138,19 @@ def _histogram(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " n
     axis.legend(frameon=False, fontsize=SMALL, loc="upper right")
 
 
-def modulation_figure(calset: CalibrationSet, points: Sequence[int], on: Canvas = PAGE) -> AnyFigure:
+def modulation_figure(
+    calset: CalibrationSet, points: Sequence[int], on: Canvas = PAGE, names: Sequence[str] | None = None
+) -> AnyFigure:
     """Signals of the arms behind the calibration polariser against its angle, at some field points.
 
-    `points` are rows of `calset.points`. Only exposures with the polariser in and the calibration plate out are shown.
+    `points` are rows of `calset.points`, `names` those of the cameras where the instrument is one's own. Only exposures
+    with the polariser in and the calibration plate out are shown.
     Two arms measure q_m and u_m; an ideal instrument would follow cos 2θ and sin 2θ, the grey lines.
     """
     e = calset.exposures
     shown = np.flatnonzero(e.clp_in & ~e.chwp_in)
     block = calset.intensities.block(0, len(calset.points))
-    names = instrument_of(calset).cameras.names
+    names = names or instrument_of(calset).cameras.names
     arms = len(names) // 2
     figure, panels = on.panels(4.1 * arms, 3.2, 1, arms, sharex=True, sharey=True, squeeze=False)
     angle = np.linspace(0.0, 360.0, 181)

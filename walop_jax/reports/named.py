@@ -201,6 +201,11 @@ def _trace(source: FigureSource) -> AnyFigure:
     )
 
 
+def _cameras(source: FigureSource) -> tuple[str, ...] | None:
+    """Their names, of which the product of an instrument of one's own knows."""
+    return None if source.product is None else source.product.design.cameras.names
+
+
 def _modulation(source: FigureSource) -> AnyFigure:
     exposures, points = source.calset.exposures, source.calset.points
     behind = np.flatnonzero(exposures.clp_in & ~exposures.chwp_in)
@@ -209,7 +214,7 @@ def _modulation(source: FigureSource) -> AnyFigure:
         raise fail("no field point was seen behind the polariser", file=source.folder, advice="plot matrix")
     away = np.hypot(points.x - source.place[0], points.y - source.place[1])
     nearest = int(np.argmin(np.where(seen, away, np.inf)))
-    return figures.modulation_figure(source.calset, [nearest], source.canvas)
+    return figures.modulation_figure(source.calset, [nearest], source.canvas, _cameras(source))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -285,7 +290,7 @@ FIGURES: Mapping[str, NamedFigure] = {
     ),
     "transmission": NamedFigure(
         "transmission of the cameras against polariser angle, with residuals",
-        lambda s: paper_figures.transmission_figure(s.calset, s.maps.filter, s.place, s.canvas),
+        lambda s: paper_figures.transmission_figure(s.calset, s.maps.filter, s.place, s.canvas, _cameras(s)),
         possible=_angles(3),
     ),
     "modulation": NamedFigure("q_m and u_m against polariser angle", _modulation, possible=_angles(1)),

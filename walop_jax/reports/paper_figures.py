@@ -115,7 +115,11 @@ def _most(values: Float[np.ndarray, " p"]) -> tuple[float, float]:
 
 
 def transmission_figure(
-    calset: CalibrationSet, filter_name: str, place: tuple[float, float] = (0.0, 0.0), on: Canvas = PAGE
+    calset: CalibrationSet,
+    filter_name: str,
+    place: tuple[float, float] = (0.0, 0.0),
+    on: Canvas = PAGE,
+    names: Sequence[str] | None = None,
 ) -> AnyFigure:
     """Share of the light in each camera against the polariser angle at the field point nearest to `place` (deg).
 
@@ -135,7 +139,7 @@ def transmission_figure(
     model = fit_transmissions(counts[None], polariser_states(angle))
     fine = np.linspace(angle.min(), angle.max(), 181)
     fitted, curve = (transmitted(model, polariser_states(angles))[0] for angles in (angle, fine))
-    names = instrument_of(calset).cameras.names
+    names = names or instrument_of(calset).cameras.names
     figure, (above, below) = on.panels(6.6, 4.2, 2, 1, sharex=True, height_ratios=(2.2, 1.0))
     for k in range(counts.shape[1]):
         above.plot(fine, curve[:, k] / curve.sum(axis=1), color=f"C{k}", lw=1.0)

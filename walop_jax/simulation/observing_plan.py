@@ -39,8 +39,8 @@ from walop_jax.data.checks import checked_curve
 from walop_jax.data.records import Exposures, FilterCurve, Points, Position, Site
 from walop_jax.data.schema import Place
 from walop_jax.data.settings import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter, single_wavelength
-from walop_jax.instruments.description import default_name, described, shipped
-from walop_jax.io.errors import errors_naming, fail, nearest
+from walop_jax.instruments.description import Reader, default_name, described, shipped
+from walop_jax.io.errors import errors_naming, nearest
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.model.effects.base import Context
 from walop_jax.model.instrument import Instrument, as_designed, nominal_instrument
@@ -167,6 +167,8 @@ class ObservingPlan:
         for prefix in self.moving:
             if prefix not in self.design.moving():
                 raise unknown_name("moving element", prefix, self.design.moving())
+            if not self.moving[prefix]:
+                raise ValueError(f"moving: {prefix} has no positions; list its angles (deg), or leave it out")
         for name in ("grid", "standard_grid"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} = {getattr(self, name)} must be at least 1")
@@ -196,8 +198,13 @@ class ObservingPlan:
             if stop.filter not in self.filter_names:
                 raise unknown_name("filter of a stop", stop.filter, self.filter_names)
             for prefix in stop.moving:
+                if prefix not in self.design.moving():
+                    raise unknown_name("moving element of a stop", prefix, self.design.moving())
                 if prefix not in self.moving:
-                    raise unknown_name("moving element of a stop", prefix, tuple(self.moving))
+                    raise ValueError(
+                        f"a stop has a position of {prefix}: list all of them in the plan as well, "
+                        f"moving = {{ {prefix} = [0, 22.5, 45] }}"
+                    )
             total = {"moon": self.moon_patches, "standard": self.standards}.get(stop.kind, 1)
             if not 0 <= stop.number < total:
                 raise ValueError(
@@ -457,8 +464,10 @@ def _curve_document(given: str | FilterCurve) -> dict[str, Any]:
 OUT = "out"
 _ANGLES = len(polariser_turn())
 FULL_TURN = "full_turn"
-_STOP = tuple(field.name for field in dataclasses.fields(Stop))
-_KNOWN = (*(field.name for field in dataclasses.fields(ObservingPlan)), FULL_TURN)
+_STOP_HINTS, _HINTS = (
+    {field.name: str(field.type) for field in dataclasses.fields(kind)} for kind in (Stop, ObservingPlan)
+)
+_KNOWN = (*_HINTS, FULL_TURN)
 
 
 def is_plan(path: str | os.PathLike[str]) -> bool:
@@ -490,22 +499,53 @@ def plan_of(
     instrument = own if instrument is None else instrument
     full_turn, angles = content.pop(FULL_TURN, None), content.get("polariser_angles", _ANGLES)
     if isinstance(angles, int):
+        if angles < 1:
+            raise ValueError(f"polariser_angles = {angles} must be at least 1, or a list of angles (deg)")
         content["polariser_angles"] = polariser_turn(angles, full_turn=bool(full_turn))
     elif full_turn is not None:
         raise ValueError(
             f"{FULL_TURN} is of no use beside a list of angles; give their number, or leave it out"
         )
     stops = content.pop("stops", [])
+    _check(content, _HINTS)
     values = {name: _value(value) for name, value in content.items()}
     for stop in stops:
         for name in stop:
-            if name not in _STOP:
-                raise unknown_name("entry of a stop", name, _STOP)
-    try:
-        values["stops"] = tuple(Stop(**_value(stop)) for stop in stops)
-        return ObservingPlan(None if instrument is None else Instrument.read(instrument), **values)
-    except TypeError as error:  # text where a number belongs
-        raise fail(str(error), advice="see `walop-jax docs files` for a plan") from None
+            if name not in _STOP_HINTS:
+                position = "; where an element stands is moving = { HWP = 22.5 }" if name.isupper() else ""
+                raise ValueError(f"{unknown_name('entry of a stop', name, _STOP_HINTS)}{position}")
+        _check(stop, _STOP_HINTS, "stops")
+    values["stops"] = tuple(Stop(**_value(stop)) for stop in stops)
+    return ObservingPlan(None if instrument is None else Instrument.read(instrument), **values)
+
+
+def _check(table: Mapping[str, Any], hints: Mapping[str, str], place: str = "") -> None:
+    """Raise `DataError`, naming table and key, for values of a plan that are not of their kind."""
+    for key, value in table.items():
+        _check_value(Reader(""), key, value, hints[key], place)
+
+
+def _check_value(read: Reader, key: str, value: Any, hint: str, place: str) -> None:
+    if hint.startswith("Mapping"):
+        for name, one in read.table(value, place, f"{key} = ").items():
+            _check_value(read, name, one, hint.removeprefix("Mapping[str, "), key)
+    elif hint.startswith("Sequence"):
+        if not isinstance(value, list | dict) or any(not isinstance(one, str) for one in value):
+            raise read.fault(place, f"{key} = {value!r} must be a list of names, or tables [{key}.NAME]")
+    elif hint.startswith("tuple"):
+        pair = hint == "tuple[float, float]"
+        if not isinstance(value, list | tuple) or (pair and len(value) != 2):
+            raise read.fault(place, f"{key} = {value!r} must be a list of {'two ' if pair else ''}numbers")
+        for one in value:
+            _check_value(read, key, one, hint.removeprefix("tuple["), place)
+    elif hint.startswith("float"):
+        if not (value == OUT and hint.startswith("float | None")):
+            read.number(value, key, place)
+    elif hint.startswith("int"):
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise read.fault(place, f"{key} = {value!r} must be a whole number")
+    else:
+        read.text(value, key, place)
 
 
 def instrument_named(content: Mapping[str, Any], folder: Path) -> str | Path | None:
@@ -525,16 +565,16 @@ def _value(value: Any) -> Any:
     return None if value == OUT else value
 
 
-def plan_text(plan: ObservingPlan) -> str:
+def plan_text(plan: ObservingPlan, described: str | None = None) -> str:
     """A plan as the text of a file that `read_plan` reads.
 
-    An instrument of one's own goes by its name: set `instrument` to its description file.
+    An instrument of one's own goes by its name, or by the file beside the plan in which it is `described`.
     """
     unused = {"polariser_angles"} if plan.stops else set()  # every exposure says its own
     return tomlkit.dumps(
         {
             name: _written(value)
-            for name, value in plan.document().items()
+            for name, value in (plan.document() | ({"instrument": described} if described else {})).items()
             if value is not None and name not in unused
         }
     )
