@@ -13,7 +13,7 @@ from walop_jax.commands.command import Job, Option, Outcome, UsageError, command
 from walop_jax.commands.inputs import PathLike
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import fail, nearest
-from walop_jax.io.text import read_text
+from walop_jax.io.text import read_text, some
 
 if TYPE_CHECKING:
     from walop_jax.science.conformance import Deviation
@@ -65,9 +65,7 @@ class Conformance(Displayed):
             if not mistake or len(found) == 1:
                 notes += map(str, found)
                 continue
-            names = ", ".join(f"{one.case} {one.quantity}" for one in found[:SHOWN])
-            more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
-            notes.append(f"{mistake}: {names}{more}")
+            notes.append(f"{mistake}: {some([f'{one.case} {one.quantity}' for one in found], SHOWN)}")
         right = self.asked - len(self.deviations)
         return Display(f"{right} of {self.asked} numbers are right", notes=tuple(notes))
 

@@ -20,7 +20,7 @@ from walop_jax.data.schema import Column, Place, converted, distinct
 from walop_jax.io.errors import DataError, fail, rows_text
 from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits
 from walop_jax.io.plain_tables import table_format
-from walop_jax.io.text import check_input
+from walop_jax.io.text import check_input, some
 
 _TRUTH = dict.fromkeys(("true", "t", "1", "1.0", "yes"), 1.0) | dict.fromkeys(
     ("false", "f", "0", "0.0", "no", ""), 0.0
@@ -119,9 +119,7 @@ def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
 
 
 def _what_is_there(source: InputTable) -> str:
-    names = [str(name) for name in source.table.colnames]
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return f"the table has {', '.join(names[:_LISTED])}{more}"
+    return f"the table has {some([str(name) for name in source.table.colnames], _LISTED)}"
 
 
 def vector_column(source: InputTable, name: str, rule: Column, cameras: Sequence[str]) -> np.ndarray:

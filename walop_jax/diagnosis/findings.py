@@ -15,7 +15,7 @@ from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.display import Display, Drawn
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.text import probability, value_and_error
+from walop_jax.io.text import probability, some, value_and_error
 from walop_jax.model import legendre
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.change import Change
@@ -339,6 +339,7 @@ def _sentence(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------ as plain data
 
 DIAGNOSIS = "diagnosis.json"
+_ALIKE, _CLASSES = 6, 3  # names that look alike, and groups of them, that are printed: the file has all
 
 
 def _number(value: float) -> float | None:
@@ -383,10 +384,10 @@ def sentences(found: Mapping[str, Any]) -> Iterator[str]:
     for one in fitted:
         sense = "smaller" if one["better_by"] > 0 else "larger"
         yield f"{one['change']}: χ² {sense} by {abs(one['better_by']):.4g}"
-    for alike in found.get("classes", ()):
+    for alike in found.get("classes", ())[:_CLASSES]:
         yield (
             f"before anything was added {alike['effect']} was significant too; these data cannot distinguish it from "
-            f"{', '.join(alike['equivalent'])}; what would: {alike['separated_by']}"
+            f"{some(alike['equivalent'], _ALIKE)}; what would: {alike['separated_by']}"
         )
     if found.get("cannot_be_tested"):
         yield f"not tested, since these data cannot show it: {', '.join(found['cannot_be_tested'])}"
@@ -417,7 +418,7 @@ def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
         yield f"{name} sits in: {'; '.join(words)}".replace("clp harmonic", "harmonic of the polariser angle")
     rivals = (*step.get("equivalent", ()), *step.get("nameless", ()))
     if rivals:
-        yield f"{name}: these data cannot distinguish it from {', '.join(rivals)}"
+        yield f"{name}: these data cannot distinguish it from {some(rivals, _ALIKE)}"
     if rivals and step.get("separated_by"):
         yield f"what would: {step['separated_by']}"
 

@@ -23,6 +23,7 @@ from scipy import special
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM
 from walop_jax.diagnosis.score import local_p
+from walop_jax.io.text import some
 
 LEAST = 0.25
 """Correlation below which a common pattern of the optics cannot be told from common noise."""
@@ -42,13 +43,10 @@ def repeated_noise(design: Design) -> Iterator[str]:
     pairs = pairs_alike(design)
     if pairs:
         number = design.fit.calset.exposures.exposure
-        listed = "; ".join(
-            f"{number[p.first]} and {number[p.second]} (correlation {p.correlation:.2f})"
-            for p in pairs[:_SHOWN]
-        )
-        more = f" and {len(pairs) - _SHOWN} pairs more" if len(pairs) > _SHOWN else ""
+        each = [f"{number[p.first]} and {number[p.second]} (correlation {p.correlation:.2f})" for p in pairs]
+        listed = some(each, _SHOWN, "; ")
         yield (
-            f"exposures hold the same noise, as independent ones never do: {listed}{more}: remove one of each pair, "
+            f"exposures hold the same noise, as independent ones never do: {listed}: remove one of each pair, "
             "repeated data shrink the errors"
         )
 

@@ -53,6 +53,7 @@ from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.search import FAR_OFF
 from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points, with_pixels
 from walop_jax.fit.verdict import Structure
+from walop_jax.io.text import some
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.frames import PixelPosterior
 from walop_jax.likelihood.layout import thinned
@@ -270,6 +271,5 @@ def _groups(design: Design) -> Iterator[str]:
     odd = [s for s in scores if s.p_value < limit and not 1.0 / UNEVEN < s.ratio < UNEVEN]
     if odd:
         odd.sort(key=lambda s: -abs(np.log(max(s.ratio, 1e-12))))
-        listed = ", ".join(f"{s.name} {s.ratio:.3g}" for s in odd[:_SHOWN])
-        more = f" and {len(odd) - _SHOWN} more" if len(odd) > _SHOWN else ""
-        yield f"some parts of the data scatter more than the rest (mean squared residual): {listed}{more}"
+        listed = some([f"{s.name} {s.ratio:.3g}" for s in odd], _SHOWN)
+        yield f"some parts of the data scatter more than the rest (mean squared residual): {listed}"

@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.io.text import rounded
+from walop_jax.io.text import rounded, some
 
 STATED = "N_ERR"
 """Origin of the errors of a fit that explains the data: the stated errors."""
@@ -114,9 +114,7 @@ class Hidden:
     def in_words(self, most: int = 1) -> str:
         """The worst of them in a sentence."""
         sizes = [f"{name} of {rounded(size, '.2g')} {unit}".rstrip() for name, size, unit in self.each()]
-        more = f" and {len(sizes) - most} more" if len(sizes) > most else ""
-        listed = ", ".join(sizes[:most]) + more
-        return f"too small to be detected, yet larger than the errors: {listed}"
+        return f"too small to be detected, yet larger than the errors: {some(sizes, most)}"
 
 
 @dataclasses.dataclass(frozen=True)

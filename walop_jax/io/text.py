@@ -11,6 +11,7 @@ import os
 import re
 import stat
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +136,12 @@ def read_json(path: str | os.PathLike[str]) -> Any:
 def json_text(value: Any) -> str:
     """The JSON text of a value, indented, with a final newline; null for what is not finite."""
     return json.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def some(items: Sequence[str], most: int, between: str = ", ") -> str:
+    """The first of some texts, and how many more there are."""
+    more = f" and {len(items) - most} more" if len(items) > most else ""
+    return f"{between.join(items[:most])}{more}"
 
 
 def plain(value: Any) -> Any:

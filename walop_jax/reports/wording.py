@@ -18,7 +18,7 @@ from walop_jax.calibration import Calibration
 from walop_jax.diagnosis.figure_data import UNNAMED
 from walop_jax.fit.parameter_table import PRIOR_ONLY
 from walop_jax.fit.verdict import Quality
-from walop_jax.io.text import probability, rounded, value_and_error, with_error, with_minus_sign
+from walop_jax.io.text import probability, rounded, some, value_and_error, with_error, with_minus_sign
 from walop_jax.model.effects import EFFECTS
 from walop_jax.reports.posterior_figures import LABELS
 
@@ -149,8 +149,7 @@ def data_in_words(product: Calibration) -> list[tuple[str, str]]:
     ]
     moon = (e.kind == "moon") & ~e.clp_in
     places = {(round(float(a), 3), round(float(d), 3)) for a, d in zip(e.ra[moon], e.dec[moon], strict=True)}
-    names = [str(name) for name in product.sources.name]
-    listed = ", ".join(names[:_MANY]) + (f" and {len(names) - _MANY} more" if len(names) > _MANY else "")
+    listed = some([str(name) for name in product.sources.name], _MANY)
     rows += [
         ("Moon patches", str(len(places)) if places else "none"),
         ("Standards", listed or "none"),
@@ -180,7 +179,7 @@ def _angles(angles: Float[np.ndarray, " a"]) -> str:
 
 def _settings(angles: Float[np.ndarray, " a"], out: bool) -> str:
     found = (["out"] if out else []) + [f"{angle:g}°" for angle in np.unique(np.round(angles, 3))]
-    return ", ".join(found[:_MANY]) + (f" and {len(found) - _MANY} more" if len(found) > _MANY else "")
+    return some(found, _MANY)
 
 
 def _range(values: Float[np.ndarray, " e"], unit: str) -> str:

@@ -25,7 +25,7 @@ from scipy import special
 
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.text import with_error, with_minus_sign
+from walop_jax.io.text import some, with_error, with_minus_sign
 from walop_jax.science.star_residuals import (
     ABOUT_GAINS,
     CROWDED,
@@ -119,8 +119,7 @@ class InstrumentChange:
         others = [self._words(entry) for entry in self.alike if entry.question != self.best.question]
         if not others:
             return text
-        more = f", and {len(others) - 4} more" if len(others) > 4 else ""
-        return f"{text}. These rows cannot distinguish it from {', '.join(others[:4])}{more}"
+        return f"{text}. These rows cannot distinguish it from {some(others, 4)}"
 
     def _words(self, found: FoundChange) -> str:
         return found.question.words(found.size, found.error)

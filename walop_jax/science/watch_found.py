@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.text import two_digits, with_minus_sign
+from walop_jax.io.text import some, two_digits, with_minus_sign
 from walop_jax.science.catalogue_check import NOISE_MATTERS, ChangeQuestion
 
 SCATTERED = 4.0
@@ -84,9 +84,8 @@ class WatchedChange:
         others = {entry.name: entry for entry in self.alike if entry.name != self.best.name}
         if not others:
             return f"{_words(self.best)} {when} {significance}"
-        told = [_words(entry) for entry in (self.best, *list(others.values())[:4])]
-        more = f" or {len(others) - 4} more" if len(others) > 4 else ""
-        return f"{when} {significance}, one of these, which the stars cannot tell apart: {' or '.join(told)}{more}"
+        told = some([_words(entry) for entry in (self.best, *others.values())], 5, " or ")
+        return f"{when} {significance}, one of these, which the stars cannot tell apart: {told}"
 
 
 def _words(entry: Suspect) -> str:
