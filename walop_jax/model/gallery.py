@@ -83,7 +83,7 @@ def _effect(effect: type[Effect]) -> Iterator[str]:
         yield from _maps(one)
     yield "## How small it may be, and what it looks like"
     if one is None:
-        yield f"Not shown by the exposures of the example ({found['plan']}), or without an amplitude."
+        yield f"The example ({found['plan']}) has no numbers of it: its exposures do not show it, or were not asked."
     else:
         yield f"In a run of {found['plan']}:"
         yield "\n".join(_sizes(one))
