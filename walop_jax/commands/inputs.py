@@ -35,7 +35,9 @@ TEFF = Option("Colour temperature (K); without it, a flat spectrum.", kind=float
 FILTER = Option("Filter of the calibration, or SDSS-r.", kind=str)
 SETS = Argument("Calibration sets (FITS), fitted as one.", metavar="CALSET...", kind=list[Path])
 EFFECTS = Option(
-    "Effects of your own beside those of the catalogue; see walop-jax docs adding-an-effect.", "FILE.toml|.py", Path
+    "Effects of your own beside those of the catalogue; see walop-jax docs adding-an-effect.",
+    "FILE.toml|.py",
+    Path,
 )
 
 Sets = Annotated["CalibrationSet | PathLike | Sequence[PathLike]", SETS]

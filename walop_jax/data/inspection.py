@@ -265,7 +265,7 @@ def _about_angles(made: Inspection) -> Iterator[Finding]:
 
 
 def about_exposures(exposures: Exposures) -> Iterator[Finding]:
-    """What exposures, taken or planned, cannot show whatever their counts are."""
+    """Notes on what exposures, taken or planned, cannot show whatever their counts are."""
     e = exposures
     if e.clp_in.any() and not e.moving and np.ptp(np.mod(e.clp_angle[e.clp_in], 360.0)) < 180.0:
         yield Finding(
