@@ -27,7 +27,8 @@ class Misfit:
     """Mean squared normalised residual per intensity in each group, and rms disagreement of matrix elements.
 
     With the flux eliminated, noise alone gives 1 − 1/K per intensity of K cameras (1 where the flux is known).
-    `outliers` is the share of (exposure, point) pairs that lie off by themselves (`outliers.outlying`).
+    `elements` are the further moving elements, by the prefix of their columns and their angle; `outliers` is the share
+    of (exposure, point) pairs that lie off by themselves (`outliers.outlying`).
     """
 
     camera: Mapping[str, float]
@@ -38,6 +39,7 @@ class Misfit:
     worst_exposure: tuple[int, float]
     worst_point: tuple[int, float, float, float]
     outliers: float = 0.0
+    elements: Mapping[str, Mapping[str, float]] = dataclasses.field(default_factory=dict)
 
     def sentences(self) -> tuple[str, ...]:
         """The disagreement in words, the largest of each kind first."""
@@ -47,6 +49,14 @@ class Misfit:
             return ", ".join(f"{name} {format(value, form)}" for name, value in order)
 
         point, x, y, value = self.worst_point
+        settings = {"calibration plate": self.calibration_plate} | {
+            f"angle of {prefix}": groups for prefix, groups in self.elements.items()
+        }
+        moved = [
+            f"by {name}: {ranked(groups, '.3g')}"
+            for name, groups in settings.items()
+            if set(groups) != {"out"}
+        ]
         clip = (
             f"{100 * self.outliers:.2g} % of the rows lie more than {BEYOND:g} standard errors off: if these are "
             "cosmic rays or stars, walop-jax clip flags them"
@@ -54,8 +64,9 @@ class Misfit:
         return (
             *([clip] if 0.0 < self.outliers <= MOST else []),
             f"mean squared residual by camera: {ranked(self.camera, '.3g')}",
-            f"by kind: {ranked(self.kind, '.3g')}; by filter: {ranked(self.filter, '.3g')}; "
-            f"by calibration plate: {ranked(self.calibration_plate, '.3g')}",
+            "; ".join(
+                (f"by kind: {ranked(self.kind, '.3g')}", f"by filter: {ranked(self.filter, '.3g')}", *moved)
+            ),
             "disagreement in the matrix, rms over field: "
             + ranked({k: 100 * v for k, v in self.matrix_element.items()}, ".3g")
             + " (%)",
@@ -88,7 +99,10 @@ def misfit_at(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Misfit
             for label in np.unique(labels)
         }
 
-    plate = np.array([f"{a:g} deg" if i else "out" for i, a in zip(e.chwp_in, e.chwp_angle, strict=True)])
+    def positions(inside: np.ndarray, angle: np.ndarray) -> dict[str, float]:
+        labels = [f"{a:g} deg" if i else "out" for i, a in zip(inside, np.round(angle, 3), strict=True)]
+        return grouped(np.array(labels))
+
     per_point = square.sum(axis=(1, 2)) / np.maximum(k * used.sum(axis=1), 1)
     worst = int(per_point.argmax())
     points = likelihood.calset.points
@@ -97,7 +111,7 @@ def misfit_at(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Misfit
         camera=dict(zip(names, (square.sum(axis=(0, 1)) / used.sum()).tolist(), strict=True)),
         kind=grouped(e.kind),
         filter=grouped(e.filter),
-        calibration_plate=grouped(plate),
+        calibration_plate=positions(e.chwp_in, e.chwp_angle),
         matrix_element=_matrix_elements(likelihood, residual),
         worst_exposure=(int(e.exposure[exposure.argmax()]), float(exposure.max())),
         worst_point=(
@@ -107,6 +121,7 @@ def misfit_at(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Misfit
             float(per_point[worst]),
         ),
         outliers=float(outlying(likelihood, residual).sum() / max(used.sum(), 1)),
+        elements={prefix: positions(one.inside, one.angle) for prefix, one in e.moving.items()},
     )
 
 
