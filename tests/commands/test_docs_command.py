@@ -37,6 +37,7 @@ def test_a_page_is_rendered_on_a_terminal(call, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_a_name_that_does_not_exist_lists_the_nearest(call):
+    assert "did you mean 'element'" in call("docs", "elements").stderr
     found = call("docs", "efects")
     assert found.exit_code == 2
     assert "effects" in found.output

@@ -75,6 +75,10 @@ def test_a_plan_for_an_instrument_of_ones_own(call, tmp_path, monkeypatch):
     assert "moving = { WIN = [0, 22.5, 45] }" in told.stderr
     assert "did you mean" not in told.stderr
     assert limits("plan.toml", effects=CATALOGUE[:1]).limits
+    told = call("simulate", "plan.toml", "--effect", "hwp1_axis=0.5", "-o", "no.fits").stderr
+    assert "effect 'hwp1_axis': the instrument has no part 'half1.plate'; known: main, polariser" in told
+    told = call("model", "set.fits", "--instrument", "own.toml", "-o", "MODEL.toml").stderr
+    assert "Next: walop-jax refit set.fits --instrument own.toml --model MODEL.toml -o RUN" in told
     call("refit", "set.fits", "--instrument", "own.toml", "-o", "RUN")
     assert call("plot", "RUN", "modulation", "-o", "angles.png").exit_code == 0
     assert design_of("RUN").description.strip() == OWN.strip()

@@ -33,6 +33,24 @@ def made(**changes) -> CalibrationSet:
     return from_arrays(**(given | changes))
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"counts": light()[..., :2], "errors": light()[..., :2]},
+            "counts: has 2 cameras, WALOP-SOUTH has 4; say with instrument= which",
+        ),
+        (
+            {"filters": {"B": ([0.44], [1.0])}},
+            r"filters: 'B' is no curve; give walop.FilterCurve\('B', wavelength in um",
+        ),
+    ],
+)
+def test_what_belongs_to_another_instrument_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        made(**changes)
+
+
 def test_arrays_come_back():
     block = made().intensities.block(0, 3)
     np.testing.assert_array_equal(block.counts, light())

@@ -82,7 +82,8 @@ def _covariance(product: Calibration) -> Check:
     lowest = float(np.linalg.eigvalsh(0.5 * (correlation + correlation.T))[0])
     lopsided = float(np.abs(correlation - correlation.T).max())
     good = lowest > -1e-8 and lopsided < 1e-10
-    found = f"smallest eigenvalue of the correlation {rounded(lowest, '.2g')}; made from {product.verdict.errors_from}"
+    shown = rounded(round(lowest, 12) + 0.0, ".2g")  # rounding errors are 0
+    found = f"smallest eigenvalue of the correlation {shown}; made from {product.verdict.errors_from}"
     return Check("covariance", good, found)
 
 

@@ -42,7 +42,8 @@ def docs(
         text = "\n".join(f"{key:<{width}}   {words}" for key, words in listed.items())
     elif (text := found.get(topic.lower().removesuffix(".md"), "")) == "":
         raise UsageError(
-            f"there is no page {topic!r}; {nearest(topic, found)} (walop-jax docs lists all)", "topic"
+            f"there is no page {topic!r}; {nearest(topic, (*found, *SINGLE))} (walop-jax docs lists all)",
+            "topic",
         )
     return Outcome(
         text,

@@ -49,6 +49,7 @@ NEXT = {
     "compress": ("walop-jax refit {output} -o RUN",),
     "clip": ("walop-jax refit {output} -o RUN",),
     "import_zemax": ("walop-jax refit {output} -o RUN",),
+    "model": ("walop-jax refit {calsets} --instrument {instrument} --model {output} -o RUN",),
     "sample": ("walop-jax report {fit}",),
     "limits": ("walop-jax report {output}", "walop-jax plan"),
     "compare": ("walop-jax report {output}",),

@@ -87,6 +87,7 @@ def simulate(
     from walop_jax import Instrument
     from walop_jax.data.write import write_calibration_set
     from walop_jax.io.atomic import atomic_path, check_output
+    from walop_jax.model.instrument import NoSuchPlaceError
     from walop_jax.simulation.observing_plan import instrument_named, read_plan
     from walop_jax.simulation.simulate import effect_from_text
     from walop_jax.simulation.simulate import simulate as simulated
@@ -111,6 +112,11 @@ def simulate(
             effect_from_text(one, context, catalogue) if isinstance(one, str) else one
             for one in _texts(effect)
         ]
+        for one in hidden:
+            try:
+                one.patch(plan.design)
+            except NoSuchPlaceError as error:
+                raise ValueError(f"effect {one.name!r}: {error}") from None
     except ValueError as error:
         raise UsageError(str(error)) from None
     if truth is not None:

@@ -39,6 +39,7 @@ from walop_jax.data.schema import CALVERS, Place, column_names, in_unit, read_ta
 from walop_jax.data.settings import builtin_filter
 from walop_jax.data.table_intensities import TableIntensities, mask_repeats, table_intensities, usable
 from walop_jax.data.write import EXTENSION, filter_columns, read_compression, remark, set_tables
+from walop_jax.instruments.description import described, shipped
 from walop_jax.io.errors import DataError, fail, nearest
 from walop_jax.io.fits_reading import UNREADABLE, OpenFile, one_line, open_fits
 
@@ -294,7 +295,7 @@ def from_arrays(
     *,
     instrument: str = "WALOP-SOUTH",
     site: Site | None = None,
-    filters: Mapping[str, FilterCurve] | None = None,
+    filters: Mapping[str, Any] | None = None,
     sources: Mapping[str, Any] | None = None,
     source: Any = None,
     origin: str = "",
@@ -309,7 +310,7 @@ def from_arrays(
     Any other column of EXPOSURES goes by its name in small letters, one value or one for each exposure: `mjd`,
     `filter`, `teff`, `temp`, `ha`, `ra`, `dec`, `rotator`, `chwp_in`, `chwp_angle`, … (docs: files). `sources` are
     the columns of SOURCES, `source` (point, exposure) the SOURCE of every intensity, −1 for none; `filters` are
-    curves by name. Quantities are converted.
+    `FilterCurve`s by name. Quantities are converted.
 
     Raises `DataError`, naming column and row, for whatever a file would be refused for.
 
@@ -327,6 +328,20 @@ def from_arrays(
             column="counts",
             advice="its axes are (point, exposure, camera)",
         )
+    cameras = len(described(instrument).cameras) if instrument.upper() in shipped() else counts.shape[2]
+    if counts.shape[2] != cameras:
+        raise fail(
+            f"has {counts.shape[2]} cameras, {instrument} has {cameras}",
+            column="counts",
+            advice="say with instrument= which other one it is",
+        )
+    for name, curve in (filters or {}).items():
+        if not isinstance(curve, FilterCurve):
+            raise fail(
+                f"{name!r} is no curve",
+                column="filters",
+                advice=f"give walop.FilterCurve({name!r}, wavelength in um, throughput)",
+            )
     if errors.shape != counts.shape:
         raise fail(f"has shape {errors.shape}, counts {counts.shape}", column="errors", advice="one for each")
     number, inside = len(angles), np.isfinite(angles)

@@ -28,6 +28,7 @@ from walop_jax.instruments.description import (
     read_description,
     shipped,
 )
+from walop_jax.io.errors import nearest
 from walop_jax.model import legendre
 from walop_jax.model.build import parts
 from walop_jax.model.cameras import Cameras, Throughput
@@ -275,15 +276,17 @@ def _changed(part: AnyPart, rest: list[str], fields: dict[str, Any], place: str)
             name: value(getattr(part, name)) if callable(value) else value for name, value in fields.items()
         }
         return dataclasses.replace(part, **new)
+    known = []
     for field in dataclasses.fields(part):
         members = getattr(part, field.name)
         if field.metadata.get("static", False) or not isinstance(members, tuple):
             continue
+        known += [_name(member) for member in members if isinstance(member, Element | Arm)]
         for i, member in enumerate(members):
             if isinstance(member, Component) and _name(member) == rest[0]:
                 new = (*members[:i], _changed(member, rest[1:], fields, place), *members[i + 1 :])
                 return dataclasses.replace(part, **{field.name: new})
-    raise NoSuchPlaceError(f"the instrument has no part {place!r}")
+    raise NoSuchPlaceError(f"the instrument has no part {place!r}; {nearest(rest[0], known)}")
 
 
 def _inserted(holder: Any, element: Element, neighbour: str, after: bool) -> Any:

@@ -92,6 +92,9 @@ class Model:
     def change(self, name: str, **changes: Any) -> Model:
         """The model with fields of one parameter replaced."""
         i = self.index(name)
+        for field in changes:
+            if field not in Parameter.__dataclass_fields__:
+                raise unknown_name("field of a parameter", field, Parameter.__dataclass_fields__)
         changed = dataclasses.replace(self.parameters[i], **changes)
         return dataclasses.replace(
             self, parameters=(*self.parameters[:i], changed, *self.parameters[i + 1 :])

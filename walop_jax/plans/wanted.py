@@ -139,7 +139,7 @@ def _at(
             if m.shape[1] != 2:
                 raise ValueError(
                     f"{plan.name} does not measure q and u in one exposure: the error of p depends on how stars are "
-                    "observed; plan for a parameter instead"
+                    f"observed; plan for a parameter instead, such as --criterion {found.names[0]}"
                 )
             blind = np.abs(np.linalg.det(m[:, :, 1:])) < SMALLEST_DETERMINANT
             form = p_forms(m.reshape(len(x), 6), stars)

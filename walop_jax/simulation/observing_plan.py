@@ -412,7 +412,9 @@ class ObservingPlan:
 def filter_curve(given: str | FilterCurve) -> FilterCurve:
     """A built-in filter, one of the narrow bands of `NARROW_BANDS` (flat-topped, 15 nm wide), or a curve, checked."""
     if isinstance(given, FilterCurve):
-        return _own_filter(given.name, given)
+        given = _own_filter(given.name, given)
+    if isinstance(given, FilterCurve):
+        return given
     if given in NARROW_BANDS:
         offset = np.linspace(-0.015, 0.015, 61)
         throughput = np.exp(-np.log(2.0) * (offset / 0.0075) ** 6)
