@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -93,3 +94,14 @@ def test_rows_that_hold_nothing_are_said(call, run, tmp_path):
     assert result.exit_code == 0
     assert "1 star(s) without a result" in result.stderr
     assert np.isnan(np.ma.filled(Table.read(tmp_path / "o.fits")["Q"], np.nan)[0])
+
+
+def test_the_summary_says_how_well_p_is_known_and_variances_are_noticed(call, run, tmp_path):
+    table = catalogue(tmp_path / "s.fits")
+    result = call("apply", run, table, "-o", tmp_path / "o.fits")
+    assert re.search(r"error of p [\d.]+ % \(median\), photons make \d+ % of its variance", result.stdout)
+    stars = Table.read(table)
+    assert "variances" not in result.stderr
+    stars["N_ERR"] = stars["N_ERR"] ** 2
+    stars.write(table, overwrite=True)
+    assert "are these variances?" in call("apply", run, table, "-o", tmp_path / "v.fits").stderr

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,6 +25,7 @@ CATALOGUE = Argument(
 )
 DEBIAS = Option("Estimator of P_DEBIASED: Plaszczynski et al. 2014, or Wardle and Kronberg 1974.", "MAS|WK")
 SATURATION = Option("Counts from here on are not used (FLAG 256).", "ELECTRONS", float)
+BRIGHT = 1000.0  # electrons: their errors are a few per cent, with a read noise of 100 electrons a tenth
 FORCE = Option("Also stars whose filter or temperature it does not cover (FLAG 2048).")
 
 
@@ -130,8 +131,20 @@ def apply(
             + f"; {n[Quality.HIGH_CROSSTALK]} in zones of high cross-talk (FLAG 16)"
             * (n[Quality.HIGH_CROSSTALK] > 0)
         ),
-        warnings=[f"{text} (FLAG {Quality.CATALOGUE:d})" for text in stars.check.warnings()],
+        warnings=[
+            *(f"{text} (FLAG {Quality.CATALOGUE:d})" for text in stars.check.warnings()),
+            *_about_noise(rows.counts, rows.sigma),
+        ],
     )
+
+
+def _about_noise(counts: Any, sigma: Any) -> Iterator[str]:
+    """A sentence where errors of bright stars are as large as what they count."""
+    import numpy as np
+
+    bright = counts > BRIGHT
+    if bright.any() and (share := float(np.median(sigma[bright] / counts[bright]))) > 0.5:
+        yield f"N_ERR of bright stars is {share:.2g} times N: are these variances? Standard errors are wanted"
 
 
 def _errors(columns: Mapping[str, tuple[Any, ...]]) -> str:
