@@ -23,8 +23,8 @@
 
 What it does not mention stays as in the base model. Names that do not exist are errors that list the nearest ones.
 
-The scale of the throughput is a gauge unless a flux is known: the constant of camera N0 is held then. Where every arm
-has a flux of its own, the whole series of its first camera is.
+The scale of the throughput is a gauge unless a flux is known: the constant of camera N0 is held then. Of two cameras,
+and where every arm has a flux of its own, the whole series of the first one is: only ratios can be known.
 """
 
 from __future__ import annotations
@@ -276,10 +276,11 @@ def base_model(
 
 def _gauges(model: Model, flux_known: bool) -> list[str]:
     """Parameters that fluxes take up: the scale of the throughput, or all that the cameras of an arm have in common."""
-    units = tuple(f"throughput.n{camera}." for camera in model.template.cameras.units)
-    if units:
-        return [name for name in model.names if name.startswith(units)]
-    return [] if flux_known else [GAUGE]
+    cameras = model.template.cameras
+    if flux_known and not cameras.split:
+        return []
+    units = tuple(f"throughput.n{camera}." for camera in cameras.units)
+    return [name for name in model.names if name.startswith(units)] if units else [GAUGE]
 
 
 def instrument_of(calset: CalibrationSet) -> Instrument:

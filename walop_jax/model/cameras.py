@@ -130,8 +130,9 @@ class Cameras(Component):
 
     @property
     def units(self) -> tuple[int, ...]:
-        """The cameras that those of their arm are compared with: of a `split` arm only ratios can be known."""
-        return tuple(arm[0] for arm in self.arms) if self.split else ()
+        """The cameras that others are compared with where only ratios can be known: of `split` arms, of a pair."""
+        alone = len(self.arms) == 1 and len(self.names) == 2
+        return tuple(arm[0] for arm in self.arms) if self.split or alone else ()
 
     @property
     def pairs(self) -> tuple[tuple[int, int], ...]:
