@@ -301,3 +301,15 @@ def test_two_experiments_share_their_largest_variance():
     assert plan.bound <= 4.5 * (1 + 1e-6)
     assert plan.value == pytest.approx(4.5, rel=1e-3)
     assert weights_at(plan, GRID, 0.0) == pytest.approx(1 / 3, abs=0.02)
+
+
+def test_a_value_that_no_budget_reaches_is_said():
+    """Candidates inform about the sum of two parameters only: one of them stays as well known as before."""
+    problem = Experiment(
+        np.diag([1.0, 4.0])[None], np.array([[[[1.0], [0.0]]]]), (regression(np.ones((1, 2))),), 1.0
+    )
+    floor = 1.0 / (1.0 + 4.0)  # x₁ + x₂ known exactly: the information of the second counts for the first
+    plan, _ = least_budget(problem, 2.0 * floor)
+    assert plan.value == pytest.approx(2.0 * floor, rel=1e-2)
+    with pytest.raises(NotEstimableError, match=f"below {floor:.3g}"):
+        least_budget(problem, 0.9 * floor)

@@ -55,12 +55,14 @@ _MAIN = 1e-5  # of the largest eigenvalue: curvature below it is left out of a s
 _ROUGH, _EXACT = 0.1, 1e-4  # of μ: Newton's decrement at which a centre is left, and at which it is found
 _BENT = 5  # draws whose curvature stands for that of all
 _NEAR = 0.85  # of the largest variance: targets below it wait until they are among the largest
+_ROUNDING = 1e-15  # of a matrix of unit diagonal, for each of its rows
 _NOTHING = 1e-9  # of the information of everything
 _HOPELESS = 1e3  # times the criterion of the best weights: some target is not determined
 _EXCHANGES = 200
 _TRIED = 60  # exchanges, most promising first, of which the first that lowers the criterion is made
 _SHARPNESS = 20  # power of the variances by which targets share the slope of an exchange
 _BUDGETS = 8  # tried until a criterion is met
+_ENDLESS = 1e6  # times the budget: no plan reaches the criterion
 _SMALL = 1e-3  # of the budget: what is known reaches the criterion already
 _TOPS = 8  # candidates of each family that may join in a round
 _PATIENCE = 4  # rounds without a better bound or value after which the search ends
@@ -190,11 +192,15 @@ class _Some:
         self.wide = _side_by_side(experiment.targets)
         self.per_target = (k, q)
 
-    def covariance(self, weight: Float[np.ndarray, " s"]) -> Float[np.ndarray, "r n n"]:
-        """M(w)⁻¹ of every draw."""
+    def information(self, weight: Float[np.ndarray, " s"]) -> Float[np.ndarray, "r n n"]:
+        """M(w) of every draw."""
         r, s, n, _ = self.matrices.shape
         there = self.experiment.known + (weight @ self.matrices.reshape(r, s, -1)).reshape(r, n, n)
-        return np.linalg.inv(0.5 * (there + np.swapaxes(there, 1, 2)))
+        return 0.5 * (there + np.swapaxes(there, 1, 2))
+
+    def covariance(self, weight: Float[np.ndarray, " s"]) -> Float[np.ndarray, "r n n"]:
+        """M(w)⁻¹ of every draw."""
+        return np.linalg.inv(self.information(weight))
 
     def variances(self, covariance: Float[np.ndarray, "r n n"]) -> Float[np.ndarray, "r k"]:
         """φ of every target."""
@@ -307,7 +313,7 @@ class _Some:
             # Curvature of the φ: Σ_k push_k 2 tr(M_s P M_t Q), P = M⁻¹, Q = Σ_k push_k y_k y_kᵀ. Its main part in some
             # of the draws, which are much alike, is enough to step by.
             pushed = y[some] * np.repeat(push[some], self.per_target[1], axis=1)[:, None]
-            left = np.linalg.cholesky(covariance[some]).swapaxes(1, 2)
+            left = np.linalg.inv(np.linalg.cholesky(self.information(weight)[some]))
             right = root_of(pushed @ np.swapaxes(y[some], 1, 2), _MAIN)
             flat = np.moveaxis(left[:, None] @ (self.matrices[some] @ right[:, None]), 1, 0).reshape(s, -1)
             alike = push.sum() / push[some].sum()
@@ -362,7 +368,7 @@ def _on_the_budget(
 ) -> Float[np.ndarray, " v"]:
     """The Newton step that leaves cost · step = 0."""
     size = np.sqrt(np.diag(hessian))
-    factor = linalg.cho_factor(hessian / np.outer(size, size) + 1e-14 * np.eye(len(size)))
+    factor = linalg.cho_factor(hessian / np.outer(size, size) + _ROUNDING * len(size) * np.eye(len(size)))
     free = linalg.cho_solve(factor, gradient / size) / size
     along = linalg.cho_solve(factor, cost / size) / size
     return -(free - along * (cost @ free) / (cost @ along))
@@ -472,7 +478,8 @@ def lower_bound(
 def least_budget(experiment: Experiment, value: float, *, gap: float = GAP) -> tuple[Allocation, float]:
     """The plan of the least budget that reaches a criterion, to `gap`, and a budget that none can reach it below.
 
-    The budget of the plan is Σ weight · cost. Raises as `optimise`.
+    The budget of the plan is Σ weight · cost. Raises as `optimise`, and NotEstimableError for a value that more and
+    more of the candidates does not reach.
     """
 
     problem = experiment.reduced()
@@ -488,6 +495,8 @@ def least_budget(experiment: Experiment, value: float, *, gap: float = GAP) -> t
             break
         # What is known already bends the law 1 / budget: the bound says where it meets the value.
         budget = max(plan.proof.budget(value) * plan.value / plan.bound, _SMALL * experiment.budget)
+        if budget > _ENDLESS * experiment.budget:
+            raise NotEstimableError(f"the criterion does not fall below {plan.bound:.3g}, whatever is spent")
         plan = best(budget)
         least = max(least, plan.proof.budget(value))
     return plan, least

@@ -298,11 +298,15 @@ def plan_from(
     best, lines, some, experiment = _at_few_angles(
         found, weights, lambda part: experiment_of(part, minutes, want, known), gap
     )
-    needed = None
+    needed, endless = None, ()
     if goal is not None:
         tell("how long the goal takes")
-        cheapest, least = least_budget(whole, want.variance(goal), gap=gap)
-        needed = (_cost(whole, cheapest) / 60.0, least / 60.0)
+        try:
+            cheapest, least = least_budget(whole, want.variance(goal), gap=gap)
+            needed = (_cost(whole, cheapest) / 60.0, least / 60.0)
+        except NotEstimableError:
+            said = f"no time reaches {digits(goal, '.3g')} {want.unit}"
+            endless = (f"{want.what}: {said}; add other settings to what could be observed",)
     total = _total(experiment, best)
     plan = dataclasses.replace(
         some.could.plan,
@@ -328,7 +332,7 @@ def plan_from(
         after=_errors(found, field, covariance(total)),
         beside=dict(_beside(found, whole, want)),
         observing_plan=plan,
-        notes=(*found.notes, *unseen),
+        notes=(*found.notes, *endless, *unseen),
         any_plate=found.could.any_plate,
     )
 
