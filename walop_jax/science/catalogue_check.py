@@ -362,7 +362,7 @@ class CatalogueSearch:
 
         def look(scale: Scale, heavier: float = 1.0) -> _Look:
             off = is_off(scale, self._alarm) and not self.crowded
-            single = scale.value * heavier if scale.value > 1 or off else 1.0
+            single = heavier * (scale.value if scale.value > 1 or off else 1.0)
             several = single
             if rows is not None and _chance_beside(rows, noise) < self._alarm:
                 several = max(single, rows.value)
@@ -378,7 +378,8 @@ class CatalogueSearch:
             about = beside_fitted(scale_of(self._left(sizes + gains)), dof, fitted)
             if about.worth < FEW:
                 break
-            found = look(about, of_few(about, threshold(self._alarm)) if is_off(about, self._alarm) else 1.0)
+            off = is_off(about, self._alarm)
+            found = look(about, of_few(about, threshold(self._alarm)) if off else 1.0)
         return found
 
     def _gains(self, look: _Look) -> tuple[Float[np.ndarray, " c"], int]:

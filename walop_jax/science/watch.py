@@ -201,7 +201,9 @@ class Watching:
         least = 1.0 if np.median(self.variance) > CROWDED else 0.0
         whole = beside_fitted(noise_scale(chi2, dof), dof, float(fitted.sum()))
         off = is_off(whole, alarm)
-        common = max(whole.value, least) * of_few(whole, self.alarm) if off else 1.0
+        common = max(whole.value, least) if off else 1.0
+        if fitted.any():  # N_ERR was in doubt ahead of the gains
+            common = max(whole.value, 1.0) * (of_few(whole, self.alarm) if off else 1.0)
         weight, share, several = np.where(whole.kept, 1.0 / common, 0.0), whole.share.copy(), off
         for pool in np.unique(self.pool):
             here = np.flatnonzero(self.pool == pool)
@@ -210,7 +212,9 @@ class Watching:
             taken = fitted[pool] if pool < len(fitted) else fitted.sum()
             own = beside_fitted(noise_scale(chi2[here], dof[here]), dof[here], float(taken))
             mine, several = is_off(own, alarm), several or is_off(own, alarm)
-            variance = max(own.value, least) * of_few(own, self.alarm) if mine else common
+            variance = (
+                max(own.value, least) * (of_few(own, self.alarm) if fitted.any() else 1.0) if mine else common
+            )
             weight[here], share[here] = np.where(own.kept, 1.0 / variance, 0.0), own.share
         return weight / self.variance, share, whole, several
 
