@@ -72,7 +72,13 @@ FACTORS = (
     "exposure 12",
     "x * hours",
 )
-TOLD = (*HEADS, *(f"{head} * {factor}" for head, factor in zip(HEADS, FACTORS, strict=False)))
+GROWS = {
+    "counts": "gain of O1",
+    "cos 2 CLP": "turn of polariser",
+    "sin 1 CHWP": "axis of chwp",
+    "exposure 12": "gain of O1",
+}
+TOLD = (*HEADS, *(f"{GROWS.get(factor, 'retardance q behind half1.plate')} * {factor}" for factor in FACTORS))
 
 
 @pytest.fixture

@@ -109,7 +109,7 @@ def test_every_pass_reads_every_slab_once(calset, streaming):
 
 def test_expansion_and_counts_agree(calset, streaming):
     one = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
-    other = Likelihood.of(calset, base_model(calset, throughput_degree=2), points_per_chunk=16)
+    other = Likelihood.of(calset, base_model(calset, throughput_degree=2), points_per_chunk=16, memory=1e9)
     assert not one.layout.kept
     assert other.layout.kept
     a, b = one.expand(one.model.start), other.expand(other.model.start)

@@ -143,7 +143,7 @@ def make_exposures(
         angle, inside = table[f"{prefix}_ANGLE"], table[f"{prefix}_IN"]
         advice = f"give the encoder reading, or set {prefix}_IN false"
         absent = inside.sum() > 1 and not np.isfinite(angle[inside]).any()
-        what = "is not finite, or missing," if absent else "is not finite"
+        what, advice = "is not finite", advice + (", if the column is there at all" if absent else "")
         place.refuse(inside & ~np.isfinite(angle), what, f"{prefix}_ANGLE", advice)
         # Out of the beam an element has no angle, whatever the header remembers.
         table[f"{prefix}_ANGLE"] = np.where(inside, angle, np.nan)
