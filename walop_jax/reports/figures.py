@@ -119,8 +119,13 @@ def point_residuals(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> 
 def _histogram(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> None:
     """All residuals of a fit, and what noise alone would give."""
     _, residual = likelihood.residuals(values)
+    # A flux takes the share y²/Σy² of the variance of every intensity y, in units of its error.
+    square = (likelihood.points.gathered("counts") * likelihood.points.gathered("weight")) ** 2
+    together = likelihood.model.template.cameras.together
+    power = square @ (np.ones((likelihood.cameras,) * 2) if together is None else np.asarray(together))
+    taken = np.where(likelihood.flux_known[:, None], 0.0, square / np.where(power > 0, power, 1.0))
+    width = np.sqrt(np.clip(1.0 - taken, 1e-3, None))[likelihood.used].ravel()
     used = residual[likelihood.used].ravel()
-    width = np.sqrt(np.mean(likelihood.data_per_row[np.nonzero(likelihood.used)[1]]) / likelihood.cameras)
     edges = np.linspace(-4.0, 4.0, 41)
     each = np.full(
         used.size, 1.0 / (used.size * (edges[1] - edges[0]))

@@ -258,7 +258,7 @@ FIGURES: Mapping[str, NamedFigure] = {
         possible=_small,
     ),
     "matrix": NamedFigure(
-        "the six elements of the instrument matrix",
+        "the elements of the instrument matrix",
         lambda s: figures.matrix_maps_figure(s.maps, on=s.canvas),
     ),
     "matrix-errors": NamedFigure(

@@ -150,7 +150,7 @@ def _next(run: RunContents, trusted: bool) -> list[tuple[str, str]]:
         steps.append(("look for what is missing", f"walop-jax diagnose {sets} -o {name}_diagnosis"))
     if run.limits is None and trusted:
         steps.append(("see what could hide in these data", f"walop-jax limits {sets} -o {name}"))
-    return [*steps, ("plan better exposures", "walop-jax plan WALOP-SOUTH")]
+    return [*steps, ("plan better exposures", f"walop-jax plan {name} --minutes 10")]
 
 
 def _accuracy_in_words(accuracy: FieldAccuracy) -> dict[str, str]:

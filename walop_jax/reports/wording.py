@@ -213,7 +213,7 @@ PLACES = {
     "half1": "half1 for the half of the pupil with HWP1",
     "half2": "half2 for that with HWP2",
     "chwp": "chwp for the calibration half-wave plate",
-    "throughput": "n0, n1, … for the cameras in their order (O1, E1, O2, E2)",
+    "throughput": "n0, n1, … for the cameras in their order",
 }
 
 
