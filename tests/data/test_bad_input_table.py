@@ -234,7 +234,7 @@ ELSEWHERE = {
     "44": "commands/test_refit_run.py::test_a_fit_that_does_not_converge_leaves_no_calibration",
     "45": "posterior/test_chains.py::test_a_killed_run_loses_one_block_and_ends_up_the_same",
     "46": "posterior/test_chains.py::test_checkpoints_come_back_and_refuse_what_is_not_theirs",
-    "47": "posterior/test_full_disk.py::test_full_disk_is_an_error_and_leaves_what_was_there",
+    "47": "posterior/test_full_disk.py::test_full_disk_is_an_error_and_leaves_nothing_half_written",
     "48": "io/test_folder.py::test_the_second_of_two_writers_is_told_who_the_first_is",
     "49": "io/test_folder.py::test_a_read_only_folder_is_refused",
     "50": "likelihood/test_large.py::test_memory_is_bounded_by_what_is_allowed",
