@@ -322,3 +322,8 @@ def test_the_page_runs_as_it_stands(sets, tmp_path, monkeypatch, capsys):
     turn = turn[turn["NAME"] == "clp_zero.angle"]
     assert np.all(np.abs(turn["VALUE"]) < 4.0 * turn["ERROR"])
     assert np.all(turn["ERROR"] < 0.05)
+
+
+def test_a_fit_says_how_nights_are_linearised(quiet, single):
+    """From Python, as a fit in memory."""
+    assert walop.stack(list(quiet.data.nights), {}, like=single, no_breaks=True).verdict.trusted

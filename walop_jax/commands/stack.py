@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.inputs import Effects, Product, calibration_of, catalogue_of
+from walop_jax.commands.inputs import Effects, PathLike, calibration_of, catalogue_of
 
 if TYPE_CHECKING:
+    from walop_jax import Calibration, FitResult, Run
     from walop_jax.nights.survey import Survey
 
 NIGHTS = Argument("Calibration sets, folders of refit, or a SURVEY.", "NIGHT...", list[Path])
@@ -25,7 +26,7 @@ def stack(
     nights: Annotated[Any, NIGHTS],
     laws: Annotated[Any, LAWS] = None,
     *,
-    like: Annotated[Product | None, LIKE] = None,
+    like: Annotated[Calibration | FitResult | Run | PathLike | None, LIKE] = None,
     events: Annotated[Any, EVENTS] = None,
     no_breaks: Annotated[bool, KNOWN] = False,
     output: Annotated[Any, SURVEY] = None,
