@@ -355,7 +355,7 @@ class CatalogueSearch:
         stars, dof = self.stars, self.stars.dof.astype(float)
 
         def scale_of(residual: Float[np.ndarray, "r k"]) -> Scale:
-            return noise_scale(np.add.reduceat(np.sum(residual**2, axis=1), stars.first) / self.variance, dof)
+            return noise_scale(stars.chi2(residual) / self.variance, dof)
 
         residual = self._left(sizes)
         noise, rows = scale_of(residual), shared_by_rows(stars, residual, self.variance)

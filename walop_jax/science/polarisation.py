@@ -5,8 +5,8 @@
 Errors      σ_p² = nᵀ C n;  σ_EVPA = σ_t / 2p with σ_t² = tᵀ C t, and no more than 180°/√12, what a uniform
             distribution has. Where p < 5 σ_p, (q, u) may as well lie on the other side of 0: there σ_EVPA is the rms
             distance, within half a turn, of the angles of a normal distribution about (q, u) from EVPA. Where C = 1 and
-            m = |(q, u)|, the angle φ of the vectors from that of their mean has the density
-            f(φ) = (φ(m) + b Φ(b) φ(m)/φ(b)) / √(2π), b = m cos φ, φ(·) and Φ the normal density and its integral
+            m = |(q, u)|, the angle α of the vectors from that of their mean has the density
+            f(α) = φ(m) (1 + b Φ(b)/φ(b)) / √(2π), b = m cos α, φ and Φ the normal density and its integral
             (Mardia 1972, Statistics of Directional Data, 3.4); C^½ takes it to any other C
 Bias        Noise across the direction of (q, u) only ever lengthens the vector: <p> ≈ p₀ + σ_t²/2p₀. Two
             estimators of p₀ are offered, both with b = σ_t, which is σ where C = σ² 1:
@@ -26,7 +26,7 @@ from scipy import special
 
 Vector = Float[np.ndarray, " s"]
 ESTIMATORS = ("MAS", "WK")
-_CERTAIN, _ANGLES, _TOGETHER = 5.0, 128, 4096
+_CERTAIN, _ANGLES, _TOGETHER = 5.0, 128, 4096  # σ_p from which C alone counts; angles, and stars at once
 NO_ANGLE = 180.0 / np.sqrt(12.0)
 """Standard deviation (deg) of an angle of which nothing is known."""
 

@@ -104,6 +104,10 @@ class StarResiduals:
         fluxes = ((used @ (arms > 0).T) > 0).sum(axis=1)
         return np.add.reduceat(used.sum(axis=1) - fluxes, self.first) - 2
 
+    def chi2(self, residual: Float[np.ndarray, "r k"]) -> Float[np.ndarray, " s"]:
+        """χ² of every star: the sum of its squared residuals."""
+        return np.add.reduceat(np.sum(residual**2, axis=1), self.first)
+
     def part(self, stars: slice) -> StarResiduals:
         """Some of the stars, a slice of them."""
         first = np.append(self.first, len(self))
@@ -165,7 +169,7 @@ def own_variance(stars: StarResiduals) -> Float[np.ndarray, " s"]:
     if stars.structure > 0:
         columns += [stars.structure * stars.model * each for each in np.eye(stars.model.shape[1])]
     for column in columns:
-        spread += np.add.reduceat(np.sum(stars.left(column) ** 2, axis=1), stars.first)
+        spread += stars.chi2(stars.left(column))
     # Gains of the cameras make fewer independent residuals than a star of several rows has.
     return 1.0 + spread / np.clip(stars.dof, 1, stars.model.shape[1] - 1)
 

@@ -173,9 +173,6 @@ class Watching:
 
     # --------------------------------------------------------------------------------------------- noise
 
-    def _chi2(self, residual: Float[np.ndarray, "r k"]) -> Float[np.ndarray, " s"]:
-        return np.add.reduceat(np.sum(residual**2, axis=1), self.stars.first) / self.variance
-
     def weights(
         self, residual: Float[np.ndarray, "r k"]
     ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Scale]:
@@ -184,19 +181,20 @@ class Watching:
         A change that stars of a night have in common is no noise: where χ² is not what N_ERR says, weights come from
         the scatter about the gains that fit each group best, if there are stars enough to know it.
         """
-        weight, share, whole, off = self._scaled(self._chi2(residual), np.zeros(len(self.time)))
+        weight, share, whole, off = self._scaled(residual, np.zeros(len(self.time)))
         for _ in range(ABOUT_GAINS if off else 0):
             left, fitted = self._behind_gains(residual, weight, share)
-            found = self._scaled(self._chi2(left), fitted)
+            found = self._scaled(left, fitted)
             if found[2].worth < FEW:
                 break
             weight, share = found[:2]
         return weight, share, whole
 
     def _scaled(
-        self, chi2: Float[np.ndarray, " s"], fitted: Float[np.ndarray, " g"]
+        self, residual: Float[np.ndarray, "r k"], fitted: Float[np.ndarray, " g"]
     ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Scale, bool]:
-        """Weights from χ² of stars, numbers fitted in every group; last, True if any scale is not that of N_ERR."""
+        """Weights behind numbers fitted in every group, κ, the scale; True if any scale is not that of N_ERR."""
+        chi2 = self.stars.chi2(residual) / self.variance
         dof, alarm = self.stars.dof.astype(float), ALARM / (len(self.time) + 1)
         least = 1.0 if np.median(self.variance) > CROWDED else 0.0
         whole = beside_fitted(noise_scale(chi2, dof), dof, float(fitted.sum()))
@@ -225,9 +223,8 @@ class Watching:
         share: Float[np.ndarray, " s"],
     ) -> tuple[Float[np.ndarray, "r k"], Float[np.ndarray, " g"]]:
         """Residuals behind the gains of the cameras that fit each group best, and how many numbers these are."""
-        groups, count, cameras = len(self.time), len(self.cameras) + len(self.optics), len(self.cameras)
-        matrix, score = self.scan(residual, weight, share)
-        blocks, slopes = matrix.reshape(groups, count, groups, count), score.reshape(groups, count)
+        groups, cameras = len(self.time), len(self.cameras)
+        blocks, slopes = self._by_group(*self.scan(residual, weight, share))
         gain, fitted = np.zeros((groups, cameras)), np.zeros(groups)
         for g in range(groups):
             root = inverse_root(blocks[g, :cameras, g, :cameras])
@@ -306,6 +303,13 @@ class Watching:
             flat = dense.reshape(-1, groups * count)
             blocks -= (flat.T @ flat).reshape(blocks.shape)
 
+    def _by_group(
+        self, matrix: Float[np.ndarray, "c c"], score: Float[np.ndarray, " c"]
+    ) -> tuple[Float[np.ndarray, "g k g k"], Float[np.ndarray, "g k"]]:
+        """Q and g of `scan` by group and change."""
+        slopes = score.reshape(len(self.time), -1)
+        return matrix.reshape(*slopes.shape, *slopes.shape), slopes
+
     def _changes(self, part: StarResiduals) -> Float[np.ndarray, "r k c"]:
         """Columns of what may change: the gains of the cameras, then the numbers of the optics."""
         gains = part.model[..., None] * np.eye(len(self.cameras))
@@ -354,9 +358,9 @@ class Watching:
 
     def answers(self, matrix: Any, score: Any) -> tuple[Answers, Answers]:
         """Sizes and standard errors of every history of every camera and number of the optics, each alone."""
-        groups, count = len(self.time), len(self.cameras) + len(self.optics)
+        blocks, slopes = self._by_group(matrix, score)
+        count = slopes.shape[1]
         size, error = np.zeros((len(self.histories), count)), np.full((len(self.histories), count), np.inf)
-        blocks, slopes = matrix.reshape(groups, count, groups, count), score.reshape(groups, count)
         for k in range(count):
             own = blocks[:, k, :, k]
             information = np.einsum("gh,gf,fh->h", self.shapes, own, self.shapes, optimize=True)
@@ -413,9 +417,7 @@ class Watching:
     ) -> Watch:
         """The record: gains are what is left behind the changes, and the changes that each camera may be."""
         groups, cameras = len(self.time), len(self.cameras)
-        count = cameras + len(self.optics)
-        blocks = matrix.reshape(groups, count, groups, count)
-        slopes = score.reshape(groups, count)
+        blocks, slopes = self._by_group(matrix, score)
         gain, error, smallest = (np.full((groups, cameras), np.nan) for _ in range(3))
         steps = np.tril(np.ones((groups, groups)))  # group, start
         for k in range(cameras):
@@ -427,7 +429,7 @@ class Watching:
             error[:, k] = np.where(own > 0, own, np.nan) ** -0.5
             information = np.einsum("gh,gf,fh->h", steps, blocks[:, k, :, k], steps, optimize=True)
             smallest[:, k] = (self.alarm + SEEN) * np.where(information > 0, information, np.nan) ** -0.5
-        chi2 = np.add.reduceat(np.sum(self.stars.residual**2, axis=1), self.stars.first)
+        chi2 = self.stars.chi2(self.stars.residual)
         dof = self.stars.dof
         pairs = np.unique(self.stars.star * groups + self.group)
         ratio = np.full(groups, np.nan)
